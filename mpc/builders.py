@@ -115,14 +115,14 @@ def _nonlinear(table: Nonlinear, vehicle: Vehicle, period: float, shapes: Sequen
 
 @law_of.register(LQRTable)
 def _lqr(table: LQRTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    return LQR(vehicle, table.settings(vehicle, period))
+    return LQR(vehicle, period, table)
 
 
 @law_of.register(PID)
 def _pid(table: PID, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    return CascadedPID(vehicle, table.settings(vehicle, period))
+    return CascadedPID(vehicle, period, table)
 
 
 @law_of.register(Geometric)
 def _geometric(table: Geometric, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    return GeometricController(vehicle, table.settings(vehicle, period))
+    return GeometricController(vehicle, period, table)

@@ -7,7 +7,6 @@ Subject to Rotor Drag for Accurate Tracking of High-Speed Trajectories", 2018.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal, TypeAlias
 
@@ -35,7 +34,7 @@ from mpc.disturbance import RampObserver, RampSettings
 from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
 from mpc.model import target_model
 from mpc.nonlinear.model import zero
-from quadsim.controller import Command, Phase, StepInputs
+from quadsim.controller import ROTORS, Command, Phase, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.rotation import multiply
@@ -45,51 +44,33 @@ from quadsim.vehicle import Vehicle
 Commands: TypeAlias = Literal["rotors", "rates", "attitude"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class GeometricSettings:
-    """Parameters of a geometric controller; `geometric_settings` derives them from a vehicle and a period."""
+NO_LAG: Final = (0.0, 0.0, 0.0, 0.0)
 
-    period: float  # tau_s [s]
+
+@dataclass(frozen=True, kw_only=True)
+class GeometricGains:
+    """Gains of a geometric controller; `geometric_gains` derives them from a vehicle and a period.
+
+    Those of the heading have `YAW_SHARE` of the bandwidth: its factor for k_Omega, its square for k_R, as reaction
+    torques are weak.
+    """
+
     k_x: float  # gain of the position error [1/s^2], k_x / m of Lee et al. (2010)
     k_v: float  # gain of the velocity error [1/s], k_v / m there
     k_R: float  # gain of the roll and pitch error [1/s^2], J^-1 k_R there
     k_Omega: float  # gain of the roll and pitch rate error [1/s], J^-1 k_Omega there
-    yaw_share: float = YAW_SHARE
-    """Bandwidth of the heading over that of roll and pitch: the factor of its k_Omega, and the square of it of its k_R.
-    Reaction torques are weak."""
-    k_i: float = 0.0  # gain of the integral of e_v + c_1 e_x [1/s^2]; 0 for none, as in Lee et al. (2010)
-    k_I: float = 0.0  # gain of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none
-    c_1: float = 1.0  # weight of the position error in the first integral [1/s]
-    c_2: float = 1.0  # weight of the attitude error in the second [1/s]
+    k_i: float  # gain of the integral of e_v + c_1 e_x [1/s^2]; 0 for none, as in Lee et al. (2010)
+    k_I: float  # gain of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none
+    c_1: float  # weight of the position error in the first integral [1/s]
+    c_2: float  # weight of the attitude error in the second [1/s]
     sigma: float = 5.0  # limit of the first integral, per axis [m/s^2]
     sigma_R: float = 5.0  # limit of the second integral, per axis [rad/s^2]
-    tilt_max: float = 45.0  # largest tilt of the desired force [deg]; our addition to Lee et al. (2010)
-    feedforward: bool = False
-    """Whether jerk, snap and drag of the reference are fed forward, and commands computed for the middle of the period
-    in which they are held."""
-    drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # d of the drag acceleration -R diag(d) R' v that is fed forward [1/s]
-    disturbance: RampSettings | None = None  # settings of the disturbance observer; None for none
-    horizon: int = 10  # N, preview samples, from which the reference's velocity and acceleration are computed
-    bounds: ActuatorBounds | None = None
-    """Limits of the commands; None for the vehicle's range of speeds, or of targets `USUAL_TARGETS`."""
-    commands: Commands = "rotors"
-    inner_lag: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-    """Time constants of thrust, p, q, r behind an autopilot's targets [s]."""
-    k_attitude: tuple[float, ...] = (0.0, 0.0, 0.0)
-    """Gains from the attitude error about body x, y, z to the rates commanded [1/s]; only for rates."""
+    k_attitude: tuple[float, ...]
+    """Gains from the attitude error about body x, y, z to the rates commanded [1/s]; only for an autopilot's rates."""
 
 
-def geometric_settings(
-    vehicle: Vehicle,
-    *,
-    period: float,
-    lag: float | None = None,
-    integral: bool = False,
-    commands: Commands = "rotors",
-    inner_lag: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
-    **others: object,
-) -> GeometricSettings:
-    """Return settings whose gains follow from the period and the lag [s]; `others` sets further fields.
+def geometric_gains(vehicle: Vehicle, period: float, settings: Geometric) -> GeometricGains:
+    """Return gains that follow from the period [s] and the lag.
 
     The law feeds forward the rotation of the desired attitude, so its linearisation has the polynomial (s^2 + k_Omega s
     + k_R)(s^2 + k_v s + k_x), and its gain from rate error to angular acceleration is about k_Omega + k_v.  That sum is
@@ -97,7 +78,7 @@ def geometric_settings(
     cascade's separation of 2), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2. The integrals of Goodarzi et
     al.  (2013) act at a quarter of the bandwidth of the loops that they support.
 
-    An autopilot's rates follow with `inner_lag` (thrust, p, q, r) [s]; `lag` replaces that of p and q.  About each
+    An autopilot's rates follow with its `inner_lag`; `lag` replaces that of p and q.  About each
     axis, an attitude error has the gain k = k_R / k_Omega, with the sum k + k_v = 1 / (2 (period / 2 + lag)), that of
     the loop which is the innermost then, and k_v = k / 2, as above.  The polynomial is (lag s^2 + s + k)(s^2 + k_v s +
     k_x), with a damping of at least 1 / sqrt(2).  The slower of p and q counts for k_v, and the autopilot integrates in
@@ -105,29 +86,27 @@ def geometric_settings(
     `lag`.
     """
     require_positive("period", period)
+    lag, targets = settings.lag, settings.commands != ROTORS
     allowed = lag_to_allow_for(vehicle, period) if lag is None else lag
     k_Omega = 1.0 / (2.0 * (0.5 * period + allowed)) / (1.0 + SEPARATION**-2)
     k_v = k_Omega / SEPARATION**2
     k = np.zeros(3)
-    if commands != "rotors":
-        lags = np.array(inner_lag[1:]) if lag is None else np.array([lag, lag, inner_lag[3]])
+    if targets:
+        _, p, q, r = require_lags(settings.inner_lag)
+        lags = np.array([p, q, r] if lag is None else [lag, lag, r])
         k = 1.0 / (2.0 * (0.5 * period + lags)) / (1.0 + SEPARATION**-1)
         k_v = float(k[:2].min()) / SEPARATION
-    values: dict[str, object] = {
-        "k_x": k_v**2 / SEPARATION,
-        "k_v": k_v,
-        "k_R": k_Omega**2 / SEPARATION,
-        "k_Omega": k_Omega,
-        "c_1": k_v / SEPARATION,
-        "c_2": k_Omega / SEPARATION,
-        "k_i": 0.25 * k_v**2 / SEPARATION if integral else 0.0,
-        "k_I": 0.05 * k_Omega**2 / SEPARATION if integral and commands == "rotors" else 0.0,
-        "commands": commands,
-        "inner_lag": tuple(inner_lag),
-        "k_attitude": tuple(k.tolist()),
-        **others,
-    }
-    return GeometricSettings(period=period, **values)  # type: ignore[arg-type]
+    return GeometricGains(
+        k_x=k_v**2 / SEPARATION,
+        k_v=k_v,
+        k_R=k_Omega**2 / SEPARATION,
+        k_Omega=k_Omega,
+        k_i=0.25 * k_v**2 / SEPARATION if settings.integral else 0.0,
+        k_I=0.05 * k_Omega**2 / SEPARATION if settings.integral and not targets else 0.0,
+        c_1=k_v / SEPARATION,
+        c_2=k_Omega / SEPARATION,
+        k_attitude=tuple(k.tolist()),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,32 +129,31 @@ class GeometricController(FeedbackLaw):
     quaternion wxyz (8,), with rates that are fed forward. With targets, `reset` and `StepInputs.acting` are targets.
 
     Attributes:
+        commands: what it commands.
+        gains: of its errors.
         k_R: (3,) gains of the attitude error about body x, y, z [1/s^2].
         k_Omega: (3,) gains of the rate error [1/s].
     """
 
     name: Final = "geometric"
 
-    def __init__(self, vehicle: Vehicle, settings: GeometricSettings) -> None:
-        self.settings, self._vehicle, self._drag = settings, vehicle, np.array(settings.drag)
-        self.commands, self._targets, half = settings.commands, settings.commands != "rotors", 0.5 * settings.period
-        self._ahead = half + (settings.inner_lag[0] if self._targets else 0.0)  # of the thrust that is fed forward
-        self._lead = np.array(settings.inner_lag[1:]) + (half if settings.feedforward else 0.0)
+    def __init__(self, vehicle: Vehicle, period: float, settings: Geometric) -> None:
+        self.commands, self._targets, self._vehicle = settings.commands, settings.commands != ROTORS, vehicle
+        self.gains = gains = geometric_gains(vehicle, period, settings)
+        self._feedforward, self._drag = settings.feedforward, np.array(settings.drag)
+        self._largest_tilt, lags = math.radians(settings.tilt), settings.inner_lag or NO_LAG
+        half = 0.5 * period
+        self._ahead = half + (lags[0] if self._targets else 0.0)  # of the thrust that is fed forward
+        self._lead = np.array(lags[1:]) + (half if settings.feedforward else 0.0)
         self._observer = None
         if settings.disturbance is not None:
-            lag = settings.inner_lag[0] if self._targets else None
-            self._observer = RampObserver(
-                settings.disturbance, vehicle, settings.period, drag=settings.drag, thrust_lag=lag
-            )
-        bounds, model = settings.bounds, None
-        if self._targets:
-            bounds = USUAL_TARGETS.actuators(vehicle) if bounds is None else bounds
-            model = target_model(vehicle, settings.period, settings.inner_lag)
-        super().__init__(vehicle, settings.period, settings.horizon, bounds, model)
+            lag = lags[0] if self._targets else None
+            self._observer = RampObserver(settings.disturbance, vehicle, period, drag=settings.drag, thrust_lag=lag)
+        super().__init__(vehicle, period, settings, target_model(vehicle, period, lags) if self._targets else None)
         if settings.feedforward:
-            self._operator = differentiator(settings.horizon, settings.period, degree=PREVIEW_DEGREE)
-        self.k_R = settings.k_R * np.array([1.0, 1.0, settings.yaw_share**2])
-        self.k_Omega = settings.k_Omega * np.array([1.0, 1.0, settings.yaw_share])
+            self._operator = differentiator(settings.horizon, period, degree=PREVIEW_DEGREE)
+        self.k_R = gains.k_R * np.array([1.0, 1.0, YAW_SHARE**2])
+        self.k_Omega = gains.k_Omega * np.array([1.0, 1.0, YAW_SHARE])
         self._allocation = make_allocation(vehicle)
 
     def reset(self, speeds: Array) -> None:
@@ -194,12 +172,12 @@ class GeometricController(FeedbackLaw):
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """Return the law's wrench as rotor speeds, or its targets; the integrals hold while bounds limit it."""
-        exact = self.settings.feedforward or self._observer is not None
+        exact = self._feedforward or self._observer is not None
         motion = motion_of(state, now.attitude, now.body_rates) if exact else motion_of(state)
         target = target_of(reference, self._operator)
-        if self.settings.feedforward and now.motion is not None:
+        if self._feedforward and now.motion is not None:
             yaw = np.array([target.yaw, target.yaw_rate, target.yaw_acceleration])
-            target = target_of_motion(now.motion, yaw, self.settings.period)
+            target = target_of_motion(now.motion, yaw, self._period)
         disturbance = self._observed(now, motion, before)
         kappa = 1.0 if self._observer is None else self._observer.thrust_scale
         if self._targets:
@@ -230,7 +208,7 @@ class GeometricController(FeedbackLaw):
             return UNDISTURBED
         self._observer.update(now.time, motion.velocity, motion.attitude, motion.rates, acting)
         self._observer.log(now)
-        return self._observer.foreseen(0.5 * self.settings.period)
+        return self._observer.foreseen(0.5 * self._period)
 
     def wrench(
         self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
@@ -276,12 +254,12 @@ class GeometricController(FeedbackLaw):
         R_rel = R.T @ desired.attitude
         Omega_d = R_rel @ desired.rates
         rates = Omega_d + self._lead * (R_rel @ desired.acceleration - np.cross(Omega, Omega_d))
-        if self.settings.commands == "rates":
-            rates -= np.array(self.settings.k_attitude) * attitude_error(R, desired.attitude)
+        if self.commands == "rates":
+            rates -= np.array(self.gains.k_attitude) * attitude_error(R, desired.attitude)
             return np.concatenate([[thrust], rates]), desired
         q = quaternion_of(desired.attitude)
-        if self.settings.feedforward:
-            q = multiply(q, np.append(1.0, 0.25 * self.settings.period * desired.rates))
+        if self._feedforward:
+            q = multiply(q, np.append(1.0, 0.25 * self._period * desired.rates))
             q /= np.linalg.norm(q)
         return np.concatenate([[thrust], rates, q]), desired
 
@@ -289,13 +267,13 @@ class GeometricController(FeedbackLaw):
         self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance
     ) -> tuple[float, DesiredAttitude]:
         """Return the thrust [N] along body z, and the desired attitude; see `wrench`."""
-        settings, m, gravity = self.settings, self._vehicle.mass, self._vehicle.gravity
+        gains, m, gravity = self.gains, self._vehicle.mass, self._vehicle.gravity
         R, Omega = motion.attitude, motion.rates
         e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
         weight = np.array([0.0, 0.0, gravity])
-        demanded = m * (-settings.k_x * e_x - settings.k_v * e_v - integrals.translation + weight + target.acceleration)
+        demanded = m * (-gains.k_x * e_x - gains.k_v * e_v - integrals.translation + weight + target.acceleration)
         demanded -= m * disturbance[0]
-        A = limit_force(demanded, least=LEAST_LIFT * m * gravity, tilt=math.radians(settings.tilt_max))
+        A = limit_force(demanded, least=LEAST_LIFT * m * gravity, tilt=self._largest_tilt)
         A1 = A2 = p1 = p2 = np.zeros(3)
         if np.array_equal(A, demanded):
             A1, A2 = self._force_derivatives(motion, target, A, e_v, disturbance)
@@ -306,7 +284,7 @@ class GeometricController(FeedbackLaw):
             self._drag,
             _heading(motion.yaw, target) if target.heading is None else target.heading,
         )
-        if not settings.feedforward:
+        if not self._feedforward:
             return float(A @ R[:, 2]), desired
         up = R[:, 2] + self._ahead * R @ np.array([Omega[1], -Omega[0], 0.0])
         along, along1 = A + m * self._drag[2] * target.velocity, A1 + self._drag[2] * p1
@@ -314,15 +292,15 @@ class GeometricController(FeedbackLaw):
 
     def integrate(self, integrals: Integrals, motion: Measured, target: Target, desired: DesiredAttitude) -> Integrals:
         """Return the integrals of e_v + c_1 e_x and e_Omega + c_2 e_R one period later, saturated."""
-        settings = self.settings
+        gains, period = self.gains, self._period
         e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
         e_R = attitude_error(motion.attitude, desired.attitude)
         e_Omega = rate_error(motion.attitude, motion.rates, desired.attitude, desired.rates)
-        translation = integrals.translation + settings.period * settings.k_i * (e_v + settings.c_1 * e_x)
-        rotation = integrals.rotation + settings.period * settings.k_I * (e_Omega + settings.c_2 * e_R)
+        translation = integrals.translation + period * gains.k_i * (e_v + gains.c_1 * e_x)
+        rotation = integrals.rotation + period * gains.k_I * (e_Omega + gains.c_2 * e_R)
         return Integrals(
-            translation=np.clip(translation, -settings.sigma, settings.sigma),
-            rotation=np.clip(rotation, -settings.sigma_R, settings.sigma_R),
+            translation=np.clip(translation, -gains.sigma, gains.sigma),
+            rotation=np.clip(rotation, -gains.sigma_R, gains.sigma_R),
         )
 
     def _force_derivatives(
@@ -332,7 +310,7 @@ class GeometricController(FeedbackLaw):
 
         The disturbance is assumed to change at a constant rate; drag turns with the body.
         """
-        m, R, Omega, k_x, k_v = self._vehicle.mass, motion.attitude, motion.rates, self.settings.k_x, self.settings.k_v
+        m, R, Omega, k_x, k_v = self._vehicle.mass, motion.attitude, motion.rates, self.gains.k_x, self.gains.k_v
         disturbing, change, _ = disturbance
         up, up1 = R[:, 2], R @ np.array([Omega[1], -Omega[0], 0.0])  # R e_3 and its derivative, R hat(Omega) e_3
         v_b = R.T @ motion.velocity
@@ -405,26 +383,10 @@ class Geometric(Tuned):
         """See `mpc.bounded.ControllerTable.audited`."""
         return super().audited(vehicle) if self.commands == "rotors" else self.target_bounds.audited(vehicle)
 
-    def settings(self, vehicle: Vehicle, period: float) -> GeometricSettings:
-        """Return the law's settings."""
-        shared = self.shared(vehicle, period)
-        if self.commands != "rotors":
-            shared |= {"inner_lag": require_lags(self.inner_lag), "bounds": self.target_bounds.actuators(vehicle)}
-        return geometric_settings(
-            vehicle,
-            lag=self.lag,
-            commands=self.commands,
-            integral=self.integral,
-            feedforward=self.feedforward,
-            drag=self.drag,
-            disturbance=self.disturbance,
-            **shared,
-        )
+    def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
+        """See `mpc.baselines.law.Baseline.actuators`; of targets where it commands these."""
+        return super().actuators(vehicle) if self.commands == ROTORS else self.target_bounds.actuators(vehicle)
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
         """See `mpc.bounded.ControllerTable.inner_loop`."""
-        if self.indi is None:
-            return None
-        own = self.input_bounds
-        bounds = ActuatorBounds.of_vehicle(vehicle) if own is None else own.actuators(vehicle)
-        return TorqueIncrement(vehicle, self.indi, bounds)
+        return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 from annotated_types import Ge, Le, doc
@@ -26,18 +26,10 @@ class FeedbackLaw(ABC):
 
     solver: Final = ""
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        period: float,
-        horizon: int,
-        bounds: ActuatorBounds | None,
-        model: LinearModel | None = None,
-    ) -> None:
-        self.bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
+    def __init__(self, vehicle: Vehicle, period: float, settings: Baseline, model: LinearModel | None = None) -> None:
+        self.bounds, self.horizon, self._period = settings.actuators(vehicle), settings.horizon, period
         self.model = hover_model(vehicle, period) if model is None else model
-        self.horizon = horizon
-        self._operator = differentiator(horizon, period)
+        self._operator = differentiator(self.horizon, period)
         self._turns = ReferenceTurns()
         self.reset(self.model.u_bar)
 
@@ -103,10 +95,9 @@ class Baseline(ControllerTable):
         """See `mpc.bounded.ControllerTable.audited`."""
         return {} if self.input_bounds is None else self.input_bounds.audited(vehicle)
 
-    def shared(self, vehicle: Vehicle, period: float) -> dict[str, Any]:
-        """Return the settings that all these laws share."""
-        bounds = None if self.input_bounds is None else self.input_bounds.actuators(vehicle)
-        return {"period": period, "horizon": self.horizon, "tilt_max": self.tilt, "bounds": bounds}
+    def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
+        """Return the limits of the commands."""
+        return ActuatorBounds.of_vehicle(vehicle) if self.input_bounds is None else self.input_bounds.actuators(vehicle)
 
 
 @dataclass(frozen=True, kw_only=True)

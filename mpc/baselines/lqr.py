@@ -10,7 +10,6 @@ import numpy as np
 from annotated_types import Ge, Le, Len, doc
 
 from mpc.allocation import allocate, make_allocation
-from mpc.answer import ActuatorBounds
 from mpc.baselines.law import Baseline, FeedbackLaw
 from mpc.bounded import InputWeights, objective_of, require_states
 from mpc.heading import turn_horizontally
@@ -33,20 +32,6 @@ SPEED_SHARE: Final = 0.05  # deviation of a rotor's speed of the same cost, as a
 LAG_MARGIN: Final = 1.5  # multiple of the vehicle's rotor lag that the loop with default weights must tolerate
 _HALVINGS: Final = 12
 _SHORTEST_LAG: Final = 1e-4  # [s]
-
-
-@dataclass(frozen=True, kw_only=True)
-class LQRSettings:
-    """Parameters of an LQR."""
-
-    period: float  # tau_s [s]
-    objective: Objective  # weights of one period; `bryson_objective` gives weights for any vehicle
-    horizon: int = 10  # N, preview samples for the reference's velocity, and periods planned
-    heading_frame: bool = True  # whether errors are turned into axes along the measured yaw, so that any heading works
-    tilt_max: float | None = 30.0
-    """Largest tilt that errors of x, y and their rates may demand [deg], or None.  The law is linear: without a limit,
-    a large error demands more tilt than the model, or the vehicle, tolerates."""
-    bounds: ActuatorBounds | None = None  # limits of the commands; None for the vehicle's range of speeds
 
 
 def bryson_objective(vehicle: Vehicle, period: float | None = None) -> Objective:
@@ -101,15 +86,22 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
 class LQR(FeedbackLaw):
     """u = u_bar - K (xi - xi_r), where the reference state xi_r has the reference's pose and velocity, upright.
 
-    Speeds beyond the bounds are limited as by `allocate`: thrust, roll and pitch torque take precedence over yaw.
+    Speeds beyond the bounds are limited as by `allocate`: thrust, roll and pitch torque take precedence over yaw.  The
+    law is linear up to the largest tilt that errors of x, y and their rates may demand: without that limit, a large
+    error demands more tilt than the model, or the vehicle, tolerates.
+
+    Attributes:
+        objective: the weights of one period.
+        gain: (4, 12) K.
     """
 
     name: Final = "lqr"
 
-    def __init__(self, vehicle: Vehicle, settings: LQRSettings) -> None:
-        super().__init__(vehicle, settings.period, settings.horizon, settings.bounds)
-        self.settings = settings
-        self.gain = lqr_gain(self.model, settings.objective)
+    def __init__(self, vehicle: Vehicle, period: float, settings: LQRTable) -> None:
+        super().__init__(vehicle, period, settings)
+        self._heading, self._largest_tilt = settings.heading, math.radians(settings.tilt)
+        self.objective = settings.objective(vehicle, period)
+        self.gain = lqr_gain(self.model, self.objective)
         self._allocation = make_allocation(vehicle)
         self._tilt_demand = np.linalg.pinv(self.gain[:, TILT]) @ self.gain[:, HORIZONTAL]
 
@@ -117,7 +109,7 @@ class LQR(FeedbackLaw):
         """Return the bounded command, and a plan from the closed loop of the model."""
         targets = self._targets(reference)
         xi = state
-        if self.settings.heading_frame:
+        if self._heading:
             turn = -float(state[INDEX["yaw"]])
             xi, targets = (
                 turn_horizontally(state, np.array(turn)),
@@ -135,7 +127,7 @@ class LQR(FeedbackLaw):
 
     def _targets(self, reference: Array) -> Array:
         """(N, 12) reference states at t_k .. t_{k+N-1}."""
-        (value, rate, acceleration), period = self._operator @ reference, self.settings.period
+        (value, rate, acceleration), period = self._operator @ reference, self._period
         poses = np.concatenate([value[None], reference[:-1]])
         rates = rate + period * np.arange(self.horizon)[:, None] * acceleration
         targets = np.zeros((self.horizon, N_STATES))
@@ -148,14 +140,11 @@ class LQR(FeedbackLaw):
 
         K e = K_tilt (tilt + G e_horizontal) + ..., so -G e_horizontal is the tilt that the law demands.
         """
-        if self.settings.tilt_max is None:
-            return error
         demanded = float(np.linalg.norm(self._tilt_demand @ error[HORIZONTAL]))
-        allowed = math.radians(self.settings.tilt_max)
-        if demanded <= allowed:
+        if demanded <= self._largest_tilt:
             return error
         limited = error.copy()
-        limited[HORIZONTAL] *= allowed / demanded
+        limited[HORIZONTAL] *= self._largest_tilt / demanded
         return limited
 
     def _held(self, speeds: Array, lower: Array, upper: Array) -> Array:
@@ -189,10 +178,8 @@ class LQRTable(Baseline):
             raise ValueError("input_weights must be given where output_weights are, and nowhere else")
         require_states(self.output_weights or {}, "output_weights")
 
-    def settings(self, vehicle: Vehicle, period: float) -> LQRSettings:
-        """Return the law's settings."""
+    def objective(self, vehicle: Vehicle, period: float) -> Objective:
+        """Return the weights of one period."""
         if self.output_weights is None or self.input_weights is None:
-            objective = bryson_objective(vehicle, period)
-        else:
-            objective = objective_of(self.output_weights, self.input_weights)
-        return LQRSettings(objective=objective, heading_frame=self.heading, **self.shared(vehicle, period))
+            return bryson_objective(vehicle, period)
+        return objective_of(self.output_weights, self.input_weights)

@@ -13,7 +13,6 @@ import numpy as np
 from annotated_types import doc
 
 from mpc.allocation import allocate, make_allocation, thrust_to_command
-from mpc.answer import ActuatorBounds
 from mpc.baselines.attitude import LEAST_LIFT, Measured, attitude_for, limit_force, motion_of, prioritised_error
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from mpc.baselines.law import FeedbackLaw, Tuned
@@ -29,34 +28,25 @@ LARGEST_THRUST: Final = 0.85
 it to yaw."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PIDSettings:
-    """Parameters of a cascade; `pid_settings` derives them from a vehicle and a period."""
+YAW_WEIGHT: Final = 0.4  # share of the heading error corrected while turning the thrust; PX4's MC_YAW_WEIGHT
+LARGEST_RATES: Final = (220.0, 220.0, 200.0)  # body rates commanded [deg/s]; PX4's MC_ROLLRATE_MAX
 
-    period: float  # tau_s [s]
+
+@dataclass(frozen=True, kw_only=True)
+class PIDGains:
+    """Gains of a cascade; `pid_gains` derives them from a vehicle and a period."""
+
     bandwidths: Bandwidths  # proportional gains of the loops [1/s]
-    velocity_integral: float = 0.4  # integral over proportional gain of the velocity loop [1/s]; 0 for none
-    rate_integral: float = 0.5  # the same of the rate loop [1/s]
+    velocity_integral: float  # integral over proportional gain of the velocity loop [1/s]; 0 for none
+    rate_integral: float  # the same of the rate loop [1/s]
     velocity_derivative: float = 0.1  # gain on the measured acceleration
     rate_derivative: float = 0.05  # gain on the measured angular acceleration; late by a period, less than 1
-    yaw_weight: float = 0.4  # share of the heading error corrected while turning the thrust; PX4's MC_YAW_WEIGHT
-    tilt_max: float = 45.0  # largest tilt commanded [deg]; PX4's MPC_TILTMAX_AIR
-    velocity_max: float = 12.0  # largest velocity commanded, horizontal and vertical [m/s]; PX4's MPC_XY_VEL_MAX
-    rate_max: tuple[float, float, float] = (220.0, 220.0, 200.0)  # body rates commanded [deg/s]; PX4's MC_ROLLRATE_MAX
-    horizon: int = 10  # N, preview samples, from which the reference's velocity and acceleration are computed
-    bounds: ActuatorBounds | None = None  # limits of the commands; None for the vehicle's range of speeds
 
 
-def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, **others: object) -> PIDSettings:
-    """Return settings whose gains follow from the period and the lag [s]; `others` sets further fields."""
-    allowed = lag_to_allow_for(vehicle, period) if lag is None else lag
-    speeds = bandwidths(period=period, lag=allowed)
-    values: dict[str, object] = {
-        "velocity_integral": 0.25 * speeds.position,
-        "rate_integral": 0.5 * speeds.position,
-        **others,
-    }
-    return PIDSettings(period=period, bandwidths=speeds, **values)  # type: ignore[arg-type]
+def pid_gains(vehicle: Vehicle, *, period: float, lag: float | None = None) -> PIDGains:
+    """Return gains that follow from the period and the lag [s], by default the vehicle's."""
+    speeds = bandwidths(period=period, lag=lag_to_allow_for(vehicle, period) if lag is None else lag)
+    return PIDGains(bandwidths=speeds, velocity_integral=0.25 * speeds.position, rate_integral=0.5 * speeds.position)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,13 +60,20 @@ class Memory:
 
 
 class CascadedPID(FeedbackLaw):
-    """Position P, velocity PID, attitude P by quaternions, rate PID, mixer, all normalised by mass and inertia."""
+    """Position P, velocity PID, attitude P by quaternions, rate PID, mixer, all normalised by mass and inertia.
+
+    Attributes:
+        gains: of the loops.
+        allocation: the mixer.
+    """
 
     name: Final = "pid"
 
-    def __init__(self, vehicle: Vehicle, settings: PIDSettings) -> None:
-        self.settings, self._vehicle, self._inertia = settings, vehicle, np.array(vehicle.inertia)
-        super().__init__(vehicle, settings.period, settings.horizon, settings.bounds)
+    def __init__(self, vehicle: Vehicle, period: float, settings: PID) -> None:
+        self.gains, self._vehicle = pid_gains(vehicle, period=period, lag=settings.lag), vehicle
+        self._inertia = np.array(vehicle.inertia)
+        self._largest_velocity, self._largest_tilt = settings.velocity, math.radians(settings.tilt)
+        super().__init__(vehicle, period, settings)
         self.allocation = make_allocation(vehicle)
         highest = 4.0 * vehicle.thrust_coefficient * float(self.bounds.u_max.min()) ** 2
         self._largest = thrust_to_command(highest, vehicle.mass * vehicle.gravity, LARGEST_THRUST)
@@ -107,12 +104,12 @@ class CascadedPID(FeedbackLaw):
         Returns:
             (4,) rotor speeds [rad/s], and the loops' new state.
         """
-        motion, k, inertia, period = motion_of(state), self.settings.bandwidths, self._inertia, self.settings.period
+        motion, k, inertia, period = motion_of(state), self.gains.bandwidths, self._inertia, self._period
         force, velocity_integral = self._velocity_loop(memory, motion, target)
         turning = np.zeros(3) if memory.rates is None else (motion.rates - memory.rates) / period
         error = self._desired_rates(motion, force, target) - motion.rates
         proportional = np.array([k.rate, k.rate, k.yaw_rate])
-        acceleration = proportional * error + memory.rate_integral - self.settings.rate_derivative * turning
+        acceleration = proportional * error + memory.rate_integral - self.gains.rate_derivative * turning
         wrench = np.concatenate([[np.linalg.norm(force)], inertia * acceleration])
         speeds = allocate(self.allocation, wrench, lower, upper)
         # Anti-windup: an integral stops where it would ask for more than the mixer can give.
@@ -121,45 +118,46 @@ class CascadedPID(FeedbackLaw):
         summed = np.where(windup, 0.0, error)
         return speeds, Memory(
             velocity_integral=velocity_integral,
-            rate_integral=memory.rate_integral + period * self.settings.rate_integral * proportional * summed,
+            rate_integral=memory.rate_integral + period * self.gains.rate_integral * proportional * summed,
             velocity=motion.velocity,
             rates=motion.rates,
         )
 
     def _velocity_loop(self, memory: Memory, motion: Measured, target: Target) -> tuple[Array, Array]:
         """Return the force (3,) [N] to command, world, and the velocity integral (3,) [m/s^2] of the next period."""
-        settings, mass, gravity = self.settings, self._vehicle.mass, self._vehicle.gravity
-        period, proportional = settings.period, settings.bandwidths.velocity
-        error = desired_velocity(settings, motion.position, target) - motion.velocity
+        gains, mass, gravity = self.gains, self._vehicle.mass, self._vehicle.gravity
+        period, proportional = self._period, gains.bandwidths.velocity
+        desired = desired_velocity(gains.bandwidths.position, self._largest_velocity, motion.position, target)
+        error = desired - motion.velocity
         measured = np.zeros(3) if memory.velocity is None else (motion.velocity - memory.velocity) / period
         demanded_acceleration = (
             target.acceleration
             + proportional * error
             + memory.velocity_integral
-            - settings.velocity_derivative * measured
+            - gains.velocity_derivative * measured
             + np.array([0.0, 0.0, gravity])
         )
-        tilt = math.radians(settings.tilt_max)
-        force = force_within(mass * demanded_acceleration, weight=mass * gravity, largest=self._largest, tilt=tilt)
+        demanded = mass * demanded_acceleration
+        force = force_within(demanded, weight=mass * gravity, largest=self._largest, tilt=self._largest_tilt)
         # Anti-windup by tracking: the integral moves to where it just saturates; PX4's gain, after Rundqwist (1990).
         error = error - 2.0 / proportional * (demanded_acceleration - force / mass)
-        integral = memory.velocity_integral + period * settings.velocity_integral * proportional * error
+        integral = memory.velocity_integral + period * gains.velocity_integral * proportional * error
         return force, np.clip(integral, -gravity, gravity)
 
     def _desired_rates(self, motion: Measured, force: Array, target: Target) -> Array:
         """Return the body rates (3,) [rad/s] that the attitude loop demands."""
-        k, limit = self.settings.bandwidths, np.radians(self.settings.rate_max)
-        error = prioritised_error(motion.attitude, attitude_for(force, target.yaw), self.settings.yaw_weight)
+        k, limit = self.gains.bandwidths, np.radians(LARGEST_RATES)
+        error = prioritised_error(motion.attitude, attitude_for(force, target.yaw), YAW_WEIGHT)
         heading = motion.attitude[2] * target.yaw_rate  # a rotation about world z, in body axes
         return np.clip(np.array([k.attitude, k.attitude, k.yaw]) * error + heading, -limit, limit)
 
 
-def desired_velocity(settings: PIDSettings, position: Array, target: Target) -> Array:
-    """(3,) velocity to fly at [m/s]: the target's, plus a share of the position error per second, within limits."""
-    velocity = target.velocity + settings.bandwidths.position * (target.position - position)
+def desired_velocity(gain: float, largest: float, position: Array, target: Target) -> Array:
+    """(3,) velocity to fly [m/s]: the target's, plus `gain` [1/s] times the position error, up to `largest` [m/s]."""
+    velocity = target.velocity + gain * (target.position - position)
     horizontal = math.hypot(velocity[0], velocity[1])
-    velocity[:2] *= min(1.0, settings.velocity_max / max(horizontal, 1e-9))
-    velocity[2] = np.clip(velocity[2], -settings.velocity_max, settings.velocity_max)
+    velocity[:2] *= min(1.0, largest / max(horizontal, 1e-9))
+    velocity[2] = np.clip(velocity[2], -largest, largest)
     return velocity
 
 
@@ -184,8 +182,3 @@ class PID(Tuned):
 
     type: Annotated[Literal["pid"], doc("the control law, by its name in `quadsim list`")] = "pid"
     velocity: Annotated[Positive, doc("[m/s] largest velocity commanded")] = 12.0
-
-    def settings(self, vehicle: Vehicle, period: float) -> PIDSettings:
-        """Return the law's settings."""
-        shared = self.shared(vehicle, period)
-        return pid_settings(vehicle, lag=self.lag, velocity_max=self.velocity, **shared)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mpc.answer import ActuatorBounds
-from mpc.baselines.geometric import GeometricController, geometric_settings
+from mpc.baselines.geometric import Geometric, GeometricController
 from mpc.indi import INDISettings, TorqueIncrement
 from mpc.pilot import Pilot
 from quadsim.controller import Phase, StepInputs
@@ -56,7 +56,7 @@ def test_an_unknown_torque_is_made_up_for_within_the_filter_s_time(vehicle: Vehi
 
 
 def flown(vehicle: Vehicle, effects: Effects, settings: INDISettings | None, periods: int = 50) -> FlightLog:
-    law = GeometricController(vehicle, geometric_settings(vehicle, period=0.05))
+    law = GeometricController(vehicle, 0.05, Geometric())
     inner = None if settings is None else TorqueIncrement(vehicle, settings, law.bounds)
     controller = Pilot(law, vehicle, inner=inner)
     with Plant(vehicle, effects=effects, limit_speeds=True) as plant:
@@ -99,7 +99,7 @@ def test_an_undisturbed_flight_is_nearly_the_one_without(vehicle: Vehicle) -> No
 
 
 def test_on_the_ground_there_is_no_inner_loop(vehicle: Vehicle) -> None:
-    law = GeometricController(vehicle, geometric_settings(vehicle, period=0.05))
+    law = GeometricController(vehicle, 0.05, Geometric())
     controller = Pilot(law, vehicle, inner=TorqueIncrement(vehicle, INDISettings(), law.bounds))
     preview = np.zeros((law.horizon, 4))
     assert controller.step(StepInputs(phase=Phase.LANDED), make_state(), preview).inner is None

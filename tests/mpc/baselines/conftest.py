@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from support import paper_reference
 
-from mpc.baselines.geometric import GeometricController, geometric_settings
-from mpc.baselines.lqr import LQR, LQRSettings, bryson_objective
-from mpc.baselines.pid import CascadedPID, pid_settings
+from mpc.baselines.geometric import Geometric
+from mpc.baselines.lqr import LQRTable
+from mpc.baselines.pid import PID
+from mpc.builders import law_of
 from quadsim.assets import vehicle_path
 from quadsim.controller import Controller
 from quadsim.flight.log import FlightLog
@@ -22,7 +23,8 @@ from quadsim.state import Array
 from quadsim.vehicle import Vehicle, load_vehicle
 
 PERIOD = 0.05
-LAWS = ("lqr", "pid", "geometric")
+TABLES: dict[str, Any] = {"lqr": LQRTable, "pid": PID, "geometric": Geometric}
+LAWS = tuple(TABLES)
 
 Build = Callable[..., Any]
 Fly = Callable[..., FlightLog]
@@ -40,14 +42,10 @@ def law(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def build() -> Build:
-    """A law by name with its defaults for a vehicle."""
+    """A law by name for a vehicle, with the defaults of its table but for some fields."""
 
     def build_law(law: str, vehicle: Vehicle, **others: Any) -> Any:
-        if law == "lqr":
-            return LQR(vehicle, LQRSettings(period=PERIOD, objective=bryson_objective(vehicle), **others))
-        if law == "pid":
-            return CascadedPID(vehicle, pid_settings(vehicle, period=PERIOD, **others))
-        return GeometricController(vehicle, geometric_settings(vehicle, period=PERIOD, **others))
+        return law_of(TABLES[law](**others), vehicle, PERIOD)
 
     return build_law
 

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from mpc.baselines.attitude import DesiredAttitude, Measured, desired_attitude, hat
-from mpc.baselines.geometric import GeometricController, Integrals, geometric_settings
+from mpc.baselines.geometric import Geometric, GeometricController, Integrals
 from mpc.baselines.preview import Target, target_of_motion
 from mpc.flatness import motion_along
 from quadsim.state import Array
@@ -81,8 +81,7 @@ def test_open_loop_along_the_flat_inputs_the_vehicle_stays_on_the_trajectory(
 @pytest.mark.parametrize("drag", DRAGS)
 def test_on_the_trajectory_the_law_gives_the_flat_torque(vehicle: Vehicle, drag: tuple[float, float, float]) -> None:
     vehicle = replace(vehicle, inertia=(0.02, 0.03, 0.04))
-    settings = geometric_settings(vehicle, period=PERIOD, feedforward=True, drag=drag, tilt_max=80.0)
-    law = GeometricController(vehicle, settings)
+    law = GeometricController(vehicle, PERIOD, Geometric(feedforward=True, drag=drag, tilt=80.0))
     J = np.array(vehicle.inertia)
     for t in (0.0, 0.7, 1.9):
         _, desired = flat(vehicle, np.array(drag), t)

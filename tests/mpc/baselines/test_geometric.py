@@ -93,7 +93,7 @@ def test_thrust_lies_along_the_body_and_torque_leads_to_the_wanted_attitude(
 def test_a_force_beyond_the_tilt_limit_is_limited_and_counts_as_constant(
     vehicle: Vehicle, build: Callable[..., Any]
 ) -> None:
-    law = build("geometric", vehicle, tilt_max=20.0)
+    law = build("geometric", vehicle, tilt=20.0)
     far = replace(TARGET, position=np.array([50.0, 0.0, 0.0]), yaw_rate=0.0, yaw_acceleration=0.0)
     _, desired = law.wrench(MOTION, far, NONE)
     assert math.degrees(math.acos(desired.attitude[2, 2])) == pytest.approx(20.0)
@@ -112,7 +112,8 @@ def test_a_heading_half_a_turn_away_is_sought_a_quarter_turn_away(vehicle: Vehic
 
 
 def test_integrals_stop_at_their_limits(vehicle: Vehicle, build: Callable[..., Any]) -> None:
-    law, integrals = build("geometric", vehicle, integral=True, sigma=0.5, sigma_R=0.25), NONE
+    law, integrals = build("geometric", vehicle, integral=True), NONE
+    law.gains = replace(law.gains, sigma=0.5, sigma_R=0.25)
     for _ in range(200):
         _, desired = law.wrench(MOTION, TARGET, integrals)
         integrals = law.integrate(integrals, MOTION, TARGET, desired)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mpc.answer import ActuatorBounds
+from mpc.bounded import InputBounds
 from quadsim.controller import Phase, StepInputs
 from quadsim.errors import CommandError
 from quadsim.state import INDEX, make_state
@@ -19,6 +19,8 @@ from quadsim.vehicle import Vehicle
 
 Build = Callable[..., Any]
 HEADINGS = [0.0, 90.0, 180.0, -135.0]
+
+BOUNDS = InputBounds(speed=(0.0, 250.0), slew=(-10.0, 5.0))
 
 
 def held(controller: Any, pose: Any) -> np.ndarray:
@@ -66,7 +68,7 @@ def test_errors_are_answered_the_right_way_at_any_heading(law: str, craft: Vehic
 def test_without_its_heading_frame_the_lqr_pushes_the_wrong_way_round(vehicle: Vehicle, build: Build) -> None:
     state, pose = make_state(euler=(0.0, 0.0, math.pi)), [-0.2, 0.0, 0.0, math.pi]
     assert first_wrench(build("lqr", vehicle), vehicle, state, pose)[2] > 0.0
-    assert first_wrench(build("lqr", vehicle, heading_frame=False), vehicle, state, pose)[2] < 0.0
+    assert first_wrench(build("lqr", vehicle, heading=False), vehicle, state, pose)[2] < 0.0
 
 
 def test_a_target_that_moves_is_followed_with_its_velocity(law: str, craft: Vehicle, build: Build) -> None:
@@ -100,8 +102,8 @@ def test_a_state_or_reference_that_is_not_finite_is_refused_and_forgotten(
 def test_on_the_ground_rotors_are_stopped_as_fast_as_slews_allow(
     law: str, vehicle: Vehicle, build: Build, phase: Phase
 ) -> None:
-    bounds = ActuatorBounds.alike((20.0, 250.0), (-10.0, 5.0))
-    controller = build(law, vehicle, bounds=bounds)
+    bounds = InputBounds(speed=(20.0, 250.0), slew=(-10.0, 5.0))
+    controller = build(law, vehicle, input_bounds=bounds)
     controller.reset(np.array([100.0, 25.0, 20.0, 200.0]))
     command = controller.step(StepInputs(phase=phase), np.full(12, math.nan), held(controller, np.zeros(4)))
     np.testing.assert_array_equal(command.speeds, [90.0, 20.0, 20.0, 190.0])
@@ -134,7 +136,7 @@ def test_any_state_gets_a_command_within_speeds_and_slews(
     law: str, vehicle: Vehicle, build: Build, seed: int, size: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    controller = build(law, vehicle, bounds=ActuatorBounds.alike((0.0, 250.0), (-10.0, 5.0)))
+    controller = build(law, vehicle, input_bounds=BOUNDS)
     before = rng.uniform(0.0, 250.0, 4)
     controller.reset(before)
     for _ in range(3):
@@ -161,7 +163,7 @@ def test_default_bounds_are_the_vehicles(law: str, craft: Vehicle, build: Build,
 
 
 def test_slews_count_from_the_command_in_force(law: str, vehicle: Vehicle, build: Build) -> None:
-    controller = build(law, vehicle, bounds=ActuatorBounds.alike((0.0, 250.0), (-10.0, 5.0)))
+    controller = build(law, vehicle, input_bounds=BOUNDS)
     late = StepInputs(acting=np.full(4, 100.0))
     speeds = controller.step(late, make_state(), held(controller, [0.0, 0.0, 5.0, 0.0])).speeds
     np.testing.assert_allclose(speeds, 105.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -106,11 +107,11 @@ def test_every_loop_is_stable_at_20_hz_with_rotor_lag(name: str, craft: Vehicle,
 def test_the_feed_forward_separates_position_from_attitude(craft: Vehicle, build: Callable[..., Any]) -> None:
     """(s^2 + k_Omega s + k_R)(s^2 + k_v s + k_x): fed back continuously, both pairs are where their gains put them."""
     controller = build("geometric", craft)
-    law, settings = geometric_law(controller, build("pid", craft).allocation), controller.settings
+    law, gains = geometric_law(controller, build("pid", craft).allocation), controller.gains
     K, _ = jacobian(lambda state, memory: (law(state, np.zeros(6))[0], memory), 12)
     A, B = continuous_model(craft)
     poles = np.linalg.eigvals(A + B @ K)
-    pairs = [(settings.k_v, settings.k_x)] * 3 + list(zip(controller.k_Omega, controller.k_R, strict=True))
+    pairs = [(gains.k_v, gains.k_x)] * 3 + list(zip(controller.k_Omega, controller.k_R, strict=True))
     expected = np.concatenate([np.roots([1.0, *pair]) for pair in pairs])
     np.testing.assert_allclose(np.sort_complex(poles.round(6)), np.sort_complex(expected.round(6)), atol=1e-3)
 
@@ -118,8 +119,9 @@ def test_the_feed_forward_separates_position_from_attitude(craft: Vehicle, build
 def test_the_cascade_has_the_characteristic_ratios_of_its_design(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     """Without integrals and derivatives: s^4 + k1 s^3 + k1 k2 s^2 + k1 k2 k3 s + k1 k2 k3 k4 for x and for y."""
     none = dict.fromkeys(("velocity_integral", "rate_integral", "velocity_derivative", "rate_derivative"), 0.0)
-    controller = build("pid", vehicle, **none)
-    law, k = pid_law(controller), controller.settings.bandwidths
+    controller = build("pid", vehicle)
+    controller.gains = replace(controller.gains, **none)
+    law, k = pid_law(controller), controller.gains.bandwidths
     K, _ = jacobian(lambda state, memory: (law(state, np.zeros(12))[0], memory), 12)
     A, B = continuous_model(vehicle)
     poles = np.linalg.eigvals(A + B @ K)
@@ -132,7 +134,7 @@ def test_the_cascade_has_the_characteristic_ratios_of_its_design(vehicle: Vehicl
 def test_the_gain_solves_the_riccati_equation(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     """P = Q + A' P (A - B K), with P found by summing the cost of the closed loop, not by the solver."""
     controller = build("lqr", vehicle)
-    model, objective = controller.model, controller.settings.objective
+    model, objective = controller.model, controller.objective
     A, B, K = model.A, model.B, controller.gain
     closed = A - B @ K
     P = scipy.linalg.solve_discrete_lyapunov(closed.T, objective.Q_y + K.T @ objective.Q_u @ K)

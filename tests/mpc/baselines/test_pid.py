@@ -32,11 +32,11 @@ def one_period(
 
 
 def test_the_desired_velocity_is_limited_and_keeps_its_direction(vehicle: Vehicle, build: Callable[..., Any]) -> None:
-    settings = build("pid", vehicle, velocity_max=5.0).settings
+    gain = build("pid", vehicle).gains.bandwidths.position
     far = replace(REST, position=np.array([300.0, 400.0, -100.0]))
-    np.testing.assert_allclose(desired_velocity(settings, np.zeros(3), far), [3.0, 4.0, -5.0])
+    np.testing.assert_allclose(desired_velocity(gain, 5.0, np.zeros(3), far), [3.0, 4.0, -5.0])
     near = replace(REST, position=np.array([1.0, 0.0, 0.0]), velocity=np.array([0.0, 0.5, 0.2]))
-    np.testing.assert_allclose(desired_velocity(settings, np.zeros(3), near), [settings.bandwidths.position, 0.5, 0.2])
+    np.testing.assert_allclose(desired_velocity(gain, 5.0, np.zeros(3), near), [gain, 0.5, 0.2])
 
 
 @pytest.mark.parametrize("force", [(50.0, 0.0, 39.0), (0.0, -8.0, 90.0), (30.0, 40.0, 60.0), (3.0, 4.0, -20.0)])
@@ -80,14 +80,14 @@ def test_tilt_stays_near_its_limit_in_flight(
     limit: float, vehicle: Vehicle, build: Callable[..., Any], fly_from: Callable[..., FlightLog]
 ) -> None:
     for law, beyond in (("pid", 1.1), ("geometric", 1.1), ("lqr", 1.15)):
-        controller = build(law, vehicle, tilt_max=limit)
+        controller = build(law, vehicle, tilt=limit)
         log = fly_from(controller, vehicle, make_state(), periods=100, course=np.array([20.0, 0.0, 0.0, 0.0]))
         pitch = np.degrees(log.plant.state[:, INDEX["pitch"]])
         assert 0.8 * limit < pitch.max() < beyond * limit
 
 
 def test_without_a_limit_of_tilt_the_lqr_is_linear(vehicle: Vehicle, build: Callable[..., Any]) -> None:
-    controller = build("lqr", vehicle, tilt_max=None)
+    controller = build("lqr", vehicle, tilt=math.inf)
     state = make_state(position=(-1e-3, 0.0, 0.0))
     answers = [controller._limited(scale * state) for scale in (1.0, 1e4)]
     np.testing.assert_allclose(answers[1], 1e4 * answers[0])
@@ -107,7 +107,7 @@ def test_derivatives_act_on_the_measurement_not_on_the_error(vehicle: Vehicle, b
     slower = replace(memory, velocity=np.array([0.0, 0.0, -0.1]))
     held_back = one_period(controller, vehicle, state, memory=slower)[0]
     thrust = vehicle.thrust_coefficient * (held_back**2).sum()
-    expected = vehicle.mass * (vehicle.gravity - controller.settings.velocity_derivative * 2.0)
+    expected = vehicle.mass * (vehicle.gravity - controller.gains.velocity_derivative * 2.0)
     assert thrust == pytest.approx(expected)
 
 
@@ -156,4 +156,4 @@ def test_a_turning_target_is_turned_with(vehicle: Vehicle, build: Callable[..., 
     np.testing.assert_allclose(speeds, vehicle.hover_speed, rtol=1e-9)
     still, _ = one_period(controller, vehicle, make_state(euler=(0.0, 0.0, 0.4)), target=turning)
     torque = (vehicle.allocation @ still**2)[3]
-    assert torque == pytest.approx(vehicle.inertia[2] * controller.settings.bandwidths.yaw_rate * 0.8)
+    assert torque == pytest.approx(vehicle.inertia[2] * controller.gains.bandwidths.yaw_rate * 0.8)

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mpc.baselines.attitude import attitude_error, motion_of
-from mpc.baselines.geometric import Geometric, GeometricController, Integrals, geometric_settings
+from mpc.baselines.geometric import Geometric, GeometricController, Integrals
 from mpc.baselines.preview import Target, target_of
 from mpc.bounded import TargetBounds
 from mpc.builders import build, law_of
@@ -47,8 +47,7 @@ class Flown(NamedTuple):
 def geometric(
     vehicle: Vehicle, inner_lag: tuple[float, ...], commands: Any = "rates", **others: Any
 ) -> GeometricController:
-    settings = geometric_settings(vehicle, period=PERIOD, commands=commands, inner_lag=inner_lag, **others)
-    return GeometricController(vehicle, settings)
+    return GeometricController(vehicle, PERIOD, Geometric(commands=commands, inner_lag=inner_lag, **others))
 
 
 def fly(
@@ -129,16 +128,16 @@ def test_the_inner_loop_makes_the_lag_a_pole_beside_those_of_the_gains(
 ) -> None:
     """(lag s^2 + s + k)(s^2 + k_v s + k_x), and k + k_v is that of a loop with this lag and half a period."""
     law = geometric(vehicle, lag)
-    settings = law.settings
-    pairs = [(1.0, settings.k_v, settings.k_x)] * 3
-    pairs += [(tau, 1.0, k) for tau, k in zip(lag[1:], settings.k_attitude, strict=True)]
+    gains = law.gains
+    pairs = [(1.0, gains.k_v, gains.k_x)] * 3
+    pairs += [(tau, 1.0, k) for tau, k in zip(lag[1:], gains.k_attitude, strict=True)]
     expected = np.concatenate([np.roots(pair) for pair in pairs])
     np.testing.assert_allclose(
         np.sort_complex(at_hover(law, vehicle, lag).round(5)), np.sort_complex(expected.round(5)), atol=1e-3
     )
-    assert settings.k_attitude[1] + settings.k_v == pytest.approx(0.5 / (0.5 * PERIOD + lag[1]))
-    allowed = geometric(vehicle, lag, lag=0.1).settings
-    assert allowed.k_attitude == pytest.approx([1.0 / 0.33, 1.0 / 0.33, settings.k_attitude[2]])
+    assert gains.k_attitude[1] + gains.k_v == pytest.approx(0.5 / (0.5 * PERIOD + lag[1]))
+    allowed = geometric(vehicle, lag, lag=0.1).gains
+    assert allowed.k_attitude == pytest.approx([1.0 / 0.33, 1.0 / 0.33, gains.k_attitude[2]])
 
 
 @pytest.mark.witness("targets")
@@ -175,9 +174,7 @@ def test_an_observed_scale_of_the_thrust_leaves_no_offset(
     """With 80 % it sags by g / 4 over k_x, 0.8 (g + k_x e) = g; with its scale observed, and wind, it does not."""
     plain = geometric(vehicle, lag, commands)
     flown = fly(plain, vehicle, at_rest, 200, lag=lag, scale=0.8)
-    assert at_rest(0.0)[2] - flown.position[-1, 2] == pytest.approx(
-        0.25 * vehicle.gravity / plain.settings.k_x, rel=0.01
-    )
+    assert at_rest(0.0)[2] - flown.position[-1, 2] == pytest.approx(0.25 * vehicle.gravity / plain.gains.k_x, rel=0.01)
     observing = geometric(vehicle, lag, commands, feedforward=True, disturbance=RampSettings(thrust_scale=True))
     flown = fly(observing, vehicle, at_rest, 200, lag=lag, scale=0.8, force=np.array([0.8, -0.4, 0.0]))
     np.testing.assert_allclose(flown.position[-1], at_rest(0.0)[:3], atol=1e-4)
@@ -211,8 +208,9 @@ def test_the_translation_s_integral_removes_the_offset_and_the_autopilot_has_the
 @COMMANDS
 def test_targets_stay_within_their_bounds_and_integrals_hold_there(vehicle: Vehicle, commands: str) -> None:
     weight = vehicle.mass * vehicle.gravity
-    bounds = TargetBounds(thrust=(0.8 * weight, 1.2 * weight), body_rate=(40.0, 50.0, 20.0)).actuators(vehicle)
-    law = geometric(vehicle, FAST, commands, bounds=bounds, integral=True)
+    target_bounds = TargetBounds(thrust=(0.8 * weight, 1.2 * weight), body_rate=(40.0, 50.0, 20.0))
+    bounds = target_bounds.actuators(vehicle)
+    law = geometric(vehicle, FAST, commands, target_bounds=target_bounds, integral=True)
     far = np.tile([5.0, -5.0, 10.0, 2.0], (law.horizon, 1))
     start = Rotation.from_euler("ZX", [0.4, math.radians(30.0)])
     flown = fly(law, vehicle, lambda t: far[0] if t else at_rest(t), 100, lag=FAST, start=start)
@@ -260,8 +258,7 @@ def test_the_table_builds_the_law_and_audits_its_targets(vehicle: Vehicle) -> No
     table = Geometric(commands="rates", inner_lag=SLOW, target_bounds=TargetBounds(body_rate=100.0), lag=0.05)
     law = law_of(table, vehicle, PERIOD)
     assert isinstance(law, GeometricController)
-    assert law.settings.inner_lag == SLOW
-    assert law.settings.k_attitude[0] == pytest.approx(1.0 / 0.18)
+    assert law.gains.k_attitude[0] == pytest.approx(1.0 / 0.18)
     np.testing.assert_allclose(law.bounds.u_max[1:], math.radians(100.0))
     assert table.audited(vehicle)["body_rate_y"] == (-100.0, 100.0)
     assert "thrust" not in Geometric().audited(vehicle)

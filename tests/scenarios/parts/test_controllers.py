@@ -311,17 +311,17 @@ def test_fields_of_the_baselines_arrive() -> None:
     assert isinstance(pid, CascadedPID)
     assert isinstance(geometric, GeometricController)
     for law in (lqr, pid, geometric):
-        assert same(law.settings.bounds, ActuatorBounds.alike((1.0, 300.0), (-20.0, 30.0)))
-        assert (law.settings.tilt_max, law.horizon) == (12.0, 7)
+        assert same(law.bounds, ActuatorBounds.alike((1.0, 300.0), (-20.0, 30.0)))
+        assert (law._largest_tilt, law.horizon) == (math.radians(12.0), 7)
     vehicle = Assembly(scenario("lqr")).vehicle
-    assert same(lqr.settings.objective, bryson_objective(vehicle))
-    assert not lqr.settings.heading_frame
-    assert pid.settings.velocity_max == 3.0
-    assert pid.settings.bandwidths.rate == pytest.approx(1.0 / (2.0 * 0.225))
-    assert geometric.settings.k_i > 0.0
+    assert same(lqr.objective, bryson_objective(vehicle))
+    assert not lqr._heading
+    assert pid._largest_velocity == 3.0
+    assert pid.gains.bandwidths.rate == pytest.approx(1.0 / (2.0 * 0.225))
+    assert geometric.gains.k_i > 0.0
     weighted = built({"type": "lqr", "output_weights": ROBUST["output_weights"], "input_weights": {"speed": 0.1}}).law
     assert isinstance(weighted, LQR)
-    assert same(weighted.settings.objective.Q_u, 0.1 * np.eye(4))
+    assert same(weighted.objective.Q_u, 0.1 * np.eye(4))
 
 
 # --- the file ------------------------------------------------------------------------------------------------------
