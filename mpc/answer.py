@@ -135,7 +135,7 @@ class AnswerCheck:
     def __call__(
         self, problem: Problem, query: Query, answer: Answer, refused: str | None
     ) -> tuple[Answer, str | None]:
-        """Return the answer with its `infeasibility` and, when due, its KKT residuals; and the reason to reject it.
+        """Return the answer with its violation of rows and, when due, KKT residuals; and the reason to reject it.
 
         A reason in `refused` takes precedence.
         """
@@ -146,8 +146,16 @@ class AnswerCheck:
         if refused is None and not violation <= INFEASIBLE:
             refused = INFEASIBLE_ANSWER
         if due or refused is not None:
-            return answer._replace(infeasibility=violation, kkt=kkt_residuals(*answer.certificate())), refused
-        return answer._replace(infeasibility=violation), refused
+            kkt = kkt_residuals(*answer.certificate())
+            stats = answer.stats._replace(
+                infeasibility=violation,
+                kkt_stationarity=kkt.stationarity,
+                kkt_complementarity=kkt.complementarity,
+                kkt_dual=kkt.dual,
+            )
+        else:
+            stats = answer.stats._replace(infeasibility=violation)
+        return answer._replace(stats=stats), refused
 
     def _infeasibility(self, problem: Problem, query: Query, answer: Answer) -> float:
         """Return the largest violation of a row by the plan, less the slack of soft rows; 0 if no row is violated."""
@@ -183,23 +191,18 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
     """Return speeds (4,) and a plan (N, 4) as a command, with its status and the statistics of the answer."""
-    accepted, kkt = status in ACCEPTED, answer.kkt
+    accepted, stats = status in ACCEPTED, answer.stats
+    if not accepted:
+        stats = stats._replace(active=0, sqp_defect=math.nan, sqp_step=math.nan)
+    elif answer.slacks.size:
+        stats = stats._replace(slack=max(float(answer.slacks.max()), 0.0))
     return Command(
         speeds=speeds.copy(),
         plan=plan,
         status=status,
         answered_by=answer.answered_by if accepted else FALLBACK,
-        iterations=answer.iterations,
-        active=answer.active if accepted else 0,
         fallback=fallback,
-        slack=max(float(answer.slacks.max()), 0.0) if accepted and answer.slacks.size else 0.0,
-        reported_primal=answer.reported_primal,
-        reported_dual=answer.reported_dual,
-        infeasibility=answer.infeasibility,
-        kkt_stationarity=math.nan if kkt is None else kkt.stationarity,
-        kkt_complementarity=math.nan if kkt is None else kkt.complementarity,
-        kkt_dual=math.nan if kkt is None else kkt.dual,
-        solve_s=answer.solve_s,
+        stats=stats,
     )
 
 

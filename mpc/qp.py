@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol, TypeAlias
@@ -11,7 +10,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem
-from quadsim.controller import SOLVED
+from quadsim.controller import NO_STATISTICS, SOLVED, Statistics
 from quadsim.state import Array
 
 Matrix: TypeAlias = Array | csc_matrix
@@ -95,18 +94,15 @@ class QPRows:
 
 
 class Solution(NamedTuple):
-    """A primal point of a QP with its multipliers and solver statistics; the arrays are copies."""
+    """A primal point of a QP with its multipliers and statistics; the arrays are copies."""
 
     x: Array
     y: Array  # multipliers of A x = b
     z: Array  # multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower
     z_box: Array  # multipliers of x_l <= x <= x_u, with the same signs
     status: str = SOLVED  # `solved`, or the solver's name for the failure
-    iterations: int = 0
-    active: int = 0  # inequality rows and box entries active at the point
-    reported_primal: float = math.nan  # residual reported by the solver; NaN if it reports none
-    reported_dual: float = math.nan  # same
-    solve_s: float = 0.0  # wall time inside the solver, updates included [s]
+    stats: Statistics = NO_STATISTICS
+    """Of the solver; `active` counts inequality rows and box entries, `solve_s` includes updates."""
 
 
 class PeriodQP(NamedTuple):

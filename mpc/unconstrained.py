@@ -14,7 +14,7 @@ from mpc.bounded import Weighted
 from mpc.condensing import condensed_cost
 from mpc.ocp import Problem
 from mpc.paper import prediction, rollout
-from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, StepInputs, stopped
+from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Statistics, StepInputs, stopped
 from quadsim.state import INDEX, Array, ReferenceTurns
 
 
@@ -68,7 +68,8 @@ class UnconstrainedMPC:
         sequence = self.gains.K @ state + self.gains.G @ desired.ravel() + self._offset
         plan = sequence.reshape(self.horizon, -1)
         spent_s = clock.perf_counter() - started
-        return Command(speeds=plan[0].copy(), plan=plan, status=UNCONSTRAINED, answered_by=GAIN, solve_s=spent_s)
+        stats = Statistics(solve_s=spent_s)
+        return Command(speeds=plan[0].copy(), plan=plan, status=UNCONSTRAINED, answered_by=GAIN, stats=stats)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     __version__: str
     from quadsim.controller import Command as Command
+    from quadsim.controller import Statistics as Statistics
     from quadsim.controller import StepInputs as StepInputs
     from quadsim.errors import QuadsimError as QuadsimError
     from quadsim.state import STATE_NAMES as STATE_NAMES
@@ -96,7 +97,7 @@ def _command() -> int:
 
 
 _MODULES = {
-    "quadsim.controller": "Command StepInputs",
+    "quadsim.controller": "Command Statistics StepInputs",
     "quadsim.errors": "QuadsimError",
     "quadsim.state": "STATE_NAMES State",
     "quadsim.vehicle": "Vehicle",

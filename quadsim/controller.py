@@ -175,14 +175,40 @@ class Settling(Protocol):
         ...
 
 
-class SQP(NamedTuple):
-    """Residuals of sequential quadratic programming, in the model's units: m, m/s, rad/s and shares.
+class Statistics(NamedTuple):
+    """How an answer was computed, declared once for solvers, answers and commands; NaN: not available.
 
-    A solved QP does not imply that they are small.
+    Attributes:
+        iterations: iterations of the solver, also if its answer was rejected; 0 for a closed form.
+        active: number of constraints active at the optimum.
+        slack: largest softening of an output bound [rad]; 0 while all bounds are hard.
+        reported_primal: largest constraint violation that the QP solver reports [in its scaling].
+        reported_dual: largest gradient of the Lagrangian that the QP solver reports [in its scaling].
+        infeasibility: largest violation of the problem's rows by the plan, soft rows less their slack [row's unit].
+        kkt_stationarity: largest entry of the Lagrangian's gradient, computed from the QP.
+        kkt_complementarity: largest product of a multiplier and the distance to its bound, computed from the QP.
+        kkt_dual: largest multiplier with the wrong sign, computed from the QP.
+        sqp_defect: largest |x_{i+1} - f(x_i, u_i)| of a plan by sequential quadratic programming, over its nodes and
+            the states' components [m, m/s, rad/s, shares]; a solved QP does not imply that it is small.
+        sqp_step: largest change of a state or an input in the last iteration, in the same units.
+        solve_s: wall time inside the solver [s].
     """
 
-    defect: float  # largest |x_{i+1} - f(x_i, u_i)| of the plan, over its nodes and the states' components
-    step: float  # largest change of a state or an input in the last iteration
+    iterations: int = 0
+    active: int = 0
+    slack: float = 0.0
+    reported_primal: float = math.nan
+    reported_dual: float = math.nan
+    infeasibility: float = math.nan
+    kkt_stationarity: float = math.nan
+    kkt_complementarity: float = math.nan
+    kkt_dual: float = math.nan
+    sqp_defect: float = math.nan
+    sqp_step: float = math.nan
+    solve_s: float = 0.0
+
+
+NO_STATISTICS: Final = Statistics()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,20 +222,9 @@ class Command:
         status: `solved`, `unconstrained`, `commanded` or `not_converged` (`ACCEPTED`), `landed` or `crashed` where
             rotors are stopped, or the solver's name for its failure.
         answered_by: source of `speeds`: `gain`, `core`, a QP solver by its name, `law`, `fallback` or `stopped`.
-        iterations: iterations of the solver, also if its answer was rejected; 0 for a closed form.
-        active: number of constraints active at the optimum.
         fallback: 0 when `speeds` is this period's optimum, higher = deeper; 1 = the shifted previous plan, or
             the last command, if it continues for one that missed its deadline.
-        slack: largest softening of an output bound [rad]; 0 while all bounds are hard.
-        reported_primal: largest constraint violation that the QP solver reports [in its scaling]; NaN, as for all
-            below, if not available.
-        reported_dual: largest gradient of the Lagrangian that the QP solver reports [in its scaling].
-        infeasibility: largest violation of the problem's rows by the plan, soft rows less their slack [row's unit].
-        kkt_stationarity: largest entry of the Lagrangian's gradient, computed from the QP.
-        kkt_complementarity: largest product of a multiplier and the distance to its bound, computed from the QP.
-        kkt_dual: largest multiplier with the wrong sign, computed from the QP.
-        solve_s: wall time inside the solver [s].
-        sqp: residuals of sequential quadratic programming; None for other laws.
+        stats: how it was computed.
         inner: inner loop that flies commands from now on; None: the rotors hold `speeds`.
 
     Examples:
@@ -224,18 +239,8 @@ class Command:
     plan: Array
     status: str = COMMANDED
     answered_by: str = LAW
-    iterations: int = 0
-    active: int = 0
     fallback: int = 0
-    slack: float = 0.0
-    reported_primal: float = math.nan
-    reported_dual: float = math.nan
-    infeasibility: float = math.nan
-    kkt_stationarity: float = math.nan
-    kkt_complementarity: float = math.nan
-    kkt_dual: float = math.nan
-    solve_s: float = 0.0
-    sqp: SQP | None = None
+    stats: Statistics = NO_STATISTICS
     inner: InnerLoop | None = None
 
 

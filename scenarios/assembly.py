@@ -40,7 +40,7 @@ from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.sim.rigid_body import check_free
-from quadsim.sim.sensing import AXES, FaultKind, Sensor, SensorFault, SensorName
+from quadsim.sim.sensing import AXES, FaultKind, Sensor, SensorFault, SensorName, in_si
 from quadsim.space import Corridor, Fence, Region
 from quadsim.state import (
     ANGLE_RATES,
@@ -87,13 +87,6 @@ _SIZES: Final = {
     "rotor_radius": ("ground", "rotor_radius", None),
 }
 """Vehicle parameters that act in an effect: its table, the field that also states it, and the switch of the effect."""
-_UNITS: Final = {
-    SensorName.POSITION: 1.0,
-    SensorName.VELOCITY: 1.0,
-    SensorName.ATTITUDE: math.radians(1.0),
-    SensorName.RATES: math.radians(1.0),
-}
-"""SI units per unit of the scenario file, by sensor."""
 _RESTING: Final = 1e-9  # vertical speed attributed to rounding [m/s]
 _OF_ALL_EVENTS: Final = ("vehicle", "autopilot", "user_autopilot", "inner_lag", "actual", "effects", "course")
 """Parts that do not depend on events, controller or duration."""
@@ -540,17 +533,9 @@ class Assembly:
         return Navigation(self.vehicle, timestep=step, sensors=sensors, rng=rng, faults=faults, estimator=estimator)
 
     @property
-    def sensors(self) -> tuple[Sensor, ...]:
-        """The scenario's sensors in SI units."""
-        present = {} if self.scenario.sensors is None else self.scenario.sensors.present()
-        return tuple(
-            Sensor(
-                name=name,
-                **vars(spec)
-                | {field: _three(getattr(spec, field), _UNITS[name]) for field in ("noise", "bias", "bias_walk")},
-            )
-            for name, spec in present.items()
-        )
+    def sensors(self) -> dict[SensorName, Sensor]:
+        """The scenario's sensors."""
+        return {} if self.scenario.sensors is None else self.scenario.sensors.present()
 
     @property
     def faults(self) -> tuple[SensorFault, ...]:
@@ -644,13 +629,8 @@ def make_fault(event: SensorFaultEvent) -> SensorFault:
         start=event.at,
         stop=event.at + event.duration,
         axes=AXES if event.axes is None else tuple(sorted({"xyz".index(axis) for axis in event.axes})),
-        offset=_three(event.offset or 0.0, _UNITS[name]),
+        offset=in_si(name, event.offset or 0.0),
     )
-
-
-def _three(value: float | Sequence[float], unit: float) -> tuple[float, float, float]:
-    x, y, z = [value] * 3 if isinstance(value, float | int) else value
-    return unit * x, unit * y, unit * z
 
 
 _Lasting = TypeVar("_Lasting", RotorLoss, Push)

@@ -27,7 +27,7 @@ from quadsim.flight.audit import (
     margins_sampled,
     worst_finding,
 )
-from quadsim.flight.log import FlightLog
+from quadsim.flight.log import FlightLog, PlantLog, columns_of
 from quadsim.flight.parquet import FORMAT, log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
 from quadsim.outputs import absolute, adding, amend, to_json, writing
@@ -204,7 +204,7 @@ class Flight(Result):
     def plant(self) -> dict[str, Array]:
         """(M,) of the time `t` [s], each true state, and rotor speeds `w1` .. `w4` [rad/s], between commands."""
         log = self.log.plant
-        speeds = {f"w{i}": column for i, column in enumerate(log.speeds.T, start=1)}
+        speeds = dict(zip(columns_of(PlantLog)["speeds"].units, log.speeds.T, strict=True))
         return {"t": log.t, **dict(zip(STATE_NAMES, log.state.T, strict=True)), **speeds}
 
     @cached_property

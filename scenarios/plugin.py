@@ -31,8 +31,8 @@ from mpc.obstacles import Shape
 from quadsim import border
 from quadsim.border import numbers_of, user_code
 from quadsim.controller import (
+    NO_STATISTICS,
     ROTORS,
-    SQP,
     TARGET_SIZES,
     Adopting,
     Command,
@@ -43,6 +43,7 @@ from quadsim.controller import (
     Predicting,
     Resetting,
     Solving,
+    Statistics,
     StepInputs,
     Stepping,
 )
@@ -56,7 +57,6 @@ from quadsim.errors import (
     printable,
 )
 from quadsim.fields import is_plain
-from quadsim.flight.log import RESIDUALS
 from quadsim.outputs import digest_of
 from quadsim.sim.effects import Force
 from quadsim.state import Array, State
@@ -70,8 +70,6 @@ _NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _STEP: Final = (
     "a class or an object with a method step(now, state, reference), or a function law(now, state, reference)"
 )
-_WHOLE: Final = ("iterations", "active", "fallback")  # parts of a Command
-_REAL: Final = ("slack", *RESIDUALS, "solve_s")
 _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
 _log: Final = logging.getLogger("quadsim")
 
@@ -211,10 +209,8 @@ class PluginController:
         try:
             if not isinstance(answer, Command):
                 answer = Command(speeds=answer, plan=np.tile(_numbers(answer, (self._size,), "it"), (self.horizon, 1)))
-            parts: dict[str, Any] = {name: operator.index(getattr(answer, name)) for name in _WHOLE}
-            parts |= {name: float(numbers_of(getattr(answer, name))) for name in _REAL}
+            parts: dict[str, Any] = {"fallback": operator.index(answer.fallback), "stats": _checked(answer.stats)}
             parts |= {name: printable(getattr(answer, name))[:200] for name in ("status", "answered_by")}
-            parts["sqp"] = None if answer.sqp is None else SQP(*map(float, answer.sqp))
             parts["speeds"] = _numbers(answer.speeds, (self._size,), "its speeds")
             parts["plan"] = _numbers(answer.plan, (self.horizon, self._size), "its plan")
             if self._size > N_ROTORS:
@@ -230,6 +226,18 @@ class PluginController:
             what = "speeds" if self.commands == ROTORS else "numbers of a target"
             problem = f"{self.name} answered {answer!r:.100}, neither {self._size} {what} nor a Command: {error}"
             raise CommandError(problem, time=now.time) from error
+
+
+def _checked(stats: Any) -> Statistics:
+    """Return statistics as plain numbers, whole where they are counts."""
+    if not isinstance(stats, Statistics):
+        raise TypeError(f"its stats must be quadsim.Statistics; got {stats!r:.80}")
+    values: tuple[Any, ...] = stats
+    numbers: list[Any] = [
+        operator.index(value) if isinstance(usual, int) else float(numbers_of(value))
+        for usual, value in zip(NO_STATISTICS, values, strict=True)
+    ]
+    return Statistics(*numbers)
 
 
 def _numbers(numbers: Any, shape: tuple[int, ...], name: str) -> Array:

@@ -22,14 +22,13 @@ from quadsim.controller import MISSED, ROTORS
 from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, FlightVerdict, audit, flight_verdict
-from quadsim.flight.log import ControlLog, FlightLog
+from quadsim.flight.log import ControlLog, FlightLog, PlantLog, columns_of
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import finding_from_json, limit_to_json
 from quadsim.report.comparison import comparison_rows
 from quadsim.sim.computation import physics_steps
 from quadsim.sim.effects.rotors import LagChange
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array, wrapped
-from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly
 from scenarios.courses.csv_course import Csv
 from scenarios.junit import Cases, flight_verdicts
@@ -50,8 +49,8 @@ ROUNDING_TILT: Final = 1e-6  # the same for the tilt: near level, an arc cosine 
 MOST_REPORTED: Final = 6  # differences that one message names
 _HOLDING: Final = ("unconstrained", "constrained", "robust", "nonlinear", "lqr", "geometric")
 """Laws that command rotor speeds for a whole period, unless INDI modifies them."""
-_COMMANDED: Final = tuple(f"u{i}" for i in range(1, N_ROTORS + 1))
-_TURNING: Final = tuple(f"w{i}" for i in range(1, N_ROTORS + 1))
+_COMMANDED: Final = tuple(columns_of(ControlLog)["speeds"].units)
+_TURNING: Final = tuple(columns_of(PlantLog)["speeds"].units)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

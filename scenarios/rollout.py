@@ -21,7 +21,7 @@ from quadsim.input_limits import MOST_STEPS
 from quadsim.sim.effects import Force
 from quadsim.sim.loop import ClosedLoop, Reference, complete
 from quadsim.sim.navigation import Navigation
-from quadsim.sim.physics import FlownPeriod, Observation, one_period
+from quadsim.sim.physics import Observation, Period, one_period
 from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from scenarios.assembly import Assembly
@@ -197,7 +197,7 @@ class Rollout:
         """
         return self.loop.observation
 
-    def step(self, command: Command | Array | None = None) -> FlownPeriod:
+    def step(self, command: Command | Array | None = None) -> Period:
         """Fly one control period.
 
         Args:
@@ -274,7 +274,7 @@ class Rollout:
         self._events.leave_course()
         self.limits = self._events.assembly.limits
 
-    def margins(self, sample: FlownPeriod | None = None) -> dict[str, float]:
+    def margins(self, sample: Period | None = None) -> dict[str, float]:
         """Return the smallest signed margin of each constraint within one period; negative = beyond the bound.
 
         At the physics rate, both ends included, in the constraint's unit; NaN outside its time window.
@@ -287,7 +287,7 @@ class Rollout:
             raise InputError("no period has been flown yet")
         return smallest_margins(one_period(sample, self._plant.timestep), self.limits)
 
-    def violations(self, sample: FlownPeriod | None = None) -> dict[str, float]:
+    def violations(self, sample: Period | None = None) -> dict[str, float]:
         """Return how far each constraint is exceeded beyond its tolerance within one period: g <= 0 if it holds.
 
         In its unit, at its worst; minus infinity outside its time window.

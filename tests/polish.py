@@ -75,7 +75,9 @@ def polish(qp: QP, solution: Solution) -> Solution:
     multipliers = np.zeros_like(lower)
     multipliers[active] = held
     z_box, z, y = np.split(multipliers, [n, n + rows])
-    return solution._replace(x=x, y=y, z=z, z_box=z_box, active=int(np.count_nonzero(active < n + rows)))
+    return solution._replace(
+        x=x, y=y, z=z, z_box=z_box, stats=solution.stats._replace(active=int(np.count_nonzero(active < n + rows)))
+    )
 
 
 def _worst(against: Array, among: Any) -> Any:

@@ -94,7 +94,9 @@ def main() -> int:
     """Take away each room, or those that are named; returns 1 if something fails without them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rooms", nargs="*", metavar="ROOM", help=", ".join(ROOMS))
-    parser.add_argument("--tests", default="-m 'not slow or witness'", help="arguments of pytest (default: %(default)s)")
+    parser.add_argument(
+        "--tests", default="-m 'not slow or witness'", help="arguments of pytest (default: %(default)s)"
+    )
     chosen = parser.parse_args()
     if unknown := {*chosen.rooms} - {*ROOMS}:
         parser.error(f"ROOM must be of {', '.join(ROOMS)}; got {', '.join(unknown)}")

@@ -18,7 +18,7 @@ from mpc.heading import turn
 from mpc.model import LinearModel
 from mpc.ocp import Problem
 from mpc.pilot import Pilot
-from quadsim.controller import SOLVED, Command, StepInputs
+from quadsim.controller import SOLVED, Command, Statistics, StepInputs
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 from scenarios.assembly import Assembly
@@ -94,7 +94,9 @@ class Scripted:
             raise entry
         plan = np.tile(model().u_bar, (self.horizon, 1))
         plan[:, 0] += np.linspace(0.0, 0.5, self.horizon)
-        return replace(Command(speeds=plan[0].copy(), plan=plan, status=SOLVED, iterations=7), **entry)
+        return replace(
+            Command(speeds=plan[0].copy(), plan=plan, status=SOLVED, stats=Statistics(iterations=7)), **entry
+        )
 
     def predict(self, states: Array, plans: Array) -> Array:
         predicted = np.empty((*plans.shape[:2], 12))

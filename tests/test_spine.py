@@ -21,6 +21,8 @@ from test_architecture import imports_of, modules
 
 ROOT = Path(__file__).resolve().parent.parent
 MOST_ENTERED, MOST_LOADED, MOST_FRAMES, LONGEST_CHAIN, SPINE_LINES = 85, 140, 8, 20, 2450
+MOST_DATA_TYPES, MOST_CLASSES = 16, 72  # may only fall
+COUNTED = "import runpy; runpy.run_path('tests/count_types.py', run_name='__main__')"
 HELP = "import scenarios.cli; scenarios.cli.main(['--help'])"
 WATCHED = """
 import json, sys
@@ -84,6 +86,14 @@ def test_the_controller_s_first_step_is_few_calls_deep(watched: Any) -> None:
     *_, frames = watched
     assert frames[0].endswith(".step")
     assert len(frames) <= MOST_FRAMES, frames
+
+
+def test_one_flight_has_few_kinds() -> None:
+    """Data types of a control period, and classes of a flight, as `tests/count_types.py` counts them."""
+    done = subprocess.run([sys.executable, "-c", COUNTED], cwd=ROOT, capture_output=True, text=True, check=True)
+    data_types, classes = map(int, re.findall(r"^(\d+) ", done.stdout, re.M))
+    assert 0 < data_types <= MOST_DATA_TYPES, done.stdout
+    assert data_types < classes <= MOST_CLASSES, done.stdout
 
 
 def spine() -> list[Path]:

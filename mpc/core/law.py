@@ -29,6 +29,7 @@ from quadsim.controller import (
     UNCONSTRAINED,
     Command,
     Phase,
+    Statistics,
     StepInputs,
     stopped,
 )
@@ -199,11 +200,13 @@ class CompiledMPC:
             plan=plan,
             status=UNCONSTRAINED if self._unbounded else STATUSES[status],
             answered_by=GAIN if self._unbounded else ANSWERERS[status],
-            iterations=self._mpc.work.changes,
-            active=active,
             fallback=LEVELS[status],
-            slack=self._most_slack() if active and self._soft else 0.0,
-            solve_s=spent_s,
+            stats=Statistics(
+                iterations=self._mpc.work.changes,
+                active=active,
+                slack=self._most_slack() if active and self._soft else 0.0,
+                solve_s=spent_s,
+            ),
         )
 
     def predict(self, states: Array, plans: Array) -> Array:

@@ -18,7 +18,7 @@ from mpc.core.tables import members, tables
 from mpc.ocp import Problem, Query
 from mpc.qp import QP, Solution
 from mpc.solvers import Answer, Method, QPSolver
-from quadsim.controller import CORE, GAIN, SOLVED, UNCONSTRAINED
+from quadsim.controller import CORE, GAIN, SOLVED, UNCONSTRAINED, Statistics
 from quadsim.state import N_STATES, Array, read_only
 from quadsim.vehicle import N_ROTORS
 
@@ -234,11 +234,9 @@ class Core:
             slacks,
             SOLVED if way else UNCONSTRAINED,
             CORE if way else GAIN,
-            iterations=self._work.changes,
-            active=active,
             method=WAYS[way],
             certificate=partial(self._certificate, query, plan, slacks, multipliers),
-            solve_s=clock.perf_counter() - started,
+            stats=Statistics(iterations=self._work.changes, active=active, solve_s=clock.perf_counter() - started),
         )
 
     def _certificate(self, query: Query, plan: Array, slacks: Array, multipliers: Array) -> tuple[QP, Solution]:
@@ -250,4 +248,4 @@ class Core:
             self._piqp = QPSolver("piqp-multistage", self._problem)
         spent_s = clock.perf_counter() - started
         answer = self._piqp.solve(query)
-        return answer._replace(solve_s=spent_s + answer.solve_s)
+        return answer._replace(stats=answer.stats._replace(solve_s=spent_s + answer.stats.solve_s))

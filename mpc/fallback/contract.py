@@ -216,8 +216,9 @@ class Guard:
         if plan is None:
             plan, level = self._hover(law, known, acting)
         spent = answer or Command(speeds=plan[0], plan=plan)
-        spent = replace(spent, status=status, answered_by=FALLBACK, fallback=level, sqp=None)
-        return replace(spent, speeds=plan[0].copy(), plan=plan, active=0, slack=0.0)
+        spent = replace(spent, status=status, answered_by=FALLBACK, fallback=level)
+        stats = spent.stats._replace(active=0, slack=0.0, sqp_defect=math.nan, sqp_step=math.nan)
+        return replace(spent, speeds=plan[0].copy(), plan=plan, stats=stats)
 
     def _shifted(self, law: Controller, known: Array, acting: Array, *, lost: bool) -> Array | None:
         """Return the rest of the last good plan (N, 4), corrected; None from when it becomes unusable."""

@@ -48,7 +48,7 @@ from mpc.obstacles import ObstacleQP, Space
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
 from mpc.solvers import INVALID_DATA, Answer, QPSolver
-from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, ROTORS, SQP, Command, Phase, StepInputs, stopped
+from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, ROTORS, Command, Phase, StepInputs, stopped
 from quadsim.errors import ParameterError
 from quadsim.rotation import (
     body_to_euler_rates,
@@ -79,7 +79,7 @@ OUTSIDE: Final = 1e-6
 SHORTEST: Final = 0.1
 """Smallest share of a Gauss-Newton step that Aitken's relaxation takes."""
 CONVERGED: Final = 0.1
-"""Largest dynamics defect of a converged plan (`quadsim.controller.SQP`). Library flights exceed it in at most 9
+"""Largest dynamics defect of a converged plan (`quadsim.controller.Statistics`). Library flights exceed it in at most 9
 periods, after steps of the course and upside down; a tumbling vehicle exceeds it in all."""
 CORRECTIONS: Final = 2
 """Most further SQP steps in a period whose plan has not `CONVERGED`, where commands are targets; if it still has not,
@@ -381,7 +381,7 @@ class NonlinearMPC:
             self._last = now.time, measured
         nodes = self._balanced(nodes)
         start = {"_plan": self._plan, "_acting": self._acting, "_model": self._model}
-        query, answer, problem, sqp = self._iterate(now.time, measured, nodes)
+        query, answer, problem = self._iterate(now.time, measured, nodes)
         answer, status = self._check(problem, query, answer, self._rejection(answer))
         if status is not None:
             if status != INVALID_DATA and (
@@ -390,9 +390,8 @@ class NonlinearMPC:
                 self.infeasible_period = InfeasiblePeriod(problem=problem, query=query, status=status, time=now.time)
             self._plan = None
             return refused(self._acting, self.horizon, status, answer)
-        assert sqp is not None
         status = answer.status
-        if sqp.defect > CONVERGED:
+        if answer.stats.sqp_defect > CONVERGED:
             status = NOT_CONVERGED
             if self.infeasible_period is None:
                 converges = partial(_converges, self._again, self.settings, start, now.time, measured, nodes)
@@ -401,7 +400,7 @@ class NonlinearMPC:
                 )
         speeds = self._speeds(self._clip(answer.plan))
         self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
-        return replace(command_of(speeds[0], np.repeat(speeds, stride, axis=0), status, answer), sqp=sqp)
+        return command_of(speeds[0], np.repeat(speeds, stride, axis=0), status, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the latest disturbance estimate, without rotor lag."""
@@ -516,7 +515,7 @@ class NonlinearMPC:
         y = np.column_stack([np.append(total, total[-1]), nodes.states[:, W]]) / model.scale
         return self._clip(0.5 * (y[:-1] + y[1:]) + np.array(model.lag) / model.step * np.diff(y, axis=0)), y
 
-    def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem, SQP | None]:
+    def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem]:
         """Take SQP steps from the stored plan; the returned problem is that of the answer."""
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
         inputs, actuators = self._reference_inputs(nodes)
@@ -544,7 +543,7 @@ class NonlinearMPC:
             else:
                 answer, problem = self._obstacles.solve(time, query, along=x[1:, P])
             if answer.states is None or answer.status not in ACCEPTED:
-                return query, answer, problem, None
+                return query, answer, problem
             states, plan = answer.states[:, :n], answer.plan
             end = np.concatenate([measured[None], states])
             end[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
@@ -570,7 +569,8 @@ class NonlinearMPC:
                 self._plan = x + share * (end - x), u + share * (plan - u)
         if self._targets and defect > CONVERGED:
             self._plan = None
-        return query, answer, problem, SQP(defect, float(moved))
+        stats = answer.stats._replace(sqp_defect=defect, sqp_step=float(moved))
+        return query, answer._replace(stats=stats), problem
 
     def _defect(self, x: Array, u: Array) -> float:
         """Return by how much a plan of states (N + 1, n) and inputs (N, 4) misses the dynamics."""
@@ -624,5 +624,5 @@ def _converges(
     """
     law = make(settings=replace(settings, iterations=iterations))
     vars(law).update(start)
-    _, answer, _, sqp = law._iterate(time, measured, nodes)
-    return law._rejection(answer) is None and sqp is not None and sqp.defect <= CONVERGED
+    _, answer, _ = law._iterate(time, measured, nodes)
+    return law._rejection(answer) is None and answer.stats.sqp_defect <= CONVERGED

@@ -15,8 +15,8 @@ import numpy as np
 from mpc.condensing import Condensed, FreeOptimum
 from mpc.ocp import Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
-from mpc.qp import QP, Backend, KKTResiduals, Solution
-from quadsim.controller import ACCEPTED, CORE, GAIN
+from mpc.qp import QP, Backend, Solution
+from quadsim.controller import ACCEPTED, CORE, GAIN, NO_STATISTICS, Statistics
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
 
@@ -158,16 +158,10 @@ class Answer(NamedTuple):
     slacks: Array  # (N, m_s) violations of soft rows
     status: str  # `solved`, `unconstrained`, or the reason of a failure
     answered_by: str  # `gain`, `core` or the QP solver's name; see `quadsim.controller.Command`
-    iterations: int = 0  # of the solver that answered
-    active: int = 0  # constraints active at the optimum
-    solve_s: float = 0.0  # wall time [s]
-    reported_primal: float = math.nan  # see `mpc.qp.Solution`, as for the next
-    reported_dual: float = math.nan
+    stats: Statistics = NO_STATISTICS  # of the solver that answered, completed by `mpc.answer.AnswerCheck`
     method: Method = Method.WHOLE  # the part of the QP that had to be solved
     states: Array | None = None  # (N, n) predicted, if the model changes and there is an optimum
     certificate: Callable[[], tuple[QP, Solution]] | None = None  # the QP and its solution; None for invalid data
-    infeasibility: float = math.nan  # see `mpc.answer.AnswerCheck`, as for the next; NaN if not computed
-    kkt: KKTResiduals | None = None
 
     @classmethod
     def of(cls, form: Formulation, qp: QP, solution: Solution, answered_by: str) -> Answer:
@@ -177,11 +171,7 @@ class Answer(NamedTuple):
             form.slacks(solution.x),
             solution.status,
             answered_by,
-            iterations=solution.iterations,
-            active=solution.active,
-            solve_s=solution.solve_s,
-            reported_primal=solution.reported_primal,
-            reported_dual=solution.reported_dual,
+            stats=solution.stats,
             certificate=lambda: (qp, solution),
         )
 
@@ -247,7 +237,8 @@ class QPSolver:
         period_qp = form.assemble(query) if period_qp is None else period_qp
         solution = self._backend.solve(period_qp.qp) if solution is None else solution
         answer = Answer.of(form, period_qp.qp, solution, by)
-        answer = answer._replace(method=method, solve_s=spent_s + solution.solve_s)
+        stats = solution.stats._replace(solve_s=spent_s + solution.stats.solve_s)
+        answer = answer._replace(method=method, stats=stats)
         if self._changing and answer.status in ACCEPTED and np.isfinite(answer.plan).all():
             return answer._replace(states=period_qp.states(solution.x))
         return answer

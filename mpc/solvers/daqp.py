@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 
 from mpc.qp import QP, Matrix, Solution
-from quadsim.controller import SOLVED
+from quadsim.controller import SOLVED, Statistics
 from quadsim.state import Array
 
 SETTINGS: Final = {
@@ -66,9 +66,11 @@ class DaqpDense:
             z=z,
             z_box=z_box,
             status=STATUS.get(flag, f"daqp_{flag}"),
-            iterations=info["iterations"],
-            active=int(np.count_nonzero(z) + np.count_nonzero(z_box)),
-            solve_s=elapsed,
+            stats=Statistics(
+                iterations=info["iterations"],
+                active=int(np.count_nonzero(z) + np.count_nonzero(z_box)),
+                solve_s=elapsed,
+            ),
         )
 
 

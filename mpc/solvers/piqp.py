@@ -10,7 +10,7 @@ import piqp
 from numpy.typing import NDArray
 
 from mpc.qp import QP, Solution
-from quadsim.controller import SOLVED
+from quadsim.controller import SOLVED, Statistics
 
 MAX_ITERATIONS: Final = 100  # limit for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 8 to 23
 
@@ -103,11 +103,13 @@ class Piqp:
             z=z,
             z_box=result.z_bu - result.z_bl,
             status=STATUS[status],
-            iterations=int(info.iter),
-            active=sum(int(np.count_nonzero(np.minimum(m, ACTIVE_SLACK) > s)) for m, s in (lower, upper, *box)),
-            reported_primal=float(info.primal_res),
-            reported_dual=float(info.dual_res),
-            solve_s=elapsed,
+            stats=Statistics(
+                iterations=int(info.iter),
+                active=sum(int(np.count_nonzero(np.minimum(m, ACTIVE_SLACK) > s)) for m, s in (lower, upper, *box)),
+                reported_primal=float(info.primal_res),
+                reported_dual=float(info.dual_res),
+                solve_s=elapsed,
+            ),
         )
 
     def _of_rows(self, part: Any) -> Any:

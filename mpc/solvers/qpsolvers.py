@@ -14,7 +14,7 @@ import qpsolvers
 from scipy.sparse import csc_matrix
 
 from mpc.qp import QP, Solution
-from quadsim.controller import SOLVED
+from quadsim.controller import SOLVED, Statistics
 
 ACTIVE_MULTIPLIER: Final = 1e-5
 """Multiplier from which a constraint counts as active; at the paper's optima they reach 1e3."""
@@ -75,6 +75,5 @@ class AnyOfQpsolvers:
             z=z,
             z_box=z_box,
             status=UNSOLVED if np.isnan(x).any() else SOLVED,
-            active=int(np.count_nonzero(np.abs(multipliers) > ACTIVE_MULTIPLIER)),
-            solve_s=elapsed,
+            stats=Statistics(active=int(np.count_nonzero(np.abs(multipliers) > ACTIVE_MULTIPLIER)), solve_s=elapsed),
         )

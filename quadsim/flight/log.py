@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final
+from dataclasses import dataclass, field, fields
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -29,52 +29,55 @@ from quadsim.state import (
 )
 from quadsim.vehicle import N_ROTORS
 
-RESIDUALS: Final = (
-    *("reported_primal", "reported_dual", "infeasibility"),
-    *("kkt_stationarity", "kkt_complementarity", "kkt_dual"),
-)
-"""Columns that some periods lack: NaN here, null in files; see `quadsim.controller.Command`."""
-WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}": "N m" for axis in "xyz"}}
-"""Columns of the external force, world, and torque, body frame, with units; only if there is any."""
-WIND: Final = {f"wind_{axis}": "m/s" for axis in "xyz"}
-"""Columns of the wind, world, with units; only if there is any."""
-BATTERY: Final = {"voltage": "V", "charge": "-"}
-"""Columns of the battery, with units; only if there is one."""
+Counts = np.ndarray[Any, np.dtype[np.int64]]
+NUMBER, TEXT, COUNT = "number", "text", "count"
+"""Kinds of columns."""
 
-QUATERNION: Final = {f"q{axis}": "-" for axis in "wxyz"}
-"""Columns of the attitude, body to world, with units; only for flights that may turn upside down."""
-BODY_RATES: Final = {f"body_rate_{axis}": "rad/s" for axis in "xyz"}
-"""Columns of the body rates, with units; same condition."""
-SQP_RESIDUAL: Final = {"sqp_defect": "-", "sqp_step": "-"}
-"""Columns of `quadsim.controller.SQP`, with units; only for flights with sequential quadratic programming."""
-TARGET: Final = {"target_thrust": "N", **{f"target_body_rate_{axis}": "rad/s" for axis in "xyz"}}
-"""Columns of the target in force, with units; only for flights with an autopilot."""
-TARGET_ATTITUDE: Final = {f"target_q{axis}": "-" for axis in "wxyz"}
-"""Columns of the attitude in it, with units; only where it has one."""
 
-Fields = dict[str, dict[str, str]]
-"""The fields of a log, each with its columns and their units."""
-STATE: Final = dict(zip(STATE_NAMES, STATE_UNITS, strict=True))
-TEXTS: Final = ("status", "answered_by", "phase")
-COUNTS: Final = ("iterations", "active", "fallback")
-CONTROL: Final[Fields] = {
-    "t": {"t": "s"},
-    "state": STATE,
-    "reference": {f"ref_{name}": unit for name, unit in zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)},
-    "speeds": {f"u{i}": "rad/s" for i in range(1, N_ROTORS + 1)},
-    **{name: {name: "-"} for name in (*TEXTS, *COUNTS)},
-    "slack": {"slack": "rad"},
-    **{name: {name: "-"} for name in RESIDUALS},
-    "delay": {"delay": "s"},
-    "truth": {f"true_{name}": unit for name, unit in STATE.items()},  # where the measured state differs
-    "attitude": QUATERNION,
-    "body_rates": BODY_RATES,
-    "sqp": SQP_RESIDUAL,
-    "target": TARGET,
-    "target_attitude": TARGET_ATTITUDE,
-}
-COLUMNS: Final = frozenset(name for units in CONTROL.values() for name in units)
-"""The columns of flight.parquet, but for those that a controller logs."""
+def columns(units: Mapping[str, str] | str = "-", *, kind: str = NUMBER, gaps: bool = False) -> dict[str, Any]:
+    """Return the metadata of a field that is written: the only statement of its columns and their units.
+
+    Args:
+        units: unit of each column, by the column's name; a single one for a column with the field's name.
+        kind: `NUMBER`, `TEXT` or `COUNT`.
+        gaps: whether some rows may lack a value: NaN in memory, null in files.
+    """
+    return {"units": units, "kind": kind, "gaps": gaps}
+
+
+class Columns(NamedTuple):
+    """What a field of a table states of its columns; see `columns`."""
+
+    units: Mapping[str, str]
+    kind: str
+    gaps: bool
+    optional: bool
+
+
+def columns_of(table: type[Any]) -> dict[str, Columns]:
+    """Return the columns of a table's fields, in their order, by field; those that default to None are optional."""
+    stated = [one for one in fields(table) if "units" in one.metadata]
+    return {
+        one.name: Columns(
+            {one.name: units} if isinstance(units := one.metadata["units"], str) else units,
+            one.metadata["kind"],
+            one.metadata["gaps"],
+            one.default is None,
+        )
+        for one in stated
+    }
+
+
+def _numbered(name: str, unit: str) -> dict[str, str]:
+    return {f"{name}{i}": unit for i in range(1, N_ROTORS + 1)}
+
+
+def _by_axis(name: str, unit: str, axes: str = "xyz") -> dict[str, str]:
+    return {f"{name}{axis}": unit for axis in axes}
+
+
+_STATE: Final = dict(zip(STATE_NAMES, STATE_UNITS, strict=True))
+_REFERENCE: Final = {f"ref_{name}": unit for name, unit in zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)}
 
 
 class LoggedSignals(dict[str, tuple[str, float]]):
@@ -101,37 +104,46 @@ def stacked(periods: Sequence[LoggedSignals]) -> dict[str, tuple[str, Array]]:
 
 @dataclass(frozen=True, kw_only=True)
 class ControlLog:
-    """One row per control period k, taken at t_k; K rows."""
+    """One row per control period k, taken at t_k; K rows.  Its fields are the columns of flight.parquet, in order."""
 
-    t: Array  # (K,) [s]
-    state: Array  # (K, 12) measured state, as the controller received it; units of `STATE_UNITS`
-    truth: Array  # (K, 12) true state; equal if measurement is perfect
-    reference: Array  # (K, 4) filtered reference x, y, z [m], yaw [rad] at t_k
-    speeds: Array  # (K, 4) commanded rotor speeds in force at the end of the period [rad/s]
+    t: Array = field(metadata=columns("s"))  # (K,)
+    state: Array = field(metadata=columns(_STATE))  # (K, 12) measured state, as the controller received it
+    reference: Array = field(metadata=columns(_REFERENCE))  # (K, 4) filtered, at t_k
+    speeds: Array = field(metadata=columns(_numbered("u", "rad/s")))
+    """(K, 4) commanded rotor speeds in force at the end of the period."""
     speeds_before: Array  # (4,) u(-1), the command before the first [rad/s]
-    status: tuple[str, ...]
+    status: tuple[str, ...] = field(metadata=columns(kind=TEXT))
     """K texts, one of `quadsim.controller.ACCEPTED` or the reason of a rejection; see `quadsim.controller.Command`."""
-    answered_by: tuple[str, ...]
+    answered_by: tuple[str, ...] = field(metadata=columns(kind=TEXT))
     """K texts: `gain`, `core`, a QP solver's name, `law`, `fallback` or `stopped`."""
-    phase: tuple[str, ...]  # K texts, see `quadsim.controller.Phase`
-    iterations: np.ndarray[Any, np.dtype[np.int64]]  # (K,) of the solver that answered
-    active: np.ndarray[Any, np.dtype[np.int64]]  # (K,) constraints active at the optimum
-    fallback: np.ndarray[Any, np.dtype[np.int64]]  # (K,) 0 none, higher = deeper
-    slack: Array  # (K,) largest softening of an output bound [rad]
-    reported_primal: Array  # (K,) as reported by the QP solver; here and below NaN if not available
-    reported_dual: Array  # (K,) same
-    infeasibility: Array  # (K,) largest violation of a row by the plan, less the row's slack [row's unit]
-    kkt_stationarity: Array  # (K,) residuals computed from the QP; see `quadsim.controller.Command`
-    kkt_complementarity: Array  # (K,) same
-    kkt_dual: Array  # (K,) same
-    delay: Array  # (K,) simulated time from the measurement to the command [s]
-    attitude: Array | None = None  # (K, 4) measured quaternion wxyz, sign continuous; None if Euler angles suffice
-    body_rates: Array | None = None  # (K, 3) measured body rates [rad/s]; None if Euler angles suffice
-    sqp: Array | None = None  # (K, 2) of `quadsim.controller.SQP`, NaN in periods without; None if all are
-    target: Array | None = None
-    """(K, 4) collective thrust [N] and body rates [rad/s] that the autopilot is to fly, NaN in periods without; None
-    without an autopilot."""
-    target_attitude: Array | None = None  # (K, 4) attitude that it is to hold, wxyz; None if it holds none
+    phase: tuple[str, ...] = field(metadata=columns(kind=TEXT))  # K texts, see `quadsim.controller.Phase`
+    iterations: Counts = field(metadata=columns(kind=COUNT))
+    """(K,), as the further fields named as those of `quadsim.controller.Statistics`."""
+    active: Counts = field(metadata=columns(kind=COUNT))
+    fallback: Counts = field(metadata=columns(kind=COUNT))  # (K,) 0 none, higher = deeper
+    slack: Array = field(metadata=columns("rad"))
+    reported_primal: Array = field(metadata=columns(gaps=True))
+    reported_dual: Array = field(metadata=columns(gaps=True))
+    infeasibility: Array = field(metadata=columns(gaps=True))
+    kkt_stationarity: Array = field(metadata=columns(gaps=True))
+    kkt_complementarity: Array = field(metadata=columns(gaps=True))
+    kkt_dual: Array = field(metadata=columns(gaps=True))
+    delay: Array = field(metadata=columns("s"))  # (K,) simulated time from the measurement to the command
+    truth: Array = field(metadata=columns({f"true_{name}": unit for name, unit in _STATE.items()}))
+    """(K, 12) true state; not written where it equals the measured one."""
+    attitude: Array | None = field(default=None, metadata=columns(_by_axis("q", "-", "wxyz")))
+    """(K, 4) measured quaternion, sign continuous; None if Euler angles suffice."""
+    body_rates: Array | None = field(default=None, metadata=columns(_by_axis("body_rate_", "rad/s")))
+    """(K, 3) measured body rates; None if Euler angles suffice."""
+    sqp: Array | None = field(default=None, metadata=columns({"sqp_defect": "-", "sqp_step": "-"}, gaps=True))
+    """(K, 2) of `quadsim.controller.Statistics`, NaN in periods without; None if all are."""
+    target: Array | None = field(
+        default=None, metadata=columns({"target_thrust": "N", **_by_axis("target_body_rate_", "rad/s")}, gaps=True)
+    )
+    """(K, 4) collective thrust and body rates that the autopilot is to fly, NaN in periods without; None without an
+    autopilot."""
+    target_attitude: Array | None = field(default=None, metadata=columns(_by_axis("target_q", "-", "wxyz"), gaps=True))
+    """(K, 4) attitude that it is to hold; None if it holds none."""
     logged: Mapping[str, tuple[str, Array]] = field(default_factory=dict)
     """What the controller logged, by name: unit and values (K,), NaN in periods without."""
 
@@ -173,30 +185,41 @@ class ControlLog:
         return np.diff(self.speeds, axis=0, prepend=self.speeds_before[None, :])
 
 
+COLUMNS: Final = frozenset(name for one in columns_of(ControlLog).values() for name in one.units)
+"""The columns of flight.parquet, but for those that a controller logs."""
+RESIDUALS: Final = tuple(name for name, one in columns_of(ControlLog).items() if one.gaps and not one.optional)
+"""Fields that every flight has, with gaps."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TimingLog:
-    """Clock times per control period."""
+    """Clock times per control period: the columns of timing.parquet."""
 
-    t: Array
-    solve_ms: Array
-    step_ms: Array
+    t: Array = field(metadata=columns("s"))
+    solve_ms: Array = field(metadata=columns("ms"))
+    step_ms: Array = field(metadata=columns("ms"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlantLog:
-    """The plant between commands; M rows, the first at t = 0 before the first command."""
+    """The plant between commands; M rows, the first at t = 0 before the first command: the columns of plant.parquet."""
 
-    t: Array  # (M,) [s]
-    state: Array  # (M, 12) true state, yaw unwrapped
-    speeds: Array  # (M, 4) rotor speeds from t on [rad/s]; rotors that lag pass through them
-    wrench: Array | None = None
-    """(M, 6) external force, world [N], and torque, body frame [N m], from t on; None if there is none."""
-    wind: Array | None = None  # (M, 3) velocity of the air, world [m/s]; None without wind
-    battery: Array | None = None  # (M, 2) voltage [V] and charge [-] of the step from t on; None without a battery
-    attitude: Array | None = None  # (M, 4) true quaternion wxyz; None if Euler angles suffice
-    body_rates: Array | None = None  # (M, 3) true body rates [rad/s]; None if Euler angles suffice
-    thrust: Array | None = None
-    """(M,) collective thrust of the rotors [N], NaN where no autopilot has a target; None without an autopilot."""
+    t: Array = field(metadata=columns("s"))  # (M,)
+    state: Array = field(metadata=columns(_STATE))  # (M, 12) true state, yaw unwrapped
+    speeds: Array = field(metadata=columns(_numbered("w", "rad/s")))
+    """(M, 4) rotor speeds from t on; rotors that lag pass through them."""
+    wrench: Array | None = field(default=None, metadata=columns(_by_axis("force_", "N") | _by_axis("torque_", "N m")))
+    """(M, 6) external force, world, and torque, body frame, from t on; None if there is none."""
+    wind: Array | None = field(default=None, metadata=columns(_by_axis("wind_", "m/s")))
+    """(M, 3) velocity of the air, world; None without wind."""
+    battery: Array | None = field(default=None, metadata=columns({"voltage": "V", "charge": "-"}))
+    """(M, 2) of the step from t on; None without a battery."""
+    attitude: Array | None = field(default=None, metadata=columns(_by_axis("q", "-", "wxyz")))
+    """(M, 4) true quaternion, body to world; None if Euler angles suffice."""
+    body_rates: Array | None = field(default=None, metadata=columns(_by_axis("body_rate_", "rad/s")))
+    """(M, 3) true body rates; None if Euler angles suffice."""
+    thrust: Array | None = field(default=None, metadata=columns("N", gaps=True))
+    """(M,) collective thrust of the rotors, NaN where no autopilot has a target; None without an autopilot."""
 
     def every(self, stride: int) -> PlantLog:
         """Return every `stride`-th row, starting with the first."""

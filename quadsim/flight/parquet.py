@@ -18,28 +18,17 @@ import pyarrow.parquet as pq
 
 from quadsim.errors import FileError
 from quadsim.flight.log import (
-    BATTERY,
-    BODY_RATES,
     COLUMNS,
-    CONTROL,
-    COUNTS,
-    QUATERNION,
-    RESIDUALS,
-    SQP_RESIDUAL,
-    STATE,
-    TARGET,
-    TARGET_ATTITUDE,
-    TEXTS,
-    WIND,
-    WRENCH,
+    COUNT,
+    TEXT,
+    Columns,
     ControlLog,
-    Fields,
     FlightLog,
     PlantLog,
     TimingLog,
+    columns_of,
 )
 from quadsim.input_limits import LARGEST_TABLE, LARGEST_TEXTS, MOST_COLUMNS, MOST_ROWS
-from quadsim.vehicle import N_ROTORS
 
 FORMAT: Final = 2
 """Version of the files of runs and campaigns; to be raised when a file of another one would be misread."""
@@ -47,47 +36,32 @@ FLIGHT_FILE: Final = "flight.parquet"
 TIMING_FILE: Final = "timing.parquet"
 PLANT_FILE: Final = "plant.parquet"
 HORIZON_FILE: Final = "horizon.parquet"
-_TIMING: Final[Fields] = {"t": {"t": "s"}, "solve_ms": {"solve_ms": "ms"}, "step_ms": {"step_ms": "ms"}}
-_PLANT: Final[Fields] = {
-    "t": {"t": "s"},
-    "state": STATE,
-    "speeds": {f"w{i}": "rad/s" for i in range(1, N_ROTORS + 1)},
-    "wrench": WRENCH,
-    "wind": WIND,
-    "battery": BATTERY,
-    "attitude": QUATERNION,
-    "body_rates": BODY_RATES,
-    "thrust": {"thrust": "N"},
-}
-_OPTIONAL: Final = frozenset(
-    {"truth", "attitude", "body_rates", "sqp", "target", "target_attitude", "wrench", "wind", "battery", "thrust"}
-)
-_GAPS: Final = frozenset({*RESIDUALS, *SQP_RESIDUAL, *TARGET, *TARGET_ATTITUDE, "thrust"})
-"""Columns that are null in some periods."""
-
-_Column = tuple[str, str, pa.Array]
+_Column = tuple[str, str, bool, pa.Array]
+"""Name and unit of a column, whether it may have gaps, and its values."""
 
 
-def _columns(log: ControlLog | TimingLog | PlantLog, fields: Fields) -> Iterator[_Column]:
-    """The columns of the fields that are there, each with its name and unit."""
-    for field, units in fields.items():
-        rows = getattr(log, field)
-        if rows is not None:
-            for (name, unit), values in zip(units.items(), [rows] if len(units) == 1 else rows.T, strict=True):
-                yield name, unit, pa.array(values, pa.string() if name in TEXTS else None, from_pandas=name in _GAPS)
+def _columns(log: ControlLog | TimingLog | PlantLog, *, without: str = "") -> Iterator[_Column]:
+    """The columns of the fields that are there."""
+    for name, stated in columns_of(type(log)).items():
+        rows = getattr(log, name)
+        if rows is not None and name != without:
+            values = [rows] if len(stated.units) == 1 else rows.T
+            kind = pa.string() if stated.kind == TEXT else None
+            for (column, unit), one in zip(stated.units.items(), values, strict=True):
+                yield column, unit, stated.gaps, pa.array(one, kind, from_pandas=stated.gaps)
 
 
 def _logged(log: ControlLog) -> Iterator[_Column]:
     """The columns that the controller logged."""
     for name, (unit, values) in log.logged.items():
-        yield name, unit, pa.array(values, from_pandas=True)
+        array = pa.array(values, from_pandas=True)
+        yield name, unit, array.null_count > 0, array
 
 
 def _table(columns: Iterable[_Column], metadata: Mapping[str, str]) -> pa.Table:
     arrays, schema = [], []
-    for name, unit, array in columns:
+    for name, unit, gaps, array in columns:
         arrays.append(array)
-        gaps = name in _GAPS or (array.null_count > 0)
         schema.append(pa.field(name, array.type, nullable=gaps, metadata={"unit": unit}))
     return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata={**metadata, "format": str(FORMAT)}))
 
@@ -113,18 +87,20 @@ def format_of(table: pa.Table) -> str | None:
 def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, str]) -> dict[str, pa.Table]:
     """A flight's tables `flight`, `timing`, `plant`, and `horizon` if positions were predicted; see `write_log`."""
     control = log.control
-    fields = {name: units for name, units in CONTROL.items() if name != "truth" or not control.measured_perfectly}
+    perfect = "truth" if control.measured_perfectly else ""
     before = ",".join(repr(float(speed)) for speed in control.speeds_before)
     tables = {
-        "flight": _table([*_columns(control, fields), *_logged(control)], {**metadata, "speeds_before": before}),
-        "timing": _table(_columns(log.timing, _TIMING), metadata),
-        "plant": _table(_columns(log.plant.every(plant_stride), _PLANT), metadata),
+        "flight": _table(
+            [*_columns(control, without=perfect), *_logged(control)], {**metadata, "speeds_before": before}
+        ),
+        "timing": _table(_columns(log.timing), metadata),
+        "plant": _table(_columns(log.plant.every(plant_stride)), metadata),
     }
     if (predicted := log.predicted) is not None:
-        columns: list[_Column] = [("t", "s", pa.array(control.t))]
+        columns: list[_Column] = [("t", "s", False, pa.array(control.t))]
         for i, axis in enumerate("xyz"):
             positions = pa.FixedSizeListArray.from_arrays(predicted[:, :, i].ravel(), predicted.shape[1])
-            columns.append((f"predicted_{axis}", "m", positions))
+            columns.append((f"predicted_{axis}", "m", False, positions))
         tables["horizon"] = _table(columns, metadata)
     return tables
 
@@ -189,26 +165,27 @@ def _read_bounded(path: Path, file: pq.ParquetFile) -> pa.Table:
     raise FileError(path, f"must be of at most {largest} in memory; it has more")
 
 
-def _fields(table: pa.Table, fields: Fields) -> dict[str, Any]:
-    """The fields of a log by name; None for those that its table may lack and does."""
+def _fields(table: pa.Table, log: type[Any], *, optional: str = "") -> dict[str, Any]:
+    """The fields of a log by name; None for those that its table may lack and does, `optional` among them."""
     values: dict[str, Any] = {}
-    for field, units in fields.items():
-        there = field not in _OPTIONAL or set(units) <= set(table.column_names)
-        columns: list[Any] = [_values(table, name) for name in units] if there else [None]
-        values[field] = columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
+    for name, stated in columns_of(log).items():
+        may_lack = stated.optional or name == optional
+        there = not may_lack or set(stated.units) <= set(table.column_names)
+        columns: list[Any] = [_values(table, column, stated) for column in stated.units] if there else [None]
+        values[name] = columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
     return values
 
 
-def _values(table: pa.Table, name: str) -> Any:
+def _values(table: pa.Table, name: str, stated: Columns) -> Any:
     column = table.column(name)
-    if name in TEXTS:
+    if stated.kind == TEXT:
         texts = tuple(column.to_pylist())
         if not all(isinstance(text, str) for text in texts):
             raise ValueError(f"{name} is not text throughout")
         return texts
-    if column.null_count and name not in _GAPS:
+    if column.null_count and not stated.gaps:
         raise ValueError(f"{name} has gaps")
-    return np.asarray(column.to_numpy(), dtype=np.int64 if name in COUNTS else np.float64)
+    return np.asarray(column.to_numpy(), dtype=np.int64 if stated.kind == COUNT else np.float64)
 
 
 def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
@@ -224,7 +201,7 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
         )
     try:
         before = np.array([float(text) for text in (flight.schema.metadata or {})[b"speeds_before"].split(b",")])
-        values = _fields(flight, CONTROL)
+        values = _fields(flight, ControlLog, optional="truth")
         if values["truth"] is None:
             values["truth"] = values["state"]
         logged = {
@@ -233,7 +210,7 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
             if field.name not in COLUMNS
         }
         control = ControlLog(**values, logged=logged, speeds_before=before)
-        plant_log, timing_log = PlantLog(**_fields(plant, _PLANT)), TimingLog(**_fields(timing, _TIMING))
+        plant_log, timing_log = PlantLog(**_fields(plant, PlantLog)), TimingLog(**_fields(timing, TimingLog))
         predicted = _read_predicted(directory / HORIZON_FILE)
         rows = {control.t.size, timing_log.t.size, *(() if predicted is None else (len(predicted),))}
         if len(rows) > 1 or not plant_log.t.size:

@@ -12,7 +12,7 @@ from typing import Final, Literal
 import numpy as np
 
 from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
-from quadsim.flight.log import ControlLog, FlightLog
+from quadsim.flight.log import ControlLog, FlightLog, PlantLog, columns_of
 from quadsim.flight.rundir import Run
 from quadsim.space import AnyObstacle, Obstacle, Region, footprint
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
@@ -84,12 +84,15 @@ def effect_curves(log: FlightLog) -> list[EffectCurves]:
     wrench = np.zeros((1, 6)) if log.plant.wrench is None else log.plant.wrench
     wind = np.zeros((1, 3)) if log.plant.wind is None else log.plant.wind
     battery = np.zeros((1, 2)) if log.plant.battery is None else log.plant.battery
+    units = {name: unit for one in columns_of(PlantLog).values() for name, unit in one.units.items()}
     curves = (
-        EffectCurves(key="force", title="external force, world", unit="N", values=wrench[:, :3]),
-        EffectCurves(key="torque", title="external torque, body", unit="N m", values=wrench[:, 3:]),
-        EffectCurves(key="wind", title="wind, world", unit="m/s", values=wind),
-        EffectCurves(key="voltage", title="battery voltage", unit="V", values=battery[:, :1], names=("voltage",)),
-        EffectCurves(key="charge", title="battery charge", unit="-", values=battery[:, 1:], names=("charge",)),
+        EffectCurves(key="force", title="external force, world", unit=units["force_x"], values=wrench[:, :3]),
+        EffectCurves(key="torque", title="external torque, body", unit=units["torque_x"], values=wrench[:, 3:]),
+        EffectCurves(key="wind", title="wind, world", unit=units["wind_x"], values=wind),
+        *(
+            EffectCurves(key=name, title=f"battery {name}", unit=units[name], values=values[:, None], names=(name,))
+            for name, values in zip(columns_of(PlantLog)["battery"].units, battery.T, strict=True)
+        ),
     )
     return [entry for entry in curves if np.any(entry.values)]
 

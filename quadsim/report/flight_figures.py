@@ -103,7 +103,9 @@ def overview(runs: Sequence[Run]) -> Figure:
         )
         for i, name, run in _flown(runs)
     )
-    rotors = Panel(title="range of rotor speeds", unit="rad/s", bands=speeds, bounds=_bounds(runs, "speed"))
+    rotors = Panel(
+        title="range of rotor speeds", unit=SIGNALS["speed"].unit, bands=speeds, bounds=_bounds(runs, "speed")
+    )
     return _timed("comparison", "", (*(_signal(runs, name) for name in names), rotors), runs)
 
 
@@ -150,7 +152,7 @@ def inputs(runs: Sequence[Run]) -> Figure:
                 for i, label, run in _flown(runs)
             )
             title = f"{title}, rotor {rotor + 1}"
-            panels.append(Panel(title=title, unit="rad/s", series=curves, bounds=_bounds(runs, name)))
+            panels.append(Panel(title=title, unit=SIGNALS[name].unit, series=curves, bounds=_bounds(runs, name)))
     return _timed("inputs", "rotor speeds and their steps", tuple(panels), runs)
 
 
@@ -340,7 +342,7 @@ def _acting(rotor: int, t: Array, commanded: Array, speeds: Array) -> Panel:
     """Plot commanded and actual speed of a rotor."""
     command = Series(x=t, y=commanded[:, rotor], colour=COLOUR.reference, label="commanded", style="steps", width=1.0)
     acting = Series(x=t, y=speeds[:, rotor], colour=COLOUR.flown, label="actual", width=1.0)
-    return Panel(title=f"rotor {rotor + 1}", unit="rad/s", series=(command, acting))
+    return Panel(title=f"rotor {rotor + 1}", unit=SIGNALS["speed"].unit, series=(command, acting))
 
 
 def _bounds(runs: Sequence[Run], signal: str) -> tuple[Bound, ...]:

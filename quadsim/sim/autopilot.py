@@ -31,9 +31,8 @@ from quadsim.fields import Fraction, NonNegative, Positive, filled
 from quadsim.rotation import conjugate, multiply
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.rotors import RotorDynamics
-from quadsim.sim.physics import inner_steps
+from quadsim.sim.physics import PHYSICS, inner_steps, whole
 from quadsim.sim.plant import Plant
-from quadsim.sim.sensing import whole
 from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -269,11 +268,11 @@ def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
     for _ in range(0, round(WINDOW / plant.timestep), stride):
         attitude, rates = plant.attitude
         speeds = autopilot.speeds(plant.time, target, rates, plant.speeds, attitude)
-        segment = plant.advance(speeds, stride)
+        steps = plant.advance(speeds, stride)
         if axis:
-            reached.append(segment.physics[:, 10 + axis] / size)
+            reached.append(steps["physics"][:, PHYSICS["body_rates"]][:, axis - 1] / size)
         else:
-            ends = np.concatenate([segment.speeds[1:], plant.speeds[None]])
+            ends = np.concatenate([steps["speeds"][1:], plant.speeds[None]])
             reached.append((vehicle.thrust_coefficient * np.square(ends).sum(axis=1) - weight) / size)
     return np.concatenate(reached)[: round(WINDOW / plant.timestep)]
 

@@ -77,7 +77,7 @@ class Computation(ComputationTime):
 
     def taken(self, time: float, command: Command, rng: np.random.Generator) -> float:
         """Return the time from the measurement at `time` [s] to the command [s]."""
-        taken = self.delay + self.per_iteration * command.iterations
+        taken = self.delay + self.per_iteration * command.stats.iterations
         if self.jitter:
             taken += rng.exponential(self.jitter)
         for stall in sorted(self.stalls, key=lambda stall: stall.at):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -32,7 +32,7 @@ from quadsim.sim.error_state import (
     stand,
     update,
 )
-from quadsim.sim.sensing import AXES, Sample, Sensor, SensorName
+from quadsim.sim.sensing import AXES, Sample, Sensor, SensorName, in_si
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -82,7 +82,7 @@ class ErrorStateFilter:
     """
 
     def __init__(
-        self, vehicle: Vehicle, sensors: Sequence[Sensor], settings: EstimatorSettings, *, timestep: float
+        self, vehicle: Vehicle, sensors: Mapping[SensorName, Sensor], settings: EstimatorSettings, *, timestep: float
     ) -> None:
         """Prepare for the modelled vehicle, sensors and a physics step [s]; call `reset` before use.
 
@@ -91,19 +91,19 @@ class ErrorStateFilter:
         """
         from scipy.special import chdtri  # whose package takes a while to load, and few flights have an estimator
 
-        names = [str(sensor.name) for sensor in sensors]
         for name in NEEDED:
-            if name not in names:
-                raise ParameterError("estimator", "sensors", names, f"such that {name} is among them")
-        for sensor in sensors:
-            if min(sensor.noise) <= 0.0:
+            if name not in sensors:
+                raise ParameterError("estimator", "sensors", [*map(str, sensors)], f"such that {name} is among them")
+        noises = {name: in_si(name, sensor.noise) for name, sensor in sensors.items()}
+        for name, noise in noises.items():
+            if min(noise) <= 0.0:
                 rule = "positive on every axis, for the estimator to weigh it"
-                raise ParameterError(f"sensors.{sensor.name}", "noise", sensor.noise, rule)
+                raise ParameterError(f"sensors.{name}", "noise", sensors[name].noise, rule)
         self.settings = settings
         self._timestep = timestep
         self._model = motion_model(vehicle, settings)
-        self._variances = {sensor.name: np.diag(np.square(sensor.noise)) for sensor in sensors}
-        self._horizon = max(sensor.latency(timestep) for sensor in sensors)
+        self._variances = {name: np.diag(np.square(noise)) for name, noise in noises.items()}
+        self._horizon = max(sensor.latency(name, timestep) for name, sensor in sensors.items())
         self._gate = float(chdtri(len(AXES), 1.0 - settings.gate))
         self._patience = settings.patience / timestep
         self._stride = max(1, int(LONGEST_STEP / timestep + 1e-9))

@@ -32,7 +32,7 @@ from quadsim.flight.log import FlightLog, LoggedSignals
 from quadsim.flight.phase import check_loss
 from quadsim.motion import Motion
 from quadsim.sim.computation import Computation, physics_steps
-from quadsim.sim.physics import FlownPeriod, Observation, Segment, flight_log, inner_steps, physics_to_state
+from quadsim.sim.physics import Observation, Period, PhysicsSteps, flight_log, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, POSITION, REFERENCE_NAMES, Array, ReferenceTurns
 from quadsim.vehicle import N_ROTORS
@@ -168,8 +168,8 @@ class ClosedLoop:
         self._answer, self._until_call = self._initial_speeds, 0
         self._plan, self._age = self._acting[None], 0  # the last plan that came in time, and how many periods ago
         self._observed: Observation | None = None
-        self._samples: list[FlownPeriod] | None = [] if recorded else None
-        self.last: FlownPeriod | None = None
+        self._samples: list[Period] | None = [] if recorded else None
+        self.last: Period | None = None
         self._predicted: list[Array | None] = []  # of the controllers before this one, and how many periods they flew
         self._switched = 0
 
@@ -216,7 +216,7 @@ class ClosedLoop:
                 self._observed = self._observe()
         return self._observed
 
-    def step(self, command: Command | None = None) -> FlownPeriod:
+    def step(self, command: Command | None = None) -> Period:
         """Fly one control period, with a command that is held instead of asking the controller, where one is given.
 
         Raises:
@@ -284,7 +284,7 @@ class ClosedLoop:
         row, preview = rows[0], rows[1:]
         phase = Phase.FLYING
         if self._ground is not None:
-            since = self._start[None] if self.last is None else self.last.segment.physics
+            since = self._start[None] if self.last is None else self.last.steps["physics"]
             phase = self._ground.advance(since[:, 0], physics_to_state(since), preview)
         self._lowest = min(self._lowest, float(row[_HEIGHT]))
         if self._loss is not None and phase is not Phase.CRASHED:
@@ -328,7 +328,7 @@ class ClosedLoop:
         raised[:, _HEIGHT] += lead
         return replace(now, motion=None if now.motion is None else now.motion.raised(lead)), state, raised
 
-    def _fly(self, observed: Observation, command: Command | None) -> FlownPeriod:
+    def _fly(self, observed: Observation, command: Command | None) -> Period:
         plant, computation, steps, now = self._plant, self.computation, self._steps, observed.moment
         step_s = 0.0
         if command is None:
@@ -355,17 +355,17 @@ class ClosedLoop:
             holds.append((self._inner, acting, steps - wait))
         self._schedule.append(holds)
         before, on_ground = plant.physics, now.phase in (Phase.LANDED, Phase.ARMED)
-        segments = []
+        flown = []
         for loop, row, count in self._schedule.popleft():
-            for segment, speeds in self._hold(loop, row, count):
+            for part, speeds in self._hold(loop, row, count):
                 if self._navigation is not None:
-                    held = np.broadcast_to(speeds, (len(segment.physics), N_ROTORS))
-                    self._navigation.advance(segment.physics, held, on_ground=on_ground)
-                segments.append(segment)
+                    held = np.broadcast_to(speeds, (len(part), N_ROTORS))
+                    self._navigation.advance(part["physics"], held, on_ground=on_ground)
+                flown.append(part)
         self._acting = acting
         piloted = takes_targets(self._inner)
         self._speeds = speeds if piloted else acting
-        return FlownPeriod(
+        return Period(
             observation=observed,
             command=command,
             speeds=self._speeds,
@@ -374,12 +374,12 @@ class ClosedLoop:
             missed=missed,
             step_s=step_s,
             before=before,
-            segment=Segment.join(segments),
+            steps=flown[0] if len(flown) == 1 else np.concatenate(flown),
             rotors=plant.speeds,
         )
 
-    def _hold(self, inner: InnerLoop | None, row: Array, steps: int) -> Iterator[tuple[Segment, Array]]:
-        """Advance under a command: segments of flight, each with the rotor speeds (4,) commanded during it [rad/s].
+    def _hold(self, inner: InnerLoop | None, row: Array, steps: int) -> Iterator[tuple[PhysicsSteps, Array]]:
+        """Advance under a command: physics steps in parts, each with the rotor speeds (4,) commanded during it [rad/s].
 
         Raises:
             RaisedError: the inner loop raised, or its period is not a whole number of physics steps.

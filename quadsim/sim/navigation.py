@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from operator import attrgetter
 
 import numpy as np
@@ -12,6 +12,7 @@ from quadsim.errors import ParameterError
 from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
 from quadsim.sim.error_state import MEAN_GYRO_BIAS, MEAN_QUATERNION, MEAN_RATES, EstimatorSettings
 from quadsim.sim.estimator import ErrorStateFilter, Tally
+from quadsim.sim.physics import PHYSICS
 from quadsim.sim.sensing import Sample, Sampler, Sensor, SensorFault, SensorName, truth
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
 from quadsim.vehicle import Vehicle
@@ -36,7 +37,7 @@ class Navigation:
         vehicle: Vehicle,
         *,
         timestep: float,
-        sensors: Sequence[Sensor],
+        sensors: Mapping[SensorName, Sensor],
         rng: np.random.Generator,
         faults: Sequence[SensorFault] = (),
         estimator: EstimatorSettings | None = None,
@@ -46,36 +47,33 @@ class Navigation:
         Args:
             vehicle: the modelled vehicle.
             timestep: physics step [s].
-            sensors: at most one per name; without an estimator, missing ones are perfect.
+            sensors: the sensors; without an estimator, missing ones are perfect.
             rng: the source of all randomness.
             faults: faults of the sensors, including perfect ones.
             estimator: settings of the error-state filter, or None.
 
         Raises:
-            ParameterError: two sensors of one name, times that are no whole physics steps, a fault of a sensor that is
-                not there, or sensors that the estimator cannot work with.
+            ParameterError: times that are no whole physics steps, a fault of a sensor that is not there, or sensors
+                that the estimator cannot work with.
         """
-        names = [sensor.name for sensor in sensors]
-        if len(set(names)) < len(names):
-            raise ParameterError("navigation", "sensors", [str(name) for name in names], "at most one of each name")
-        faulty = {fault.sensor for fault in faults} - set(names)
+        faulty = {fault.sensor for fault in faults} - sensors.keys()
         if estimator is not None and faulty:
-            rule = f"on a sensor that the estimator has ({', '.join(names)})"
+            rule = f"on a sensor that the estimator has ({', '.join(sensors)})"
             raise ParameterError("fault", "sensor", str(min(faulty)), rule)
-        perfect = [Sensor(name=name, rate=1.0 / timestep) for name in sorted(faulty)]
+        perfect = {name: Sensor(rate=1.0 / timestep) for name in sorted(faulty)}
         self._rng, *others = rng.spawn(1 + len(SensorName))
         generators = dict(zip(SensorName, others, strict=True))
         self._samplers = tuple(
-            Sampler(sensor, timestep=timestep, faults=tuple(faults), rng=generators[sensor.name])
-            for sensor in (*sensors, *perfect)
+            Sampler(name, sensor, timestep=timestep, faults=tuple(faults), rng=generators[name])
+            for name, sensor in {**sensors, **perfect}.items()
         )
-        sensed = {sampler.sensor.name for sampler in self._samplers}
+        sensed = {sampler.name for sampler in self._samplers}
         self._perfect = tuple(name for name in SensorName if name not in sensed)
         self._filter = None if estimator is None else ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
 
     def watches(self, sensor: SensorName) -> bool:
         """Whether a sensor has had a fault in view from the start, and so may have another."""
-        return any(sampler.watched for sampler in self._samplers if sampler.sensor.name is sensor)
+        return any(sampler.watched for sampler in self._samplers if sampler.name is sensor)
 
     def reschedule(self, faults: Sequence[SensorFault]) -> None:
         """Replace the faults of watched sensors; samples already taken stay."""
@@ -85,14 +83,15 @@ class Navigation:
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
         """Restart at MuJoCo's state (14,) and rotor speeds [rad/s] with the same draws; yaw is near `yaw` [rad]."""
         self._step, self._yaw, self._physics = 0, YawTurns(yaw), physics.copy()
-        self.attitude: tuple[Array, Array] = physics[4:8].copy(), physics[11:14].copy()
+        self.attitude: tuple[Array, Array] = physics[PHYSICS["attitude"]].copy(), physics[PHYSICS["body_rates"]].copy()
         self._held = {name: truth(name, physics[None])[0] for name in SensorName}
         self._bias, self._sensed = np.zeros(3), self.attitude
         self._in_flight: list[Sample] = []
         for sampler in self._samplers:
             sampler.reset()
         if self._filter is not None:
-            mean = np.concatenate([physics[1:4], physics[8:11], physics[4:8], physics[11:14], np.zeros(3)])
+            known = [physics[PHYSICS[name]] for name in ("position", "velocity", "attitude", "body_rates")]
+            mean = np.concatenate([*known, np.zeros(3)])
             self._filter.reset(mean, speeds, copy.deepcopy(self._rng))
         self._receive(physics[None], first=0)
         if self._filter is not None:
@@ -118,7 +117,7 @@ class Navigation:
         """
         if self._filter is None:
             self._hear()
-        attitude, rates = self._physics[4:8], self._physics[11:14]
+        attitude, rates = self._physics[PHYSICS["attitude"]], self._physics[PHYSICS["body_rates"]]
         if SensorName.RATES not in self._perfect:
             rates = self._held[SensorName.RATES] - self._bias
         if SensorName.ATTITUDE not in self._perfect:

@@ -5,18 +5,40 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from quadsim.controller import FALLBACK, MISSED, Command, Phase, StepInputs
-from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, LoggedSignals, PlantLog, TimingLog, stacked
+from quadsim.controller import FALLBACK, MISSED, Command, Phase, Statistics, StepInputs
+from quadsim.errors import ParameterError
+from quadsim.flight.log import ControlLog, FlightLog, LoggedSignals, PlantLog, TimingLog, stacked
 from quadsim.rotation import body_to_euler_rates, quaternion_to_euler
-from quadsim.sim.sensing import whole
 from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, TURN, VELOCITIES, Array, whole_turns
 from quadsim.vehicle import N_ROTORS
 
+PHYSICS: Final = {
+    "position": slice(1, 4),  # world [m]
+    "attitude": slice(4, 8),  # quaternion wxyz, body to world
+    "velocity": slice(8, 11),  # world [m/s]
+    "body_rates": slice(11, 14),  # body frame [rad/s]
+}
+"""Columns of MuJoCo's state (14,), whose first is the time [s]."""
+PhysicsSteps = NDArray[np.void]
+"""Physics steps, a row each, with the fields of `steps_type`."""
 Integrator = Literal["mujoco", "rk4"]  # integrator of the physics steps: MuJoCo, or `quadsim.sim.rigid_body`
+
+
+def whole(owner: str, name: str, value: float, count: float, rule: str, *, smallest: int = 1) -> int:
+    """Convert a count of physics steps, derived from a parameter, to a whole number.
+
+    Raises:
+        ParameterError: it is not whole, or too small.
+    """
+    steps = round(count)
+    if steps < smallest or not math.isclose(steps, count, rel_tol=1e-9, abs_tol=1e-9):
+        raise ParameterError(owner, name, value, rule)
+    return steps
 
 
 def steps_per_period(control_period: float, timestep: float) -> int:
@@ -39,6 +61,25 @@ def inner_steps(rate: float, timestep: float, owner: str = "controller.inner") -
     return whole(owner, "rate", rate, 1.0 / (rate * timestep), rule)
 
 
+def steps_type(*, wrench: bool = False, wind: bool = False, battery: bool = False) -> np.dtype[np.void]:
+    """Return the type of a row of `PhysicsSteps`; fields that nothing causes are absent.
+
+    `physics` (14,) is MuJoCo's state after the step; `speeds` (4,) are the rotor speeds at its start [rad/s]; `thrust`
+    is the collective thrust in its middle [N]; `wrench` (6,) is the force, world [N], and torque, body frame about its
+    origin [N m], of all effects but contact over the step; `wind` (3,) is the velocity of the air in its middle, world
+    [m/s]; `battery` (2,) is the voltage over the step [V] and the charge at its start [-].
+    """
+    optional = {"wrench": (6, wrench), "wind": (3, wind), "battery": (2, battery)}
+    return np.dtype(
+        [
+            ("physics", float, 14),
+            ("speeds", float, N_ROTORS),
+            ("thrust", float),
+            *((name, float, size) for name, (size, there) in optional.items() if there),
+        ]
+    )
+
+
 def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
     """Convert MuJoCo's states to the paper's states (M, 12).
 
@@ -49,10 +90,10 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
         yaw: the first row's yaw is unwrapped to the turn nearest to it [rad].
     """
     state = np.empty((physics.shape[0], N_STATES))
-    euler = quaternion_to_euler(physics[:, 4:8])
-    state[:, POSITIONS] = physics[:, 1:4]
-    state[:, VELOCITIES] = physics[:, 8:11]
-    state[:, ANGLE_RATES] = body_to_euler_rates(euler, physics[:, 11:14])
+    euler = quaternion_to_euler(physics[:, PHYSICS["attitude"]])
+    state[:, POSITIONS] = physics[:, PHYSICS["position"]]
+    state[:, VELOCITIES] = physics[:, PHYSICS["velocity"]]
+    state[:, ANGLE_RATES] = body_to_euler_rates(euler, physics[:, PHYSICS["body_rates"]])
     if len(euler) > 1:
         euler[:, 2] = np.unwrap(euler[:, 2])
     if len(euler) and math.isfinite(euler[0, 2]):
@@ -69,30 +110,6 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Segment:
-    """The motion over a number of physics steps; M rows, one per step."""
-
-    physics: Array  # (M, 14) MuJoCo's state after each step; see `physics_to_state`
-    speeds: Array  # (M, 4) rotor speeds at the start of each step [rad/s]
-    wrench: Array | None
-    """(M, 6) force, world [N], and torque, body frame about its origin [N m], of all effects but contact, over each
-    step; None if no effect causes any."""
-    wind: Array | None  # (M, 3) velocity of the air in the middle of each step, world [m/s]; None without wind
-    thrust: Array | None = None  # (M,) collective thrust in the middle of each step [N]; None if the plant knows none
-    battery: Array | None = None  # (M, 2) voltage [V] over each step, charge [-] at its start; None without a battery
-
-    @staticmethod
-    def join(parts: Sequence[Segment]) -> Segment:
-        """Concatenate segments."""
-        if len(parts) == 1:
-            return parts[0]
-
-        columns = {name: [getattr(part, name) for part in parts] for name in vars(parts[0])}
-        stacked: dict[str, Any] = {name: None if c[0] is None else np.concatenate(c) for name, c in columns.items()}
-        return Segment(**stacked)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Observation:
     """The data at the start of a control period."""
 
@@ -105,8 +122,8 @@ class Observation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FlownPeriod:
-    """One flown control period."""
+class Period:
+    """One flown control period: M physics steps, and the command that they follow."""
 
     observation: Observation  # the data at its start
     command: Command  # the controller's answer, or the command passed to `step`
@@ -118,7 +135,7 @@ class FlownPeriod:
     missed: bool  # whether the command came too late
     step_s: float  # wall time of the controller's step [s]; 0 if the command was passed in
     before: Array  # (14,) MuJoCo's state at its start; see `quadsim.sim.physics.physics_to_state`
-    segment: Segment  # its physics steps
+    steps: PhysicsSteps  # (M,) its physics steps
     rotors: Array  # (4,) rotor speeds at its end [rad/s]
 
     @property
@@ -126,9 +143,33 @@ class FlownPeriod:
         """The phase of the flight."""
         return self.observation.moment.phase
 
+    @property
+    def position(self) -> Array:
+        """(M, 3) after each step, world [m]."""
+        return self._physics("position")
+
+    @property
+    def attitude(self) -> Array:
+        """(M, 4) after each step: quaternion wxyz, body to world, sign continuous."""
+        return self._physics("attitude")
+
+    @property
+    def velocity(self) -> Array:
+        """(M, 3) after each step, world [m/s]."""
+        return self._physics("velocity")
+
+    @property
+    def body_rates(self) -> Array:
+        """(M, 3) after each step, body frame [rad/s]."""
+        return self._physics("body_rates")
+
+    def _physics(self, name: str) -> Array:
+        part: Array = self.steps["physics"][:, PHYSICS[name]]
+        return part
+
 
 def flight_log(
-    samples: Sequence[FlownPeriod], start: Array, speeds: Array, yaw: float, period: float, timestep: float,
+    samples: Sequence[Period], start: Array, speeds: Array, yaw: float, period: float, timestep: float,
     *, quaternions: bool = False,
 ) -> FlightLog:  # fmt: skip
     """Convert control periods of a length [s] to a log with plant rows at the physics rate.
@@ -142,15 +183,16 @@ def flight_log(
         attitudes = np.array([moment.attitude for moment in moments], float).reshape(-1, 4)
         rates = np.array([moment.body_rates for moment in moments], float).reshape(-1, 3)
         control = replace(control, attitude=attitudes, body_rates=rates)
-        physics = np.concatenate([start[None], *(sample.segment.physics for sample in samples)])
-        plant = replace(plant, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
+        physics = np.concatenate([start[None], *(sample.steps["physics"] for sample in samples)])
+        attitude, body_rates = physics[:, PHYSICS["attitude"]], physics[:, PHYSICS["body_rates"]]
+        plant = replace(plant, attitude=attitude, body_rates=body_rates)
     if control.target is not None:
         thrust = np.concatenate([_thrusts(sample) for sample in samples])
         plant = replace(plant, thrust=np.append(thrust, thrust[-1]))
     return FlightLog(control=control, timing=_timing_log(samples, control.t), plant=plant)
 
 
-def one_period(sample: FlownPeriod, timestep: float) -> FlightLog:
+def one_period(sample: Period, timestep: float) -> FlightLog:
     """Convert one control period to a log: one row, and the plant's rows from its start to its end, both included."""
     moment = sample.observation.moment
     assert moment.acting is not None
@@ -163,15 +205,15 @@ def one_period(sample: FlownPeriod, timestep: float) -> FlightLog:
     )
 
 
-def _control_log(samples: Sequence[FlownPeriod], initial_speeds: Array, period: float) -> ControlLog:
+def _control_log(samples: Sequence[Period], initial_speeds: Array, period: float) -> ControlLog:
     observed = [sample.observation for sample in samples]
 
-    def column(name: str, kind: type) -> np.ndarray[Any, np.dtype[Any]]:
-        return np.array([getattr(sample.command, name) for sample in samples], dtype=kind)
-
-    fallback = column("fallback", np.int64)
+    rows = np.array([sample.command.stats for sample in samples], float).reshape(-1, len(Statistics._fields))
+    stats = dict(zip(Statistics._fields, rows.T.copy(), strict=True))
+    sqp = np.column_stack([stats.pop("sqp_defect"), stats.pop("sqp_step")])
+    del stats["solve_s"]  # a clock time
+    fallback = np.array([sample.command.fallback for sample in samples], dtype=np.int64)
     late = np.array([sample.missed for sample in samples], dtype=bool)
-    residuals = [sample.command.sqp for sample in samples]
     target = _targets(samples)
     return ControlLog(
         t=_times(len(samples), period),
@@ -185,26 +227,25 @@ def _control_log(samples: Sequence[FlownPeriod], initial_speeds: Array, period: 
             FALLBACK if sample.missed or sample.command.fallback else sample.command.answered_by for sample in samples
         ),
         phase=tuple(str(sample.phase) for sample in samples),
-        iterations=column("iterations", np.int64),
-        active=column("active", np.int64),
+        iterations=stats.pop("iterations").astype(np.int64),
+        active=stats.pop("active").astype(np.int64),
         fallback=np.where(late, np.maximum(fallback, 1), fallback),
-        slack=column("slack", float),
-        **{name: column(name, float) for name in RESIDUALS},
+        **stats,
         delay=np.array([sample.delay for sample in samples], float),
-        sqp=np.array([residual or (math.nan, math.nan) for residual in residuals]) if any(residuals) else None,
+        sqp=None if np.isnan(sqp).all() else sqp,
         target=None if target is None else target[:, :4],
         target_attitude=None if target is None or np.isnan(target[:, 4:]).all() else target[:, 4:],
         logged=stacked([s for o in observed if isinstance(s := o.moment.signals, LoggedSignals)]),
     )
 
 
-def _thrusts(sample: FlownPeriod) -> Array:
+def _thrusts(sample: Period) -> Array:
     """(M,) collective thrust over the steps of a period [N]; NaN where no autopilot has a target."""
-    thrust = sample.segment.thrust
-    return np.full(len(sample.segment.physics), math.nan) if sample.target is None or thrust is None else thrust
+    thrust: Array = sample.steps["thrust"]
+    return np.full(len(thrust), math.nan) if sample.target is None else thrust
 
 
-def _targets(samples: Sequence[FlownPeriod]) -> Array | None:
+def _targets(samples: Sequence[Period]) -> Array | None:
     """(K, 8) targets in force, four numbers and an attitude, NaN where there is none; None without an autopilot."""
     if all(sample.target is None for sample in samples):
         return None
@@ -215,28 +256,30 @@ def _targets(samples: Sequence[FlownPeriod]) -> Array | None:
     return rows
 
 
-def _timing_log(samples: Sequence[FlownPeriod], t: Array) -> TimingLog:
+def _timing_log(samples: Sequence[Period], t: Array) -> TimingLog:
     return TimingLog(
         t=t,
-        solve_ms=np.array([1e3 * sample.command.solve_s for sample in samples]),
+        solve_ms=np.array([1e3 * sample.command.stats.solve_s for sample in samples]),
         step_ms=np.array([1e3 * sample.step_s for sample in samples]),
     )
 
 
-def _plant_log(
-    samples: Sequence[FlownPeriod], start: Array, initial_speeds: Array, yaw: float, timestep: float
-) -> PlantLog:
+def _plant_log(samples: Sequence[Period], start: Array, initial_speeds: Array, yaw: float, timestep: float) -> PlantLog:
     if not samples:
         return PlantLog(t=_times(1, timestep), state=physics_to_state(start[None], yaw), speeds=initial_speeds[None])
-    segment = Segment.join([sample.segment for sample in samples])
-    physics = np.concatenate([start[None], segment.physics])
+    steps = np.concatenate([sample.steps for sample in samples])
+    physics = np.concatenate([start[None], steps["physics"]])
+    # What acts during a step is shown from its start on, so the last row repeats that of the last step.
+    acting = {
+        name: np.append(steps[name], steps[name][-1:], axis=0)
+        for name in ("wrench", "wind", "battery")
+        if name in (steps.dtype.names or ())
+    }
     return PlantLog(
         t=_times(len(physics), timestep),
         state=physics_to_state(physics, yaw),
-        speeds=np.concatenate([segment.speeds, samples[-1].rotors[None]]),
-        wrench=None if segment.wrench is None else np.concatenate([segment.wrench, segment.wrench[-1:]]),
-        wind=None if segment.wind is None else np.concatenate([segment.wind, segment.wind[-1:]]),
-        battery=None if segment.battery is None else np.concatenate([segment.battery, segment.battery[-1:]]),
+        speeds=np.concatenate([steps["speeds"], samples[-1].rotors[None]]),
+        **acting,
     )
 
 

@@ -24,7 +24,7 @@ from quadsim.sim.effects.forces import StepForces
 from quadsim.sim.effects.load import Load, MassChange, Payload, PayloadDrop, apply_mass, mass_properties
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
-from quadsim.sim.physics import Integrator, Segment, physics_to_state
+from quadsim.sim.physics import PHYSICS, Integrator, PhysicsSteps, physics_to_state, steps_type
 from quadsim.sim.rigid_body import RigidBody, check_free
 from quadsim.space import Obstacle
 from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
@@ -107,6 +107,7 @@ class Plant:
         self._by_step = effects.follows_state or wind is not None or bool(self._own)
         self._by_step = self._by_step or bool(self._moving) or integrator == "rk4"
         self._by_step = self._by_step or any(isinstance(change, PushChange) for change in changes)
+        self._steps_type = steps_type(wrench=self._by_step, wind=wind is not None, battery=effects.battery is not None)
         bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
         self._mocaps = self.model.body_mocapid[bodies]
         self._changes = self._scheduled(changes)
@@ -202,14 +203,14 @@ class Plant:
     def attitude(self) -> tuple[Array, Array]:
         """The true attitude now (4,), wxyz, body to world, sign continuous, and the body rates (3,) [rad/s]."""
         physics = self._physics[0]
-        return physics[4:8].copy(), physics[11:14].copy()
+        return physics[PHYSICS["attitude"]].copy(), physics[PHYSICS["body_rates"]].copy()
 
     def applied(self, speeds: Array) -> Array:
         """Return the command (4,) [rad/s], saturated at the rotors' limits and at zero."""
         return np.clip(speeds, *self._speed_range)
 
-    def advance(self, speeds: Array, steps: int) -> Segment:
-        """Hold commanded rotor speeds (4,) [rad/s] for a number of physics steps, at least 1.
+    def advance(self, speeds: Array, steps: int) -> PhysicsSteps:
+        """Hold commanded rotor speeds (4,) [rad/s] for M physics steps, at least 1; return these (M,).
 
         Raises:
             CommandError: the command is not four finite numbers; nothing moved.
@@ -224,7 +225,7 @@ class Plant:
             self._change()
             until = min(end, self._pending[0][0]) if self._pending else end
             parts.append(self._hold(target, until - self._step))
-        return Segment.join(parts)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def allows(self, changes: Sequence[Change]) -> bool:
         """Return whether it was built for changes of these kinds."""
@@ -264,7 +265,7 @@ class Plant:
         load = replace(self._load, mass_factor=mass_factor)
         apply_mass(self.model, BODY, mass_properties(self.vehicle, load, payloads))
 
-    def _hold(self, target: Array, steps: int) -> Segment:
+    def _hold(self, target: Array, steps: int) -> PhysicsSteps:
         """Advance while only vehicle and air change."""
         rotors, timestep = self._rotors, self.timestep
         if rotors.at_once:
@@ -298,8 +299,12 @@ class Plant:
         self._check(trajectory)
         self._physics[0] = trajectory[-1]
         self._step += steps
-        thrust = thrusts.sum(axis=1)
-        return Segment(physics=trajectory, speeds=before, wrench=wrench, wind=wind, thrust=thrust, battery=battery)
+        flown = np.empty(steps, self._steps_type)
+        flown["physics"], flown["speeds"], flown["thrust"] = trajectory, before, thrusts.sum(axis=1)
+        for name, part in (("wrench", wrench), ("wind", wind), ("battery", battery)):
+            if part is not None:
+                flown[name] = part
+        return flown
 
     def _run(self, thrusts: Array) -> Array:
         """Take all steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""

@@ -10,15 +10,18 @@ from enum import StrEnum
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Le, doc
+from annotated_types import Ge, Le, Len, doc
 from numpy.typing import NDArray
 
-from quadsim.errors import ParameterError
-from quadsim.fields import Fraction
+from quadsim.fields import Fraction, NonNegative, Number
 from quadsim.rotation import Vector, exponential, multiply, quaternion_to_euler
+from quadsim.sim.physics import PHYSICS, whole
 from quadsim.state import Array
 
 AXES: Final = (0, 1, 2)
+Deviations = NonNegative | Annotated[tuple[NonNegative, ...], Len(3, 3)]
+"""One standard deviation for all three axes, or one per axis."""
+Offsets = Number | Annotated[tuple[Number, ...], Len(3, 3)]  # one offset for all three axes, or one per axis
 
 
 class SensorName(StrEnum):
@@ -44,8 +47,12 @@ class Outliers:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sampling:
-    """When a sensor's samples are taken and arrive, and which are lost."""
+class Sensor:
+    """One sensor, in scenario files' unit of what it measures: m, m/s, deg or deg/s; see `in_si`.
+
+    A sample taken at t = j / rate is value + bias + walk(t) + noise.  It arrives `delay` later, or is lost.  The
+    variance of walk(t) is bias_walk^2 t.
+    """
 
     rate: Annotated[
         float, Ge(0.01), Le(1e4), doc("[Hz] samples per second, the first at t = 0; a divisor of the physics rate")
@@ -55,38 +62,39 @@ class Sampling:
     ] = 0.0
     dropout: Annotated[Fraction, doc("[-] probability of a sample being lost")] = 0.0
     outliers: Annotated[Outliers | None, doc("absent: no outliers")] = None
+    noise: Annotated[
+        Deviations, doc("[the sensor's unit] standard deviation from sample to sample, one for all axes or x, y, z")
+    ] = 0.0
+    bias: Annotated[
+        Offsets,
+        doc("[the sensor's unit] constant offset, of attitude a rotation about the body axes; one or x, y, z"),
+    ] = 0.0
+    bias_walk: Annotated[Deviations, doc("[the sensor's unit/sqrt(s)] random walk of the offset, one or x, y, z")] = 0.0
 
-
-@dataclass(frozen=True, kw_only=True)
-class Sensor(Sampling):
-    """One sensor, in the unit of its name (see `SensorName`).
-
-    A sample taken at t = j / rate is value + bias + walk(t) + noise.  It arrives `delay` later, or is lost.
-    """
-
-    name: SensorName  # the measured quantity
-    noise: Vector = (0.0, 0.0, 0.0)  # standard deviation per axis, white from sample to sample
-    bias: Vector = (0.0, 0.0, 0.0)  # constant offset per axis
-    bias_walk: Vector = (0.0, 0.0, 0.0)
-    """The bias's random walk per axis [unit/sqrt(s)]: its variance grows by bias_walk^2 t."""
-
-    def stride(self, timestep: float) -> int:
+    def stride(self, name: SensorName, timestep: float) -> int:
         """Return the physics steps between samples.
 
         Raises:
             ParameterError: the rate does not divide the physics rate.
         """
         rule = f"a divisor of the physics rate of {1.0 / timestep:g} Hz"
-        return whole(f"sensors.{self.name}", "rate", self.rate, 1.0 / (self.rate * timestep), rule)
+        return whole(f"sensors.{name}", "rate", self.rate, 1.0 / (self.rate * timestep), rule)
 
-    def latency(self, timestep: float) -> int:
+    def latency(self, name: SensorName, timestep: float) -> int:
         """Return the physics steps from a sample to its arrival.
 
         Raises:
             ParameterError: the delay is not a whole number of physics steps.
         """
         rule = f"a whole multiple of the physics step of {timestep} s"
-        return whole(f"sensors.{self.name}", "delay", self.delay, self.delay / timestep, rule, smallest=0)
+        return whole(f"sensors.{name}", "delay", self.delay, self.delay / timestep, rule, smallest=0)
+
+
+def in_si(name: SensorName, value: float | Sequence[float]) -> Vector:
+    """Return a number of a sensor's settings, or one per axis, as three in SI units."""
+    x, y, z = [value] * 3 if isinstance(value, float | int) else value
+    unit = math.radians(1.0) if name in (SensorName.ATTITUDE, SensorName.RATES) else 1.0
+    return unit * x, unit * y, unit * z
 
 
 class FaultKind(StrEnum):
@@ -116,26 +124,6 @@ class SensorFault:
         return first, math.ceil(self.stop / timestep - 1e-6) if math.isfinite(self.stop) else None
 
 
-def whole(owner: str, name: str, value: float, count: float, rule: str, *, smallest: int = 1) -> int:
-    """Convert a count of physics steps, derived from a parameter, to a whole number.
-
-    Raises:
-        ParameterError: it is not whole, or too small.
-    """
-    steps = round(count)
-    if steps < smallest or not math.isclose(steps, count, rel_tol=1e-9, abs_tol=1e-9):
-        raise ParameterError(owner, name, value, rule)
-    return steps
-
-
-_COLUMNS = {
-    SensorName.POSITION: slice(1, 4),
-    SensorName.VELOCITY: slice(8, 11),
-    SensorName.ATTITUDE: slice(4, 8),
-    SensorName.RATES: slice(11, 14),
-}
-"""Position of a sensor's quantity in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
-
 Flags = NDArray[np.bool_]
 Steps = NDArray[np.int64]
 
@@ -151,8 +139,13 @@ class Sample(NamedTuple):
 
 def truth(name: SensorName, physics: Array) -> Array:
     """Return a perfect sensor's samples (M, 3) of MuJoCo's states (M, 14)."""
-    values = physics[:, _COLUMNS[name]]
+    values = _of(name, physics)
     return quaternion_to_euler(values) if name is SensorName.ATTITUDE else values.copy()
+
+
+def _of(name: SensorName, physics: Array) -> Array:
+    """Return a sensor's quantity of MuJoCo's states (M, 14): (M, 3), or attitudes (M, 4)."""
+    return physics[:, PHYSICS["body_rates" if name is SensorName.RATES else name.value]]
 
 
 class Sampler:
@@ -162,13 +155,19 @@ class Sampler:
     """
 
     def __init__(
-        self, sensor: Sensor, *, timestep: float, faults: tuple[SensorFault, ...], rng: np.random.Generator
+        self,
+        name: SensorName,
+        sensor: Sensor,
+        *,
+        timestep: float,
+        faults: tuple[SensorFault, ...],
+        rng: np.random.Generator,
     ) -> None:
-        self.sensor = sensor
-        self._stride = sensor.stride(timestep)
-        self._latency = sensor.latency(timestep)
-        self._noise, self._bias = np.array(sensor.noise), np.array(sensor.bias)
-        self._step = np.array(sensor.bias_walk) * math.sqrt(self._stride * timestep)
+        self.name, self._sensor = name, sensor
+        self._stride = sensor.stride(name, timestep)
+        self._latency = sensor.latency(name, timestep)
+        self._noise, self._bias = np.array(in_si(name, sensor.noise)), np.array(in_si(name, sensor.bias))
+        self._step = np.array(in_si(name, sensor.bias_walk)) * math.sqrt(self._stride * timestep)
         self._timestep = timestep
         self.reschedule(faults)
         self._initial = tuple(rng.spawn(4))
@@ -181,7 +180,7 @@ class Sampler:
 
     def reschedule(self, faults: Sequence[SensorFault]) -> None:
         """Replace the faults; those of other sensors are ignored."""
-        of_this = (fault for fault in faults if fault.sensor is self.sensor.name)
+        of_this = (fault for fault in faults if fault.sensor is self.name)
         self._faults = tuple((fault, fault.window(self._timestep)) for fault in of_this)
 
     def reset(self) -> None:
@@ -203,7 +202,7 @@ class Sampler:
             return []
         taken = np.arange(first + first_row, first + len(physics), self._stride)
         errors = self._walk(count) + self._draw_noise(count) + 0.0  # turns -0 into 0
-        lost = self._of_dropout.random(count) < self.sensor.dropout
+        lost = self._of_dropout.random(count) < self._sensor.dropout
         affected = [(fault, _within(taken, window)) for fault, window in self._faults]
         offset, frozen = np.zeros((count, 3)), np.zeros(count, dtype=bool)
         for fault, within in affected:
@@ -224,7 +223,7 @@ class Sampler:
         for fault, within in affected:
             if fault.kind is FaultKind.NAN:
                 values[np.ix_(np.flatnonzero(within), np.array(fault.axes))] = np.nan
-        name, latency = self.sensor.name, self._latency
+        name, latency = self.name, self._latency
         return [
             Sample(name, step, step + latency, value)
             for step, value, gone in zip(taken.tolist(), values, lost.tolist(), strict=True)
@@ -244,18 +243,18 @@ class Sampler:
 
     def _draw_noise(self, count: int) -> Array:
         noise = self._noise * self._of_noise.standard_normal((count, 3))
-        draws, outliers = self._of_outliers.random(count), self.sensor.outliers
+        draws, outliers = self._of_outliers.random(count), self._sensor.outliers
         if outliers is not None:
             noise[draws < outliers.probability] *= outliers.size
         return noise
 
     def _measure(self, rows: Array, errors: Array) -> Array:
-        name = self.sensor.name
+        name = self.name
         if name is not SensorName.ATTITUDE:
-            return rows[:, _COLUMNS[name]] + errors
+            return _of(name, rows) + errors
         turned = [
             multiply((w, x, y, z), exponential((a, b, c)))
-            for (w, x, y, z), (a, b, c) in zip(rows[:, _COLUMNS[name]].tolist(), errors.tolist(), strict=True)
+            for (w, x, y, z), (a, b, c) in zip(_of(name, rows).tolist(), errors.tolist(), strict=True)
         ]
         return quaternion_to_euler(np.array(turned))
 

@@ -14,8 +14,9 @@ from mpc.answer import ActuatorBounds
 from mpc.bounded import Bounded
 from quadsim.controller import Command
 from quadsim.errors import ParameterError, UnknownNameError
+from quadsim.flight.log import ControlLog, columns_of
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings
-from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, STATE_NAMES, STATE_UNITS, Array
+from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.schema.scenario import Scenario
 
@@ -126,13 +127,14 @@ class Observations:
         for part in parts:
             if part not in PARTS:
                 raise UnknownNameError("part of the observation", str(part), PARTS)
-        named = [(name, STATE_UNITS[i]) for name, i in zip(REFERENCE_NAMES, REFERENCE_STATES, strict=True)]
+        stated = columns_of(ControlLog)
+        named = list(zip(REFERENCE_NAMES, stated["reference"].units.values(), strict=True))
         rows = [(f"{name}[{i}]", unit) for i in range(1, preview + 1) for name, unit in named]
         entries = {
-            "state": list(zip(STATE_NAMES, STATE_UNITS, strict=True)),
+            "state": list(stated["state"].units.items()),
             "preview": rows,
             "ahead": [(f"{name} ahead", unit) for name, unit in rows],
-            "command": [(f"u{i + 1}", "rad/s") for i in range(N_ROTORS)],
+            "command": list(stated["speeds"].units.items()),
         }
         self._parts = tuple(parts)
         self.layout = tuple(Entry(name=name, unit=unit) for part in parts for name, unit in entries[part])

@@ -29,8 +29,8 @@ from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.palette import CYCLE
 from quadsim.report.figure import least_range
 from quadsim.rotation import quaternion_to_euler
-from quadsim.sim.physics import FlownPeriod
-from quadsim.state import wrapped
+from quadsim.sim.physics import Period
+from quadsim.state import POSITION, wrapped
 from scenarios.flight import Flight
 from scenarios.live import readout
 from scenarios.live.controls import ControllerTab, Steering, Widgets, disturb
@@ -342,13 +342,13 @@ class Page:
                     widget.visible = client != driver
 
 
-def _values(sample: FlownPeriod) -> tuple[float, ...]:
+def _values(sample: Period) -> tuple[float, ...]:
     """Return what is plotted of a period, in the order of `_PLOTS`."""
-    observed, physics = sample.observation, sample.segment.physics
-    up = 1.0 - 2.0 * (physics[:, 5] ** 2 + physics[:, 6] ** 2)
+    observed, (_, x, y, _) = sample.observation, sample.attitude.T
+    up = 1.0 - 2.0 * (x**2 + y**2)
     tilt = math.degrees(math.acos(np.clip(up.min(), -1.0, 1.0)))
-    yaw = quaternion_to_euler(physics[-1:, 4:8])[0, 2] - observed.reference[3]
-    error = observed.truth[[0, 2, 4]] - observed.reference[:3]
+    yaw = quaternion_to_euler(sample.attitude[-1:])[0, 2] - observed.reference[3]
+    error = observed.truth[[*POSITION]] - observed.reference[:3]
     turned = math.degrees(wrapped(float(yaw)))
     return (*error, tilt, turned, *sample.speeds, 1e3 * sample.step_s)
 

@@ -101,9 +101,9 @@ def numbers(frame: Frame | None, states: Sequence[tuple[float, float]] = (), los
     solved = f"QP {escape(command.status)} by {escape(command.answered_by)}"
     if command.status not in OPTIMAL or command.fallback:
         solved = f'<span class="bad">QP {escape(command.status)}, fallback {command.fallback}</span>'
-    elif not command.active:
+    elif not command.stats.active:
         solved = f"no bound active, by {escape(command.answered_by)}"
-    active = f", {command.active} bounds active" if command.active else ""
+    active = f", {command.stats.active} bounds active" if command.stats.active else ""
     weak = [f"rotor {i}: {100 * (share - 1):.0f} %" for i, share in enumerate(frame.health, 1) if share < 1.0]
     rows = [
         f"MPC: {solved}{active}",

@@ -25,7 +25,7 @@ from quadsim.flight.audit import COMMANDED, Limit
 from quadsim.sim.effects.load import Load, MassChange
 from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss
 from quadsim.sim.effects.wind import Air, WindChange
-from quadsim.sim.physics import FlownPeriod
+from quadsim.sim.physics import Period
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
@@ -97,7 +97,7 @@ class Frame:
 
     k: int  # which period
     time: float  # when it began [s]
-    samples: tuple[FlownPeriod | None, ...]
+    samples: tuple[Period | None, ...]
     margins: tuple[Mapping[str, float], ...]  # see `Rollout.margins`
     horizons: tuple[Array | None, ...]  # (N, 3) predicted positions [m], from the period's end on
     pull: Array  # (3,) the force of the person's hand [N]; zero without one
@@ -218,7 +218,7 @@ class Session:
                     refused.append(f"{name}{error}")
         pull, shown = self._hold(refused), []
         for flight in self.flights:
-            entry: tuple[FlownPeriod | None, Mapping[str, float], Array | None] = None, {}, None
+            entry: tuple[Period | None, Mapping[str, float], Array | None] = None, {}, None
             if flight.loop.reason is None:
                 try:
                     sample = flight.step()
@@ -328,7 +328,7 @@ class Session:
         events: list[dict[str, Any]] = []
         if held.pull is not None:
             weight = self.flights[0].actual.mass * self.flights[0].actual.gravity
-            force = STIFFNESS * weight * (held.pull - last.segment.physics[-1, 1:4])
+            force = STIFFNESS * weight * (held.pull - last.position[-1])
             force *= min(1.0, STRONGEST * weight / max(float(np.linalg.norm(force)), 1e-9))
             force = np.round(force, 3)  # [N]
             if force.any():
@@ -361,7 +361,7 @@ def read_script(path: str | Path) -> Script:
     return script
 
 
-def _horizon(flight: Rollout, sample: FlownPeriod) -> Array | None:
+def _horizon(flight: Rollout, sample: Period) -> Array | None:
     controller, state = flight.loop.controller, sample.observation.state
     if not isinstance(controller, Predicting) or len(sample.command.plan) < 1:
         return None
@@ -369,4 +369,4 @@ def _horizon(flight: Rollout, sample: FlownPeriod) -> Array | None:
     if predicted is None:
         return None
     path = predicted[0][:, list(POSITION)]
-    return np.concatenate([sample.segment.physics[-1:, 1:4], path[1:]])  # the period that is shown is over
+    return np.concatenate([sample.position[-1:], path[1:]])  # the period that is shown is over

@@ -126,7 +126,7 @@ class Stage:
             tips = self._rotors + np.outer(lengths, [0.0, 0.0, 1.0])
             self._arrows[i].points = np.stack([self._rotors, tips], axis=1).astype(np.float32)
             if frame.k % _EVERY == 0:
-                self._trails[i].append(sample.segment.physics[-1, 1:4])
+                self._trails[i].append(sample.position[-1])
                 self._paths[i].points = _segments(np.array(self._trails[i]), TRAIL)
             line = self._horizons[i]
             if horizon is not None:  # of another length than the first controller's, it is thinned
@@ -139,7 +139,7 @@ class Stage:
         self._events = len(events)
         first = frame.samples[0]
         if first is not None:
-            at = first.segment.physics[-1, 1:4]
+            at = first.position[-1]
             self._goal.position = first.observation.reference[:3]
             self.ground = min(self.ground, at[2] + self._drop)
             self._floor.position = (*(2.0 * self._square * np.round(at[:2] / (2.0 * self._square))), self.ground)
@@ -154,11 +154,11 @@ class Stage:
         """Draw the vehicles at a fraction of the period; return the position of the first (3,) [m]."""
         for sample, handle, (shadow, plumb) in zip(frame.samples, self._frames, self._shadows, strict=True):
             if sample is not None:
-                physics = sample.segment.physics
-                row = physics[min(len(physics) - 1, int(share * len(physics)))]
-                handle.position, handle.wxyz = row[1:4], row[4:8]
+                step = min(len(sample.steps) - 1, int(share * len(sample.steps)))
+                at = handle.position = sample.position[step]
+                handle.wxyz = sample.attitude[step]
                 foot = self.ground + 0.01 * self.unit
-                shadow.position, plumb.scale = (*row[1:3], foot), (1.0, 1.0, float(row[3] - foot))
+                shadow.position, plumb.scale = (*at[:2], foot), (1.0, 1.0, float(at[2] - foot))
         return np.asarray(self._frames[0].position)
 
     def reset(self) -> None:

@@ -34,7 +34,7 @@ from scenarios.schema.controllers import AnyController, changed
 from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
 from scenarios.schema.initial import Initial
 from scenarios.schema.problems import ScenarioError, parse_table
-from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
+from scenarios.schema.sensors import EstimatorSpec, Sensors, check_sensing
 from scenarios.schema.settings import separate, set_field
 from scenarios.schema.writing import to_toml
 
@@ -181,7 +181,7 @@ class Scenario:
         doc("user-defined forces on the vehicle, called once per physics step"),
     ] = ()
     computation: Annotated[ComputationTime | None, doc("absent: commands take no time")] = None
-    sensors: Annotated[SensorsSpec | None, doc("absent: the controller receives the true state")] = None
+    sensors: Annotated[Sensors | None, doc("absent: the controller receives the true state")] = None
     estimator: Annotated[
         EstimatorSpec | None, doc("absent: the controller receives the raw samples of the sensors")
     ] = None

@@ -17,70 +17,28 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import Len, doc
+from annotated_types import doc
 
 from quadsim.errors import ParameterError
-from quadsim.fields import NonNegative, Number, Vector
 from quadsim.sim.error_state import EstimatorSettings
-from quadsim.sim.sensing import Sampling, Sensor, SensorName
-
-Deviations = NonNegative | Annotated[tuple[NonNegative, ...], Len(3, 3)]
-"""One standard deviation for all three axes, or one per axis."""
-Offsets = Number | Vector  # one offset for all three axes, or one per axis
+from quadsim.sim.sensing import Sensor, SensorName
 
 
 @dataclass(frozen=True, kw_only=True)
-class PositionSpec(Sampling):
-    """Position, world frame: satellite navigation or motion capture."""
-
-    noise: Annotated[Deviations, doc("[m] standard deviation, one for all axes or x, y, z")] = 0.0
-    bias: Annotated[Offsets, doc("[m] constant offset, one for all axes or x, y, z")] = 0.0
-    bias_walk: Annotated[Deviations, doc("[m/sqrt(s)] random walk of the offset")] = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class VelocitySpec(Sampling):
-    """Velocity, world frame."""
-
-    noise: Annotated[Deviations, doc("[m/s] standard deviation, one for all axes or x, y, z")] = 0.0
-    bias: Annotated[Offsets, doc("[m/s] constant offset, one for all axes or x, y, z")] = 0.0
-    bias_walk: Annotated[Deviations, doc("[m/s/sqrt(s)] random walk of the offset")] = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class AttitudeSpec(Sampling):
-    """Roll, pitch and yaw, with errors that are small rotations about the body axes."""
-
-    noise: Annotated[Deviations, doc("[deg] standard deviation, one for all body axes or x, y, z")] = 0.0
-    bias: Annotated[Offsets, doc("[deg] constant rotation, one for all body axes or x, y, z")] = 0.0
-    bias_walk: Annotated[Deviations, doc("[deg/sqrt(s)] random walk of that rotation")] = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class RatesSpec(Sampling):
-    """Body rates p, q, r: a rate gyro."""
-
-    noise: Annotated[Deviations, doc("[deg/s] standard deviation, one for all body axes or x, y, z")] = 0.0
-    bias: Annotated[Offsets, doc("[deg/s] constant offset, one for all body axes or x, y, z")] = 0.0
-    bias_walk: Annotated[Deviations, doc("[deg/s/sqrt(s)] random walk of the offset")] = 0.0
-
-
-AnySensorSpec = PositionSpec | VelocitySpec | AttitudeSpec | RatesSpec
-
-
-@dataclass(frozen=True, kw_only=True)
-class SensorsSpec:
+class Sensors:
     """Sensors of the state; without an estimator a missing sensor is perfect, with one it is absent."""
 
-    position: Annotated[PositionSpec | None, doc("[m] in the world frame")] = None
-    velocity: Annotated[VelocitySpec | None, doc("[m/s] in the world frame")] = None
-    attitude: Annotated[AttitudeSpec | None, doc("[deg] roll, pitch, yaw")] = None
-    rates: Annotated[RatesSpec | None, doc("[deg/s] body rates")] = None
+    position: Annotated[Sensor | None, doc("[m] world frame: satellite navigation or motion capture")] = None
+    velocity: Annotated[Sensor | None, doc("[m/s] world frame")] = None
+    attitude: Annotated[
+        Sensor | None, doc("[deg] roll, pitch, yaw, with errors that are small rotations about the body axes")
+    ] = None
+    rates: Annotated[Sensor | None, doc("[deg/s] body rates p, q, r: a rate gyro")] = None
 
-    def present(self) -> dict[SensorName, AnySensorSpec]:
+    def present(self) -> dict[SensorName, Sensor]:
         """Return the sensors of the scenario."""
         named = {name: getattr(self, name.value) for name in SensorName}
-        return {name: spec for name, spec in named.items() if spec is not None}
+        return {name: sensor for name, sensor in named.items() if sensor is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,21 +48,20 @@ class EstimatorSpec(EstimatorSettings):
     type: Annotated[Literal["error_state"], doc("kind of estimator")]
 
 
-def check_sensing(sensors: SensorsSpec | None, estimator: EstimatorSpec | None, *, timestep: float) -> None:
+def check_sensing(sensors: Sensors | None, estimator: EstimatorSpec | None, *, timestep: float) -> None:
     """Refuse sensors that do not fit the physics step, or that an estimator cannot work with.
 
     Raises:
         ValueError: the message starts with the field's name.
     """
     present = {} if sensors is None else sensors.present()
-    for name, spec in present.items():
-        probe = Sensor(name=name, rate=spec.rate, delay=spec.delay)
+    for name, sensor in present.items():
         try:
-            probe.stride(timestep)
-            probe.latency(timestep)
+            sensor.stride(name, timestep)
+            sensor.latency(name, timestep)
         except ParameterError as error:
             raise ValueError(str(error)) from error
-        noise = [*spec.noise] if isinstance(spec.noise, tuple) else spec.noise
+        noise = [*sensor.noise] if isinstance(sensor.noise, tuple) else sensor.noise
         if estimator is not None and not np.all(np.array(noise) > 0.0):
             raise ValueError(
                 f"sensors.{name}.noise must be positive, for the estimator to weigh its samples; got {noise}"

@@ -58,7 +58,7 @@ def test_commands_respect_their_hard_bounds_exactly() -> None:
     assert slews.max() <= 5.0 + 1e-12
     assert slews.max() == pytest.approx(5.0)  # the climb wants more
     assert {command.status for command in commands} == {"solved"}
-    assert commands[0].active > 0
+    assert commands[0].stats.active > 0
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: s
         assert residuals.stationarity < 1e-4  # gradients are of order 1e4
         assert residuals.complementarity < 1e-4  # multipliers reach 1e3
         assert residuals.dual == 0.0
-        active += solution.active
+        active += solution.stats.active
     assert active > 100  # the flight does press against its bounds
 
 

@@ -279,7 +279,7 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
     np.testing.assert_allclose(command.plan, peer.plan, rtol=0.0, atol=1e-5)
     held = problem.constraints[0]
     beyond = ocp_peer.violation(held, given, command.plan)
-    assert command.slack == pytest.approx(peer.slacks.max(initial=0.0), abs=1e-6)
+    assert command.stats.slack == pytest.approx(peer.slacks.max(initial=0.0), abs=1e-6)
     assert (beyond.max() > 1e-3) == (kind == "soft")
     if kind != "soft":
         assert beyond.max() < 1e-6

@@ -94,7 +94,7 @@ def test_the_unconstrained_optimum_is_tried_first_unless_size_or_rounding_forbid
     assert answer.certificate is not None
     assert kkt_residuals(*answer.certificate()).worst < 1e-5
     np.testing.assert_allclose(answer.plan[0], whole.plan[0], atol=1e-3)
-    assert answer.solve_s > 0.0
+    assert answer.stats.solve_s > 0.0
 
 
 def test_equality_rows_and_multipliers() -> None:
@@ -216,7 +216,7 @@ def test_a_solver_of_qpsolvers_keeps_nothing_and_meets_the_kkt_conditions(constr
         assert answers[0].certificate is not None
         qp, solution = answers[0].certificate()
         assert kkt_residuals(qp, solution).worst < 1e-3 * max(1.0, float(np.abs(solution.z).max()))
-        active += answers[0].active
+        active += answers[0].stats.active
     assert active > 10
 
 

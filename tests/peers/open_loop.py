@@ -105,7 +105,7 @@ def fly_mujoco(vehicle: Vehicle, speeds: Array, timestep: float) -> Path:
     steps = steps_per_period(HOLD, timestep)
     with Plant(vehicle, timestep=timestep) as plant:
         plant.reset(make_state())
-        physics = np.array([plant.advance(held, steps).physics[-1] for held in speeds])
+        physics = np.array([plant.advance(held, steps)["physics"][-1] for held in speeds])
     return Path(position=physics[:, 1:4], attitude=Rotation.from_quat(physics[:, 4:8], scalar_first=True))
 
 

@@ -13,7 +13,7 @@ import casadi
 import numpy as np
 
 from mpc.qp import QP, Solution
-from quadsim.controller import SOLVED
+from quadsim.controller import SOLVED, Statistics
 
 SETTINGS: Final[dict[str, Any]] = {
     "printLevel": "none",
@@ -46,4 +46,4 @@ class Qpoases:
         stats = self._solver.stats()
         x, z_box, z = (result[name].full().ravel() for name in ("x", "lam_x", "lam_a"))
         status = SOLVED if stats["success"] else str(stats["return_status"])
-        return Solution(x, np.zeros(0), z, z_box, status=status, iterations=int(stats["iter_count"]))
+        return Solution(x, np.zeros(0), z, z_box, status=status, stats=Statistics(iterations=int(stats["iter_count"])))

@@ -10,6 +10,7 @@ whatever tau_m is, so that the speed is held exactly, as in our plant.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 from quadsim.errors import ParameterError
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
-from quadsim.sim.physics import Segment, physics_to_state
+from quadsim.sim.physics import PhysicsSteps, physics_to_state, steps_type
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -111,7 +112,7 @@ class RotorPyPlant:
         """The rotor speeds (4,) [rad/s] that a command makes."""
         return np.maximum(speeds, 0.0)
 
-    def advance(self, speeds: Array, steps: int) -> Segment:
+    def advance(self, speeds: Array, steps: int) -> PhysicsSteps:
         """Hold rotor speeds (4,) [rad/s], and return the states in MuJoCo's order.
 
         RotorPy's `step` integrates the same function in the same way, but gives the end of the hold alone.
@@ -130,7 +131,9 @@ class RotorPyPlant:
         vectors[:, 6:10] /= np.linalg.norm(vectors[:, 6:10], axis=1, keepdims=True)
         physics = _to_physics(self._time + t, vectors)
         self._time, self._vector = float(physics[-1, 0]), vectors[-1].copy()
-        return Segment(physics=physics, speeds=np.tile(held, (steps, 1)), wrench=None, wind=None)
+        flown = np.empty(steps, steps_type())
+        flown["physics"], flown["speeds"], flown["thrust"] = physics, held, math.nan
+        return flown
 
 
 def _to_physics(t: Array, vectors: Array) -> Array:

@@ -38,8 +38,8 @@ def test_nothing_in_a_first_solve_is_printed(name: str, capfd: pytest.CaptureFix
     desired = problem.objective.desired(paper_reference(51)[1:])
     solution = backend.solve(formulation.assemble(Query(np.zeros(12), desired, problem.model.u_bar)).qp)
     assert solution.status in {SOLVED, UNSOLVED}
-    assert solution.solve_s > 0.0
-    assert solution.iterations >= 0
+    assert solution.stats.solve_s > 0.0
+    assert solution.stats.iterations >= 0
     assert capfd.readouterr() == ("", "")
 
 

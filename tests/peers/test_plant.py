@@ -46,7 +46,7 @@ def test_the_adapter_lands_where_rotorpys_own_step_does(vehicle: Vehicle) -> Non
     path = open_loop.fly_rotorpy(vehicle, speeds)
     plant = RotorPyPlant(vehicle)
     plant.reset(make_state())
-    physics = np.array([plant.advance(held, 50).physics[-1] for held in speeds])
+    physics = np.array([plant.advance(held, 50)["physics"][-1] for held in speeds])
     np.testing.assert_allclose(physics[:, 1:4], path.position, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(physics[:, 0], open_loop.HOLD * np.arange(1, len(speeds) + 1))
 

@@ -76,5 +76,5 @@ def test_infeasibility_is_the_largest_violation_of_a_row_step_by_step() -> None:
         expected = max(float(np.maximum(values - rows.upper, rows.lower - values).max()), 0.0)
         for result in (check, other):
             checked, refused = result(problem, query, answer, None)
-            assert checked.infeasibility == pytest.approx(expected, rel=1e-9, abs=1e-11)
+            assert checked.stats.infeasibility == pytest.approx(expected, rel=1e-9, abs=1e-11)
             assert (refused == "infeasible_answer") == (expected > INFEASIBLE)

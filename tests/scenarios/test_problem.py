@@ -56,8 +56,8 @@ def test_the_problem_of_the_robust_controller_has_its_slacks_and_tightened_bound
     np.testing.assert_allclose(x[:4], command.speeds, rtol=0.0, atol=1e-3)
     slacks = problem.condensed().slacks(x)
     assert slacks.size == problem.horizon * problem.rows.slacks.size > 0
-    assert slacks.max() == pytest.approx(command.slack, abs=1e-5)
-    assert (command.slack > 0.01) == (roll > 0.0)
+    assert slacks.max() == pytest.approx(command.stats.slack, abs=1e-5)
+    assert (command.stats.slack > 0.01) == (roll > 0.0)
 
 
 def test_without_constraints_the_optimum_is_a_linear_system_and_the_law_s_command() -> None:

@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 
 from quadsim.controller import OPTIMAL, Phase
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
-from quadsim.flight.log import BODY_RATES, QUATERNION
+from quadsim.flight.log import PlantLog, columns_of
 from quadsim.flight.metrics import never_took_off, unrecovered
 from quadsim.flight.rundir import Run
 from quadsim.palette import line_colour
@@ -84,12 +84,13 @@ def _send_signals(recording: rr.RecordingStream, run: Run, reached: Sequence[Lim
         values += [np.array([limit.lower, limit.upper]) for limit in bounding]
         contents += [f"limits/{limit.name}" for limit in bounding]
         views += _view(title, contents, run, ends=least_range(values, SIGNALS[names[0]].unit))
-    for name, vectors, columns in (
-        ("quaternion", log.plant.attitude, QUATERNION),
-        ("body_rates", log.plant.body_rates, BODY_RATES),
+    stated = columns_of(PlantLog)
+    for name, vectors, units in (
+        ("quaternion", log.plant.attitude, stated["attitude"].units),
+        ("body_rates", log.plant.body_rates, stated["body_rates"].units),
     ):
         if vectors is not None:
-            labels = dict(zip((f"{column} [{unit}]" for column, unit in columns.items()), SERIES, strict=False))
+            labels = dict(zip((f"{column} [{unit}]" for column, unit in units.items()), SERIES, strict=False))
             contents = _send_curves(recording, f"signals/{name}", log.plant.t, vectors, labels)
             views += _view(name.replace("_", " ").capitalize(), contents, run)
     return views

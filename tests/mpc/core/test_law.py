@@ -103,11 +103,11 @@ def test_the_answerer_is_reported(mpc: CompiledMPC) -> None:
     hover = mpc.problem.model.u_bar
     at_rest, target = np.zeros(N_STATES), np.zeros((mpc.horizon, 4))
     free = mpc.step(StepInputs(time=0.0, phase=Phase.FLYING), at_rest, target)
-    assert (free.status, free.answered_by, free.active) == ("unconstrained", GAIN, 0)
+    assert (free.status, free.answered_by, free.stats.active) == ("unconstrained", GAIN, 0)
     assert free.speeds == pytest.approx(hover)
     far = ask(mpc, 1, at_rest)
     assert (far.status, far.answered_by, far.fallback) == ("solved", CORE, 0)
-    assert far.active > 0
+    assert far.stats.active > 0
 
 
 def test_without_an_optimum_the_last_plan_is_flown_to_its_end() -> None:

@@ -22,7 +22,7 @@ def test_a_good_answer_passes_unchanged() -> None:
     answer = inner.step(StepInputs(), np.zeros(12), np.zeros((30, 4)))
     np.testing.assert_array_equal(command.speeds, answer.speeds)
     np.testing.assert_array_equal(command.plan, answer.plan)
-    assert (command.status, command.fallback, command.iterations) == ("solved", 0, 7)
+    assert (command.status, command.fallback, command.stats.iterations) == ("solved", 0, 7)
     guarded = guard(inner)
     assert (guarded.name, guarded.solver, guarded.horizon) == ("scripted", "none", 30)
 
@@ -35,7 +35,7 @@ def test_a_failed_period_flies_the_shifted_plan(status: str) -> None:
     np.testing.assert_allclose(commands[2].plan[:28], commands[0].plan[2:], atol=1e-9)
     assert [command.fallback for command in commands] == [0, 1, 1, 0]
     assert [command.status for command in commands] == ["solved", status, status, "solved"]
-    assert commands[1].iterations == 7
+    assert commands[1].stats.iterations == 7
 
 
 def test_every_status_of_piqp_is_known() -> None:

@@ -82,7 +82,7 @@ def fly_paper(
             initial_speeds=plant.hover_speeds,
             periods=periods,
             steps_per_period=50,
-            navigation=Navigation(vehicle, timestep=1e-3, sensors=(), rng=rng, faults=sensors) if sensors else None,
+            navigation=Navigation(vehicle, timestep=1e-3, sensors={}, rng=rng, faults=sensors) if sensors else None,
             **options,
         )
     speeds = log.control.speeds

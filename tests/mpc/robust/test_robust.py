@@ -96,7 +96,7 @@ def test_without_optional_parts_it_is_the_papers_controller(constrained_flight: 
     for moment, state, reference in moments(constrained_flight, 180, 100):
         expected, command = paper.step(moment, state, reference), ours.step(moment, state, reference)
         np.testing.assert_allclose(command.speeds, expected.speeds, atol=5e-3)
-        active += command.active
+        active += command.stats.active
     assert active > 100
 
 
@@ -109,7 +109,7 @@ def test_a_period_without_an_active_constraint_has_its_status(vehicle: Vehicle, 
         controller.reset(np.full(4, vehicle.hover_speed))
         command = controller.step(now, np.zeros(12), reference)
         assert command.status == status
-        assert (command.active > 0) == (status == SOLVED)
+        assert (command.stats.active > 0) == (status == SOLVED)
 
 
 # Lag
@@ -411,7 +411,7 @@ def test_without_a_solution_the_command_in_force_is_held(vehicle: Vehicle) -> No
     tilted = make_state(euler=(math.radians(30.0), 0.0, 0.0))
     command = controller.step(StepInputs(acting=acting), tilted, HOLD)
     assert command.status in {"primal_infeasible", "max_iterations", "numerics"}
-    assert command.active == 0
+    assert command.stats.active == 0
     np.testing.assert_array_equal(command.plan, np.tile(acting, (50, 1)))
     assert controller.step(StepInputs(acting=acting), np.zeros(12), HOLD).status in ACCEPTED
 

@@ -38,7 +38,9 @@ def fly(vehicle: Vehicle, autopilot: Autopilot, target: Array, seconds: float, e
         rows = []
         for _ in range(round(seconds * 1e3)):
             attitude, rates = plant.attitude
-            rows.append(plant.advance(autopilot.speeds(plant.time, target, rates, plant.speeds, attitude), 1).physics)
+            rows.append(
+                plant.advance(autopilot.speeds(plant.time, target, rates, plant.speeds, attitude), 1)["physics"]
+            )
         return np.concatenate(rows)
 
 

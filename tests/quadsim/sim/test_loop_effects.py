@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadsim.controller import GROUNDED, MISSED, Command, Phase, StepInputs, stopped
+from quadsim.controller import GROUNDED, MISSED, Command, Phase, Statistics, StepInputs, stopped
 from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import computation, estimation, ground
 from quadsim.flight.phase import PhaseMonitor
@@ -47,7 +47,9 @@ class Scripted:
         self.states.append(state.copy())
         if now.phase in GROUNDED:
             return stopped(np.zeros(4), self.horizon, now.phase)
-        return Command(speeds=self.speeds[k], plan=np.tile(self.speeds[k], (self.horizon, 1)), iterations=k)
+        return Command(
+            speeds=self.speeds[k], plan=np.tile(self.speeds[k], (self.horizon, 1)), stats=Statistics(iterations=k)
+        )
 
     def predict(self, states: Array, plans: Array) -> Array:
         return np.repeat(states[:, None, :], plans.shape[1], axis=1)
@@ -149,8 +151,10 @@ def test_a_deadline_follows_the_commands_under_way(vehicle: Vehicle, speeds: Arr
     class Planner(Scripted):
         def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
             command = super().step(now, state, reference)
-            slow = {2: 2, 3: 4}.get(command.iterations, 0)
-            return Command(speeds=command.speeds, plan=command.speeds + np.arange(4.0)[:, None], iterations=slow)
+            slow = {2: 2, 3: 4}.get(command.stats.iterations, 0)
+            return Command(
+                speeds=command.speeds, plan=command.speeds + np.arange(4.0)[:, None], stats=Statistics(iterations=slow)
+            )
 
     late = Computation(delay=0.12, per_iteration=0.01, plan=plan)
     with Plant(vehicle) as plant:
@@ -182,7 +186,7 @@ def test_drawn_delays_are_the_seed_s(vehicle: Vehicle, speeds: Array) -> None:
 
 
 def test_the_controller_receives_the_sensors_samples(vehicle: Vehicle, speeds: Array) -> None:
-    sensors = [Sensor(name=SensorName.POSITION, rate=20.0, noise=(0.1, 0.1, 0.1))]
+    sensors = {SensorName.POSITION: Sensor(rate=20.0, noise=0.1)}
     navigation = Navigation(vehicle, timestep=1e-3, sensors=sensors, rng=np.random.default_rng(0))
     controller = Scripted(speeds)
     with Plant(vehicle) as plant:
@@ -206,7 +210,7 @@ def test_the_estimator_receives_the_saturated_command(vehicle: Vehicle) -> None:
             received.append(commands[0].copy())
             super().advance(physics, commands, on_ground=on_ground)
 
-    navigation = Witness(vehicle, timestep=1e-3, sensors=[], rng=np.random.default_rng(0))
+    navigation = Witness(vehicle, timestep=1e-3, sensors={}, rng=np.random.default_rng(0))
     with Plant(vehicle, limit_speeds=True) as plant:
         fly_scripted(plant, Scripted(np.full((2, 4), 300.0)), navigation=navigation)
     np.testing.assert_array_equal(received, np.full((2, 4), vehicle.speed_max))
@@ -214,7 +218,7 @@ def test_the_estimator_receives_the_saturated_command(vehicle: Vehicle) -> None:
 
 def test_a_sample_that_is_not_a_number_is_counted(vehicle: Vehicle, speeds: Array) -> None:
     fault = SensorFault(sensor=SensorName.RATES, kind=FaultKind.NAN, start=0.1, stop=0.2)
-    navigation = Navigation(vehicle, timestep=1e-3, sensors=[], rng=np.random.default_rng(0), faults=[fault])
+    navigation = Navigation(vehicle, timestep=1e-3, sensors={}, rng=np.random.default_rng(0), faults=[fault])
     with Plant(vehicle) as plant:
         log = fly_scripted(plant, Scripted(speeds), navigation=navigation)
     assert estimation(log.control)["not_finite"] == 2
@@ -335,7 +339,7 @@ def test_a_sliding_vehicle_is_stopped_by_friction(vehicle: Vehicle) -> None:
     assert abs(state[1]) < 1e-3
 
 
-COMMAND = Command(speeds=np.zeros(4), plan=np.zeros((1, 4)), iterations=12)
+COMMAND = Command(speeds=np.zeros(4), plan=np.zeros((1, 4)), stats=Statistics(iterations=12))
 
 
 def delay(computation: Computation, time: float = 0.0) -> float:

@@ -114,7 +114,7 @@ def test_state_comes_out_with_euler_rates_and_unwrapped_yaw(vehicle: Vehicle) ->
         yaws = []
         rows = []
         for _ in range(80):
-            rows.append(plant.advance(hover, STEPS).physics)
+            rows.append(plant.advance(hover, STEPS)["physics"])
             yaws.append(plant.state()[10])
     np.testing.assert_allclose(yaws, 4.0 * PERIOD * np.arange(1, 81), atol=1e-9)  # sixteen radians, no jump
     np.testing.assert_allclose(physics_to_state(np.concatenate(rows))[-1, 10], 16.0, atol=1e-9)
@@ -183,7 +183,7 @@ def test_equal_commands_give_equal_bits(vehicle: Vehicle) -> None:
     def fly() -> Array:
         with Plant(vehicle) as plant:
             plant.reset(make_state())
-            return np.concatenate([plant.advance(speeds, STEPS).physics for speeds in holds])
+            return np.concatenate([plant.advance(speeds, STEPS)["physics"] for speeds in holds])
 
     np.testing.assert_array_equal(fly(), fly())
 

@@ -36,7 +36,7 @@ def flown(vehicle: Vehicle, effects: Effects, steps: int, start: Array = START, 
     """The last state of MuJoCo's order after so many steps."""
     with Plant(vehicle, effects=effects, **settings) as plant:
         plant.reset(start)
-        return plant.advance(SPEEDS, steps).physics[-1]
+        return plant.advance(SPEEDS, steps)["physics"][-1]
 
 
 def rates(x: Array, vehicle: Vehicle, wind: Array) -> Array:
@@ -130,11 +130,10 @@ def test_its_wrench_is_the_mean_of_what_acted(torrente: Vehicle) -> None:
     """Impulse: m dv is what gravity, the rotors and the recorded force gave."""
     with Plant(torrente, effects=DRAG, timestep=5e-4, integrator="rk4") as plant:
         plant.reset(START)
-        segment = plant.advance(np.zeros(4), 200)
-    assert segment.wrench is not None
-    gained = segment.physics[-1, 8:11] - START[[1, 3, 5]]
+        flown = plant.advance(np.zeros(4), 200)
+    gained = flown["physics"][-1, 8:11] - START[[1, 3, 5]]
     fallen = np.array([0.0, 0.0, -torrente.gravity * 0.1])
-    np.testing.assert_allclose(gained - fallen, segment.wrench[:, :3].sum(axis=0) * 5e-4 / torrente.mass, atol=1e-12)
+    np.testing.assert_allclose(gained - fallen, flown["wrench"][:, :3].sum(axis=0) * 5e-4 / torrente.mass, atol=1e-12)
 
 
 def test_drag_along_the_axes_alone_slows_a_fall_as_its_closed_form(torrente: Vehicle) -> None:
@@ -163,8 +162,8 @@ def test_thrust_noise_is_drawn_anew_in_each_step_and_again_after_a_reset(torrent
     noisy = Effects(thrust_noise=ThrustNoise(deviation=0.02))
     for integrator in ("rk4", "mujoco"):
         with Plant(torrente, effects=noisy, timestep=5e-4, integrator=integrator) as plant:
-            first = plant.advance(SPEEDS, 400).physics
+            first = plant.advance(SPEEDS, 400)["physics"]
             plant.reset(np.zeros(12))
-            np.testing.assert_array_equal(plant.advance(SPEEDS, 400).physics, first)
+            np.testing.assert_array_equal(plant.advance(SPEEDS, 400)["physics"], first)
         gains = np.diff(first[:, 10]) / 5e-4
         assert gains.std() == pytest.approx(2.0 * 0.02 * 20.0 * math.sqrt((SPEEDS[0] / 1000) ** 2), rel=0.15)

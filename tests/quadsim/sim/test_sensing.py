@@ -29,8 +29,8 @@ def physics() -> Array:
     return rows
 
 
-def sampler(sensor: Sensor, *faults: SensorFault, seed: int = 0) -> Sampler:
-    return Sampler(sensor, timestep=TIMESTEP, faults=faults, rng=np.random.default_rng(seed))
+def sampler(name: SensorName, sensor: Sensor, *faults: SensorFault, seed: int = 0) -> Sampler:
+    return Sampler(name, sensor, timestep=TIMESTEP, faults=faults, rng=np.random.default_rng(seed))
 
 
 def errors(samples: list[Sample], physics: Array) -> Array:
@@ -46,7 +46,7 @@ def errors(samples: list[Sample], physics: Array) -> Array:
 
 @pytest.mark.parametrize("name", list(SensorName))
 def test_a_perfect_sensor_reports_the_truth(name: SensorName, physics: Array) -> None:
-    samples = sampler(Sensor(name=name, rate=100.0)).sample(physics, 0)
+    samples = sampler(name, Sensor(rate=100.0)).sample(physics, 0)
     assert [sample.taken for sample in samples] == list(range(0, STEPS + 1, 10))
     assert np.abs(errors(samples, physics)).max() < 1e-12
 
@@ -54,8 +54,9 @@ def test_a_perfect_sensor_reports_the_truth(name: SensorName, physics: Array) ->
 @pytest.mark.parametrize("name", list(SensorName))
 def test_noise_and_bias_are_as_stated_on_each_axis(name: SensorName, physics: Array) -> None:
     noise, bias = np.array([0.01, 0.02, 0.05]), np.array([0.1, -0.2, 0.05])
-    sensor = Sensor(name=name, rate=1000.0, noise=tuple(noise), bias=tuple(bias))
-    result = errors(sampler(sensor).sample(physics, 0), physics)
+    stated = [np.degrees(v) if name in ("attitude", "rates") else v for v in (noise, bias)]
+    sensor = Sensor(rate=1000.0, noise=tuple(stated[0]), bias=tuple(stated[1]))
+    result = errors(sampler(name, sensor).sample(physics, 0), physics)
     np.testing.assert_allclose(result.mean(0), bias, atol=4 * noise.max() / np.sqrt(STEPS))
     np.testing.assert_allclose(result.std(0), noise, rtol=4 / np.sqrt(2 * STEPS))  # of a standard deviation, 4 sigma
     corr = np.corrcoef(result[1:].T, result[:-1].T)
@@ -64,8 +65,10 @@ def test_noise_and_bias_are_as_stated_on_each_axis(name: SensorName, physics: Ar
 
 def test_the_variance_of_a_walking_bias_grows_as_time() -> None:
     rest = np.zeros((101, 14))
-    sensor = Sensor(name=SensorName.VELOCITY, rate=20.0, bias=(0.3, 0.0, 0.0), bias_walk=(0.1, 0.2, 0.4))
-    walks = np.array([[s.value for s in sampler(sensor, seed=seed).sample(rest, 0)] for seed in range(1000)])
+    sensor = Sensor(rate=20.0, bias=(0.3, 0.0, 0.0), bias_walk=(0.1, 0.2, 0.4))
+    walks = np.array(
+        [[s.value for s in sampler(SensorName.VELOCITY, sensor, seed=seed).sample(rest, 0)] for seed in range(1000)]
+    )
     assert walks[:, 0].tolist() == [[0.3, 0.0, 0.0]] * 1000
     t = 0.05 * np.arange(1, walks.shape[1])
     expected = np.outer(t, np.square(sensor.bias_walk))
@@ -73,22 +76,20 @@ def test_the_variance_of_a_walking_bias_grows_as_time() -> None:
 
 
 def test_rates_and_delays_are_exact(physics: Array) -> None:
-    samples = sampler(Sensor(name=SensorName.POSITION, rate=40.0, delay=0.11)).sample(physics[:101], 0)
+    samples = sampler(SensorName.POSITION, Sensor(rate=40.0, delay=0.11)).sample(physics[:101], 0)
     assert [(sample.taken, sample.arrival) for sample in samples] == [(25 * i, 25 * i + 110) for i in range(5)]
 
 
 def test_the_share_lost_is_as_stated(physics: Array) -> None:
-    samples = sampler(Sensor(name=SensorName.RATES, rate=1000.0, dropout=0.3)).sample(physics, 0)
+    samples = sampler(SensorName.RATES, Sensor(rate=1000.0, dropout=0.3)).sample(physics, 0)
     assert len(samples) / STEPS == pytest.approx(0.7, abs=4 * np.sqrt(0.3 * 0.7 / STEPS))
-    assert not sampler(Sensor(name=SensorName.RATES, rate=1000.0, dropout=1.0)).sample(physics, 0)
+    assert not sampler(SensorName.RATES, Sensor(rate=1000.0, dropout=1.0)).sample(physics, 0)
 
 
 def test_outliers_widen_the_noise_of_their_share_of_samples(physics: Array) -> None:
-    sensor = Sensor(
-        name=SensorName.POSITION, rate=1000.0, noise=(0.1, 0.1, 0.1), outliers=Outliers(probability=0.1, size=20.0)
-    )
-    result = errors(sampler(sensor).sample(physics, 0), physics)
-    clean = errors(sampler(replace(sensor, outliers=None)).sample(physics, 0), physics)
+    sensor, name = Sensor(rate=1000.0, noise=0.1, outliers=Outliers(probability=0.1, size=20.0)), SensorName.POSITION
+    result = errors(sampler(name, sensor).sample(physics, 0), physics)
+    clean = errors(sampler(name, replace(sensor, outliers=None)).sample(physics, 0), physics)
     widened = np.isclose(result, 20.0 * clean, rtol=1e-6, atol=1e-9)
     assert np.all(widened | np.isclose(result, clean, rtol=1e-6, atol=1e-9))
     assert np.all(widened.all(axis=1) == widened.any(axis=1))  # all axes of a sample together
@@ -99,16 +100,15 @@ def test_outliers_widen_the_noise_of_their_share_of_samples(physics: Array) -> N
 @pytest.mark.parametrize("cuts", [(1,), (7,), (50,), (13, 200, 1)])
 def test_samples_do_not_depend_on_how_time_is_cut(name: SensorName, cuts: tuple[int, ...], physics: Array) -> None:
     sensor = Sensor(
-        name=name,
         rate=200.0,
-        noise=(0.1, 0.1, 0.1),
-        bias_walk=(0.1, 0.1, 0.1),
+        noise=0.1,
+        bias_walk=0.1,
         dropout=0.2,
         outliers=Outliers(probability=0.2, size=5.0),
     )
     freeze = SensorFault(sensor=name, kind=FaultKind.FREEZE, start=0.1, stop=0.2)
-    whole = sampler(sensor, freeze).sample(physics[:401], 0)
-    pieces, at, first, again = [], 0, 0, sampler(sensor, freeze)
+    whole = sampler(name, sensor, freeze).sample(physics[:401], 0)
+    pieces, at, first, again = [], 0, 0, sampler(name, sensor, freeze)
     again.sample(physics[:100], 0)
     again.reset()
     while first < 401:
@@ -118,18 +118,18 @@ def test_samples_do_not_depend_on_how_time_is_cut(name: SensorName, cuts: tuple[
     assert [(s.taken, s.arrival, s.value.tolist()) for s in pieces] == [
         (s.taken, s.arrival, s.value.tolist()) for s in whole
     ]
-    other = sampler(sensor, freeze, seed=1).sample(physics[:401], 0)
+    other = sampler(name, sensor, freeze, seed=1).sample(physics[:401], 0)
     assert [s.value.tolist() for s in other] != [s.value.tolist() for s in whole]
 
 
 @pytest.mark.parametrize(
     "change",
-    [{"noise": (1.0, 1.0, 1.0)}, {"bias_walk": (1.0, 1.0, 1.0)}, {"outliers": Outliers(probability=0.5, size=3.0)}],
+    [{"noise": 1.0}, {"bias_walk": (1.0, 1.0, 1.0)}, {"outliers": Outliers(probability=0.5, size=3.0)}],
 )
 def test_one_imperfection_leaves_the_draws_of_the_others_alone(change: dict[str, Any], physics: Array) -> None:
-    sensor = Sensor(name=SensorName.POSITION, rate=100.0, dropout=0.5)
-    plain = sampler(sensor).sample(physics, 0)
-    assert [s.taken for s in sampler(replace(sensor, **change)).sample(physics, 0)] == [s.taken for s in plain]
+    sensor, name = Sensor(rate=100.0, dropout=0.5), SensorName.POSITION
+    plain = sampler(name, sensor).sample(physics, 0)
+    assert [s.taken for s in sampler(name, replace(sensor, **change)).sample(physics, 0)] == [s.taken for s in plain]
 
 
 # --- faults --------------------------------------------------------------------------------------------------------
@@ -137,7 +137,7 @@ def test_one_imperfection_leaves_the_draws_of_the_others_alone(change: dict[str,
 
 def befallen(physics: Array, kind: FaultKind, **more: Any) -> dict[int, Array]:
     fault = SensorFault(sensor=SensorName.POSITION, kind=kind, start=0.1, stop=0.2, **more)
-    samples = sampler(Sensor(name=SensorName.POSITION, rate=100.0), fault).sample(physics[:301], 0)
+    samples = sampler(SensorName.POSITION, Sensor(rate=100.0), fault).sample(physics[:301], 0)
     return {sample.taken: sample.value for sample in samples}
 
 
@@ -158,13 +158,13 @@ def test_faults_hold_from_their_start_until_before_their_end(physics: Array) -> 
 
 def test_a_sensor_frozen_from_the_start_repeats_its_first_sample(physics: Array) -> None:
     fault = SensorFault(sensor=SensorName.POSITION, kind=FaultKind.FREEZE, start=0.0)
-    samples = sampler(Sensor(name=SensorName.POSITION, rate=100.0), fault).sample(physics[:301], 0)
+    samples = sampler(SensorName.POSITION, Sensor(rate=100.0), fault).sample(physics[:301], 0)
     assert all(np.array_equal(sample.value, physics[0, 1:4]) for sample in samples)
 
 
 def test_the_fault_of_another_sensor_changes_nothing(physics: Array) -> None:
     fault = SensorFault(sensor=SensorName.VELOCITY, kind=FaultKind.NAN, start=0.0)
-    samples = sampler(Sensor(name=SensorName.POSITION, rate=100.0), fault).sample(physics[:301], 0)
+    samples = sampler(SensorName.POSITION, Sensor(rate=100.0), fault).sample(physics[:301], 0)
     assert len(samples) == 31
     assert np.abs(errors(samples, physics)).max() == 0.0
 

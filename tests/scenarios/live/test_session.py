@@ -376,8 +376,7 @@ def test_the_scenario_made_for_sessions_can_have_every_input_and_withstands_a_br
     flown(session, 160)
     assert session.reason is None
     assert (
-        abs(session.flights[0].loop.last.observation.reference[2] - session.flights[0].loop.last.segment.physics[-1, 3])
-        < 0.05
+        abs(session.flights[0].loop.last.observation.reference[2] - session.flights[0].loop.last.position[-1, 2]) < 0.05
     )
     session.close()
 

@@ -107,7 +107,7 @@ def test_a_recording_has_every_pose_with_the_first_vehicle_in_the_middle(
         for vehicle, sample in enumerate(frame.samples):
             assert sample is not None
             shown = [at for k, at in poses[f"/flight/vehicle{vehicle}"].items() if k <= i][-1]
-            assert shown == pytest.approx(sample.segment.physics[-1, 1:4], abs=1e-4)
+            assert shown == pytest.approx(sample.position[-1], abs=1e-4)
         root = [at for k, at in poses["/flight"].items() if k <= i][-1]
         assert root == pytest.approx(-[at for k, at in poses["/flight/vehicle0"].items() if k <= i][-1], abs=1e-4)
     camera = {m["type"]: m for time, m in messages if m["type"].startswith("SetCamera") and time == 0.0}

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from support import scenario_table
 
-from quadsim.sim.sensing import FaultKind, SensorFault, SensorName
+from quadsim.sim.sensing import FaultKind, Outliers, SensorFault, SensorName, in_si
 from quadsim.vehicle import Vehicle
 from scenarios.assembly import Assembly, make_fault
 from scenarios.loading import parse_scenario
@@ -27,16 +27,20 @@ def scenario(**tables: Any) -> Scenario:
     return parse_scenario(scenario_table() | tables)
 
 
-def test_sensors_are_in_si_units() -> None:
-    position, attitude, rates = Assembly(scenario(sensors=SENSORS)).sensors
-    assert (position.name, position.rate, position.delay) == (SensorName.POSITION, 20.0, 0.11)
-    assert position.noise == (0.1, 0.1, 0.2)
-    assert attitude.noise == pytest.approx([math.radians(1.0)] * 3)
-    assert (attitude.outliers.probability, attitude.outliers.size) == (0.01, 10.0)
-    assert rates.noise == pytest.approx([math.radians(0.3)] * 3)
-    assert rates.bias == pytest.approx([math.radians(0.5), math.radians(-0.5), 0.0])
-    assert rates.bias_walk == pytest.approx([math.radians(0.002)] * 3)
-    assert rates.dropout == 0.1
+def test_sensors_are_in_the_file_s_units_and_convert_to_si() -> None:
+    sensors = Assembly(scenario(sensors=SENSORS)).sensors
+    assert [*sensors] == [SensorName.POSITION, SensorName.ATTITUDE, SensorName.RATES]
+    position, attitude, rates = sensors.values()
+    assert (position.rate, position.delay, rates.dropout) == (20.0, 0.11, 0.1)
+    assert attitude.outliers == Outliers(probability=0.01, size=10.0)
+    for name, value, expected in (
+        (SensorName.POSITION, position.noise, [0.1, 0.1, 0.2]),
+        (SensorName.ATTITUDE, attitude.noise, [math.radians(1.0)] * 3),
+        (SensorName.RATES, rates.noise, [math.radians(0.3)] * 3),
+        (SensorName.RATES, rates.bias, [math.radians(0.5), math.radians(-0.5), 0.0]),
+        (SensorName.RATES, rates.bias_walk, [math.radians(0.002)] * 3),
+    ):
+        assert in_si(name, value) == pytest.approx(expected)
 
 
 def test_the_estimator_flies_by_its_table(vehicle: Vehicle) -> None:

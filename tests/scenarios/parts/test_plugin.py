@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from support import NO_PRODUCTS
 
-from quadsim.controller import Command, StepInputs
+from quadsim.controller import Command, Statistics, StepInputs
 from quadsim.errors import CommandError, InputError
 from quadsim.state import Array
 from scenarios.assembly import Assembly
@@ -129,7 +129,7 @@ def test_without_predict_a_run_has_no_horizon_and_with_it_has_one(written: Write
 
 
 FULL = """
-from quadsim.controller import Command
+from quadsim.controller import Command, Statistics
 import numpy as np
 
 class Hover:
@@ -140,7 +140,7 @@ class Hover:
         self.speeds = speeds
     def step(self, now, state, reference):
         state[:], reference[:] = np.nan, np.nan
-        return Command(speeds=self.speeds, plan=np.tile(self.speeds, (self.horizon, 1)), iterations=3)
+        return Command(speeds=self.speeds, plan=np.tile(self.speeds, (self.horizon, 1)), stats=Statistics(iterations=3))
 """
 
 
@@ -191,7 +191,8 @@ class Answers:
         ("speeds", None, "its speeds must have shape"),
         ("plan", np.zeros((2, 4)), r"its plan must have shape \(3, 4\); got \(2, 4\)"),
         ("status", None, "'NoneType' object has no attribute"),
-        ("iterations", 2.5, "'float' object cannot be interpreted as an integer"),
+        ("stats", Statistics(iterations=2.5), "'float' object cannot be interpreted as an integer"),  # type: ignore[arg-type]
+        ("stats", (1, 2), r"its stats must be quadsim.Statistics; got \(1, 2\)"),
         ("inner", 500.0, "'float' object has no attribute 'rate'"),
     ],
 )

@@ -13,7 +13,7 @@ from quadsim.sim.effects import Disturbance, Effects, ThrustNoise
 from quadsim.sim.effects.battery import EFFICIENCY, Battery
 from quadsim.sim.effects.load import PayloadPickup
 from quadsim.sim.effects.rotors import RotorChange, RotorDynamics
-from quadsim.sim.physics import Integrator, Segment
+from quadsim.sim.physics import Integrator
 from quadsim.sim.plant import Plant
 from quadsim.state import N_STATES, Array
 from quadsim.vehicle import Vehicle, load_vehicle
@@ -94,9 +94,8 @@ def test_momentum_theory_gives_the_current_of_hover() -> None:
 def fallen(vehicle: Vehicle, effects: Effects, speeds: Array, integrator: Integrator = "mujoco") -> tuple[Array, Array]:
     """(200,) vertical acceleration [m/s^2] and (200, 2) battery while commands hold."""
     with Plant(vehicle, effects=effects, integrator=integrator) as plant:
-        segment = plant.advance(speeds, 200)
-    assert segment.battery is not None
-    return np.diff(segment.physics[:, 10], prepend=0.0) / TIMESTEP, segment.battery
+        flown = plant.advance(speeds, 200)
+    return np.diff(flown["physics"][:, 10], prepend=0.0) / TIMESTEP, flown["battery"]
 
 
 @pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
@@ -117,13 +116,13 @@ def test_thrust_has_the_factor_of_the_voltage(
 def test_a_weak_rotor_draws_its_share_and_its_torque_sags_with_its_thrust(vehicle: Vehicle) -> None:
     effects = Effects(battery=SMALL, rotors=RotorDynamics(efficiency=(1.0, 0.0, 0.0, 0.0)))
     with Plant(vehicle, effects=effects) as plant:
-        segment = plant.advance(plant.hover_speeds, 1)
+        flown = plant.advance(plant.hover_speeds, 1)
     expected, _ = discharged(SMALL, 0.25, 1)
-    np.testing.assert_allclose(segment.battery, expected, rtol=1e-14)
+    np.testing.assert_allclose(flown["battery"], expected, rtol=1e-14)
     b, d = vehicle.thrust_coefficient, vehicle.drag_coefficient
     factor, spin = (expected[0, 0] / 16.0) ** 2, vehicle.rotor_spins[0]
     rate = spin * d / b * factor * 0.25 * vehicle.mass * vehicle.gravity / vehicle.inertia[2] * TIMESTEP
-    assert segment.physics[0, 13] == pytest.approx(rate, rel=1e-6)
+    assert flown["physics"][0, 13] == pytest.approx(rate, rel=1e-6)
 
 
 @pytest.mark.parametrize("lag", [None, 0.02])
@@ -140,9 +139,8 @@ def test_a_flight_does_not_depend_on_how_its_holds_are_cut(
     with Plant(vehicle, effects=effects, changes=changes) as plant:
         for parts in (1, 5, 50):
             plant.reset(np.zeros(N_STATES))
-            segment = Segment.join([plant.advance(speeds, 50 // parts) for _ in range(parts)])
-            assert segment.battery is not None
-            flights.append(np.hstack([segment.physics, segment.battery]))
+            flown = np.concatenate([plant.advance(speeds, 50 // parts) for _ in range(parts)])
+            flights.append(np.hstack([flown["physics"], flown["battery"]]))
     tolerance = 1e-12 if lag else 0.0
     for flight in flights[1:]:
         np.testing.assert_allclose(flight, flights[0], rtol=tolerance, atol=tolerance)
@@ -154,6 +152,6 @@ def test_without_a_battery_nothing_is_recorded_and_at_its_reference_voltage_noth
     for battery in (None, ideal):
         with Plant(vehicle, effects=Effects(battery=battery)) as plant:
             segments.append(plant.advance(1.02 * plant.hover_speeds, 100))
-    assert segments[0].battery is None
-    np.testing.assert_array_equal(segments[0].physics, segments[1].physics)
-    assert segments[1].physics[-1, 3] > 0.0
+    assert "battery" not in (segments[0].dtype.names or ())
+    np.testing.assert_array_equal(segments[0]["physics"], segments[1]["physics"])
+    assert segments[1]["physics"][-1, 3] > 0.0

@@ -72,9 +72,8 @@ def test_body_drag_is_half_rho_area_speed_squared(vehicle: Vehicle, axis: int, n
     areas = (0.02, 0.03, 0.06)
     with Plant(vehicle, effects=Effects(air=Air(body_drag=areas, density=1.2))) as plant:
         plant.reset(moving(**{name: 8.0}))
-        wrench = plant.advance(plant.hover_speeds, 2000).wrench
+        wrench = plant.advance(plant.hover_speeds, 2000)["wrench"]
         speed = plant.state()[[1, 3, 5]][axis]
-    assert wrench is not None
     decay = 0.5 * 1.2 * areas[axis] / vehicle.mass  # dv/dt = -decay v^2
     assert speed == pytest.approx(8.0 / (1.0 + 8.0 * decay * 2.0), rel=1e-9)
     assert wrench[0, axis] == pytest.approx(-decay * vehicle.mass * 64.0, rel=1e-2)
@@ -105,10 +104,9 @@ def test_only_the_air_speed_counts(vehicle: Vehicle, effects: Effects) -> None:
     """Moving with the wind is as standing in still air."""
     with Plant(vehicle, effects=effects, wind=still_air((4.0, -2.0, 0.0))) as plant:
         plant.reset(moving(vx=4.0, vy=-2.0))
-        segment = plant.advance(plant.hover_speeds, 100)
-    assert segment.wrench is not None
-    np.testing.assert_allclose(segment.wrench, 0.0, atol=1e-12)
-    np.testing.assert_array_equal(segment.wind, np.tile([4.0, -2.0, 0.0], (100, 1)))
+        flown = plant.advance(plant.hover_speeds, 100)
+    np.testing.assert_allclose(flown["wrench"], 0.0, atol=1e-12)
+    np.testing.assert_array_equal(flown["wind"], np.tile([4.0, -2.0, 0.0], (100, 1)))
 
 
 def test_a_gust_pushes_by_its_integral(vehicle: Vehicle) -> None:
@@ -156,17 +154,16 @@ def test_ground_effect_lifts_by_cheeseman_and_bennett(vehicle: Vehicle) -> None:
     speeds = vehicle.hover_speed * np.array([1.05, 0.95, 1.05, 0.95])
     with Plant(vehicle, effects=Effects(ground=Ground(effect=True, rotor_radius=radius))) as plant:
         plant.reset(make_state(position=(0.0, 0.0, height), euler=(roll, 0.0, 0.0)), speeds)
-        segment = plant.advance(speeds, 1)
+        flown = plant.advance(speeds, 1)
     floor, disc = -0.132, 0.034  # where the drawing has them
     above = height - floor + disc * math.cos(roll) + vehicle.rotor_positions[:, 1] * math.sin(roll)
     gains = vehicle.thrust_coefficient * speeds**2 * (1.0 / (1.0 - (radius / (4.0 * above)) ** 2) - 1.0)
-    assert segment.wrench is not None
     up = np.array([0.0, -math.sin(roll), math.cos(roll)])
-    np.testing.assert_allclose(segment.wrench[0, :3], gains.sum() * up, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(flown["wrench"][0, :3], gains.sum() * up, rtol=1e-9, atol=1e-12)
     torque = [gains @ vehicle.rotor_positions[:, 1], -gains @ vehicle.rotor_positions[:, 0], 0.0]
-    np.testing.assert_allclose(segment.wrench[0, 3:], torque, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(flown["wrench"][0, 3:], torque, rtol=1e-9, atol=1e-12)
     yaw_torque = vehicle.drag_coefficient * (np.array(vehicle.rotor_spins) @ speeds**2)
-    assert segment.physics[0, 13] == pytest.approx(1e-3 * yaw_torque / vehicle.inertia[2], rel=1e-3)
+    assert flown["physics"][0, 13] == pytest.approx(1e-3 * yaw_torque / vehicle.inertia[2], rel=1e-3)
 
 
 def test_a_lost_propeller_neither_drags_nor_carries_momentum(vehicle: Vehicle) -> None:
@@ -177,7 +174,7 @@ def test_a_lost_propeller_neither_drags_nor_carries_momentum(vehicle: Vehicle) -
     start[7] = 0.5
     with Plant(vehicle, effects=effects) as plant:
         plant.reset(start)
-        wrench = plant.advance(1.1 * plant.hover_speeds, 10).wrench
+        wrench = plant.advance(1.1 * plant.hover_speeds, 10)["wrench"]
     np.testing.assert_array_equal(wrench, np.zeros((10, 6)))
 
 
@@ -187,7 +184,7 @@ def test_a_second_flight_meets_the_same_wind(vehicle: Vehicle) -> None:
         winds = []
         for _ in range(2):
             plant.reset(HIGH)
-            winds.append(plant.advance(plant.hover_speeds, 80).wind)
+            winds.append(plant.advance(plant.hover_speeds, 80)["wind"])
     np.testing.assert_array_equal(winds[0], winds[1])
     assert np.ptp(winds[0]) > 1.0
 
@@ -218,7 +215,7 @@ def test_a_plant_taken_step_by_step_flies_as_in_one_call(vehicle: Vehicle) -> No
     for effects in (Effects(), Effects(air=Air(rotor_drag=1e-300))):
         with Plant(vehicle, effects=effects) as plant:
             plant.reset(make_state())
-            ends.append(np.concatenate([plant.advance(command, 50).physics for command in commands]))
+            ends.append(np.concatenate([plant.advance(command, 50)["physics"] for command in commands]))
     np.testing.assert_allclose(ends[1], ends[0], rtol=0.0, atol=1e-13)
 
 

@@ -44,7 +44,7 @@ def test_inertia_errors_scale_angular_acceleration(vehicle: Vehicle) -> None:
     for factors in ((1.0, 1.0, 1.0), (1.2, 1.1, 0.9)):
         with Plant(vehicle, effects=Effects(load=Load(inertia_factor=factors))) as plant:
             plant.reset(make_state())
-            rates[factors] = plant.advance(speeds, 1).physics[0, 11:]
+            rates[factors] = plant.advance(speeds, 1)["physics"][0, 11:]
     np.testing.assert_allclose(rates[(1.0, 1.0, 1.0)] / rates[(1.2, 1.1, 0.9)], [1.2, 1.1, 0.9], rtol=1e-5)
 
 
@@ -53,7 +53,7 @@ def test_a_shifted_centre_of_mass_tips_the_vehicle(vehicle: Vehicle) -> None:
     shift = 0.01
     with Plant(vehicle, effects=Effects(load=Load(centre_of_mass=(shift, 0.0, 0.0)))) as plant:
         plant.reset(make_state(position=(0.0, 0.0, 100.0)))
-        row = plant.advance(plant.hover_speeds, 1).physics[0]
+        row = plant.advance(plant.hover_speeds, 1)["physics"][0]
     weight = vehicle.mass * vehicle.gravity
     assert row[12] / 1e-3 == pytest.approx(shift * weight / vehicle.inertia[1], rel=1e-5)  # thrust behind the centre
     assert row[10] / 1e-3 == pytest.approx(
@@ -70,7 +70,7 @@ def test_payload_is_taken_up_and_let_go(vehicle: Vehicle) -> None:
     with Plant(vehicle, changes=changes) as plant:
         for _ in range(2):  # the second flight begins as the first did
             plant.reset(make_state(position=(0.0, 0.0, 100.0)))
-            slopes = np.diff(plant.advance(plant.hover_speeds, 1500).physics[:, 10]) / 1e-3
+            slopes = np.diff(plant.advance(plant.hover_speeds, 1500)["physics"][:, 10]) / 1e-3
             m, g = vehicle.mass, vehicle.gravity
             for first, last, carried in ((0, 199, 0.0), (200, 499, 1.0), (500, 999, 2.0), (1000, 1498, 0.0)):
                 expected = m * g / (m + carried) - g

@@ -79,11 +79,11 @@ def simulate(
 def run(
     vehicle: Vehicle,
     motion: Motion,
-    sensors: tuple[Sensor, ...],
+    sensors: dict[SensorName, Sensor],
     settings: EstimatorSettings,
     *,
     seed: int,
-    believed: tuple[Sensor, ...] | None = None,
+    believed: dict[SensorName, Sensor] | None = None,
     chunk: int = 50,
     standing: range = range(0),
     **faults: Any,
@@ -96,11 +96,13 @@ def run(
     """
     rng = np.random.default_rng([8, seed])
     bias = math.radians(settings.initial_gyro_bias) * rng.standard_normal(3)
-    known = [replace(s, bias=tuple(bias)) if s.name is SensorName.RATES else s for s in sensors]
+    known = {
+        name: replace(s, bias=tuple(np.degrees(bias))) if name is SensorName.RATES else s for name, s in sensors.items()
+    }
     generators = rng.spawn(len(SensorName))
     samplers = [
-        Sampler(s, timestep=TIMESTEP, faults=faults.get("faults", ()), rng=g)
-        for s, g in zip(known, generators, strict=False)
+        Sampler(name, s, timestep=TIMESTEP, faults=faults.get("faults", ()), rng=g)
+        for (name, s), g in zip(known.items(), generators, strict=False)
     ]
     filter_ = ErrorStateFilter(vehicle, believed or sensors, settings, timestep=TIMESTEP)
     filter_.reset(motion.bias_free_mean(seed, 0), motion.commands[0], rng)

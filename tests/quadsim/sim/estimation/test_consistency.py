@@ -8,6 +8,7 @@ Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Na
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -25,16 +26,16 @@ FEW = 20
 """That are enough to see a noise that is wrong by half."""
 STEPS = 1000
 SETTINGS = EstimatorSettings(acceleration_noise=0.3, angular_acceleration_noise=1.0, gate=1.0 - 1e-12)
-SENSORS = (
-    Sensor(name=SensorName.POSITION, rate=20.0, noise=(0.05, 0.05, 0.1)),
-    Sensor(name=SensorName.VELOCITY, rate=20.0, noise=(0.1, 0.1, 0.1)),
-    Sensor(name=SensorName.ATTITUDE, rate=50.0, noise=(0.01, 0.01, 0.02)),
-    Sensor(name=SensorName.RATES, rate=100.0, noise=(0.01, 0.01, 0.01)),
-)
-LATE = tuple(
-    replace(sensor, delay={"position": 0.11, "velocity": 0.11, "attitude": 0.02}.get(sensor.name, 0.0))
-    for sensor in SENSORS
-)
+SENSORS = {
+    SensorName.POSITION: Sensor(rate=20.0, noise=(0.05, 0.05, 0.1)),
+    SensorName.VELOCITY: Sensor(rate=20.0, noise=0.1),
+    SensorName.ATTITUDE: Sensor(rate=50.0, noise=tuple(np.degrees([0.01, 0.01, 0.02]))),
+    SensorName.RATES: Sensor(rate=100.0, noise=math.degrees(0.01)),
+}
+LATE = {
+    name: replace(sensor, delay={"position": 0.11, "velocity": 0.11, "attitude": 0.02}.get(name, 0.0))
+    for name, sensor in SENSORS.items()
+}
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +54,10 @@ def within(total: float, count: int) -> bool:
 
 @pytest.mark.parametrize("sensors", [SENSORS, LATE], ids=["prompt", "late"])
 def test_errors_and_innovations_match_the_filters_covariance(
-    sensors: tuple[Sensor, ...], motion: Any, run_filter: Callable[..., Any]
+    sensors: dict[SensorName, Sensor], motion: Any, run_filter: Callable[..., Any]
 ) -> None:
     last, middle = [], []
-    nis = {sensor.name: 0.0 for sensor in sensors}
+    nis = dict.fromkeys(sensors, 0.0)
     counts = dict.fromkeys(nis, 0)
     for seed in range(SEEDS):
         filter_, _, _, nees = run_filter(motion, sensors, SETTINGS, seed=seed, chunk=250)
@@ -77,7 +78,7 @@ def test_errors_and_innovations_match_the_filters_covariance(
 def test_a_filter_with_the_wrong_noise_fails_the_same_test(
     factor: float, motion: Any, run_filter: Callable[..., Any]
 ) -> None:
-    believed = tuple(replace(s, noise=tuple(np.sqrt(factor) * np.array(s.noise))) for s in SENSORS)
+    believed = {name: replace(s, noise=tuple(np.sqrt(factor) * np.ones(3) * s.noise)) for name, s in SENSORS.items()}
     runs = [run_filter(motion, SENSORS, SETTINGS, seed=seed, believed=believed, chunk=250) for seed in range(FEW)]
     assert not within(sum(nees[-1] for *_, nees in runs), 15 * FEW)
     for name in (SensorName.POSITION, SensorName.ATTITUDE):

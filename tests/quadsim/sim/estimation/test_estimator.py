@@ -13,16 +13,21 @@ import pytest
 from quadsim.errors import ParameterError
 from quadsim.sim.error_state import EstimatorSettings
 from quadsim.sim.estimator import ErrorStateFilter
-from quadsim.sim.sensing import FaultKind, Outliers, Sample, Sensor, SensorFault, SensorName
+from quadsim.sim.sensing import FaultKind, Outliers, Sample, Sensor, SensorFault, SensorName, in_si
 from quadsim.vehicle import Vehicle
 
 SETTINGS = EstimatorSettings(acceleration_noise=0.1, angular_acceleration_noise=0.5)
-POSITION = Sensor(name=SensorName.POSITION, rate=20.0, noise=(0.05, 0.05, 0.05))
-VELOCITY = Sensor(name=SensorName.VELOCITY, rate=20.0, noise=(0.05, 0.05, 0.05))
-ATTITUDE = Sensor(name=SensorName.ATTITUDE, rate=50.0, noise=(0.01, 0.01, 0.01))
-RATES = Sensor(name=SensorName.RATES, rate=100.0, noise=(0.01, 0.01, 0.01))
-SENSORS = (POSITION, VELOCITY, ATTITUDE, RATES)
+SENSORS = {
+    SensorName.POSITION: Sensor(rate=20.0, noise=0.05),
+    SensorName.VELOCITY: Sensor(rate=20.0, noise=0.05),
+    SensorName.ATTITUDE: Sensor(rate=50.0, noise=math.degrees(0.01)),
+    SensorName.RATES: Sensor(rate=100.0, noise=math.degrees(0.01)),
+}
 SIMULATE = Callable[..., Any]
+
+
+def without(*names: SensorName) -> dict[SensorName, Sensor]:
+    return {name: sensor for name, sensor in SENSORS.items() if name not in names}
 
 
 def hover(vehicle: Vehicle, steps: int) -> np.ndarray:
@@ -45,7 +50,10 @@ def test_without_disturbance_and_with_little_noise_the_estimate_becomes_the_trut
     still = EstimatorSettings(acceleration_noise=0.0, angular_acceleration_noise=0.0, gyro_bias_walk=0.0)
     commands = np.repeat(vehicle.hover_speed + np.random.default_rng(0).standard_normal((40, 4)), 50, axis=0)
     motion = simulate_motion(still, commands, seeds=1, rng=np.random.default_rng(0))
-    fine = tuple(replace(sensor, noise=(1e-4, 1e-4, 1e-4)) for sensor in SENSORS)
+    fine = {
+        name: replace(sensor, noise=1e-4 if name in ("position", "velocity") else math.degrees(1e-4))
+        for name, sensor in SENSORS.items()
+    }
     believed = replace(still, acceleration_noise=1e-3, angular_acceleration_noise=1e-2)
     _, errors, _, _ = run_filter(motion, fine, believed, seed=0)
     assert np.abs(errors[0]).max() > 1e-3  # the gyro's bias at first
@@ -54,8 +62,8 @@ def test_without_disturbance_and_with_little_noise_the_estimate_becomes_the_trut
 
 def test_the_estimate_is_better_than_the_samples(gentle: Any, run_filter: SIMULATE) -> None:
     errors = [run_filter(gentle, SENSORS, SETTINGS, seed=seed)[1][20:] for seed in range(4)]
-    assert rms(errors, slice(0, 3)) < 0.5 * POSITION.noise[0]
-    assert rms(errors, slice(6, 9)) < 0.5 * ATTITUDE.noise[0]
+    assert rms(errors, slice(0, 3)) < 0.5 * in_si(SensorName.POSITION, SENSORS[SensorName.POSITION].noise)[0]
+    assert rms(errors, slice(6, 9)) < 0.5 * in_si(SensorName.ATTITUDE, SENSORS[SensorName.ATTITUDE].noise)[0]
 
 
 def test_late_samples_are_weighted_by_their_time_stamp(
@@ -63,7 +71,7 @@ def test_late_samples_are_weighted_by_their_time_stamp(
 ) -> None:
     """Falling, a tenth of a second is worth many times the noise; the naive filter does not know the delay."""
     motion = simulate_motion(SETTINGS, 0.9 * hover(vehicle, 2000), seeds=4, rng=np.random.default_rng(2))
-    late = (replace(POSITION, delay=0.1), replace(VELOCITY, delay=0.1), ATTITUDE, RATES)
+    late = SENSORS | {name: replace(SENSORS[name], delay=0.1) for name in (SensorName.POSITION, SensorName.VELOCITY)}
     prompt, fused, naive = (
         rms([run_filter(motion, sensors, SETTINGS, seed=s, believed=believed)[1][20:] for s in range(4)], slice(0, 3))
         for sensors, believed in ((SENSORS, SENSORS), (late, late), (late, SENSORS))
@@ -74,21 +82,18 @@ def test_late_samples_are_weighted_by_their_time_stamp(
 
 def test_a_filter_at_a_late_horizon_finds_what_a_prompt_one_does(gentle: Any, run_filter: SIMULATE) -> None:
     """The same samples with and without a horizon: only the order of the computation differs."""
-    far = Sensor(
-        name=SensorName.VELOCITY, rate=0.1, noise=(1e6, 1e6, 1e6), delay=0.2
-    )  # no information, moves the horizon
-    none = replace(far, delay=0.0)
-    sensors = (POSITION, ATTITUDE, RATES)
-    _, prompt, deviations, _ = run_filter(gentle, (*sensors, none), SETTINGS, seed=0)
-    _, late, same, _ = run_filter(gentle, (*sensors, far), SETTINGS, seed=0)
+    far = Sensor(rate=0.1, noise=1e6, delay=0.2)  # no information, moves the horizon
+    (_, prompt, deviations, _), (_, late, same, _) = (
+        run_filter(gentle, SENSORS | {SensorName.VELOCITY: last}, SETTINGS, seed=0)
+        for last in (replace(far, delay=0.0), far)
+    )
     np.testing.assert_allclose(late, prompt, atol=1e-9)
     np.testing.assert_allclose(same, deviations, atol=1e-9)
 
 
-@pytest.mark.parametrize("sensors", [SENSORS, tuple(replace(s, delay=0.03) for s in SENSORS)], ids=["prompt", "late"])
-def test_estimates_do_not_depend_on_how_time_is_cut(
-    sensors: tuple[Sensor, ...], gentle: Any, run_filter: SIMULATE
-) -> None:
+@pytest.mark.parametrize("delay", [0.0, 0.03])
+def test_estimates_do_not_depend_on_how_time_is_cut(delay: float, gentle: Any, run_filter: SIMULATE) -> None:
+    sensors = {name: replace(sensor, delay=delay) for name, sensor in SENSORS.items()}
     _, whole, _, _ = run_filter(gentle, sensors, SETTINGS, seed=0, chunk=300)
     _, cut, _, _ = run_filter(gentle, sensors, SETTINGS, seed=0, chunk=12)
     assert np.array_equal(cut[24::25], whole)
@@ -128,7 +133,8 @@ def test_without_samples_the_covariance_grows_and_comes_back(gentle: Any, run_fi
 
 
 def test_outliers_are_refused_and_do_no_harm(gentle: Any, run_filter: SIMULATE) -> None:
-    wild = tuple(replace(sensor, outliers=Outliers(probability=0.1, size=100.0)) for sensor in SENSORS)
+    outliers = Outliers(probability=0.1, size=100.0)
+    wild = {name: replace(sensor, outliers=outliers) for name, sensor in SENSORS.items()}
     rejected, total, clean, dirty = 0, 0, [], []
     for seed in range(4):
         clean.append(run_filter(gentle, SENSORS, SETTINGS, seed=seed)[1][20:])
@@ -174,7 +180,7 @@ def test_a_velocity_far_off_is_found_again(gentle: Any, run_filter: SIMULATE) ->
     physics[:, 1001:, 8:11] += [5.0, 0.0, -7.0]
     physics[:, 1001:, 1:4] += after * [5.0, 0.0, -7.0]
     settings = replace(SETTINGS, patience=0.5)
-    sensors = (POSITION, ATTITUDE, RATES)
+    sensors = without(SensorName.VELOCITY)
     filter_, errors, deviations, _ = run_filter(replace(gentle, physics=physics), sensors, settings, seed=0)
     assert np.abs(errors[28, 3:6]).max() > 4.0  # at 1.45 s, still unbelieved
     assert np.all(np.abs(errors[42:, :6]) < 5.0 * deviations[42:, :6])  # from 2.15 s on
@@ -221,15 +227,17 @@ def test_it_never_fails_nor_answers_with_nan(vehicle: Vehicle) -> None:
     ("sensors", "message"),
     [
         (
-            (VELOCITY, ATTITUDE),
+            without(SensorName.POSITION, SensorName.RATES),
             r"estimator\.sensors must be such that position is among them; got \['velocity', 'attit",
         ),
         (
-            (POSITION, RATES),
+            without(SensorName.VELOCITY, SensorName.ATTITUDE),
             r"estimator\.sensors must be such that attitude is among them; got \['position', 'rates'\]",
         ),
     ],
 )
-def test_sensors_it_cannot_work_with_are_refused(sensors: tuple[Sensor, ...], message: str, vehicle: Vehicle) -> None:
+def test_sensors_it_cannot_work_with_are_refused(
+    sensors: dict[SensorName, Sensor], message: str, vehicle: Vehicle
+) -> None:
     with pytest.raises(ParameterError, match=f"^{message}"):
         ErrorStateFilter(vehicle, sensors, SETTINGS, timestep=1e-3)

@@ -27,11 +27,11 @@ from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
 SETTINGS = EstimatorSettings(acceleration_noise=0.1, angular_acceleration_noise=0.5, gyro_bias_walk=math.degrees(1e-3))
-SENSORS = (
-    Sensor(name=SensorName.POSITION, rate=100.0, noise=(0.01, 0.01, 0.01)),
-    Sensor(name=SensorName.ATTITUDE, rate=100.0, noise=(0.005, 0.005, 0.005)),
-    Sensor(name=SensorName.RATES, rate=500.0, noise=(0.0075, 0.0075, 0.0075)),
-)
+SENSORS = {
+    SensorName.POSITION: Sensor(rate=100.0, noise=0.01),
+    SensorName.ATTITUDE: Sensor(rate=100.0, noise=math.degrees(0.005)),
+    SensorName.RATES: Sensor(rate=500.0, noise=math.degrees(0.0075)),
+}
 REST = 900
 """Steps on the ground in the flights below."""
 FLIGHT = 600
@@ -121,11 +121,13 @@ def test_at_a_late_horizon_each_step_knows_whether_it_stood(takeoff: Any, run_fi
         physics=np.concatenate([takeoff.physics[:, REST:], still], axis=1),
         commands=np.concatenate([takeoff.commands[REST:], takeoff.commands[:REST]]),
     )
-    far = Sensor(name=SensorName.VELOCITY, rate=0.1, noise=(1e6, 1e6, 1e6), delay=0.2)
+    far = Sensor(rate=0.1, noise=1e6, delay=0.2)
     for motion, standing in ((takeoff, range(REST)), (landing, range(FLIGHT, FLIGHT + REST))):
         result: list[Array] = []
         for horizon in (replace(far, delay=0.0), far):
-            _, errors, deviations, _ = run_filter(motion, (*SENSORS, horizon), SETTINGS, seed=1, standing=standing)
+            _, errors, deviations, _ = run_filter(
+                motion, SENSORS | {SensorName.VELOCITY: horizon}, SETTINGS, seed=1, standing=standing
+            )
             result.append(np.hstack([errors, deviations]))
         np.testing.assert_allclose(result[1], result[0], atol=1e-9)
         stood = np.all(result[0][:, 3:6] == 0.0, axis=1)
@@ -133,7 +135,7 @@ def test_at_a_late_horizon_each_step_knows_whether_it_stood(takeoff: Any, run_fi
 
 
 def test_estimates_do_not_depend_on_how_time_on_the_ground_is_cut(takeoff: Any, run_filter: Callable[..., Any]) -> None:
-    late = tuple(replace(sensor, delay=0.03) for sensor in SENSORS)
+    late = {name: replace(sensor, delay=0.03) for name, sensor in SENSORS.items()}
     whole, cut = (
         run_filter(takeoff, late, SETTINGS, seed=0, chunk=chunk, standing=range(REST))[1] for chunk in (300, 12)
     )
