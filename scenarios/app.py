@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     VehicleName: TypeAlias = File
     ScenarioName: TypeAlias = Scenario | File
     CampaignName: TypeAlias = ScenarioName
-    Target: TypeAlias = Flight | ScenarioName
+    ComparedName: TypeAlias = Flight | ScenarioName
     Changes: TypeAlias = Mapping[Any, Any] | Sequence[str]
     Names: TypeAlias = Sequence[str]
     Whole = int
@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     UserCode = object
     UserForces = Sequence[object]
     UserReference: TypeAlias = Callable[[float], ArrayLike] | None
-    Fields: TypeAlias = Mapping[str, Any] | None
-    Draws: TypeAlias = Sequence[Mapping[str, Any]]
+    FieldValues: TypeAlias = Mapping[str, Any] | None
+    DrawTables: TypeAlias = Sequence[Mapping[str, Any]]
     Watched: TypeAlias = Progress | bool
     Flown: TypeAlias = Callable[[Flight], object] | None
 else:  # as cyclopts reads them: it resolves all annotations where a command is declared
@@ -82,14 +82,16 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
     Replay = Reproductions = ScenarioFile = TuningResult = VehicleReport = IdentifiedVehicle = Any
     File, Files = Path, Sequence[Path]
     VehicleName = _one_of(vehicle_names)
-    Target = ScenarioName = _one_of(scenario_names)
+    ComparedName = ScenarioName = _one_of(scenario_names)
     CampaignName, PaperName = _one_of(campaign_names), _one_of(paper_names)
     TuningName = _one_of(tuning_names)
     Changes = Annotated[Sequence[str], Parameter(name="--set")]
     Names = Annotated[Sequence[str], Parameter(name="--name")]
     Whole = Annotated[int, Parameter(converter=_whole)]
     Flag = Annotated[bool, Parameter(negative="")]
-    UserCode = UserForces = UserReference = Fields = Draws = Watched = Flown = Annotated[Any, Parameter(parse=False)]
+    UserCode = UserForces = UserReference = FieldValues = DrawTables = Watched = Flown = Annotated[
+        Any, Parameter(parse=False)
+    ]
 
 
 def _version() -> str:
@@ -524,12 +526,12 @@ def check(
     )
 )
 def compare(
-    *targets: Target,
+    *targets: ComparedName,
     out: File | None = None,
     overwrite: Flag = False,
     names: Names = (),
     markdown: Flag = False,
-    constraints: Target | None = None,
+    constraints: ComparedName | None = None,
     video: bool | None = None,
     recording: bool | None = None,
     figures: bool | None = None,
@@ -818,8 +820,8 @@ def campaign(
     junit: File | None = None,
     changes: Changes = (),
     seed: Whole | None = None,
-    vary: Draws = (),
-    fields: Fields = None,
+    vary: DrawTables = (),
+    fields: FieldValues = None,
     controller: UserCode = None,
     forces: UserForces = (),
     progress: Watched = True,
@@ -1178,14 +1180,14 @@ def identify(
         quadsim.errors.FileError: not-logged-yet.csv: is missing, or not a file
     """
     from quadsim.assets import vehicle_path
-    from scenarios.identify.report import NEEDED, identify_logs
+    from scenarios.identify.report import NEEDED_PARAMETERS, identify_logs
 
     if not logs:
         raise InputError("identify needs a flight log: CSV, Parquet, ULog, or a run directory")
     if vehicle is None:
         raise InputError(
             "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template > start.toml"
-            f" writes one; give your {NEEDED}, and estimates of the rest"
+            f" writes one; give your {NEEDED_PARAMETERS}, and estimates of the rest"
         )
     for name, path, ending in (("--out", out, ".toml"), ("--page", page, ".html")):
         if path is not None and Path(path).suffix != ending:

@@ -22,7 +22,7 @@ from mpc.fallback.contract import Guarded
 from mpc.ocp import InfeasiblePeriod
 from mpc.robust.settings import Robust
 from quadsim.errors import InputError
-from quadsim.flight.audit import TERMS, sum_signal
+from quadsim.flight.audit import TERM_SIGNALS, sum_signal
 from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.schema.base import fields_of
@@ -131,7 +131,7 @@ class _Case:
         if side.place == 0:
             name = [state for state in STATE_NAMES if state in self._spec.output_bounds][side.row]
             factor, field = math.degrees(1.0) if name in IN_DEGREES else 1.0, f"controller.output_bounds.{name}"
-            return _Bound(name=name, side=which, unit=TERMS[name].unit, factor=factor, field=field, entry=entry)
+            return _Bound(name=name, side=which, unit=TERM_SIGNALS[name].unit, factor=factor, field=field, entry=entry)
         polytope, name = self._polytope(side), self._infeasible_period.problem.every_constraint[side.place].name
         if self._is_space(side):
             return _Bound(name=name, side=which, unit="m", entry=side.row)

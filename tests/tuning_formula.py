@@ -13,7 +13,7 @@ import pytest
 import tomlkit
 
 from scenarios.campaign.plan import Plan
-from scenarios.campaign.rows import Row
+from scenarios.many import Row
 from scenarios.schema.scenario import Scenario
 from scenarios.tuning.tuning import TuningResult, fly_tuning
 from scenarios.tuning.tuning_plan import TuningPlan

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Fraction
-from quadsim.rotation import Vector, exponential, multiply, quaternion_to_euler
+from quadsim.rotation import Vector3, exponential, multiply, quaternion_to_euler
 from quadsim.state import Array
 
 AXES: Final = (0, 1, 2)
@@ -65,9 +65,9 @@ class Sensor(Sampling):
     """
 
     name: SensorName  # the measured quantity
-    noise: Vector = (0.0, 0.0, 0.0)  # standard deviation per axis, white from sample to sample
-    bias: Vector = (0.0, 0.0, 0.0)  # constant offset per axis
-    bias_walk: Vector = (0.0, 0.0, 0.0)
+    noise: Vector3 = (0.0, 0.0, 0.0)  # standard deviation per axis, white from sample to sample
+    bias: Vector3 = (0.0, 0.0, 0.0)  # constant offset per axis
+    bias_walk: Vector3 = (0.0, 0.0, 0.0)
     """The bias's random walk per axis [unit/sqrt(s)]: its variance grows by bias_walk^2 t."""
 
     def stride(self, timestep: float) -> int:
@@ -107,7 +107,7 @@ class SensorFault:
     start: float  # [s]
     stop: float = math.inf  # [s]; infinite for a permanent fault
     axes: tuple[int, ...] = AXES  # indices of the numbers that become NaN
-    offset: Vector = (0.0, 0.0, 0.0)
+    offset: Vector3 = (0.0, 0.0, 0.0)
     """The offset, in the sensor's unit; a rotation vector in the body frame for attitude."""
 
     def window(self, timestep: float) -> tuple[int, int | None]:

@@ -17,7 +17,7 @@ from mpc.core.numbers import Exportable
 from mpc.core.solver import WAYS, CoreProblem, core_library
 from mpc.export.ctext import CText, Precision
 from mpc.export.source import CHANGES, DATA, CController, part
-from mpc.export.targets import TARGETS, Target
+from mpc.export.targets import TARGETS, Machine
 from mpc.ocp import Problem
 from quadsim.controller import ROTORS
 from quadsim.errors import ExportError, ParameterError
@@ -204,7 +204,7 @@ def room_sentence(facts: Mapping[str, Any]) -> str:
     return f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory; {Reach(**facts['reach'])}"
 
 
-def programs(target: Target, precision: Precision) -> dict[str, str]:
+def programs(target: Machine, precision: Precision) -> dict[str, str]:
     """Return the files that run the controller on a target, by name."""
     names = ("main.c", "serial.c", "target.h", *target.sources, "LICENSE")
     return {name: part(name) for name in names} | {"Makefile": target.makefile(precision) + part("Makefile")}

@@ -15,8 +15,8 @@ from quadsim.errors import InputError, MissingPackageError
 from quadsim.outputs import Growing
 from quadsim.state import Array
 from scenarios.campaign.campaign_file import Choice, Integer, LogUniform, Value
-from scenarios.campaign.rows import Row
 from scenarios.campaign.store import Store
+from scenarios.many import Row
 from scenarios.tuning.tuning_plan import START, Searched, SearchPlan, TuningPlan, Values
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ from scenarios.campaign.campaign_file import (
     Varied,
     check_fields,
 )
-from scenarios.campaign.events import Event, is_comparable, parse_event
+from scenarios.campaign.events import CountedEvent, is_comparable, parse_event
 from scenarios.campaign.plan import (
     Plan,
     cell,
@@ -44,10 +44,10 @@ from scenarios.campaign.plan import (
     parse_campaign,
     read_campaign,
 )
-from scenarios.campaign.rows import Row
 from scenarios.campaign.statistics import Requirement, parse_requirement
 from scenarios.catalogue import tuning_path
 from scenarios.loading import parse_scenario
+from scenarios.many import Row
 from scenarios.schema.bases import merge
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.scenario import Scenario
@@ -162,7 +162,7 @@ class TuningPlan:
         return parse_requirement(self.spec.require)
 
     @cached_property
-    def guard(self) -> Event:
+    def guard(self) -> CountedEvent:
         """The event that counts in the search."""
         return parse_event(self.spec.guard or self.requirement.event.text, self.start.columns)
 
