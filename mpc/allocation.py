@@ -67,8 +67,8 @@ def allocate(allocation: Allocation, wrench: Array, lower: Array, upper: Array) 
 
 def _less_yaw(squares: Array, yaw: Array, low: Array, high: Array) -> Array | None:
     """Return the point of the line along `yaw` closest to `squares` and within the bounds; None if there is none."""
-    room = 1e-9 * max(float(high.max()), 1.0)  # rounding must not exclude a corner of the bounds
-    ends = np.sort(np.stack([(low - room - squares) / yaw, (high + room - squares) / yaw]), axis=0)
+    rounding = 1e-9 * max(float(high.max()), 1.0)  # rounding must not exclude a corner of the bounds
+    ends = np.sort(np.stack([(low - rounding - squares) / yaw, (high + rounding - squares) / yaw]), axis=0)
     first, last = ends[0].max(), ends[1].min()
     return squares + np.clip(0.0, first, last) * yaw if first <= last else None
 

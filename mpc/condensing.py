@@ -22,9 +22,9 @@ from mpc.qp import QP, PeriodQP, QPRows, Solution
 from quadsim.controller import UNCONSTRAINED
 from quadsim.state import N_STATES, REFERENCE_STATES, Array
 
-Flags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
+RowFlags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
-LARGEST: Final = 2**20
+LARGEST_QP: Final = 2**20
 """Largest size of the QP's matrices [entries] for which trying the unconstrained optimum first saves time."""
 ILL_CONDITIONED: Final = 1e-4
 """A Hessian is too ill-conditioned if a constant input, recovered from its gradient, has a larger error than this."""
@@ -80,7 +80,7 @@ class RowMaps:
     of_state: Array  # (N, m, n) in dx = x(k) - x_s
 
 
-def states_rows(C: Array, of_states: Flags, maps: Prediction, N: int) -> RowMaps:
+def states_rows(C: Array, of_states: RowFlags, maps: Prediction, N: int) -> RowMaps:
     """Return rows C (m, n) at x(k+1) .. x(k+N) if they depend on states alone, otherwise at x(k) .. x(k+N-1)."""
     n, columns = C.shape[1], maps.Psi.shape[1]
     Psi = np.concatenate([np.zeros((1, n, columns)), maps.Psi.reshape(N, n, columns)])
@@ -96,7 +96,7 @@ def row_maps(rows: QPRows, maps: Prediction) -> RowMaps:
     return replace(values, of_inputs=_with_inputs(values.of_inputs, rows))
 
 
-def _on_states(C: Array, of_states: Flags, S: Array) -> Array:
+def _on_states(C: Array, of_states: RowFlags, S: Array) -> Array:
     """Return (N, m, columns): rows C applied to the slopes S (N + 1, n, columns) of x(k) .. x(k+N)."""
     return np.asarray((C * of_states[:, None]) @ S[1:] + (C * ~of_states[:, None]) @ S[:-1])
 
@@ -301,7 +301,7 @@ class FreeOptimum:
         if not changing:
             self._factor, failed = lapack.dpotrf(H)
             hold = np.ones(len(H))
-            self._usable = form.qp.P.size + form.qp.G.size <= LARGEST and not failed
+            self._usable = form.qp.P.size + form.qp.G.size <= LARGEST_QP and not failed
             self._usable &= np.abs(lapack.dpotrs(self._factor, H @ hold)[0] - hold).max() < ILL_CONDITIONED
 
     def __call__(self, qp: QP) -> Solution | None:

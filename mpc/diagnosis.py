@@ -32,7 +32,7 @@ from mpc.solvers import QPSolver
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 
-SOLVER: Final = "piqp-multistage"
+DIAGNOSIS_SOLVER: Final = "piqp-multistage"
 """Solves the suggested problems; the flight may use another solver."""
 FEASIBLE: Final = 1e-6
 """Violation, as a share of half the gap between a row's bounds, attributed to rounding."""
@@ -136,7 +136,7 @@ def recovery(infeasible_period: InfeasiblePeriod, plan: Array) -> int | None:
 
 def _set_up(problem: Problem, query: Query) -> Callable[[Query], bool]:
     """Return a function that tells whether queries of this kind are solved."""
-    solver = QPSolver(SOLVER, problem, changing=query.steps is not None)
+    solver = QPSolver(DIAGNOSIS_SOLVER, problem, changing=query.steps is not None)
     return lambda query: solver.solve(query).status == SOLVED
 
 

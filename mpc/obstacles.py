@@ -38,14 +38,14 @@ from quadsim.state import POSITION, Array
 
 Shape: TypeAlias = AnyObstacle | Corridor | Fence
 
-LOOSE: Final = 1e3
+SWITCHED_OFF: Final = 1e3
 """Bound [m] of a half-space that is switched off."""
 SOLVER: Final = "piqp-multistage"  # solves QPs with half-spaces; the problem's own solver solves the others
 SOFT_SPACE: Final = "controller.avoidance.soft"
 """Table of a scenario file that makes half-spaces soft (`mpc.constraints.Origin.soft`)."""
-ROUNDING: Final = 1e-6
+HALF_SPACE_ROUNDING: Final = 1e-6
 """Violation of a half-space [m] attributed to rounding."""
-NEAR: Final = 1e-2
+TOUCHING: Final = 1e-2
 """Distance from a half-space [m] within which a plan counts as touching it."""
 SETTLED: Final = 1e-2
 """Change of all predicted positions [m] below which planes are not recomputed in the same period."""
@@ -120,7 +120,7 @@ class Space:
             normals[at] = -rows[:, None, :]
             # Also inside at the neighbouring instants, so that the motion between two instants stays inside.
             in_force = (t > region.start - self.period) & (t < region.stop + self.period)
-            bounds[at] = np.where(in_force, -upper[:, None], (normals[at] * positions).sum(axis=2) - LOOSE)
+            bounds[at] = np.where(in_force, -upper[:, None], (normals[at] * positions).sum(axis=2) - SWITCHED_OFF)
         return normals, bounds + self._distance + (np.abs(normals) * self._margins).sum(axis=2)
 
     def constraint(self, normals: Array, bounds: Array, states: int, *, name: str = "space") -> Constraint:
@@ -184,7 +184,7 @@ class ObstacleQP:
         problem, among = self.problem, False
         if self._changing and along is not None:
             # Where the last plan touched half-spaces, this one is all but sure to: it is sought among them at once.
-            among = bool((_room(*self._space.half_spaces(t, along), along) < NEAR).any())
+            among = bool((_distances(*self._space.half_spaces(t, along), along) < TOUCHING).any())
         if along is None or not among:
             answer = self._solver.solve(query)
             if answer.status not in ACCEPTED:
@@ -196,10 +196,10 @@ class ObstacleQP:
             planned = along
         for i in range(self._space.settings.iterations):
             normals, bounds = self._space.half_spaces(t, along)
-            room = _room(normals, bounds, planned)
-            if (room >= -ROUNDING).all() and not (among and i == 0):
+            distances = _distances(normals, bounds, planned)
+            if (distances >= -HALF_SPACE_ROUNDING).all() and not (among and i == 0):
                 break
-            answer, problem, planned = self._solve_with_half_spaces(query, normals, bounds, room, turn)
+            answer, problem, planned = self._solve_with_half_spaces(query, normals, bounds, distances, turn)
             if answer.status not in ACCEPTED:
                 named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
                 constraints = (*self.problem.constraints, *named)
@@ -221,12 +221,12 @@ class ObstacleQP:
         return replace(self.problem, constraints=(*self.problem.constraints, added))
 
     def _solve_with_half_spaces(
-        self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array
+        self, query: Query, normals: Array, bounds: Array, distances: Array, turn: Array
     ) -> tuple[Answer, Problem, Array]:
-        """The optimum with half-spaces of the world, and its positions; `room` (S, N) gives the tightest."""
+        """The optimum with half-spaces of the world, and its positions; `distances` (S, N) gives the tightest."""
         count = self._space.settings.rows
         while True:
-            at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
+            at = np.argsort(distances, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
             problem = self._with_half_spaces(normals[at] @ turn.T, bounds[at])
             form, backend = self._form(len(at[0]))
             qp = form.assemble(query, problem).qp
@@ -234,12 +234,12 @@ class ObstacleQP:
             if answer.status not in ACCEPTED:
                 return answer, problem, np.empty(0)
             answer, planned = self._predicted(query, answer, turn)
-            room = _room(normals, bounds, planned)
-            violated = room < -ROUNDING
+            distances = _distances(normals, bounds, planned)
+            violated = distances < -HALF_SPACE_ROUNDING
             violated[at] = False
             if not violated.any():
                 return answer, problem, planned
-            room[at] = -LOOSE  # what was there stays
+            distances[at] = -SWITCHED_OFF  # what was there stays
             count *= 2
 
     def _form(self, count: int) -> tuple[PartiallyCondensed, Piqp]:
@@ -255,6 +255,6 @@ class ObstacleQP:
         return self._forms[count]
 
 
-def _room(normals: Array, bounds: Array, positions: Array) -> Array:
+def _distances(normals: Array, bounds: Array, positions: Array) -> Array:
     """(S, N) how far positions (N, 3) are inside half-spaces [m]."""
     return np.asarray((normals * positions).sum(axis=2) - bounds)

@@ -31,7 +31,7 @@ from mpc.ocp import Problem, Query
 from mpc.qp import QP, PeriodQP, QPRows, Solution
 from quadsim.state import Array, Indices
 
-ROUNDING: Final = 1e-14
+BLOCK_ROUNDING: Final = 1e-14
 """Entries below this fraction of the largest of their block are rounding errors: dropped from constant matrices."""
 STEPS_OF_ONE_INPUT: Final = 10
 """M for one input; for more inputs, M falls with the square root of their number. The resulting five steps for four
@@ -90,8 +90,8 @@ class Layout:
     """
 
     def __init__(self, N: int, n: int, nu: int, n_s: int, M: int) -> None:
-        room = M + (n // nu if M > 1 else 0)
-        L = N if room >= N else room - (room - N) % M
+        most = M + (n // nu if M > 1 else 0)
+        L = N if most >= N else most - (most - N) % M
         self.N, self.n, self.nu, self.L, self.M = N, n, nu, L, M
         stages = (N - L) // M
         first, width = L * nu + (L - 1) * n_s, n + M * (nu + n_s)
@@ -170,7 +170,7 @@ class PartiallyCondensed:
         if changing:  # for matrices in general position, an entry is zero only where it always is
             rng = np.random.default_rng(0)
             A, B = (rng.normal(size=(N, at.n, width)) for width in (at.n, at.nu))
-        rounding = 0.0 if changing else ROUNDING
+        rounding = 0.0 if changing else BLOCK_ROUNDING
         head, tail = self._slopes(A, B)
         slack, numbers = at.slacks.reshape(-1, 1), np.arange(rows.lower.size).reshape(at.N, -1)
         costs = [(at.head, at.head), (at.tail, at.tail), (at.starts[-1], at.starts[-1]), (slack, slack)]

@@ -207,7 +207,7 @@ class InterruptedFlightError(FlightError):
         super().__init__("interrupted (Ctrl-C)", time=time)
 
 
-def failure(error: BaseException) -> str:
+def failure_line(error: BaseException) -> str:
     """Return why something was not made, in one line: `failed: ValueError: no`."""
     text = str(error) if isinstance(error, QuadsimError) else described(error)
     text = error.problem if isinstance(error, OutputError) else text  # its path is that of what was to be made

@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeVar
 
 from annotated_types import Ge, Gt, Le, Len, doc
 
-Settings = TypeVar("Settings")
+Declaration = TypeVar("Declaration")
 
 Number = Annotated[float, Ge(-1e6), Le(1e6)]
 NonNegative = Annotated[float, Ge(0.0), Le(1e6)]
@@ -26,7 +26,7 @@ Pair = Annotated[tuple[Number, ...], Len(2, 2)]
 Instant = Annotated[float, Ge(0.0), Le(1e6), doc("[s] when it happens")]  # of an event
 
 
-def filled(settings: Settings, **values: object) -> Settings:
+def filled(settings: Declaration, **values: object) -> Declaration:
     """Return settings with the fields that are None set to `values`."""
     absent: dict[str, Any] = {name: value for name, value in values.items() if getattr(settings, name) is None}
     return replace(settings, **absent)  # type: ignore[type-var]

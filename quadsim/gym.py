@@ -27,6 +27,6 @@ __all__ = ["MPCSafetyFilter", "QuadrotorEnv", "environment_id", "make_env", "mak
 
 if find_spec("gymnasium") is None:
     raise MissingPackageError("quadsim.gym", "gymnasium", extra="gym")
-_environment, _safety = (importlib.import_module(f"scenarios.gym.{room}") for room in ("environment", "safety"))
+_environment, _safety = (importlib.import_module(f"scenarios.gym.{part}") for part in ("environment", "safety"))
 globals().update({name: getattr(_environment, name, None) or getattr(_safety, name) for name in __all__})
 _environment.register_library()

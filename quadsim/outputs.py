@@ -24,7 +24,7 @@ from pathlib import Path
 from stat import S_IMODE, S_ISDIR, S_ISREG
 from typing import Any, Final
 
-from quadsim.errors import OutputError, failure, printable
+from quadsim.errors import OutputError, failure_line, printable
 
 SUMMARY_FILE: Final = "summary.json"
 LOCK_FILE: Final = ".lock"  # in a directory that grows
@@ -167,7 +167,7 @@ def optional(name: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        _log.warning("%s %s", name, failure(error))
+        _log.warning("%s %s", name, failure_line(error))
 
 
 def require_file(path: Path | str, *, overwrite: bool = False) -> Path:

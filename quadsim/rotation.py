@@ -20,7 +20,7 @@ import numpy as np
 from quadsim.state import ANGLE_RATES, ANGLES, Array
 
 Quaternion = tuple[float, float, float, float]
-Vector = tuple[float, float, float]
+Vector3 = tuple[float, float, float]
 
 
 @overload
@@ -60,7 +60,7 @@ def normalise(q: Quaternion) -> Quaternion:
     return q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale
 
 
-def exponential(vector: Vector) -> Quaternion:
+def exponential(vector: Vector3) -> Quaternion:
     """The unit quaternion of a rotation vector [rad]."""
     x, y, z = vector
     angle = math.sqrt(x * x + y * y + z * z)
@@ -69,7 +69,7 @@ def exponential(vector: Vector) -> Quaternion:
     return math.cos(0.5 * angle), scale * x, scale * y, scale * z
 
 
-def logarithm(q: Quaternion) -> Vector:
+def logarithm(q: Quaternion) -> Vector3:
     """The shortest rotation vector [rad] of a unit quaternion, at most pi long; q and -q are one rotation."""
     w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
     sine = math.sqrt(x * x + y * y + z * z)

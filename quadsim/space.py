@@ -18,7 +18,7 @@ import numpy as np
 from annotated_types import Len, MaxLen, doc
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from quadsim.fields import NonNegative, Number, Positive, Vector
+from quadsim.fields import NonNegative, Number, Pair, Positive, Vector
 from quadsim.state import Array
 
 MAX_POSITIONS: Final = 1000  # of one obstacle's path, or half-spaces of one polytope
@@ -27,8 +27,7 @@ _PARALLEL: Final = 1e-9  # determinant of three unit normals below which their p
 
 _ROUNDING: Final = 1e-9  # of lengths along a path [m]
 
-Name = Annotated[str, doc("name in reports")]
-Pair = Annotated[tuple[Number, ...], Len(2, 2)]
+ReportName = Annotated[str, doc("name in reports")]
 Sizes = Annotated[tuple[Positive, ...], Len(3, 3)]  # along x, y, z
 
 
@@ -118,7 +117,7 @@ class Place:
 class Obstacle:
     """An object that the vehicle must not touch; fixed, or moving along a stated path without turning."""
 
-    name: Name = field(metadata=_NAME)
+    name: ReportName = field(metadata=_NAME)
     position: Annotated[Vector, doc("[m] x, y, z of its centre, world; if it moves, its position until then")]
     start: Annotated[NonNegative, doc("[s] when it starts to move")] = 0.0
     velocity: Annotated[Vector, doc("[m/s] from start on")] = (0.0, 0.0, 0.0)
@@ -373,7 +372,7 @@ class Region:
 class Corridor(Region):
     """A convex region to stay in during a window of time, or of the reference's path."""
 
-    name: Name = field(metadata=_NAME)
+    name: ReportName = field(metadata=_NAME)
     start: Annotated[Number, doc("[s] start of the time window")] = 0.0
     stop: Annotated[Number, doc("[s] end of the time window; absent: the end of the flight")] = math.inf
     path: Annotated[

@@ -23,7 +23,6 @@ from scenarios.arguments import (
     Flown,
     Names,
     ScenarioName,
-    Target,
     UserCode,
     UserForces,
     UserReference,

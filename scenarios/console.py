@@ -21,7 +21,7 @@ from rich.text import Text
 from quadsim.errors import printable
 from quadsim.report.table import Cell, Grid, Mark
 
-WIDTH: Final = 120  # characters, without a terminal
+CONSOLE_WIDTH: Final = 120  # characters, without a terminal
 _UNBOUNDED: Final = 10_000  # characters, more than any table has
 _STYLES: Final = {Mark.BEST: "bold", Mark.GOOD: "green", Mark.WARN: "yellow", Mark.BAD: "red"}
 
@@ -53,7 +53,7 @@ def styled(*parts: str | tuple[str, str]) -> Text:
 def stdout() -> PlainConsole:
     """Return stdout, wide enough for the tables if it is a file or a pipe."""
     console = PlainConsole()
-    return console if console.is_terminal else PlainConsole(width=WIDTH)
+    return console if console.is_terminal else PlainConsole(width=CONSOLE_WIDTH)
 
 
 def stderr() -> PlainConsole:
@@ -89,14 +89,14 @@ def _wrapped(text: Text, width: int) -> Text:
 
 def to_text(parts: Iterable[RenderableType]) -> str:
     """Return sentences and tables as text without colours."""
-    console = PlainConsole(width=WIDTH, file=io.StringIO())
+    console = PlainConsole(width=CONSOLE_WIDTH, file=io.StringIO())
     show(parts, console)
     return console.export_text()
 
 
 def to_html(parts: Iterable[RenderableType]) -> str:
     """Return sentences and tables as HTML for a notebook."""
-    console = PlainConsole(width=WIDTH, file=io.StringIO())
+    console = PlainConsole(width=CONSOLE_WIDTH, file=io.StringIO())
     show(parts, console)
     return console.export_html(inline_styles=True, code_format='<pre style="line-height: normal">{code}</pre>')
 
@@ -171,7 +171,7 @@ class _SparingTable(Table):
         yield from Table.__rich_console__(shown, console, options)
 
 
-def cell(cell: Cell) -> Text:
+def styled_cell(cell: Cell) -> Text:
     """Return a cell of a report's table."""
     return styled((cell.text, _STYLES.get(cell.mark, "")))
 
@@ -179,7 +179,7 @@ def cell(cell: Cell) -> Text:
 def grids(grids: Iterable[Grid], *, left: Collection[str] = ()) -> Iterator[RenderableType]:
     """Return tables of a report with their notes; `left` names columns of words."""
     for grid in grids:
-        lines = [[cell(value) for value in line] for line in grid.lines]
+        lines = [[styled_cell(value) for value in line] for line in grid.lines]
         yield table(grid.title, grid.head, lines, caption=grid.note.replace("`", "") or None, left=left)
         yield ""
 

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from scenarios.assembly import Assembly
     from scenarios.schema.scenario import Scenario
 
-Range = tuple[float, float]
-
 
 def report(assembly: Assembly) -> Feasibility:
     """Compare the demands of what is flown with the vehicle's limits and the controller's bounds.
@@ -185,7 +183,10 @@ def _isolated(kinks: Sequence[float], period: float) -> Array:
     return at[np.maximum(gaps[1:], gaps[:-1])[: at.size] > period * (1.0 + 1e-6)]
 
 
-def _bounds(scenario: Scenario, vehicle: Vehicle) -> tuple[dict[str, Range], dict[str, Range]]:
+_Bounds = dict[str, tuple[float, float]]
+
+
+def _bounds(scenario: Scenario, vehicle: Vehicle) -> tuple[_Bounds, _Bounds]:
     """Return the controller's bounds, and those on outputs after tightening at the end of the horizon; SI."""
     spec = scenario.controller
     if not isinstance(spec, Bounded):

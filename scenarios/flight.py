@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from quadsim.controller import NOT_CONVERGED
-from quadsim.errors import MissingPackageError, OutputError, UnknownNameError, failure
+from quadsim.errors import MissingPackageError, OutputError, UnknownNameError, failure_line
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import (
     SIGNALS,
@@ -570,7 +570,7 @@ def _add_products(
         except KeyboardInterrupt:
             interrupted, problem = True, "interrupted (Ctrl-C)"
         except Exception as error:
-            problem = failure(error)
+            problem = failure_line(error)
             if demanded:
                 failed[name] = problem
         else:

@@ -16,7 +16,7 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
 from quadsim.outputs import reserving
 from quadsim.report.comparison import different_audits
-from quadsim.report.table import Row
+from quadsim.report.table import QuantityRow
 from scenarios.flight import Flight, require_rendering, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
@@ -33,7 +33,7 @@ _FIRST: Final = 4  # flights of which its repr has two lines
 _BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "answered by", "statuses", "whole step, m")
 """Starts of the row labels to show; the page and its `comparison.md` have all rows."""
 
-Target = Flight | Scenario | str | Path
+Compared = Flight | Scenario | str | Path
 """A flight, a run directory, or a scenario to fly, as an object or by name."""
 
 
@@ -42,7 +42,7 @@ class FlightComparison(Result):
     """Flights side by side."""
 
     runs: tuple[rundir.Run, ...]  # the flights
-    rows: list[Row]  # the table, a row per quantity
+    rows: list[QuantityRow]  # the table, a row per quantity
     notes: tuple[str, ...]  # in what the audits differ, and whose constraints they were audited against
     names: tuple[str, ...]  # column names, one per flight
     page: Path | None  # `index.html`, if it was written
@@ -76,7 +76,7 @@ class FlightComparison(Result):
         lines = [
             (
                 (row.group if row.headline else row.label) + (f" [{row.unit}]" if row.unit else ""),
-                *map(console.cell, row.cells),
+                *map(console.styled_cell, row.cells),
             )
             for row in self.rows
             if row.label.startswith(_BRIEF)
@@ -100,14 +100,14 @@ class FlightComparison(Result):
 
 
 def compare_flights(
-    targets: Sequence[Target],
+    targets: Sequence[Compared],
     out: Path | None = None,
     progress: Progress = silent,
     *,
     overwrite: bool = False,
     names: Sequence[str] = (),
     products: Mapping[str, bool | None] = MappingProxyType({}),
-    constraints: Target | None = None,
+    constraints: Compared | None = None,
 ) -> FlightComparison:
     """Compare flights, and write the page to `out`; scenarios are flown and saved beside it, in `OUT-runs`.
 
@@ -153,7 +153,7 @@ def compare_flights(
             return replace(comparison, page=write_comparison(runs, out, notes=notes, overwrite=overwrite))
 
 
-def place_of(target: Target, targets: Sequence[Target]) -> int:
+def place_of(target: Compared, targets: Sequence[Compared]) -> int:
     """Return the place of the target whose constraints are to be used."""
     for i, each in enumerate(targets):
         if each is target or (isinstance(target, str | Path) and str(each) == str(target)):
@@ -193,7 +193,7 @@ def check_names(names: Sequence[str], count: int) -> None:
         raise ParameterError("", "names", shown, f"{count} different texts, one for each target")
 
 
-def _check(target: Target) -> None:
+def _check(target: Compared) -> None:
     """Reject targets that cannot be compared, before any flight."""
     if isinstance(target, Flight | Scenario):
         return
@@ -205,7 +205,7 @@ def _check(target: Target) -> None:
 
 
 def _run_of(
-    target: Target, beside: Path, progress: Progress, products: Mapping[str, bool | None], *, pictures: bool
+    target: Compared, beside: Path, progress: Progress, products: Mapping[str, bool | None], *, pictures: bool
 ) -> rundir.Run:
     """Return a target as a run; fly and save it beside the page if necessary."""
     if isinstance(target, Flight):

@@ -27,7 +27,7 @@ from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing import SensorName
 from quadsim.state import REFERENCE_NAMES
-from scenarios.schema.controllers import AnyController, changed
+from scenarios.schema.controllers import AnyController, changed_controller
 from scenarios.schema.events import (
     MOST_EVENTS,
     ControllerEvent,
@@ -138,7 +138,7 @@ class FlightEvents:
 
     def successor(self, fields: Mapping[str, Any]) -> Successor:
         """See `scenarios.rollout.Rollout.successor`."""
-        return self._built(changed(self._spec, fields))
+        return self._built(changed_controller(self._spec, fields))
 
     def leave_course(self) -> None:
         """End the constraints on the tracking error, and drop those that would begin later."""
@@ -208,7 +208,7 @@ class FlightEvents:
                 self._reference.set(k, event.values)
                 self._loop.motion = None
             else:
-                self._switch(changed(self._spec, event.fields), ready)
+                self._switch(changed_controller(self._spec, event.fields), ready)
 
     def first_infeasible_period(self) -> InfeasiblePeriod | None:
         """Return, over all controllers so far, the first QP without an answer, or else the first SQP not converged."""

@@ -12,7 +12,7 @@ import numpy as np
 from mpc.constraints import Bounds, Constraint
 from mpc.ocp import Problem
 from quadsim.errors import InputError
-from quadsim.flight.audit import SUM, TERMS, Limit
+from quadsim.flight.audit import SUM, TERM_SIGNALS, Limit
 from quadsim.state import N_STATES, STATE_NAMES, STATE_UNITS, Array, shown_unit
 from quadsim.vehicle import N_ROTORS
 from scenarios.schema.problems import parse_table
@@ -111,4 +111,4 @@ def _row(constraint: Constraint, i: int, C: Array, D: Array) -> Iterator[Limit]:
         yield Limit(name=f"{constraint.name}_{i + 1}", signal=SUM, terms=terms, lower=lower, upper=upper)
 
 
-assert set(_SPEEDS) < set(TERMS)
+assert set(_SPEEDS) < set(TERM_SIGNALS)

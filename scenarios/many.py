@@ -28,8 +28,8 @@ from typing import Any, Final
 from quadsim.errors import MissingPackageError, ParameterError, QuadsimError, described
 from scenarios.machine import code_digest, usable_cores, versions
 
-Row = dict[str, Any]
-Rows = Generator[tuple[int, Row]]
+Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
+FlownRows = Generator[tuple[int, Row]]
 Fly = Callable[[Any], Row]
 ERROR, TIMEOUT, MEMORY, DIED = "error", "timeout", "memory", "died"
 """Verdicts of flights without a row: an exception, a timeout, too much memory, or a dead process."""
@@ -61,7 +61,7 @@ def fly_many(
     memory: float = 2000.0,
     isolate: bool = False,
     cluster: str | None = None,
-) -> Rows:
+) -> FlownRows:
     """Yield the row of each flight with its index, as flights finish; closing the iterator, or Ctrl-C, stops all work.
 
     The row of a flight that failed has a `verdict` (error, timeout, memory, died) and a `reason`.
@@ -106,7 +106,7 @@ def _require(workers: int | None, cluster: str | None) -> None:
 # --- on this machine -------------------------------------------------------------------------------------------------
 
 
-def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory: float, isolate: bool) -> Rows:
+def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory: float, isolate: bool) -> FlownRows:
     todo, workers = enumerate(flights), list[_Worker]()
     try:
         flight = next(todo, None)
@@ -251,7 +251,7 @@ def _limit_memory(megabytes: float) -> None:
 # --- on a cluster ----------------------------------------------------------------------------------------------------
 
 
-def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float, memory: float) -> Rows:
+def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float, memory: float) -> FlownRows:
     todo, places = enumerate(flights), dict[str, int]()
     with _client(address) as client:
         distributed = _distributed()

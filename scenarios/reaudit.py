@@ -40,10 +40,10 @@ from scenarios.schema.controllers import LAWS
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import leaves
 
-TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
-OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
+TABLE_FILES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
+OURS: Final = {*TABLE_FILES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
 """Files that only a run writes under these names."""
-ROUNDING: Final = 1e-9
+ARITHMETIC_TOLERANCE: Final = 1e-9
 """Tolerance for another machine's arithmetic, relative to 1 or to the larger number."""
 ROUNDING_TILT: Final = 1e-6  # the same for the tilt: near level, an arc cosine has half of a number's digits
 MOST_REPORTED: Final = 6  # differences that one message names
@@ -162,7 +162,7 @@ def stored_scenario(directory: Path) -> Scenario:
 
 def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> Iterator[str]:
     """Yield the files that differ from those written."""
-    needed = (*TABLES, rundir.SCENARIO_FILE)
+    needed = (*TABLE_FILES, rundir.SCENARIO_FILE)
     for name in rundir.damaged_files(directory, summary):
         if (directory / name).is_file():
             yield f"{name} is not the file that was written"
@@ -198,7 +198,7 @@ def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
         (TIMING_FILE, timing.t, period, count),
         (PLANT_FILE, plant.t, row, count * steps // stride + 1),
     ):
-        if t.size != expected or (np.abs(t - spacing * np.arange(t.size)) > ROUNDING).any():
+        if t.size != expected or (np.abs(t - spacing * np.arange(t.size)) > ARITHMETIC_TOLERANCE).any():
             yield f"{name} does not have the {expected} times k * {spacing:g} s"
             return
     both = np.flatnonzero(np.arange(count) * steps % stride == 0)  # control periods that start with a row of the plant
@@ -212,7 +212,7 @@ def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
         speeds, known = _in_force(scenario, control, starts)
         limits = (run.vehicle.speed_min, run.vehicle.speed_max) if scenario.plant.limit_speeds else (0.0, None)
         applied = np.clip(speeds, *limits)
-        wrong = (np.abs(applied - plant.speeds[:-1]) > ROUNDING * np.maximum(1.0, applied)) & known[:, None]
+        wrong = (np.abs(applied - plant.speeds[:-1]) > ARITHMETIC_TOLERANCE * np.maximum(1.0, applied)) & known[:, None]
         yield from _where(wrong, _TURNING, plant.t, f"of {PLANT_FILE} is not the speed that {FLIGHT_FILE} commands")
 
 
@@ -236,7 +236,7 @@ def _in_force(
     arrives = np.where(missed, due, starts + np.array(waits, dtype=np.int64))
     assembly, laws = Assembly(scenario), [(0.0, scenario.controller), *scenario.controller_changes]
     settings = [assembly.computation(spec) for _, spec in laws]
-    law = np.searchsorted([time for time, _ in laws], control.t + ROUNDING, side="right") - 1
+    law = np.searchsorted([time for time, _ in laws], control.t + ARITHMETIC_TOLERANCE, side="right") - 1
     planning = np.array([entry is not None and bool(entry.plan) for entry in settings])[law]
     coming = np.searchsorted(arrives, at, side="right")
     unknown_from = np.append(np.where(planning, due, math.inf), math.inf)
@@ -269,7 +269,7 @@ def _differences(
     numbers = metrics.flight_numbers(log, deadline_ms=deadline_ms, course=Assembly(scenario).course_steps)
     before = dict(leaves({key: summary[key] for key in numbers}))
     for key, again in leaves(numbers):
-        yield from _recorded(key, before.get(key, again), again, "the tables give", ROUNDING)
+        yield from _recorded(key, before.get(key, again), again, "the tables give", ARITHMETIC_TOLERANCE)
     entries = summary["constraints"]
     names, expected = [entry["name"] for entry in entries], [finding.limit.name for finding in findings]
     if names != expected:
@@ -316,7 +316,7 @@ def _constraint_differences(
     for key in _DEMANDS:
         if entry.get(key) != again.get(key):
             yield f"{key} is recorded as {entry.get(key)!r:.80}, and is {again.get(key)!r:.80} in the scenario"
-    rounding = ROUNDING_TILT if limit.signal == "tilt" else ROUNDING
+    rounding = ROUNDING_TILT if limit.signal == "tilt" else ARITHMETIC_TOLERANCE
     sampled = limit.source.plant is None
     whole = sampled or scenario.plant_stride == 1 or not log.control.t.size  # the tables are complete
     alike = ("peak_sampled", "worst_margin_sampled", *(("peak_plant", "worst_margin", "worst_time") if whole else ()))
@@ -344,7 +344,7 @@ def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[
     signal, limit, seen = finding.limit.source, finding.limit, finding.time_violated
     row = 1.0 / scenario.log_rate if scenario.plant_stride > 1 else 0.0
     if signal.plant is None or not log.control.t.size or scenario.plant_stride == 1:
-        return seen - ROUNDING, seen + row + ROUNDING
+        return seen - ARITHMETIC_TOLERANCE, seen + row + ARITHMETIC_TOLERANCE
     t = log.plant.t[:-1]  # the last row ends the flight, and lasts no time
     beyond = limit.excess(limit.margin(signal.plant(log.plant)))[:-1] > ROUNDING_TILT
     return max(0.0, (np.count_nonzero(limit.holds_at(t) & beyond) - 1) * scenario.plant.timestep), math.inf

@@ -24,10 +24,10 @@ from scenarios.flight import Flight
 from scenarios.infeasibility import Settings, change_text, changed_scenario
 from scenarios.schema.scenario import Scenario
 
-Fly: TypeAlias = Callable[[Assembly, float], Flight]
+FlyUntil: TypeAlias = Callable[[Assembly, float], Flight]
 
 AFTER: Final = 5.0  # flown beyond the first period without an answer [s]
-LONGEST: Final = 60.0  # longest flight of a change [s]; what would have to be flown for longer is not flown
+LONGEST_TRIAL: Final = 60.0  # longest flight of a change [s]; what would have to be flown for longer is not flown
 MOST_FLOWN: Final = 6  # flights of one diagnosis
 LEAVING_FROM, LEAVING_FOR = 1.0, 1.0
 """Distance from the reference [m], and time for which it has grown [s], from which on a vehicle is leaving it."""
@@ -36,7 +36,7 @@ HOVER_RESERVE: Final = 0.1  # distance of the advised bound on rotor speeds from
 _SPEED: Final = "controller.input_bounds.speed"
 
 
-def tried(explanation: Mapping[str, Any], flight: Flight, fly: Fly) -> dict[str, Any]:
+def tried(explanation: Mapping[str, Any], flight: Flight, fly: FlyUntil) -> dict[str, Any]:
     """Fly each suggestion of a flight's `diagnose`; return the report with those that prevent the failure as advice.
 
     `suggestions` are then those with an answer in every period, or the fallback, and a flight that is satisfied as far
@@ -84,7 +84,7 @@ def _not_flown(flight: Flight, time: float, until: float) -> str:
         return "the scenario does not repeat code that was passed in"
     if flight.scenario.controller_at(time) != flight.scenario.controller:
         return "an event had changed the controller"
-    return f"it would take more than {LONGEST:g} s of flight" if until > LONGEST else ""
+    return f"it would take more than {LONGEST_TRIAL:g} s of flight" if until > LONGEST_TRIAL else ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +95,7 @@ class _Trial:
     violated: tuple[str, ...] = ()  # required constraints that it violates, while it returns to them
 
 
-def _trial(scenario: Scenario, assembly: Assembly, settings: Settings, until: float, fly: Fly) -> _Trial:
+def _trial(scenario: Scenario, assembly: Assembly, settings: Settings, until: float, fly: FlyUntil) -> _Trial:
     """Fly a scenario with other fields."""
     changed = changed_scenario(scenario, settings)
     if changed is None:

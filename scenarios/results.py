@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from quadsim.errors import OutputError, QuadsimError, failure
+from quadsim.errors import OutputError, QuadsimError, failure_line
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -71,12 +71,12 @@ class Result:
 
 def plot_html(figure: Figure | None) -> str:
     """Return a plot for a notebook, or a line where it cannot be drawn."""
-    from quadsim.report.to_matplotlib import to_html
+    from quadsim.report.to_matplotlib import figure_html
 
     try:
-        return "" if figure is None else to_html(figure)
+        return "" if figure is None else figure_html(figure)
     except Exception as error:
-        return f"<p>the plot {escape(failure(error))}</p>"
+        return f"<p>the plot {escape(failure_line(error))}</p>"
 
 
 @contextlib.contextmanager
@@ -92,7 +92,7 @@ def after(result: Result, output: Path) -> Iterator[None]:
         error.result = result
         raise
     except Exception as error:
-        problem = OutputError(output, failure(error))
+        problem = OutputError(output, failure_line(error))
         problem.result = result
         raise problem from error
 

@@ -17,7 +17,7 @@ from quadsim.errors import InputError, ParameterError
 from quadsim.sim.effects import Force
 from quadsim.state import Array
 from scenarios.assembly import Assembly
-from scenarios.courses.csv_course import LARGEST, tabulated
+from scenarios.courses.csv_course import LARGEST_NUMBER, tabulated
 from scenarios.plugin import import_plugin, make_force, make_law, reason_of, refer_to, require_importable
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import plain
@@ -69,8 +69,8 @@ def following(assembly: Assembly, reference: object) -> Assembly:
 def _pose(reference: Callable[[float], Any], time: float) -> Array:
     with user_code(lambda error: InputError(f"reference: f({time:g}) cannot be used: {reason_of(error)}")):
         pose = numbers_of(answer := reference(time))
-    if pose.shape != (4,) or not (np.abs(pose) <= LARGEST).all():
-        rule = f"four numbers within +-{LARGEST:g}: x, y, z [m], yaw [rad]"
+    if pose.shape != (4,) or not (np.abs(pose) <= LARGEST_NUMBER).all():
+        rule = f"four numbers within +-{LARGEST_NUMBER:g}: x, y, z [m], yaw [rad]"
         raise InputError(f"reference: f({time:g}) must be {rule}; got {answer!r:.200}")
     return pose
 

@@ -15,7 +15,7 @@ from typing import Final
 from quadsim.assets import vehicle_names, vehicle_path
 from quadsim.flight.metrics import peak_tilt, tracking
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
+from scenarios.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
 from scenarios.design.plausible_vehicles import plausible_vehicles
 from scenarios.loading import parse_scenario
 from scenarios.rollout import Rollout
@@ -82,7 +82,7 @@ def fly_first(vehicle: Vehicle, course: str, law: str) -> FirstFlight:
 
 def main() -> None:
     """Fly everything and print it."""
-    cells = list(product(vehicles(), COURSES, LAWS))
+    cells = list(product(vehicles(), COURSES, DESIGNED_LAWS))
     with ProcessPoolExecutor() as pool:
         flown = pool.map(fly_first, *zip(*cells, strict=True))
         names = [{"vehicle": vehicle.name, "course": course, "law": law} for vehicle, course, law in cells]

@@ -15,7 +15,7 @@ from mpc.constrained import Constrained
 from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.linear import LinearMPC, NominalPreparation
 from mpc.model import LinearModel
-from mpc.nonlinear.model import NonlinearModel, advance
+from mpc.nonlinear.model import NonlinearModel, next_state
 from mpc.ocp import Equilibrium, Objective, Problem, Query
 from mpc.robust.controller import RobustPreparation
 from mpc.robust.settings import Robust
@@ -31,9 +31,9 @@ from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios import many
 from scenarios.assembly import Assembly
-from scenarios.campaign.rows import Row
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
+from scenarios.many import Row
 from scenarios.rollout import closed_loop
 from scenarios.schema.scenario import Scenario
 
@@ -109,13 +109,13 @@ def random_problem(rng: np.random.Generator, *, horizon: int, n: int = 3, nu: in
     return Problem(model=model, horizon=horizon, objective=objective, bounds=bounds)
 
 
-def random_axes(rng: np.random.Generator, *, horizon: int, room: float) -> Problem:
+def random_axes(rng: np.random.Generator, *, horizon: int, wider: float) -> Problem:
     """Two random systems with bounded outputs and one without, in a random order of states and mixed by their inputs.
 
     Args:
         rng: random numbers.
         horizon: N.
-        room: by how much bounds on inputs and their steps are wider than those of `random_problem`.
+        wider: by how much bounds on inputs and their steps are wider than those of `random_problem`.
     """
     parts = [random_problem(rng, horizon=horizon, n=n, nu=nu, n_c=nu) for n, nu in ((3, 1), (2, 2), (2, 1))]
     order, mixing = rng.permutation(7), np.linalg.qr(rng.normal(size=(4, 4)))[0]
@@ -123,7 +123,7 @@ def random_axes(rng: np.random.Generator, *, horizon: int, room: float) -> Probl
     Q_u = mixing @ block_diag(*(part.objective.Q_u for part in parts)) @ mixing.T
     limits = [part.bounds for part in parts if part.bounds is not None]
     C_c = block_diag(*(bounds.C_c for bounds in limits[:2]), np.zeros((0, 2)))
-    step, span = room * rng.uniform(0.1, 2.0, 4), room * rng.uniform(0.1, 3.0, 4)
+    step, span = wider * rng.uniform(0.1, 2.0, 4), wider * rng.uniform(0.1, 3.0, 4)
     return Problem(
         model=LinearModel(
             A=block_diag(*(part.model.A for part in parts))[np.ix_(order, order)],
@@ -214,7 +214,7 @@ def linearised(model: NonlinearModel, x: Array, u: Array) -> tuple[Array, Array,
     joint, h = np.concatenate([x, u]), 1e-4
 
     def after(joint: Array) -> Array:
-        return advance(model, joint[: model.n], joint[model.n :])
+        return next_state(model, joint[: model.n], joint[model.n :])
 
     slopes = np.array([after(joint + step) - after(joint - step) for step in h * np.eye(joint.size)]).T / (2.0 * h)
     A, B = slopes[:, : model.n], slopes[:, model.n :]
@@ -224,7 +224,7 @@ def linearised(model: NonlinearModel, x: Array, u: Array) -> tuple[Array, Array,
 def derivative(model: NonlinearModel, x: Array, u: Array) -> Array:
     """dx/dt (..., n) of states x (..., n) under inputs u (..., 4), by central differences over short periods."""
     h, points = 1e-5, list(zip(x.reshape(-1, x.shape[-1]), u.reshape(-1, 4), strict=True))
-    ends = [np.array([advance(replace(model, period=s), *point) for point in points]) for s in (h, -h)]
+    ends = [np.array([next_state(replace(model, period=s), *point) for point in points]) for s in (h, -h)]
     return np.asarray((ends[0] - ends[1]) / (2.0 * h)).reshape(x.shape)
 
 

@@ -44,7 +44,7 @@ def start() -> None:
 
 def panels(run: Run, title: str, shot: Shot) -> Iterator[Image.Image]:
     """Frames of a flight, `shot.width` wide: title, picture (`shot.height`), tilt over time, nearest margins."""
-    from quadsim.report.film.render_worker import Stage
+    from quadsim.report.film.render_worker import FilmStage
 
     footage = make_footage(run, shot.times)
     nearest = sorted(footage.margins, key=lambda track: track.rank)[:MOST_ROWS]
@@ -53,7 +53,7 @@ def panels(run: Run, title: str, shot: Shot) -> Iterator[Image.Image]:
     rows_top = plot_top + PLOT + GAP
     height = 2 * ((rows_top + ROW * len(tracks) + GAP) // 2)
     plot = Plot(run, footage, LABEL, plot_top, shot.width - LABEL - GAP)
-    with Stage(run, footage, width=SHARP * shot.width, height=SHARP * shot.height) as stage:
+    with FilmStage(run, footage, width=SHARP * shot.width, height=SHARP * shot.height) as stage:
         for i in range(shot.count):
             image = Image.new("RGB", (SHARP * shot.width, SHARP * height), GROUND)
             image.paste(Image.fromarray(stage.render(i)), (0, SHARP * HEAD))

@@ -13,7 +13,7 @@ from mpc.nonlinear.rigidbody import rotation
 from quadsim.rotation import body_to_world, euler_to_body_rates
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array
 
-LEAST_LIFT: Final = 0.2
+LEAST_THRUST_SHARE: Final = 0.2
 """Least thrust as a share of the weight, so that torques keep their authority.  Our addition."""
 
 

@@ -16,7 +16,7 @@ from annotated_types import Len, doc
 from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
 from mpc.baselines.attitude import (
-    LEAST_LIFT,
+    LEAST_THRUST_SHARE,
     DesiredAttitude,
     Measured,
     attitude_error,
@@ -273,7 +273,7 @@ class GeometricController(FeedbackLaw):
         weight = np.array([0.0, 0.0, gravity])
         demanded = m * (-gains.k_x * e_x - gains.k_v * e_v - integrals.translation + weight + target.acceleration)
         demanded -= m * disturbance[0]
-        A = limit_force(demanded, least=LEAST_LIFT * m * gravity, tilt=self._largest_tilt)
+        A = limit_force(demanded, least=LEAST_THRUST_SHARE * m * gravity, tilt=self._largest_tilt)
         A1 = A2 = p1 = p2 = np.zeros(3)
         if np.array_equal(A, demanded):
             A1, A2 = self._force_derivatives(motion, target, A, e_v, disturbance)

@@ -25,10 +25,10 @@ LARGEST_DEVIATIONS: Final = {
     "x": 0.5, "vx": 2.0, "y": 0.5, "vy": 2.0, "z": 0.1, "vz": 1.0,
     "roll": 0.3, "roll_rate": 1.5, "pitch": 0.3, "pitch_rate": 1.5, "yaw": 0.5, "yaw_rate": 3.0,
 }  # fmt: skip
-"""Deviations of equal cost, in each state's unit; `SPEED_SHARE` is that of the inputs; see `bryson_objective`."""
+"""Deviations of equal cost, in each state's unit; `LQR_SPEED_SHARE` is that of the inputs; see `bryson_objective`."""
 HORIZONTAL: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 TILT: Final = [INDEX[name] for name in ("roll", "pitch")]
-SPEED_SHARE: Final = 0.05  # deviation of a rotor's speed of the same cost, as a share of the hover speed
+LQR_SPEED_SHARE: Final = 0.05  # deviation of a rotor's speed of the same cost, as a share of the hover speed
 LAG_MARGIN: Final = 1.5  # multiple of the vehicle's rotor lag that the loop with default weights must tolerate
 _HALVINGS: Final = 12
 _SHORTEST_LAG: Final = 1e-4  # [s]
@@ -41,7 +41,7 @@ def bryson_objective(vehicle: Vehicle, period: float | None = None) -> Objective
     lag, the deviation of the rotor speeds is halved until the loop is stable.  Without a period [s] the lag is ignored.
     """
     deviations = np.array([LARGEST_DEVIATIONS[name] for name in STATE_NAMES])
-    share = SPEED_SHARE
+    share = LQR_SPEED_SHARE
     for _ in range(_HALVINGS):
         speed = share * vehicle.hover_speed
         objective = Objective(C_r=np.eye(N_STATES), Q_y=np.diag(deviations**-2.0), Q_u=np.eye(N_ROTORS) / speed**2)

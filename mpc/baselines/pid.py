@@ -13,7 +13,7 @@ import numpy as np
 from annotated_types import doc
 
 from mpc.allocation import allocate, make_allocation, thrust_to_command
-from mpc.baselines.attitude import LEAST_LIFT, Measured, attitude_for, limit_force, motion_of, prioritised_error
+from mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured, attitude_for, limit_force, motion_of, prioritised_error
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import Target, target_of
@@ -166,7 +166,7 @@ def force_within(force: Array, *, weight: float, largest: float, tilt: float) ->
 
     What climbing leaves to the sides never takes more than half of the thrust above the weight.
     """
-    upright = limit_force(force, least=LEAST_LIFT * weight, tilt=tilt)
+    upright = limit_force(force, least=LEAST_THRUST_SHARE * weight, tilt=tilt)
     horizontal = math.hypot(upright[0], upright[1])
     climbing = min(0.5 * (weight + largest), largest)
     spared = min(horizontal, HORIZONTAL_MARGIN * largest, math.sqrt(largest**2 - climbing**2))

@@ -14,7 +14,7 @@ from quadsim.state import Array
 Precision = Literal["double", "float"]
 LEAST_FLOAT: Final = 1.2e-38
 """Magnitude below which a number becomes 0: some compilers reject constants that single precision would truncate."""
-STRUCTS: Final = {"axes": "quadsim_axis", "rows": "quadsim_row", "terms": "quadsim_term"}
+ELEMENT_TYPES: Final = {"axes": "quadsim_axis", "rows": "quadsim_row", "terms": "quadsim_term"}
 """Element types of the lists among a struct's members."""
 
 
@@ -60,7 +60,7 @@ class CText:
                 blocks += [block for inner, _ in parts for block in inner]
                 entries = ["{" + ", ".join(f".{k} = {v}" for k, v in part.items()) + "}" for _, part in parts]
                 lines = ",\n".join(entries or ["{0}"]).splitlines()
-                blocks.append(self._array(STRUCTS[name], name, len(value), lines))
+                blocks.append(self._array(ELEMENT_TYPES[name], name, len(value), lines))
             elif isinstance(value, np.ndarray):
                 blocks.append(self.array(f"{name}{suffix}", value))
             else:

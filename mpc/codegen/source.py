@@ -15,7 +15,7 @@ from mpc.core.tables import Tables, members
 from mpc.robust.settings import split_delay
 from quadsim.vehicle import N_ROTORS
 
-CORE: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_math.h", "quadsim_mpc.h", "quadsim_mpc.c")
+CORE_FILES: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_math.h", "quadsim_mpc.h", "quadsim_mpc.c")
 """Files of `mpc/core/c` to export verbatim."""
 DATA: Final = "quadsim_data.h"
 """The generated file."""
@@ -72,7 +72,7 @@ class CController:
     @cached_property
     def files(self) -> dict[str, str]:
         """Its C files, by name."""
-        return {name: part(name, "mpc.core") for name in CORE} | {DATA: self._data()}
+        return {name: part(name, "mpc.core") for name in CORE_FILES} | {DATA: self._data()}
 
     def _data(self) -> str:
         text = CText(self.precision, "quadsim_data_")

@@ -8,12 +8,12 @@ from typing import Final
 from mpc.codegen.ctext import Precision
 
 EMULATOR: Final = "qemu-system-arm"
-TICK: Final = 40
+INSTRUCTIONS_PER_TICK: Final = 40
 """Instructions per tick of the emulated processors' clock, with `-icount shift=0`."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Target:
+class Machine:
     """A machine: how programs for it are compiled and run."""
 
     name: str  # value of `--target`
@@ -46,8 +46,8 @@ class Target:
         return "".join(f"{name} = {value}".rstrip() + "\n" for name, value in lines.items())
 
 
-def _cortex(name: str, title: str, machine: str, board: str) -> Target:
-    return Target(
+def _cortex(name: str, title: str, machine: str, board: str) -> Machine:
+    return Machine(
         name=name,
         title=title,
         sources=("startup.c", "mps2.ld"),
@@ -61,7 +61,7 @@ def _cortex(name: str, title: str, machine: str, board: str) -> Target:
 TARGETS: Final = {
     target.name: target
     for target in (
-        Target(name="posix", title="POSIX", sources=("posix.c",), compiler="cc"),
+        Machine(name="posix", title="POSIX", sources=("posix.c",), compiler="cc"),
         _cortex("cortex-m7", "Cortex-M7", "-mcpu=cortex-m7 -mfpu=fpv5-d16", "mps2-an500"),
         _cortex("cortex-m4f", "Cortex-M4F", "-mcpu=cortex-m4 -mfpu=fpv4-sp-d16", "mps2-an386"),
     )

@@ -26,7 +26,7 @@ from mpc.model import LinearModel
 from mpc.ocp import Objective, Problem
 from quadsim.state import Array, Indices
 
-ROUNDING: Final = 1e-12
+COUPLING_ROUNDING: Final = 1e-12
 """Relative size below which a coupling of two states counts as rounding."""
 
 
@@ -54,11 +54,11 @@ def axes(problem: Problem) -> list[Axis]:
     root = np.linalg.cholesky(objective.Q_u)
     reach = _normalised(np.linalg.solve(root, model.B.T))
     tied = (C_r.T @ np.abs(objective.Q_y) @ C_r + C.T @ C) > 0.0
-    tied |= np.abs(model.A) > ROUNDING * np.abs(model.A).max()
-    tied |= np.abs(reach.T @ reach) > ROUNDING
+    tied |= np.abs(model.A) > COUPLING_ROUNDING * np.abs(model.A).max()
+    tied |= np.abs(reach.T @ reach) > COUPLING_ROUNDING
     if objective.P is not None:
         size = np.sqrt(np.abs(objective.P.diagonal()))
-        tied |= np.abs(objective.P) > ROUNDING * np.outer(size, size)
+        tied |= np.abs(objective.P) > COUPLING_ROUNDING * np.outer(size, size)
     count, label = connected_components(csr_matrix(tied), directed=False)
     whole = axis_of(problem, np.eye(model.nu), np.arange(model.n), np.arange(len(C_r)), np.flatnonzero(bounded))
     on_nothing = not (C_r.any(axis=1).all() and bounded[rows.of_states].all())
@@ -69,14 +69,14 @@ def axes(problem: Problem) -> list[Axis]:
         regulated, outputs = C_r[:, states].any(axis=1), bounded & C[:, states].any(axis=1)
         if reach[:, states].any() and regulated.any():
             directions, sizes, _ = np.linalg.svd(reach[:, states], full_matrices=False)
-            T = _normalised(np.linalg.solve(root.T, directions[:, sizes > ROUNDING]))
+            T = _normalised(np.linalg.solve(root.T, directions[:, sizes > COUPLING_ROUNDING]))
             parts.append(axis_of(problem, T, states, np.flatnonzero(regulated), np.flatnonzero(outputs)))
         elif outputs.any():
             return [whole]
     if objective.Q_d is not None:
         T, of = np.hstack([axis.T for axis in parts]), np.repeat(range(len(parts)), [axis.T.shape[1] for axis in parts])
         moves = np.abs(T.T @ objective.Q_d @ T)
-        if T.shape[0] != T.shape[1] or (moves[of[:, None] != of] > ROUNDING * moves.max()).any():
+        if T.shape[0] != T.shape[1] or (moves[of[:, None] != of] > COUPLING_ROUNDING * moves.max()).any():
             return [whole]
     return parts
 

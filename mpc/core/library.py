@@ -16,7 +16,7 @@ MIRRORS: Final = (
 """Structs that Python writes or reads, in the order of `quadsim_library_sizes`."""
 
 
-def load() -> ctypes.CDLL:
+def load_library() -> ctypes.CDLL:
     """Return the library, loaded once per process; `MissingCoreError` if it is missing or of other sources."""
     reason = why_missing()
     if reason is not None:
@@ -29,7 +29,7 @@ def load() -> ctypes.CDLL:
 def check_mirrors(**mirrors: type[ctypes.Structure]) -> None:
     """Assert that the structs named in `MIRRORS` have the library's sizes."""
     sizes = (ctypes.c_size_t * len(MIRRORS))()
-    load().quadsim_library_sizes(sizes)
+    load_library().quadsim_library_sizes(sizes)
     theirs = dict(zip(MIRRORS, sizes, strict=True))
     for name, mirror in mirrors.items():
         assert ctypes.sizeof(mirror) == theirs[name], f"{name} has {theirs[name]} bytes, not {ctypes.sizeof(mirror)}"

@@ -13,7 +13,7 @@ from typing import Any, Final, Generic, NoReturn, TypeVar
 import numpy as np
 
 from mpc.condensing import Condensed
-from mpc.core.library import check_mirrors, load
+from mpc.core.library import check_mirrors, load_library
 from mpc.core.tables import members, tables
 from mpc.ocp import Problem, Query
 from mpc.qp import QP, Solution
@@ -80,7 +80,7 @@ class Work(ctypes.Structure):
 @cache
 def core_library() -> ctypes.CDLL:
     """Return the library with its functions declared."""
-    library = load()
+    library = load_library()
     check_mirrors(quadsim_axis=_Axis, quadsim_row=_Row, quadsim_term=_Term, quadsim_problem=_Problem, quadsim_work=Work)
     library.quadsim_work_reals.restype, library.quadsim_work_reals.argtypes = ctypes.c_long, [_AT]
     library.quadsim_work_start.argtypes = [_AT, _AT, _AT]

@@ -30,15 +30,15 @@ from quadsim.errors import ParameterError
 from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 
-ROUNDING: Final = 1e-13
+ROW_ROUNDING: Final = 1e-13
 """Share of the largest number of a row of C_r, D, E, or T below which a number counts as rounding."""
-LARGEST: Final = 2**20
+LARGEST_RESPONSES: Final = 2**20
 """Largest total of entries of all responses that the core takes: 8 MiB."""
 LEAST_QUADRATIC: Final = 1e-9
 """Share of l1 that replaces a zero quadratic penalty, for which a step length is undefined."""
 MOST_STATES: Final = 20
 """Most states of an axis, including previous inputs where changes have a weight; as in quadsim_core.h."""
-MOST_ROWS: Final = 256
+MOST_STEP_ROWS: Final = 256
 """Most rows of a step, numbered in bytes."""
 NO_BOUND: Final = 1e30
 """Stands for infinity."""
@@ -116,17 +116,17 @@ def tables(problem: Problem) -> Tables:
         raise ParameterError("controller", "problem", f"{problem.model.nu} inputs", f"of {N_ROTORS} inputs")
     parts, T = _all_axes(problem)
     entries = sum((N * (part.T.shape[1] + part.outputs.size)) ** 2 // 2 for part in parts)
-    if entries > LARGEST:
-        rule = f"so short that its responses have at most {LARGEST} numbers; they have {entries}"
+    if entries > LARGEST_RESPONSES:
+        rule = f"so short that its responses have at most {LARGEST_RESPONSES} numbers; they have {entries}"
         raise ParameterError("controller", "horizon", N, rule)
     T_inverse = np.array(np.linalg.inv(T), float)
-    T_inverse[np.abs(T_inverse) < ROUNDING * np.abs(T_inverse).max()] = 0.0
+    T_inverse[np.abs(T_inverse) < ROW_ROUNDING * np.abs(T_inverse).max()] = 0.0
     first = np.cumsum([0, *(part.T.shape[1] for part in parts)]).tolist()
     axis_tables = [_axis(rows, part, at, N) for part, at in zip(parts, first, strict=False)]
     row_tables = [_row(rows, i, axis_tables) for i in range(rows.l1.size)]
     for name, count, most in (
         ("states of an axis", max(len(part.B) for part in axis_tables), MOST_STATES),
-        ("rows of a step", len(row_tables), MOST_ROWS),
+        ("rows of a step", len(row_tables), MOST_STEP_ROWS),
     ):
         if count > most:
             raise ParameterError("controller", "problem", f"{count} {name}", f"such that there are at most {most}")
@@ -237,7 +237,7 @@ def _in_modes(problem: Problem, modes: Array) -> Problem:
     back = np.linalg.inv(to)
     A, B = to @ model.A @ back, to @ model.B
     for matrix in (A, B):
-        matrix[np.abs(matrix) < ROUNDING * np.abs(matrix).max()] = 0.0
+        matrix[np.abs(matrix) < ROW_ROUNDING * np.abs(matrix).max()] = 0.0
     P = None if objective.P is None else symmetric(back.T @ objective.P @ back)
     return Problem(
         model=replace(model, A=A, B=B),
@@ -251,7 +251,7 @@ def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:
     """Return the axes, the last perhaps without effect, and T (nu, nu) of all of them."""
     parts, nu = axes(problem), problem.model.nu
     T = np.hstack([part.T for part in parts])
-    T[np.abs(T) < ROUNDING] = 0.0
+    T[np.abs(T) < ROW_ROUNDING] = 0.0
     missing = nu - T.shape[1]
     if missing:
         _, _, rest = np.linalg.svd((problem.objective.Q_u @ T).T)

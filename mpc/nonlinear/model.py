@@ -77,7 +77,7 @@ def nonlinear_model(
     )
 
 
-def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
+def next_state(model: NonlinearModel, x: Array, u: Array) -> Array:
     """The state (n,) one period after a state x (n,) under inputs u (4,) [rad/s]."""
     return advance_disturbed(model, x, u, model.period, model.effectiveness, model.acceleration.tolist())
 
@@ -85,7 +85,7 @@ def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
 def advance_disturbed(
     model: NonlinearModel, x: Array, u: Array, period: float, effectiveness: Array, acceleration: Sequence[float]
 ) -> Array:
-    """`advance` with the disturbance given as numbers.
+    """`next_state` with the disturbance given as numbers.
 
     It uses plain numbers: arrays of three are several times slower.
     """

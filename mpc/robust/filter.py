@@ -43,7 +43,7 @@ from quadsim.vehicle import Vehicle
 LATER: Final = 1e-6
 """epsilon: weight of the later inputs' distance from trim, relative to the first input's from the request."""
 PENALTY: Final = 1e4
-"""l1 of violating a soft row by its room on one side, for a unit weight of the first input."""
+"""l1 of violating a soft row by half its band, for a unit weight of the first input."""
 TERMINAL_TOLERANCE: Final = 1e-4
 """Largest change per period of the steady part of the state at the plan's end [unit of the state]."""
 LOOSE: Final = 1e4
@@ -170,8 +170,8 @@ def _soft(part: Constraint) -> Constraint:
     lower, upper = np.atleast_2d(part.lower)[-1], np.atleast_2d(part.upper)[-1]
     both = np.isfinite(lower) & np.isfinite(upper)
     one = np.abs(np.where(np.isfinite(lower), lower, upper))
-    room = np.where(both, 0.5 * (upper - lower), np.where(one > 0.0, one, 1.0))
-    return replace(part, penalty=Penalty(l1=PENALTY / room, l2=np.zeros(room.size)))
+    half_band = np.where(both, 0.5 * (upper - lower), np.where(one > 0.0, one, 1.0))
+    return replace(part, penalty=Penalty(l1=PENALTY / half_band, l2=np.zeros(half_band.size)))
 
 
 def _steady_rows(problem: Problem) -> Array:

@@ -96,18 +96,18 @@ def margins(
     """
     if 0.0 < rotor_lag < SHORTEST_LAG:
         raise ParameterError("controller", "rotor_lag", rotor_lag, f"0, or at least {SHORTEST_LAG:g} s")
-    room = 0.5 * (bounds.y_max - bounds.y_min)
-    for i in np.flatnonzero(~np.isfinite(room)):
+    half_band = 0.5 * (bounds.y_max - bounds.y_min)
+    for i in np.flatnonzero(~np.isfinite(half_band)):
         output = bounds.output(int(i))
         name, scale = output.name, output.factor
         sides = [scale * float(bounds.y_min[i]), scale * float(bounds.y_max[i])]
         raise ParameterError("controller.output_bounds", name, sides, "finite on both sides, to be tightened")
-    A, B, C, E, K = _corrected(vehicle, rotor_lag, period, bounds.C_c, ERROR_SHARE * room, settings, estimated)
+    A, B, C, E, K = _corrected(vehicle, rotor_lag, period, bounds.C_c, ERROR_SHARE * half_band, settings, estimated)
     margins = growth(A, B, C, E, K, period=period, horizon=horizon, delay=delay)
     passed = between_samples(settings.turning, period)
     margins += passed
-    worst = int(np.argmax(np.round(margins[-1] / room, 9)))  # the first of equal ones
-    if margins[-1, worst] > LARGEST_SHARE * room[worst]:
+    worst = int(np.argmax(np.round(margins[-1] / half_band, 9)))  # the first of equal ones
+    if margins[-1, worst] > LARGEST_SHARE * half_band[worst]:
         turned = growth(A, B, C, E * _TURNS, K, period=period, horizon=horizon, delay=delay)[-1, worst]
         shares = {
             "acceleration": margins[-1, worst] - turned - passed,
@@ -118,9 +118,9 @@ def margins(
         output = bounds.output(worst)
         name, scale, unit = output.name, output.factor, output.unit
         rule = (
-            f"smaller, or the bounds on {name} wider: these leave {scale * room[worst]:.3g} {unit} on either side of "
-            f"their middle, of which {scale * margins[-1, worst]:.3g} {unit} would be given up and at most "
-            f"{scale * LARGEST_SHARE * room[worst]:.3g} {unit} may be"
+            f"smaller, or the bounds on {name} wider: these leave {scale * half_band[worst]:.3g} {unit} on either side "
+            f"of their middle, of which {scale * margins[-1, worst]:.3g} {unit} would be given up and at most "
+            f"{scale * LARGEST_SHARE * half_band[worst]:.3g} {unit} may be"
         )
         raise ParameterError("controller.tightening", most, getattr(settings, most), rule)
     return read_only(margins)

@@ -86,7 +86,7 @@ CORE_OR_PIQP: Final = "core-or-piqp"
 INVALID_DATA: Final = "invalid_data"
 """Status of a query with numbers that no back end receives."""
 
-LARGEST: Final = 1e6
+LARGEST_ENTRY: Final = 1e6
 """Largest plausible number in a changing model: beyond it, four steps multiply to 1e30, which PIQP treats as
 infinite."""
 
@@ -219,8 +219,8 @@ class QPSolver:
     def solve(self, query: Query) -> Answer:
         """See `Solver.solve`.
 
-        Data that is not finite, or beyond `LARGEST` in a changing model, gives the status `invalid_data`, since back
-        ends may not notice it.
+        Data that is not finite, or beyond `LARGEST_ENTRY` in a changing model, gives the status `invalid_data`, since
+        back ends may not notice it.
         """
         form, by, method, spent_s = self.formulation, self.name, Method.WHOLE, 0.0
         if not _usable(query):
@@ -245,9 +245,9 @@ class QPSolver:
 
 
 def _usable(query: Query) -> bool:
-    """Return whether all numbers are finite and, in a changing model, at most `LARGEST`."""
+    """Return whether all numbers are finite and, in a changing model, at most `LARGEST_ENTRY`."""
     state, desired, u_before, rest, steps = query
     if steps is None:
         return math.isfinite(state.sum() + desired.sum() + u_before.sum())
     parts = (*steps, state, desired, u_before, *(() if rest is None else (rest.u,)))
-    return all(np.abs(part).max() <= LARGEST for part in parts)
+    return all(np.abs(part).max() <= LARGEST_ENTRY for part in parts)

@@ -17,12 +17,12 @@ from mpc.qp import QP, Matrix, Solution
 from quadsim.controller import SOLVED, Statistics
 from quadsim.state import Array
 
-SETTINGS: Final = {
+DAQP_SETTINGS: Final = {
     "primal_tol": 1e-8,  # rad or rad/s; DAQP's default of 1e-6 is equally fast
     "iter_limit": 5000,  # changes of the active set; the paper's QPs take 1 to 180
 }
 
-STATUS: Final = {
+DAQP_STATUS: Final = {
     1: SOLVED,
     -1: "primal_infeasible",
     -2: "cycling",
@@ -41,7 +41,7 @@ class DaqpDense:
         """See `mpc.qp.Backend.setup`."""
         self._qp = qp
         self._model = daqp.Model()
-        self._model.settings = SETTINGS
+        self._model.settings = DAQP_SETTINGS
         sense = np.zeros(qp.c.size + qp.h_l.size + qp.b.size, dtype=np.intc)
         sense[qp.c.size + qp.h_l.size :] = 5  # always active
         rows, bounds = np.concatenate([_dense(qp.G), _dense(qp.A)]), _bounds(qp)
@@ -65,7 +65,7 @@ class DaqpDense:
             y=y,
             z=z,
             z_box=z_box,
-            status=STATUS.get(flag, f"daqp_{flag}"),
+            status=DAQP_STATUS.get(flag, f"daqp_{flag}"),
             stats=Statistics(
                 iterations=info["iterations"],
                 active=int(np.count_nonzero(z) + np.count_nonzero(z_box)),

@@ -51,7 +51,7 @@ UNAUDITED_ADVICE: Final = (
     'example name = "tilt", signal = "tilt", upper = 30.0'
 )
 """What to do about an unaudited flight."""
-COMMANDED: Final = ("speed", "slew")
+COMMAND_SIGNALS: Final = ("speed", "slew")
 """Signals that the controller sets itself."""
 
 
@@ -73,9 +73,9 @@ MOTION: Final = Tolerance(plant=0.01, sampled=0.002)
 """Of quantities that a controller bounds at its samples, and that overshoot between them."""
 AT_SAMPLES: Final = Tolerance(plant=0.01, sampled=0.01)
 """Of quantities that exist only at the samples, and that no controller bounds."""
-ROUNDING: Final = Tolerance(plant=1e-6, sampled=1e-6, of_band=False)
+COMMAND_TOLERANCE: Final = Tolerance(plant=1e-6, sampled=1e-6, of_band=False)
 """Of commands [rad/s]."""
-EXACT: Final = Tolerance(plant=0.0, sampled=0.0)
+ZERO_TOLERANCE: Final = Tolerance(plant=0.0, sampled=0.0)
 """Of clearances."""
 
 
@@ -140,8 +140,10 @@ SIGNALS: Final[dict[str, Signal]] = {
         sampled=lambda log: _present(log.target[:, 0] if log.target is not None else None, log.t),
         plant=lambda log: _present(log.thrust, log.t),
     ),
-    "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds, tolerance=ROUNDING),
-    "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None, tolerance=ROUNDING),
+    "speed": Signal(
+        unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds, tolerance=COMMAND_TOLERANCE
+    ),
+    "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None, tolerance=COMMAND_TOLERANCE),
 }
 
 
@@ -150,11 +152,11 @@ def _rotor(i: int) -> Signal:
         unit="rad/s",
         sampled=lambda log: log.speeds[:, i],
         plant=lambda log: log.speeds[:, i],
-        tolerance=ROUNDING,
+        tolerance=COMMAND_TOLERANCE,
     )
 
 
-TERMS: Final[dict[str, Signal]] = {
+TERM_SIGNALS: Final[dict[str, Signal]] = {
     **{name: SIGNALS[name] for name in STATE_NAMES},
     **{f"speed_{i + 1}": _rotor(i) for i in range(N_ROTORS)},
 }
@@ -164,14 +166,14 @@ CLEARANCE: Final = "clearance"  # the signal of a limit in space: clearance of t
 
 
 def sum_signal(terms: Mapping[str, float]) -> Signal:
-    """Return the signal of a sum of terms: names in `TERMS` with their factors."""
-    signals = [(factor, TERMS[name]) for name, factor in terms.items()]
+    """Return the signal of a sum of terms: names in `TERM_SIGNALS` with their factors."""
+    signals = [(factor, TERM_SIGNALS[name]) for name, factor in terms.items()]
     units = {signal.unit for _, signal in signals}
     return Signal(
         unit=units.pop() if len(units) == 1 else "-",
         sampled=lambda log: np.sum([factor * signal.sampled(log) for factor, signal in signals], axis=0),
         plant=lambda log: np.sum([factor * signal.plant(log) for factor, signal in signals if signal.plant], axis=0),
-        tolerance=ROUNDING if all(signal.tolerance is ROUNDING for _, signal in signals) else MOTION,
+        tolerance=COMMAND_TOLERANCE if all(signal.tolerance is COMMAND_TOLERANCE for _, signal in signals) else MOTION,
     )
 
 
@@ -229,8 +231,8 @@ class Limit:
         if self.signal not in (*SIGNALS, SUM):
             raise UnknownNameError("signal", self.signal, [*SIGNALS, SUM])
         for name in self.terms or ():
-            if name not in TERMS:
-                raise UnknownNameError("signal", name, TERMS)
+            if name not in TERM_SIGNALS:
+                raise UnknownNameError("signal", name, TERM_SIGNALS)
 
     @property
     def source(self) -> Signal:
@@ -316,7 +318,7 @@ class SpaceLimit(Limit):
             unit="m",
             sampled=lambda log: self.shape.clearance(log.t, log.truth[:, POSITION]) - self.radius,
             plant=lambda log: self.shape.clearance(log.t, log.state[:, POSITION]) - self.radius,
-            tolerance=EXACT,
+            tolerance=ZERO_TOLERANCE,
         )
 
 
@@ -382,7 +384,9 @@ def worst_finding(findings: Iterable[Finding]) -> Finding | None:
     to six decimals, so that no machine's rounding decides.
     """
     reached = [finding for finding in findings if math.isfinite(finding.margin)]
-    counted = [finding for finding in reached if finding.verdict == "violated" or finding.limit.signal not in COMMANDED]
+    counted = [
+        finding for finding in reached if finding.verdict == "violated" or finding.limit.signal not in COMMAND_SIGNALS
+    ]
     required = [finding for finding in counted if finding.limit.required] or counted
     return min(required, key=lambda finding: (round(finding.share, 6), finding.limit.name), default=None)
 

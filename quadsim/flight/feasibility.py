@@ -37,7 +37,7 @@ from quadsim.state import (
 from quadsim.vehicle import Vehicle
 
 STENCIL: Final = 2  # samples on either side that a torque depends on
-TOLERANCE: Final = 1e-6
+DIFFERENCE_ROUNDING: Final = 1e-6
 """Tolerances of a bound, relative and absolute, for rounding in the differences."""
 
 
@@ -190,7 +190,7 @@ def _problems(
     least, most = vehicle.speed_min, vehicle.speed_max
     problems = _beyond("rotor speed", "rad/s", needed.speeds, (least, most), "limit")
     thrust = float(needed.thrusts.min())
-    if thrust < -TOLERANCE * vehicle.mass * vehicle.gravity:
+    if thrust < -DIFFERENCE_ROUNDING * vehicle.mass * vehicle.gravity:
         problems.append(f"not flyable: a rotor would need a negative thrust, down to {thrust:.4g} N")
     for name, (lower, upper) in bounds.items():
         if name == "speed":  # an equally narrow vehicle limit is already listed
@@ -215,9 +215,9 @@ def _beyond(name: str, unit: str, values: Array, allowed: tuple[float, float], k
         return []
     (lower, upper), low, high = allowed, float(values.min()), float(values.max())
     problems = []
-    if high > upper + TOLERANCE * (1.0 + abs(upper)):
+    if high > upper + DIFFERENCE_ROUNDING * (1.0 + abs(upper)):
         problems.append(f"{name} up to {high:.4g} {unit} ({kind} {upper:.4g})")
-    if low < lower - TOLERANCE * (1.0 + abs(lower)):
+    if low < lower - DIFFERENCE_ROUNDING * (1.0 + abs(lower)):
         problems.append(f"{name} down to {low:.4g} {unit} ({kind} {lower:.4g})")
     return problems
 

@@ -17,7 +17,7 @@ from quadsim.controller import Phase, law_name
 from quadsim.errors import printable
 from quadsim.flight.audit import VERDICT_TEXT, Finding, Limit, SpaceLimit, worst_finding
 from quadsim.flight.rundir import findings_of
-from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
+from quadsim.report.table import ABSENT, Cell, Mark, QuantityRow, format_number
 from quadsim.space import Obstacle
 from quadsim.state import VELOCITY
 
@@ -75,19 +75,19 @@ def different_audits(first: str, second: str, differences: Sequence[str]) -> str
     )
 
 
-def comparison_rows(runs: Sequence[Run]) -> list[Row]:
+def comparison_rows(runs: Sequence[Run]) -> list[QuantityRow]:
     """Everything the summaries say, side by side; a value that a run lacks is shown as `-`."""
     summaries = [run.summary for run in runs]
 
-    def rows(group: str, lines: Iterable[_Line], only_with: str = "status") -> Iterator[Row]:
+    def rows(group: str, lines: Iterable[_Line], only_with: str = "status") -> Iterator[QuantityRow]:
         if any(summary.get(only_with) for summary in summaries):
             for label, unit, cell in lines:
-                yield Row(group=group, label=label, unit=unit, cells=tuple(map(cell, summaries)))
+                yield QuantityRow(group=group, label=label, unit=unit, cells=tuple(map(cell, summaries)))
 
     return [
         *rows(GLANCE, _GLANCE),
         _best_smallest(GLANCE, "RMS error, position", "m", summaries, list(map(_position_error, summaries))),
-        Row(group=GLANCE, label="highest speed", unit="m/s", cells=tuple(map(_highest_speed, runs))),
+        QuantityRow(group=GLANCE, label="highest speed", unit="m/s", cells=tuple(map(_highest_speed, runs))),
         *rows(GLANCE, [("step time", "ms", _step_time)]),
         *rows("Flight", _FLIGHT),
         *rows("Course", _COURSE, "course"),
@@ -262,7 +262,7 @@ def tolerance_text(limit: Limit) -> str:
     return f"{plant:.3g}" if plant == sampled else f"{plant:.3g}, {sampled:.3g} at the samples"
 
 
-def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[QuantityRow]:
     measures = {"rmse": "RMS error", "max_error": "largest error", "final_error": "final error"}
     for measure, label in {**measures, "overshoot": "overshoot"}.items():
         for channel in _present_keys(summaries, "tracking", measure):
@@ -278,7 +278,7 @@ def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
         yield _best_smallest("Tracking", f"settling, {channel} at {time:g} s", "s", summaries, times)
 
 
-def _step_time_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+def _step_time_rows(summaries: Sequence[Summary]) -> Iterator[QuantityRow]:
     measures = {"p50": "median", "p95": "95th percentile", "p99": "99th percentile", "max": "maximum"}
     for clock, part in {"step_ms": "whole step", "solve_ms": "optimum alone, by any answerer"}.items():
         for measure, label in measures.items():
@@ -288,7 +288,7 @@ def _step_time_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
 
 def _best_smallest(
     group: str, label: str, unit: str, summaries: Sequence[Summary], values: Sequence[float | None]
-) -> Row:
+) -> QuantityRow:
     """Return a row with its smallest magnitude marked, among completed flights and if they differ."""
     texts = [format_number(value) for value in values]
     eligible = {
@@ -299,16 +299,16 @@ def _best_smallest(
     differ = len({texts[i] for i in eligible}) > 1
     best = {i for i in eligible if differ and texts[i] == texts[min(eligible, key=eligible.__getitem__)]}
     cells = tuple(Cell(text=text, mark=Mark.BEST if i in best else Mark.NONE) for i, text in enumerate(texts))
-    return Row(group=group, label=label, unit=unit, cells=cells)
+    return QuantityRow(group=group, label=label, unit=unit, cells=cells)
 
 
-def _constraint_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
+def _constraint_rows(summaries: Sequence[Summary]) -> Iterator[QuantityRow]:
     audits = [{finding.limit.name: finding for finding in findings_of(summary)} for summary in summaries]
     for name in dict.fromkeys(name for audit in audits for name in audit):
         entries = [audit.get(name) for audit in audits]
         own_unit = next(entry.limit.unit for entry in entries if entry is not None)
         for label, unit, cell in _CONSTRAINT:
-            yield Row(
+            yield QuantityRow(
                 group=f"Constraint {name}",
                 label=label,
                 unit=own_unit if unit == _OWN else unit,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from quadsim.errors import printable
 from quadsim.palette import css
-from quadsim.report.table import Cell, Grid, Row
+from quadsim.report.table import Cell, Grid, QuantityRow
 from quadsim.report.to_plotly import Plot, plotly_script
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def render_page(
     verdict: Cell | None = None,
     notes: Sequence[str] = (),
     runs: Sequence[RunView] = (),
-    rows: Sequence[Row] = (),
+    rows: Sequence[QuantityRow] = (),
     files: Mapping[str, str] | None = None,
 ) -> str:
     """A page of a kind, e.g. `campaign`.

@@ -33,7 +33,7 @@ class Cell:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class QuantityRow:
     """One quantity under the heading of its group: a cell for each run, in order.
 
     A headline is its group's answer in one line, such as the verdict on a constraint.
@@ -65,7 +65,7 @@ def line(*cells: Cell | str) -> tuple[Cell, ...]:
     return tuple(cell if isinstance(cell, Cell) else Cell(text=cell) for cell in cells)
 
 
-def to_markdown(rows: Sequence[Row], names: Sequence[str]) -> str:
+def to_markdown(rows: Sequence[QuantityRow], names: Sequence[str]) -> str:
     """A Markdown table of the rows: headlines and the best values in bold type."""
     lines, group = [], ""
     for row in rows:

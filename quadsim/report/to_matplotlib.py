@@ -83,7 +83,7 @@ def to_png(figure: Figure, dpi: float | None = None) -> bytes:
     return png.getvalue()
 
 
-def to_html(figure: Figure) -> str:
+def figure_html(figure: Figure) -> str:
     """The figure for a notebook: SVG, or PNG where its curves make that large."""
     svg = io.StringIO()
     with _style({"svg.fonttype": "none", "svg.hashsalt": figure.key}):

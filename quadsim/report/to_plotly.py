@@ -137,7 +137,7 @@ def scene_to_plot(scene: Scene) -> Plot:
     return embed(canvas, scene.key, scene.title, _SCENE)
 
 
-def thin(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
+def thinned_curve(values: Array, points: int) -> np.ndarray[Any, np.dtype[np.intp]]:
     """Rising indices of about `points` of the values (K,): the lowest and highest of each segment, so no peak is lost.
 
     The first, the last, and all gaps, where a value is not finite, are retained.
@@ -208,7 +208,11 @@ def _draw_series(canvas: Canvas, series: Series, place: dict[str, int], points: 
             Bar(x=series.x.astype(np.float32), y=series.y, customdata=series.y, hovertemplate=hover, **shared), **place
         )
         return
-    drawn = thin(series.y, points) if series.style != "points" or series.flights is None else np.arange(series.y.size)
+    drawn = (
+        thinned_curve(series.y, points)
+        if series.style != "points" or series.flights is None
+        else np.arange(series.y.size)
+    )
     x, y = series.x[drawn].astype(np.float32), series.y[drawn].astype(np.float32)
     if series.style == "points":
         shared["marker"] = {"color": series.colour, "size": 1.5 * series.width, "symbol": series.marker}

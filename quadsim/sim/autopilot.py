@@ -40,9 +40,9 @@ Gains = Annotated[tuple[NonNegative, ...], Len(3, 3)]
 
 RATE, GYRO_CUTOFF, D_CUTOFF = 1000.0, 100.0, 60.0  # [Hz]
 LARGEST_RATE: Final = (500.0, 500.0, 200.0)  # [deg/s]
-DAMPING: Final = 0.7
+RATE_LOOP_DAMPING: Final = 0.7
 """Damping of the rate loop that the default gains aim at."""
-FASTEST: Final = 40.0
+FASTEST_RATE_LOOP: Final = 40.0
 """Largest bandwidth of the default rate loop [rad/s]."""
 LARGEST_D: Final = 2.0
 """Largest default of d: it multiplies the effect of gyro noise."""
@@ -99,16 +99,16 @@ class AutopilotSettings:
         usual = filled(usual, delay=1.0 / rate)
         filtering = 1.0 / (math.tau * usual.gyro_cutoff) if usual.gyro_cutoff else 0.0
         lag = (vehicle.rotor_rise or 0.0) + filtering + (usual.delay or 0.0) + 0.5 / rate
-        w = min(FASTEST, (1.0 + LARGEST_D) / (2.0 * DAMPING * lag))
-        p, d = w * max(w * lag, 0.5 / DAMPING), max(2.0 * DAMPING * w * lag - 1.0, 0.0)
+        w = min(FASTEST_RATE_LOOP, (1.0 + LARGEST_D) / (2.0 * RATE_LOOP_DAMPING * lag))
+        p, d = w * max(w * lag, 0.5 / RATE_LOOP_DAMPING), max(2.0 * RATE_LOOP_DAMPING * w * lag - 1.0, 0.0)
         gains = filled(usual, p=(p, p, min(0.5 * p, 0.5 / lag)), d=(d, d, 0.0))
         assert gains.p is not None
         effect = np.abs(vehicle.allocation[1:]).sum(axis=1) / np.array(vehicle.inertia)
-        room = min(vehicle.hover_speed**2 - vehicle.speed_min**2, vehicle.speed_max**2 - vehicle.hover_speed**2)
+        reserve = min(vehicle.hover_speed**2 - vehicle.speed_min**2, vehicle.speed_max**2 - vehicle.hover_speed**2)
         return filled(
             gains,
             i=tuple(gain / INTEGRAL_TIME for gain in gains.p),
-            i_max=tuple((AUTHORITY * effect * room).tolist()),
+            i_max=tuple((AUTHORITY * effect * reserve).tolist()),
             attitude=(0.25 * w, 0.25 * w, 0.25 * min(w, gains.p[2])),
             idle=vehicle.speed_min / vehicle.speed_max,
         )
@@ -174,7 +174,7 @@ class Autopilot:
         """Return the rotor speeds (4,) [rad/s] until the next call, for the target `commanded` (4,) or (8,)."""
         target = commanded[1:4]
         if commanded.size > N_ROTORS:
-            turning = target + self._attitude * attitude_error(attitude, commanded[4:])
+            turning = target + self._attitude * body_attitude_error(attitude, commanded[4:])
             target = np.minimum(np.maximum(turning, -self._largest), self._largest)
         before, self._filtered = self._filtered, self._filtered + self._gyro_share * (rates - self._filtered)
         y = self._filtered
@@ -203,21 +203,21 @@ class Autopilot:
         low, high = self._range
         level, yaw = self._to_thrusts[:, 1:3] @ torque[:2], self._to_thrusts[:, 3] * torque[2]
         base, airmode = min(max(0.25 * thrust, low), high), self.settings.airmode
-        room = high - low if airmode else min(base - low, high - base)
+        reserve = high - low if airmode else min(base - low, high - base)
         extent = float(level.max() - level.min()) if airmode else float(np.abs(level).max())
-        share = min(1.0, room / extent) if extent else 1.0
+        share = min(1.0, reserve / extent) if extent else 1.0
         level = share * level
         # With airmode the parts need room for their differences alone: the collective thrust yields.
         rows = [*zip(level.tolist(), yaw.tolist(), strict=True)]
         pairs = [(a - c, b - d) for a, b in rows for c, d in rows] if airmode else [*rows, *((-a, -b) for a, b in rows)]
-        turn = max(min([1.0, *((room - part) / change for part, change in pairs if change > 0.0)]), 0.0)
+        turn = max(min([1.0, *((reserve - part) / change for part, change in pairs if change > 0.0)]), 0.0)
         parts = level + turn * yaw
         if airmode:
             base = min(max(base, low - float(parts.min())), high - float(parts.max()))
         return np.minimum(np.maximum(base + parts, low), high), np.array([share < 1.0, share < 1.0, turn < 1.0])
 
 
-def attitude_error(attitude: Array, target: Array) -> Array:
+def body_attitude_error(attitude: Array, target: Array) -> Array:
     """(3,) 2 vec(q* q_c), the shorter way: the rotation from q to q_c, wxyz, about body axes [rad], to first order."""
     w, *vector = multiply(conjugate(tuple(attitude.tolist())), tuple(target.tolist()))
     return math.copysign(2.0, w) * np.array(vector)
@@ -225,8 +225,8 @@ def attitude_error(attitude: Array, target: Array) -> Array:
 
 STEPS: Final = (0.1, 1.0, 1.0, 0.5)
 """Steps by which lags are identified: of the weight, and of body rates [rad/s]."""
-WINDOW: Final = 0.3  # time of a step response that is fitted [s]
-SHORTEST_LAG, LONGEST_LAG = 1e-4, 0.6  # [s]
+FIT_WINDOW: Final = 0.3  # time of a step response that is fitted [s]
+SHORTEST_FITTED_LAG, LONGEST_FITTED_LAG = 1e-4, 0.6  # [s]
 
 
 def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float = 1e-3) -> tuple[float, ...]:
@@ -239,7 +239,7 @@ def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float
 
     rise, fall = vehicle.rotor_rise or 0.0, vehicle.rotor_fall or vehicle.rotor_rise or 0.0
     rotors = RotorDynamics(rise=rise or None, fall=fall or None, inertia=None if rise else 0.0).resolved(vehicle)
-    times = np.arange(1, round(WINDOW / timestep) + 1) * timestep
+    times = np.arange(1, round(FIT_WINDOW / timestep) + 1) * timestep
     lags = []
     with Plant(vehicle, timestep=timestep, effects=Effects(rotors=rotors), limit_speeds=True) as plant:
         for axis in range(4):
@@ -248,8 +248,8 @@ def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float
             def misfit(lag: float, response: Array = response) -> float:
                 return float(np.square(1.0 - np.exp(-times / lag) - response).sum())
 
-            lag = float(minimize_scalar(misfit, bounds=(SHORTEST_LAG, LONGEST_LAG), method="bounded").x)
-            if lag > 0.95 * LONGEST_LAG:
+            lag = float(minimize_scalar(misfit, bounds=(SHORTEST_FITTED_LAG, LONGEST_FITTED_LAG), method="bounded").x)
+            if lag > 0.95 * LONGEST_FITTED_LAG:
                 name = ("thrust", "p", "q", "r")[axis]
                 raise InputError(f"autopilot: a step of {name} is not reached, so no lag fits it; state inner_lag")
             lags.append(lag)
@@ -265,7 +265,7 @@ def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
     autopilot.reset()
     reached = []
     target[axis] += size
-    for _ in range(0, round(WINDOW / plant.timestep), stride):
+    for _ in range(0, round(FIT_WINDOW / plant.timestep), stride):
         attitude, rates = plant.attitude
         speeds = autopilot.speeds(plant.time, target, rates, plant.speeds, attitude)
         steps = plant.advance(speeds, stride)
@@ -274,7 +274,7 @@ def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
         else:
             ends = np.concatenate([steps["speeds"][1:], plant.speeds[None]])
             reached.append((vehicle.thrust_coefficient * np.square(ends).sum(axis=1) - weight) / size)
-    return np.concatenate(reached)[: round(WINDOW / plant.timestep)]
+    return np.concatenate(reached)[: round(FIT_WINDOW / plant.timestep)]
 
 
 @cache

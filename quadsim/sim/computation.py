@@ -31,7 +31,7 @@ def physics_steps(time: float, timestep: float) -> int:
     return math.ceil(time / timestep - 1e-6)
 
 
-Seconds = Annotated[float, Ge(0.0), Le(100.0)]
+ComputationSeconds = Annotated[float, Ge(0.0), Le(100.0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,9 +42,10 @@ class ComputationTime:
     """
 
     delay: Annotated[
-        Seconds, doc("[s] fixed part; longer than a control period: several commands are under way at a time")
+        ComputationSeconds,
+        doc("[s] fixed part; longer than a control period: several commands are under way at a time"),
     ] = 0.0
-    per_iteration: Annotated[Seconds, doc("[s] for each iteration of the solver")] = 0.0
+    per_iteration: Annotated[ComputationSeconds, doc("[s] for each iteration of the solver")] = 0.0
     plan: Annotated[
         bool | None,
         doc(
@@ -52,7 +53,7 @@ class ComputationTime:
             "with a controller within the fallback contract"
         ),
     ] = None
-    jitter: Annotated[Seconds, doc("[s] mean of an exponentially distributed part")] = 0.0
+    jitter: Annotated[ComputationSeconds, doc("[s] mean of an exponentially distributed part")] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

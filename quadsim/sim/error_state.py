@@ -45,11 +45,11 @@ from quadsim.sim.sensing import SensorName
 from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
 
-POSITION: Final = slice(0, 3)
-VELOCITY: Final = slice(3, 6)
-ATTITUDE: Final = slice(6, 9)
-RATES: Final = slice(9, 12)
-GYRO_BIAS: Final = slice(12, 15)
+POSITION_PART: Final = slice(0, 3)
+VELOCITY_PART: Final = slice(3, 6)
+ATTITUDE_PART: Final = slice(6, 9)
+RATES_PART: Final = slice(9, 12)
+GYRO_BIAS_PART: Final = slice(12, 15)
 N_ERRORS: Final = 15
 
 MEAN_QUATERNION: Final = slice(6, 10)
@@ -98,7 +98,7 @@ def retract(mean: Array, error: Array) -> Array:
     moved = np.empty_like(mean)
     moved[:6] = mean[:6] + error[:6]
     w, x, y, z = mean[MEAN_QUATERNION].tolist()
-    a, b, c = error[ATTITUDE].tolist()
+    a, b, c = error[ATTITUDE_PART].tolist()
     moved[MEAN_QUATERNION] = normalise(multiply((w, x, y, z), exponential((a, b, c))))
     moved[10:] = mean[10:] + error[9:]
     return moved
@@ -111,7 +111,7 @@ def difference(mean: Array, other: Array) -> Array:
     error[9:] = mean[10:] - other[10:]
     w, x, y, z = mean[MEAN_QUATERNION].tolist()
     a, b, c, d = other[MEAN_QUATERNION].tolist()
-    error[ATTITUDE] = logarithm(multiply(conjugate((a, b, c, d)), (w, x, y, z)))
+    error[ATTITUDE_PART] = logarithm(multiply(conjugate((a, b, c, d)), (w, x, y, z)))
     return error
 
 
@@ -125,7 +125,7 @@ STILL_TIME: Final = 0.01  # correlation time tau of these velocities and rates [
 
 
 _CHAIN = np.zeros((N_ERRORS, N_ERRORS))  # the two double integrators, dp/dt = v and dtheta/dt = omega
-_CHAIN[POSITION, VELOCITY] = _CHAIN[ATTITUDE, RATES] = np.eye(3)
+_CHAIN[POSITION_PART, VELOCITY_PART] = _CHAIN[ATTITUDE_PART, RATES_PART] = np.eye(3)
 read_only(_CHAIN)
 
 
@@ -152,9 +152,9 @@ class MotionModel:
 def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:
     """Return the model of a vehicle with the disturbances of the settings."""
     density = np.zeros(N_ERRORS)
-    density[VELOCITY] = settings.acceleration_noise**2
-    density[RATES] = settings.angular_acceleration_noise**2
-    density[GYRO_BIAS] = math.radians(settings.gyro_bias_walk) ** 2
+    density[VELOCITY_PART] = settings.acceleration_noise**2
+    density[RATES_PART] = settings.angular_acceleration_noise**2
+    density[GYRO_BIAS_PART] = math.radians(settings.gyro_bias_walk) ** 2
     return MotionModel(
         mass=vehicle.mass,
         gravity=vehicle.gravity,
@@ -170,7 +170,7 @@ def drive(model: MotionModel, speeds: Array) -> Drive:
     return Drive(acceleration=thrust / model.mass, torque=(x, y, z))
 
 
-def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: float) -> Estimate:
+def predict_estimate(model: MotionModel, estimate: Estimate, driven: Drive, duration: float) -> Estimate:
     """Predict the estimate a time h [s] later, short compared with the time in which the vehicle turns.
 
     The mean by the midpoint rule, the attitude on the sphere; the covariance as F P F' + Q(h), F to third order in h.
@@ -206,7 +206,7 @@ def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: flo
     # -R [a]x = a [-r2, r1, 0] with r1, r2 the columns of R, all at mid-step.  The six columns of attitude and rates are
     # filled block by block: one assignment costs as much as 9.
     A = _CHAIN.copy()
-    A[VELOCITY.start : RATES.stop, ATTITUDE.start : RATES.stop] = [
+    A[VELOCITY_PART.start : RATES_PART.stop, ATTITUDE_PART.start : RATES_PART.stop] = [
         [-2.0 * a * (x * y - w * z), a * (1.0 - 2.0 * (y * y + z * z)), 0.0, 0.0, 0.0, 0.0],
         [-a * (1.0 - 2.0 * (x * x + z * z)), 2.0 * a * (x * y + w * z), 0.0, 0.0, 0.0, 0.0],
         [-2.0 * a * (y * z + w * x), 2.0 * a * (x * z - w * y), 0.0, 0.0, 0.0, 0.0],
@@ -236,9 +236,9 @@ def _gathered(density: Array) -> tuple[Array, Array, Array]:
 
 _RETAINED, _VARIANCE, _WALK = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
 """1 for entries without velocity or rates, else 0; the variance of velocity and rates; the growth of the rest."""
-_RETAINED[VELOCITY] = _RETAINED[RATES] = 0.0
-_VARIANCE[VELOCITY], _VARIANCE[RATES] = STILL_VELOCITY**2, STILL_RATE**2
-_WALK[POSITION], _WALK[ATTITUDE] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
+_RETAINED[VELOCITY_PART] = _RETAINED[RATES_PART] = 0.0
+_VARIANCE[VELOCITY_PART], _VARIANCE[RATES_PART] = STILL_VELOCITY**2, STILL_RATE**2
+_WALK[POSITION_PART], _WALK[ATTITUDE_PART] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
 
 
 def lifts(model: MotionModel, driven: Drive) -> bool:
@@ -249,23 +249,23 @@ def lifts(model: MotionModel, driven: Drive) -> bool:
 def stand(model: MotionModel, estimate: Estimate, duration: float) -> Estimate:
     """Predict the estimate of a vehicle on the ground a time h [s] later, without its velocity and rates."""
     mean = estimate.mean.copy()
-    mean[VELOCITY] = mean[MEAN_RATES] = 0.0
+    mean[VELOCITY_PART] = mean[MEAN_RATES] = 0.0
     covariance = np.outer(_RETAINED, _RETAINED) * estimate.covariance + np.diag(_VARIANCE + duration * _WALK)
-    covariance[GYRO_BIAS, GYRO_BIAS] += duration * model.noise[0][GYRO_BIAS, GYRO_BIAS]
+    covariance[GYRO_BIAS_PART, GYRO_BIAS_PART] += duration * model.noise[0][GYRO_BIAS_PART, GYRO_BIAS_PART]
     return Estimate(mean=mean, covariance=covariance)
 
 
 _BLOCKS: Final = {
-    SensorName.POSITION: (POSITION,),
-    SensorName.VELOCITY: (VELOCITY,),
-    SensorName.ATTITUDE: (ATTITUDE,),
-    SensorName.RATES: (RATES, GYRO_BIAS),
+    SensorName.POSITION: (POSITION_PART,),
+    SensorName.VELOCITY: (VELOCITY_PART,),
+    SensorName.ATTITUDE: (ATTITUDE_PART,),
+    SensorName.RATES: (RATES_PART, GYRO_BIAS_PART),
 }
 """The error components whose sum a sensor measures."""
 _LEADS: Final = {
-    SensorName.POSITION: (VELOCITY,),
+    SensorName.POSITION: (VELOCITY_PART,),
     SensorName.VELOCITY: (),
-    SensorName.ATTITUDE: (RATES, GYRO_BIAS),
+    SensorName.ATTITUDE: (RATES_PART, GYRO_BIAS_PART),
     SensorName.RATES: (),
 }
 """The components whose errors accumulate in it; the gyro's bias does so through the rates, which follow the gyro."""

@@ -27,7 +27,7 @@ from quadsim.sim.error_state import (
     inflate,
     lifts,
     motion_model,
-    predict,
+    predict_estimate,
     retract,
     stand,
     update,
@@ -196,7 +196,7 @@ class ErrorStateFilter:
             if driven is None:
                 after = stand(self._model, track.estimate, duration)
             else:
-                after = predict(self._model, track.estimate, driven, duration)
+                after = predict_estimate(self._model, track.estimate, driven, duration)
             size, spread = after.mean @ after.mean, after.covariance.trace()
             if not (size < _LARGEST**2 and spread < _LARGEST_VARIANCE):
                 # The estimate is lost: keep the mean, restore the initial covariance, and let the sensors correct it.

@@ -25,7 +25,7 @@ from quadsim.sim.effects.load import Load, MassChange, Payload, PayloadDrop, app
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import PHYSICS, Integrator, PhysicsSteps, physics_to_state, steps_type
-from quadsim.sim.rigid_body import RigidBody, check_free
+from quadsim.sim.rigid_body import FreeBody, check_free
 from quadsim.space import Obstacle
 from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -190,8 +190,8 @@ class Plant:
         return StepForces(self.vehicle, self.effects, timestep=self.timestep, floor=shape.floor, disc=shape.disc)
 
     @cached_property
-    def _body(self) -> RigidBody:
-        return RigidBody(self.vehicle, self._forces, self.timestep)
+    def _body(self) -> FreeBody:
+        return FreeBody(self.vehicle, self._forces, self.timestep)
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""

@@ -16,7 +16,7 @@ from quadsim.sim.effects.load import Load
 from quadsim.space import Obstacle
 from quadsim.vehicle import Vehicle
 
-Rates = tuple[list[float], Wrench]
+StateRates = tuple[list[float], Wrench]
 
 
 def check_free(effects: Effects, changes: Iterable[Change], obstacles: Sequence[Obstacle] = ()) -> None:
@@ -35,7 +35,7 @@ def check_free(effects: Effects, changes: Iterable[Change], obstacles: Sequence[
         raise ParameterError("plant", "integrator", "rk4", f"mujoco with {' and '.join(names)}")
 
 
-class RigidBody:
+class FreeBody:
     """The equations of motion of a vehicle, and one step of them.
 
         dp/dt = v,  dq/dt = q (0, w) / 2,  m dv/dt = -m g e_z + R(q) F e_z + f,  J dw/dt = tau + t - w x J w
@@ -67,7 +67,7 @@ class RigidBody:
         h, (f1, f2, f3, f4) = self._step, thrusts
         fixed = f1 + f2 + f3 + f4, [a * f1 + b * f2 + c * f3 + d * f4 for a, b, c, d in self._torques], held
 
-        def rates(x: Sequence[float]) -> Rates:
+        def rates(x: Sequence[float]) -> StateRates:
             wrench = self._forces.at(x[:7], x[7:], thrusts, of_rotors, wind)
             return self._rates(x, wrench, *fixed), wrench
 

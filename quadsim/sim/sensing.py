@@ -14,7 +14,7 @@ from annotated_types import Ge, Le, Len, doc
 from numpy.typing import NDArray
 
 from quadsim.fields import Fraction, NonNegative, Number
-from quadsim.rotation import Vector, exponential, multiply, quaternion_to_euler
+from quadsim.rotation import Vector3, exponential, multiply, quaternion_to_euler
 from quadsim.sim.physics import PHYSICS, whole
 from quadsim.state import Array
 
@@ -90,7 +90,7 @@ class Sensor:
         return whole(f"sensors.{name}", "delay", self.delay, self.delay / timestep, rule, smallest=0)
 
 
-def in_si(name: SensorName, value: float | Sequence[float]) -> Vector:
+def in_si(name: SensorName, value: float | Sequence[float]) -> Vector3:
     """Return a number of a sensor's settings, or one per axis, as three in SI units."""
     x, y, z = [value] * 3 if isinstance(value, float | int) else value
     unit = math.radians(1.0) if name in (SensorName.ATTITUDE, SensorName.RATES) else 1.0
@@ -115,7 +115,7 @@ class SensorFault:
     start: float  # [s]
     stop: float = math.inf  # [s]; infinite for a permanent fault
     axes: tuple[int, ...] = AXES  # indices of the numbers that become NaN
-    offset: Vector = (0.0, 0.0, 0.0)
+    offset: Vector3 = (0.0, 0.0, 0.0)
     """The offset, in the sensor's unit; a rotation vector in the body frame for attitude."""
 
     def window(self, timestep: float) -> tuple[int, int | None]:

@@ -10,11 +10,13 @@ import pyarrow as pa
 
 from quadsim.errors import InputError
 from quadsim.flight.audit import Limit, limit_differences
-from scenarios.campaign.events import HARMLESS, INCOMPLETE, Event
+from scenarios.campaign.events import HARMLESS, INCOMPLETE, CountedEvent
 from scenarios.campaign.rows import MARGIN, SAMPLED, SATISFIED, TIME_VIOLATED, flags, numbers, texts
 
 
-def judged_by(limits: Sequence[Limit], own: Sequence[Limit], table: pa.Table, failure: Sequence[Event]) -> pa.Table:
+def judged_by(
+    limits: Sequence[Limit], own: Sequence[Limit], table: pa.Table, failure: Sequence[CountedEvent]
+) -> pa.Table:
     """Return a campaign's table as if its flights had been audited with the tolerances of other limits.
 
     The worst margins do not depend on tolerances.  Times beyond them do, and are left out.

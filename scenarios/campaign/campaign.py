@@ -20,10 +20,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from quadsim.errors import InputError, OutputError, ParameterError
+from quadsim.flight.rundir import SCENARIO_FILE
 from quadsim.outputs import Growing, growing, optional
 from quadsim.report.figure import Figure
 from scenarios.campaign import store as records
-from scenarios.campaign.campaign_report import overview, write_report
+from scenarios.campaign.campaign_report import campaign_overview, write_report
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.rows import make_table, read_table
 from scenarios.campaign.statistics import Judgement, estimate, proportion, worst_flight
@@ -96,7 +97,7 @@ class CampaignResult(Result):
 
     def small_plot(self) -> Figure | None:
         """See `Result.small_plot`: worst margins and relevant parameters."""
-        figure = overview(self.table, self.summary, "")
+        figure = campaign_overview(self.table, self.summary, "")
         return figure if figure.panels else None
 
     def shown(self) -> Shown:
@@ -138,12 +139,12 @@ def fly_campaign(
     if records.is_campaign(directory) and not (resume or overwrite):
         raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
     code_digest()  # kept: a process that dies before its manifest is there could not be resumed
-    first = (records.CAMPAIGN_FILE, records.SCENARIO_FILE)
+    first = (records.CAMPAIGN_FILE, SCENARIO_FILE)
     with growing(directory, records.MANIFEST_FILE, overwrite=overwrite, first=first) as files:
         if records.is_campaign(directory):
             records.require_same(plan, directory)
         progress = _Progress(plan, files, until_width=until_width, watch=watch)
-        manifest = records.start(plan, files, session, flying=bool(progress.missing))
+        manifest = records.start_session(plan, files, session, flying=bool(progress.missing))
         if progress.missing:
             _put_report(files, REPORT_FILES, None)  # an earlier report lacks the flights to come
         try:

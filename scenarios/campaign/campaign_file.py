@@ -26,11 +26,11 @@ from scenarios.campaign.events import parse_event
 from scenarios.schema.base import LARGEST_SEED
 from scenarios.schema.writing import to_toml
 
-Whole = Annotated[int, Ge(-LARGEST_SEED), Le(LARGEST_SEED)]
+WholeNumber = Annotated[int, Ge(-LARGEST_SEED), Le(LARGEST_SEED)]
 Seed = Annotated[int, Ge(0), Le(LARGEST_SEED)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$"), MaxLen(60)]
 Unit = Annotated[str, MaxLen(20), doc("of the values, for tables and plots")]
-Value = bool | Whole | Number | str | list[Number]
+Value = bool | WholeNumber | Number | str | list[Number]
 """Values of a list to draw from: any value of a scenario's field except tables."""
 MOST_FLIGHTS: Final = 1_000_000
 _TAIL: Final = 1e-3  # share of a distribution beyond the values taken as its ends
@@ -104,8 +104,8 @@ class Integer(_Ranged):
     """Every whole number between two bounds, both included, is equally likely."""
 
     distribution: Literal["integer"]
-    low: Whole
-    high: Whole
+    low: WholeNumber
+    high: WholeNumber
 
     def quantile(self, share: float) -> Value:
         """See `Varied`."""
@@ -185,13 +185,13 @@ class Choice(_Listed):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Grid(_Listed):
+class GridValues(_Listed):
     """Every value in turn; several grids give every combination, the last one changing fastest."""
 
     distribution: Literal["grid"]
 
 
-Vary = Annotated[Uniform | LogUniform | Normal | Integer | Choice | Grid, Field(discriminator="distribution")]
+Vary = Annotated[Uniform | LogUniform | Normal | Integer | Choice | GridValues, Field(discriminator="distribution")]
 
 
 def _require_range(low: float, high: float) -> None:
@@ -265,7 +265,7 @@ class CampaignFile:
         if len(set(names)) < len(names):
             raise ValueError(f"vary must have distinct names; got {names}")
         _require_separate_fields(self.vary)
-        grids = ", ".join(entry.name for entry in self.vary if isinstance(entry, Grid))
+        grids = ", ".join(entry.name for entry in self.vary if isinstance(entry, GridValues))
         if grids and self.sampling in ("sobol", "halton"):
             rule = f"random or latin_hypercube where there are grids ({grids}), whose turns go with its points"
             raise ValueError(f"sampling must be {rule}; got {self.sampling!r}")
@@ -282,7 +282,7 @@ class CampaignFile:
     @property
     def cells(self) -> int:
         """Number of combinations of the grids; 1 without any."""
-        return math.prod(len(entry.values) for entry in self.vary if isinstance(entry, Grid))
+        return math.prod(len(entry.values) for entry in self.vary if isinstance(entry, GridValues))
 
     def to_toml(self) -> str:
         """Return the file with every field, defaults included; reading it gives this campaign."""
@@ -298,7 +298,7 @@ class Draws:
         self._repeats: dict[str, int] = {}  # for how many flights in a row each grid keeps its value
         repeat = 1
         for entry in reversed(spec.vary):
-            if isinstance(entry, Grid):
+            if isinstance(entry, GridValues):
                 self._repeats[entry.name] = repeat
                 repeat *= len(entry.values)
 
@@ -314,7 +314,7 @@ class Draws:
             point = self._spread[flight]
         return {
             entry.name: entry.values[flight // self._repeats[entry.name] % len(entry.values)]
-            if isinstance(entry, Grid)
+            if isinstance(entry, GridValues)
             else entry.quantile(share)
             for entry, share in zip(self._spec.vary, point.tolist(), strict=True)
         }

@@ -23,7 +23,7 @@ from scenarios.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS,
 from scenarios.campaign.rows import (
     DRAW,
     MARGIN,
-    Summary,
+    CampaignSummary,
     draw_names,
     is_number,
     numbers,
@@ -48,7 +48,9 @@ _ENDS: Final = ("lower", "upper")
 _ALWAYS: Final = ("failure", "violation", "lost")  # events that are listed even where they never happened
 
 
-def campaign_lines(summary: Summary, judgements: Sequence[Judgement], directory: Path) -> Iterator[RenderableType]:
+def campaign_lines(
+    summary: CampaignSummary, judgements: Sequence[Judgement], directory: Path
+) -> Iterator[RenderableType]:
     """Return the report for a console."""
     from scenarios import console
 
@@ -76,7 +78,7 @@ def _brief(grid: Grid) -> Grid:
     return replace(grid, note="", lines=tuple(lines))
 
 
-def verdict_sentence(summary: Summary) -> str:
+def verdict_sentence(summary: CampaignSummary) -> str:
     """Return the failures with their confidence interval: `3 of 40 flights failed: 7.5 % (95 % interval: ...)`."""
     failure = summary["events"]["failure"]
     text = f"{failure['count']} of {count_of(failure['flights'], 'flight')} failed"
@@ -90,7 +92,7 @@ def verdict_sentence(summary: Summary) -> str:
     return text
 
 
-def definition_sentence(summary: Summary, failure: Sequence[str]) -> str:
+def definition_sentence(summary: CampaignSummary, failure: Sequence[str]) -> str:
     """Return what counts as failure, and how many flights violated a constraint where that alone does not count."""
     units = {name: metric["unit"] for name, metric in summary["metrics"].items()}
     units |= {MARGIN + name: constraint["unit"] for name, constraint in summary["constraints"].items()}
@@ -103,7 +105,7 @@ def definition_sentence(summary: Summary, failure: Sequence[str]) -> str:
     return sentence
 
 
-def driver_sentence(summary: Summary) -> str:
+def driver_sentence(summary: CampaignSummary) -> str:
     """Return the parameters on which the worst margin, or else failure, depends significantly, strongest first."""
     outcome = "worst_margin" if any(related["worst_margin"] for related in drivers(summary).values()) else "failed"
     sure = {
@@ -120,7 +122,7 @@ def _grid(key: str, head: Sequence[str], lines: Iterable[tuple[Cell, ...]], note
     return Grid(key=key, title=_TITLES[key], head=tuple(head), lines=tuple(lines), note=note)
 
 
-def event_table(summary: Summary) -> Grid:
+def event_table(summary: CampaignSummary) -> Grid:
     """Return the frequency of each event that happened."""
     sure = f"{100.0 * summary['confidence']:g} %"
     head = ("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}")
@@ -139,7 +141,7 @@ def event_table(summary: Summary) -> Grid:
     return _grid("events", head, lines, note)
 
 
-def constraint_table(summary: Summary) -> Grid:
+def constraint_table(summary: CampaignSummary) -> Grid:
     """Return the number of violations and the worst margin of each constraint."""
     sure, lines = f"{100.0 * summary['confidence']:g} % interval", []
     for name, constraint in summary["constraints"].items():
@@ -156,7 +158,7 @@ def constraint_table(summary: Summary) -> Grid:
     return _grid("constraints", head, lines, note)
 
 
-def metric_table(summary: Summary) -> Grid:
+def metric_table(summary: CampaignSummary) -> Grid:
     """Return the distribution of every metric."""
     measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
     lines = (
@@ -167,7 +169,7 @@ def metric_table(summary: Summary) -> Grid:
     return _grid("metrics", ("metric", *measures, "flights"), lines, note)
 
 
-def worst_table(summary: Summary, directory: str) -> Grid:
+def worst_table(summary: CampaignSummary, directory: str) -> Grid:
     """Return the worst flights and the commands that replay them."""
     worst = summary["worst"]
     lines = (
@@ -187,14 +189,14 @@ def worst_table(summary: Summary, directory: str) -> Grid:
     return _grid("worst", ("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason"), lines, note)
 
 
-def _worst_margin(summary: Summary, flight: Mapping[str, Any]) -> tuple[str, str]:
+def _worst_margin(summary: CampaignSummary, flight: Mapping[str, Any]) -> tuple[str, str]:
     name = flight["worst_constraint"]
     if name is None:
         return ABSENT, ABSENT
     return f"{format_number(flight['margin'])} {summary['constraints'][name]['unit']}", name
 
 
-def worst_draws_table(summary: Summary) -> Grid:
+def worst_draws_table(summary: CampaignSummary) -> Grid:
     """Return the parameters of the worst flights, one column each."""
     worst = summary["worst"]
     lines = (
@@ -217,7 +219,7 @@ def _shares(share: Mapping[str, Any]) -> tuple[str, str]:
     return percent(share["share"]), interval(share["lower"], share["upper"])
 
 
-def driver_table(summary: Summary) -> Grid:
+def driver_table(summary: CampaignSummary) -> Grid:
     """Return how the worst margin and failure depend on each varied parameter."""
     lines = (
         line(label(name, related["unit"]), *_association(related["worst_margin"]), *_association(related["failed"]))
@@ -233,7 +235,7 @@ def driver_table(summary: Summary) -> Grid:
     return _grid("drivers-table", head, lines, note)
 
 
-def group_table(summary: Summary) -> Grid:
+def group_table(summary: CampaignSummary) -> Grid:
     """Return failures over each varied parameter, lowest values first; no lines if none or all flights failed."""
     failure = summary["events"]["failure"]
     listed = {}
@@ -289,7 +291,7 @@ _FENCE: Final = 5.0  # quartile ranges beyond the quartiles up to which values a
 
 
 def write_report(
-    directory: Path, table: pa.Table, summary: Summary, spec: CampaignFile, *, campaign: Path | None = None
+    directory: Path, table: pa.Table, summary: CampaignSummary, spec: CampaignFile, *, campaign: Path | None = None
 ) -> Path:
     """Write `index.html` and `campaign.png` into a directory that is being made; the page.
 
@@ -301,7 +303,7 @@ def write_report(
     campaign = campaign or directory
     sentence = verdict_sentence(summary)
     with optional("campaign.png"):
-        figure = overview(table, summary, f"{spec.name}: {sentence}")
+        figure = campaign_overview(table, summary, f"{spec.name}: {sentence}")
         write_pngs([figure] if figure.panels else [], directory)
     often = (event_table(summary), constraint_table(summary))
     shapes = _plots("metrics", "Flights by verdict", histograms(table), _MARGINS)
@@ -337,7 +339,7 @@ def _plots(key: str, title: str, panels: Sequence[Panel], note: str) -> tuple[Pl
     return (to_plot(Figure(key=key, title=title, panels=tuple(panels)), note=note),) if panels else ()
 
 
-def overview(table: pa.Table, summary: Summary, title: str) -> Figure:
+def campaign_overview(table: pa.Table, summary: CampaignSummary, title: str) -> Figure:
     """Worst margins, or else the first metric that differs between flights, and the parameters that matter."""
     strongest = list(drivers(summary))
     clouds = {panel.x_label.partition(" [")[0]: panel for panel in scatters(table)}
@@ -383,7 +385,7 @@ def scatters(table: pa.Table) -> list[Panel]:
     low, high = _ends(margins[np.isfinite(margins)])
     low, high = min(0.0, low), max(0.0, high)  # 0, the end of what is allowed, is among them
     y, beyond_y = _clip(np.where(np.isfinite(margins), margins, -np.inf), low, high, "down", "up")
-    room, panels = 0.6 * _GAP * ((high - low) or 1.0), []
+    padding, panels = 0.6 * _GAP * ((high - low) or 1.0), []
     for name in names:
         kinds: tuple[str, ...] = ()
         if is_number(table, DRAW + name):
@@ -414,7 +416,7 @@ def scatters(table: pa.Table) -> list[Panel]:
                 series=tuple(points),
                 bounds=(Bound(value=0.0),),
                 x_names=kinds,
-                y_range=(float(y.min()) - room, float(y.max()) + room),
+                y_range=(float(y.min()) - padding, float(y.max()) + padding),
             )
         )
     return panels

@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-Flags = np.ndarray[Any, np.dtype[np.bool_]]
+FlightFlags = np.ndarray[Any, np.dtype[np.bool_]]
 HARMLESS: Final = "satisfied"
 INCOMPLETE: Final = "incomplete"  # of a flight that ended before it reached a required constraint: neither good nor bad
 UNAUDITED: Final = "unaudited"  # of a flight without any constraint: it shows no violation, and not that there is none
 
 
-class Verdict(NamedTuple):
+class VerdictMeaning(NamedTuple):
     """Properties of a verdict."""
 
     badness: int  # its place among the worst flights: the larger, the worse
@@ -37,15 +37,15 @@ class Verdict(NamedTuple):
 
 
 VERDICTS: Final = {
-    HARMLESS: Verdict(0, COLOUR.satisfied, "circle"),
-    INCOMPLETE: Verdict(1, COLOUR.warning, "cross"),
-    UNAUDITED: Verdict(1, COLOUR.measured, "circle-open"),
-    "violated": Verdict(2, COLOUR.violated, "diamond"),
-    "lost": Verdict(6, COLOUR.lost, "x"),
-    ERROR: Verdict(5, COLOUR.measured, "square"),
-    DIED: Verdict(5, CYCLE[2], "pentagon"),
-    TIMEOUT: Verdict(4, CYCLE[3], "triangle-up"),
-    MEMORY: Verdict(3, CYCLE[4], "triangle-down"),
+    HARMLESS: VerdictMeaning(0, COLOUR.satisfied, "circle"),
+    INCOMPLETE: VerdictMeaning(1, COLOUR.warning, "cross"),
+    UNAUDITED: VerdictMeaning(1, COLOUR.measured, "circle-open"),
+    "violated": VerdictMeaning(2, COLOUR.violated, "diamond"),
+    "lost": VerdictMeaning(6, COLOUR.lost, "x"),
+    ERROR: VerdictMeaning(5, COLOUR.measured, "square"),
+    DIED: VerdictMeaning(5, CYCLE[2], "pentagon"),
+    TIMEOUT: VerdictMeaning(4, CYCLE[3], "triangle-up"),
+    MEMORY: VerdictMeaning(3, CYCLE[4], "triangle-down"),
 }
 """In the order in which they are drawn and counted."""
 
@@ -66,7 +66,7 @@ _COMPARISON: Final = re.compile(r"(?P<column>[^<>=]*?)\s*(?P<operation><=|>=|<|>
 EVENT_NAMES: Final = tuple(_NAMED)
 
 
-class Event(NamedTuple):
+class CountedEvent(NamedTuple):
     """An event, whose occurrence a flight's row shows."""
 
     text: str  # in its standard form: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`
@@ -92,14 +92,14 @@ class Event(NamedTuple):
             raise _no_number(self.text, self.column_name)
         return math.isnan(value) or bool(OPERATIONS[self.operation](value, self.value))
 
-    def column(self, table: pa.Table) -> Flags:
+    def column(self, table: pa.Table) -> FlightFlags:
         """(K,) whether it happened, flight by flight; the same as `holds` of every row, with the same refusals."""
         if self.operation != "==":
             _require_number(self.text, self.column_name, {field.name: field.type for field in table.schema})
         return np.array([self.holds(row) for row in table.select([self.column_name]).to_pylist()], bool)
 
 
-def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> Event:
+def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> CountedEvent:
     """Parse an event from its text.
 
     Args:
@@ -116,7 +116,7 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> 
     name = _SPELLINGS.get(text, text)
     if name in _NAMED:
         column, value = _NAMED[name]
-        return Event(name, column, "==", value)
+        return CountedEvent(name, column, "==", value)
     comparison = _COMPARISON.fullmatch(text)
     if comparison is None:
         hint = "or a comparison, COLUMN OP NUMBER with < <= > or >=, such as 'rmse.z > 0.5'"
@@ -130,7 +130,7 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> 
         _require_number(text, column, columns)
     with contextlib.suppress(ValueError):
         if math.isfinite(number := float(threshold)):
-            return Event(f"{column} {operation} {number:.15g}", column, operation, number)
+            return CountedEvent(f"{column} {operation} {number:.15g}", column, operation, number)
     raise ParameterError(f"event {text!r}", "number", threshold, "a finite number")
 
 

@@ -17,9 +17,10 @@ import pyarrow as pa
 from quadsim.errors import InputError
 from quadsim.outputs import to_json, writing
 from quadsim.report.comparison import different_audits
+from quadsim.report.comparison_page import TABLE_FILE
 from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
-from scenarios.campaign.events import EVENT_NAMES, INCOMPLETE, UNAUDITED, Flags, parse_event
+from scenarios.campaign.events import EVENT_NAMES, INCOMPLETE, UNAUDITED, FlightFlags, parse_event
 from scenarios.campaign.rows import (
     DRAW,
     MARGIN,
@@ -49,10 +50,9 @@ from scenarios.campaign.statistics import (
     percent,
 )
 from scenarios.results import Result, Shown
-from scenarios.schema.settings import shown
+from scenarios.schema.settings import field_text
 
 COMPARISON_FILE: Final = "comparison.json"
-TABLE_FILE: Final = "comparison.md"
 COMPARED: Final = (
     *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
     *(f"max_error.{name}" for name in ("x", "y", "z")),
@@ -158,7 +158,7 @@ class PairedComparison(Result):
     @property
     def difference_tables(self) -> tuple[Grid, ...]:
         """Return the fields in which the campaigns' scenarios and draws differ; no table without differences."""
-        lines = tuple(line(field, shown(a), shown(b)) for field, a, b in self.differences or ())
+        lines = tuple(line(field, field_text(a), field_text(b)) for field, a, b in self.differences or ())
         grid = Grid(key="differences", title="What differs", head=("field", *self.names), lines=lines)
         return (grid,) if lines else ()
 
@@ -342,7 +342,7 @@ def _by_audit(event: str) -> bool:
     return event in _BY_AUDIT or column.startswith((MARGIN, SAMPLED, SATISFIED, TIME_VIOLATED, "worst_"))
 
 
-def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> MetricComparison:
+def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: FlightFlags) -> MetricComparison:
     first, second = numbers(a, name), numbers(b, name)
     valid = completed & np.isfinite(first) & np.isfinite(second)
     first, second = first[valid], second[valid]

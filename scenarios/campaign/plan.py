@@ -17,13 +17,13 @@ from quadsim.errors import FileError, InputError, ParameterError, QuadsimError
 from quadsim.flight.audit import Limit
 from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import CampaignFile, Draws, Value, Varied
-from scenarios.campaign.events import Event, parse_event
-from scenarios.campaign.rows import DRAW, TIMES, Row, flown_row, make_schema
+from scenarios.campaign.events import CountedEvent, parse_event
+from scenarios.campaign.rows import DRAW, TIMES, flown_row, make_schema
 from scenarios.catalogue import campaign_path, scenario_path
 from scenarios.flight import Flight
 from scenarios.loading import parse_scenario
 from scenarios.machine import processor_name
-from scenarios.many import ERROR, MEMORY, fly_many
+from scenarios.many import ERROR, MEMORY, Row, fly_many
 from scenarios.plugin import Plugin
 from scenarios.rollout import Rollout
 from scenarios.schema.bases import locate_files, merge, read_scenario
@@ -40,7 +40,7 @@ from scenarios.schema.settings import (
 )
 
 FIRST: Final = 5  # flights of which one at least has to be possible
-Change = tuple[Varied, Value]
+DrawnChange = tuple[Varied, Value]
 Parse = Callable[[dict[str, Any]], Scenario]
 
 
@@ -87,7 +87,7 @@ class Plan:
         return {field.name: field.type for field in self.schema if field.name not in others}
 
     @cached_property
-    def failure(self) -> tuple[Event, ...]:
+    def failure(self) -> tuple[CountedEvent, ...]:
         """Events that count as failure of a flight."""
         try:
             return tuple(parse_event(text, self.columns) for text in self.spec.failure)
@@ -176,7 +176,7 @@ class Plan:
         row = dict.fromkeys(self.schema.names) | self.identity(flight) | outcome
         return row | {"failed": any(event.holds(row) for event in self.failure)}
 
-    def _varied(self, changes: Sequence[Change], *, name: str, seed: int) -> Scenario:
+    def _varied(self, changes: Sequence[DrawnChange], *, name: str, seed: int) -> Scenario:
         def parse(data: dict[str, Any]) -> Scenario:
             return parse_scenario({**data, "name": name, "seed": seed}, source=name)
 
@@ -293,7 +293,7 @@ def cell(value: Value) -> Value | str:
     return float(value) if isinstance(value, int | float) else str(value)
 
 
-def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *, table: str) -> Scenario:
+def changed(data: Mapping[str, Any], changes: Sequence[DrawnChange], parse: Parse, *, table: str) -> Scenario:
     """A scenario's tables with the fields of some entries replaced, parsed; `table` of the file has the entries.
 
     Raises:

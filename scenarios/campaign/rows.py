@@ -21,9 +21,9 @@ from quadsim.flight.audit import Finding, Limit, worst_finding
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FORMAT, read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
-from scenarios.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, Event, Flags
+from scenarios.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, CountedEvent, FlightFlags
+from scenarios.many import Row
 
-Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
 DRAW: Final = "draw."  # how the columns of drawn values begin
 VIOLATION: Final = "violation"  # the event
 MARGIN, SAMPLED, TIME_VIOLATED, SATISFIED = "margin.", "margin_sampled.", "time_violated.", "satisfied."
@@ -59,10 +59,10 @@ _TIMING: Final = [
 ]
 TIMES: Final = tuple(field.name for field in _TIMING)
 """Clock times of a flight and its machine, in a separate table."""
-Summary = Mapping[str, Any]
+CampaignSummary = Mapping[str, Any]
 Texts = np.ndarray[Any, np.dtype[np.object_]]
 _NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, SAMPLED, TIME_VIOLATED, SATISFIED)
-Rows = np.ndarray[Any, np.dtype[np.intp]]
+RowIndices = np.ndarray[Any, np.dtype[np.intp]]
 
 
 def make_schema(
@@ -177,7 +177,7 @@ def numbers(table: pa.Table, name: str) -> Array:
     return np.array(table[name].cast(pa.float64()).to_numpy(), float)
 
 
-def flags(table: pa.Table, name: str, *, absent: bool) -> Flags:
+def flags(table: pa.Table, name: str, *, absent: bool) -> FlightFlags:
     """(K,) a column of truth values, with `absent` where a flight has none."""
     return np.array(table[name].fill_null(absent).to_pylist(), bool)
 
@@ -188,7 +188,7 @@ def texts(table: pa.Table, name: str) -> Texts:
     return np.array(["-" if value is None else str(value) for value in words.to_pylist()], object)
 
 
-def verdicts(table: pa.Table) -> dict[str, Flags]:
+def verdicts(table: pa.Table) -> dict[str, FlightFlags]:
     """(K,) which flights have each verdict."""
     return {verdict: np.asarray(texts(table, "verdict") == verdict, bool) for verdict in VERDICTS}
 
@@ -199,7 +199,7 @@ def failure_of(table: pa.Table) -> list[str]:
     return stated.decode().split("; ")
 
 
-def unaudited(table: pa.Table) -> Flags:
+def unaudited(table: pa.Table) -> FlightFlags:
     """(K,) which flights had no constraint; none of a table without verdicts."""
     return (
         np.asarray(texts(table, "verdict") == UNAUDITED)
@@ -208,7 +208,7 @@ def unaudited(table: pa.Table) -> Flags:
     )
 
 
-def is_counted(table: pa.Table, event: Event) -> Flags:
+def is_counted(table: pa.Table, event: CountedEvent) -> FlightFlags:
     """(K,) which flights count for an event's share: of failure and violation, those that show whether it happened.
 
     A flight without it that is incomplete or unaudited shows neither: it is left out, as it is no success.  Unaudited

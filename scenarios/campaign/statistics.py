@@ -28,15 +28,15 @@ from scenarios.campaign.events import (
     INCOMPLETE,
     OPERATIONS,
     VERDICTS,
-    Event,
-    Flags,
+    CountedEvent,
+    FlightFlags,
     parse_event,
 )
 from scenarios.campaign.rows import (
     DRAW,
     MARGIN,
     SATISFIED,
-    Summary,
+    CampaignSummary,
     constraint_names,
     draw_names,
     flags,
@@ -339,7 +339,7 @@ def parameters(table: pa.Table) -> dict[str, Any]:
     return outcomes
 
 
-def drivers(summary: Summary) -> dict[str, Mapping[str, Any]]:
+def drivers(summary: CampaignSummary) -> dict[str, Mapping[str, Any]]:
     """The varied parameters on which an outcome may depend at all, the strongest first.
 
     They are ordered by how `worst_margin` depends on them, or else `failed`.
@@ -357,13 +357,13 @@ def drivers(summary: Summary) -> dict[str, Mapping[str, Any]]:
     return dict(sorted(related.items(), key=weakness))
 
 
-def _levels(table: pa.Table, name: str, failed: Flags) -> dict[str, Any]:
+def _levels(table: pa.Table, name: str, failed: FlightFlags) -> dict[str, Any]:
     levels = texts(table, DRAW + name)
     shares = {level: share_of(failed[levels == level]) for level in sorted(set(levels))}
     return {"kind": "name", "unit": unit_of(table, DRAW + name), "levels": shares}
 
 
-def _groups(values: Array, failed: Flags) -> list[dict[str, Any]]:
+def _groups(values: Array, failed: FlightFlags) -> list[dict[str, Any]]:
     """Failures by thirds or fifths of a varied parameter, or by its values if no more; none of few flights."""
     there = np.isfinite(values)
     values, failed = values[there], failed[there]
@@ -393,7 +393,7 @@ class Requirement:
     """The probability of an event on one side of a share, with this confidence."""
 
     text: str
-    event: Event
+    event: CountedEvent
     operation: str
     share: float
     confidence: float

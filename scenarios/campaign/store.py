@@ -22,17 +22,17 @@ import pyarrow.parquet as pq
 
 from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FORMAT, format_of, require_format
-from quadsim.flight.rundir import read_json, require_inside
+from quadsim.flight.rundir import SCENARIO_FILE, read_json, require_inside
 from quadsim.outputs import SUMMARY_FILE, Growing, digest_of, to_json
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import Plan, load_plan
-from scenarios.campaign.rows import TIMES, Row, make_table, read_table, split_times
+from scenarios.campaign.rows import TIMES, make_table, read_table, split_times
 from scenarios.machine import code_digest, digest_below, machine, versions
+from scenarios.many import Row
 from scenarios.plugin import Plugin, PluginForce, import_plugin
 
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
-SCENARIO_FILE: Final = "scenario.toml"
 CAMPAIGN: Final = "quadsim campaign"
 _FORM: Final = {"format": str, "name": str, "status": str, "flights": int, "flown": int, "sessions": list}
 FLIGHTS_FILE: Final = "flights.parquet"
@@ -136,7 +136,7 @@ def _encoded(table: pa.Table) -> bytes:
     return buffer.getvalue()
 
 
-def start(plan: Plan, files: Growing, session: Mapping[str, Any], *, flying: bool) -> dict[str, Any]:
+def start_session(plan: Plan, files: Growing, session: Mapping[str, Any], *, flying: bool) -> dict[str, Any]:
     """Start or resume a campaign: write the files that define it, the manifest last, and return the manifest.
 
     Raises:

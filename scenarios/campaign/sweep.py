@@ -17,7 +17,7 @@ from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.palette import COLOUR
 from quadsim.report.figure import Bound, Figure, Panel, Series
 from scenarios.assembly import Assembly
-from scenarios.campaign.campaign_file import CampaignFile, Grid
+from scenarios.campaign.campaign_file import CampaignFile, GridValues
 from scenarios.campaign.plan import Plan, audited, cell
 from scenarios.campaign.rows import DRAW, is_number, make_table, numbers
 from scenarios.flight import to_pandas
@@ -150,7 +150,7 @@ def fly_sweep(
     return Sweep(scenario.name, tuple(swept), pa.Table.from_arrays(columns, schema=schema))
 
 
-def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> Grid:
+def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> GridValues:
     """Return the values of a field, or of several together, after checking each."""
     owner = fields if isinstance(fields, str) else f"({', '.join(fields)})"
     if isinstance(tried, str) or not hasattr(tried, "__len__") or not len(tried):
@@ -161,12 +161,12 @@ def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> Grid:
     else:
         values = [tuple(separate({fields: value}, source="sweep").values()) for value in values]
     try:
-        return Grid(name=owner, fields=[*fields], distribution="grid", values=values)
+        return GridValues(name=owner, fields=[*fields], distribution="grid", values=values)
     except ValueError as error:
         raise InputError(f"sweep.{owner}: {error}") from error
 
 
-def _swept(entries: Sequence[Grid]) -> dict[str, pa.Array]:
+def _swept(entries: Sequence[GridValues]) -> dict[str, pa.Array]:
     """Return the columns of the swept values, by the dotted path of each number or text."""
     rows = []
     for combination in itertools.product(*(entry.values for entry in entries)):

@@ -24,7 +24,7 @@ from scenarios.courses.legs import polyline
 
 POSE_HEADER: Final = ("t", "x", "y", "z", "yaw")
 VELOCITY_HEADER: Final = ("vx", "vy", "vz")
-LARGEST: Final = 1e6  # largest magnitude of a number in the table, as in the scenario file
+LARGEST_NUMBER: Final = 1e6  # largest magnitude of a number in the table, as in the scenario file
 MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
 ROUNDED: Final = range(2, 8)
 """Decimals of a rounded column: with fewer its numbers are exact, with more rounding cannot be detected."""
@@ -81,7 +81,7 @@ class Csv(Started):
     def build(self, initial: Array, gravity: float) -> Course:
         """As `Filtered.build`."""
         path = FilePath(self.file)
-        table = read_table(path) if self.content is None else parse_table(path, self.content)
+        table = read_course_table(path) if self.content is None else parse_rows(path, self.content)
         if self.sha256 not in (None, table.sha256):
             raise FileError(self.file, f"is not the file of the scenario: its SHA-256 is not {self.sha256}")
         course = begin(through_rows(table), start=self.start + float(table.t[0]), initial=initial)
@@ -95,7 +95,7 @@ class Csv(Started):
         """
         for path in (directory / self.file, FilePath(self.file)):
             if path.is_file():
-                return replace(self, file=str(path.resolve()), sha256=self.sha256 or read_table(path).sha256)
+                return replace(self, file=str(path.resolve()), sha256=self.sha256 or read_course_table(path).sha256)
         return self
 
 
@@ -111,11 +111,11 @@ def tabulated(file: str, t: Array, poses: Array) -> Csv:
     return course
 
 
-def read_table(path: FilePath) -> Table:
-    """Read a file with the header `t,x,y,z,yaw` or `t,x,y,z,yaw,vx,vy,vz`, yaw in radians; see `parse_table`.
+def read_course_table(path: FilePath) -> Table:
+    """Read a file with the header `t,x,y,z,yaw` or `t,x,y,z,yaw,vx,vy,vz`, yaw in radians; see `parse_rows`.
 
     Raises:
-        FileError: it cannot be read, or as of `parse_table`.
+        FileError: it cannot be read, or as of `parse_rows`.
     """
     try:
         if path.exists() and not path.is_file():
@@ -127,10 +127,10 @@ def read_table(path: FilePath) -> Table:
         raise
     except (OSError, ValueError) as error:  # the latter for a null byte
         raise FileError(path, f"cannot be read ({error})") from error
-    return parse_table(path, content)
+    return parse_rows(path, content)
 
 
-def parse_table(path: FilePath, content: bytes) -> Table:
+def parse_rows(path: FilePath, content: bytes) -> Table:
     """Parse the rows of a file's content.
 
     Yaw that changes by more than half a turn between rows is taken as wrapped, and unwrapped.
@@ -304,8 +304,8 @@ def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, .
             value = float(cell)
         except ValueError:
             raise FileError(path, f"{place}: must be a number; got {_short(cell)}") from None
-        if not math.isfinite(value) or abs(value) > LARGEST:
-            raise FileError(path, f"{place}: must be a finite number within +-{LARGEST:g}; got {_short(cell)}")
+        if not math.isfinite(value) or abs(value) > LARGEST_NUMBER:
+            raise FileError(path, f"{place}: must be a finite number within +-{LARGEST_NUMBER:g}; got {_short(cell)}")
         values.append(value)
     return values
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from scipy.interpolate import BPoly
 
 SNAP: Final = 4
-ACCELERATION: Final = 2
+ACCELERATION_ORDER: Final = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +112,7 @@ def minimum_snap(start: Array, poses: Array, times: Sequence[float]) -> Path:
     """Least snap of x, y, z and angular acceleration of yaw through poses (n, 4) at times (n,) [s], rest to rest."""
     knots, through = np.array([0.0, *times]), np.vstack([start, poses])
     position = smoothest(knots, through[:, :3], SNAP)
-    yaw = smoothest(knots, through[:, 3:], ACCELERATION)
+    yaw = smoothest(knots, through[:, 3:], ACCELERATION_ORDER)
     return Path(pose=lambda t: np.hstack([position(t), yaw(t)]), duration=float(knots[-1]))
 
 

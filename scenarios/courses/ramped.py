@@ -25,7 +25,7 @@ MOST_SAMPLES: Final = 100_000  # of the phase: 2000 s at 50 Hz
 
 
 @dataclass(frozen=True, kw_only=True)
-class Phase:
+class PhaseAngle:
     """An angle over samples a step apart, with its rate and acceleration; K samples."""
 
     angle: Array  # (K,) theta [rad]
@@ -38,7 +38,7 @@ Curve = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 """Angle, rate and acceleration (M,) -> position, velocity and acceleration (M, 3), world, from the origin on."""
 
 
-def ramped_phase(*, rate: float, acceleration: float, ramp: float, step: float) -> Phase:
+def ramped_phase(*, rate: float, acceleration: float, ramp: float, step: float) -> PhaseAngle:
     """An angle that gains a rate [rad/s] at an acceleration [rad/s^2], and loses it at once in the same way.
 
     The share s of the acceleration goes by phases, each sampled from its own start, its end excluded, with T = ramp:
@@ -61,7 +61,7 @@ def ramped_phase(*, rate: float, acceleration: float, ramp: float, step: float) 
     share = np.concatenate([risen, constant, np.cos(bend * turning), -constant, risen - 1.0])
     alpha = acceleration * share
     omega = step * np.cumsum(alpha)
-    return Phase(angle=step * np.cumsum(omega), rate=omega, acceleration=alpha, step=step)
+    return PhaseAngle(angle=step * np.cumsum(omega), rate=omega, acceleration=alpha, step=step)
 
 
 def circle_curve(radius: float) -> Curve:
@@ -106,7 +106,7 @@ def lemniscate_curve(radius: float) -> Curve:
     return curve
 
 
-def fly_ramped(curve: Curve, phase: Phase, *, initial: Array, gravity: float, free_heading: bool) -> Path:
+def fly_ramped(curve: Curve, phase: PhaseAngle, *, initial: Array, gravity: float, free_heading: bool) -> Path:
     """A curve flown from and to rest, from the initial pose (4,) on; of a free heading see `Path`.
 
     The yaw is that of the attitude; of a curve that turns the vehicle upside down, where Euler's yaw turns by 180 deg,

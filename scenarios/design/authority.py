@@ -13,7 +13,7 @@ from quadsim.sim.airframe import added_mass
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.vehicle import Vehicle
 
-AXES: Final = ("x", "y", "z")
+FORCE_AXES: Final = ("x", "y", "z")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +87,7 @@ def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
     times v, the thrust is its first row times v, and v_i lies between the squares of the speed limits.
     """
     ranges = []
-    for axis, name in enumerate(AXES):
+    for axis, name in enumerate(FORCE_AXES):
         (low, high), (low_pure, high_pure) = (_extremes(vehicle, 1 + axis, pure=pure) for pure in (False, True))
         ranges.append(
             TorqueRange(

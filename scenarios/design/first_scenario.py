@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
 
 COURSES: Final = ("hover", "step", "figure-eight")
-LAWS: Final = ("robust", "lqr", "pid", "geometric", "rates")
+DESIGNED_LAWS: Final = ("robust", "lqr", "pid", "geometric", "rates")
 """Controllers: `rates` is nonlinear MPC of thrust and body rates, through the vehicle's autopilot."""
 NODE: Final = 0.04  # shortest time between its nodes [s]
 AHEAD: Final = 0.8  # its horizon [s]
@@ -45,13 +45,13 @@ EIGHT_RATIO: Final = 0.3
 """Turns of a figure eight per time [rad/s] over the loop's bandwidth: across it moves twice as fast."""
 STEP_RATIO: Final = 0.28  # bandwidth of the filter of steps over the loop's
 STEP: Final = 1.0  # [m]
-ROOM: Final = 0.15
+ALLOWED_SHARE: Final = 0.15
 """The tracking requirement, the same for every controller: the largest error along x, y and z over the course's size.
 The robust controller's is 11 % on steps and 5 % on figure eights, at most (docs/own-vehicle.md)."""
-CLEARANCE: Final = 1.5
+HEIGHT_OVER_ERROR: Final = 1.5
 """Height of the course above the floor over the largest error allowed, where that is more than `LOWEST`."""
 LOWEST: Final = 1.0  # height of a course [m]
-SOFT: Final = (2e4, 1e3)
+SOFT_WEIGHTS: Final = (2e4, 1e3)
 """l1 and l2 of the tilt bounds over the weight of x, as the defaults have them with the paper's weight of 10."""
 LQR_TILT: Final = 30.0
 BASELINE_SHARE: Final = 0.8
@@ -100,10 +100,10 @@ def first_scenario(
 ) -> FirstScenario:
     """Return a scenario that the vehicle flies well, with numbers derived from the vehicle; see `quadsim.scenario`.
 
-    `file` is where these are, as the scenario is to name it; `course` is one of `COURSES`, `law` of `LAWS`; a `tilt`
-    bound [deg] replaces that of the rules.
+    `file` is where these are, as the scenario is to name it; `course` is one of `COURSES`, `law` of `DESIGNED_LAWS`; a
+    `tilt` bound [deg] replaces that of the rules.
     """
-    for kind, name, known in (("course", course, COURSES), ("controller", law, LAWS)):
+    for kind, name, known in (("course", course, COURSES), ("controller", law, DESIGNED_LAWS)):
         if name not in known:
             raise UnknownNameError(kind, name, known)
     tuning = design_for(vehicle, tilt)
@@ -275,8 +275,8 @@ speed / ({MOVE_RATIO:g} w tau)^2
 [controller.offset_free]  # force and torque that the model does not know are estimated and compensated
 
 [controller.soft]
-linear = {_rounded(SOFT[0] * place)}  # l1: {SOFT[0]:g} times the weight of x
-quadratic = {_rounded(SOFT[1] * place)}  # l2: {SOFT[1]:g} times the weight of x
+linear = {_rounded(SOFT_WEIGHTS[0] * place)}  # l1: {SOFT_WEIGHTS[0]:g} times the weight of x
+quadratic = {_rounded(SOFT_WEIGHTS[1] * place)}  # l2: {SOFT_WEIGHTS[1]:g} times the weight of x
 
 [controller.output_weights]
 x = {place}  # 1 / (g tan(tilt bound) / w^2)^2: {tuning.deviation:.3g} m is what the tilt bound answers
@@ -316,7 +316,7 @@ horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for t
 
 def _constraints(law: str, vehicle: Vehicle, tuning: Design, size: float) -> str:
     """Return the audited constraints that are not bounds of the controller; `size` of the course [m]."""
-    tilt, off = _tilt(tuning), _rounded(ROOM * size)
+    tilt, off = _tilt(tuning), _rounded(ALLOWED_SHARE * size)
 
     def entry(name: str, signal: str, lower: float, upper: float | None, why: str) -> str:
         text = f'\n[[constraints]]\nname = "{name}"\nsignal = "{signal}"\nlower = {lower}  # {why}\n'
@@ -325,7 +325,7 @@ def _constraints(law: str, vehicle: Vehicle, tuning: Design, size: float) -> str
     hull = (
         "m, radius of the ball about the hull: the lowest centre that keeps all of the vehicle above the ground, z = 0"
     )
-    room = f"m, {100 * ROOM:g} % of the course's size, {size:g} m: the same for every controller"
+    note = f"m, {100 * ALLOWED_SHARE:g} % of the course's size, {size:g} m: the same for every controller"
     entries = ["\n# Audited without an entry: every bound of the controller.\n"]
     if law == "rates":  # it bounds the thrust of all rotors together
         entries += [entry("speed", "speed", vehicle.speed_min, vehicle.speed_max, "rad/s, what the rotors hold")]
@@ -333,7 +333,7 @@ def _constraints(law: str, vehicle: Vehicle, tuning: Design, size: float) -> str
         why = "deg, the tilt bound, at every instant"
         entries += [entry(name, name, -tilt, tilt, why) for name in ("roll", "pitch")]
     entries += [entry("floor", "z", _floor(vehicle), None, hull)]
-    return "".join(entries + [entry(f"hold_{axis}", f"{axis}_error", -off, off, room) for axis in "xyz"])
+    return "".join(entries + [entry(f"hold_{axis}", f"{axis}_error", -off, off, note) for axis in "xyz"])
 
 
 def _floor(vehicle: Vehicle) -> float:
@@ -343,7 +343,7 @@ def _floor(vehicle: Vehicle) -> float:
 
 def _height(vehicle: Vehicle, size: float) -> float:
     """Height [m] of the lowest points of a course of some size [m], to a decimetre above."""
-    return max(LOWEST, math.ceil(10.0 * (_floor(vehicle) + CLEARANCE * ROOM * size) - 1e-6) / 10.0)
+    return max(LOWEST, math.ceil(10.0 * (_floor(vehicle) + HEIGHT_OVER_ERROR * ALLOWED_SHARE * size) - 1e-6) / 10.0)
 
 
 def _tilt(tuning: Design) -> float:

@@ -14,7 +14,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 LIGHTEST, HEAVIEST = 0.03, 25.0
 """[kg]"""
-WEAKEST, STRONGEST = 1.6, 6.0
+LEAST_RATIO, MOST_RATIO = 1.6, 6.0
 """Thrust to weight."""
 QUICKEST, SLOWEST = 0.01, 0.12
 """Time constant of the rotors [s]."""
@@ -35,7 +35,7 @@ def _vehicle(name: str, place: list[float], rng: np.random.Generator, *, cross: 
     thrust is 0.12 to 0.25 of its radius.  Drag slows by 0.1 to 0.3 of the speed per second.
     """
     mass = _between(LIGHTEST, HEAVIEST, place[0])
-    ratio = _between(WEAKEST, STRONGEST, place[1])
+    ratio = _between(LEAST_RATIO, MOST_RATIO, place[1])
     lag = _between(QUICKEST, SLOWEST, place[2])
     gravity = 9.81
     arm = 0.178 * mass**0.375 * rng.uniform(0.85, 1.15)

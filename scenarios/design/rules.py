@@ -8,7 +8,7 @@
      0.8 (T + tau / 2) more delay than it knows of (`delay_margin`; the tests measure it);
    - 0.5 sqrt(alpha / tilt), alpha the angular acceleration in reserve: the largest tilt is reached and left within
      2 sqrt(tilt / alpha) = 1 / w;
-   - `FASTEST`, so that a period of 10 ms or more is enough.
+   - `FASTEST_LOOP`, so that a period of 10 ms or more is enough.
 2. *Period*: the longest with tau w <= `PERIOD_SHARE`, 40 samples in each period of the loop's own motion (Astroem and
    Wittenmark, "Computer-Controlled Systems", 1997, recommend 15 to 60).
 3. *Horizon*: `HORIZON_TIMES` / w, in which the loop's own motion has died out.
@@ -40,7 +40,7 @@ from scenarios.design.authority import Authority, authority
 PERIODS: Final = (0.05, 0.04, 0.025, 0.02, 0.01)
 """Control periods to choose from [s], whole multiples of the physics step."""
 LAG_RATIO: Final = 2.5  # 1 / w over the lag and half a period
-FASTEST: Final = 6.0  # largest bandwidth [rad/s]
+FASTEST_LOOP: Final = 6.0  # largest bandwidth [rad/s]
 STEEPEST: Final = math.radians(40.0)
 """Largest tilt bound [rad]: at hover the model takes tan(tilt) for tilt, 20 % less at 40 deg."""
 LEAST_TILT, LARGEST_TILT = 1.0, 80.0
@@ -153,7 +153,7 @@ def _bandwidth(can: Authority, tilt: float) -> tuple[float, Literal["lag", "torq
         limits: dict[Literal["lag", "torque", "period"], float] = {
             "lag": 1.0 / (LAG_RATIO * (can.lag + 0.5 * period)),
             "torque": 0.5 * math.sqrt(min(can.turning[:2]) / tilt),
-            "period": FASTEST,
+            "period": FASTEST_LOOP,
         }
         limited_by = min(limits, key=lambda name: limits[name])
         if limits[limited_by] * period <= PERIOD_SHARE:

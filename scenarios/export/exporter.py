@@ -14,7 +14,7 @@ import numpy as np
 from mpc.bounded import Weighted
 from mpc.codegen.ctext import CText, Precision
 from mpc.codegen.source import CHANGES, DATA, CController, part
-from mpc.codegen.targets import TARGETS, Target
+from mpc.codegen.targets import TARGETS, Machine
 from mpc.core.library import MIRRORS
 from mpc.core.numbers import Exportable, exportable
 from mpc.core.solver import WAYS, CoreProblem, core_library
@@ -203,7 +203,7 @@ def room_sentence(facts: Mapping[str, Any]) -> str:
     return f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory; {Reach(**facts['reach'])}"
 
 
-def programs(target: Target, precision: Precision) -> dict[str, str]:
+def programs(target: Machine, precision: Precision) -> dict[str, str]:
     """Return the files that run the controller on a target, by name."""
     names = ("main.c", "serial.c", "target.h", *target.sources, "LICENSE")
     return {name: part(name) for name in names} | {"Makefile": target.makefile(precision) + part("Makefile")}

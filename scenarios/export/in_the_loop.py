@@ -25,12 +25,12 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds
 from mpc.codegen.ctext import Precision
-from mpc.codegen.targets import EMULATOR, TARGETS, Target
+from mpc.codegen.targets import EMULATOR, TARGETS, Machine
 from mpc.core.law import ANSWERERS, LEVELS, STATUSES
 from mpc.ocp import Problem
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Phase, StepInputs, stopped
 from quadsim.errors import FlightError, MissingProgramError, QuadsimError
-from quadsim.flight.audit import COMMANDED, Limit
+from quadsim.flight.audit import COMMAND_SIGNALS, Limit
 from quadsim.outputs import reserving
 from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS
@@ -44,10 +44,11 @@ from scenarios.schema.scenario import Scenario
 
 CROSS_PACKAGES: Final = "make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 HOST_PACKAGES: Final = "make gcc libc6-dev"
-PATIENCE: Final = 120.0  # how long an answer of the emulated processor may take [s]; the longest step takes a second
+LONGEST_ANSWER: Final = 120.0
+"""How long an answer of the emulated processor may take [s]; the longest step takes a second."""
 
 
-def require_programs(target: Target, what: str) -> None:
+def require_programs(target: Machine, what: str) -> None:
     """Refuse a target whose compiler or emulator is not installed.
 
     Raises:
@@ -58,7 +59,7 @@ def require_programs(target: Target, what: str) -> None:
             raise MissingProgramError(what, program, packages=CROSS_PACKAGES if target.board else HOST_PACKAGES)
 
 
-def build(directory: Path, program: str, *settings: str) -> Path:
+def make_program(directory: Path, program: str, *settings: str) -> Path:
     """Make a program of an export, a target of its Makefile, with settings of its variables, e.g. `CC=clang`.
 
     Raises:
@@ -74,7 +75,7 @@ def build(directory: Path, program: str, *settings: str) -> Path:
 class Program:
     """A program that runs, and the serial line to it; see `Line`."""
 
-    def __init__(self, target: Target, image: Path) -> None:
+    def __init__(self, target: Machine, image: Path) -> None:
         command = [*target.emulation, "-serial", "stdio", "-kernel", str(image)] if target.board else [str(image)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0
@@ -94,10 +95,10 @@ class Program:
             self._process.stdin.write(data)
 
     def receive(self, count: int) -> bytes:
-        """Return `count` bytes; fewer if the program has ended, or sends nothing for `PATIENCE`."""
+        """Return `count` bytes; fewer if the program has ended, or sends nothing for `LONGEST_ANSWER`."""
         assert self._process.stdout is not None
         line, data = self._process.stdout.fileno(), b""
-        while len(data) < count and select.select([line], [], [], PATIENCE)[0]:
+        while len(data) < count and select.select([line], [], [], LONGEST_ANSWER)[0]:
             more = os.read(line, count - len(data))
             if not more:
                 break
@@ -109,7 +110,7 @@ MARK: Final = 0x4D504351
 _LETTER: Final = {"double": "d", "float": "f"}
 
 
-class Kind(IntEnum):
+class QueryKind(IntEnum):
     """The kind of a query."""
 
     START = 0  # begin anew after u(-1), the reference its one row throughout
@@ -118,7 +119,7 @@ class Kind(IntEnum):
     STAND = 3  # the same while the ground holds the vehicle, which shows no disturbance
 
 
-Solving = Literal[Kind.STEP, Kind.STAND]
+Solving = Literal[QueryKind.STEP, QueryKind.STAND]
 
 
 class Reply(NamedTuple):
@@ -154,7 +155,7 @@ class Frames:
         """Bytes of an answer."""
         return self._answer.size
 
-    def question(self, kind: Kind, number: int, state: Array, row: Array, acting: Array) -> bytes:
+    def question(self, kind: QueryKind, number: int, state: Array, row: Array, acting: Array) -> bytes:
         """A question with its checksum; what its kind does not take may be anything."""
         data = self._question.pack(MARK, number % 2**32, *state, *row, *acting, kind, 0)[:-4]
         return data + zlib.crc32(data).to_bytes(4, "little")
@@ -180,7 +181,7 @@ class SerialMPC:
         """Restart after u(-1) (4,) [rad/s]."""
         self._speeds, self._window = np.array(speeds, float), np.zeros((0, 4))
 
-    def step(self, time: float, state: Array, reference: Array, acting: Array, kind: Solving = Kind.STEP) -> Reply:
+    def step(self, time: float, state: Array, reference: Array, acting: Array, kind: Solving = QueryKind.STEP) -> Reply:
         """The answer at t_k [s] to x(k) (12,), the reference (N, 4) and u(k-1) (4,) [rad/s].
 
         Where the reference is the last one moved on, its last row alone is sent.
@@ -189,14 +190,14 @@ class SerialMPC:
             FlightError: no answer came, or none that is whole.
         """
         if not len(self._window):
-            self._query(time, Kind.START, state, reference[0], self._speeds)
+            self._query(time, QueryKind.START, state, reference[0], self._speeds)
         if not np.array_equal(self._window[1:], reference[:-1]):
             for row in reference[:-1]:
-                self._query(time, Kind.ROW, state, row, acting)
+                self._query(time, QueryKind.ROW, state, row, acting)
         self._window = np.array(reference)
         return self._query(time, kind, state, reference[-1], acting)
 
-    def _query(self, time: float, kind: Kind, state: Array, row: Array, acting: Array) -> Reply:
+    def _query(self, time: float, kind: QueryKind, state: Array, row: Array, acting: Array) -> Reply:
         self._number += 1
         self._line.send(self._frames.question(kind, self._number, state, row, acting))
         while True:
@@ -219,7 +220,7 @@ class MPCInTheLoop:
 
     predict: Callable[[Array, Array], Array]  # there is none: plans stay where they are made
 
-    def __init__(self, serial: SerialMPC, problem: Problem, name: str, target: Target) -> None:
+    def __init__(self, serial: SerialMPC, problem: Problem, name: str, target: Machine) -> None:
         self.name, self.solver, self.horizon = name, f"C99 on {target.title}", problem.horizon
         self.ways = [0] * len(STATUSES)
         self._serial, self._before = serial, problem.model.u_bar[:N_ROTORS]
@@ -241,7 +242,7 @@ class MPCInTheLoop:
             self._before = np.zeros(N_ROTORS) if self._bounds is None else self._bounds.reach(acting)[0]
             self._serial.reset(self._before)
             return stopped(self._before.copy(), self.horizon, now.phase)
-        kind: Solving = Kind.STEP if now.phase is Phase.FLYING else Kind.STAND
+        kind: Solving = QueryKind.STEP if now.phase is Phase.FLYING else QueryKind.STAND
         reply = self._serial.step(now.time, state, reference, acting, kind)
         self._before = reply.command
         self.ways[reply.status] += 1
@@ -294,7 +295,8 @@ def fly_exported(
         directory = Path(scratch)
         for name, text in files.items():
             (directory / name).write_text(text, encoding="utf-8")
-        image = build(directory, "serial.elf", "CPPFLAGS=-DWATCHDOG_MS=0")  # the emulated clock is not the flight's
+        # The emulated clock is not the flight's.
+        image = make_program(directory, "serial.elf", "CPPFLAGS=-DWATCHDOG_MS=0")
         with Program(machine, image) as line:
             serial = SerialMPC(line, precision, problem.horizon)
             law = MPCInTheLoop(serial, problem, scenario.controller.type, machine)
@@ -310,7 +312,7 @@ def _allowing(scenario: Scenario, spacing: float) -> Scenario:
     """The scenario with tolerances of at least `spacing` [rad/s] on speeds and their steps."""
 
     def widened(limit: Limit) -> Limit:
-        if limit.signal not in COMMANDED:
+        if limit.signal not in COMMAND_SIGNALS:
             return limit
         plant, sampled = (max(spacing, tolerance) for tolerance in limit.tolerances)
         return replace(limit, tolerance=plant, tolerance_sampled=sampled)

@@ -24,7 +24,7 @@ from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 MPC = LinearMPC | UnconstrainedMPC
-WAYS: Final = {Method.FREE: 0, Method.AXES: 1, Method.WHOLE: 2}
+METHOD_CODES: Final = {Method.FREE: 0, Method.AXES: 1, Method.WHOLE: 2}
 REFUSED: Final = 3  # least status of a period without an optimum
 
 
@@ -113,7 +113,7 @@ def _answers(
             command = law.step(StepInputs(time=k * period, acting=acting), state, reference)
             if command.status in ACCEPTED:
                 assert law.answer is not None
-                answer = WAYS[law.answer.method], command.speeds
+                answer = METHOD_CODES[law.answer.method], command.speeds
                 if command.answered_by not in (GAIN, CORE):
                     break
         answers.append(answer)

@@ -25,9 +25,9 @@ Action = NDArray[np.floating]
 ACTIONS: Final = ("deviations", "speeds", "rates")
 PARTS: Final = ("state", "preview", "ahead", "command")
 USUAL: Final = ("state", "preview", "command")
-LARGEST: Final = 1e6  # magnitude that the plant takes for divergence
+DIVERGED: Final = 1e6  # magnitude that the plant takes for divergence
 LARGEST_RATES: Final = (6.0, 6.0, 2.0)  # body rates at an action of 1 [rad/s]
-STATUS: Final = "given"
+GIVEN: Final = "given"
 """Status of a command that no controller computed."""
 BANDWIDTH: Final = (20.0, 20.0, 20.0)  # of the autopilot's rate loop, proportional alone [1/s]
 INNER_PERIOD: Final = 0.002  # longest time between two calls of the autopilot [s]
@@ -83,7 +83,7 @@ class Actions:
         elif self._kind == "deviations":
             speeds = self._hover + speeds * np.where(speeds < 0.0, self._down, self._up)
         plan = np.broadcast_to(speeds, (horizon, N_ROTORS))
-        return Command(speeds=speeds, plan=plan, status=STATUS, inner=inner)
+        return Command(speeds=speeds, plan=plan, status=GIVEN, inner=inner)
 
     def of(self, speeds: Array) -> Action:
         """The action that commands rotor speeds (4,) [rad/s]; beyond [-1, 1] where these are beyond their bounds.
@@ -118,7 +118,7 @@ class Observations:
 
     Attributes:
         layout: an `Entry` for each entry.
-        space: up to `LARGEST`, which no flight passes; what a faulty sensor gives, such as NaN, is not in it.
+        space: up to `DIVERGED`, which no flight passes; what a faulty sensor gives, such as NaN, is not in it.
     """
 
     def __init__(self, parts: Sequence[str], preview: int) -> None:
@@ -138,7 +138,7 @@ class Observations:
         }
         self._parts = tuple(parts)
         self.layout = tuple(Entry(name=name, unit=unit) for part in parts for name, unit in entries[part])
-        self.space = Box(-LARGEST, LARGEST, (len(self.layout),), dtype=np.float64)
+        self.space = Box(-DIVERGED, DIVERGED, (len(self.layout),), dtype=np.float64)
 
     def of(self, state: Array, preview: Array, command: Array) -> Array:
         """The observation of a state (12,), a preview (n, 4) and a command (4,)."""

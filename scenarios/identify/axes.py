@@ -18,11 +18,12 @@ from quadsim.rotation import conjugate
 from quadsim.state import Array
 from scenarios.identify.correlation import Pairs, aligned, correlations, likeness, moments, pairs_of, shifts, stride
 from scenarios.identify.record import Record, driver
-from scenarios.identify.windows import body_z, mean, slope, to_world, turn_rate
+from scenarios.identify.windows import body_z, mean, rate_over_window, to_world, turn_rate
 
 WINDOW: Final = 0.1  # [s] over which rates and thrust are compared
 SLOW_WINDOW: Final = 0.2  # [s] for lateral accelerations
-GAIN: Final = 0.7  # by which the correlations of three axes must rise: one of -0.6 negated gains 1.2, and costs 0.5
+LEAST_RISE: Final = 0.7
+"""By which the correlations of three axes must rise: one of -0.6 negated gains 1.2, and costs 0.5."""
 SCALE: Final = 3.0  # by which rates and turning attitude may differ
 READINGS: Final[dict[str, Callable[[Array], Array]]] = {
     "": lambda q: q,
@@ -47,7 +48,7 @@ def check_axes(record: Record, parts: Sequence[slice], gravity: float) -> None:
     _check_tilt(record, parts, gravity)
 
 
-def turning(record: Record, parts: Sequence[slice], meant: Callable[[Array], Array] = READINGS[""]) -> Pairs:
+def turning_pairs(record: Record, parts: Sequence[slice], meant: Callable[[Array], Array] = READINGS[""]) -> Pairs:
     """Rates at which the attitude turns, and those of the gyro."""
     return pairs_of(
         record,
@@ -62,7 +63,7 @@ def lateral_motion(record: Record, parts: Sequence[slice]) -> Lateral:
     step, motion = stride(record.period), []
     for part in parts:
         velocity, axis = record.velocity[part], body_z(record.attitude[part])
-        rows = [slope(velocity, record.period, SLOW_WINDOW)]
+        rows = [rate_over_window(velocity, record.period, SLOW_WINDOW)]
         rows += [mean(values, record.period, SLOW_WINDOW) for values in (axis, velocity)]
         acceleration, axis, velocity = (x[::step, 0] + 1j * x[::step, 1] for x in rows)
         motion.append((acceleration, axis, velocity))
@@ -91,7 +92,7 @@ def tilt_fit(motion: Lateral, *, mirrored: bool = False, shift: int = 0) -> tupl
 
 def _check_rates(record: Record, parts: Sequence[slice]) -> None:
     """Refuse rates that are not those at which the attitude turns."""
-    readings = {reading: turning(record, parts, meant) for reading, meant in READINGS.items()}
+    readings = {reading: turning_pairs(record, parts, meant) for reading, meant in READINGS.items()}
     if better := _better(readings, ("wx", "wy", "wz"), record.period):
         raise InputError(f"{record.name}: the rates are not those at which the attitude turns: {better}")
     _, turns, rates = moments(readings[""])
@@ -109,7 +110,7 @@ def _check_velocity(record: Record, parts: Sequence[slice], position: Array) -> 
         return pairs_of(
             record,
             parts,
-            lambda part: slope(position[part], record.period, WINDOW),
+            lambda part: rate_over_window(position[part], record.period, WINDOW),
             lambda part: mean(velocity[part], record.period, WINDOW),
         )
 
@@ -160,7 +161,9 @@ def _lifting(record: Record, parts: Sequence[slice], gravity: float, lag: float)
         upward = np.square(driver(record)[part]).sum(axis=1, keepdims=True) * body_z(record.attitude[part])[:, 2:]
         return mean(gravity * upward / upward.mean(), record.period, SLOW_WINDOW)
 
-    pairs = pairs_of(record, parts, lift, lambda part: slope(record.velocity[part, 2:], record.period, SLOW_WINDOW))
+    pairs = pairs_of(
+        record, parts, lift, lambda part: rate_over_window(record.velocity[part, 2:], record.period, SLOW_WINDOW)
+    )
     covariance, lifts, climbs = moments(pairs, round(lag / (stride(record.period) * record.period)))
     return 2.0 * float(covariance[0, 0]) / max(float(lifts[0] + climbs[0]), 1e-30)
 
@@ -179,7 +182,7 @@ def _better(readings: Mapping[str, Pairs], names: Sequence[str], period: float) 
                 total = score - 0.7 * bool(reading) - cost
                 if total > best:
                     best, better = total, ("; ".join(filter(None, (reading, change))), score - usual)
-    return better[0] if better[1] > GAIN else ""
+    return better[0] if better[1] > LEAST_RISE else ""
 
 
 def _changes(correlation: Array, names: Sequence[str]) -> Iterator[tuple[str, float]]:

@@ -17,11 +17,11 @@ from scenarios.identify.clocks import check_clocks
 from scenarios.identify.columns import RPM
 from scenarios.identify.record import INPUTS, Record, driver
 from scenarios.identify.rotor_order import check_rotor_order
-from scenarios.identify.windows import body_z, slope
+from scenarios.identify.windows import body_z, rate_over_window
 
-SHORTEST: Final = 2.0  # [s] of a span that is used
+SHORTEST_SPAN: Final = 2.0  # [s] of a span that is used
 LEAST: Final = 4.0  # [s] that the longest must have
-MARGIN: Final = 0.5  # [s] cut beside the ground, where it still acts through the air and the legs
+GROUND_MARGIN: Final = 0.5  # [s] cut beside the ground, where it still acts through the air and the legs
 SLOW, CALM = 0.3, 0.5
 """Speed [m/s] and turn rate [rad/s] below which a vehicle may stand on the ground."""
 CONSTANT: Final = 3e-3  # share of the outputs below which their change in a second is none
@@ -51,7 +51,7 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
         InputError: none is 4 s long, or the motors never run.
     """
     logged = _logged(record)
-    shortest = round(SHORTEST / record.period)
+    shortest = round(SHORTEST_SPAN / record.period)
     aloft = _runs(logged, shortest) and _runs(logged & ~_grounded(record, logged, vehicle.gravity), shortest)
     longest = max((part.stop - part.start for part in aloft), default=0) * record.period
     if longest >= LEAST * (1.0 - 1e-6):
@@ -72,7 +72,7 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     )
 
 
-def check(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str, ...]:
+def check_log(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str, ...]:
     """Return notes on a log that can be used, empty if nothing is to be said.
 
     Raises:
@@ -97,7 +97,7 @@ def _grounded(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDAr
     )
     second = round(1.0 / record.period)
     effort = uniform_filter1d(np.square(inputs).mean(axis=1), max(second // 10, 1))
-    acceleration = slope(velocity, record.period, 0.2)
+    acceleration = rate_over_window(velocity, record.period, 0.2)
     load = ((acceleration + np.array([0.0, 0.0, gravity])) * body_z(attitude)).sum(axis=1) / gravity
     heavy = logged & (effort > 0.5 * effort[logged].max()) & (load > 0.3)
     hover = float(np.median(effort[heavy] / load[heavy])) if heavy.any() else float(np.median(effort[logged]))
@@ -111,7 +111,7 @@ def _grounded(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDAr
         return constant
     resting = calm & (lacking > 0.15) & (np.abs(acceleration[:, 2]) < 0.4 * lacking * gravity)
     lasting = minimum_filter1d(resting.astype(np.int8), 2 * (second // 8) + 1)  # not the top of a climb
-    return np.asarray(maximum_filter1d(lasting, 2 * (round(MARGIN * second) + second // 8) + 1) > 0)
+    return np.asarray(maximum_filter1d(lasting, 2 * (round(GROUND_MARGIN * second) + second // 8) + 1) > 0)
 
 
 def _bridged(rows: Array, logged: NDArray[np.bool_]) -> Array:
@@ -133,7 +133,7 @@ def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
             continue
         squares, loads = [], []
         for part in parts:
-            rate = slope(record.velocity[part], record.period, 0.2) + np.array([0.0, 0.0, vehicle.gravity])
+            rate = rate_over_window(record.velocity[part], record.period, 0.2) + np.array([0.0, 0.0, vehicle.gravity])
             loads.append((rate * body_z(record.attitude[part])).sum(axis=1) / vehicle.gravity)
             squares.append(np.square(rows[part]).mean(axis=1))
         hover = float(np.sqrt(np.median(np.concatenate(squares)) / max(np.median(np.concatenate(loads)), 0.1)))

@@ -9,11 +9,11 @@ import numpy as np
 
 from quadsim.errors import InputError
 from quadsim.state import Array
-from scenarios.identify.axes import lateral_motion, tilt_fit, turning
+from scenarios.identify.axes import lateral_motion, tilt_fit, turning_pairs
 from scenarios.identify.correlation import likeness, shifts, stride
 from scenarios.identify.record import Record
 
-REFUSED: Final = {"rates are": 0.015, "velocity is": 0.05}
+REFUSED_SHIFT: Final = {"rates are": 0.015, "velocity is": 0.05}
 """Shift [s] that is refused: drag and yaw reaction would be wrong, and their intervals with them."""
 SHOWN: Final = 5e-3  # [s] of shift
 
@@ -22,10 +22,10 @@ def check_clocks(record: Record, parts: Sequence[slice]) -> Iterator[str]:
     """Notes on shifts between the clocks of attitude, rates and velocity, where the motion shows them clearly.
 
     Raises:
-        InputError: a shift is above `REFUSED`.
+        InputError: a shift is above `REFUSED_SHIFT`.
     """
     ticks, tick = shifts(record.period), stride(record.period) * record.period
-    turns = turning(record, parts)
+    turns = turning_pairs(record, parts)
     like = np.array([likeness(turns, shift) for shift in ticks])
     if like.max() > 0.7:
         yield from _note(record.name, "rates are", _peak(like) * tick)
@@ -40,8 +40,10 @@ def _note(name: str, late: str, shift: float) -> Iterator[str]:
     if abs(shift) < SHOWN:
         return
     text = f"{name}: the {late} {1e3 * abs(shift):.0f} ms {'late' if shift > 0.0 else 'early'} against the attitude"
-    if abs(shift) > REFUSED[late]:
-        raise InputError(f"{text}; at most {1e3 * REFUSED[late]:.0f} ms are allowed: shift the columns onto one clock")
+    if abs(shift) > REFUSED_SHIFT[late]:
+        raise InputError(
+            f"{text}; at most {1e3 * REFUSED_SHIFT[late]:.0f} ms are allowed: shift the columns onto one clock"
+        )
     yield f"{text}; shift its columns onto one clock for better estimates"
 
 

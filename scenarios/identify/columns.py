@@ -15,9 +15,9 @@ from quadsim.errors import FileError, InputError, ParameterError
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, read_parquet
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.state import Array
-from scenarios.identify.series import Series
+from scenarios.identify.series import SampledSeries
 
-TABLES: Final = (".csv", ".parquet")
+TABLE_SUFFIXES: Final = (".csv", ".parquet")
 RPM: Final = math.tau / 60.0  # [rad/s]
 NO_ERPM: Final = 65535  # of 16 bits: no value, but a gap
 SPELLINGS: Final[dict[str, tuple[str, ...]]] = {
@@ -34,7 +34,7 @@ SPELLINGS: Final[dict[str, tuple[str, ...]]] = {
     "voltage": ("voltage", "vbat"),
 }
 """Columns of each quantity, by the names that are read."""
-TIMES: Final = {
+TIME_COLUMNS: Final = {
     "t": 1.0,
     **dict.fromkeys(("t_s", "time_s"), 1.0),
     **dict.fromkeys(("t_ms", "time_ms", "timestamp_ms"), 1e-3),
@@ -43,7 +43,11 @@ TIMES: Final = {
 """Columns of time, with their units [s]."""
 TIMES_OF_ANY_UNIT: Final = ("time", "timestamp")
 """Columns of time in s, ms or us: their step tells which, as a log has 10 to 1000 samples per second."""
-KNOWN: Final = {*TIMES, *TIMES_OF_ANY_UNIT, *" ".join(way for ways in SPELLINGS.values() for way in ways).split()}
+KNOWN: Final = {
+    *TIME_COLUMNS,
+    *TIMES_OF_ANY_UNIT,
+    *" ".join(way for ways in SPELLINGS.values() for way in ways).split(),
+}
 """Every column that is read."""
 RANGES: Final = {
     "throttle": (0.0, 1.0, "throttle1..4 must be shares of full throttle, 0 to 1"),
@@ -52,7 +56,7 @@ RANGES: Final = {
     "euler": (-math.pi, math.pi, "roll and pitch must be in rad"),
 }
 """Least and largest value of a quantity, and the rule."""
-NEEDED: Final = {
+NEEDED_COLUMNS: Final = {
     "velocity": ("velocity", "position"),
     "attitude": ("attitude", "euler"),
     "body rates": ("rates", "euler_rates"),
@@ -61,7 +65,7 @@ NEEDED: Final = {
 """What a log needs: one of each."""
 
 
-def read_table(path: Path, *, poles: int | None = None) -> dict[str, Series]:
+def read_columns(path: Path, *, poles: int | None = None) -> dict[str, SampledSeries]:
     """Read the series of a table by field of `scenarios.identify.record.Record`; arguments and errors as there."""
     table = _read_csv(path) if path.suffix.lower() == ".csv" else read_parquet(path)
     listed = [name.partition("[")[0].strip().lower() for name in table.column_names]
@@ -72,7 +76,7 @@ def read_table(path: Path, *, poles: int | None = None) -> dict[str, Series]:
     if b"speeds_before" in (table.schema.metadata or {}):  # quadsim's own
         spellings = {**SPELLINGS, "euler_rates": ("roll_rate pitch_rate yaw_rate",)}
     fields = {field: spelt for field, ways in spellings.items() if (spelt := _spelling(ways, columns))}
-    for what, needed in NEEDED.items():
+    for what, needed in NEEDED_COLUMNS.items():
         if not {*needed} & {*fields}:
             ways = " or ".join(spellings[field][0].replace(" ", ",") for field in needed if field in spellings)
             raise FileError(path, f"lacks {what}: columns {ways}; it has {_listed(columns)}")
@@ -81,11 +85,11 @@ def read_table(path: Path, *, poles: int | None = None) -> dict[str, Series]:
         field: np.stack([_numbers(path, name, columns[name]) for name in names], axis=1)
         for field, names in fields.items()
     }
-    series = {field: Series(t=t, values=rows) for field, rows in _in_our_units(path.name, values, poles).items()}
+    series = {field: SampledSeries(t=t, values=rows) for field, rows in _in_our_units(path.name, values, poles).items()}
     plant = path.parent / PLANT_FILE
     if path.name == FLIGHT_FILE and plant.is_file() and "voltage" in (battery := read_parquet(plant)).column_names:
         clock, volts = (np.asarray(battery.column(name), float) for name in ("t", "voltage"))
-        series["voltage"] = Series(t=t, values=np.interp(t, clock, volts)[:, None])
+        series["voltage"] = SampledSeries(t=t, values=np.interp(t, clock, volts)[:, None])
     return series
 
 
@@ -120,13 +124,13 @@ def _numbers(path: Path, name: str, column: pa.ChunkedArray) -> Array:
 
 def _time(path: Path, columns: Mapping[str, pa.ChunkedArray]) -> Array:
     """The time [s] of each row."""
-    name = next((name for name in (*TIMES, *TIMES_OF_ANY_UNIT) if name in columns), None)
+    name = next((name for name in (*TIME_COLUMNS, *TIMES_OF_ANY_UNIT) if name in columns), None)
     if name is None:
-        allowed = ", ".join((*TIMES, *TIMES_OF_ANY_UNIT))
+        allowed = ", ".join((*TIME_COLUMNS, *TIMES_OF_ANY_UNIT))
         raise FileError(path, f"lacks a column of time: one of {allowed}; it has {_listed(columns)}")
     t = _numbers(path, name, columns[name])
     step = float(np.median(np.abs(np.diff(t)))) if t.size > 1 else 1.0
-    return t * TIMES.get(name, 1.0 if step < 0.5 else 1e-3 if step < 200.0 else 1e-6)
+    return t * TIME_COLUMNS.get(name, 1.0 if step < 0.5 else 1e-3 if step < 200.0 else 1e-6)
 
 
 def _in_our_units(name: str, values: dict[str, Array], poles: int | None) -> dict[str, Array]:

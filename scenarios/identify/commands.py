@@ -49,14 +49,14 @@ def identify(
         quadsim.errors.FileError: not-logged-yet.csv: is missing, or not a file
     """
     from quadsim.assets import vehicle_path
-    from scenarios.identify.report import NEEDED, identify_logs
+    from scenarios.identify.report import NEEDED_PARAMETERS, identify_logs
 
     if not logs:
         raise InputError("identify needs a flight log: CSV, Parquet, ULog, or a run directory")
     if vehicle is None:
         raise InputError(
             "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template > start.toml"
-            f" writes one; give your {NEEDED}, and estimates of the rest"
+            f" writes one; give your {NEEDED_PARAMETERS}, and estimates of the rest"
         )
     for name, path, ending in (("--out", out, ".toml"), ("--page", page, ".html")):
         if path is not None and Path(path).suffix != ending:

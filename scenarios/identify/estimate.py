@@ -8,7 +8,7 @@ from quadsim.vehicle import Vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
-class Estimate:
+class ParameterEstimate:
     """One parameter."""
 
     name: str  # as in the vehicle file, an inertia with its axis: inertia_x
@@ -27,7 +27,7 @@ class Estimate:
 class Identification:
     """The fit of one or several logs."""
 
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[ParameterEstimate, ...]
     vehicle: Vehicle  # the start with what was identified in its place
     delay: float  # of the commands, or by which measured speeds are logged late [s]
     offset: tuple[float, float]  # x and y of the centre of mass in the rotors' frame [m]

@@ -12,13 +12,13 @@ from scipy.stats import t as student
 
 from quadsim.errors import InputError
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.identify.estimate import Estimate, Identification
-from scenarios.identify.model import AXES, Stretch, stretch
+from scenarios.identify.estimate import Identification, ParameterEstimate
+from scenarios.identify.model import INCREMENTS, Stretch, stretch
 from scenarios.identify.record import Record
 from scenarios.identify.rotors import smoothed
 from scenarios.identify.search import LEVEL_PLATE, PLATE, Search
 
-CONFIDENCE: Final = 0.95
+INTERVAL_SHARE: Final = 0.95
 WIDEST: Final = 0.25
 """Half-width of an interval, in logarithms, above which a log is said not to excite a parameter."""
 WIDEST_DELAY: Final = 0.01  # the same of a delay [s]
@@ -26,7 +26,7 @@ MOST_COLOUR: Final = 0.2  # largest autocorrelation of the innovations [-]
 CHANCE: Final = 3.7
 """The same times sqrt(N) that noise of N samples stays below in 99 %, at 8 lags of 6 axes: more than 0.2 if N < 342."""
 MOST_PRIOR: Final = 0.25  # share of the information on a parameter that rules and start may give
-WINDOW: Final = 0.5  # of the output-error method [s]
+OUTPUT_ERROR_WINDOW: Final = 0.5  # of the output-error method [s]
 _NORMAL: Final = 1.96  # standard deviations on either side, of a normal distribution
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
 _STEPS: Final = 6  # of the output-error method
@@ -182,7 +182,7 @@ class _Fit:
             cross_check=_output_error(search),
         )
 
-    def _estimate(self, i: int) -> Estimate:
+    def _estimate(self, i: int) -> ParameterEstimate:
         number, x = self.search.sought[i], self.search.x[i]
         half = self._half_width({i: 1.0})
         found = self._judged(
@@ -212,14 +212,14 @@ class _Fit:
             return f"depends on the noise model: {other:.3g} with one of third order"
         return ""
 
-    def _judged(self, name: str, value: float, low: float, high: float, refused: str) -> Estimate:
+    def _judged(self, name: str, value: float, low: float, high: float, refused: str) -> ParameterEstimate:
         field, _, axis = name.partition("_") if name.startswith("inertia") else (name, "", "")
         start = getattr(self.vehicle, field, None)
         if axis and start is not None:
             start = start["xyz".index(axis)]
         elif isinstance(start, tuple):
             start = start[0]
-        return Estimate(
+        return ParameterEstimate(
             name=name,
             unit=_KINDS[name].unit or VEHICLE_UNITS[field],
             value=value,
@@ -231,7 +231,7 @@ class _Fit:
             in_file=field in VEHICLE_UNITS,
         )
 
-    def _delay(self) -> Estimate:
+    def _delay(self) -> ParameterEstimate:
         """One delay of all stretches: the mean, and an interval that holds each."""
         search = self.search
         every = [i for i, number in enumerate(search.sought) if number.name == "delay"]
@@ -243,12 +243,14 @@ class _Fit:
         name = "lateness" if self._alone else "delay"
         return self._judged(name, value, value - half, value + half, refused)
 
-    def _lags_as_stated(self) -> dict[str, Estimate]:
+    def _lags_as_stated(self) -> dict[str, ParameterEstimate]:
         """Rotor lag where speeds were measured and no commands."""
         why, lag = "the log has the rotors' speeds but not their commands", self.vehicle.rotor_rise or 0.0
         return {name: self._judged(name, lag, lag, lag, why) for name in ("rotor_rise", "rotor_fall")}
 
-    def _yaw_gain(self, estimates: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[Estimate, Vehicle]:
+    def _yaw_gain(
+        self, estimates: Mapping[str, ParameterEstimate], vehicle: Vehicle
+    ) -> tuple[ParameterEstimate, Vehicle]:
         """The yaw reaction that gives the identified yaw acceleration with the inertia that the file keeps."""
         told, share = estimates["drag_to_thrust"], {"drag_to_thrust": 1.0, "thrust_coefficient": 1.0, "inertia_z": -1.0}
         sought = enumerate(self.search.sought)
@@ -282,7 +284,7 @@ def _is_body(inertia: Sequence[float]) -> bool:
 
 def _quantile(blocks: int) -> float:
     """Student's, two-sided."""
-    return float(student.ppf(0.5 + 0.5 * CONFIDENCE, max(blocks - 1, 1)))
+    return float(student.ppf(0.5 + 0.5 * INTERVAL_SHARE, max(blocks - 1, 1)))
 
 
 def _not_excited(half: float) -> str:
@@ -292,19 +294,19 @@ def _not_excited(half: float) -> str:
 
 def _colour(search: Search) -> dict[str, float]:
     """Largest |autocorrelation| of each axis's innovations at lags up to `_LONGEST_LAG`."""
-    colour = np.zeros(len(AXES))
+    colour = np.zeros(len(INCREMENTS))
     for part, innovations in zip(search.parts, search.innovations(search.x), strict=True):
         e = innovations - innovations.mean(axis=0)
         for lag in range(1, 1 + max(1, round(_LONGEST_LAG / part.record.period))):
             colour = np.maximum(colour, np.abs((e[lag:] * e[:-lag]).mean(axis=0)) / (e**2).mean(axis=0))
-    return dict(zip(AXES, colour.tolist(), strict=True))
+    return dict(zip(INCREMENTS, colour.tolist(), strict=True))
 
 
 def _output_error(search: Search) -> dict[str, float]:
     """Estimates of the output-error method over those of the search, by parameter.
 
-    It takes all noise for the sensors': windows of `WINDOW`, each with a first sample and a constant torque of its own.
-    A torque that the loop answers makes it wrong, by 10 to 20 % in the inertias.
+    It takes all noise for the sensors': windows of `OUTPUT_ERROR_WINDOW`, each with a first sample and a constant
+    torque of its own.  A torque that the loop answers makes it wrong, by 10 to 20 % in the inertias.
     """
     count = len(search.sought)
     x = search.x.copy()
@@ -313,9 +315,11 @@ def _output_error(search: Search) -> dict[str, float]:
         H, g = prior.H[:count, :count].copy(), prior.g[:count].copy()
         for i, part in enumerate(search.parts):
             misfit, slopes = search.misfits(x, i)
-            n = max(4, round(WINDOW / part.record.period))
+            n = max(4, round(OUTPUT_ERROR_WINDOW / part.record.period))
             rows = len(misfit) // n * n
-            every = np.concatenate([misfit[:rows, :, None], slopes[:rows]], axis=2).reshape(-1, n, len(AXES), count + 1)
+            every = np.concatenate([misfit[:rows, :, None], slopes[:rows]], axis=2).reshape(
+                -1, n, len(INCREMENTS), count + 1
+            )
             summed = np.cumsum(every, axis=1)
             summed -= summed.mean(axis=1, keepdims=True)
             slope = np.arange(n) - 0.5 * (n - 1)

@@ -10,8 +10,8 @@ import numpy as np
 from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import Figure, Panel, Series
 from quadsim.state import shown_unit
-from scenarios.identify.estimate import Estimate
-from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, Prediction, Trace
+from scenarios.identify.estimate import ParameterEstimate
+from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, PredictionErrors, Trace
 
 _COLOURS: Final = dict(zip((IDENTIFIED, THRUST_ONLY, START), CYCLE, strict=False))
 _TRACED: Final = (
@@ -20,7 +20,7 @@ _TRACED: Final = (
 )
 
 
-def interval_figure(estimates: Sequence[Estimate]) -> Figure:
+def interval_figure(estimates: Sequence[ParameterEstimate]) -> Figure:
     """Return each parameter's interval and start in percent of its value; those that a gate refuses are grey."""
     drawn = [estimate for estimate in estimates if estimate.in_file]
     series = []
@@ -63,7 +63,7 @@ def interval_figure(estimates: Sequence[Estimate]) -> Figure:
     return Figure(key="intervals", title="intervals", panels=(panel,), columns=1)
 
 
-def _percent(value: float, estimate: Estimate) -> float:
+def _percent(value: float, estimate: ParameterEstimate) -> float:
     return 100.0 * (value / estimate.value - 1.0)
 
 
@@ -89,7 +89,7 @@ def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)
     return Figure(key="trace", title=title, panels=tuple(panels), end=float(t[-1, -1]))
 
 
-def horizon_figure(prediction: Prediction) -> Figure:
+def horizon_figure(prediction: PredictionErrors) -> Figure:
     """Return the mean errors over the horizon."""
     x, panels = np.array((0.0, *HORIZONS)), []
     for j, (quantity, si) in enumerate(QUANTITIES.items()):

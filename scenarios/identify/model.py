@@ -16,7 +16,7 @@ from quadsim.vehicle import Vehicle
 from scenarios.identify.record import Record
 from scenarios.identify.rotors import Turning, corrected, lagging, measured, smoothed
 
-AXES: Final = ("roll", "pitch", "yaw", "vx", "vy", "vz")
+INCREMENTS: Final = ("roll", "pitch", "yaw", "vx", "vy", "vz")
 AT_ONCE: Final = 1e-6  # lag of rotors that have none [s]
 _SMOOTHING: Final = 0.1
 """Time constant [s] below which the attitude follows the gyro: it averages the noise of the attitude itself."""
@@ -57,7 +57,7 @@ class Parameters:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion:
+class MeanMotion:
     """The motion of a vehicle over M periods, as its mean in each, or of M vehicles over one."""
 
     period: float  # [s]
@@ -72,7 +72,7 @@ class Stretch:
 
     record: Record
     increments: Array  # (N - 1, 6) of body rates [rad/s] and world velocity [m/s]
-    motion: Motion
+    motion: MeanMotion
 
 
 def stretch(record: Record) -> Stretch:
@@ -85,7 +85,7 @@ def stretch(record: Record) -> Stretch:
     return Stretch(
         record=record,
         increments=np.diff(np.concatenate([record.rates, record.velocity], axis=1), axis=0),
-        motion=Motion(period=record.period, rates=rates, turn=turns, velocity=velocity),
+        motion=MeanMotion(period=record.period, rates=rates, turn=turns, velocity=velocity),
     )
 
 
@@ -118,7 +118,7 @@ def turning(record: Record, vehicle: Vehicle, p: Parameters) -> Turning:
     return follower if record.speeds is None else corrected(follower, record.speeds, record.period)
 
 
-def predicted(motion: Motion, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:
+def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:
     """(M, 6) increments of body rates and velocity in each period, as the parameters predict them.
 
     J dw/dt = sum r_i x f_i - w x (J w + h e_z) - dh/dt e_z with h = -sum spin_i J_r w_i, f_i = (b w_i^2 -

@@ -17,17 +17,17 @@ from scipy.spatial.transform import Rotation
 from quadsim.errors import InputError
 from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
-from scenarios.identify.checks import SHORTEST
+from scenarios.identify.checks import SHORTEST_SPAN
 from scenarios.identify.estimate import Identification
-from scenarios.identify.model import Motion, Parameters, predicted, turning
+from scenarios.identify.model import MeanMotion, Parameters, predicted_increments, turning
 from scenarios.identify.record import Record
 from scenarios.identify.rotors import Turning
 
-WINDOW: Final = 0.5  # longest horizon [s]; windows start every half of it
+PREDICTION_WINDOW: Final = 0.5  # longest horizon [s]; windows start every half of it
 HORIZONS: Final = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)  # at which errors are taken [s]
 IDENTIFIED, START, THRUST_ONLY = "identified", "start", "thrust only"
 QUANTITIES: Final = {"position": "m", "velocity": "m/s", "attitude": "rad", "body rates": "rad/s"}
-ROTORS: Final = ("commands", "throttle", "speeds", "voltage")  # what a record may say of them
+ROTOR_FIELDS: Final = ("commands", "throttle", "speeds", "voltage")  # what a record may say of them
 _HELD_OUT: Final = 0.2  # share of the airborne samples of a log
 _SHOWN: Final = 10  # windows in a trace
 _VELOCITY_AND_RATES: Final = [3, 4, 5, 10, 11, 12]  # of a state
@@ -44,7 +44,7 @@ class Trace:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prediction:
+class PredictionErrors:
     """Errors of all windows."""
 
     windows: int
@@ -63,7 +63,7 @@ def hold_out(record: Record, spans: Sequence[slice]) -> tuple[list[slice], list[
     for span in spans:
         cut = min(span.start + left, span.stop)
         left -= cut - span.start
-        if (cut - span.start) * record.period < SHORTEST * (1.0 - 1e-6):
+        if (cut - span.start) * record.period < SHORTEST_SPAN * (1.0 - 1e-6):
             cut = span.start
         fitted += [slice(span.start, cut)] if cut > span.start else []
         held += [slice(cut, span.stop)] if cut < span.stop else []
@@ -72,7 +72,7 @@ def hold_out(record: Record, spans: Sequence[slice]) -> tuple[list[slice], list[
 
 def predict(
     records: Sequence[Record], spans: Sequence[Sequence[slice]], identification: Identification, start: Vehicle
-) -> Prediction:
+) -> PredictionErrors:
     """Predict every window of the held-out spans of some records.
 
     Raises:
@@ -98,7 +98,7 @@ def predict(
     errors: dict[str, list[Array]] = {name: [] for name in models}
     traces = []
     for record, span in ((record, span) for record, own in zip(records, spans, strict=True) for span in own):
-        length = max(1, round(WINDOW / record.period))
+        length = max(1, round(PREDICTION_WINDOW / record.period))
         rows = np.arange(span.start, span.stop - length, max(1, length // 2))[:, None] + np.arange(length + 1)
         if not rows.size:
             continue
@@ -116,11 +116,11 @@ def predict(
         )
     if not traces:
         raise InputError(
-            f"what is held out for the prediction is shorter than one window of {WINDOW:g} s: fly longer, or give "
-            "another log with --test"
+            f"what is held out for the prediction is shorter than one window of {PREDICTION_WINDOW:g} s: fly longer, "
+            "or give another log with --test"
         )
     whole = {name: np.concatenate(parts) for name, parts in errors.items()}
-    return Prediction(
+    return PredictionErrors(
         windows=len(whole[IDENTIFIED]),
         errors={name: of.mean(axis=0) for name, of in whole.items()},
         trace=max(traces, key=lambda trace: len(trace.t)),
@@ -165,13 +165,13 @@ def _simulate(
     states, share = [measured[:, 0]], np.array([float(turns)] * 3 + [1.0] * 3)
     for k in rows.T[:-1]:
         of = rotors.during(k)
-        motion = Motion(period=period, rates=rates, turn=attitude.as_matrix(), velocity=velocity)
-        begun = 0.5 * share * predicted(motion, of, vehicle, p)
+        motion = MeanMotion(period=period, rates=rates, turn=attitude.as_matrix(), velocity=velocity)
+        begun = 0.5 * share * predicted_increments(motion, of, vehicle, p)
         ahead = attitude * Rotation.from_rotvec(0.5 * period * rates)
-        middle = Motion(
+        middle = MeanMotion(
             period=period, rates=rates + begun[:, :3], turn=ahead.as_matrix(), velocity=velocity + begun[:, 3:]
         )
-        change = share * predicted(middle, of, vehicle, p)
+        change = share * predicted_increments(middle, of, vehicle, p)
         position = position + period * (velocity + 0.5 * change[:, 3:])
         attitude = attitude * Rotation.from_rotvec(period * (rates + 0.5 * change[:, :3]))
         velocity, rates = velocity + change[:, 3:], rates + change[:, :3]
@@ -181,7 +181,7 @@ def _simulate(
 
 def _held(record: Record) -> Record:
     """The record with what it says of the rotors held through its gaps."""
-    found: dict[str, Any] = {name: rows for name in ROTORS if (rows := getattr(record, name)) is not None}
+    found: dict[str, Any] = {name: rows for name in ROTOR_FIELDS if (rows := getattr(record, name)) is not None}
     there = np.isfinite(np.column_stack([*found.values()])).all(axis=1)
     latest = np.maximum.accumulate(np.where(there, np.arange(len(record.t)), int(there.argmax())))
     return replace(record, **{name: rows[latest] for name, rows in found.items()})

@@ -12,13 +12,13 @@ import numpy as np
 from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array
-from scenarios.identify.columns import TABLES, read_table
-from scenarios.identify.series import Series
+from scenarios.identify.columns import TABLE_SUFFIXES, read_columns
+from scenarios.identify.series import SampledSeries
 from scenarios.identify.ulog import ULOGS, read_ulog
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
-ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
+STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
 INPUTS: Final = ("commands", "throttle", "speeds")
 
 
@@ -70,15 +70,15 @@ def read_record(path: Path | str, *, poles: int | None = None) -> Record:
     if not file.is_file():
         raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
     kind = file.suffix.lower()
-    if kind not in (*TABLES, *ULOGS):
-        raise FileError(given, f"is not a log that can be read (these can: {', '.join((*TABLES, *ULOGS))})")
+    if kind not in (*TABLE_SUFFIXES, *ULOGS):
+        raise FileError(given, f"is not a log that can be read (these can: {', '.join((*TABLE_SUFFIXES, *ULOGS))})")
     if kind in ULOGS and poles is not None:
         raise InputError(f"{given.name}: a ULog has no eRPM that poles could turn into speeds; leave poles out")
-    series = read_ulog(file) if kind in ULOGS else read_table(file, poles=poles)
+    series = read_ulog(file) if kind in ULOGS else read_columns(file, poles=poles)
     return to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series)
 
 
-def to_record(name: str, series: Mapping[str, Series]) -> Record:
+def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
     """Sample the series of a log, by field of `Record`, on one uniform clock.
 
     Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
@@ -94,7 +94,7 @@ def to_record(name: str, series: Mapping[str, Series]) -> Record:
     if "velocity" not in series:
         place = series["position"]
         slope = np.gradient(place.values, place.t, axis=0)
-        series = {**series, "velocity": Series(t=place.t, values=slope)}
+        series = {**series, "velocity": SampledSeries(t=place.t, values=slope)}
         notes = (f"{name}: no velocity is logged; it is the central difference of the position",)
     turn = series["attitude"]
     series = {**series, "attitude": replace(turn, values=_continuous(name, turn.values))}
@@ -146,7 +146,7 @@ def _usual_period(t: Array) -> float:
     return float(steps[steps <= 1.5 * np.median(steps)].mean())
 
 
-def _clock(name: str, series: Mapping[str, Series]) -> Array:
+def _clock(name: str, series: Mapping[str, SampledSeries]) -> Array:
     """The common clock: of the rates or of the commands, whichever is slower; where all fields have samples."""
     driver = next((field for field in INPUTS if field in series), None)
     if driver is None:
@@ -167,13 +167,13 @@ def _clock(name: str, series: Mapping[str, Series]) -> Array:
         off = np.abs(slower - line).max()
         if off <= 1e-6 * period + 4.0 * np.spacing(np.abs(slower).max()):
             return slower
-        if off <= min(ROUNDING, 0.25 * period):
+        if off <= min(STAMP_ROUNDING, 0.25 * period):
             slower[:] = line  # stamps in whole milliseconds: the clock is uniform, its stamps are rounded
             return slower
     return np.asarray(start + period * np.arange(int((stop - start) / period + 1e-6) + 1))
 
 
-def _sampled(series: Series, grid: Array, *, held: bool) -> Array:
+def _sampled(series: SampledSeries, grid: Array, *, held: bool) -> Array:
     """Values (N, n) of a series at the times of a grid, NaN in gaps."""
     there = np.isfinite(series.values).all(axis=1)
     if series.t is grid and there.all():

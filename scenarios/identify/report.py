@@ -19,16 +19,16 @@ from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from quadsim.report.to_plotly import to_plot
 from quadsim.state import shown_unit
 from quadsim.vehicle import Vehicle, load_vehicle
-from scenarios.identify.checks import check, spans
-from scenarios.identify.estimate import Estimate, Identification
+from scenarios.identify.checks import check_log, spans
+from scenarios.identify.estimate import Identification, ParameterEstimate
 from scenarios.identify.fit import identify_records
 from scenarios.identify.identification_figures import horizon_figure, interval_figure, trace_figure
-from scenarios.identify.prediction import HORIZONS, QUANTITIES, Prediction, hold_out, predict
+from scenarios.identify.prediction import HORIZONS, QUANTITIES, PredictionErrors, hold_out, predict
 from scenarios.identify.record import read_record
-from scenarios.identify.vehicle_file import interval, rounded, vehicle_text, verdict
+from scenarios.identify.vehicle_file import interval_text, rounded, vehicle_text, verdict
 from scenarios.results import Result, Shown, after
 
-NEEDED: Final = "mass, gravity, arm_length, rotor_azimuths, rotor_spins, speed_min and speed_max"
+NEEDED_PARAMETERS: Final = "mass, gravity, arm_length, rotor_azimuths, rotor_spins, speed_min and speed_max"
 _SHOWN_HORIZONS: Final = (0.1, 0.5)  # of the table of errors [s]
 
 
@@ -37,7 +37,7 @@ class IdentifiedVehicle(Result):
     """A vehicle that was identified from flight logs."""
 
     identification: Identification
-    prediction: Prediction
+    prediction: PredictionErrors
     notes: tuple[str, ...]  # of the checks
     logs: tuple[str, ...]  # fitted
     test: tuple[str, ...]  # predicted; empty where the last fifth of each log is
@@ -188,7 +188,7 @@ def identify_logs(
     notes = [
         note
         for record, parts in zip([*records, *tested], airborne, strict=True)
-        for note in check(record, vehicle, parts)
+        for note in check_log(record, vehicle, parts)
     ]
     fitted, held = airborne[: len(records)], airborne[len(records) :]
     if not tested:
@@ -243,13 +243,13 @@ def _render(result: IdentifiedVehicle) -> str:
     )
 
 
-def _parameter(estimate: Estimate, known: Identification) -> tuple[Cell, ...]:
+def _parameter(estimate: ParameterEstimate, known: Identification) -> tuple[Cell, ...]:
     """Return a line of the table of parameters."""
     start = ABSENT if estimate.start is None else f"{estimate.start:.4g}"
     value, ratio = f"{rounded(estimate.value, estimate):.7g}", known.cross_check.get(estimate.name)
     checked = ABSENT if ratio is None else f"{ratio:.3f}"
     found = Cell(text=verdict(estimate, known.vehicle), mark=Mark.TEXT)
-    return line(estimate.name, estimate.unit, start, value, interval(estimate), checked, found)
+    return line(estimate.name, estimate.unit, start, value, interval_text(estimate), checked, found)
 
 
 def _plain(values: Any) -> Any:

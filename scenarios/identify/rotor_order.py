@@ -14,9 +14,9 @@ from quadsim.errors import InputError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.identify.record import Record, driver
-from scenarios.identify.windows import mean, slope
+from scenarios.identify.windows import mean, rate_over_window
 
-WINDOW: Final = 0.02  # [s] of an angular acceleration
+ACCELERATION_WINDOW: Final = 0.02  # [s] of an angular acceleration
 LAGS: Final = (0.0, 0.015, 0.03, 0.06, 0.1)  # [s] of rotors that are tried
 BLOCK: Final = 1.0  # [s] in each of which an order must prove itself
 AGREEING: Final = 0.8  # share of blocks
@@ -68,8 +68,10 @@ def _moments(record: Record, parts: Sequence[slice], lag: float) -> Moments:
             before = np.concatenate([inputs[:1], inputs[:-1]])  # a command moves the rotors after its sample
             inputs = lfilter([1.0 - pole], [1.0, -pole], before, axis=0, zi=pole * inputs[:1])[0]
         whole = len(inputs) // size * size
-        speeds.append(mean(np.square(inputs), period, WINDOW)[:whole].reshape(-1, size, N_ROTORS))
-        accelerations.append(slope(record.rates[part], period, WINDOW)[:whole].reshape(-1, size, 3))
+        speeds.append(mean(np.square(inputs), period, ACCELERATION_WINDOW)[:whole].reshape(-1, size, N_ROTORS))
+        accelerations.append(
+            rate_over_window(record.rates[part], period, ACCELERATION_WINDOW)[:whole].reshape(-1, size, 3)
+        )
     x, a = (np.concatenate(rows) for rows in (speeds, accelerations))
     x, a = x - x.mean(axis=1, keepdims=True), a - a.mean(axis=1, keepdims=True)
     return Moments(xx=x.transpose(0, 2, 1) @ x, xa=x.transpose(0, 2, 1) @ a, aa=np.square(a).sum(axis=1))

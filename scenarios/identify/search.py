@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 
 from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
-from scenarios.identify.model import AXES, Parameters, Stretch, predicted, turning
+from scenarios.identify.model import INCREMENTS, Parameters, Stretch, predicted_increments, turning
 from scenarios.identify.rotors import Turning
 
 TURN_ON: Final = 0.5  # time [s] after a stretch begins until the rotors have forgotten the speeds assumed there
@@ -30,7 +30,7 @@ LONGEST_FORCE: Final = 2.0
 BALANCE: Final = 0.002
 """Standard deviation of the mean lift over a log that is not the rotors' or drag, over the weight [-]."""
 _MOST_KNOTS: Final = 40
-BLOCK: Final = 3.0  # shortest part of a log that is left out in turn [s]
+SHORTEST_FOLD: Final = 3.0  # shortest part of a log that is left out in turn [s]
 FEWEST: Final = 6  # parts, shorter ones of a log of less than 18 s: of 2, Student's t makes intervals useless
 _MOST_BLOCKS: Final = 20
 _NOISE_AT_FIRST: Final = ((1.0, 0.0), (-1.5, 0.5))  # reflection coefficients of A and C, before tanh
@@ -40,7 +40,7 @@ LEVEL_PLATE: Final = (1.0, 1.0, 2.0)  # drag areas along x, y, z to each other, 
 _LAG_RATIO: Final = 0.5  # standard deviation of log(rise / fall)
 _WIND_STEP: Final = 1.0  # standard deviation of the wind's change from knot to knot [m/s]
 _STEPS, _TRIES, _SMALL = 60, 8, 5e-3  # of the search: how many, shortened how often, until the likelihood gains less
-LAGS: Final = ("rotor_rise", "rotor_fall", "delay", "throttle_curve", "voltage_exponent")
+ROTOR_PARAMETERS: Final = ("rotor_rise", "rotor_fall", "delay", "throttle_curve", "voltage_exponent")
 """Parameters that the rotors' speeds depend on."""
 
 
@@ -94,7 +94,7 @@ def _knots(part: Stretch) -> int:
     return int(np.clip(np.ceil(len(part.increments) * part.record.period / KNOT), 2, _MOST_KNOTS))
 
 
-class Normal(NamedTuple):
+class NormalEquations(NamedTuple):
     """Normal equations of the innovations of some samples: H dx = -g."""
 
     H: Array
@@ -110,12 +110,12 @@ class Search:
         voltages = [part.record.voltage for part in parts if part.record.voltage is not None]
         self.voltage = float(np.mean(np.concatenate(voltages))) if voltages else 0.0
         self._physical = len(self.sought)
-        noise = [*itertools.chain(*([*half, *[0.0] * (order - 2)] for half in _NOISE_AT_FIRST))] * len(AXES)
+        noise = [*itertools.chain(*([*half, *[0.0] * (order - 2)] for half in _NOISE_AT_FIRST))] * len(INCREMENTS)
         self._starts = self._physical + len(noise)  # where what is wrong with the first samples is
-        self.x = np.concatenate([np.zeros(self._physical), noise, np.zeros(len(AXES) * len(parts))])
+        self.x = np.concatenate([np.zeros(self._physical), noise, np.zeros(len(INCREMENTS) * len(parts))])
         self._fading = math.exp(-parts[0].record.period / LONGEST_FORCE)
         self._skip = [int(TURN_ON / part.record.period) for part in parts]
-        self.sigma = np.ones(len(AXES))  # of the innovations [rad/s, m/s]
+        self.sigma = np.ones(len(INCREMENTS))  # of the innovations [rad/s, m/s]
         deviations = [number.deviation for number in self.sought]
         self._weights = np.array([0.0 if sd is None else sd**-2.0 for sd in deviations] + [1 / 9.0] * len(noise))
         self._weights = np.append(self._weights, np.full(len(self.x) - self._starts, 1 / 16.0))
@@ -141,7 +141,9 @@ class Search:
         """(N, 6) measured less predicted increments of a stretch, and its rotors."""
         parameters = self.parameters(x, part)
         rotors = rotors or turning(self.parts[part].record, self.vehicle, parameters)
-        misfit = self.parts[part].increments - predicted(self.parts[part].motion, rotors, self.vehicle, parameters)
+        misfit = self.parts[part].increments - predicted_increments(
+            self.parts[part].motion, rotors, self.vehicle, parameters
+        )
         return misfit[self._skip[part] :], rotors
 
     def _polynomials(self, noise: Array, axis: int) -> tuple[Array, Array]:
@@ -157,15 +159,15 @@ class Search:
         return filtered
 
     def _innovations(self, misfit: Array, x: Array, part: int) -> Array:
-        noise = x[self._physical : self._starts].reshape(len(AXES), 2 * self.order)
-        start = x[self._starts + len(AXES) * part :]
-        return np.stack([self._filtered(misfit, i, noise[i], start[i]) for i in range(len(AXES))], axis=1)
+        noise = x[self._physical : self._starts].reshape(len(INCREMENTS), 2 * self.order)
+        start = x[self._starts + len(INCREMENTS) * part :]
+        return np.stack([self._filtered(misfit, i, noise[i], start[i]) for i in range(len(INCREMENTS))], axis=1)
 
     def innovations(self, x: Array) -> list[Array]:
         """(N, 6) of each stretch."""
         return [self._innovations(self._misfit(x, i)[0], x, i) for i in range(len(self.parts))]
 
-    def prior(self, x: Array) -> tuple[float, Normal]:
+    def prior(self, x: Array) -> tuple[float, NormalEquations]:
         """Half the squares of what the priors add, and their normal equations."""
         H, g = np.diag(self._weights), self._weights * x
         cost = 0.5 * float(self._weights @ x**2)
@@ -176,7 +178,7 @@ class Search:
             H += np.outer(slope, slope)
             g += slope * residual / deviation
             cost += 0.5 * (residual / deviation) ** 2
-        return cost, Normal(H, g)
+        return cost, NormalEquations(H, g)
 
     def _rules(self, x: Array) -> Iterator[tuple[list[tuple[int, float]], float, float]]:
         """Priors on several numbers at once: slopes by index, residual, standard deviation."""
@@ -217,7 +219,9 @@ class Search:
             step = 1e-4 if number.scale is None else 1e-2
             moved = x.copy()
             moved[i] += step
-            slopes[:, :, i] = (self._misfit(moved, part, None if number.name in LAGS else rotors)[0] - misfit) / step
+            slopes[:, :, i] = (
+                self._misfit(moved, part, None if number.name in ROTOR_PARAMETERS else rotors)[0] - misfit
+            ) / step
         when = np.linspace(0.0, 1.0, len(misfit) + self._skip[part])[self._skip[part] :]
         for wind in self._winds[part].T:  # as it is linear between its knots, so is what a change of all of them does
             moved = x.copy()
@@ -232,7 +236,7 @@ class Search:
         long = sum(len(one.increments) * one.record.period for one in self.parts)
         size = len(self.parts[part].increments) - self._skip[part]
         seconds = size * self.parts[part].record.period
-        count = max(math.ceil(FEWEST / len(self.parts)), round(seconds / max(BLOCK, long / _MOST_BLOCKS)))
+        count = max(math.ceil(FEWEST / len(self.parts)), round(seconds / max(SHORTEST_FOLD, long / _MOST_BLOCKS)))
         return np.array_split(np.arange(size), count)
 
     def _lift(self, misfit: Array, part: int) -> Array:
@@ -249,8 +253,8 @@ class Search:
         misfit, raw = self.misfits(x, part)
         innovations, size = self._innovations(misfit, x, part), 2 * self.order
         slopes = np.zeros((*innovations.shape, len(x)))
-        for axis in range(len(AXES)):
-            own, first = physical + size * axis, starts + len(AXES) * part + axis
+        for axis in range(len(INCREMENTS)):
+            own, first = physical + size * axis, starts + len(INCREMENTS) * part + axis
             top, bottom = self._polynomials(x[own : own + size], axis)
             slopes[:, axis, :physical] = lfilter(top, bottom, raw[:, axis], axis=0)
             for i in (*range(own, own + size), first):
@@ -262,14 +266,14 @@ class Search:
         lift[:, :physical] = self._lift(raw[:, -1], part)
         return innovations, slopes, self._lift(misfit[:, -1], part), lift
 
-    def blocks(self) -> list[Normal]:
-        """Normal equations of the log's parts, each of `BLOCK` or longer but for `FEWEST`, without priors."""
+    def blocks(self) -> list[NormalEquations]:
+        """Normal equations of the log's parts, each of `SHORTEST_FOLD` or longer but for `FEWEST`, without priors."""
         blocks = []
         for i in range(len(self.parts)):
             innovations, slopes, lift, lift_slopes = self._slopes(i)
             for rows, mean, slope in zip(self._rows(i), lift, lift_slopes, strict=True):
                 J = np.vstack([(slopes[rows] / self.sigma[:, None]).reshape(-1, len(self.x)), slope])
-                blocks.append(Normal(J.T @ J, J.T @ np.append((innovations[rows] / self.sigma).ravel(), mean)))
+                blocks.append(NormalEquations(J.T @ J, J.T @ np.append((innovations[rows] / self.sigma).ravel(), mean)))
         return blocks
 
     def run(self) -> None:
@@ -278,7 +282,7 @@ class Search:
         for _ in range(_STEPS):
             every = np.concatenate(self.innovations(self.x))
             scale, self.sigma = self.sigma, np.sqrt((every**2).mean(axis=0))
-            starts = self.x[self._starts :].reshape(-1, len(AXES))
+            starts = self.x[self._starts :].reshape(-1, len(INCREMENTS))
             starts *= scale / self.sigma  # they count in sigma
             blocks, (_, prior) = self.blocks(), self.prior(self.x)
             H, g = sum(b.H for b in blocks) + prior.H, sum(b.g for b in blocks) + prior.g
@@ -301,8 +305,8 @@ class Search:
         """Begin where a search with a lower order ended."""
         self.x[: self._physical] = other.x[: other._physical]
         self.x[self._starts :] = other.x[other._starts :]
-        mine = self.x[self._physical : self._starts].reshape(len(AXES), 2, self.order)
-        mine[:, :, : other.order] = other.x[other._physical : other._starts].reshape(len(AXES), 2, other.order)
+        mine = self.x[self._physical : self._starts].reshape(len(INCREMENTS), 2, self.order)
+        mine[:, :, : other.order] = other.x[other._physical : other._starts].reshape(len(INCREMENTS), 2, other.order)
         mine[:, :, other.order :] = 0.0
         self.sigma = other.sigma
 

@@ -8,7 +8,7 @@ from quadsim.state import Array
 
 
 @dataclass(frozen=True, kw_only=True)
-class Series:
+class SampledSeries:
     """M samples of n numbers."""
 
     t: Array  # (M,) [s]

@@ -11,7 +11,7 @@ from quadsim.errors import FileError, MissingPackageError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.identify.columns import RPM
-from scenarios.identify.series import Series
+from scenarios.identify.series import SampledSeries
 
 ULOGS: Final = (".ulg", ".ulog")
 HALF_TURN: Final = np.array([1.0, -1.0, -1.0])  # about x: NED to north, west, up; FRD to x forward, y left, z up
@@ -40,7 +40,7 @@ _PULSES: Final = (
 _NEEDED: Final = (("rates",), ("attitude",), ("velocity",), ("throttle", "pwm", "speeds"))
 
 
-def read_ulog(path: Path) -> dict[str, Series]:
+def read_ulog(path: Path) -> dict[str, SampledSeries]:
     """Read the series of a ULog by field of `scenarios.identify.record.Record`.
 
     Raises:
@@ -70,20 +70,20 @@ def read_ulog(path: Path) -> dict[str, Series]:
             float(next((log.initial_parameters[name] for name in names if name in log.initial_parameters), usual))
             for usual, names in _PULSES
         )
-        series["throttle"] = Series(t=pwm.t, values=(pwm.values - low) / (high - low))
+        series["throttle"] = SampledSeries(t=pwm.t, values=(pwm.values - low) / (high - low))
     for field in ("rates", "velocity", "position"):
         if field in series:
-            series[field] = Series(t=series[field].t, values=series[field].values * HALF_TURN)
+            series[field] = SampledSeries(t=series[field].t, values=series[field].values * HALF_TURN)
     turn = series["attitude"]
-    series["attitude"] = Series(t=turn.t, values=turn.values * [1.0, *HALF_TURN])
+    series["attitude"] = SampledSeries(t=turn.t, values=turn.values * [1.0, *HALF_TURN])
     if "speeds" in series:
         rpm = series.pop("speeds")
         if np.abs(rpm.values).max() > 0.0:  # speed controllers without telemetry report zeros
-            series["speeds"] = Series(t=rpm.t, values=np.abs(rpm.values) * RPM)
+            series["speeds"] = SampledSeries(t=rpm.t, values=np.abs(rpm.values) * RPM)
     return series
 
 
-def _series(ways: tuple[tuple[str, tuple[str, ...]], ...], topics: dict[str, Any]) -> Series | None:
+def _series(ways: tuple[tuple[str, tuple[str, ...]], ...], topics: dict[str, Any]) -> SampledSeries | None:
     """The first of the topics that is there with all its fields, on the clock of its measurement."""
     for topic, fields in ways:
         data: dict[str, Array] = topics.get(topic, {})
@@ -91,5 +91,7 @@ def _series(ways: tuple[tuple[str, tuple[str, ...]], ...], topics: dict[str, Any
             stamps = data.get("timestamp_sample", data["timestamp"])
             t = np.asarray(stamps if np.any(stamps) else data["timestamp"], float) * 1e-6
             _, rows = np.unique(t, return_index=True)  # an estimator may publish one sample twice
-            return Series(t=t[rows], values=np.stack([np.asarray(data[name], float)[rows] for name in fields], axis=1))
+            return SampledSeries(
+                t=t[rows], values=np.stack([np.asarray(data[name], float)[rows] for name in fields], axis=1)
+            )
     return None

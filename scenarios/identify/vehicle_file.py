@@ -11,25 +11,25 @@ import numpy as np
 import tomlkit
 
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.identify.estimate import Estimate, Identification
+from scenarios.identify.estimate import Identification, ParameterEstimate
 
 _AXES: Final = ("_x", "_y", "_z")
 _DIGITS: Final = 100.0  # the last digit is no more than this part of an interval
 
 
-def field_of(estimate: Estimate) -> str:
+def field_of(estimate: ParameterEstimate) -> str:
     """Return the field of a vehicle file that holds an estimate: `inertia` of `inertia_x`."""
     return estimate.name[:-2] if estimate.name.endswith(_AXES) else estimate.name
 
 
-def number_in(vehicle: Vehicle, estimate: Estimate) -> float | None:
+def number_in(vehicle: Vehicle, estimate: ParameterEstimate) -> float | None:
     """Return what a vehicle has for an estimate; of `body_drag` the first number, as the others follow it."""
     value = getattr(vehicle, field_of(estimate))
     axis = estimate.name[-1] if field_of(estimate) != estimate.name else "x"
     return value["xyz".index(axis)] if isinstance(value, tuple) else value
 
 
-def verdict(estimate: Estimate, vehicle: Vehicle) -> str:
+def verdict(estimate: ParameterEstimate, vehicle: Vehicle) -> str:
     """Return whether a number is identified, or else why it is not, and what the vehicle has."""
     if not estimate.refused:
         return "identified"
@@ -39,7 +39,7 @@ def verdict(estimate: Estimate, vehicle: Vehicle) -> str:
     return f"kept: {estimate.refused}" if number == estimate.start else f"set to {number:.4g}: {estimate.refused}"
 
 
-def rounded(value: float, estimate: Estimate) -> float:
+def rounded(value: float, estimate: ParameterEstimate) -> float:
     """Round a value to the digits that an estimate's interval supports, and its own two first ones."""
     width = estimate.high - estimate.low
     if not (width > 0.0 and math.isfinite(width)):
@@ -48,7 +48,7 @@ def rounded(value: float, estimate: Estimate) -> float:
     return round(value, math.ceil(-math.log10(last))) + 0.0  # never -0
 
 
-def interval(estimate: Estimate) -> str:
+def interval_text(estimate: ParameterEstimate) -> str:
     """Return the 95 % interval as text."""
     return f"{rounded(estimate.low, estimate):.7g} to {rounded(estimate.high, estimate):.7g}"
 
@@ -59,7 +59,7 @@ def vehicle_text(identification: Identification, start: Path, logs: Sequence[str
     A value that a gate refuses is the start's, and its source says why; of a vector this is said axis by axis.
     """
     document = tomlkit.parse(start.read_text(encoding="utf-8-sig"))
-    of_field: dict[str, list[Estimate]] = {}
+    of_field: dict[str, list[ParameterEstimate]] = {}
     for estimate in identification.estimates:
         if estimate.in_file:
             of_field.setdefault(field_of(estimate), []).append(estimate)
@@ -76,7 +76,7 @@ def vehicle_text(identification: Identification, start: Path, logs: Sequence[str
     return tomlkit.dumps(document)
 
 
-def _value(value: Any, estimates: Sequence[Estimate]) -> Any:
+def _value(value: Any, estimates: Sequence[ParameterEstimate]) -> Any:
     """Return a number, or the numbers of a vector, rounded where they are identified."""
     numbers = np.atleast_1d(value).tolist()
     by_number = estimates if len(estimates) == len(numbers) else [*estimates] * len(numbers)
@@ -84,13 +84,13 @@ def _value(value: Any, estimates: Sequence[Estimate]) -> Any:
     return numbers if isinstance(value, tuple) else numbers[0]
 
 
-def _source(vehicle: Vehicle, estimates: Sequence[Estimate], before: str, logs: Sequence[str]) -> str:
+def _source(vehicle: Vehicle, estimates: Sequence[ParameterEstimate], before: str, logs: Sequence[str]) -> str:
     """Return where each number is from."""
     parts = []
     for estimate in estimates:
         start = "" if estimate.start is None else f"; start {estimate.start:.4g}"
         axis = "" if len(estimates) == 1 else f"{estimate.name[-1]} "
-        within = "" if estimate.refused else f": 95 % within {interval(estimate)}{start}"
+        within = "" if estimate.refused else f": 95 % within {interval_text(estimate)}{start}"
         parts.append(f"{axis}{verdict(estimate, vehicle)}{within}")
     refused = [bool(estimate.refused) for estimate in estimates]
     parts += [] if all(refused) else [f"logs {', '.join(logs)}"]

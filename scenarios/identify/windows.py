@@ -14,14 +14,14 @@ def half_window(period: float, window: float) -> int:
     return max(1, round(0.5 * window / period))
 
 
-def slope(values: Array, period: float, window: float) -> Array:
+def rate_over_window(values: Array, period: float, window: float) -> Array:
     """Rate of change (N, n) over a window [s] about each sample; near the ends, that of the nearest whole window."""
     half = half_window(period, window)
     return _padded((values[2 * half :] - values[: -2 * half]) / (2 * half * period), half)
 
 
 def mean(values: Array, period: float, window: float) -> Array:
-    """Mean (N, n) over a window [s] about each sample, as `slope` of their integral; likewise at the ends."""
+    """Mean (N, n) over a window [s] about each sample, as `rate_over_window` of their integral; so at the ends."""
     half = half_window(period, window)
     inner = uniform_filter1d(0.5 * (values[1:] + values[:-1]), 2 * half, axis=0)  # of steps k - half .. k + half - 1
     return _padded(inner[half : len(inner) - half + 1], half)

@@ -17,7 +17,7 @@ import numpy as np
 from quadsim.errors import InputError
 from quadsim.vehicle import N_ROTORS
 from scenarios.live import readout
-from scenarios.live.knobs import TURNED, Knob, Value, knobs
+from scenarios.live.knobs import TURNED_FIELDS, Knob, KnobValue, knobs
 from scenarios.live.session import Disturbances, Session
 from scenarios.live.stage import Stage
 from scenarios.schema.controllers import AnyController
@@ -276,7 +276,7 @@ class ControllerTab:
     def __init__(self, widgets: Widgets, others: Mapping[str, AnyController], doing: Callable[[str], Any]) -> None:
         self._widgets, self._session, self._doing = widgets, widgets.session, doing
         self._laws = {"initial": self._session.scenario.controller, **others}
-        self._values: dict[str, Value] = {}  # by path, as they fly
+        self._values: dict[str, KnobValue] = {}  # by path, as they fly
         self._groups: list[Any] = []  # folders of fields
         chosen = widgets.gui.add_dropdown("Controller", tuple(self._laws))
         widgets.button("Use this controller", lambda event: self._take(event, chosen.value))
@@ -296,7 +296,7 @@ class ControllerTab:
         self._values = {path: knob.value for path, knob in fields.items()}
         groups = {
             title: [(fields.pop(path), label) for path, label in turned.items() if path in fields]
-            for title, turned in TURNED.items()
+            for title, turned in TURNED_FIELDS.items()
         }
         groups["All fields"] = [(knob, knob.path) for knob in fields.values()]
         for title, group in groups.items():

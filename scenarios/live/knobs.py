@@ -10,9 +10,9 @@ from scenarios.schema.base import fields_of, is_table
 from scenarios.schema.controllers import AnyController
 from scenarios.schema.problems import Kind, kinds_of
 
-Value = float | int | bool | str | tuple[float, ...]
+KnobValue = float | int | bool | str | tuple[float, ...]
 
-TURNED: Final = {
+TURNED_FIELDS: Final = {
     "Tracking weights": {
         "output_weights.x": "x [1/m²]",
         "output_weights.y": "y [1/m²]",
@@ -46,7 +46,7 @@ class Knob:
     """A field with its value."""
 
     path: str  # dotted, in `[controller]`
-    value: Value  # as it is
+    value: KnobValue  # as it is
     about: str  # unit and meaning
     minimum: float | None = None  # of a number, or each of a pair; None for none
     maximum: float | None = None  # likewise

@@ -148,7 +148,7 @@ class Page:
                 loops = [flight.loop for flight in self._session.flights[1:]]
                 lost = [f"{law_name(loop.controller.name)} lost: {loop.reason}" for loop in loops if loop.reason]
                 states = [(value[3], math.hypot(*value[:3])) for value in values if value is not None]
-                self._numbers.content = readout.numbers(frame, states, lost)
+                self._numbers.content = readout.readings(frame, states, lost)
                 audited = {limit.name for limit in self._session.limits}
                 self._margins.content = self._constraints.rows(frame, audited)
             if (frame.k % (2 * _EVERY) == 0 or self._pace.paused) and len(self._history) > 1:
@@ -181,10 +181,10 @@ class Page:
 
     def _build(self, others: Mapping[str, AnyController]) -> None:
         gui = self._server.gui
-        gui.add_html(readout.STYLE)
+        gui.add_html(readout.READOUT_STYLE)
         self._overlay = gui.add_html(readout.hints(self._used, self._names))
         self._headline = gui.add_html("")
-        self._numbers = gui.add_html(readout.numbers(None))
+        self._numbers = gui.add_html(readout.readings(None))
         self._margins = gui.add_html("")
         with gui.add_folder("Run"):
             toggles = {"Pause": self._toggle, "Resume": self._toggle}  # one at a time
@@ -237,7 +237,7 @@ class Page:
             state = "ready" if self._frame is None else "paused"
         else:
             state = "flying"
-        self._headline.content = readout.headline(state, self._frame, self._factor)
+        self._headline.content = readout.status_line(state, self._frame, self._factor)
         self._flight.options = ("Resume" if self._pace.paused else "Pause", "Step", "Reset")
 
     def _use(self, hint: str) -> None:

@@ -34,7 +34,7 @@ STEER: Final = (
     "Keys W, S, A, D, R, F fly the set-point along x, y and z; X stops it.</span>"
 )
 
-STYLE: Final = f"""<style>
+READOUT_STYLE: Final = f"""<style>
 .q{{font:12px/1.5 system-ui,sans-serif;padding:0 .8em}}.q b,.q .n{{font-variant-numeric:tabular-nums}}
 .q .line{{height:1.5em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}}
 .chip{{display:inline-block;padding:0 .6em;border-radius:1em;color:#fff;background:#6b7280;font-weight:600}}
@@ -80,7 +80,7 @@ def hints(used: Collection[str], names: Sequence[str]) -> str:
     return f'<div class="hints">{left}<div class="key">octahedron: set-point; {key}</div></div>'
 
 
-def headline(state: str, frame: Frame | None, factor: float) -> str:
+def status_line(state: str, frame: Frame | None, factor: float) -> str:
     """Return what the flight does now, its time and its speed."""
     time = "" if frame is None else f" <b>{frame.time:.2f} s</b>"
     speed = f", real-time factor {factor:.2f}" if frame is not None and state == "flying" else ""
@@ -89,7 +89,7 @@ def headline(state: str, frame: Frame | None, factor: float) -> str:
     return block(f"{chip}{time}{speed}", "line") + over
 
 
-def numbers(frame: Frame | None, states: Sequence[tuple[float, float]] = (), lost: Collection[str] = ()) -> str:
+def readings(frame: Frame | None, states: Sequence[tuple[float, float]] = (), lost: Collection[str] = ()) -> str:
     """Return the answer of the first vehicle's controller, the `states` of the vehicles, and why the other was lost.
 
     A state is tilt [deg] and position error [m].

@@ -21,7 +21,7 @@ from quadsim.assets import read_toml
 from quadsim.controller import Predicting
 from quadsim.errors import FlightError, InputError, ParameterError
 from quadsim.fields import Fraction, Vector
-from quadsim.flight.audit import COMMANDED, Limit
+from quadsim.flight.audit import COMMAND_SIGNALS, Limit
 from quadsim.sim.effects.load import Load, MassChange
 from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss
 from quadsim.sim.effects.wind import Air, WindChange
@@ -242,7 +242,7 @@ class Session:
         for signal, (lower, upper) in result.spec.audited(flight.vehicle).items():
             hover = flight.vehicle.hover_speed if signal == "speed" else 0.0
             if signal not in REFERENCE_NAMES and not lower <= hover <= upper:
-                table = "input_bounds" if signal in COMMANDED else "output_bounds"
+                table = "input_bounds" if signal in COMMAND_SIGNALS else "output_bounds"
                 rule = f"a range that contains {hover:.4g}, as in hover"
                 raise ParameterError(f"controller.{table}", signal, [lower, upper], rule)
         return result

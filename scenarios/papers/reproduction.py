@@ -23,7 +23,7 @@ from scenarios.loading import parse_scenario
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.rollout import Rollout
-from scenarios.schema.base import Pair
+from scenarios.schema.base import PairList
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import parse_table
 from scenarios.schema.scenario import Scenario
@@ -46,7 +46,7 @@ class PublishedNumber:
         "tracking.position_error.mean"
     )
     unit: Annotated[str, MaxLen(20), doc("of the number, for tables")] = "m"
-    published: Annotated[Number | Pair, doc("[unit] the number, or the lowest and the highest of several")]
+    published: Annotated[Number | PairList, doc("[unit] the number, or the lowest and the highest of several")]
     relation: Annotated[Literal["equal", "at most", "at least"], doc("what ours is to be to the published one")] = (
         "equal"
     )

@@ -65,7 +65,7 @@ class _Holder:
     controller: AnyController
 
 
-def changed(controller: AnyController, fields: Mapping[str, Any]) -> AnyController:
+def changed_controller(controller: AnyController, fields: Mapping[str, Any]) -> AnyController:
     """Return a controller with new values of some fields, by dotted path; a `type` replaces the whole table.
 
     Raises:

@@ -23,7 +23,7 @@ from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.vehicle import MEANT
 from scenarios.schema.base import STRICT, fields_of, is_table
 
-Table = TypeVar("Table")
+TableType = TypeVar("TableType")
 
 _LISTS: Final = (list, tuple, Sequence)  # types written as lists in a file
 _TAGS: Final = ("type", "distribution")  # fields that distinguish tables
@@ -129,7 +129,7 @@ def _number(value: float) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
+class FilePlace:
     """A place in the file."""
 
     names: tuple[str, ...]  # from the root; an entry of a list by its name, or else by its index
@@ -148,7 +148,7 @@ class Place:
         return isinstance(self.given, list) and not any(low <= len(self.given) <= high for low, high in lists)
 
 
-def find(path: Sequence[int | str], data: Any, root: type[Any]) -> Place:
+def find(path: Sequence[int | str], data: Any, root: type[Any]) -> FilePlace:
     """Return the place of one of pydantic's paths in a file of type `root`."""
     names: list[str] = []
     kinds: tuple[Kind, ...] = (Kind(type=root),)
@@ -167,7 +167,7 @@ def find(path: Sequence[int | str], data: Any, root: type[Any]) -> Place:
             data = data.get(part) if isinstance(data, Mapping) else None
             inner = [kinds_of(field.annotation, tuple(field.metadata)) for field in fields]
             kinds = tuple(kind for group in inner or [kind.entries for kind in kinds] for kind in group)
-    return Place(names=tuple(names), kinds=kinds, given=data)
+    return FilePlace(names=tuple(names), kinds=kinds, given=data)
 
 
 def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...]:
@@ -203,14 +203,14 @@ class ScenarioError(InputError):
         self.source, self.problems = source, tuple(problems)
 
 
-def parse_table(kind: type[Table], data: Mapping[str, Any], source: str, *, file: str = "scenario") -> Table:
+def parse_table(kind: type[TableType], data: Mapping[str, Any], source: str, *, file: str = "scenario") -> TableType:
     """Parse nested tables as an instance of a table class.
 
     Raises:
         ScenarioError: the message starts with `source` and names every invalid field.
     """
     try:
-        table: Table = adapter(cast(Any, kind)).validate_json(json.dumps(data, default=lambda _: math.inf))
+        table: TableType = adapter(cast(Any, kind)).validate_json(json.dumps(data, default=lambda _: math.inf))
     except ValidationError as error:
         lines = [*_not_unicode(data)] or describe_all(error, data, kind, file=file)
         raise ScenarioError(source, lines) from error

@@ -30,7 +30,7 @@ from scenarios.catalogue import Group
 from scenarios.courses.table import ReferenceTable
 from scenarios.plugin import PluginForce
 from scenarios.schema.base import LARGEST_SEED
-from scenarios.schema.controllers import AnyController, changed
+from scenarios.schema.controllers import AnyController, changed_controller
 from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
 from scenarios.schema.initial import Initial
 from scenarios.schema.problems import ScenarioError, parse_table
@@ -320,7 +320,7 @@ class Scenario:
                     raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
             elif isinstance(event, ControllerEvent):
                 try:
-                    controller = changed(controller, event.fields)
+                    controller = changed_controller(controller, event.fields)
                 except InputError as error:
                     problems = getattr(error, "problems", (error,))
                     raise ValueError(f"events.{i}.fields: {'; '.join(map(str, problems))}") from error
@@ -331,7 +331,7 @@ class Scenario:
         changes: list[tuple[float, AnyController]] = []
         events = (event for event in self.events if isinstance(event, ControllerEvent))
         for event in sorted(events, key=lambda event: event.at):
-            changes.append((event.at, changed(changes[-1][1] if changes else self.controller, event.fields)))
+            changes.append((event.at, changed_controller(changes[-1][1] if changes else self.controller, event.fields)))
         return changes
 
     def controller_at(self, time: float) -> AnyController:

@@ -121,7 +121,7 @@ def _note(data: dict[str, Any], changes: Iterable[tuple[str, Any]]) -> None:
     for path, value in changes:
         if path not in NOT_DESCRIBED:
             notes.pop(path, None)
-            notes[path] = f"{path} = {shown(value)}"
+            notes[path] = f"{path} = {field_text(value)}"
     if notes:
         data["description"] = f"{text}{_CHANGED}{'; '.join(notes.values())})"
 
@@ -146,7 +146,7 @@ def leaves(data: Mapping[str, Any], above: str = "", *, entries: bool = False) -
             yield above + key, below
 
 
-def shown(value: Any) -> str:
+def field_text(value: Any) -> str:
     """Return a value on one line, numbers to six digits; None is an absent field."""
     if value is None:
         return "absent"

@@ -14,7 +14,7 @@ import pytest
 from firmware.conftest import Answers, Export, Run
 
 from quadsim.state import Array
-from scenarios.export.in_the_loop import Frames, Kind, Reply, SerialMPC, build
+from scenarios.export.in_the_loop import Frames, QueryKind, Reply, SerialMPC, make_program
 from scenarios.export.record import Recording, record
 from scenarios.loading import load_scenario
 
@@ -36,7 +36,7 @@ def recorded() -> Recording:
 @pytest.fixture
 def terminal(exported: Export, run: Run) -> Iterator[Terminal]:
     run("make", "--version"), run("cc", "--version")
-    result = Terminal(build(exported("posix", "double", SHORT), "serial.elf"))
+    result = Terminal(make_program(exported("posix", "double", SHORT), "serial.elf"))
     yield result
     result.close()
 
@@ -47,19 +47,19 @@ class Autopilot:
     def __init__(self, line: Terminal, recorded: Recording) -> None:
         self.line, self.recorded, self.frames, self.number = line, recorded, Frames("double"), 0
 
-    def question(self, kind: Kind, row: Array, k: int = 0) -> bytes:
+    def question(self, kind: QueryKind, row: Array, k: int = 0) -> bytes:
         self.number += 1
-        acting = self.recorded.speeds if kind is Kind.START else self.recorded.acting[k]
+        acting = self.recorded.speeds if kind is QueryKind.START else self.recorded.acting[k]
         return self.frames.question(kind, self.number, self.recorded.state[k], row, acting)
 
     def start(self) -> None:
         """Fill the window but for the last row of the first period."""
-        self.send(self.question(Kind.START, self.recorded.path[0]))
+        self.send(self.question(QueryKind.START, self.recorded.path[0]))
         for row in self.recorded.path[1 : N - 1]:
-            self.send(self.question(Kind.ROW, row))
+            self.send(self.question(QueryKind.ROW, row))
 
     def period(self, k: int) -> bytes:
-        return self.question(Kind.STEP, self.recorded.path[k + N - 1], k)
+        return self.question(QueryKind.STEP, self.recorded.path[k + N - 1], k)
 
     def send(self, data: bytes) -> Reply:
         """The answer to a question, but for what the watchdog has sent meanwhile, on a busy machine."""

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from firmware.conftest import Answer, Answers, Export, Measured, Run
 
-from mpc.codegen.targets import TARGETS, TICK
-from scenarios.export.in_the_loop import build
+from mpc.codegen.targets import INSTRUCTIONS_PER_TICK, TARGETS
+from scenarios.export.in_the_loop import make_program
 
 HERE = Path(__file__).parent
 BOARDS = [name for name, target in TARGETS.items() if target.board]
@@ -82,7 +82,7 @@ def test_contraction_would_change_bits(answers: Answers) -> None:
 )
 def test_a_step_takes_few_instructions(board: str, precision: str, answers: Answers, measured: Measured) -> None:
     """Instructions, not cycles: the emulator has neither caches nor wait states."""
-    steps = np.array([int(answer[7], 16) * TICK for answer in answers(board, precision)])
+    steps = np.array([int(answer[7], 16) * INSTRUCTIONS_PER_TICK for answer in answers(board, precision)])
     result = {"p50": np.median(steps), "p99": np.percentile(steps, 99), "warm": steps[1:].max(), "first": steps[0]}
     measured(board, precision, **result)
     assert result["p50"] <= MEDIAN
@@ -99,7 +99,7 @@ def test_a_controller_fits(
 ) -> None:
     directory, tools = exported(board, precision), "arm-none-eabi-size"
     run(TARGETS[board].compiler, "--version")
-    build(directory, "vectors.elf")
+    make_program(directory, "vectors.elf")
     numbers = tmp_path / "numbers.c"
     numbers.write_text('#include "quadsim_data.h"\nconst quadsim_controller *const used = &QUADSIM_CONTROLLER;\n')
     flags = [*TARGETS[board].machine.split(), *DEFINES[precision], "-std=c99", "-I", directory]

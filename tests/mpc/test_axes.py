@@ -139,7 +139,7 @@ def cost(problem: Problem, state: Array, desired: Array, moves: Array) -> float:
 def test_costs_and_outputs_fall_apart() -> None:
     """Whatever the inputs of an axis, they change its own cost, states and outputs, and no other's."""
     rng = np.random.default_rng(3)
-    problem = random_axes(rng, horizon=5, room=1.0)
+    problem = random_axes(rng, horizon=5, wider=1.0)
     assert problem.bounds is not None
     result = axes(problem)
     assert sorted(axis.states.size for axis in result) == [2, 2, 3]

@@ -13,7 +13,7 @@ from support import changing_period, paper_problem, random_problem
 
 from mpc.constraints import Penalty
 from mpc.ocp import Problem
-from mpc.solvers import LARGEST, Answer, QPSolver
+from mpc.solvers import LARGEST_ENTRY, Answer, QPSolver
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED
 
 
@@ -46,7 +46,7 @@ def corrupted(now: Period, part: str, number: float) -> Period:
 
 
 @pytest.mark.parametrize("part", PARTS)
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, -1.1 * LARGEST])
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, -1.1 * LARGEST_ENTRY])
 def test_implausible_data_is_refused(part: str, number: float) -> None:
     """With answers of the usual shapes, and without harm to what is solved next."""
     problem = soft_problem()

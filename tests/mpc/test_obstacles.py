@@ -117,9 +117,9 @@ def test_regions_are_exact_and_hold_in_their_window() -> None:
     t = PERIOD * np.arange(1, N + 1)
     normals, bounds = space(tube).half_spaces(t, np.zeros((N, 3)))
     in_force = (t > 0.5 - PERIOD) & (t < 1.0 + PERIOD)
-    room = -bounds  # at the origin
-    np.testing.assert_allclose(room[:, in_force], np.tile([[1], [2], [3], [1], [2], [3]], in_force.sum()) - RADIUS)
-    assert (room[:, ~in_force] > 100.0).all()
+    distance = -bounds  # at the origin
+    np.testing.assert_allclose(distance[:, in_force], np.tile([[1], [2], [3], [1], [2], [3]], in_force.sum()) - RADIUS)
+    assert (distance[:, ~in_force] > 100.0).all()
     assert normals.shape == (6, N, 3)
 
 
@@ -131,9 +131,9 @@ def test_the_optimum_is_that_of_a_dense_qp(problem: Problem) -> None:
     assert np.abs(result[0].plan - free[0].plan).max() > 1.0
     normals, bounds = among.half_spaces(PERIOD * np.arange(1, N + 1), free[0].states[:, list(POSITION)])
     np.testing.assert_allclose(result[0].plan, by_dense_qp(problem, posed, normals, bounds), atol=2e-3)
-    room = (normals * result[0].states[:, list(POSITION)]).sum(axis=2) - bounds
-    assert room.min() > -1e-5
-    assert room.min() < 1e-3  # active
+    distance = (normals * result[0].states[:, list(POSITION)]).sum(axis=2) - bounds
+    assert distance.min() > -1e-5
+    assert distance.min() < 1e-3  # active
 
 
 def test_rows_are_added_until_all_half_spaces_are_satisfied(problem: Problem) -> None:

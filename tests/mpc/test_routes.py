@@ -55,9 +55,9 @@ def coupled(problem: Problem, given: Period, *, soft: bool, share: float = 0.5, 
     goes = ocp_peer.values(row, given, ocp_peer.optimum(problem, given).plan) - D @ problem.model.u_bar
     upwards = np.where(goes.max(axis=0) > -goes.min(axis=0), 1.0, -1.0) * [1.0, -1.0, 1.0]
     C, D, E = (upwards[:, None] * part for part in (C, D, E))
-    level, room = D @ problem.model.u_bar, share * np.abs(goes).max(axis=0)
-    assert np.all(room > 1e-2)
-    lower, upper = level - room, level + room
+    level, half = D @ problem.model.u_bar, share * np.abs(goes).max(axis=0)
+    assert np.all(half > 1e-2)
+    lower, upper = level - half, level + half
     lower[0], upper[1] = -math.inf, math.inf
     penalty = Penalty(l1=np.full(m, l1), l2=np.full(m, 0.5)) if soft else None
     return replace(row, C=C, D=D, E=E, lower=lower, upper=upper, penalty=penalty)
@@ -207,9 +207,9 @@ def test_rows_of_states_alone_are_held_axis_by_axis(soft: bool) -> None:
 
 
 def margins(row: Constraint, level: Array) -> Array:
-    """Growing along the horizon to half of the room between hover and the nearer bound."""
-    room = np.minimum(level - row.lower, row.upper - level)
-    return np.asarray(np.linspace(0.0, 0.5, N)[:, None] * room)
+    """Growing along the horizon to half of the distance between hover and the nearer bound."""
+    half = np.minimum(level - row.lower, row.upper - level)
+    return np.asarray(np.linspace(0.0, 0.5, N)[:, None] * half)
 
 
 def modelled(vehicle: Vehicle, table: Robust, drawn_in: Array | None, constraints: tuple[Constraint, ...]) -> Problem:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from quadsim.rotation import (
-    Vector,
+    Vector3,
     body_rates_of,
     body_to_euler_rates,
     body_to_world,
@@ -105,14 +105,14 @@ def test_yaw_is_unwrapped_along_a_flight() -> None:
 
 
 @given(a=vectors, b=vectors)
-def test_products_are_those_of_scipy(a: Vector, b: Vector) -> None:
+def test_products_are_those_of_scipy(a: Vector3, b: Vector3) -> None:
     expected = (Rotation.from_rotvec(a) * Rotation.from_rotvec(b)).as_quat(scalar_first=True)
     result = np.array(multiply(exponential(a), exponential(b)))
     assert abs(result @ expected) == pytest.approx(1.0, abs=1e-14)
 
 
 @given(vector=vectors)
-def test_the_logarithm_inverts_the_exponential(vector: Vector) -> None:
+def test_the_logarithm_inverts_the_exponential(vector: Vector3) -> None:
     assert logarithm(exponential(vector)) == pytest.approx(vector, rel=1e-12, abs=1e-15)
     w, x, y, z = exponential(vector)
     assert logarithm((-w, -x, -y, -z)) == pytest.approx(vector, rel=1e-12, abs=1e-15)
@@ -125,14 +125,14 @@ def test_small_angles_keep_their_digits(angle: float) -> None:
 
 
 @given(a=vectors)
-def test_a_rotation_and_its_conjugate_cancel(a: Vector) -> None:
+def test_a_rotation_and_its_conjugate_cancel(a: Vector3) -> None:
     q = exponential(a)
     assert multiply(q, conjugate(q)) == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-15)
     assert normalise((3.0 * q[0], 3.0 * q[1], 3.0 * q[2], 3.0 * q[3])) == pytest.approx(q, abs=1e-15)
 
 
 @given(vectors=st.lists(st.tuples(vectors, vectors), min_size=1, max_size=4))
-def test_arrays_are_multiplied_as_each_of_their_rows_is(vectors: list[tuple[Vector, Vector]]) -> None:
+def test_arrays_are_multiplied_as_each_of_their_rows_is(vectors: list[tuple[Vector3, Vector3]]) -> None:
     pairs = [(exponential(a), conjugate(exponential(b))) for a, b in vectors]
     a, b = (np.array(each) for each in zip(*pairs, strict=True))
     np.testing.assert_array_equal(multiply(a, conjugate(conjugate(b))), [multiply(p, q) for p, q in pairs])

@@ -91,8 +91,8 @@ def test_every_docstring_has_an_example_that_runs(
 def test_the_page_of_the_api_has_every_name() -> None:
     page = (EXAMPLES.parent / "docs/api.md").read_text(encoding="utf-8")
     named = set(re.findall(r"^::: ((?:quadsim|quadsim\.gym|mpc)\.\w+)$", page, re.MULTILINE))
-    rooms = {name for name in mpc.__all__ if isinstance(getattr(mpc, name), ModuleType)}
-    handed_out = {quadsim: {*quadsim.__all__}, quadsim.gym: {*quadsim.gym.__all__}, mpc: {*mpc.__all__} - rooms}
+    subpackages = {name for name in mpc.__all__ if isinstance(getattr(mpc, name), ModuleType)}
+    handed_out = {quadsim: {*quadsim.__all__}, quadsim.gym: {*quadsim.gym.__all__}, mpc: {*mpc.__all__} - subpackages}
     assert named == {f"{package.__name__}.{name}" for package, names in handed_out.items() for name in names}
 
 

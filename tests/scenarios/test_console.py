@@ -15,7 +15,7 @@ from rich.text import Text
 
 from quadsim.errors import printable
 from quadsim.flight.rundir import findings_of
-from quadsim.report.table import Cell, Grid, Mark, Row, to_markdown
+from quadsim.report.table import Cell, Grid, Mark, QuantityRow, to_markdown
 from scenarios import console
 from scenarios.junit import write_cases
 from scenarios.summary_tables import audit_table, summary_tables
@@ -43,7 +43,7 @@ def test_a_foreign_summary_is_shown_as_text(nasty: str, short_run: Any, capsys: 
     for entry in summary["constraints"]:
         entry |= {"name": nasty, "unit": nasty}
     cells = tuple(Cell(text=nasty, mark=mark) for mark in (Mark.NONE, Mark.BAD))
-    row = Row(group=nasty, label="outcome", unit=nasty, cells=cells, headline=True)
+    row = QuantityRow(group=nasty, label="outcome", unit=nasty, cells=cells, headline=True)
     grid = Grid(key="k", title=nasty, head=(nasty, nasty), lines=(cells,), note=nasty)
     path = Path(nasty.encode(errors="replace").decode())
     parts = [*summary_tables(summary), console.written_to(path), console.to_open(path), *console.grids([grid])]

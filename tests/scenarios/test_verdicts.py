@@ -14,7 +14,14 @@ import pytest
 import mpc
 import quadsim
 from quadsim.errors import InputError
-from quadsim.flight.audit import ROUNDING, UNAUDITED_ADVICE, Limit, flight_verdict, limit_differences, worst_finding
+from quadsim.flight.audit import (
+    COMMAND_TOLERANCE,
+    UNAUDITED_ADVICE,
+    Limit,
+    flight_verdict,
+    limit_differences,
+    worst_finding,
+)
 from quadsim.flight.rundir import findings_of
 from scenarios.cli import main
 from scenarios.law_bounds import law_limits
@@ -65,7 +72,7 @@ def test_tolerances_default_by_signal_and_a_stated_one_sets_the_other_in_proport
 def test_a_sum_of_rotor_speeds_is_a_command_and_any_other_sum_is_not() -> None:
     speeds = Limit(name="a", signal="sum", terms={"speed_1": 1.0, "speed_3": -1.0}, upper=20.0)
     mixed = Limit(name="b", signal="sum", terms={"speed_1": 1.0, "x": 5.0}, upper=20.0)
-    assert (speeds.source.tolerance, mixed.tolerances) == (ROUNDING, pytest.approx((0.2, 0.04)))
+    assert (speeds.source.tolerance, mixed.tolerances) == (COMMAND_TOLERANCE, pytest.approx((0.2, 0.04)))
 
 
 def test_a_bases_tolerance_survives_only_in_an_entry_that_states_neither_bounds_nor_tolerances() -> None:

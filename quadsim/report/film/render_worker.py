@@ -92,7 +92,7 @@ def _place(
     mujoco.mj_camlight(model, data)
 
 
-class Stage:
+class FilmStage:
     """A vehicle in its scene, rendered off screen; use it as a context manager, it owns an OpenGL context.
 
     Besides the airframe and obstacles, frames show the regions in force, the reference path, the path flown in the last
@@ -114,7 +114,7 @@ class Stage:
         self._speed_bound = min((limit.upper for limit in run.limits if limit.signal == "speed"), default=np.inf)
         self._renderer = _renderer(self._model, width, height)
 
-    def __enter__(self) -> Stage:
+    def __enter__(self) -> FilmStage:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -195,13 +195,13 @@ def frames(run: Run, shot: Shot) -> Iterator[Picture]:
     """The frames of a shot, each (height, width, 3)."""
     footage = make_footage(run, shot.times)
     overlay = Overlay(run, footage, width=shot.width, height=shot.height) if shot.captions else None
-    with Stage(run, footage, width=shot.width, height=shot.height) as stage:
+    with FilmStage(run, footage, width=shot.width, height=shot.height) as stage:
         for i in range(shot.count):
             picture = stage.render(i)
             yield picture if overlay is None else overlay.draw(picture, i)
 
 
-def film(shot: Shot, path: Path) -> None:
+def film_shot(shot: Shot, path: Path) -> None:
     """Render a shot and encode it as H.264, reporting frames done on stdout."""
     options = ["-preset", "veryfast", "-crf", "23", "-threads", "1"]
     writer: Any = imageio.get_writer(
@@ -261,18 +261,18 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
             pictures.flush()
 
 
-def main(arguments: list[str]) -> None:
+def carry_out(arguments: list[str]) -> None:
     """Do `serve`, `film SHOT MP4` or `portrait VEHICLE PNG W H`."""
     match arguments:
         case ["serve"]:
             serve(sys.stdin.buffer, sys.stdout.buffer)
         case ["film", shot, path]:
-            film(Shot(**json.loads(shot)), Path(path))
+            film_shot(Shot(**json.loads(shot)), Path(path))
         case ["portrait", vehicle, path, width, height]:
             draw_portrait(Vehicle(**json.loads(vehicle)), Path(path), int(width), int(height))
         case _:
-            raise SystemExit(main.__doc__)
+            raise SystemExit(carry_out.__doc__)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    carry_out(sys.argv[1:])

@@ -44,7 +44,7 @@ _PROBE_SECONDS: Final = 60.0
 _LEAST_FREE_BYTES: Final = 1024 * 1024
 _FEWEST_FRAMES: Final = 30  # smallest number of frames that justifies a further worker
 
-Progress = Callable[[int, int], None]
+FrameProgress = Callable[[int, int], None]
 
 
 def rendering_backend() -> str:
@@ -93,7 +93,7 @@ def render_video(
     path: Path,
     *,
     workers: int | None = None,
-    progress: Progress | None = None,
+    progress: FrameProgress | None = None,
     width: int = 1280,
     height: int = 720,
     fps: int = 30,
@@ -121,7 +121,7 @@ def render_gif(
     path: Path,
     *,
     workers: int | None = None,
-    progress: Progress | None = None,
+    progress: FrameProgress | None = None,
     overwrite: bool = False,
 ) -> None:
     """Film a run as a small looping GIF without captions, six times as fast; arguments and errors as `render_video`.
@@ -156,7 +156,7 @@ def write_poster(film: Path, poster: Path) -> bool:
     return subprocess.run([*_ffmpeg(), "-i", str(film), *frame], capture_output=True).returncode == 0
 
 
-def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None) -> str:
+def _film(shot: Shot, path: Path, workers: int | None, progress: FrameProgress | None) -> str:
     """Film a shot in pieces and join them; the back end that did it."""
     pieces = worker_count(shot.count, workers)
     backend = rendering_backend()

@@ -29,7 +29,7 @@ from quadsim.report.recording.world import (
     FRONT_PANELS,
     REFERENCE,
     SERIES,
-    VERDICTS,
+    VERDICT_COLOURS,
     Colour,
     on_screen,
     panels,
@@ -121,13 +121,15 @@ def _send_limit(recording: rr.RecordingStream, limit: Limit, run: Run) -> bool:
     labels = {f"{limit.name} {sign} {bound:g} {limit.unit}": BOUND for sign, bound in bounds.items()}
     _send_curves(recording, f"limits/{limit.name}", window, np.tile([*bounds.values()], (2, 1)), labels)
 
-    names, entity = list(VERDICTS), f"verdicts/{limit.name}"
+    names, entity = list(VERDICT_COLOURS), f"verdicts/{limit.name}"
     band = limit.upper - limit.lower
     near = max(limit.tolerances[1], _ACTIVE * band if math.isfinite(band) else 0.0)
     violated = limit.violated(margins, sampled=True)
     verdicts = np.select([violated, margins <= near, inside], [2, 1, 0], default=3)
     changes = np.flatnonzero(np.diff(verdicts, prepend=-1))
-    style = rr.StateConfiguration(values=names, colors=list(VERDICTS.values()), visible=[True, True, True, False])
+    style = rr.StateConfiguration(
+        values=names, colors=list(VERDICT_COLOURS.values()), visible=[True, True, True, False]
+    )
     recording.log(entity, style, static=True)
     states = rr.StateChange.columns(state=[names[verdicts[k]] for k in changes])
     recording.send_columns(entity, [time_column(t[changes])], states)

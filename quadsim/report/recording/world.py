@@ -66,9 +66,9 @@ SERIES: Final = tuple(on_screen(line_colour(i)) for i in range(N_ROTORS))
 REFERENCE: Final = on_screen(COLOUR.reference)
 BOUND: Final = on_screen(COLOUR.bound)
 DISTURBANCE: Final = on_screen(COLOUR.disturbance)
-AXES: Final = tuple(map(on_screen, (COLOUR.axis_x, COLOUR.axis_y, COLOUR.axis_z)))
+AXIS_COLOURS: Final = tuple(map(on_screen, (COLOUR.axis_x, COLOUR.axis_y, COLOUR.axis_z)))
 
-VERDICTS: Final = {
+VERDICT_COLOURS: Final = {
     "holds": on_screen(COLOUR.satisfied),
     "active": on_screen(COLOUR.warning),
     "violated": on_screen(COLOUR.violated),
@@ -130,7 +130,7 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     position = plant.state[:, POSITION]
     thickness = min(0.02, 0.06 * run.vehicle.arm_length)
     axes = rr.Arrows3D(
-        origins=np.zeros((3, 3)), vectors=np.eye(3), radii=thickness, colors=AXES, labels=["x", "y", "z"]
+        origins=np.zeros((3, 3)), vectors=np.eye(3), radii=thickness, colors=AXIS_COLOURS, labels=["x", "y", "z"]
     )
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("world/axes", axes, static=True)

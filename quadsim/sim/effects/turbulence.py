@@ -31,7 +31,7 @@ from annotated_types import Ge, Le, doc
 
 from quadsim.state import Array
 
-LOWEST, HIGHEST = 3.048, 304.8
+LOWEST_HEIGHT, HIGHEST_HEIGHT = 3.048, 304.8
 """Heights [m] between which the low-altitude model holds: 10 and 1000 ft (Figs. 10 and 11)."""
 SLOWEST_AIRSPEED, FASTEST_AIRSPEED = 0.01, 200.0
 """[m/s] at which turbulence may pass; at the slower one, it takes hours."""
@@ -39,7 +39,7 @@ _METRES_PER_FOOT: Final = 0.3048
 _BLOCK: Final = 4096
 """Samples made at a time: their number is fixed, so that it makes no difference how many are drawn at once."""
 _OUTPUT: Final = np.array([[1.0, *2 * [math.sqrt(1.5)]], [0.0, *2 * [(1.0 - math.sqrt(3.0)) / math.sqrt(2.0)]]])
-"""(2, 3) what the states a and b of `discretise` give to u, v, w at unit sigma; from the partial fractions of H."""
+"""(2, 3) what the states a and b of `discretise_filters` give to u, v, w at unit sigma; from partial fractions of H."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,9 @@ class Dryden:
     Turbulence is light, moderate and severe at a mean wind of 15, 30 and 45 knots (7.7, 15.4 and 23.2 m/s, Fig. 9).
     """
 
-    altitude: Annotated[float, Ge(LOWEST), Le(HIGHEST), doc("[m] above the ground, for the scale lengths")] = 10.0
+    altitude: Annotated[
+        float, Ge(LOWEST_HEIGHT), Le(HIGHEST_HEIGHT), doc("[m] above the ground, for the scale lengths")
+    ] = 10.0
     wind_speed_20ft: Annotated[
         float,
         Ge(0.0),
@@ -89,7 +91,7 @@ class Turbulence:
     def __init__(self, dryden: Dryden, *, timestep: float, rng: np.random.Generator) -> None:
         assert dryden.airspeed is not None, "resolved"
         self._intensities = dryden.intensities
-        self._steps = [discretise(timestep * dryden.airspeed / length) for length in dryden.lengths]
+        self._steps = [discretise_filters(timestep * dryden.airspeed / length) for length in dryden.lengths]
         (self._source,) = rng.spawn(1)
         self.reset()
 
@@ -126,7 +128,7 @@ class Turbulence:
         return block
 
 
-def discretise(ratio: float) -> tuple[Array, Array]:
+def discretise_filters(ratio: float) -> tuple[Array, Array]:
     """One exact time step of the filters' states a and b, which are the same for all axes but for their time.
 
     White noise n of unit intensity drives, in the time s = t / tau,

@@ -54,7 +54,7 @@ def flown(vehicle: Vehicle, x: Array, u: Array, *, effects: Effects, timestep: f
 
 
 def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
-    return np.array([module.advance(model, *one) for one in zip(x, u, strict=True)])
+    return np.array([module.next_state(model, *one) for one in zip(x, u, strict=True)])
 
 
 def test_derivative_is_that_of_a_rigid_body_at_any_attitude(vehicle: Vehicle) -> None:

@@ -14,7 +14,7 @@ from support import constrained_mpc, derivative, paper_problem, paper_reference,
 from mpc.bounded import InputWeights, Soft
 from mpc.heading import turn_horizontally
 from mpc.linear import LinearMPC
-from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model
+from mpc.nonlinear.model import NonlinearModel, next_state, nonlinear_model
 from mpc.observer import ObserverSettings
 from mpc.robust.controller import RobustPreparation
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Phase, StepInputs
@@ -64,7 +64,7 @@ def flown(
         sent.append(command.speeds)
         for duration, speeds in ((late, sent.pop(0)), (PERIOD - late, sent[0])):
             if duration > 0.0:
-                x = advance(replace(plant, period=duration), x, speeds)
+                x = next_state(replace(plant, period=duration), x, speeds)
 
 
 def preparation_of(controller: LinearMPC) -> RobustPreparation:
@@ -359,7 +359,7 @@ def test_a_delay_is_answered_from_where_the_vehicle_will_be(vehicle: Vehicle, de
     rotors = commands[0] + (before - commands[0]) * math.exp(-(PERIOD - rest) / rotor_lag) if rotor_lag else acting
     there = np.concatenate([state, rotors])[: model.n]
     for duration, speeds in zip([rest, *[PERIOD] * whole], commands, strict=True):
-        there = advance(replace(model, period=duration), there, speeds)
+        there = next_state(replace(model, period=duration), there, speeds)
     prompt = robust(vehicle, rotor_lag=rotor_lag, heading=True)
     prompt.reset(before)
     shifted = np.minimum(np.arange(50.0) + delay / PERIOD, 49.0)[:, None] * 0.05 * np.array([1.0, 0.5, 0.2, 0.1])

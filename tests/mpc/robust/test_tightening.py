@@ -17,7 +17,7 @@ from mpc.bounded import SHORTEST_LAG, InputWeights, Soft
 from mpc.constraints import Bounds
 from mpc.linear import LinearMPC
 from mpc.model import discretise
-from mpc.nonlinear.model import advance, nonlinear_model
+from mpc.nonlinear.model import next_state, nonlinear_model
 from mpc.observer import ObserverSettings
 from mpc.robust.tightening import (
     ERROR_SHARE,
@@ -378,7 +378,7 @@ def pushed_tilt(vehicle: Vehicle, course: Course, *, rotor_lag: float, delay: fl
             w = course((k + i / substeps) * PERIOD, x[TILTS])
             late = i < round(delay / plant.period)
             pushed = replace(plant, acceleration=w[:3], angular_acceleration=w[3:])
-            x = advance(pushed, x, acting if late else command.speeds)
+            x = next_state(pushed, x, acting if late else command.speeds)
             peak = max(peak, float(np.abs(x[TILTS]).max()))
         acting = command.speeds
     return peak

@@ -19,7 +19,7 @@ from quadsim.report.comparison import (
     verdict_cell,
     violated_otherwise,
 )
-from quadsim.report.table import Cell, Mark, Row, format_number, to_markdown
+from quadsim.report.table import Cell, Mark, QuantityRow, format_number, to_markdown
 from quadsim.state import VELOCITY
 
 
@@ -57,16 +57,16 @@ def worse_run(short_run: Run) -> Run:
     return run
 
 
-def cells(rows: list[Row], label: str, group: str | None = None) -> tuple[Cell, ...]:
+def cells(rows: list[QuantityRow], label: str, group: str | None = None) -> tuple[Cell, ...]:
     (result,) = (row for row in rows if row.label == label and group in (None, row.group))
     return result.cells
 
 
-def texts(rows: list[Row], label: str, group: str | None = None) -> list[str]:
+def texts(rows: list[QuantityRow], label: str, group: str | None = None) -> list[str]:
     return [cell.text for cell in cells(rows, label, group)]
 
 
-def marks(rows: list[Row], label: str, group: str | None = None) -> list[Mark]:
+def marks(rows: list[QuantityRow], label: str, group: str | None = None) -> list[Mark]:
     return [cell.mark for cell in cells(rows, label, group)]
 
 

@@ -35,8 +35,8 @@ from quadsim.report.figure import (
     least_range,
 )
 from quadsim.report.flight_figures import effects, inputs, overview, page_figures, states, times, write_figures
-from quadsim.report.to_matplotlib import draw, to_html, to_png
-from quadsim.report.to_plotly import thin, to_plot
+from quadsim.report.to_matplotlib import draw, figure_html, to_png
+from quadsim.report.to_plotly import thinned_curve, to_plot
 from quadsim.space import Cylinder
 from quadsim.state import INDEX, POSITION, Array
 
@@ -183,11 +183,11 @@ def test_both_libraries_draw_the_same_numbers(x_label: str) -> None:
 def test_thinning_keeps_ends_extremes_and_gaps() -> None:
     values = np.random.default_rng(0).normal(size=10_007)
     values[[10, 5000]] = np.nan
-    thinned = thin(values, 500)
+    thinned = thinned_curve(values, 500)
     assert thinned.size <= 506
     assert np.all(np.diff(thinned) > 0)
     assert {0, 10, 5000, 10_006, int(np.nanargmin(values)), int(np.nanargmax(values))} <= set(thinned.tolist())
-    np.testing.assert_array_equal(thin(values[:300], 300), np.arange(300))
+    np.testing.assert_array_equal(thinned_curve(values[:300], 300), np.arange(300))
 
 
 def test_a_run_among_obstacles_is_drawn_from_above_with_its_clearances(short_run: Run) -> None:
@@ -285,7 +285,7 @@ def test_a_user_s_own_settings_change_no_figure_and_its_texts_are_literal() -> N
     expected = to_png(figure)
     with matplotlib.rc_context({"text.usetex": True, "axes.facecolor": "red", "font.size": 30.0, "lines.linewidth": 9}):
         assert to_png(figure) == expected
-        assert to_html(figure).count("$") >= 4
+        assert figure_html(figure).count("$") >= 4
         assert matplotlib.rcParams["text.usetex"]
 
 

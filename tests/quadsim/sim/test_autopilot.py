@@ -10,7 +10,7 @@ import pytest
 
 from quadsim.assets import vehicle_path
 from quadsim.rotation import exponential, multiply
-from quadsim.sim.autopilot import DAMPING, Autopilot, AutopilotSettings, attitude_error, identify_lags
+from quadsim.sim.autopilot import RATE_LOOP_DAMPING, Autopilot, AutopilotSettings, body_attitude_error, identify_lags
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.plant import Plant
@@ -95,9 +95,9 @@ def test_default_gains_follow_the_rule(vehicle: Vehicle) -> None:
     assert settings.d is not None
     lag = (vehicle.rotor_rise or 0.0) + 1.0 / (math.tau * 100.0) + 1.5e-3
     if settings.d[0] > 0.0:  # lag s^2 + (1 + d) s + p
-        assert (1.0 + settings.d[0]) / (2.0 * math.sqrt(settings.p[0] * lag)) == pytest.approx(DAMPING)
+        assert (1.0 + settings.d[0]) / (2.0 * math.sqrt(settings.p[0] * lag)) == pytest.approx(RATE_LOOP_DAMPING)
     else:
-        assert settings.p[0] == pytest.approx(40.0 / (2.0 * DAMPING))
+        assert settings.p[0] == pytest.approx(40.0 / (2.0 * RATE_LOOP_DAMPING))
     assert settings.resolved(vehicle) == settings
 
 
@@ -139,7 +139,7 @@ def test_the_integral_is_limited_and_stops_where_an_axis_is_cut(vehicle: Vehicle
 def test_an_attitude_is_held(vehicle: Vehicle) -> None:
     attitude = np.array(exponential((math.radians(15.0), 0.0, 0.0)))
     flown = fly(vehicle, Autopilot(vehicle), np.concatenate([hover(vehicle), attitude]), 2.0)
-    assert attitude_error(flown[-1, 4:8], attitude) == pytest.approx(np.zeros(3), abs=2e-3)
+    assert body_attitude_error(flown[-1, 4:8], attitude) == pytest.approx(np.zeros(3), abs=2e-3)
 
 
 def test_the_attitude_error_is_the_rotation_vector_the_shorter_way() -> None:
@@ -150,7 +150,7 @@ def test_the_attitude_error_is_the_rotation_vector_the_shorter_way() -> None:
         turn *= 1e-4 / np.linalg.norm(turn)
         end = np.array(multiply(start, exponential(tuple(turn.tolist()))))
         for sign in (1.0, -1.0):
-            assert attitude_error(np.array(start), sign * end) == pytest.approx(turn, rel=1e-6, abs=1e-11)
+            assert body_attitude_error(np.array(start), sign * end) == pytest.approx(turn, rel=1e-6, abs=1e-11)
 
 
 @pytest.mark.parametrize("bandwidth", [10.0, 20.0])

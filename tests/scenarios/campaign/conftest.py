@@ -10,7 +10,8 @@ import pyarrow as pa
 import pytest
 
 from quadsim.flight.audit import Limit
-from scenarios.campaign.rows import Row, make_schema, make_table, split_times
+from scenarios.campaign.rows import make_schema, make_table, split_times
+from scenarios.many import Row
 
 LIMITS = (
     Limit(name="roll", signal="roll", lower=-5.0, upper=5.0, tolerance=0.05),

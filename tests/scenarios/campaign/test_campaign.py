@@ -27,9 +27,10 @@ from scenarios.campaign.campaign import CampaignResult as Result
 from scenarios.campaign.campaign_file import Choice
 from scenarios.campaign.events import parse_event
 from scenarios.campaign.plan import Plan, load_plan
-from scenarios.campaign.rows import Row, read_table
+from scenarios.campaign.rows import read_table
 from scenarios.campaign.store import read_manifest
 from scenarios.machine import processor_name
+from scenarios.many import Row
 from scenarios.rollout import Rollout
 
 pytestmark = pytest.mark.slow("campaigns")

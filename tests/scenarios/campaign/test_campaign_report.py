@@ -16,15 +16,15 @@ from quadsim.report.figure import Panel
 from quadsim.report.to_matplotlib import to_png
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.campaign_report import (
+    campaign_overview,
     group_table,
     histograms,
-    overview,
     scatters,
     worst_draws_table,
     worst_table,
     write_report,
 )
-from scenarios.campaign.rows import Summary
+from scenarios.campaign.rows import CampaignSummary
 from scenarios.campaign.statistics import estimate, interval, percent
 
 pytestmark = pytest.mark.slow("campaigns")
@@ -40,7 +40,7 @@ def write(
     directory: Path,
     table: pa.Table,
     text: str = "What is flown.",
-    summary: Summary | None = None,
+    summary: CampaignSummary | None = None,
     failure: Sequence[str] = ("violated", "rmse.z > 0.5"),
 ) -> str:
     directory.mkdir(exist_ok=True)
@@ -51,12 +51,12 @@ def write(
 
 
 @pytest.fixture(scope="module")
-def estimated(thousand: pa.Table) -> Summary:
+def estimated(thousand: pa.Table) -> CampaignSummary:
     return estimate(thousand)
 
 
 @pytest.fixture(scope="module")
-def reported(thousand: pa.Table, estimated: Summary, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def reported(thousand: pa.Table, estimated: CampaignSummary, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The directory of a campaign of a thousand flights, with its report."""
     directory = tmp_path_factory.mktemp("reported") / "runs" / "my campaign"
     directory.mkdir(parents=True)
@@ -71,7 +71,7 @@ def without_scripts(page: str) -> str:
 
 
 @pytest.mark.witness("campaigns")
-def test_the_page_shows_what_the_flights_show(estimated: Summary, reported: Path) -> None:
+def test_the_page_shows_what_the_flights_show(estimated: CampaignSummary, reported: Path) -> None:
     directory = reported
     text = without_scripts((directory / "index.html").read_text())
     assert '<p class="verdict bad">30 of 1000 flights failed: 3.0 % (95 % interval: 2.0 to 4.3 %)</p>' in text
@@ -171,8 +171,8 @@ def test_many_flights_are_thinned_evenly_and_by_verdict(make_campaign: MakeCampa
     assert over(table, "solver").x_names == ("daqp", "gain", "piqp")
 
 
-def test_the_figure_shows_the_parameters_that_matter_most(thousand: pa.Table, estimated: Summary) -> None:
-    figure = overview(thousand, estimated, NAME)
+def test_the_figure_shows_the_parameters_that_matter_most(thousand: pa.Table, estimated: CampaignSummary) -> None:
+    figure = campaign_overview(thousand, estimated, NAME)
     assert [panel.x_label for panel in figure.panels] == [*("worst margin [half bands]", "wind [m/s]", "mass", "yaw")]
     assert to_png(figure, dpi=40) == to_png(figure, dpi=40)
 

@@ -22,7 +22,6 @@ from quadsim.flight.rundir import Run
 from quadsim.outputs import Growing, growing
 from scenarios.campaign import store
 from scenarios.campaign.rows import (
-    Row,
     flown_row,
     make_schema,
     make_table,
@@ -31,6 +30,7 @@ from scenarios.campaign.rows import (
     unit_of,
 )
 from scenarios.campaign.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store, read_flights
+from scenarios.many import Row
 
 FAILED: Row = {"status": "error", "verdict": "error", "reason": "x", "violated": True, "crashed": False}
 SCHEMA = make_schema({"mass": (pa.float64(), "kg")}, [])

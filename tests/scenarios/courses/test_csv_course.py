@@ -15,7 +15,7 @@ from quadsim.errors import FileError
 from quadsim.state import Array
 from scenarios.catalogue import scenario_names
 from scenarios.console import to_text
-from scenarios.courses.csv_course import Csv, Table, read_table, through_rows
+from scenarios.courses.csv_course import Csv, Table, read_course_table, through_rows
 
 ROWS = "0,0,0,1,0\n1,2,0,1,0.5\n3,2,4,2,1\n"
 
@@ -28,7 +28,7 @@ def write(tmp_path: Path, text: str) -> Path:
 
 def test_a_table_is_read_with_its_hash(tmp_path: Path) -> None:
     path = write(tmp_path, f"t,x,y,z,yaw\n{ROWS}\n\n")
-    table = read_table(path)
+    table = read_course_table(path)
     np.testing.assert_array_equal(table.t, [0.0, 1.0, 3.0])
     np.testing.assert_array_equal(table.poses, [[0, 0, 1, 0], [2, 0, 1, 0.5], [2, 4, 2, 1]])
     assert table.velocities is None
@@ -39,20 +39,20 @@ def test_what_spreadsheets_write_is_read_as_well(tmp_path: Path) -> None:
     """A byte order mark, carriage returns, quotes and blanks around numbers."""
     path = tmp_path / "course.csv"
     path.write_bytes(b'\xef\xbb\xbft,x,y,z,yaw\r\n0,"1.5", 2 ,3e0,-1\r\n1,0,0,0,0\r\n')
-    np.testing.assert_array_equal(read_table(path).poses[0], [1.5, 2.0, 3.0, -1.0])
+    np.testing.assert_array_equal(read_course_table(path).poses[0], [1.5, 2.0, 3.0, -1.0])
 
 
 def test_it_is_known_to_how_many_decimals_a_column_is_rounded(tmp_path: Path) -> None:
     """Whole numbers are exact; of doubles in full nobody can know."""
-    table = read_table(write(tmp_path, "t,x,y,z,yaw\n0,0.1234,1.5,3, 1e-3\n1,0.2,-2,4,0.30000000000000004\n"))
+    table = read_course_table(write(tmp_path, "t,x,y,z,yaw\n0,0.1234,1.5,3, 1e-3\n1,0.2,-2,4,0.30000000000000004\n"))
     assert table.resolution == (1e-4, 0.0, 0.0, 0.0)
-    table = read_table(write(tmp_path, "t,x,y,z,yaw\n0,12.5e-3,1.25,0.123456789,0\n1,0,-2,4,0\n"))
+    table = read_course_table(write(tmp_path, "t,x,y,z,yaw\n0,12.5e-3,1.25,0.123456789,0\n1,0,-2,4,0\n"))
     assert table.resolution == (1e-4, 1e-2, 0.0, 0.0)
     assert through_rows(table).resolution == table.resolution
 
 
 def test_without_velocities_lines_are_straight(tmp_path: Path) -> None:
-    path = through_rows(read_table(write(tmp_path, f"t,x,y,z,yaw\n{ROWS}")))
+    path = through_rows(read_course_table(write(tmp_path, f"t,x,y,z,yaw\n{ROWS}")))
     poses = path.pose(np.array([0.0, 0.5, 1.0, 2.0, 3.0]))
     expected = [[0, 0, 1, 0], [1, 0, 1, 0.25], [2, 0, 1, 0.5], [2, 2, 1.5, 0.75], [2, 4, 2, 1]]
     np.testing.assert_allclose(poses, expected)
@@ -74,7 +74,7 @@ def test_with_velocities_a_cubic_is_met_exactly() -> None:
 
 def test_yaw_that_wraps_is_unwrapped(tmp_path: Path) -> None:
     path = write(tmp_path, "t,x,y,z,yaw\n0,0,0,0,3.1\n1,0,0,0,-3.1\n2,0,0,0,-2.9\n")
-    np.testing.assert_allclose(read_table(path).poses[:, 3], [3.1, math.tau - 3.1, math.tau - 2.9])
+    np.testing.assert_allclose(read_course_table(path).poses[:, 3], [3.1, math.tau - 3.1, math.tau - 2.9])
 
 
 T = np.arange(0.0, 6.05, 0.1)
@@ -103,12 +103,12 @@ def circle(
 
 
 def test_columns_that_agree_have_no_notes(tmp_path: Path) -> None:
-    assert read_table(circle(tmp_path, velocity=1.0)).notes == ()
-    assert read_table(circle(tmp_path, yaw=RATE * T)).notes == ()
+    assert read_course_table(circle(tmp_path, velocity=1.0)).notes == ()
+    assert read_course_table(circle(tmp_path, yaw=RATE * T)).notes == ()
     for name in scenario_names():
         course = quadsim.load(name).reference
         if isinstance(course, Csv):
-            assert read_table(Path(course.file)).notes == ()
+            assert read_course_table(Path(course.file)).notes == ()
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_columns_that_agree_have_no_notes(tmp_path: Path) -> None:
 def test_velocities_that_contradict_the_positions_are_noted_with_both_numbers(
     tmp_path: Path, factor: float, hint: str
 ) -> None:
-    notes = read_table(circle(tmp_path, velocity=np.array([factor, 1.0, 1.0]))).notes
+    notes = read_course_table(circle(tmp_path, velocity=np.array([factor, 1.0, 1.0]))).notes
     moved = float(np.abs(np.diff(RADIUS * np.cos(RATE * T))).sum() / T[-1])
     said = abs(factor) * moved
     assert len(notes) == 1
@@ -131,55 +131,55 @@ def test_velocities_that_contradict_the_positions_are_noted_with_both_numbers(
 def test_velocities_at_rest_in_every_row_are_noted(tmp_path: Path) -> None:
     """Rows a second apart, between which the course would stop each time."""
     rows = "".join(f"{t},{1.5 * t},0,1,0,0,0,0\n" for t in range(9))
-    (note,) = read_table(write(tmp_path, f"t,x,y,z,yaw,vx,vy,vz\n{rows}")).notes
+    (note,) = read_course_table(write(tmp_path, f"t,x,y,z,yaw,vx,vy,vz\n{rows}")).notes
     assert note == "column vx is 0 m/s on average, but column x moves at 1.5 m/s"
 
 
 @pytest.mark.parametrize(("factor", "hint"), [(1000.0, "mm/s"), (100.0, "cm/s")])
 def test_velocities_many_times_those_of_the_positions_are_refused(tmp_path: Path, factor: float, hint: str) -> None:
     with pytest.raises(FileError, match=rf"column vx: must agree with column x, which moves at .* is it in {hint}\?"):
-        read_table(circle(tmp_path, velocity=factor))
+        read_course_table(circle(tmp_path, velocity=factor))
     rows = "".join(f"{t / 10},0,0,1,0,100,0,0\n" for t in range(20))
     rule = "column vx: must agree with column x, which moves at 0 m/s on average; got 100 m/s"
     with pytest.raises(FileError, match=rule):
-        read_table(write(tmp_path, f"t,x,y,z,yaw,vx,vy,vz\n{rows}"))
+        read_course_table(write(tmp_path, f"t,x,y,z,yaw,vx,vy,vz\n{rows}"))
 
 
 def test_positions_in_millimetres_are_noted_or_refused_by_their_size(tmp_path: Path) -> None:
-    (note,) = read_table(circle(tmp_path, place=100.0)).notes
+    (note,) = read_course_table(circle(tmp_path, place=100.0)).notes
     assert note == "column x: the course moves at 99.99 m/s on average; if it is in mm instead of m, 0.09999 m/s"
     rule = "must not make the course faster than 340 m/s on average; got 999.9 .if it is in mm instead of m, 0.9999 m/s"
     with pytest.raises(FileError, match=rule):
-        read_table(circle(tmp_path, place=1000.0))
+        read_course_table(circle(tmp_path, place=1000.0))
     still = "t,x,y,z,yaw\n0,0,0,1000,0\n10,0,0,1000,0\n"
     course = Csv(type="csv", file=str(write(tmp_path, still))).build(np.array([0.0, 0.0, 1.0, 0.0]), 9.81)
     assert course.notes == ("columns x, y, z begin 999 m from the vehicle; if they are in mm instead of m, 0 m",)
 
 
 def test_yaw_in_degrees_is_noted_or_refused_by_its_size(tmp_path: Path) -> None:
-    (note,) = read_table(circle(tmp_path, yaw=15.0 * T)).notes
+    (note,) = read_course_table(circle(tmp_path, yaw=15.0 * T)).notes
     turned = "column yaw turns at 859.4 deg/s on average; if it is in degrees instead of radians, 15 deg/s"
     assert note == turned
-    (note,) = read_table(circle(tmp_path, yaw=90.0)).notes
+    (note,) = read_course_table(circle(tmp_path, yaw=90.0)).notes
     assert note.startswith(
         "column yaw goes from 5157 to 5157 deg; if it is in degrees instead of radians, from 90 to 90"
     )
-    (note,) = read_table(circle(tmp_path, yaw=7.5 * T)).notes
+    (note,) = read_course_table(circle(tmp_path, yaw=7.5 * T)).notes
     assert "turns at 429.7 deg/s" in note
-    (note,) = read_table(circle(tmp_path, yaw=6.0 * np.minimum(T, 5.9) - 0.3)).notes
+    (note,) = read_course_table(circle(tmp_path, yaw=6.0 * np.minimum(T, 5.9) - 0.3)).notes
     assert "turns at" in note
     rows = "".join(f"{t / 100},0,0,1,{0.45 * t}\n" for t in range(100))
     with pytest.raises(FileError, match=r"must not turn faster than 2000 deg/s on average; got 2578 .* 45 deg/s"):
-        read_table(write(tmp_path, f"t,x,y,z,yaw\n{rows}"))
+        read_course_table(write(tmp_path, f"t,x,y,z,yaw\n{rows}"))
     wrapped = np.array([math.remainder(170.0 + 10.0 * t, 360.0) for t in T.tolist()])
     with pytest.raises(FileError, match=r"row \d+, column yaw: must be within half a turn, .* is it in degrees"):
-        read_table(circle(tmp_path, yaw=wrapped))
+        read_course_table(circle(tmp_path, yaw=wrapped))
 
 
 def test_a_turn_of_yaw_per_row_is_refused_as_it_would_be_read_as_none(tmp_path: Path) -> None:
     rows = "".join(f"{t},0,0,1,{math.tau * t}\n" for t in range(7))
     with pytest.raises(FileError, match=r"row 3, column yaw: must be within half a turn, 3.142 rad, .* got 6.28319"):
-        read_table(write(tmp_path, f"t,x,y,z,yaw\n{rows}"))
+        read_course_table(write(tmp_path, f"t,x,y,z,yaw\n{rows}"))
 
 
 def test_the_notes_on_a_table_are_part_of_the_flights_summary(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import PPoly
 
 from quadsim.state import Array
-from scenarios.courses.minimum_snap import ACCELERATION, SNAP, minimum_snap, smoothest
+from scenarios.courses.minimum_snap import ACCELERATION_ORDER, SNAP, minimum_snap, smoothest
 
 TIMES = np.array([0.0, 1.5, 2.0, 5.0, 6.2])
 VALUES = np.array([[0.0, 1.0], [2.0, -1.0], [1.0, 0.5], [4.0, 3.0], [0.0, 0.0]])
@@ -54,7 +54,7 @@ def test_one_segment_from_rest_to_rest_is_the_known_polynomial() -> None:
     )
 
 
-@pytest.mark.parametrize("order", [ACCELERATION, SNAP])
+@pytest.mark.parametrize("order", [ACCELERATION_ORDER, SNAP])
 def test_the_whole_kkt_system_has_the_same_solution(order: int) -> None:
     curve = smoothest(TIMES, VALUES, order)
     expected = PPoly(np.moveaxis(kkt_solution(TIMES, VALUES, order)[:, ::-1], 1, 0), TIMES)

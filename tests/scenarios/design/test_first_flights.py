@@ -20,7 +20,14 @@ from quadsim.assets import vehicle_path
 from quadsim.errors import ParameterError
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.assembly import Assembly
-from scenarios.design.first_scenario import BASELINE_SHARE, CLEARANCE, COURSES, LAWS, ROOM, first_scenario
+from scenarios.design.first_scenario import (
+    ALLOWED_SHARE,
+    BASELINE_SHARE,
+    COURSES,
+    DESIGNED_LAWS,
+    HEIGHT_OVER_ERROR,
+    first_scenario,
+)
 from scenarios.loading import parse_scenario
 
 pytestmark = pytest.mark.slow("first flights")
@@ -53,7 +60,7 @@ def test_rotors_with_inertia_and_no_lag_make_a_scenario_that_flies(tmp_path: Pat
     assert quadsim.fly(made.replace({"duration": 0.5}), progress=False).log.reason is None
 
 
-@pytest.mark.parametrize("law", LAWS[1:])
+@pytest.mark.parametrize("law", DESIGNED_LAWS[1:])
 def test_pid_and_geometric_control_meet_all_requirements_and_the_lqr_tracks_no_moving_course(law: str) -> None:
     for course in ("hover", "figure-eight"):
         flight = flown("crazyflie2", course, law)
@@ -84,7 +91,7 @@ def test_a_course_that_is_tracked_stays_above_the_floor(course: str) -> None:
         data = first_scenario(vehicle, vehicle.name, course=course).to_data()
         bounds = {constraint["name"]: constraint["lower"] for constraint in data["constraints"]}
         assert bounds["floor"] >= vehicle.enclosing_radius
-        assert data["initial"]["position"][2] >= bounds["floor"] - CLEARANCE * bounds["hold_z"] - 1e-3
+        assert data["initial"]["position"][2] >= bounds["floor"] - HEIGHT_OVER_ERROR * bounds["hold_z"] - 1e-3
 
 
 def test_the_figure_eight_comes_near_to_what_it_is_made_for() -> None:
@@ -94,7 +101,7 @@ def test_the_figure_eight_comes_near_to_what_it_is_made_for() -> None:
 
 
 @pytest.mark.witness("first flights")
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", DESIGNED_LAWS)
 @pytest.mark.parametrize("course", COURSES)
 def test_the_file_states_what_is_flown(course: str, law: str) -> None:
     made = first_scenario(ALL["hummingbird"], "hummingbird", course=course, law=law)
@@ -117,11 +124,13 @@ def test_the_file_states_what_is_flown(course: str, law: str) -> None:
     assert bounds["speed"] == (ALL["hummingbird"].speed_min, ALL["hummingbird"].speed_max)
     assert not stated.keys() & Assembly(scenario, ALL["hummingbird"]).bounds.keys()  # nothing is said twice
     for axis in "xyz":
-        assert bounds[f"{axis}_error"] == pytest.approx((-ROOM * made.size, ROOM * made.size), rel=0.01)
+        assert bounds[f"{axis}_error"] == pytest.approx(
+            (-ALLOWED_SHARE * made.size, ALLOWED_SHARE * made.size), rel=0.01
+        )
     assert bounds["z"][0] == pytest.approx(ALL["hummingbird"].enclosing_radius, abs=1e-3)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", DESIGNED_LAWS)
 def test_a_tilt_bound_of_ones_own_is_in_the_design_and_in_the_audit(law: str) -> None:
     made = first_scenario(ALL["hummingbird"], "hummingbird", law=law, tilt=22.5)
     assert made.notes[1].endswith(" --tilt 22.5")

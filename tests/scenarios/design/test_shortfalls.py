@@ -12,7 +12,7 @@ from quadsim.assets import vehicle_path
 from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.cli import main
-from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
+from scenarios.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
 from scenarios.design.shortfalls import shortfalls
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.results import EXIT_DONE
@@ -51,7 +51,7 @@ def test_a_course_that_is_too_fast_is_reported_with_the_speed_at_which_it_fits()
     assert shortfalls(load_scenario("hummingbird-figure-eight"), HUMMINGBIRD) == ()
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", DESIGNED_LAWS)
 @pytest.mark.parametrize("course", COURSES)
 def test_a_first_scenario_suits_its_vehicle(course: str, law: str) -> None:
     made = parse_scenario(first_scenario(HUMMINGBIRD, "hummingbird", course=course, law=law).to_data())

@@ -20,7 +20,7 @@ from quadsim.state import INDEX, N_STATES, make_state
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import authority
 from scenarios.design.first_scenario import SHARE, first_scenario, largest_eight
-from scenarios.design.rules import FASTEST, PERIOD_SHARE, delay_margin, design_for, gain, is_stable
+from scenarios.design.rules import FASTEST_LOOP, PERIOD_SHARE, delay_margin, design_for, gain, is_stable
 from scenarios.loading import parse_scenario
 
 ALL = vehicles()
@@ -58,7 +58,7 @@ def test_a_baselines_loop_tolerates_a_quarter_to_three_quarters_of_that_delay(ve
 @EVERY
 def test_period_horizon_and_bandwidth_go_together(vehicle: Vehicle) -> None:
     tuning = design_for(vehicle)
-    assert tuning.bandwidth <= FASTEST
+    assert tuning.bandwidth <= FASTEST_LOOP
     assert tuning.bandwidth * tuning.period <= PERIOD_SHARE
     assert 30 <= tuning.horizon <= 60
     assert 0.0 < tuning.tilt < tuning.authority.steady_tilt

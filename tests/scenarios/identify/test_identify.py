@@ -18,7 +18,7 @@ from quadsim.errors import InputError, ParameterError
 from quadsim.vehicle import load_vehicle, vehicle_sources
 from scenarios.cli import main
 from scenarios.flight import Flight
-from scenarios.identify.estimate import Estimate, Identification
+from scenarios.identify.estimate import Identification, ParameterEstimate
 from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, hold_out, predict
 from scenarios.identify.record import read_record
 from scenarios.identify.report import IdentifiedVehicle
@@ -58,11 +58,13 @@ def here(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def estimate(name: str, value: float, start: float | None, *, width: float = 0.02, refused: str = "") -> Estimate:
+def estimate(
+    name: str, value: float, start: float | None, *, width: float = 0.02, refused: str = ""
+) -> ParameterEstimate:
     """An estimate whose interval has a width of some share of its value."""
     low, high = sorted((value * (1.0 - 0.5 * width), value * (1.0 + 0.5 * width)))
     advice = "yaw steps" if refused else ""
-    return Estimate(
+    return ParameterEstimate(
         name=name, unit="-", value=value, low=low, high=high, start=start, refused=refused, advice=advice
     )  # fmt: skip
 

@@ -16,7 +16,7 @@ from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES
 from quadsim.vehicle import Vehicle
 from scenarios.flight import Flight
-from scenarios.identify.estimate import Estimate, Identification
+from scenarios.identify.estimate import Identification, ParameterEstimate
 from scenarios.identify.fit import identify_records
 from scenarios.identify.record import Record
 from scenarios.identify.rotors import lagging
@@ -91,7 +91,7 @@ def of_the_eight() -> Identification:
     return identify(record_of(flown()))
 
 
-def by_name(found: Identification) -> dict[str, Estimate]:
+def by_name(found: Identification) -> dict[str, ParameterEstimate]:
     return {estimate.name: estimate for estimate in found.estimates}
 
 

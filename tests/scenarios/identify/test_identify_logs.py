@@ -19,7 +19,7 @@ from quadsim.rotation import conjugate, quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.flight import Flight
-from scenarios.identify.checks import check, spans
+from scenarios.identify.checks import check_log, spans
 from scenarios.identify.record import Record, read_record
 from scenarios.identify.windows import to_world
 
@@ -60,7 +60,7 @@ def hummingbird() -> Vehicle:
 
 
 def notes(record: Record, vehicle: Vehicle) -> tuple[str, ...]:
-    return check(record, vehicle, spans(record, vehicle))
+    return check_log(record, vehicle, spans(record, vehicle))
 
 
 def columns(record: Record, **others: Array) -> dict[str, Array]:
@@ -149,7 +149,7 @@ def test_gaps(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
     assert np.isnan(read.rates[300:330]).all()
     parts = spans(read, hummingbird)
     assert parts == [slice(0, 300), slice(330, 800)]
-    (note,) = check(read, hummingbird, parts)
+    (note,) = check_log(read, hummingbird, parts)
     assert note == "d.csv: 3.7 % of its samples, left out, are in gaps, the first at t = 3 s"
     with pytest.raises(InputError, match=r"flies for 3\.. s at most in one piece; .* \(9. % of its samples"):
         spans(read_record(write_csv(tmp_path / "e.csv", columns(eight), rows=np.r_[0:300, 330:650])), hummingbird)

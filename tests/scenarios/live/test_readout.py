@@ -9,7 +9,7 @@ import pytest
 
 from quadsim.flight.audit import Limit
 from quadsim.palette import COLOUR
-from scenarios.live.readout import Constraints, hints, numbers
+from scenarios.live.readout import Constraints, hints, readings
 from scenarios.live.session import Frame, Session
 from scenarios.loading import load_scenario
 
@@ -85,6 +85,6 @@ def test_numbers_keep_their_height_and_name_a_broken_rotor() -> None:
     session.submit({"type": "wear", "rotor": 2, "loss": 0.4})
     broken = session.advance()
     session.close()
-    assert numbers(None).count('class="line"') == numbers(sound, [(0.0, 0.0)]).count('class="line"')
-    assert "rotor 2: -40 %" in numbers(broken, [(0.0, 0.0)])
-    assert "rotor" not in numbers(sound, [(0.0, 0.0)])
+    assert readings(None).count('class="line"') == readings(sound, [(0.0, 0.0)]).count('class="line"')
+    assert "rotor 2: -40 %" in readings(broken, [(0.0, 0.0)])
+    assert "rotor" not in readings(sound, [(0.0, 0.0)])

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from quadsim.sim.effects import turbulence
-from quadsim.sim.effects.turbulence import Dryden, Turbulence, discretise
+from quadsim.sim.effects.turbulence import Dryden, Turbulence, discretise_filters
 from quadsim.state import Array
 
 DRYDEN = Dryden(altitude=6.096, wind_speed_20ft=7.7, airspeed=5.0)
@@ -57,7 +57,7 @@ def test_the_spectra_integrate_to_the_variances() -> None:
 @pytest.mark.parametrize("ratio", RATIOS)
 def test_the_time_step_is_van_loans(ratio: float) -> None:
     """C. F. Van Loan, "Computing Integrals Involving the Matrix Exponential", 1978: exp of [[-F, G G'], [0, F']] dt."""
-    transition, factor = discretise(ratio)
+    transition, factor = discretise_filters(ratio)
     drift, noise = np.array([[-1.0, 0.0], [1.0, -1.0]]), np.array([[2.0, 0.0], [0.0, 0.0]])
     exponential = expm(ratio * np.block([[-drift, noise], [np.zeros((2, 2)), drift.T]]))
     np.testing.assert_allclose(transition, exponential[2:, 2:].T, rtol=1e-10, atol=1e-12)
@@ -67,13 +67,13 @@ def test_the_time_step_is_van_loans(ratio: float) -> None:
 
 @pytest.mark.parametrize("ratio", RATIOS)
 def test_the_stationary_covariance_is_preserved_by_every_step(ratio: float) -> None:
-    transition, factor = discretise(ratio)
+    transition, factor = discretise_filters(ratio)
     np.testing.assert_allclose(transition @ STATIONARY @ transition.T + factor @ factor.T, STATIONARY, atol=1e-15)
 
 
 def test_the_sampled_autocovariance_is_that_of_the_continuous_process() -> None:
     ratio = 0.3
-    transition, _ = discretise(ratio)
+    transition, _ = discretise_filters(ratio)
     for k in range(20):
         carried = np.linalg.matrix_power(transition, k) @ STATIONARY
         assert carried[0, 0] == pytest.approx(np.exp(-k * ratio), rel=1e-12)

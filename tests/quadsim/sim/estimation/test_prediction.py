@@ -16,7 +16,7 @@ from quadsim.sim.error_state import (
     difference,
     drive,
     motion_model,
-    predict,
+    predict_estimate,
     retract,
 )
 from quadsim.sim.plant import Plant
@@ -52,7 +52,7 @@ def test_the_mean_follows_the_plant_to_second_order(vehicle: Vehicle, model: Mot
     for h in (0.02, 0.01, 0.005):
         estimate = Estimate(mean=first, covariance=np.eye(15))
         for _ in range(round(0.4 / h)):
-            estimate = predict(model, estimate, drive(model, speeds), h)
+            estimate = predict_estimate(model, estimate, drive(model, speeds), h)
         errors.append(np.abs(difference(estimate.mean, last)).max())
     assert errors[-1] < 2e-4
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.2)
@@ -65,11 +65,13 @@ def test_the_covariance_moves_by_the_jacobian_of_the_mean(vehicle: Vehicle, mode
     h, step = 0.005, 1e-6
     for _ in range(5):
         mean = tumbling(rng)
-        after = predict(model, Estimate(mean=mean, covariance=np.eye(15)), driven, h)
+        after = predict_estimate(model, Estimate(mean=mean, covariance=np.eye(15)), driven, h)
         J = np.empty((15, 15))
         for i in range(15):
             ends = [
-                predict(model, Estimate(mean=retract(mean, s * step * np.eye(15)[i]), covariance=np.eye(15)), driven, h)
+                predict_estimate(
+                    model, Estimate(mean=retract(mean, s * step * np.eye(15)[i]), covariance=np.eye(15)), driven, h
+                )
                 for s in (1.0, -1.0)
             ]
             J[:, i] = difference(ends[0].mean, ends[1].mean) / (2.0 * step)
@@ -86,7 +88,9 @@ def test_the_noise_that_gathers_is_van_loans(vehicle: Vehicle) -> None:
     rest = np.zeros(16)
     rest[6] = 1.0
     h = 0.01
-    result = predict(model, Estimate(mean=rest, covariance=np.zeros((15, 15))), drive(model, np.zeros(4)), h).covariance
+    result = predict_estimate(
+        model, Estimate(mean=rest, covariance=np.zeros((15, 15))), drive(model, np.zeros(4)), h
+    ).covariance
     # Without thrust at rest: two double integrators and a walk.  Van Loan, IEEE TAC 23 (1978).
     A, Q = np.zeros((15, 15)), np.zeros((15, 15))
     A[0:3, 3:6] = A[6:9, 9:12] = np.eye(3)
