@@ -18,6 +18,7 @@ from cyclopts import App, Parameter
 from quadsim.errors import FileError, InputError, ParameterError
 from scenarios.arguments import (
     Changes,
+    ComparedName,
     File,
     Flag,
     Flown,
@@ -458,12 +459,12 @@ def check(
     )
 )
 def compare(
-    *targets: Target,
+    *targets: ComparedName,
     out: File | None = None,
     overwrite: Flag = False,
     names: Names = (),
     markdown: Flag = False,
-    constraints: Target | None = None,
+    constraints: ComparedName | None = None,
     video: bool | None = None,
     recording: bool | None = None,
     figures: bool | None = None,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     Files: TypeAlias = Sequence[File]
     VehicleName: TypeAlias = File
     ScenarioName: TypeAlias = Scenario | File
-    Target: TypeAlias = Flight | ScenarioName
+    ComparedName: TypeAlias = Flight | ScenarioName
     Changes: TypeAlias = Mapping[Any, Any] | Sequence[str]
     Names: TypeAlias = Sequence[str]
     Whole = int
@@ -52,7 +52,7 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
 
     File, Files = Path, Sequence[Path]
     VehicleName = one_of(vehicle_names)
-    Target = ScenarioName = one_of(scenario_names)
+    ComparedName = ScenarioName = one_of(scenario_names)
     Changes = Annotated[Sequence[str], Parameter(name="--set")]
     Names = Annotated[Sequence[str], Parameter(name="--name")]
     Whole = Annotated[int, Parameter(converter=_whole)]

@@ -14,12 +14,12 @@ from cyclopts import Parameter
 from quadsim.errors import InputError, ParameterError
 from scenarios.arguments import (
     Changes,
+    ComparedName,
     Fields,
     File,
     Flag,
     Flown,
     ScenarioName,
-    Target,
     UserCode,
     UserForces,
     Watched,
@@ -296,7 +296,7 @@ def compare_directories(
     *,
     overwrite: bool = False,
     names: Sequence[str] = (),
-    constraints: Target | None = None,
+    constraints: ComparedName | None = None,
 ) -> PairedComparison:
     """Compare two campaigns flight by flight, and write the report if a directory is given.
 
