@@ -24,6 +24,8 @@ from scenarios.identify.record import read_record
 from scenarios.identify.report import IdentifiedVehicle
 from scenarios.identify.vehicle_file import rounded, vehicle_text
 
+pytestmark = pytest.mark.slow("identification")
+
 TRUE = "hummingbird"
 
 
@@ -67,6 +69,7 @@ def estimate(name: str, value: float, start: float | None, *, width: float = 0.0
     )  # fmt: skip
 
 
+@pytest.mark.witness("identification")
 def test_the_command_finds_the_vehicle_that_flew(identified: IdentifiedVehicle) -> None:
     true, found = quadsim.load_vehicle(TRUE), identified.vehicle
     assert found.thrust_coefficient == pytest.approx(true.thrust_coefficient, rel=0.02)
@@ -259,6 +262,7 @@ REFUSED: list[tuple[str, str]] = [
 ]
 
 
+@pytest.mark.witness("identification")
 @pytest.mark.parametrize(("words", "message"), REFUSED, ids=[words for words, _ in REFUSED])
 def test_wrong_input_gives_one_message_and_leaves_nothing_behind(
     words: str, message: str, here: Path, capsys: pytest.CaptureFixture[str]
