@@ -69,7 +69,6 @@ def estimate(name: str, value: float, start: float | None, *, width: float = 0.0
     )  # fmt: skip
 
 
-@pytest.mark.witness("identification")
 def test_the_command_finds_the_vehicle_that_flew(identified: IdentifiedVehicle) -> None:
     true, found = quadsim.load_vehicle(TRUE), identified.vehicle
     assert found.thrust_coefficient == pytest.approx(true.thrust_coefficient, rel=0.02)
