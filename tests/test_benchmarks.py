@@ -36,7 +36,6 @@ def quick(name: str, tmp_path: Path) -> list[dict[str, Any]]:
     return records
 
 
-@pytest.mark.witness("benchmarks")
 def test_solvers_agree_on_the_optimum(tmp_path: Path) -> None:
     records = {(record["scenario"], record["solver"]): record for record in quick("solvers", tmp_path)}
     names = ["piqp-multistage", "piqp-dense", "daqp"]
@@ -47,6 +46,7 @@ def test_solvers_agree_on_the_optimum(tmp_path: Path) -> None:
         assert 0.0 < record["p50_ms"] <= record["p99_ms"] <= record["max_ms"]
 
 
+@pytest.mark.witness("benchmarks")
 def test_the_parts_of_a_flight_make_up_its_time(tmp_path: Path) -> None:
     *parts, _ = quick("flight", tmp_path)
     assert sum(part["share_%"] for part in parts) == pytest.approx(100.0)

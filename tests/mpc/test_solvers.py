@@ -171,6 +171,7 @@ def test_every_part_of_a_qp_may_change_from_one_solve_to_the_next(name: str) -> 
     assert not still, "these changes move no optimum, so that nothing is tested"
 
 
+@pytest.mark.slow("core")
 def test_a_flight_by_daqp_holds_its_audit_and_is_the_same(constrained_flight: Flight) -> None:
     flight = Rollout(load_scenario("paper-constrained", ["controller.solver=daqp"])).fly()
     assert (flight.solver, constrained_flight.solver) == ("daqp", "piqp-multistage")

@@ -94,6 +94,7 @@ def test_an_output_that_was_asked_for_and_fails_comes_after_the_result_and_decid
     assert not (here / command[-1]).exists()
 
 
+@pytest.mark.slow("identification")
 def test_an_identified_vehicle_is_written_before_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_log(fly_eight("hummingbird"), tmp_path / "eight.csv")
     monkeypatch.setattr("scenarios.identify.report.render", fail)

@@ -19,12 +19,16 @@ from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 
 
+@pytest.mark.slow("core")
 @pytest.mark.parametrize(
     ("name", "settings", "answered_by"),
     [
         ("paper-constrained", (), {"gain": 607, "piqp-multistage": 593}),
         ("paper-constrained", ("controller.solver=core",), {"gain": 607, "core": 593}),
-        ("robust", ("controller.solver=core",), {"gain": 196, "core": 404}),
+        pytest.param(
+            *("robust", ("controller.solver=core",), {"gain": 196, "core": 404}),
+            marks=pytest.mark.witness("core"),
+        ),
     ],
 )
 def test_as_many_periods_are_a_solvers_as_it_had_calls(

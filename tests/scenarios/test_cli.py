@@ -205,6 +205,7 @@ VIOLATED = ["--set", "constraints.speed.upper=150.0"]
 LOST = ["--set", "initial.euler=[60.0, 0.0, 0.0]"]
 
 
+@pytest.mark.slow("commands")
 @pytest.mark.parametrize(
     ("settings", "expect", "as_expected", "line"),
     [

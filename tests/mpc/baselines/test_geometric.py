@@ -121,10 +121,11 @@ def test_integrals_stop_at_their_limits(vehicle: Vehicle, build: Callable[..., A
     np.testing.assert_allclose(np.abs(integrals.rotation), 0.25)
 
 
+@pytest.mark.slow("baselines")
 @pytest.mark.parametrize(
     ("name", "euler"),
     [
-        ("lopes2011", (120.0, 0.0, 0.0)),
+        pytest.param("lopes2011", (120.0, 0.0, 0.0), marks=pytest.mark.witness("baselines")),
         ("hummingbird", (-120.0, 20.0, 90.0)),
         ("lopes2011", (170.0, 0.0, 0.0)),
         ("crazyflie2", (170.0, 0.0, 0.0)),

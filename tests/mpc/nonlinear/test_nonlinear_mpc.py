@@ -209,6 +209,7 @@ def test_solvers_agree(solver: str) -> None:
 # --- any attitude --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow("nonlinear")
 @pytest.mark.parametrize("q", [(0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.05, 0.7, 0.7, 0.1)])
 def test_upside_down_it_turns_over_and_comes_back(q: tuple[float, ...]) -> None:
     states = fly(law(horizon=20), at_rest(q), 3.0)
@@ -217,6 +218,7 @@ def test_upside_down_it_turns_over_and_comes_back(q: tuple[float, ...]) -> None:
     assert np.abs(states[:, P]).max() < 2.0
 
 
+@pytest.mark.witness("nonlinear")
 def test_a_flip_is_flown_through() -> None:
     """A whole turn about body x in 0.6 s, one second in; the quaternion comes back with the other sign."""
     t = PERIOD * np.arange(225)
@@ -272,6 +274,7 @@ def test_nodes_of_a_preview_have_its_velocity_and_its_yaw() -> None:
 DISTURBANCE = {"acceleration": np.array([0.25, -0.1, 0.2]), "angular_acceleration": np.array([0.5, -0.25, 0.1])}
 
 
+@pytest.mark.slow("nonlinear")
 def test_a_constant_disturbance_leaves_no_error_with_the_observer_and_one_without() -> None:
     quick = ObserverSettings(velocity_noise=0.01, velocity_walk=0.01, rate_noise=0.02)
     with_it, without = (
@@ -282,6 +285,7 @@ def test_a_constant_disturbance_leaves_no_error_with_the_observer_and_one_withou
     assert np.linalg.norm(without[-1, P]) > 0.02
 
 
+@pytest.mark.slow("nonlinear")
 def test_known_drag_is_balanced() -> None:
     """A straight flight at 4 m/s."""
     t = PERIOD * np.arange(250)
@@ -306,6 +310,7 @@ def furthest(states: Array) -> tuple[float, float]:
     return float(np.degrees(np.arccos(thrust_axis(states[:, Q])[:, 2]).max())), float(np.abs(states[:, W]).max())
 
 
+@pytest.mark.witness("nonlinear")
 def test_tilt_and_body_rates_are_bounded() -> None:
     x = at_rest()
     x[P] = 3.0, -3.0, 0.0

@@ -195,6 +195,7 @@ def test_it_follows_a_previewed_step_quickly_with_small_overshoot(axis: int) -> 
     assert {command.fallback for command in commands} == {0}
 
 
+@pytest.mark.slow("nonlinear")
 @pytest.mark.parametrize(("period", "node", "horizon"), [(0.02, 0.04, 40), (0.05, 0.05, 20)])
 @pytest.mark.parametrize(("tilt", "linear"), [(20.0, 200.0), (20.0, 600.0), (30.0, 2000.0)])
 def test_a_stiff_soft_tilt_does_not_turn_it_over(
@@ -208,6 +209,7 @@ def test_a_stiff_soft_tilt_does_not_turn_it_over(
     np.testing.assert_allclose(states[-1, P], 1.0, atol=0.02)
 
 
+@pytest.mark.witness("nonlinear")
 def test_targets_and_body_rates_hold_their_bounds() -> None:
     bounds = TargetBounds(thrust=(3.5, 8.0), body_rate=(120.0, 90.0, 60.0))
     made = table(target_bounds=bounds, body_rate=100.0, soft=Soft(linear=1e4, quadratic=10.0))
@@ -244,6 +246,7 @@ def test_grounded_it_turns_nowhere_with_the_least_thrust() -> None:
         )
 
 
+@pytest.mark.slow("nonlinear")
 def test_offset_free_it_finds_the_thrust_that_holds_the_height() -> None:
     weak = {"thrust_scale": 0.8}
     still: Course = step_of(0.0, 0.0, 0.0, 0.0)
@@ -256,6 +259,7 @@ def test_offset_free_it_finds_the_thrust_that_holds_the_height() -> None:
     assert commands[-1].speeds[0] == pytest.approx(LEVEL[0] / 0.8, rel=1e-3)
 
 
+@pytest.mark.witness("nonlinear")
 @pytest.mark.parametrize("scaled", [True, False])
 def test_the_observer_of_forces_finds_the_thrust_that_holds_the_height(scaled: bool) -> None:
     made = table(disturbance=RampSettings(thrust_scale=scaled), horizon=20, node=0.05)
@@ -340,6 +344,7 @@ def test_it_keeps_the_first_period_that_its_steps_did_not_make_converge() -> Non
 # --- the fallback --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow("nonlinear")
 @pytest.mark.parametrize("period", [0.02, 0.05])
 @pytest.mark.parametrize("lag", [LAG, (0.072, 0.072, 0.072, 0.15), (0.0, 0.0, 0.0, 0.0)])
 def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tuple[float, ...]) -> None:
@@ -358,6 +363,7 @@ def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tup
     assert np.linalg.norm(states[-1, V]) < 0.1
 
 
+@pytest.mark.slow("nonlinear")
 @pytest.mark.parametrize("known", [True, False])
 def test_level_hover_holds_its_height_by_the_thrust_scale_that_is_estimated(known: bool) -> None:
     made = build(table(), VEHICLE, 0.02)

@@ -324,10 +324,14 @@ def test_without_margins_the_tilt_passes_its_bound(vehicle: Vehicle) -> None:
     assert peak_tilt(vehicle, CHANGING, tight=False) > LIMIT
 
 
+@pytest.mark.slow("tightening")
 @pytest.mark.parametrize(
     ("sets", "rotor_lag"),
-    [((), 0.0), ((WIND, PUSH, *LAGGING), LAG), ((CHANGING,), 0.0)],
-    ids=["nominal", "wind, push and lag", "changing"],
+    [
+        pytest.param((), 0.0, id="nominal", marks=pytest.mark.witness("tightening")),
+        pytest.param((WIND, PUSH, *LAGGING), LAG, id="wind, push and lag"),
+        pytest.param((CHANGING,), 0.0, id="changing"),
+    ],
 )
 def test_with_margins_the_tilt_stays_within_its_bound_at_every_instant(
     vehicle: Vehicle, sets: tuple[str, ...], rotor_lag: float

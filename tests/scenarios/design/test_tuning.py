@@ -27,6 +27,7 @@ ALL = vehicles()
 EVERY = pytest.mark.parametrize("vehicle", ALL, ids=lambda vehicle: vehicle.name)
 
 
+@pytest.mark.witness("first flights")
 @EVERY
 def test_the_loop_stands_a_third_of_its_time_constant_of_more_delay(vehicle: Vehicle) -> None:
     """The bound by lag then leaves 0.8 (T + tau / 2), whatever the vehicle."""
@@ -36,6 +37,7 @@ def test_the_loop_stands_a_third_of_its_time_constant_of_more_delay(vehicle: Veh
     assert margin > 0.75 * (tuning.authority.lag + 0.5 * tuning.period)
 
 
+@pytest.mark.slow("first flights")
 @pytest.mark.parametrize("vehicle", ALL, ids=lambda vehicle: vehicle.name)
 @pytest.mark.parametrize("law", ["pid", "geometric"])
 def test_a_baselines_loop_tolerates_a_quarter_to_three_quarters_of_that_delay(vehicle: Vehicle, law: str) -> None:

@@ -137,6 +137,7 @@ def test_the_command_prints_figures_and_sources(name: str, capsys: pytest.Captur
     assert ("rotors that rise" in printed) == (vehicle.rotor_rise is not None)
 
 
+@pytest.mark.slow("first flights")
 @pytest.mark.parametrize(
     ("field", "value", "axis"),
     [

@@ -24,6 +24,8 @@ from scenarios.identify.record import read_record
 from scenarios.identify.report import IdentifiedVehicle
 from scenarios.identify.vehicle_file import rounded, vehicle_text
 
+pytestmark = pytest.mark.slow("identification")
+
 TRUE = "hummingbird"
 
 
@@ -261,6 +263,7 @@ REFUSED: list[tuple[str, str]] = [
 ]
 
 
+@pytest.mark.witness("identification")
 @pytest.mark.parametrize(("words", "message"), REFUSED, ids=[words for words, _ in REFUSED])
 def test_wrong_input_gives_one_message_and_leaves_nothing_behind(
     words: str, message: str, here: Path, capsys: pytest.CaptureFixture[str]

@@ -22,6 +22,8 @@ from scenarios.identify.record import Record
 from scenarios.identify.rotors import lagging
 from scenarios.identify.search import _polynomial
 
+pytestmark = pytest.mark.slow("identification")
+
 TRUE = replace(quadsim.load_vehicle("hummingbird"), rotor_rise=0.03, rotor_fall=0.04)
 START = replace(
     TRUE,
@@ -129,12 +131,14 @@ def test_a_delay_shifts_what_rotors_do(delay: float) -> None:
     )
 
 
+@pytest.mark.witness("identification")
 def test_a_polynomial_of_reflection_coefficients_is_stable_and_complete() -> None:
     assert _polynomial(np.array([0.5, -0.3])) == pytest.approx([1.0, 0.5 * 0.7, -0.3])
     for reflections in np.random.default_rng(0).uniform(-1.0, 1.0, (50, 4)):
         assert np.abs(np.roots(_polynomial(reflections))).max() < 1.0
 
 
+@pytest.mark.witness("identification")
 def test_an_eight_with_yaw_steps_gives_all_but_the_body_s_drag() -> None:
     found = of_the_eight()
     assert not wrong(found)

@@ -20,6 +20,7 @@ def error(flight: Flight) -> float:
     return float(flight.metrics["position_error.mean"])
 
 
+@pytest.mark.slow("papers")
 @pytest.mark.parametrize(
     ("name", "settings", "share"),
     [("torrente-loop8-flatness", (), 0.4), ("torrente-loop8-all", ("controller.disturbance={}",), 0.7)],
