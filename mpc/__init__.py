@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mpc.model import LinearModel as LinearModel
     from mpc.model import hover_model as hover_model
     from mpc.nonlinear.controller import NonlinearMPC as NonlinearMPC
-    from mpc.nonlinear.settings import NonlinearSettings as NonlinearSettings
+    from mpc.nonlinear.settings import Nonlinear as Nonlinear
     from mpc.ocp import InfeasiblePeriod as InfeasiblePeriod
     from mpc.ocp import Objective as Objective
     from mpc.ocp import Problem as Problem
@@ -43,7 +43,7 @@ _MODULES = {
     "mpc.linear": ("LinearMPC", "NominalPreparation"),
     "mpc.model": ("LinearModel", "hover_model"),
     "mpc.nonlinear.controller": ("NonlinearMPC",),
-    "mpc.nonlinear.settings": ("NonlinearSettings",),
+    "mpc.nonlinear.settings": ("Nonlinear",),
     "mpc.ocp": ("Objective", "Problem", "Query", "InfeasiblePeriod"),
     "mpc.pilot": ("Pilot",),
     "mpc.robust.controller": ("RobustPreparation",),

@@ -105,7 +105,7 @@ def _nonlinear(table: Nonlinear, vehicle: Vehicle, period: float, shapes: Sequen
     return NonlinearMPC(
         vehicle,
         period=period,
-        settings=table.settings(vehicle, table.stride(period)),
+        settings=table,
         bounds=table.actuators(vehicle),
         constraints=table.constraints(),
         space=table.space(shapes, vehicle, period),

@@ -35,7 +35,8 @@ from scenarios.rooms import ROOMS, owner_of
 
 if TYPE_CHECKING:
     from mpc.ocp import Problem
-    from quadsim.controller import AutopilotLoop, Controller
+    from mpc.pilot import Pilot
+    from quadsim.controller import AutopilotLoop
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
     from scenarios.catalogue import Catalogue
@@ -129,8 +130,10 @@ def feasibility(scenario: ScenarioName) -> Feasibility:
     return feasibility_check.report(loading.assemble(scenario))
 
 
-def make_controller(scenario: ScenarioName) -> Controller:
+def make_controller(scenario: ScenarioName) -> Pilot:
     """Return the controller of a scenario, ready for `reset` and `step`, without a simulator.
+
+    Its `law` is the control law itself, around which there may be a fallback contract and an autopilot.
 
     Raises:
         InputError: the controller cannot be built from these numbers.

@@ -5,8 +5,8 @@ In each period, the model is linearised along the previous plan, at the nodes' s
     min  sum |C_r (s_i - s_i^r)|^2_Q + |u_i - u_i^r|^2_R    s.t.  s_{i+1} = A_i s_i + B_i u_i + c_i,  s_0 measured
 
 is solved: a full Gauss-Newton step, the real-time iteration (Diehl, Bock and Schloeder 2005). The states s contain the
-quaternion q_r* q instead of q, with the node's reference q_r: a rotation of four numbers that makes both attitude
-errors of `AttitudeError` linear with constant weights.  A measured state enters only as s_0; node 0 is linearised at
+quaternion q_r* q instead of q, with the node's reference q_r: a rotation of four numbers that makes both kinds of
+`Nonlinear.attitude_error` linear with constant weights.  A measured state enters only as s_0; node 0 is linearised at
 the stored state.
 """
 
@@ -22,7 +22,7 @@ import numpy as np
 import scipy.linalg
 
 from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, resized
-from mpc.bounded import USUAL_TARGETS
+from mpc.bounded import resolved_lag
 from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver
 from mpc.equilibrium import LEAST_LIFT, Trim
@@ -42,7 +42,7 @@ from mpc.nonlinear.rigidbody import (
     rotation,
     thrust_axis,
 )
-from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
+from mpc.nonlinear.settings import Nonlinear
 from mpc.observer import DisturbanceObserver, disturbance_of
 from mpc.obstacles import ObstacleQP, Space
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
@@ -81,6 +81,7 @@ SHORTEST: Final = 0.1
 CONVERGED: Final = 0.1
 """Largest dynamics defect of a converged plan (`quadsim.controller.Statistics`). Library flights exceed it in at most 9
 periods, after steps of the course and upside down; a tumbling vehicle exceeds it in all."""
+TOLERANCE: Final = 1e-6  # largest change of a state or an input at which the SQP of a period stops
 CORRECTIONS: Final = 2
 """Most further SQP steps in a period whose plan has not `CONVERGED`, where commands are targets; if it still has not,
 the next period starts from the reference. A single step from far away may leave a plan with a full turn in it, which
@@ -113,6 +114,8 @@ class NonlinearMPC:
     """One step of sequential quadratic programming per period, or more; see the module.
 
     Attributes:
+        settings: its table.
+        tolerance: `TOLERANCE`, for this law.
         infeasible_period: the first period whose QP had no answer or, if there is none, whose SQP did not converge.
     """
 
@@ -123,7 +126,7 @@ class NonlinearMPC:
         vehicle: Vehicle,
         *,
         period: float,
-        settings: NonlinearSettings,
+        settings: Nonlinear,
         bounds: ActuatorBounds | None = None,
         constraints: tuple[Constraint, ...] = (),
         space: Space | None = None,
@@ -131,20 +134,21 @@ class NonlinearMPC:
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
-        self._targets = settings.inputs is Inputs.RATES
-        self.commands = "rates" if self._targets else ROTORS
-        usual = USUAL_TARGETS.actuators if self._targets else ActuatorBounds.of_vehicle
-        self._bounds = usual(vehicle) if bounds is None else bounds
-        self._nodes = settings.horizon
-        self.horizon = settings.horizon * settings.stride
+        self._stride, self._targets = settings.stride(period), settings.commands != ROTORS
+        self._inputs = Inputs.RATES if self._targets else Inputs(settings.inputs)
+        lags, rotor_lag = settings.inner_lag or (0.0, 0.0, 0.0, 0.0), resolved_lag(settings.rotor_lag, vehicle)
+        self._drag = np.array(settings.drag)
+        self.commands: str = settings.commands
+        self._bounds = settings.actuators(vehicle) if bounds is None else bounds
+        self._nodes, self.horizon = settings.horizon // self._stride, settings.horizon
         self._model = rigid_body(
             vehicle,
-            period * settings.stride,
+            period * self._stride,
             substeps=settings.substeps,
-            inputs=settings.inputs,
-            rotor_lag=settings.rotor_lag or None,
-            lag=settings.inner_lag,
-            drag=np.array(settings.drag),
+            inputs=self._inputs,
+            rotor_lag=rotor_lag or None,
+            lag=lags,
+            drag=self._drag,
             quadratic_drag=np.array(settings.quadratic_drag),
         )
         self._inverse = np.linalg.inv(self._model.effectiveness)
@@ -152,8 +156,9 @@ class NonlinearMPC:
         self._level = np.full(N_ROTORS, vehicle.hover_speed)
         if self._targets:
             self._level = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
-        self._lag = settings.inner_lag[0] if self._targets else settings.rotor_lag or 0.0  # of actuator states [s]
+        self._lag = lags[0] if self._targets else rotor_lag  # of actuator states [s]
         self._tilted = settings.tilt is not None
+        self.tolerance = TOLERANCE
         self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         self.problem = self._problem(constraints)
         self._check = AnswerCheck(self.problem, kkt_every)
@@ -161,19 +166,20 @@ class NonlinearMPC:
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = QPSolver(self.solver, self.problem, changing=True, free_first=True)
         self._obstacles = None if space is None else ObstacleQP(self.problem, self._qp, space, changing=True)
-        self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
+        observing, ramp = settings.offset_free, settings.disturbance
+        self._observer = None if observing is None else DisturbanceObserver(observing, period)
         self._ramp: RampObserver | None = None
-        if settings.ramp is not None:
-            lag = self._lag if settings.ramp.rotor_lag is None else settings.ramp.rotor_lag
+        if ramp is not None:
+            lag = self._lag if ramp.rotor_lag is None else ramp.rotor_lag
             self._ramp = RampObserver(
-                replace(settings.ramp, rotor_lag=lag),
+                replace(ramp, rotor_lag=lag),
                 vehicle,
                 period,
                 drag=self._model.drag / vehicle.mass,
                 quadratic_drag=self._model.quadratic_drag / vehicle.mass,
                 thrust_lag=self._lag if self._targets else None,
             )
-        self._shift = settings.stride == 1 if settings.shift is None else settings.shift
+        self._shift = self._stride == 1 if settings.shift is None else settings.shift
         self.reset(self._level)
 
     def _shares(self, speeds: Array) -> Array:
@@ -213,7 +219,7 @@ class NonlinearMPC:
         if settings.terminal == "lqr":
             P = self._riccati(linear, objective)
         else:
-            P = float(settings.terminal) * objective.weights[0]
+            P = (0.0 if settings.terminal == "none" else float(settings.terminal)) * objective.weights[0]
         if self._tilted:  # two further states: the thrust axis along world x and y
             none = np.zeros((2, 2))
             A, B = scipy.linalg.block_diag(linear.A, none), np.vstack([linear.B, np.zeros((2, N_ROTORS))])
@@ -221,7 +227,7 @@ class NonlinearMPC:
             objective = replace(objective, C_r=np.hstack([objective.C_r, np.zeros((len(rows), 2))]))
         return Problem(
             model=linear,
-            horizon=settings.horizon,
+            horizon=self._nodes,
             objective=replace(objective, P=P),
             constraints=(
                 Constraint(name="inputs", lower=self._lower, upper=self._upper, D=np.eye(N_ROTORS)),
@@ -234,29 +240,31 @@ class NonlinearMPC:
         """Yield the bounds on slew, tilt and body rates, in a problem with n states."""
         settings, bounds, largest = self.settings, self._bounds, self._vehicle.speed_max
         if np.isfinite(bounds.delta_min).any() or np.isfinite(bounds.delta_max).any():
-            if settings.inputs is not Inputs.SPEED:
+            if self._inputs is not Inputs.SPEED:
                 rule = 'left out where inputs = "thrust": a step of a speed is not linear in thrusts; inputs = "speed"'
                 raise ParameterError("controller", "input_bounds.slew", bounds.delta_max.tolist(), rule)
-            steps = np.full((settings.horizon, 1), float(settings.stride))  # periods between nodes,
+            steps = np.full((self._nodes, 1), float(self._stride))  # periods between nodes,
             steps[0] = 1.0  # except the first node, which follows the command in force
             lower, upper = steps * bounds.delta_min / largest, steps * bounds.delta_max / largest
             yield Constraint(name="slews", lower=lower, upper=upper, E=np.eye(N_ROTORS))
         if settings.tilt is not None:
+            tilt = math.radians(settings.tilt)
             angles = math.tau / TILT_SIDES * np.arange(TILT_SIDES)
             rows = np.zeros((TILT_SIDES, n))
             rows[:, -2], rows[:, -1] = np.cos(angles), np.sin(angles)
-            upper = np.full(TILT_SIDES, math.sin(settings.tilt) * math.cos(math.pi / TILT_SIDES))
-            penalty = self._penalty(TILT_SIDES, 1.0 / math.cos(settings.tilt))  # in the sine of the tilt
+            upper = np.full(TILT_SIDES, math.sin(tilt) * math.cos(math.pi / TILT_SIDES))
+            penalty = self._penalty(TILT_SIDES, 1.0 / math.cos(tilt))  # in the sine of the tilt
             yield Constraint(name="tilt", lower=np.full(TILT_SIDES, -math.inf), upper=upper, C=rows, penalty=penalty)
-        rates = np.array(settings.largest_rates)
+        rates = settings.largest_rates
         if np.isfinite(rates).any():
             rows = np.eye(n)[W]
             yield Constraint(name="body_rates", lower=-rates, upper=rates, C=rows, penalty=self._penalty(3, 1.0))
 
     def _penalty(self, rows: int, scale: float) -> Penalty | None:
-        if self.settings.soft is None:
+        soft = self.settings.soft
+        if soft is None:
             return None
-        l1, l2 = self.settings.soft
+        l1, l2 = soft.linear, soft.quadratic
         return Penalty(l1=np.full(rows, l1 * scale), l2=np.full(rows, l2 * scale**2), largest=True)
 
     def _of_states(self, constraint: Constraint, n: int) -> Constraint:
@@ -271,7 +279,7 @@ class NonlinearMPC:
             if self._targets:
                 rule = 'without rotor speeds where commands = "rates": an inner loop commands the rotors'
                 raise ParameterError("controller", constraint.name, "of those", rule)
-            if self.settings.inputs is not Inputs.SPEED:
+            if self._inputs is not Inputs.SPEED:
                 rule = 'without rotor speeds where inputs = "thrust", in which they are not linear: inputs = "speed"'
                 raise ParameterError("controller", constraint.name, "of those", rule)
             D = constraint.D * self._vehicle.speed_max
@@ -281,7 +289,7 @@ class NonlinearMPC:
         """Return P at hover, where the quaternion's scalar part is constant and has no cost."""
         others = np.delete(np.arange(linear.n), 3)
         reduced = replace(objective, C_r=objective.C_r[:, others], P=None)
-        if self.settings.attitude_error is AttitudeError.DIFFERENCE:
+        if self.settings.attitude_error == "difference":
             rows = np.delete(np.arange(len(objective.C_r)), 3)
             reduced = replace(reduced, C_r=reduced.C_r[rows], Q_y=objective.Q_y[np.ix_(rows, rows)])
         part = replace(linear, A=linear.A[np.ix_(others, others)], B=linear.B[others])
@@ -311,14 +319,14 @@ class NonlinearMPC:
             self._observer.reset()
         if self._ramp is not None:
             self._ramp.reset(self._in_force)
-            self._model = replace(self._model, drag=np.array(self.settings.drag), thrust_scale=self._ramp.thrust_scale)
+            self._model = replace(self._model, drag=self._drag, thrust_scale=self._ramp.thrust_scale)
         self._update_disturbance(np.zeros(6))
 
     def adopt(self, previous: object) -> None:
         """Take over disturbance, rotor speeds and plan of the previous law, these only from one with like commands."""
         law = previous if isinstance(previous, NonlinearMPC) else None
         if law is not None:
-            alike = self.settings.inputs is law.settings.inputs
+            alike = self._inputs is law._inputs
             same_space = self._targets is law._targets
             if same_space:
                 shares = law._rotors, law._rotors_before
@@ -357,7 +365,7 @@ class NonlinearMPC:
         measured = self._measured(now, state)
         if not (np.abs(measured) <= _PLAUSIBLE).all() or not (np.abs(reference) <= _PLAUSIBLE).all():
             return refused(self._acting, self.horizon, INVALID_DATA)
-        stride = self.settings.stride
+        stride = self._stride
         if now.motion is not None:
             nodes = nodes_of_motion(now.motion, self._nodes, stride)
         else:
@@ -468,7 +476,7 @@ class NonlinearMPC:
         drag = ramp.drag
         self._model = replace(
             self._model,
-            drag=self.settings.drag + self._vehicle.mass * drag,
+            drag=self._drag + self._vehicle.mass * drag,
             acceleration=acceleration + R @ (drag * (R.T @ velocity)),
             angular_acceleration=angular,
             thrust_scale=ramp.thrust_scale,
@@ -522,7 +530,7 @@ class NonlinearMPC:
         start = np.hstack([nodes.states, actuators])[:, :n]
         target, s0 = start.copy(), measured.copy()
         target[:, Q], s0[Q] = 0.0, frames[0] @ measured[Q]
-        target[:, 3] = self.settings.attitude_error is AttitudeError.DIFFERENCE
+        target[:, 3] = self.settings.attitude_error == "difference"
         if self._tilted:
             target = np.hstack([target, np.zeros((len(target), 2))])
             s0 = np.append(s0, thrust_axis(measured[Q])[:2])
@@ -553,7 +561,7 @@ class NonlinearMPC:
             if self._targets and k + 1 >= iterations and defect <= CONVERGED:
                 break
             if iterations > 1:
-                if moved <= self.settings.tolerance:
+                if moved <= self.tolerance:
                     break
                 # Full Gauss-Newton steps may oscillate.  Aitken's relaxation (Irons and Tuck 1969) takes a share of
                 # each step, from how much of the previous step it undoes; the largest share falls permanently if steps
@@ -615,7 +623,7 @@ def _body(states: Array) -> Array:
 
 
 def _converges(
-    make: Callable[..., NonlinearMPC], settings: NonlinearSettings, start: Mapping[str, object], time: float,
+    make: Callable[..., NonlinearMPC], settings: Nonlinear, start: Mapping[str, object], time: float,
     measured: Array, nodes: Nodes, iterations: int,
 ) -> bool:  # fmt: skip
     """Return whether a period's plan converges within `iterations`, from a law's attributes before it.

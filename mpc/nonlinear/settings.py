@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
@@ -32,7 +31,6 @@ from mpc.bounded import (
     require_ordered,
     require_solver,
     require_space,
-    resolved_lag,
     rows_of,
     selection,
 )
@@ -41,7 +39,7 @@ from mpc.disturbance import RampSettings
 from mpc.fallback.contract import USUAL_FALLBACK, FallbackSettings, Guard
 from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
 from mpc.model import hover_model, target_model
-from mpc.nonlinear.rigidbody import RATE_SCALE, Inputs
+from mpc.nonlinear.rigidbody import RATE_SCALE
 from mpc.observer import ObserverSettings
 from mpc.obstacles import Shape, Space
 from mpc.qp import KKT_EVERY
@@ -59,15 +57,6 @@ Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
 
 AxisWeights = Weight | Annotated[Sequence[Weight], Len(3, 3)]
 """One weight for three axes, or one per axis."""
-
-
-class AttitudeError(StrEnum):
-    """The attitude error that is weighted, with the reference q_r."""
-
-    ERROR_STATE = "error-state"
-    """2 vec(q_r* q), three components: the rotation vector to first order, and equal for q and -q."""
-    DIFFERENCE = "difference"
-    """q - q_r, four components, for equal signs of q and q_r: half the rotation vector to first order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,42 +89,6 @@ class Weights:
 
 
 _USUAL = Weights()
-
-
-@dataclass(frozen=True, kw_only=True)
-class NonlinearSettings:
-    """Horizon, cost and model; weights are in the units of the states, inputs are shares of the largest."""
-
-    horizon: int = 10  # N, nodes
-    stride: int = 1  # control periods per node
-    iterations: int = 1  # most SQP steps in a period; 1 is the real-time iteration
-    tolerance: float = 1e-6  # largest change of a state or an input at which they stop
-    shift: bool | None = None  # whether the plan is shifted by a node before it is linearised; None: if stride is 1
-    substeps: int = 1  # Runge-Kutta steps per node
-    inputs: Inputs = Inputs.THRUST  # physical quantity of the inputs
-    inner_lag: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # of thrust, p, q, r behind targets [s]; only with these
-    rotor_lag: float | None = None  # time constant of the rotors' thrusts or speeds [s]; None for none
-    drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # linear drag in the model, body axes [N s/m]
-    quadratic_drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # in each component of the velocity [N s^2/m^2]
-    attitude_error: AttitudeError = AttitudeError.ERROR_STATE  # the attitude error that is weighted
-    weights: Weights = _USUAL  # weights of distances from the reference
-    terminal: float | str = (
-        0.0  # weight of the last state relative to the others, 0 for none; "lqr" for the Riccati equation's
-    )
-    tilt: float | None = None  # largest angle between thrust axis and vertical [rad], below pi/2; None for no bound
-    largest_rates: tuple[float, ...] = (math.inf, math.inf, math.inf)  # bounds on body rates [rad/s]
-    soft: tuple[float, float] | None = None  # (l1, l2) per 1 rad or 1 rad/s beyond these bounds; None for hard bounds
-    observer: ObserverSettings | None = None  # settings of the disturbance observer; None for no offset-free tracking
-    ramp: RampSettings | None = None  # settings of the observer of changing forces and drag; None for none
-    solver: str | None = None  # see `mpc.solvers.find_solver`; None for the fastest for the size
-
-    def outputs(self) -> tuple[Array, Array]:
-        """C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
-        weights, difference = self.weights, self.attitude_error is AttitudeError.DIFFERENCE
-        rows = np.eye(13) if difference else np.delete(np.eye(13), 3, axis=0)
-        attitude = np.full(4, weights.attitude) if difference else 4.0 * _three(weights.attitude)
-        parts = (_three(weights.position), attitude, _three(weights.velocity), _three(weights.body_rates))
-        return rows, np.concatenate(parts)
 
 
 def _three(weight: AxisWeights) -> Array:
@@ -298,29 +251,18 @@ class Nonlinear(ControllerTable):
         """Return the bounds on its commands."""
         return (self.input_bounds if self.commands == ROTORS else self.target_bounds).actuators(vehicle)
 
-    def settings(self, vehicle: Vehicle, stride: int) -> NonlinearSettings:
-        """Return the same in SI units, for nodes of `stride` periods."""
-        return NonlinearSettings(
-            horizon=self.horizon // stride,
-            stride=stride,
-            iterations=self.iterations,
-            shift=self.shift,
-            substeps=self.substeps,
-            inputs=Inputs.RATES if self.commands == "rates" else Inputs(self.inputs),
-            inner_lag=self.inner_lag or (0.0, 0.0, 0.0, 0.0),
-            rotor_lag=resolved_lag(self.rotor_lag, vehicle),
-            drag=self.drag,
-            quadratic_drag=self.quadratic_drag,
-            attitude_error=AttitudeError(self.attitude_error),
-            weights=self.weights,
-            terminal=0.0 if self.terminal == "none" else self.terminal,
-            tilt=None if self.tilt is None else math.radians(self.tilt),
-            largest_rates=tuple(np.radians(_three(math.inf if self.body_rate is None else self.body_rate)).tolist()),
-            soft=None if self.soft is None else (self.soft.linear, self.soft.quadratic),
-            observer=self.offset_free,
-            ramp=self.disturbance,
-            solver=self.solver,
-        )
+    def outputs(self) -> tuple[Array, Array]:
+        """Return C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
+        weights, difference = self.weights, self.attitude_error == "difference"
+        rows = np.eye(13) if difference else np.delete(np.eye(13), 3, axis=0)
+        attitude = np.full(4, weights.attitude) if difference else 4.0 * _three(weights.attitude)
+        parts = (_three(weights.position), attitude, _three(weights.velocity), _three(weights.body_rates))
+        return rows, np.concatenate(parts)
+
+    @property
+    def largest_rates(self) -> Array:
+        """(3,) bounds on body rates [rad/s], infinite for none."""
+        return np.radians(_three(math.inf if self.body_rate is None else self.body_rate))
 
     def stride(self, period: float) -> int:
         """Return the number of periods per node."""

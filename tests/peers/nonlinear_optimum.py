@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from peers.casadi_ocp import Case, Found, Peer
@@ -13,9 +13,9 @@ from peers.checks import Check
 from peers.do_mpc_ocp import DoMPC
 
 from mpc.answer import ActuatorBounds
+from mpc.bounded import Soft
 from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.rigidbody import Inputs
-from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
+from mpc.nonlinear.settings import Nonlinear, Weights
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.motion import Motion
 from quadsim.state import N_STATES, POSITIONS, VELOCITIES, Array
@@ -78,26 +78,28 @@ class Course:
         self.motion: Motion = motion
         self.stride = round(case.node / PERIOD[case])
 
-    def law(self, **settings: Any) -> NonlinearMPC:
+    def law(self, iterations: int = 1, tolerance: float | None = None) -> NonlinearMPC:
         """Our controller; the QPs are solved by DAQP, to rounding."""
         case, largest = self.case, self.vehicle.speed_max
         bounds = ActuatorBounds.of_vehicle(self.vehicle)
         if case.steps:
             bounds = ActuatorBounds.alike((0.0, largest), (-case.steps[0] * largest, case.steps[0] * largest))
         weights = {name: getattr(case, name) for name in vars(Weights())}
-        made = NonlinearSettings(
-            horizon=case.nodes,
-            stride=self.stride,
-            inputs=Inputs.SPEED if case.speeds else Inputs.THRUST,
-            rotor_lag=case.lag or None,
-            attitude_error=AttitudeError.DIFFERENCE if case.difference else AttitudeError.ERROR_STATE,
+        made = Nonlinear(
+            horizon=case.nodes * self.stride,
+            node=case.node,
+            iterations=iterations,
+            inputs="speed" if case.speeds else "thrust",
+            rotor_lag=case.lag,
+            attitude_error="difference" if case.difference else "error-state",
             weights=Weights(**weights),
-            tilt=case.tilt or None,
-            soft=case.penalty if any(case.penalty) else None,
+            tilt=math.degrees(case.tilt) if case.tilt else None,
+            soft=Soft(linear=case.penalty[0], quadratic=case.penalty[1]) if any(case.penalty) else None,
             solver="daqp",
-            **settings,
         )
-        return NonlinearMPC(self.vehicle, period=PERIOD[case], settings=made, bounds=bounds)
+        law = NonlinearMPC(self.vehicle, period=PERIOD[case], settings=made, bounds=bounds)
+        law.tolerance = law.tolerance if tolerance is None else tolerance
+        return law
 
     def question(self, k: int, rng: np.random.Generator, before: Array | None, rotors: Array | None) -> Question:
         """A random state near the course at sample k, after an input, near the course's too where it is not given."""

@@ -16,7 +16,7 @@ from mpc.diagnosis import find_conflict
 from mpc.nonlinear.controller import CONVERGED, NonlinearMPC
 from mpc.nonlinear.reference import nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, advance_nodes, rigid_body, thrust_axis
-from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
+from mpc.nonlinear.settings import Nonlinear, Weights
 from mpc.observer import ObserverSettings
 from quadsim.assets import vehicle_path
 from quadsim.controller import ACCEPTED, NOT_CONVERGED, OPTIMAL, Command, Phase, StepInputs
@@ -29,14 +29,18 @@ from quadsim.vehicle import load_vehicle
 VEHICLE = load_vehicle(vehicle_path("hummingbird"))
 PERIOD = 0.02
 HOVER = np.full(4, VEHICLE.hover_speed)
-ERRORS = list(AttitudeError)
+ERRORS = ("error-state", "difference")
 
 
 def law(
     bounds: ActuatorBounds | None = None, constraints: tuple[Constraint, ...] = (), **settings: Any
 ) -> NonlinearMPC:
-    made = NonlinearSettings(**{"horizon": 10, "stride": 2, **settings})
-    return NonlinearMPC(VEHICLE, period=PERIOD, settings=made, bounds=bounds, constraints=constraints)
+    """Of nodes of two periods; the horizon is in nodes."""
+    nodes, tolerance = settings.pop("horizon", 10), settings.pop("tolerance", None)
+    made = Nonlinear(horizon=2 * nodes, node=2.0 * PERIOD, **settings)
+    controller = NonlinearMPC(VEHICLE, period=PERIOD, settings=made, bounds=bounds, constraints=constraints)
+    controller.tolerance = controller.tolerance if tolerance is None else tolerance
+    return controller
 
 
 def call(
@@ -117,7 +121,7 @@ def test_more_iterations_converge_where_one_does_not() -> None:
 
 
 def test_an_infeasible_qp_takes_precedence_over_an_unconverged_sqp() -> None:
-    controller = law(horizon=20, largest_rates=(1.0, 1.0, 1.0))
+    controller = law(horizon=20, body_rate=math.degrees(1.0))
     call(controller, at_rest((0.0, 1.0, 0.0, 0.0)))
     spinning = at_rest()
     spinning[W] = 50.0
@@ -132,7 +136,7 @@ def test_an_infeasible_qp_takes_precedence_over_an_unconverged_sqp() -> None:
 
 @pytest.mark.parametrize("error", ERRORS)
 @pytest.mark.parametrize("inputs", [Inputs.THRUST, Inputs.SPEED])
-def test_converged_it_is_the_optimum_of_an_independent_solver(error: AttitudeError, inputs: Inputs) -> None:
+def test_converged_it_is_the_optimum_of_an_independent_solver(error: str, inputs: Inputs) -> None:
     """SLSQP on the nonlinear problem from its definition: rolled out, no QP, no derivative of ours."""
     weights = Weights(position=(10.0, 8.0, 12.0), attitude=2.0, velocity=0.5, body_rates=0.05, input=0.02, move=0.01)
     controller = law(
@@ -149,7 +153,7 @@ def test_converged_it_is_the_optimum_of_an_independent_solver(error: AttitudeErr
         u, x, total = flat.reshape(-1, 4, 4), np.tile(x0, (len(flat), 1)), np.zeros(len(flat))
         for i in range(4):
             x = advance_nodes(model, x, u[:, i])
-            turned = x[:, Q] - [1, 0, 0, 0] if error is AttitudeError.DIFFERENCE else 2.0 * x[:, 4:7]
+            turned = x[:, Q] - [1, 0, 0, 0] if error == "difference" else 2.0 * x[:, 4:7]
             stage = np.square(x[:, P]) @ weights.position + weights.attitude * np.square(turned).sum(axis=1)
             stage += (
                 np.square(x[:, V]).sum(axis=1) * weights.velocity + np.square(x[:, W]).sum(axis=1) * weights.body_rates
@@ -278,7 +282,7 @@ DISTURBANCE = {"acceleration": np.array([0.25, -0.1, 0.2]), "angular_acceleratio
 def test_a_constant_disturbance_leaves_no_error_with_the_observer_and_one_without() -> None:
     quick = ObserverSettings(velocity_noise=0.01, velocity_walk=0.01, rate_noise=0.02)
     with_it, without = (
-        fly(law(observer=observer), at_rest(), seconds, **DISTURBANCE)
+        fly(law(offset_free=observer), at_rest(), seconds, **DISTURBANCE)
         for observer, seconds in ((quick, 9.0), (None, 2.0))
     )
     assert np.linalg.norm(with_it[-1, P]) < 2e-3
@@ -316,10 +320,10 @@ def test_tilt_and_body_rates_are_bounded() -> None:
     x[P] = 3.0, -3.0, 0.0
     gentle = Weights(position=2.0, velocity=0.5, attitude=0.5, body_rates=0.2)
     free, quick = furthest(fly(law(weights=gentle, horizon=20), x, 2.0))
-    held, _ = furthest(fly(law(weights=gentle, horizon=20, tilt=math.radians(15.0)), x, 2.0))
+    held, _ = furthest(fly(law(weights=gentle, horizon=20, tilt=15.0), x, 2.0))
     assert free > 25.0
     assert 12.0 < held < 15.6
-    _, slow = furthest(fly(law(weights=gentle, horizon=20, largest_rates=(1.0, 1.0, 1.0)), x, 2.0))
+    _, slow = furthest(fly(law(weights=gentle, horizon=20, body_rate=math.degrees(1.0)), x, 2.0))
     assert quick > 1.5
     assert slow < 1.02
 
@@ -400,7 +404,7 @@ def test_grounded_rotors_stop() -> None:
 @pytest.mark.parametrize("observer", [None, ObserverSettings()])
 def test_predictions_match_the_model(observer: ObserverSettings | None) -> None:
     """With the disturbance that is estimated: here the vehicle stays where it should have risen."""
-    controller = law(observer=observer)
+    controller = law(offset_free=observer)
     x = at_rest((0.9, 0.3, 0.0, 0.1))
     for k in range(3):
         command = call(controller, x, k * PERIOD)

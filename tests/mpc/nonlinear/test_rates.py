@@ -338,7 +338,7 @@ def test_it_keeps_the_first_period_that_its_steps_did_not_make_converge() -> Non
     period = controller.infeasible_period  # type: ignore[attr-defined]
     assert command.status == NOT_CONVERGED == period.status
     assert period.converges(1) is False
-    assert controller._plan is None  # type: ignore[attr-defined]
+    assert controller.law._plan is None  # type: ignore[attr-defined]
 
 
 # --- the fallback --------------------------------------------------------------------------------------------------
@@ -446,6 +446,5 @@ def test_a_thrust_scale_excludes_indi() -> None:
 
 def test_rows_over_rotor_speeds_have_no_meaning_for_targets() -> None:
     row = Constraint(name="total", lower=np.zeros(1), upper=np.ones(1), D=np.ones((1, 4)))
-    settings = table().settings(VEHICLE, 2)
     with pytest.raises(ParameterError, match="without rotor speeds"):
-        NonlinearMPC(VEHICLE, period=0.02, settings=settings, constraints=(row,))
+        NonlinearMPC(VEHICLE, period=0.02, settings=table(), constraints=(row,))

@@ -239,16 +239,20 @@ def test_fields_of_nonlinear_mpc_arrive() -> None:
     law = built(NONLINEAR).law
     assert isinstance(law, NonlinearMPC)
     made, x = law.settings, math.radians(1.0)
-    assert (law.horizon, made.horizon, made.stride, law.solver) == (12, 4, 3, "daqp")
+    assert (law.horizon, law.problem.horizon, law._stride, law.solver) == (12, 4, 3, "daqp")
     assert (made.iterations, made.shift, made.substeps, made.inputs) == (3, True, 2, "speed")
     weights = Weights(position=(1.0, 2.0, 3.0), attitude=4.0, velocity=5.0, body_rates=6.0, input=7.0, move=8.0)
     assert made.weights == weights
     assert (made.attitude_error, made.terminal, made.rotor_lag) == ("difference", 2.0, 0.03)
     assert (made.drag, made.quadratic_drag) == ((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
-    assert made.tilt == pytest.approx(20.0 * x)
-    assert made.largest_rates == pytest.approx((90.0 * x, 180.0 * x, 45.0 * x))
-    assert (made.soft, made.observer) == ((9.0, 10.0), ObserverSettings(force_walk=0.3))
+    assert law._observer is not None
+    np.testing.assert_array_equal(law._observer.gain, DisturbanceObserver(ObserverSettings(force_walk=0.3), 0.05).gain)
     constraints = {part.name: part for part in law.problem.every_constraint}
+    assert constraints["tilt"].upper == pytest.approx(math.sin(20.0 * x) * math.cos(math.pi / 12.0))
+    assert constraints["body_rates"].upper == pytest.approx((90.0 * x, 180.0 * x, 45.0 * x))
+    assert constraints["body_rates"].penalty is not None
+    np.testing.assert_array_equal(constraints["body_rates"].penalty.l1, 9.0)
+    np.testing.assert_array_equal(constraints["body_rates"].penalty.l2, 10.0)
     assert list(constraints) == ["inputs", "slews", "tilt", "body_rates", "outputs", "wall"]
     np.testing.assert_allclose(constraints["inputs"].upper, 200.0 / Assembly(scenario("pid")).vehicle.speed_max)
     assert constraints["outputs"].penalty is not None
