@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from mpc.bounded import Range
 from mpc.pilot import Pilot
@@ -20,7 +21,9 @@ from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.vehicle import Vehicle
 from scenarios.law_bounds import law_limits
 from scenarios.plugin import PluginController
-from scenarios.schema.scenario import Scenario
+
+if TYPE_CHECKING:
+    from scenarios.schema.scenario import Scenario
 
 
 def signal_limits(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit]:

@@ -97,7 +97,7 @@ def test_an_output_that_was_asked_for_and_fails_comes_after_the_result_and_decid
 @pytest.mark.slow("identification")
 def test_an_identified_vehicle_is_written_before_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_log(fly_eight("hummingbird"), tmp_path / "eight.csv")
-    monkeypatch.setattr("scenarios.identify.report.render", fail)
+    monkeypatch.setattr("scenarios.identify.report._render", fail)
     files = {"out": tmp_path / "mine.toml", "page": tmp_path / "mine.html"}
     with pytest.raises(OutputError, match=r"mine\.html: failed: ValueError: no LaTeX") as caught:
         quadsim.identify(tmp_path / "eight.csv", vehicle="hummingbird", **files)

@@ -515,7 +515,7 @@ def test_what_cannot_be_flown_again_is_advised_as_not_flown(monkeypatch: pytest.
     changed = quadsim.fly(tilted.replace({"events": [event]}), progress=False)
     assert changed.diagnosis is not None
     assert changed.diagnosis["advice"].startswith("to try, not flown, as an event had changed the controller: ")
-    monkeypatch.setattr(remedies, "LONGEST", 0.1)
+    monkeypatch.setattr(remedies, "LONGEST_TRIAL", 0.1)
     late = quadsim.fly(tilted, progress=False).diagnosis
     assert late is not None
     assert late["advice"].startswith("to try, not flown, as it would take more than 0.1 s of flight: ")
