@@ -42,8 +42,8 @@ IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
 """Distributions whose import name is not their own."""
 HANDING_OUT = ("quadsim", "mpc")
 """Packages with a table of public names, each imported on first use; `quadsim` also starts the command."""
-MOST_CIRCLES, MOST_IN_CIRCLES, MOST_DEFINED_TWICE = 2, 11, 22
-"""Circles of imports, the modules in them, and public names that several modules define: these may only fall."""
+MOST_DEFINED_TWICE = 20
+"""Public names that several modules define: they may only get fewer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,10 +198,8 @@ def test_a_circle_is_seen_even_if_it_closes_late_or_for_types_alone() -> None:
     assert circles(found) == [["mpc.ocp", "mpc.paper", "mpc.qp"]]
 
 
-def test_modules_import_in_few_circles(imports: list[Import]) -> None:
-    result = circles(imports)
-    assert len(result) <= MOST_CIRCLES, result
-    assert sum(map(len, result)) <= MOST_IN_CIRCLES, result
+def test_no_modules_import_in_a_circle(imports: list[Import]) -> None:
+    assert circles(imports) == []
 
 
 def test_two_values_alone_use_what_their_package_hands_out(imports: list[Import]) -> None:
