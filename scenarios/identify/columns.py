@@ -71,7 +71,7 @@ def read_table(path: Path, *, poles: int | None = None) -> dict[str, Series]:
     spellings = SPELLINGS
     if b"speeds_before" in (table.schema.metadata or {}):  # quadsim's own
         spellings = {**SPELLINGS, "euler_rates": ("roll_rate pitch_rate yaw_rate",)}
-    fields = {field: names for field, ways in spellings.items() if (names := _spelling(ways, columns))}
+    fields = {field: spelt for field, ways in spellings.items() if (spelt := _spelling(ways, columns))}
     for what, needed in NEEDED.items():
         if not {*needed} & {*fields}:
             ways = " or ".join(spellings[field][0].replace(" ", ",") for field in needed if field in spellings)
