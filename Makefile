@@ -50,7 +50,7 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 test test-all rooms peers firmware betaflight numbers reproduce: export OMP_NUM_THREADS := 1
 test test-all rooms peers firmware betaflight numbers reproduce: export OPENBLAS_NUM_THREADS := 1
 test test-all rooms peers firmware betaflight numbers reproduce: export MKL_NUM_THREADS := 1
-test: setup $(VENV)/.browser  ## three minutes: all tests but the slow groups, of each its witness (OPTIONS="-k audit" for some)
+test: setup $(VENV)/.browser  ## all tests but the slow groups, of which it runs a witness each (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope -m "not slow or witness" $(OPTIONS)
 
 test-all: setup $(VENV)/.browser  ## run every test that needs no peer

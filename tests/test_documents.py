@@ -82,6 +82,7 @@ def test_every_table_that_is_filled_is_known_and_stays_where_its_file_is_not(
     assert stated in remake.filled(page)[0]
 
 
+@pytest.mark.slow("pages")
 def test_the_examples_in_the_page_on_effects_are_a_scenario(tmp_path: Path) -> None:
     page = (ROOT / "docs/effects.md").read_text(encoding="utf-8")
     example, mismatch, battery, events = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)

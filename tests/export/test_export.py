@@ -36,6 +36,7 @@ NOT_EXPORTED = {
 }
 
 
+@pytest.mark.slow("export")
 def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
     exported, refused, seen = 0, {}, set()
     for name in read_catalogue().scenarios:
@@ -73,6 +74,7 @@ def test_the_core_is_exported_byte_for_byte(tmp_path: Path) -> None:
         assert (directory / name).read_bytes() == (folder / name).read_bytes()
 
 
+@pytest.mark.slow("export")
 def test_the_same_export_twice_is_the_same_bytes(tmp_path: Path) -> None:
     scenario = quadsim.load("robust", SHORT)
     for name in ("one", "two"):
@@ -103,6 +105,7 @@ def test_capacity_is_as_requested_and_its_reach_is_stated(tmp_path: Path) -> Non
         assert 200 <= reach["feasible"] <= reach["drawn"]
 
 
+@pytest.mark.witness("export")
 def test_an_export_is_complete_and_replaces_an_earlier_one_on_request(tmp_path: Path) -> None:
     scenario = quadsim.load("hover", SHORT)
     directory = quadsim.export(scenario, tmp_path / "c")

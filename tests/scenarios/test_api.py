@@ -378,6 +378,7 @@ def test_what_is_handed_out_names_itself_in_a_few_lines() -> None:
     assert (len(lines), lines[-1]) == (10, " and 2 more>")
 
 
+@pytest.mark.slow("docstrings")
 def test_a_notebook_shows_tables_and_a_small_plot(hover: Scenario, flight: Flight, tmp_path: Path) -> None:
     swept = quadsim.sweep(hover, {"controller.horizon": [20, 30]}, workers=1, progress=False)
     mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "grid", "values": [3.9, 4.0, 4.1]}

@@ -43,6 +43,7 @@ def test_the_papers_course_steps_and_what_its_filter_leaves_is_beyond_the_bound(
     assert finding.advice == fitting(Assembly(made))
 
 
+@pytest.mark.slow("library")
 def test_a_note_on_a_shipped_course_has_at_most_two_lines() -> None:
     for name in scenario_names():
         result = report(Assembly(load_scenario(name)))

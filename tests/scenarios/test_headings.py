@@ -60,6 +60,7 @@ def verdicts(flight: Flight) -> list[tuple[str, str]]:
     return [("flight", flight.outcome), *((each.limit.name, each.verdict) for each in flight.findings)]
 
 
+@pytest.mark.slow("headings")
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_whole_turns_of_reference_or_initial_yaw_change_no_command_and_no_verdict(name: str) -> None:
     """Whole turns of the initial yaw, in whole degrees, change not a bit."""
@@ -78,6 +79,7 @@ def test_whole_turns_of_reference_or_initial_yaw_change_no_command_and_no_verdic
         assert verdicts(shifted) == verdicts(flown)
 
 
+@pytest.mark.witness("headings")
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_a_law_called_by_itself_takes_headings_that_jump_by_whole_turns(name: str) -> None:
     """Each period's preview is on another turn, and jumps from its third sample on."""

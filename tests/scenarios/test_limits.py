@@ -65,6 +65,7 @@ def test_an_entry_for_a_part_of_the_flight_leaves_the_bound_audited() -> None:
     assert (limits["roll"].upper, limits["controller.roll"].upper) == (1.0, 5.0)
 
 
+@pytest.mark.slow("library")
 def test_other_numbers_than_the_controllers_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = ["constraints.roll.lower=-8.0", "constraints.roll.upper=8.0", "duration=0.5"]
     line = "roll: audited against ±8 deg, the controller bounds ±5 deg"

@@ -38,12 +38,14 @@ def assert_constrained_flight_holds(flight: Flight, *, plant_tolerance: float) -
     assert np.abs(error).max() < 0.01
 
 
+@pytest.mark.witness("paper")
 def test_constrained_flight_keeps_every_bound_and_arrives(constrained_flight: Flight) -> None:
     assert_constrained_flight_holds(constrained_flight, plant_tolerance=PLANT)
     assert constrained_flight.satisfied
     assert constrained_flight.log.plant.t.size == 60_001  # audited at the physics rate
 
 
+@pytest.mark.slow("paper")
 @pytest.mark.parametrize("arm_length", [0.2, 0.5])
 @pytest.mark.parametrize("drag_to_thrust", [0.012, 0.048])
 def test_it_holds_over_the_parameters_the_paper_leaves_out(
@@ -55,6 +57,7 @@ def test_it_holds_over_the_parameters_the_paper_leaves_out(
     assert_constrained_flight_holds(flight, plant_tolerance=0.1)
 
 
+@pytest.mark.witness("paper")
 def test_unconstrained_flight_tracks_and_leaves_every_bound(unconstrained_flight: Flight) -> None:
     control, result = unconstrained_flight.log.control, findings(unconstrained_flight)
     error = control.state[:, [0, 2, 4, 10]] - control.reference
@@ -90,6 +93,7 @@ def test_constraints_make_the_profile_smoother(constrained_flight: Flight, uncon
     assert total_variation(constrained_flight) < total_variation(unconstrained_flight)  # by 2 % only
 
 
+@pytest.mark.slow("paper")
 def test_both_solvers_fly_the_same_commands(constrained_flight: Flight, fly_once: Callable[..., Flight]) -> None:
     dense = fly_once("paper-constrained", "controller.solver=piqp-dense")
     difference = np.abs(dense.log.control.speeds - constrained_flight.log.control.speeds).max()

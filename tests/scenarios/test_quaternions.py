@@ -56,6 +56,7 @@ def test_attitude_and_body_rates_are_logged_and_read_back(inverted: Flight, tmp_
     assert np.degrees(tilt(log.plant.state)).max() == pytest.approx(180.0, abs=0.1)
 
 
+@pytest.mark.slow("library")
 def test_a_loop_by_sensors_is_flown_audited_and_logged(fly_once: Callable[..., Flight]) -> None:
     flight = fly_once("power-loop")
     assert flight.outcome == "satisfied"

@@ -83,6 +83,7 @@ def written_and_read(scenario: Scenario) -> Scenario:
     return Scenario.parse(tomllib.loads(scenario.to_toml()))
 
 
+@pytest.mark.witness("by hand")
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_periods_by_hand_are_the_batch_flight(name: str) -> None:
     scenario = cut(name)
@@ -95,6 +96,7 @@ def test_periods_by_hand_are_the_batch_flight(name: str) -> None:
     assert stepped.scenario == flown.scenario
 
 
+@pytest.mark.slow("by hand")
 @settings(max_examples=25)
 @given(name=st.sampled_from([*SCENARIOS]), inputs=INPUTS)
 def test_what_was_applied_flies_again_to_the_bit(name: str, inputs: list[tuple[int, bool, dict[str, Any]]]) -> None:

@@ -20,6 +20,7 @@ Build = Callable[..., Any]
 Fly = Callable[..., FlightLog]
 
 
+@pytest.mark.slow("baselines")
 def test_every_vehicle_arrives_along_the_papers_course(law: str, craft: Vehicle, build: Build, fly_from: Fly) -> None:
     """Nine seconds: 10 m up, the first second of them at all the thrust there is, turning 30 deg at once."""
     state = make_state(euler=(0.0, 0.0, math.radians(30.0)))
@@ -43,6 +44,7 @@ def test_a_flight_repeats_itself_with_the_same_controller(
     np.testing.assert_array_equal(flights[0].control.speeds, flights[1].control.speeds)
 
 
+@pytest.mark.witness("baselines")
 def test_half_a_turn_is_turned_while_flying_sideways(law: str, vehicle: Vehicle, build: Build, fly_from: Fly) -> None:
     state = make_state(euler=(0.0, 0.0, math.pi))
     log = fly_from(build(law, vehicle), vehicle, state, periods=160, course=np.array([1.0, 1.0, 0.0, 0.0])).control
@@ -60,6 +62,7 @@ def test_slow_rotors_and_a_heavier_vehicle_are_survived(
     assert abs(log.control.truth[-1, 4] - log.control.reference[-1, 2]) < 1.5
 
 
+@pytest.mark.slow("baselines")
 @pytest.mark.parametrize(("law", "others"), [("pid", {}), ("geometric", {"integral": True})])
 def test_integrals_lift_a_heavier_vehicle_to_its_height(
     law: str, others: dict[str, Any], vehicle: Vehicle, build: Build, fly_from: Fly

@@ -183,6 +183,7 @@ def test_a_state_lost_for_long_is_hovered_through(vehicle: Vehicle) -> None:
     assert not log.control.fallback[110:].any()
 
 
+@pytest.mark.slow("fallback")
 def test_a_solver_that_never_recovers_ends_in_a_landing(vehicle: Vehicle) -> None:
     shape = outline(vehicle)
     log = fly_paper(

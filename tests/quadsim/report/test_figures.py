@@ -40,6 +40,8 @@ from quadsim.report.to_plotly import thinned_curve, to_plot
 from quadsim.space import Cylinder
 from quadsim.state import INDEX, POSITION, Array
 
+pytestmark = pytest.mark.slow("figures")
+
 
 def named(run: Run, scenario: str) -> Run:
     return dataclasses.replace(run, summary={**run.summary, "scenario": scenario})
@@ -62,6 +64,7 @@ def with_effects(run: Run) -> Run:
     return dataclasses.replace(run, log=dataclasses.replace(run.log, plant=plant, control=control))
 
 
+@pytest.mark.witness("figures")
 def test_the_papers_scenario_gives_the_papers_figure_numbers(short_run: Run, tmp_path: Path) -> None:
     paths = write_figures(short_run, tmp_path)
     assert [path.name for path in paths] == ["figure4_states.png", "figure5_inputs.png", "solve_times.png"]

@@ -101,6 +101,7 @@ def test_default_gains_follow_the_rule(vehicle: Vehicle) -> None:
     assert settings.resolved(vehicle) == settings
 
 
+@pytest.mark.witness("autopilot")
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_step_of_a_body_rate_is_reached_with_little_overshoot(vehicle: Vehicle, axis: int) -> None:
     target = hover(vehicle)
@@ -110,6 +111,7 @@ def test_a_step_of_a_body_rate_is_reached_with_little_overshoot(vehicle: Vehicle
     assert rates[-1] == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow("autopilot")
 def test_a_constant_torque_is_integrated_away(vehicle: Vehicle) -> None:
     torque = 2.0 * vehicle.inertia[0]
     effects = Effects(rotors=RotorDynamics().resolved(vehicle), disturbance=Disturbance(torque=(torque, 0.0, 0.0)))

@@ -121,6 +121,7 @@ def test_the_resolved_file_is_the_same_campaign(tmp_path: Path) -> None:
     assert load_plan(str(tmp_path / "again.toml")).spec == made.spec
 
 
+@pytest.mark.slow("campaigns")
 @pytest.mark.parametrize("name", campaign_names())
 def test_every_campaign_that_ships_can_be_flown(name: str) -> None:
     made = load_plan(name)

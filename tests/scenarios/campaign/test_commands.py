@@ -161,6 +161,7 @@ def test_wrong_input_is_status_2_with_one_message_and_flies_nothing(
     assert {path.name for path in file.parent.iterdir()} == before
 
 
+@pytest.mark.slow("process")
 def test_ctrl_c_keeps_what_was_flown(file: Path) -> None:
     command = [sys.executable, "-c", HASTY, "campaign", str(file), "--out", "c", "--flights", "2000"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as campaign:

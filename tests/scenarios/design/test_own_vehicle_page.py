@@ -14,6 +14,7 @@ from scenarios.results import EXIT_DONE
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "own-vehicle.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow("pages")
 def test_its_commands_end_with_a_good_flight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

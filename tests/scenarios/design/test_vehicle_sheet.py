@@ -119,6 +119,7 @@ def test_rotors_that_lag_add_their_poles() -> None:
     assert make_sheet(LOPES).lag_poles == {}
 
 
+@pytest.mark.slow("figures")
 @pytest.mark.parametrize("name", vehicle_names())
 def test_the_command_prints_figures_and_sources(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     vehicle = load_vehicle(vehicle_path(name))

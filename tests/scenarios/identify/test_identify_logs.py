@@ -23,6 +23,8 @@ from scenarios.identify.checks import check_log, spans
 from scenarios.identify.record import Record, read_record
 from scenarios.identify.windows import to_world
 
+pytestmark = pytest.mark.slow("identification")
+
 FIELDS = {"position": "x y z", "velocity": "vx vy vz", "attitude": "qw qx qy qz", "rates": "wx wy wz"}
 FIELDS |= {"commands": "u1 u2 u3 u4"}
 NOISE = {"position": 0.002, "velocity": 0.02, "attitude": 0.26, "rates": 0.43}
@@ -90,6 +92,7 @@ def late(record: Record, count: int, *fields: str) -> Record:
 # Reading
 
 
+@pytest.mark.witness("identification")
 def test_run_directory(run_directory: Path, eight: Record) -> None:
     """What was measured, the command of each period, and the battery's voltage from the plant's table."""
     assert eight.name == read_record(run_directory / "flight.parquet").name == run_directory.name
@@ -327,6 +330,7 @@ SPOILT: dict[str, Spoil] = {
 }
 
 
+@pytest.mark.witness("identification")
 @pytest.mark.parametrize("name", SPOILT)
 def test_spoilt_logs_are_refused_by_name(eight: Record, hummingbird: Vehicle, name: str) -> None:
     with pytest.raises(InputError, match=name) as error:

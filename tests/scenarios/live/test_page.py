@@ -44,6 +44,7 @@ pytestmark = pytest.mark.slow("live")
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 
 
+@pytest.mark.witness("live")
 @pytest.mark.parametrize(
     ("headers", "query", "let_in"),
     [
@@ -301,6 +302,7 @@ def tab(browser: Any, served: Served) -> Iterator[Any]:
     tab.close()
 
 
+@pytest.mark.witness("live")
 def test_the_address_alone_opens_the_page(served: Served) -> None:
     bare = served.page.address.partition("?")[0]
     with pytest.raises(urllib.error.HTTPError, match="403") as refused:
@@ -312,7 +314,6 @@ def test_the_address_alone_opens_the_page(served: Served) -> None:
         assert "HttpOnly" in response.headers["Set-Cookie"]
 
 
-@pytest.mark.witness("live")
 def test_a_push_by_the_mouse_acts_and_ends(tab: Any, served: Served) -> None:
     box = tab.locator("canvas").first.bounding_box()
     x, y = box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
