@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -12,11 +12,13 @@ from mpc.condensing import states_rows
 from mpc.ocp import Problem, Query, predicted
 from mpc.paper import prediction
 from mpc.qp import kkt_residuals
-from mpc.solvers import Answer
 from quadsim.controller import ACCEPTED, FALLBACK, Command
 from quadsim.errors import ParameterError
 from quadsim.state import Array, Indices, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
+
+if TYPE_CHECKING:
+    from mpc.solvers import Answer
 
 BOUND_TOLERANCE: Final = 1e-6
 """Tolerance of the bounds [rad/s]: an answer outside by no more is moved onto its bounds and accepted."""

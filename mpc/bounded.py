@@ -9,6 +9,7 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import singledispatch
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Final, Literal
 
@@ -18,7 +19,7 @@ from annotated_types import Ge, Le, Len, MaxLen, doc
 from mpc.allocation import thrust_to_command
 from mpc.answer import ActuatorBounds
 from mpc.constraints import Bounds, Constraint, Origin, Penalty
-from mpc.fallback.contract import FallbackSettings, Guard
+from mpc.fallback.settings import FallbackSettings
 from mpc.indi import INDISettings, TorqueIncrement
 from mpc.model import SHORTEST_LAG, hover_model
 from mpc.obstacles import AvoidanceSettings, Shape, Space
@@ -26,7 +27,7 @@ from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
 from mpc.solvers import ALIASES, CORE_OR_PIQP, SOLVERS, Solver, find_solver
 from mpc.solvers.by_name import make_solver
-from quadsim.controller import CORE, ROTORS
+from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number, Pair, Positive, Weight
 from quadsim.input_limits import MOST_ENTRIES
@@ -82,13 +83,15 @@ class ControllerTable:
         """Return its hard and soft bounds on audited signals, in file units."""
         return {}
 
-    def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
-        """Return the fallback contract around the law; None without one."""
-        return None
-
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
         """Return the inner loop that corrects the rotor speeds it commands; None without one."""
         return None
+
+
+@singledispatch
+def law_of(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+    """Return the law of a table, in Python; see `mpc.builders.build`.  Each table's builder registers itself here."""
+    raise NotImplementedError(type(table).__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -443,13 +446,6 @@ class Bounded(Weighted):
             rule = "a QP solver such as 'piqp' with controller.avoidance, whose half-spaces differ from step to step"
             raise ParameterError("controller", "solver", CORE, rule)
         return make_solver("piqp" if space is not None and self.solver == CORE_OR_PIQP else self.solver, problem)
-
-    def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
-        """See `ControllerTable.guard`."""
-        if self.fallback is None:
-            return None
-        bounds = self.input_bounds.actuators(vehicle)
-        return self.fallback.guard(hover_model(vehicle, period), bounds, self.output_bounds)
 
 
 def rows_of(polytopes: Sequence[Polytope]) -> tuple[Constraint, ...]:

@@ -1,25 +1,23 @@
-"""From the tables `[controller]` to what flies: one builder per table, which alone knows the table and its law.
+"""From the tables `[controller]` to what flies.
 
-Laws are imported when one is built: most flights need one of them.
+A law in one file with its table registers its builder there; those here are imported when one is built: most flights
+need one of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import singledispatch
 
 import numpy as np
 
-from mpc.baselines.geometric import Geometric, GeometricController
-from mpc.baselines.lqr import LQR, LQRTable
-from mpc.baselines.pid import PID, CascadedPID
-from mpc.bounded import Bounded, ControllerTable, Weighted, require_lags
+from mpc.bounded import Bounded, ControllerTable, Weighted, law_of, require_lags
 from mpc.constrained import Constrained
+from mpc.fallback.contract import Guard
+from mpc.model import hover_model, target_model
 from mpc.nonlinear.settings import Nonlinear
 from mpc.obstacles import Shape
 from mpc.pilot import Pilot
 from mpc.robust.settings import Robust
-from mpc.unconstrained import Unconstrained, UnconstrainedMPC
 from quadsim.controller import ROTORS, Controller
 from quadsim.errors import InputError, MissingCoreError
 from quadsim.vehicle import Vehicle
@@ -43,31 +41,34 @@ def build(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Seque
             "the controller's gain cannot be computed: its weights and the vehicle's numbers are too many orders "
             f"of magnitude apart ({error})"
         ) from error
-    return Pilot(law, vehicle, guard=table.guard(vehicle, period), inner=table.inner_loop(vehicle))
+    return Pilot(law, vehicle, guard=guard_of(table, vehicle, period), inner=table.inner_loop(vehicle))
 
 
-@singledispatch
-def law_of(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    """Return the law of a table, in Python; see `build`.  A table from elsewhere registers its builder here."""
-    raise NotImplementedError(type(table).__name__)
-
-
-@law_of.register(Unconstrained)
-def _unconstrained(
-    table: Unconstrained, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()
-) -> UnconstrainedMPC:
-    return UnconstrainedMPC(table.problem(vehicle, period))
+def guard_of(table: ControllerTable, vehicle: Vehicle, period: float) -> Guard | None:
+    """Return the fallback contract around the law of a table; None without one."""
+    fallback = table.fallback
+    if fallback is None or not fallback.enabled:
+        return None
+    if isinstance(table, Nonlinear):
+        model = hover_model(vehicle, period)
+        if table.commands != ROTORS:
+            model = target_model(vehicle, period, require_lags(table.inner_lag))
+        return Guard(model, bounds=table.actuators(vehicle), settings=fallback)
+    assert isinstance(table, Bounded)
+    bounds, settings = table.input_bounds.actuators(vehicle), fallback.within(table.output_bounds)
+    return Guard(hover_model(vehicle, period), bounds=bounds, settings=settings)
 
 
 @law_of.register(Constrained)
 @law_of.register(Robust)
 def _linear(table: Bounded, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
     from mpc.linear import LinearMPC, NominalPreparation, Preparation
-    from mpc.robust.controller import RobustPreparation
 
     problem, space = table.problem(vehicle, period), table.space(shapes, vehicle, period)
     preparation: Preparation = NominalPreparation(problem)
     if isinstance(table, Robust):
+        from mpc.robust.controller import RobustPreparation
+
         preparation = RobustPreparation(vehicle, problem, table)
     return LinearMPC(
         preparation,
@@ -111,18 +112,3 @@ def _nonlinear(table: Nonlinear, vehicle: Vehicle, period: float, shapes: Sequen
         space=table.space(shapes, vehicle, period),
         kkt_every=table.kkt_every,
     )
-
-
-@law_of.register(LQRTable)
-def _lqr(table: LQRTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    return LQR(vehicle, period, table)
-
-
-@law_of.register(PID)
-def _pid(table: PID, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    return CascadedPID(vehicle, period, table)
-
-
-@law_of.register(Geometric)
-def _geometric(table: Geometric, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    return GeometricController(vehicle, period, table)

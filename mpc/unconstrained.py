@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
@@ -10,12 +11,14 @@ import numpy as np
 import scipy.linalg
 from annotated_types import doc
 
-from mpc.bounded import Weighted
+from mpc.bounded import Weighted, law_of
 from mpc.condensing import condensed_cost
+from mpc.obstacles import Shape
 from mpc.ocp import Problem
 from mpc.paper import prediction, rollout
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Statistics, StepInputs, stopped
 from quadsim.state import INDEX, Array, ReferenceTurns
+from quadsim.vehicle import Vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,3 +84,8 @@ class Unconstrained(Weighted):
     """The paper's unconstrained MPC, a constant gain (Sec. 4)."""
 
     type: Annotated[Literal["unconstrained"], doc("the control law, by its name in `quadsim list`")] = "unconstrained"
+
+
+@law_of.register(Unconstrained)
+def _law(table: Unconstrained, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> UnconstrainedMPC:
+    return UnconstrainedMPC(table.problem(vehicle, period))

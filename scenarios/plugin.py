@@ -14,7 +14,7 @@ import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from importlib.machinery import PathFinder
@@ -25,8 +25,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from annotated_types import doc
 
-from mpc.bounded import ControllerTable, Horizon
-from mpc.builders import law_of
+from mpc.bounded import ControllerTable, Horizon, law_of
 from mpc.obstacles import Shape
 from quadsim import border
 from quadsim.border import numbers_of, user_code
@@ -36,13 +35,9 @@ from quadsim.controller import (
     TARGET_SIZES,
     Adopting,
     Command,
-    Commanding,
     Controller,
-    Diagnosable,
-    Named,
     Predicting,
     Resetting,
-    Solving,
     Statistics,
     StepInputs,
     Stepping,
@@ -158,9 +153,9 @@ class PluginController:
     def __init__(self, law: Any, horizon: int) -> None:
         self.law, self.horizon, kind = law, horizon, type(law).__name__
         with user_code(lambda error: InputError(f"controller: {kind} cannot be used: {reason_of(error)}")):
-            self.name = printable(str(law.name if isinstance(law, Named) else kind))[:200]
-            self.solver = printable(str(law.solver if isinstance(law, Solving) else ""))[:200]
-            self.commands = law.commands if isinstance(law, Commanding) else ROTORS
+            self.name = printable(str(_optional(lambda: law.name, kind)))[:200]
+            self.solver = printable(str(_optional(lambda: law.solver, "")))[:200]
+            self.commands = _optional(lambda: law.commands, ROTORS)
             self._predicting = law if isinstance(law, Predicting) else None
         if not isinstance(self.commands, str) or self.commands not in TARGET_SIZES:
             raise ParameterError("controller", f"{self.name}.commands", self.commands, f"one of {[*TARGET_SIZES]}")
@@ -171,7 +166,7 @@ class PluginController:
         """The first problem without an answer, an `mpc.InfeasiblePeriod`, if the law keeps one."""
         try:
             with user_code(lambda error: InputError(reason_of(error))):
-                return self.law.infeasible_period if isinstance(self.law, Diagnosable) else None
+                return _optional(lambda: self.law.infeasible_period, None)
         except InputError as error:  # the flight is complete and must not be lost
             if not self._warned:
                 _log.warning("no diagnosis: infeasible_period raised %s", error)
@@ -238,6 +233,14 @@ def _checked(stats: Any) -> Statistics:
         for usual, value in zip(NO_STATISTICS, values, strict=True)
     ]
     return Statistics(*numbers)
+
+
+def _optional(read: Callable[[], Any], default: Any) -> Any:
+    """Return what a user's object says, or the default where it says nothing; it is asked once, whatever it raises."""
+    try:
+        return read()
+    except AttributeError:
+        return default
 
 
 def _numbers(numbers: Any, shape: tuple[int, ...], name: str) -> Array:

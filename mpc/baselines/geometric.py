@@ -7,6 +7,7 @@ Subject to Rotor Drag for Accurate Tracking of High-Speed Trajectories", 2018.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal, TypeAlias
 
@@ -29,11 +30,12 @@ from mpc.baselines.attitude import (
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
 from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion
-from mpc.bounded import USUAL_TARGETS, Range, Seconds, TargetBounds, require_lags, require_space
+from mpc.bounded import USUAL_TARGETS, Range, Seconds, TargetBounds, law_of, require_lags, require_space
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
 from mpc.model import target_model
 from mpc.nonlinear.model import zero
+from mpc.obstacles import Shape
 from quadsim.controller import ROTORS, Command, Phase, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
@@ -390,3 +392,8 @@ class Geometric(Tuned):
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
         """See `mpc.bounded.ControllerTable.inner_loop`."""
         return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
+
+
+@law_of.register(Geometric)
+def _law(table: Geometric, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> GeometricController:
+    return GeometricController(vehicle, period, table)

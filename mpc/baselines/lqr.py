@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
@@ -11,9 +12,10 @@ from annotated_types import Ge, Le, Len, doc
 
 from mpc.allocation import allocate, make_allocation
 from mpc.baselines.law import Baseline, FeedbackLaw
-from mpc.bounded import InputWeights, objective_of, require_states
+from mpc.bounded import InputWeights, law_of, objective_of, require_states
 from mpc.heading import turn_horizontally
 from mpc.model import LinearModel, continuous_model, discretise, hover_model, lqr
+from mpc.obstacles import Shape
 from mpc.ocp import Objective
 from quadsim.controller import Command, StepInputs
 from quadsim.errors import ParameterError
@@ -183,3 +185,8 @@ class LQRTable(Baseline):
         if self.output_weights is None or self.input_weights is None:
             return bryson_objective(vehicle, period)
         return objective_of(self.output_weights, self.input_weights)
+
+
+@law_of.register(LQRTable)
+def _law(table: LQRTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LQR:
+    return LQR(vehicle, period, table)

@@ -6,6 +6,7 @@ The structure is PX4's (PositionControl, AttitudeControl, RateControl); ArduPilo
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Final, Literal
 
@@ -17,6 +18,8 @@ from mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured, attitude_for, l
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import Target, target_of
+from mpc.bounded import law_of
+from mpc.obstacles import Shape
 from quadsim.controller import Command, Phase, StepInputs
 from quadsim.fields import Positive
 from quadsim.state import Array
@@ -182,3 +185,8 @@ class PID(Tuned):
 
     type: Annotated[Literal["pid"], doc("the control law, by its name in `quadsim list`")] = "pid"
     velocity: Annotated[Positive, doc("[m/s] largest velocity commanded")] = 12.0
+
+
+@law_of.register(PID)
+def _law(table: PID, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> CascadedPID:
+    return CascadedPID(vehicle, period, table)

@@ -22,17 +22,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, Final
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
-from annotated_types import Gt, Lt, doc
 
 from mpc.answer import ActuatorBounds, rejection, resized, shifted
 from mpc.equilibrium import Trim, Trimmed
 from mpc.fallback.completion import PLAUSIBLE_REFERENCE, StateCompletion, completed_inputs
 from mpc.fallback.hover import HoverLaw
+from mpc.fallback.settings import USUAL_FALLBACK, USUAL_TILT, FallbackSettings
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
 from quadsim.controller import (
@@ -48,68 +48,12 @@ from quadsim.controller import (
     stopped,
 )
 from quadsim.errors import FlightError
-from quadsim.fields import Positive
-from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, all_true, by_group
+from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
 
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """Exceptions of numerics and compiled back ends.  Programming errors (`TypeError`, `KeyError`, ...) end the run."""
 _MISTAKES: Final = (NotImplementedError, RecursionError)  # subclasses of `RuntimeError` that are programming errors
-USUAL_TILT: Final = 10.0
-"""Default limit of the tilt [deg], for a controller without a bound on tilt."""
-_SHARE: Final = 0.8
-"""Tilt as a share of the tightest bound on it, so that the controller resumes within its bounds."""
-_SMALLEST_TILT: Final = 0.5  # [deg] whatever the bounds; below it there is no lateral authority
-
-
-@dataclass(frozen=True, kw_only=True)
-class FallbackSettings:
-    """The fallback contract: the shifted plan with an LQR correction, then level hover, then descent.
-
-    A plan lasts at most its horizon; its own tilt adds to `tilt`.
-    """
-
-    enabled: Annotated[bool, doc("false: the controller handles missing answers itself")] = True
-    unseen: Annotated[Positive, doc("[s] longest time that predictions may replace a missing measurement")] = 1.5
-    plan_age: Annotated[Positive, doc("[s] longest time that one shifted plan is flown")] = 1.0
-    position: Annotated[Positive, doc("[m] largest distance from the plan")] = 0.5
-    velocity: Annotated[Positive, doc("[m/s] largest velocity deviation from the plan")] = 1.0
-    angle: Annotated[Positive, doc("[deg] largest deviation of roll, pitch and yaw from the plan")] = 11.5
-    rate: Annotated[Positive, doc("[deg/s] largest deviation of their rates from the plan")] = 57.3
-    hover: Annotated[Positive, doc("[s] longest time in level hover, before the descent")] = 5.0
-    sink: Annotated[Positive, doc("[m/s] speed of the descent")] = 0.5
-    tilt: Annotated[
-        Annotated[float, Gt(0.0), Lt(90.0)] | None,
-        doc(
-            "[deg] largest tilt commanded; absent: 0.8 of the tightest bound on roll or pitch, so that the controller "
-            f"takes over again within its bounds, or {USUAL_TILT:g} where there is none"
-        ),
-    ] = None
-    settled: Annotated[Positive, doc("[m/s] above this horizontal speed it brakes without going back to a place")] = 0.3
-
-    @property
-    def distance(self) -> Array:
-        """Return (12,) the largest deviations from a plan's states [m], [m/s], [rad], [rad/s]."""
-        return by_group(self.position, self.velocity, math.radians(self.angle), math.radians(self.rate))
-
-    def guard(
-        self, model: LinearModel, bounds: ActuatorBounds, output_bounds: Mapping[str, Sequence[float]] | None = None
-    ) -> Guard | None:
-        """Return the contract, with the tilt of `output_bounds` [deg]; None if it is disabled.
-
-        `model` is the hover model whose inputs are the law's commands, and `bounds` are theirs.
-        """
-        if not self.enabled:
-            return None
-        settings = self
-        if output_bounds is not None and self.tilt is None:
-            pairs = (output_bounds[name] for name in ("roll", "pitch") if name in output_bounds)
-            tightest = min((_SHARE * min(-lower, upper) for lower, upper in pairs), default=USUAL_TILT)
-            settings = replace(self, tilt=min(max(tightest, _SMALLEST_TILT), USUAL_TILT))
-        return Guard(model, bounds=bounds, settings=settings)
-
-
-USUAL_FALLBACK: Final = FallbackSettings()
 
 
 class Guard:

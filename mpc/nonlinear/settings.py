@@ -27,7 +27,6 @@ from mpc.bounded import (
     TargetBounds,
     ranges,
     require_lag,
-    require_lags,
     require_ordered,
     require_solver,
     require_space,
@@ -36,9 +35,8 @@ from mpc.bounded import (
 )
 from mpc.constraints import Constraint, origin_of_state
 from mpc.disturbance import RampSettings
-from mpc.fallback.contract import USUAL_FALLBACK, FallbackSettings, Guard
+from mpc.fallback.settings import USUAL_FALLBACK, FallbackSettings
 from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
-from mpc.model import hover_model, target_model
 from mpc.nonlinear.rigidbody import RATE_SCALE
 from mpc.observer import ObserverSettings
 from mpc.obstacles import Shape, Space
@@ -234,14 +232,6 @@ class Nonlinear(ControllerTable):
         stride = self.stride(period)
         step, nodes = stride * period, self.horizon // stride
         return self.avoidance.space(shapes, vehicle, period=step, horizon=nodes, positions=(0, 1, 2), largest=True)
-
-    def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
-        """See `mpc.bounded.ControllerTable.guard`."""
-        if self.commands == ROTORS:
-            model = hover_model(vehicle, period)
-        else:
-            model = target_model(vehicle, period, require_lags(self.inner_lag))
-        return self.fallback.guard(model, self.actuators(vehicle))
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
         """See `mpc.bounded.ControllerTable.inner_loop`."""

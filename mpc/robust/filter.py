@@ -28,7 +28,6 @@ from mpc.constraints import Constraint, Penalty
 from mpc.equilibrium import Trim
 from mpc.ocp import Objective, Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
-from mpc.pilot import Pilot
 from mpc.qp import QPRows
 from mpc.robust.controller import RobustPreparation
 from mpc.robust.settings import Robust
@@ -117,8 +116,8 @@ class SafetyFilter:
         return self._preparation.predict(states, plans)
 
 
-def safety_filter(table: Robust, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Pilot]:
-    """Return the safety filter with a table's constraints, and the same within its fallback contract, to fly.
+def safety_filter(table: Robust, vehicle: Vehicle, period: float) -> SafetyFilter:
+    """Return the safety filter with a table's constraints; it flies within that table's fallback contract.
 
     Raises:
         InputError: no filter can be built from these numbers.
@@ -126,8 +125,7 @@ def safety_filter(table: Robust, vehicle: Vehicle, period: float) -> tuple[Safet
     if table.avoidance is not None:
         rule = "absent for a safety filter, which keeps no half-spaces"
         raise ParameterError("controller", "avoidance", "given", rule)
-    law = SafetyFilter(RobustPreparation(vehicle, table.problem(vehicle, period), table))
-    return law, Pilot(law, vehicle, guard=table.guard(vehicle, period))
+    return SafetyFilter(RobustPreparation(vehicle, table.problem(vehicle, period), table))
 
 
 class _Nearest:

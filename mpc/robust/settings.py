@@ -18,7 +18,7 @@ from mpc.bounded import (
     require_lag,
     resolved_lag,
 )
-from mpc.fallback.contract import USUAL_FALLBACK, FallbackSettings
+from mpc.fallback.settings import USUAL_FALLBACK, FallbackSettings
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.observer import ObserverSettings
 from mpc.ocp import Problem, lqr_terminal_weight

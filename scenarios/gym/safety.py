@@ -9,6 +9,8 @@ import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
+from mpc.builders import guard_of
+from mpc.pilot import Pilot
 from mpc.robust.filter import safety_filter
 from mpc.robust.settings import Robust
 from quadsim.controller import UNCONSTRAINED
@@ -71,7 +73,9 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         observed = self.env.reset(seed=seed, options=options)
         started = self._base.started
         if started.vehicle != self._vehicle:
-            self._filter, self._law = safety_filter(self._spec, started.vehicle, started.scenario.control_period)
+            vehicle, period = started.vehicle, started.scenario.control_period
+            self._filter = safety_filter(self._spec, vehicle, period)
+            self._law = Pilot(self._filter, vehicle, guard=guard_of(self._spec, vehicle, period))
             self._vehicle = started.vehicle
         acting = started.observation.moment.acting
         assert acting is not None
