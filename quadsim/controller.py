@@ -192,6 +192,12 @@ class Statistics(NamedTuple):
             the states' components [m, m/s, rad/s, shares]; a solved QP does not imply that it is small.
         sqp_step: largest change of a state or an input in the last iteration, in the same units.
         solve_s: wall time inside the solver [s].
+
+    Examples:
+        >>> import quadsim
+        >>> stats = quadsim.Statistics(iterations=3, active=2)
+        >>> quadsim.Command(speeds=[200.0] * 4, plan=[[200.0] * 4], stats=stats).stats.active
+        2
     """
 
     iterations: int = 0
