@@ -15,7 +15,7 @@ from quadsim.palette import COLOUR, CYCLE, ON_DARK, ON_LIGHT, css, line_colour, 
 
 ROOT = Path(__file__).resolve().parents[2]
 READ = (
-    *("quadsim/**/*.py", "mpc/**/*.py", "scenarios/**/*.py", "docs/*.py", "docs/fly/*", "docs/assets/*.css"),
+    *("quadsim/**/*.py", "mpc/**/*.py", "scenarios/**/*.py", "docs/tools/*.py", "docs/fly/*", "docs/assets/*.css"),
     *("quadsim/report/templates/*", "docs/assets/gallery/*.svg", "docs/assets/*.svg"),
 )
 GREYEST = 40

@@ -112,9 +112,9 @@ def test_flights_are_exact_in_every_period_and_those_of_piqp(name: str) -> None:
 TERMS = ("Q_d", "P", "rest")
 
 
-def drawn(rng: np.random.Generator, terms: Collection[str], *, size: float, room: float) -> tuple[Problem, Query]:
+def drawn(rng: np.random.Generator, terms: Collection[str], *, size: float, wider: float) -> tuple[Problem, Query]:
     """Three systems in one, with a query; moves are weighed in proportion to inputs, so that the axes stay apart."""
-    problem = random_axes(rng, horizon=5, room=room)
+    problem = random_axes(rng, horizon=5, wider=wider)
     objective, model = problem.objective, problem.model
     if "Q_d" in terms:
         objective = replace(objective, Q_d=3.0 * objective.Q_u)
@@ -122,7 +122,7 @@ def drawn(rng: np.random.Generator, terms: Collection[str], *, size: float, room
         objective = replace(objective, P=lqr_terminal_weight(model, objective))
     rest = problem.equilibrium
     if "rest" in terms:
-        rest = Equilibrium(0.1 * rng.normal(size=7), model.u_bar + 0.1 * room * rng.normal(size=4))
+        rest = Equilibrium(0.1 * rng.normal(size=7), model.u_bar + 0.1 * wider * rng.normal(size=4))
     before = model.u_bar + 0.01 * rng.normal(size=4)
     query = Query(size * rng.normal(size=7), size * rng.normal(size=(5, 7)), before, rest)
     return replace(problem, objective=objective), query
@@ -132,10 +132,10 @@ def drawn(rng: np.random.Generator, terms: Collection[str], *, size: float, room
     seed=st.integers(0, 2**32 - 1),
     terms=st.sets(st.sampled_from(TERMS)),
     size=st.sampled_from([0.05, 0.5, 2.0]),
-    room=st.sampled_from([1.0, 10.0, 1000.0]),
+    wider=st.sampled_from([1.0, 10.0, 1000.0]),
 )
-def test_every_way_ends_at_the_peers_optimum(seed: int, terms: set[str], size: float, room: float) -> None:
-    problem, query = drawn(np.random.default_rng(seed), terms, size=size, room=room)
+def test_every_way_ends_at_the_peers_optimum(seed: int, terms: set[str], size: float, wider: float) -> None:
+    problem, query = drawn(np.random.default_rng(seed), terms, size=size, wider=wider)
     answer = Core(problem).solve(query)
     peer = ocp_peer.optimum(problem, ocp_peer.period(problem, *query[:4]))
     assert (answer.status in ACCEPTED) == (peer.solution.status == SOLVED)
@@ -150,8 +150,8 @@ def test_every_way_is_taken(terms: tuple[str, ...]) -> None:
     methods = []
     for seed in range(30):
         rng = np.random.default_rng(seed)
-        size, room = float(rng.choice([0.05, 2.0])), float(rng.choice([1.0, 1000.0]))
-        problem, query = drawn(rng, terms, size=size, room=room)
+        size, wider = float(rng.choice([0.05, 2.0])), float(rng.choice([1.0, 1000.0]))
+        problem, query = drawn(rng, terms, size=size, wider=wider)
         assert len(axes(problem)) == 3
         answer = Core(problem).solve(query)
         methods.append(answer.method)
@@ -163,7 +163,7 @@ def test_every_way_is_taken(terms: tuple[str, ...]) -> None:
 
 def test_moves_that_tie_the_axes_leave_one_piece() -> None:
     """By a weight on the change of one rotor alone, which is part of all of them; the optimum is the peer's still."""
-    problem, query = drawn(np.random.default_rng(1), (), size=0.05, room=1000.0)
+    problem, query = drawn(np.random.default_rng(1), (), size=0.05, wider=1000.0)
     tied = replace(problem, objective=replace(problem.objective, Q_d=np.diag([1.0, 0.0, 0.0, 0.0])))
     assert len(axes(tied)) == 1
     peer = ocp_peer.optimum(tied, ocp_peer.period(tied, *query[:4]))
