@@ -57,7 +57,7 @@ class SafetyFilter:
     """A controller that sends the requested command as far as it is safe; see the module.
 
     If the constraints cannot hold, for example after a disturbance larger than stated, the filter softens those on
-    states and solves the QP once more.  If that fails too, the status reports it, and `mpc.fallback.contract.Guarded`
+    states and solves the QP once more.  If that fails too, the status reports it, and `mpc.fallback.contract.Guard`
     flies the last good plan.
 
     The robust MPC's preparation provides model, observer and constraints.  Set `requested` (4,) to the command of the
