@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow("packages")
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("quadsim", "mpc", "scenarios")
-DATA = ("*.py", "py.typed", "*.toml", "*.csv", "*.xml", "*.j2", "*.css", "*.js", "export/c/*", "core/c/*")
+DATA = ("*.py", "py.typed", "*.toml", "*.csv", "*.xml", "*.j2", "*.css", "*.js", "codegen/c/*", "core/c/*")
 
 
 @pytest.fixture(scope="module")
