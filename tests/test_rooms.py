@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 from pathlib import Path
 
 import pytest
 import rooms as taking
-from test_architecture import Import, imports_of, modules
+from test_architecture import PACKAGES, Import, imports_of, modules
 
 from scenarios.rooms import ROOMS, commands_of
 
+MOST_USED = 276
+"""Names of the core that rooms import, each counted once; they may only get fewer."""
 LISTS = ("quadsim", "quadsim.gym", "scenarios.rooms")
 """Where a room is named: what users import, and the list of the rooms."""
 
@@ -44,6 +47,19 @@ def test_the_core_names_no_room_and_no_room_names_another(imports: list[Import])
         and item.importer not in LISTS
     ]
     assert wrong == []
+
+
+def test_rooms_use_few_names_of_the_core() -> None:
+    used = {
+        (node.module, name.name)
+        for module, path in modules().items()
+        if (room := room_of(module)) is not None
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(PACKAGES)
+        if room_of(str(node.module)) != room
+        for name in node.names
+    }
+    assert 0 < len(used) <= MOST_USED, sorted(used)
 
 
 def test_the_list_of_commands_says_what_the_rooms_say() -> None:
