@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from rooms import USING
 from support import NO_PRODUCTS, draw_nothing, fly_here
 
 from quadsim.flight import rundir
@@ -24,6 +25,7 @@ from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.rollout import Rollout
+from scenarios.rooms import ROOMS
 
 # Compiled code is cached, whatever the environment sets: the workers, and all processes that tests
 # start, would compile the same modules again.  `make clean` removes it.
@@ -47,6 +49,8 @@ LONG = (
     *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/core/test_core.py"),
 )
 """Modules that take longest."""
+collect_ignore = [module for module, used in USING.items() if not {*used} <= {*ROOMS}]
+"""Tests of rooms that have been taken away."""
 _fly = Rollout.fly
 """Whatever stands in for it in a test."""
 

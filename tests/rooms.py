@@ -37,6 +37,36 @@ PARTS: Final = {
 }
 """Folders, tests and pages of each room, beside `scenarios/NAME` and `tests/scenarios/NAME`."""
 
+EVERY: Final = tuple(PARTS)
+USING: Final = {
+    "mpc/core/test_law.py": ("export",),
+    "quadsim/test_palette.py": ("live",),
+    "quadsim/test_plausibility.py": ("design",),
+    "scenarios/test_answer_first.py": ("campaign", "design", "identify"),
+    "scenarios/test_api.py": EVERY,
+    "scenarios/test_bounded_input.py": ("campaign", "identify"),
+    "scenarios/test_cli.py": EVERY,
+    "scenarios/test_help.py": EVERY,
+    "scenarios/test_infeasibility.py": ("campaign",),
+    "scenarios/test_initial.py": ("campaign", "gym"),
+    "scenarios/test_latency.py": ("design",),
+    "scenarios/test_library.py": ("campaign",),
+    "scenarios/test_limits.py": ("live",),
+    "scenarios/test_logged.py": ("campaign",),
+    "scenarios/test_piloted.py": ("design",),
+    "scenarios/test_progress.py": ("campaign",),
+    "scenarios/test_verdicts.py": ("campaign",),
+    "scenarios/test_versions.py": ("campaign",),
+    "test_commands.py": EVERY,
+    "test_documents.py": EVERY,
+    "test_examples.py": EVERY,
+    "test_groups.py": EVERY,
+    "test_own_packages.py": ("campaign",),
+    "test_packaging.py": EVERY,
+    "test_refusals.py": ("campaign",),
+    "test_rooms.py": EVERY,
+}
+"""Modules of tests that use a room beside its own, and are left out without it; `EVERY` of what lists all."""
 COMMANDS: Final = (
     ("scenarios.entry", "list"),
     ("scenarios.entry", "run", "hover", "--no-video", "--no-recording", "--no-figures", "--overwrite"),
