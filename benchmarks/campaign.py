@@ -9,13 +9,13 @@ from pathlib import Path
 from timing import Record, options, run
 
 from mpc.core.library import why_missing
-from scenarios.app import load
 from scenarios.assembly import Assembly
 from scenarios.campaign.campaign import fly_campaign
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.rows import read_table
 from scenarios.campaign.store import FLIGHTS_FILE, TIMES_FILE
+from scenarios.commands.app import load
 from scenarios.progress import Progress
 from scenarios.schema.scenario import Scenario
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from timing import Record, Stopwatch, options, run
 
 from quadsim.report.film.video import render_video, rendering_backend, worker_count
-from scenarios.app import load
+from scenarios.commands.app import load
 from scenarios.progress import Progress
 from scenarios.rollout import Rollout
 

@@ -8,8 +8,8 @@ import numpy as np
 from timing import Record, Stopwatch, options, run, undisturbed
 
 from quadsim.sim.loop import complete
-from scenarios.app import load
 from scenarios.assembly import Assembly
+from scenarios.commands.app import load
 from scenarios.progress import Progress
 from scenarios.rollout import closed_loop
 

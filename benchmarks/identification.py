@@ -26,7 +26,7 @@ from quadsim.flight.metrics import tracking
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.campaign.statistics import proportion
 from scenarios.design.plausible_vehicles import plausible_vehicles
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.identify.report import IdentifiedVehicle
 from scenarios.loading import parse_scenario
 from scenarios.many import fly_many

@@ -24,7 +24,7 @@ from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.design.first_scenario import first_scenario
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.identify.fit import identify_records
 from scenarios.identify.record import Record as Log
 from scenarios.loading import parse_scenario

@@ -18,8 +18,8 @@ from quadsim.assets import read_toml
 from quadsim.errors import QuadsimError
 from quadsim.flight import metrics
 from quadsim.state import INDEX, POSITION
-from scenarios.app import load
 from scenarios.catalogue import scenario_path
+from scenarios.commands.app import load
 from scenarios.many import fly_many
 from scenarios.progress import Progress
 from scenarios.rollout import Rollout

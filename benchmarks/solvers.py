@@ -21,9 +21,9 @@ from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import FlightError, InputError, MissingCoreError, MissingPackageError
 from quadsim.flight.log import ControlLog
 from quadsim.state import Array, make_state
-from scenarios.app import load
 from scenarios.assembly import Assembly
 from scenarios.catalogue import read_catalogue
+from scenarios.commands.app import load
 from scenarios.progress import Progress
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario

@@ -25,29 +25,29 @@ if TYPE_CHECKING:
     from quadsim.state import STATE_NAMES as STATE_NAMES
     from quadsim.state import State as State
     from quadsim.vehicle import Vehicle as Vehicle
-    from scenarios.app import catalogue as catalogue
-    from scenarios.app import check as check
-    from scenarios.app import compare as compare
-    from scenarios.app import doctor as doctor
-    from scenarios.app import feasibility as feasibility
-    from scenarios.app import film as film
-    from scenarios.app import fly as fly
-    from scenarios.app import load as load
-    from scenarios.app import load_vehicle as load_vehicle
-    from scenarios.app import make_controller as make_controller
-    from scenarios.app import problem as problem
-    from scenarios.app import read as read
-    from scenarios.app import run as run
-    from scenarios.app import start as start
-    from scenarios.app import view as view
     from scenarios.campaign.commands import campaign as campaign
     from scenarios.campaign.commands import replay as replay
     from scenarios.campaign.commands import sweep as sweep
+    from scenarios.commands.app import catalogue as catalogue
+    from scenarios.commands.app import check as check
+    from scenarios.commands.app import compare as compare
+    from scenarios.commands.app import doctor as doctor
+    from scenarios.commands.app import feasibility as feasibility
+    from scenarios.commands.app import film as film
+    from scenarios.commands.app import fly as fly
+    from scenarios.commands.app import load as load
+    from scenarios.commands.app import load_vehicle as load_vehicle
+    from scenarios.commands.app import make_controller as make_controller
+    from scenarios.commands.app import problem as problem
+    from scenarios.commands.app import read as read
+    from scenarios.commands.app import run as run
+    from scenarios.commands.app import start as start
+    from scenarios.commands.app import view as view
     from scenarios.design.commands import scenario as scenario
     from scenarios.design.commands import vehicle_report as vehicle_report
     from scenarios.export.exporter import export as export
     from scenarios.export.in_the_loop import fly_exported as fly_exported
-    from scenarios.flight import Flight as Flight
+    from scenarios.flown import Flight as Flight
     from scenarios.identify.commands import identify as identify
     from scenarios.live.commands import live as live
     from scenarios.papers.commands import reproduce as reproduce
@@ -91,7 +91,7 @@ _require_own_packages()
 
 def _command() -> int:
     """The `quadsim` command: it starts here, so that it finds our own packages too; returns the exit status."""
-    from scenarios.entry import main
+    from scenarios.commands.entry import main
 
     return main()
 
@@ -101,13 +101,13 @@ _MODULES = {
     "quadsim.errors": "QuadsimError",
     "quadsim.state": "STATE_NAMES State",
     "quadsim.vehicle": "Vehicle",
-    "scenarios.app": "catalogue check compare doctor feasibility film fly load load_vehicle make_controller problem "
-    "read run start view",
+    "scenarios.commands.app": "catalogue check compare doctor feasibility film fly load load_vehicle make_controller "
+    "problem read run start view",
     "scenarios.campaign.commands": "campaign replay sweep",
     "scenarios.design.commands": "scenario vehicle_report",
     "scenarios.export.exporter": "export",
     "scenarios.export.in_the_loop": "fly_exported",
-    "scenarios.flight": "Flight",
+    "scenarios.flown": "Flight",
     "scenarios.identify.commands": "identify",
     "scenarios.live.commands": "live",
     "scenarios.papers.commands": "reproduce",

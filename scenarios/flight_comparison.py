@@ -17,7 +17,7 @@ from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
 from quadsim.outputs import reserving
 from quadsim.report.comparison import different_audits
 from quadsim.report.table import QuantityRow
-from scenarios.flight import Flight, require_rendering, worst_margin
+from scenarios.flown import Flight, require_rendering, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import reaudit, stored_run

@@ -22,7 +22,7 @@ from scenarios.schema.settings import apply_setting
 def load_scenario(
     source: Scenario | str | Path, changes: Mapping[str, Any] | Sequence[str] = (), seed: int | None = None
 ) -> Scenario:
-    """Return the scenario of `assemble`; see `scenarios.app.load`."""
+    """Return the scenario of `assemble`; see `scenarios.commands.app.load`."""
     return assemble(source, changes, seed).scenario
 
 

@@ -30,8 +30,8 @@ from quadsim.sim.computation import physics_steps
 from quadsim.sim.effects.rotors import LagChange
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array, wrapped
 from scenarios.assembly import Assembly
+from scenarios.commands.junit import Cases, flight_verdicts
 from scenarios.courses.csv_course import Csv
-from scenarios.junit import Cases, flight_verdicts
 from scenarios.loading import parse_scenario
 from scenarios.plugin import is_plugin
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
@@ -70,12 +70,12 @@ class Reaudit(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios.summary_tables import summary_tables
+        from scenarios.commands.summary_tables import summary_tables
 
         return summary_tables(self.to_json())
 
     def verdicts(self) -> tuple[str, Cases]:
-        """See `scenarios.junit.Judged`."""
+        """See `scenarios.commands.junit.Judged`."""
         return flight_verdicts(self.summary)
 
     def to_json(self) -> dict[str, Any]:
@@ -128,7 +128,7 @@ def stored_run(directory: Path) -> rundir.Run:
     Raises:
         FileError: a file is missing or damaged.
     """
-    from scenarios.summary_tables import summary_tables
+    from scenarios.commands.summary_tables import summary_tables
 
     run = rundir.load_run(directory)
     try:

@@ -20,7 +20,7 @@ from quadsim.flight.metrics import unrecovered
 from quadsim.state import Array
 from scenarios.assembly import Assembly
 from scenarios.feasibility_check import hover_notes, hover_speed
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.infeasibility import Settings, change_text, changed_scenario
 from scenarios.schema.scenario import Scenario
 

@@ -22,7 +22,7 @@ EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
 
 
 class Result:
-    """A result of the functions of `scenarios.app` that users and programs read."""
+    """A result of the functions of `scenarios.commands.app` that users and programs read."""
 
     @property
     def exit_status(self) -> int:

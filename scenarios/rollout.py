@@ -25,8 +25,8 @@ from quadsim.sim.physics import Observation, Period, one_period
 from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from scenarios.assembly import Assembly
-from scenarios.flight import Flight
 from scenarios.flight_events import FlightEvents, Successor, prepared
+from scenarios.flown import Flight
 from scenarios.progress import Progress, silent
 from scenarios.schema.events import ControllerEvent, Event
 from scenarios.schema.scenario import LONGEST_FLIGHT, Scenario
@@ -122,8 +122,8 @@ class Rollout:
             scenario: the scenario to fly, or its assembly.
             law: replaces the scenario's controller.
             forces: replace the scenario's forces.
-            live: see `scenarios.app.start`.
-            recorded: see `scenarios.app.start`.
+            live: see `scenarios.commands.app.start`.
+            recorded: see `scenarios.commands.app.start`.
 
         Raises:
             InputError: something cannot be built.

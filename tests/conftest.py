@@ -21,11 +21,11 @@ from quadsim.flight.rundir import Run
 from quadsim.vehicle import Vehicle
 from scenarios.assembly import Assembly
 from scenarios.catalogue import scenario_names
-from scenarios.flight import Flight
+from scenarios.commands.rooms import ROOMS
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.rollout import Rollout
-from scenarios.rooms import ROOMS
 
 # Compiled code is cached, whatever the environment sets: the workers, and all processes that tests
 # start, would compile the same modules again.  `make clean` removes it.

@@ -18,7 +18,7 @@ from quadsim.controller import ACCEPTED, SOLVED
 from quadsim.flight.audit import worst_finding
 from quadsim.flight.metrics import peak_tilt, tracking
 from scenarios.catalogue import scenario_names
-from scenarios.flight import Flight, summarise
+from scenarios.flown import Flight, summarise
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 

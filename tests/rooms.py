@@ -1,8 +1,8 @@
 """Take rooms away and see the rest pass: `make rooms`.
 
 In a copy of the checkout each room loses its folders, its tests, its pages and its lines in the two lists of rooms,
-`scenarios/rooms.py` and `quadsim/__init__.py`; then `quadsim list`, `quadsim run hover` and the remaining quick tests
-are run there.
+`scenarios/commands/rooms.py` and `quadsim/__init__.py`; then `quadsim list`, `quadsim run hover` and the remaining
+quick tests are run there.
 
     python tests/rooms.py                # each room by itself, then all at once
     python tests/rooms.py live campaign  # these two at once
@@ -23,7 +23,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-from scenarios.rooms import ROOMS
+from scenarios.commands.rooms import ROOMS
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 PARTS: Final = {
@@ -68,8 +68,8 @@ USING: Final = {
 }
 """Modules of tests that use a room beside its own, and are left out without it; `EVERY` of what lists all."""
 COMMANDS: Final = (
-    ("scenarios.entry", "list"),
-    ("scenarios.entry", "run", "hover", "--no-video", "--no-recording", "--no-figures", "--overwrite"),
+    ("scenarios.commands.entry", "list"),
+    ("scenarios.commands.entry", "run", "hover", "--no-video", "--no-recording", "--no-figures", "--overwrite"),
 )
 """What has to work without any room."""
 
@@ -92,7 +92,7 @@ def copy_without(rooms: Iterable[str], folder: Path) -> None:
         for part in (f"scenarios/{room}", f"tests/scenarios/{room}", *PARTS[room]):
             path = folder / part
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-        _drop_entry(folder / "scenarios" / "rooms.py", room)
+        _drop_entry(folder / "scenarios" / "commands" / "rooms.py", room)
         names = folder / "quadsim" / "__init__.py"
         lines = names.read_text(encoding="utf-8").splitlines(keepends=True)
         names.write_text("".join(line for line in lines if not re.search(rf"\bscenarios\.{room}\b", line)))

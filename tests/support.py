@@ -31,7 +31,7 @@ from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios import many
 from scenarios.assembly import Assembly
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.many import Row
 from scenarios.rollout import closed_loop

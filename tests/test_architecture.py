@@ -16,7 +16,7 @@ from typing import TypeGuard
 
 import pytest
 
-from scenarios.rooms import ROOMS
+from scenarios.commands.rooms import ROOMS
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("quadsim", "mpc", "scenarios")
@@ -257,10 +257,10 @@ def test_what_is_imported_is_what_is_declared(imports: list[Import]) -> None:
 
 
 def test_help_loads_little_and_list_no_simulator() -> None:
-    loaded = loaded_by("import scenarios.cli\nscenarios.cli.main(['--help'])")
+    loaded = loaded_by("import scenarios.commands.cli\nscenarios.commands.cli.main(['--help'])")
     assert "scenarios" in loaded
     assert loaded & declared() == {"cyclopts", "rich"}
-    loaded = loaded_by("import scenarios.cli\nscenarios.cli.main(['list'])")
+    loaded = loaded_by("import scenarios.commands.cli\nscenarios.commands.cli.main(['list'])")
     assert not loaded & {"mujoco", "pydantic", "pyarrow", "pandas"}
 
 

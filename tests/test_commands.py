@@ -15,9 +15,9 @@ from support import NO_PRODUCTS, fly_here
 import quadsim
 from quadsim.errors import RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
-from scenarios.app import app
-from scenarios.cli import main
-from scenarios.flight import Flight
+from scenarios.commands.app import app
+from scenarios.commands.cli import main
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED
 from scenarios.rollout import Rollout

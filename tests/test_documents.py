@@ -17,7 +17,7 @@ import remake
 from golden_numbers import PAPER, paper_entry, read
 from test_spine import spine
 
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenarios.cli import main
-from scenarios.flight import Flight
+from scenarios.commands.cli import main
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 

@@ -53,5 +53,7 @@ def test_one_that_was_imported_before_is_named_with_what_to_do(beside: Path, nam
 
 
 def test_quadsim_s_own_may_be_imported_first(tmp_path: Path) -> None:
-    done = run("import mpc, scenarios.entry\nfirst = mpc\nimport quadsim, mpc\nprint(mpc is first)\n", tmp_path)
+    done = run(
+        "import mpc, scenarios.commands.entry\nfirst = mpc\nimport quadsim, mpc\nprint(mpc is first)\n", tmp_path
+    )
     assert done.stdout == "True\n", done.stderr

@@ -91,7 +91,7 @@ def test_wheel_flies_alone(installed: Path, tmp_path: Path) -> None:
     flight = ["run", "hover", "--set", "duration=1.0", "--no-video", "--no-recording", "--no-figures"]
     comparison = ["compare", "runs/hover", "--out", "page"]
     code = (
-        "import sys, quadsim, mpc, scenarios; from scenarios.cli import main; "
+        "import sys, quadsim, mpc, scenarios; from scenarios.commands.cli import main; "
         "print(quadsim.__file__, mpc.__file__, scenarios.__file__); "
         f"sys.exit(main({flight}) or main({comparison}))"
     )
@@ -107,7 +107,7 @@ def test_wheel_flies_alone(installed: Path, tmp_path: Path) -> None:
 
 def test_version_is_the_same_everywhere(dist: Path) -> None:
     printed = subprocess.run(
-        [sys.executable, "-m", "scenarios.entry", "--version"], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-m", "scenarios.commands.entry", "--version"], cwd=ROOT, capture_output=True, text=True
     )
     changes = re.search(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     citation = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)

@@ -27,7 +27,7 @@ from quadsim.vehicle import VEHICLE_UNITS, load_vehicle
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import load_plan, parse_campaign, read_campaign
 from scenarios.catalogue import campaign_names, scenario_names, scenario_path
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.base import fields_of
 from scenarios.schema.bases import read_scenario

@@ -10,11 +10,11 @@ import pytest
 import rooms as taking
 from test_architecture import PACKAGES, Import, imports_of, modules
 
-from scenarios.rooms import ROOMS, commands_of
+from scenarios.commands.rooms import ROOMS, commands_of
 
 MOST_USED = 276
 """Names of the core that rooms import, each counted once; they may only get fewer."""
-LISTS = ("quadsim", "quadsim.gym", "scenarios.rooms")
+LISTS = ("quadsim", "quadsim.gym", "scenarios.commands.rooms")
 """Where a room is named: what users import, and the list of the rooms."""
 
 
@@ -76,5 +76,5 @@ def test_without_a_room_the_rest_imports(room: str, tmp_path: Path) -> None:
     """The command and its list, in a copy; `make rooms` runs its tests too."""
     taking.copy_without([room], tmp_path)
     assert not (tmp_path / "scenarios" / room).exists()
-    assert room not in (tmp_path / "scenarios" / "rooms.py").read_text().split("ROOMS")[1].split('"')
+    assert room not in (tmp_path / "scenarios" / "commands" / "rooms.py").read_text().split("ROOMS")[1].split('"')
     assert taking.failure_of(taking.COMMANDS, tmp_path) is None

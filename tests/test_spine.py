@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 MOST_ENTERED, MOST_LOADED, MOST_FRAMES, LONGEST_CHAIN, SPINE_LINES = 85, 146, 8, 20, 2450
 MOST_DATA_TYPES, MOST_CLASSES = 16, 74  # may only fall
 COUNTED = "import runpy; runpy.run_path('tests/count_types.py', run_name='__main__')"
-HELP = "import scenarios.cli; scenarios.cli.main(['--help'])"
+HELP = "import scenarios.commands.cli; scenarios.commands.cli.main(['--help'])"
 WATCHED = """
 import json, sys
 from collections import Counter
@@ -51,7 +51,7 @@ def watch(frame, event, _):
 
 sys.argv = ["quadsim", *sys.argv[1:]]
 sys.setprofile(watch)
-from scenarios.entry import main
+from scenarios.commands.entry import main
 status = main()
 sys.setprofile(None)
 print(json.dumps([status, sorted(entered), sorted(loaded | entered), calls, frames]), file=sys.stderr)
@@ -151,7 +151,7 @@ def test_the_longest_chain_of_imports_is_short() -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "most"), [("import quadsim", 0.1), ("import scenarios.cli as c; c.main(['-h'])", 0.3)]
+    ("code", "most"), [("import quadsim", 0.1), ("import scenarios.commands.cli as c; c.main(['-h'])", 0.3)]
 )
 def test_what_answers_at_once_does(code: str, most: float) -> None:
     """Processor time of the fastest of five, without the interpreter's own; twice that on a busy machine."""

@@ -136,12 +136,12 @@ def architecture() -> str:
     parts += [arrow(other, 378, other, 336, "turn"), text(other + 10, 361, "answer, checked", "start", TURN)]
     parts += [arrow(right, 307, left + wide + 2, 307, "turn"), text(335, 299, "command", colour=TURN)]
     parts.append(arrow(middle, 562, middle, 588, "soft"))
-    parts += box(left, 590, wide, "Flight", "scenarios.flight:Flight")
+    parts += box(left, 590, wide, "Flight", "scenarios.flown:Flight")
     parts += [arrow(left + wide, 617, right - 2, 617, "soft")]
     parts += box(right, 590, wide, "Audit", "quadsim.flight.audit:audit")
     parts += [arrow(other, 646, other, 674, "soft"), arrow(middle, 646, middle, 674, "soft")]
     parts += box(left, 676, wide, "Tables", "quadsim.flight.parquet:write_log")
-    parts += box(right, 676, wide, "Summary", "scenarios.flight:summarise")
+    parts += box(right, 676, wide, "Summary", "scenarios.flown:summarise")
     return svg(680, 745, parts)
 
 

@@ -37,8 +37,8 @@ from scenarios.campaign.store import (
     read_manifest,
     stored_plan,
 )
-from scenarios.flight import Flight, to_pandas
-from scenarios.junit import Cases
+from scenarios.commands.junit import Cases
+from scenarios.flown import Flight, to_pandas
 from scenarios.machine import code_digest
 from scenarios.many import MEMORY, TIMEOUT, count_workers
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
@@ -79,7 +79,7 @@ class CampaignResult(Result):
         return EXIT_DONE if all(judgement.holds for judgement in self.judgements) else EXIT_FAILED
 
     def verdicts(self) -> tuple[str, Cases]:
-        """See `scenarios.junit.Judged`."""
+        """See `scenarios.commands.junit.Judged`."""
         cases = [(entry.requirement.text, entry.holds, entry.sentence) for entry in self.judgements]
         return self.summary["campaign"], cases
 

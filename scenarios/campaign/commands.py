@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 from cyclopts import Parameter
 
 from quadsim.errors import InputError, ParameterError
-from scenarios.arguments import (
+from scenarios.catalogue import campaign_names
+from scenarios.commands.arguments import (
     Changes,
     ComparedName,
     Fields,
@@ -25,7 +26,6 @@ from scenarios.arguments import (
     Watched,
     Whole,
 )
-from scenarios.catalogue import campaign_names
 
 if TYPE_CHECKING:
     from scenarios.campaign.campaign import CampaignResult, Replay
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     CampaignName: TypeAlias = ScenarioName
     Draws: TypeAlias = Sequence[Mapping[str, Any]]
 else:
-    from scenarios.arguments import one_of
+    from scenarios.commands.arguments import one_of
 
     CampaignResult = PairedComparison = Replay = Any
     CampaignName = one_of(campaign_names)
@@ -158,7 +158,7 @@ def campaign(
     from scenarios.campaign.events import parse_event
     from scenarios.campaign.plan import load_plan, make_plan
     from scenarios.campaign.statistics import judge, parse_requirement
-    from scenarios.junit import junit_file, write_junit
+    from scenarios.commands.junit import junit_file, write_junit
     from scenarios.results import after
     from scenarios.schema.scenario import Scenario
     from scenarios.user_code import importable
@@ -232,7 +232,7 @@ def replay(
     """
     from quadsim.outputs import run_directory
     from scenarios.campaign.campaign import compare_replay, recorded_flight
-    from scenarios.flight import require_rendering, write_run
+    from scenarios.flown import require_rendering, write_run
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
 

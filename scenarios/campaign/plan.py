@@ -20,7 +20,7 @@ from scenarios.campaign.campaign_file import CampaignFile, Draws, Value, Varied
 from scenarios.campaign.events import CountedEvent, parse_event
 from scenarios.campaign.rows import DRAW, TIMES, flown_row, make_schema
 from scenarios.catalogue import campaign_path, scenario_path
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.loading import parse_scenario
 from scenarios.machine import processor_name
 from scenarios.many import ERROR, MEMORY, Row, fly_many

@@ -20,7 +20,7 @@ from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import CampaignFile, GridValues
 from scenarios.campaign.plan import Plan, audited, cell
 from scenarios.campaign.rows import DRAW, is_number, make_table, numbers
-from scenarios.flight import to_pandas
+from scenarios.flown import to_pandas
 from scenarios.progress import Progress, silent
 from scenarios.results import Result, Shown
 from scenarios.schema.scenario import Scenario

@@ -10,8 +10,8 @@ from cyclopts import Parameter
 
 from quadsim.assets import vehicle_names
 from quadsim.errors import InputError, ParameterError
-from scenarios.arguments import Changes, File, Flag, ScenarioName, VehicleName, Whole
 from scenarios.catalogue import scenario_names
+from scenarios.commands.arguments import Changes, File, Flag, ScenarioName, VehicleName, Whole
 
 if TYPE_CHECKING:
     from scenarios.design.vehicle_report import VehicleReport

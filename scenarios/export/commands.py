@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Any, Final
 
-from scenarios.arguments import Changes, File, Flag, ScenarioName, Watched, Whole
+from scenarios.commands.arguments import Changes, File, Flag, ScenarioName, Watched, Whole
 
 if TYPE_CHECKING:
-    from scenarios.flight import Flight
+    from scenarios.flown import Flight
     from scenarios.results import Document
 else:
     Document = Flight = Any

@@ -36,7 +36,7 @@ from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly
 from scenarios.export.exporter import c_controller, exported_law, programs
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, reporting
 from scenarios.rollout import Rollout

@@ -23,11 +23,11 @@ from quadsim.sim.physics import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array, wrapped
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.catalogue import scenario_names, scenario_path
-from scenarios.flight import Flight
+from scenarios.commands.rooms import commands_of
+from scenarios.flown import Flight
 from scenarios.gym.spaces import USUAL, Action, Actions, Observations
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
-from scenarios.rooms import commands_of
 from scenarios.schema.base import LARGEST_SEED
 from scenarios.schema.bases import read_scenario
 from scenarios.schema.scenario import Scenario

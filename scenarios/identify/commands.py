@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadsim.errors import InputError, ParameterError
-from scenarios.arguments import File, Files, Flag, VehicleName, Whole
+from scenarios.commands.arguments import File, Files, Flag, VehicleName, Whole
 
 if TYPE_CHECKING:
     from scenarios.identify.report import IdentifiedVehicle

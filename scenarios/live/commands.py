@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadsim.errors import ParameterError
-from scenarios.arguments import Changes, File, Flag, ScenarioName, Whole
+from scenarios.commands.arguments import Changes, File, Flag, ScenarioName, Whole
 
 if TYPE_CHECKING:
     from scenarios.results import Document

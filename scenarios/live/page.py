@@ -31,7 +31,7 @@ from quadsim.report.figure import least_range
 from quadsim.rotation import quaternion_to_euler
 from quadsim.sim.physics import Period
 from quadsim.state import POSITION, wrapped
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.live import readout
 from scenarios.live.controls import ControllerTab, Steering, Widgets, disturb
 from scenarios.live.guard import Guard

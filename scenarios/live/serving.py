@@ -19,7 +19,7 @@ from quadsim.errors import MissingPackageError, ParameterError
 from quadsim.outputs import run_directory
 from scenarios import console
 from scenarios.catalogue import scenario_names
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.live.guard import LOOPBACK
 from scenarios.live.pace import Pace
 from scenarios.live.session import Session, read_script

@@ -28,8 +28,8 @@ from quadsim.sim.effects.wind import Air, WindChange
 from quadsim.sim.physics import Period
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 from scenarios.assembly import Assembly, preferring_core
-from scenarios.flight import Flight
 from scenarios.flight_events import Successor
+from scenarios.flown import Flight
 from scenarios.progress import Progress, silent
 from scenarios.rollout import Rollout
 from scenarios.schema.controllers import AnyController

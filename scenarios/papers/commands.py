@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from scenarios.arguments import File, Watched
 from scenarios.catalogue import paper_names
+from scenarios.commands.arguments import File, Watched
 
 if TYPE_CHECKING:
     from scenarios.papers.reproduction import Reproductions
 
     PaperName: TypeAlias = File
 else:
-    from scenarios.arguments import one_of
+    from scenarios.commands.arguments import one_of
 
     Reproductions = Any
     PaperName = one_of(paper_names)
@@ -40,7 +40,7 @@ def reproduce(
         >>> paper.within, paper.numbers[2].spec.published, round(paper.numbers[2].ours, 3)
         (True, 250.0, 250.0)
     """
-    from scenarios.junit import junit_file, write_junit
+    from scenarios.commands.junit import junit_file, write_junit
     from scenarios.papers.reproduction import Reproductions, load_paper, reproduce_paper
     from scenarios.progress import reporting
     from scenarios.results import after

@@ -18,7 +18,7 @@ from quadsim.input_limits import MOST_ENTRIES
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
 from scenarios.assembly import Assembly
 from scenarios.catalogue import paper_path, scenario_path
-from scenarios.junit import Cases
+from scenarios.commands.junit import Cases
 from scenarios.loading import parse_scenario
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
@@ -220,7 +220,7 @@ class Reproductions(tuple[Reproduction, ...], Result):
         return EXIT_DONE if all(paper.within for paper in self) else EXIT_FAILED
 
     def verdicts(self) -> tuple[str, Cases]:
-        """See `scenarios.junit.Judged`."""
+        """See `scenarios.commands.junit.Judged`."""
         numbers = [(entry.paper.name, number) for entry in self for number in entry.numbers]
         return "reproduce", [(f"{paper}: {it.spec.name}", it.within, it.sentence) for paper, it in numbers]
 

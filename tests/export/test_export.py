@@ -22,7 +22,7 @@ from quadsim.errors import ExportError, OutputError, ParameterError
 from quadsim.state import REFERENCE_STATES, Array
 from scenarios.assembly import Assembly
 from scenarios.catalogue import read_catalogue
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.export.exporter import FACTS, c_controller, export, exported_law, room_sentence
 from scenarios.export.record import record
 from scenarios.loading import load_scenario

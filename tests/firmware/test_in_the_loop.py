@@ -10,7 +10,7 @@ import pytest
 
 from mpc.codegen.targets import TARGETS
 from quadsim.errors import FlightError, MissingProgramError
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.export.in_the_loop import Program, SerialMPC, fly_exported, require_programs
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout

@@ -35,7 +35,7 @@ from mpc.solvers.piqp import Piqp
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 
 LAG = 0.05
 

@@ -18,7 +18,7 @@ from mpc.solvers import SOLVERS, Formulation, QPSolver, make_backend
 from mpc.solvers.piqp import Piqp
 from quadsim.controller import SOLVED
 from quadsim.state import Array
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 
 STATE = np.zeros(12)
 STATE[10] = np.pi / 6

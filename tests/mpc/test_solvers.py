@@ -24,7 +24,7 @@ from mpc.solvers.daqp import DaqpDense
 from mpc.solvers.piqp import Piqp
 from quadsim.controller import CORE, GAIN, SOLVED, StepInputs
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 

@@ -10,7 +10,7 @@ from mpc.ocp import Query
 from mpc.solvers import SOLVERS, QPSolver, find_solver, make_backend
 from mpc.solvers.qpsolvers import UNSOLVED
 from quadsim.controller import SOLVED
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.results import EXIT_DONE
 
 NAMES = (*SOLVERS, "clarabel", "osqp", "proxqp", "quadprog")

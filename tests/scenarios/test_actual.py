@@ -18,7 +18,7 @@ from quadsim.report.comparison import comparison_rows
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import VEHICLE_UNITS
 from scenarios.assembly import Assembly
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.reaudit import reaudit
 from scenarios.rollout import Rollout

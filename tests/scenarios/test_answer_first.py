@@ -12,7 +12,7 @@ from flown_logs import fly_eight, write_log
 
 import quadsim
 from quadsim.errors import OutputError
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
 
 SHORT = ("--set", "duration=0.5", "--set", "constraints=[]")
@@ -71,7 +71,7 @@ def test_runs_and_their_comparison_stand_without_figures(here: Path, capsys: pyt
 @pytest.mark.parametrize(
     ("command", "broken", "shown"),
     [
-        (("check", "hover", *SHORT, "--junit", "v.xml"), "scenarios.junit.write_junit", "verdict"),
+        (("check", "hover", *SHORT, "--junit", "v.xml"), "scenarios.commands.junit.write_junit", "verdict"),
         (("compare", "r", "r", "--out", "pair"), "quadsim.report.comparison_page.render_page", "outcome"),
         (("vehicle", "hummingbird", "--out", "v.png"), "quadsim.report.film.video.render_portrait", "hummingbird"),
     ],

@@ -14,7 +14,7 @@ from mpc.ocp import Query, predicted
 from mpc.qp import KKT_EVERY
 from mpc.solvers import QPSolver
 from mpc.solvers.piqp import Piqp
-from scenarios.flight import summarise
+from scenarios.flown import summarise
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 

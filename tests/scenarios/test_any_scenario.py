@@ -22,7 +22,7 @@ from quadsim.errors import InputError
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import write_log
 from scenarios.assembly import Assembly
-from scenarios.flight import summarise
+from scenarios.flown import summarise
 from scenarios.loading import parse_scenario
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario

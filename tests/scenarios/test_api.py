@@ -26,7 +26,7 @@ from quadsim.flight import rundir
 from quadsim.report.film.video import rendering_backend
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.schema.scenario import Scenario
 
 Fly = Callable[..., Flight]

@@ -19,12 +19,12 @@ from quadsim import __version__
 from quadsim.assets import vehicle_names
 from quadsim.errors import RenderingUnavailableError
 from quadsim.flight import rundir
-from scenarios import flight
-from scenarios.app import app
+from scenarios import flown
 from scenarios.campaign.plan import read_campaign
 from scenarios.catalogue import campaign_names, scenario_names
-from scenarios.cli import main
-from scenarios.doctor import capabilities
+from scenarios.commands.app import app
+from scenarios.commands.cli import main
+from scenarios.commands.doctor import capabilities
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
@@ -140,7 +140,7 @@ def test_doctor_reports_a_package_that_does_not_work_and_the_rest(monkeypatch: p
         raise RuntimeError("libdaqp.so is of another machine")
 
     monkeypatch.setattr("mpc.solvers.daqp.DaqpDense.setup", broken)
-    monkeypatch.setattr("scenarios.doctor._rendering", lambda: 1 / 0)
+    monkeypatch.setattr("scenarios.commands.doctor._rendering", lambda: 1 / 0)
     checks = capabilities()
     assert checks["solvers"]["daqp"] == "fails: RuntimeError: libdaqp.so is of another machine"
     assert checks["rendering"]["video"] == "fails: ZeroDivisionError: division by zero"
@@ -163,14 +163,14 @@ def test_run_prints_tables_and_where_the_files_are(here: Path, capsys: pytest.Ca
 def test_run_prints_the_verdict_before_its_film_and_what_to_open_at_its_end(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before, make = [], flight._add_products
+    before, make = [], flown._add_products
 
     def slow(*arguments: Any) -> dict[str, str]:
         before.append(capsys.readouterr().out)
         assert rundir.read_summary(here / "runs" / "hover")["verdict"] == "satisfied"
         return make(*arguments)
 
-    monkeypatch.setattr(flight, "_add_products", slow)
+    monkeypatch.setattr(flown, "_add_products", slow)
     assert main(["run", "hover", *SHORT, "--no-video", "--no-figures"]) == EXIT_DONE
     assert before[0].startswith("hover  completed, every required constraint holds  0.50 s flown\n")
     assert capsys.readouterr().out == "written to runs/hover\nquadsim view runs/hover\n"

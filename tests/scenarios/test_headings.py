@@ -16,7 +16,7 @@ from quadsim.state import INDEX, REFERENCE_NAMES, TURN, Array, make_state
 from scenarios.assembly import Assembly
 from scenarios.courses.csv_course import tabulated
 from scenarios.feasibility_check import report
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 
 YAW: Final = REFERENCE_NAMES.index("yaw")
 CONTROLLERS: Final[dict[str, tuple[str, dict[str, Any]]]] = {

@@ -7,8 +7,8 @@ import shlex
 
 import pytest
 
-from scenarios.app import app
-from scenarios.cli import main
+from scenarios.commands.app import app
+from scenarios.commands.cli import main
 
 COMMANDS = [
     "campaign",

@@ -29,7 +29,7 @@ from quadsim.vehicle import Vehicle
 from scenarios import infeasibility, remedies
 from scenarios.assembly import Assembly
 from scenarios.catalogue import scenario_path
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.infeasibility import diagnose
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.rollout import Rollout

@@ -16,7 +16,7 @@ from quadsim.controller import StepInputs
 from quadsim.errors import InputError
 from quadsim.state import INDEX, Array
 from scenarios.campaign.plan import make_plan
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.rollout import Rollout
 from scenarios.schema.bases import read_whole

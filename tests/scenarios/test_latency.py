@@ -11,7 +11,7 @@ import pytest
 import quadsim
 from quadsim.flight.rundir import load_run
 from quadsim.report.figure import commanded_speeds
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.reaudit import reaudit
 from scenarios.schema.scenario import Scenario
 

@@ -21,7 +21,7 @@ from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from quadsim.report.comparison import comparison_rows
 from scenarios.campaign.rows import flown_row
 from scenarios.catalogue import CONTROLLERS, FLIGHTS, scenario_names
-from scenarios.flight import Flight, summarise
+from scenarios.flown import Flight, summarise
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.rollout import Rollout
 from scenarios.schema.base import fields_of

@@ -11,7 +11,7 @@ import pytest
 import quadsim
 from quadsim.flight.audit import UNAUDITED_ADVICE, Limit
 from scenarios.assembly import Assembly
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.live.session import Session
 from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit

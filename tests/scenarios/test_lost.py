@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from quadsim.flight import rundir
-from scenarios import cli
-from scenarios.flight import summarise
+from scenarios.commands import cli
+from scenarios.flown import summarise
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 

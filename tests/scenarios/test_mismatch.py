@@ -9,7 +9,7 @@ import pytest
 
 import quadsim
 from scenarios.assembly import Assembly
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.loading import load_scenario
 from scenarios.mismatch import model_notes
 

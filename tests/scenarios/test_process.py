@@ -31,7 +31,7 @@ def environment() -> dict[str, str]:
 @pytest.mark.witness("process")
 def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0() -> None:
     """`quadsim list | true`."""
-    command = [sys.executable, "-m", "scenarios.entry", "list"]
+    command = [sys.executable, "-m", "scenarios.commands.entry", "list"]
     process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stderr is not None
@@ -88,7 +88,7 @@ def listening() -> None:
 @pytest.mark.parametrize("closed", [(1,), (0, 2)])
 def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "scenarios.entry", "run", "hover", *TABLES, *SHORT, "--out", "run"],
+        [sys.executable, "-m", "scenarios.commands.entry", "run", "hover", *TABLES, *SHORT, "--out", "run"],
         cwd=tmp_path,
         env=environment(),
         capture_output=True,
@@ -106,7 +106,18 @@ def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> N
 
 def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-m", "scenarios.entry", "run", "hover", *TABLES, "--set", "duration=1800", "--out", "run"],
+        [
+            sys.executable,
+            "-m",
+            "scenarios.commands.entry",
+            "run",
+            "hover",
+            *TABLES,
+            "--set",
+            "duration=1800",
+            "--out",
+            "run",
+        ],
         cwd=tmp_path,
         env=environment(),
         stdout=subprocess.PIPE,
@@ -139,7 +150,7 @@ def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path) -> N
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full to write to")
 def test_output_that_cannot_be_written_is_reported() -> None:
     with Path("/dev/full").open("w") as full:
-        command = [sys.executable, "-m", "scenarios.entry", "list", "--json"]
+        command = [sys.executable, "-m", "scenarios.commands.entry", "list", "--json"]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     assert done.stderr == "quadsim: cannot write the output: No space left on device\n"
     assert done.returncode == EXIT_WRONG_INPUT

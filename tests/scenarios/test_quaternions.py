@@ -15,7 +15,7 @@ from quadsim.flight.parquet import read_log, write_log
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion, quaternion_to_euler
 from quadsim.sim.physics import physics_to_state
 from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, Array, YawTurns, tilt
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 

@@ -21,8 +21,8 @@ from quadsim.errors import FileError
 from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
 from scenarios.assembly import Assembly
-from scenarios.cli import main
-from scenarios.flight import Flight
+from scenarios.commands.cli import main
+from scenarios.flown import Flight
 from scenarios.reaudit import _in_force, reaudit
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 

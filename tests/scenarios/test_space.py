@@ -19,13 +19,13 @@ from quadsim.report.figure import Scene, has_space, obstacles_in, outlines, regi
 from quadsim.report.flight_figures import page_figures, write_figures
 from quadsim.report.recording import write_recording
 from quadsim.space import Cylinder
-from scenarios.flight import Flight
+from scenarios.commands.summary_tables import outcome_line
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import plain
-from scenarios.summary_tables import outcome_line
 
 PILLAR = {"type": "cylinder", "name": "pillar", "position": [1.0, 0.0, 1.0], "radius": 0.1, "height": 3.0}
 BALL = {

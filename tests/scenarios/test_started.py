@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from quadsim.errors import CommandError, FlightError, InputError
 from scenarios.assembly import Assembly
-from scenarios.flight import Flight
 from scenarios.flight_events import prepared
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario

@@ -15,7 +15,7 @@ from quadsim.flight.metrics import never_took_off
 from quadsim.flight.phase import AIRBORNE, LARGEST_LEAD
 from quadsim.sim.loop import TAKEOFF_LEAD
 from quadsim.state import INDEX
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.reaudit import reaudit
 from scenarios.results import EXIT_FAILED
 

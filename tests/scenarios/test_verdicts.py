@@ -23,7 +23,7 @@ from quadsim.flight.audit import (
     worst_finding,
 )
 from quadsim.flight.rundir import findings_of
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.law_bounds import law_limits
 from scenarios.schema.bases import merge
 from scenarios.schema.scenario import Scenario

@@ -15,7 +15,7 @@ from support import NO_PRODUCTS
 import quadsim
 from quadsim.errors import FileError
 from quadsim.flight.parquet import FORMAT
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.reaudit import reaudit
 
 

@@ -31,7 +31,7 @@ from quadsim.controller import ACCEPTED, CORE, GAIN, SOLVED, UNCONSTRAINED
 from quadsim.errors import MissingCoreError, ParameterError
 from quadsim.state import Array
 from scenarios.assembly import Assembly
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 

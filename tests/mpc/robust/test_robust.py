@@ -21,7 +21,7 @@ from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Phase, StepInput
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 
 PERIOD = 0.05
 SOFT = Soft(linear=2e5, quadratic=1e4)

@@ -220,7 +220,7 @@ def test_code_of_the_user_is_known_wherever_a_campaign_names_it(tmp_path: Path) 
 
 def test_a_campaign_that_is_killed_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     plan = plan_of_kinds(tmp_path, "sleeps", vary=[CAMPAIGN["vary"][0]], flights=16)
-    often = "from scenarios.campaign import store; store.FLUSH_S = 0.2; from scenarios.cli import main; main()"
+    often = "from scenarios.campaign import store; store.FLUSH_S = 0.2; from scenarios.commands.cli import main; main()"
     options = ("little.toml", "--out", "c", "--workers", "2", "--no-report", "--resume")
     command = [sys.executable, "-c", often, "campaign", *options]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import pytest
 import tomlkit
 
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 MASS = {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
@@ -27,7 +27,7 @@ CAMPAIGN = {
     "vary": [MASS],
 }
 HASTY = (
-    "from scenarios import entry; from scenarios.campaign import store; "
+    "from scenarios.commands import entry; from scenarios.campaign import store; "
     "store.FLUSH_S = 0.3; raise SystemExit(entry.main())"
 )
 """A command line whose campaigns write what is flown as soon as it is there."""

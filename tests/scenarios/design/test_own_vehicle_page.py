@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.results import EXIT_DONE
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "own-vehicle.md").read_text(encoding="utf-8")

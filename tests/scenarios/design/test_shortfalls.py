@@ -11,7 +11,7 @@ import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
 from scenarios.design.shortfalls import shortfalls
 from scenarios.loading import load_scenario, parse_scenario

@@ -20,7 +20,7 @@ from quadsim.report.film.video import render_portrait, rendering_backend
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.assembly import Assembly
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.design.authority import torque_ranges
 from scenarios.design.vehicle_report import make_sheet
 from scenarios.loading import load_scenario

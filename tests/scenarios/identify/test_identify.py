@@ -16,8 +16,8 @@ import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError, ParameterError
 from quadsim.vehicle import load_vehicle, vehicle_sources
-from scenarios.cli import main
-from scenarios.flight import Flight
+from scenarios.commands.cli import main
+from scenarios.flown import Flight
 from scenarios.identify.estimate import Identification, ParameterEstimate
 from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, hold_out, predict
 from scenarios.identify.record import read_record

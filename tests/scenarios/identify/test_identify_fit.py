@@ -15,7 +15,7 @@ from quadsim.errors import InputError
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES
 from quadsim.vehicle import Vehicle
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.identify.estimate import Identification, ParameterEstimate
 from scenarios.identify.fit import identify_records
 from scenarios.identify.record import Record

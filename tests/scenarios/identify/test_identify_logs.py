@@ -18,7 +18,7 @@ from quadsim.flight.parquet import write_log
 from quadsim.rotation import conjugate, quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.flight import Flight
+from scenarios.flown import Flight
 from scenarios.identify.checks import check_log, spans
 from scenarios.identify.record import Record, read_record
 from scenarios.identify.windows import to_world

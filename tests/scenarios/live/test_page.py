@@ -27,8 +27,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from scenarios.cli import main
-from scenarios.flight import Flight
+from scenarios.commands.cli import main
+from scenarios.flown import Flight
 from scenarios.live import serving
 from scenarios.live.guard import Guard
 from scenarios.live.pace import Pace

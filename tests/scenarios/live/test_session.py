@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import scenarios.flight_events
 from quadsim.errors import InputError
-from scenarios.cli import main
+from scenarios.commands.cli import main
 from scenarios.live.commands import live
 from scenarios.live.knobs import knobs
 from scenarios.live.pace import LATE, Pace

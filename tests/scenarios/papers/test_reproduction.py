@@ -17,8 +17,8 @@ import quadsim
 from quadsim.errors import FileError, UnknownNameError
 from quadsim.report.table import grid_to_markdown
 from scenarios.catalogue import paper_names, scenario_names
-from scenarios.cli import main
-from scenarios.flight import Flight
+from scenarios.commands.cli import main
+from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.papers.reproduction import (
     PublishedNumber,

@@ -1,4 +1,4 @@
-"""The `quadsim` command: it parses the line, calls a function of `scenarios.app`, and shows the result.
+"""The `quadsim` command: it parses the line, calls a function of `scenarios.commands.app`, and shows the result.
 
 Exit status: 0 done; 1 a required constraint does not hold, or the flight was aborted or interrupted; 2 invalid input.
 """
@@ -19,7 +19,7 @@ from typing import Annotated, Any, Final
 from cyclopts import CycloptsError, Parameter
 
 from quadsim.errors import QuadsimError, printable
-from scenarios.app import app
+from scenarios.commands.app import app
 from scenarios.results import EXIT_FAILED, EXIT_WRONG_INPUT, Document, Result
 
 _MOST_LINES, _LONGEST_LINE = 21, 1000  # of a message: one with many problems has a line for each

@@ -391,7 +391,7 @@ class Flight(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios.summary_tables import summary_tables
+        from scenarios.commands.summary_tables import summary_tables
 
         return summary_tables(self.to_json())
 

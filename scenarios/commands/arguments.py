@@ -15,7 +15,7 @@ from scenarios.catalogue import scenario_names
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from scenarios.flight import Flight
+    from scenarios.flown import Flight
     from scenarios.progress import Progress
     from scenarios.schema.scenario import Scenario
 

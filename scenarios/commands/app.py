@@ -1,7 +1,7 @@
 """The functions of quadsim: the API of `import quadsim` and the commands of the command line.
 
-A function under `@app.command` is both.  Only `scenarios.cli` prints; it shows the results (`scenarios.results`).
-Heavy imports are inside the functions, so that importing this module is fast.
+A function under `@app.command` is both.  Only `scenarios.commands.cli` prints; it shows the results
+(`scenarios.results`).  Heavy imports are inside the functions, so that importing this module is fast.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from cyclopts import App, Parameter
 
 from quadsim.errors import FileError, InputError, ParameterError
-from scenarios.arguments import (
+from scenarios.commands.arguments import (
     Changes,
     ComparedName,
     File,
@@ -31,7 +31,7 @@ from scenarios.arguments import (
     Watched,
     Whole,
 )
-from scenarios.rooms import ROOMS, owner_of
+from scenarios.commands.rooms import ROOMS, owner_of
 
 if TYPE_CHECKING:
     from mpc.ocp import Problem
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
     from scenarios.catalogue import Catalogue
-    from scenarios.flight import Flight
+    from scenarios.flown import Flight
     from scenarios.reaudit import Reaudit
     from scenarios.results import Listing, Result
     from scenarios.rollout import Rollout
@@ -294,7 +294,7 @@ def run(
     from quadsim.outputs import run_directory
     from scenarios import loading, user_code
     from scenarios.feasibility_check import hover_notes
-    from scenarios.flight import require_rendering, write_run
+    from scenarios.flown import require_rendering, write_run
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
 
@@ -371,7 +371,7 @@ def read(directory: str | Path) -> Flight:
     from quadsim.flight.rundir import findings_of
     from quadsim.vehicle import Vehicle
     from scenarios.assembly import Assembly
-    from scenarios.flight import Flight
+    from scenarios.flown import Flight
     from scenarios.reaudit import stored_run, stored_scenario
 
     directory = Path(directory)
@@ -429,7 +429,7 @@ def check(
         (True, ())
     """
     from scenarios import loading, reaudit
-    from scenarios.junit import junit_file, write_junit
+    from scenarios.commands.junit import junit_file, write_junit
     from scenarios.progress import reporting
     from scenarios.results import after
     from scenarios.rollout import Rollout
@@ -694,7 +694,7 @@ def doctor() -> Listing:
         >>> sorted(checks)
         ['machine', 'packages', 'rendering', 'solvers', 'viewer']
     """
-    from scenarios.doctor import capabilities
+    from scenarios.commands.doctor import capabilities
     from scenarios.results import Listing
 
     return Listing(capabilities())
