@@ -26,7 +26,7 @@ from quadsim.errors import InputError
 from quadsim.vehicle import VEHICLE_UNITS, load_vehicle
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import load_plan, parse_campaign, read_campaign
-from scenarios.catalogue import campaign_names, scenario_names, scenario_path
+from scenarios.catalogue import campaign_names, scenario_names, scenario_source
 from scenarios.cli import main
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.base import fields_of
@@ -127,9 +127,9 @@ class Kind:
 
 def kinds() -> Iterator[Kind]:
     whole = scenario_schema()
-    files = [read_scenario(scenario_path(name), scenario_path) for name in scenario_names()]
+    files = [read_scenario(scenario_source(name)) for name in scenario_names()]
     for settings in BESIDES:
-        files.append(read_scenario(scenario_path("hover"), scenario_path))
+        files.append(read_scenario(scenario_source("hover")))
         for setting in settings:
             apply_setting(files[-1], setting)
     files.sort(key=lambda data: len(str(data)))

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.assets import DEEPEST, read_toml
-from quadsim.errors import FileError, ParameterError
+from quadsim.errors import FileError, InputError, ParameterError
+from scenarios.catalogue import VARIANTS, Source, scenario_source
 from scenarios.plugin import located
-from scenarios.schema.settings import note_changes, state_bounds
+from scenarios.schema.settings import note_changes, set_field, state_bounds
 
 _TOLERANCES: Final = ("tolerance", "tolerance_sampled")
 
@@ -27,21 +28,40 @@ def locate_files(data: dict[str, Any], directory: Path) -> None:
         data["forces"] = [located(force, directory) for force in data["forces"]]
 
 
-def read_scenario(
-    path: Path,
-    find: Callable[[str], Path],
-    *,
-    locate: Callable[[dict[str, Any], Path], None] = locate_files,
-    above: tuple[Path, ...] = (),
-) -> dict[str, Any]:
-    """Return a scenario file's tables, merged over its base, the base of that, and so on.
-
-    `find` gives the file that a name means; `locate` makes the paths in a base independent of its folder, in place;
-    `above` are the files that led here.
+def read_scenario(source: Source) -> dict[str, Any]:
+    """Return a scenario's tables: of a file merged over its base, the base of that, and so on; of a variant changed.
 
     Raises:
-        FileError: a file is missing, too large, is not TOML, or is its own base in the end.
+        FileError: a file is missing, too large, is not TOML, or is its own base in the end; a variant sets what cannot
+            be set.
         ParameterError: `base` is not a text.
+    """
+    return _changed(read_merged(source.file, scenario_source, locate_files), source)
+
+
+def _changed(data: dict[str, Any], source: Source) -> dict[str, Any]:
+    """Apply what a variant sets to the tables of its file, in place."""
+    for path, value in source.changes.items():
+        try:
+            set_field(data, path, value, source="set")
+        except InputError as error:
+            raise FileError(VARIANTS, f"{source.changes['name']}.set.{path}: {error}") from error
+    return data
+
+
+def read_merged(
+    path: Path,
+    find: Callable[[str], Source],
+    locate: Callable[[dict[str, Any], Path], None],
+    above: tuple[Path, ...] = (),
+) -> dict[str, Any]:
+    """Return a file's tables, merged over its base, the base of that, and so on.
+
+    `find` gives what a name means; `locate` makes the paths in a base independent of its folder, in place; `above` are
+    the files that led here.
+
+    Raises:
+        FileError, ParameterError: as `read_scenario`.
     """
     data = _read(path)
     if "base" not in data:
@@ -51,12 +71,12 @@ def read_scenario(
         raise ParameterError(path.name, "base", name, "a scenario's name or a path ending in .toml")
     base = _find_base(path, name, find)
     chain = (*above, path.resolve())
-    if base.resolve() in chain:
+    if base.file.resolve() in chain:
         raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), base.name])}")
     if len(chain) > DEEPEST:
         raise FileError(path, f"must have at most {DEEPEST} bases above one another")
-    inherited = read_scenario(base, find, locate=locate, above=chain)
-    locate(inherited, base.parent)
+    inherited = _changed(read_merged(base.file, find, locate, chain), base)
+    locate(inherited, base.file.parent)
     if "controller" in data:
         state_bounds(inherited, data["controller"])
     # Group and expected verdict are not inherited.
@@ -66,20 +86,20 @@ def read_scenario(
     return merged
 
 
-def _find_base(path: Path, name: str, find: Callable[[str], Path]) -> Path:
-    """Return the path of a base: beside the file that names it, or in the library."""
+def _find_base(path: Path, name: str, find: Callable[[str], Source]) -> Source:
+    """Return where a base is: beside the file that names it, or in the library."""
     beside = path.parent / name
-    return beside if name.endswith(".toml") and beside.is_file() else find(name)
+    return find(str(beside) if name.endswith(".toml") and beside.is_file() else name)
 
 
-def replaced_tables(path: Path, find: Callable[[str], Path]) -> dict[str, str]:
+def replaced_tables(path: Path) -> dict[str, str]:
     """Return, by name, tables that replace the base's because their `type` differs: the old type and its file."""
     data = _read(path)
     if "base" not in data:
         return {}
-    base = _find_base(path, data["base"], find)
-    return replaced_tables(base, find) | {
-        name: f"{before!r} in {base.name}" for name, before in retyped(read_scenario(base, find), data).items()
+    base = _find_base(path, data["base"], scenario_source)
+    return replaced_tables(base.file) | {
+        name: f"{before!r} in {base.name}" for name, before in retyped(read_scenario(base), data).items()
     }
 
 
