@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, TypeAlias, get_args
 
 from quadsim.assets import read_toml, vehicle_names, vehicle_path
 from quadsim.errors import FileError, UnknownNameError
@@ -81,19 +81,6 @@ def read_variants(path: Path) -> dict[str, Variant]:
     return rows
 
 
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """What is read: a file, and for a variant of a scenario what its row changes there."""
-
-    file: Path
-    changes: Mapping[str, Any] = field(default_factory=dict)  # by dotted path
-
-    @property
-    def name(self) -> str:
-        """Name for messages: of the file, or of the table and its row."""
-        return f"{VARIANTS.name}, {self.changes['name']}" if self.changes else self.file.name
-
-
 @cache
 def variants() -> Mapping[str, Variant]:
     """Return the variants of the library's scenarios by name, in the order of their table."""
@@ -105,6 +92,10 @@ def scenario_names() -> list[str]:
     return sorted([*_names(FLIGHTS), *variants()])
 
 
+Source: TypeAlias = tuple[Path, Mapping[str, Any]]
+"""What is read: a file, and by dotted path what a variant changes there; nothing if it is the file itself."""
+
+
 def scenario_source(name: str) -> Source:
     """Return where a scenario of the library, or of a path ending in `.toml`, is read from.
 
@@ -113,9 +104,14 @@ def scenario_source(name: str) -> Source:
     """
     row = variants().get(name)
     if row is None:
-        return Source(file=_path("scenario", FLIGHTS, name, variants()))
-    changes = {**row.set, "name": name, "description": row.description}
-    return Source(file=FLIGHTS / f"{row.base}.toml", changes=changes)
+        return _path("scenario", FLIGHTS, name, variants()), {}
+    return FLIGHTS / f"{row.base}.toml", {**row.set, "name": name, "description": row.description}
+
+
+def source_label(source: Source) -> str:
+    """Return what messages call it: a file's name, or the table of variants and its row."""
+    file, changes = source
+    return f"{VARIANTS.name}, {changes['name']}" if changes else file.name
 
 
 campaign_names, campaign_path = partial(_names, CAMPAIGNS), partial(_path, "campaign", CAMPAIGNS)
@@ -183,8 +179,8 @@ def read_catalogue() -> Catalogue:
 
     scenarios = {}
     for name in scenario_names():
-        source, read = scenario_source(name), dict[str, Any](group="other", expect="satisfied")
-        read |= {**read_toml(source.file), **source.changes}
+        file, changes = scenario_source(name)
+        read = {"group": "other", "expect": "satisfied", **read_toml(file), **changes}
         scenarios[name] = LibraryScenario(
             description=read["description"], group=read["group"], expect=read["expect"], variant=variants().get(name)
         )

@@ -10,7 +10,7 @@ from typing import Any
 
 from quadsim.errors import FileError, InputError
 from scenarios.assembly import Assembly
-from scenarios.catalogue import scenario_source
+from scenarios.catalogue import scenario_source, source_label
 from scenarios.courses.csv_course import Csv
 from scenarios.results import Document
 from scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
@@ -57,16 +57,16 @@ def assemble(
 
 
 def _read(name: str, settings: Sequence[str]) -> Scenario:
-    source = scenario_source(name)
-    data = read_scenario(source)
+    data, (file, changes) = read_scenario(name), scenario_source(name)
+    label = source_label((file, changes))
     unchanged = copy.deepcopy(data)
     for setting in settings:
         apply_setting(data, setting)
     try:
-        return parse_scenario(data, source=source.name, directory=source.file.parent)
+        return parse_scenario(data, source=label, directory=file.parent)
     except ScenarioError as error:
         causes = _of_types(error.problems, name, unchanged, data)
-        raise ScenarioError(source.name, [*error.problems, *causes]) from error
+        raise ScenarioError(label, [*error.problems, *causes]) from error
 
 
 def _of_types(problems: Sequence[str], name: str, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
@@ -80,7 +80,8 @@ def _of_types(problems: Sequence[str], name: str, read: Mapping[str, Any], data:
             base = Path(name).name
             yield f'{table}: {changed}; a file with base = "{base}" and a whole [{table}] replaces them'
     missing = {problem.partition(".")[0] for problem in problems if problem.endswith(" is missing")}
-    for table, before in replaced_tables(scenario_source(name).file).items():
+    file, _ = scenario_source(name)
+    for table, before in replaced_tables(file).items():
         if table in missing - {*types_before}:
             other = f"of another type than that of its base ({before})"
             yield f"{table}: {other}, it replaces it whole and inherits nothing"

@@ -22,7 +22,7 @@ from quadsim.report.film.camera import Camera
 from quadsim.sim.physics import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array, wrapped
 from scenarios.assembly import Assembly, preferring_core
-from scenarios.catalogue import scenario_names, scenario_source
+from scenarios.catalogue import scenario_names
 from scenarios.flight import Flight
 from scenarios.gym.spaces import USUAL, Action, Actions, Observations
 from scenarios.loading import load_scenario
@@ -364,7 +364,7 @@ def environment_id(name: str) -> str:
 def register_library() -> None:
     """Register the shipped scenarios, without checking them."""
     for name in scenario_names():
-        scenario = Scenario.parse(read_scenario(scenario_source(name)))
+        scenario = Scenario.parse(read_scenario(name))
         gymnasium.registry.setdefault(environment_id(name), _specification(scenario, scenario=name))
 
 

@@ -102,9 +102,9 @@ class Paper(PaperFile):
         """Return the scenario of a number."""
         beside = self.path.parent / number.scenario
         own_file = number.scenario.endswith(".toml") and beside.is_file()
-        source = scenario_source(str(beside) if own_file else number.scenario)
-        data = merge(read_scenario(source), number.set)
-        scenario = parse_scenario(data, source=f"{number.name}: {source.name}", directory=source.file.parent)
+        name = str(beside) if own_file else number.scenario
+        data, (file, _) = merge(read_scenario(name), number.set), scenario_source(name)
+        scenario = parse_scenario(data, source=f"{number.name}: {number.scenario}", directory=file.parent)
         Assembly(scenario).check()
         return scenario
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from quadsim.assets import DEEPEST, read_toml
 from quadsim.errors import FileError, InputError, ParameterError
-from scenarios.catalogue import VARIANTS, Source, scenario_source
+from scenarios.catalogue import VARIANTS, Source, scenario_source, source_label
 from scenarios.plugin import located
 from scenarios.schema.settings import note_changes, set_field, state_bounds
 
@@ -28,34 +28,24 @@ def locate_files(data: dict[str, Any], directory: Path) -> None:
         data["forces"] = [located(force, directory) for force in data["forces"]]
 
 
-def read_scenario(source: Source) -> dict[str, Any]:
-    """Return a scenario's tables: of a file merged over its base, the base of that, and so on; of a variant changed.
+def read_scenario(name: str) -> dict[str, Any]:
+    """Return a scenario's tables, by its name or file: merged over its base, and so on; those of a variant changed.
 
     Raises:
         FileError: a file is missing, too large, is not TOML, or is its own base in the end; a variant sets what cannot
             be set.
         ParameterError: `base` is not a text.
     """
-    return _changed(read_merged(source.file, scenario_source, locate_files), source)
-
-
-def _changed(data: dict[str, Any], source: Source) -> dict[str, Any]:
-    """Apply what a variant sets to the tables of its file, in place."""
-    for path, value in source.changes.items():
-        try:
-            set_field(data, path, value, source="set")
-        except InputError as error:
-            raise FileError(VARIANTS, f"{source.changes['name']}.set.{path}: {error}") from error
-    return data
+    return read_merged(scenario_source(name), scenario_source, locate_files)
 
 
 def read_merged(
-    path: Path,
+    source: Source,
     find: Callable[[str], Source],
     locate: Callable[[dict[str, Any], Path], None],
     above: tuple[Path, ...] = (),
 ) -> dict[str, Any]:
-    """Return a file's tables, merged over its base, the base of that, and so on.
+    """Return tables, merged over their base, the base of that, and so on.
 
     `find` gives what a name means; `locate` makes the paths in a base independent of its folder, in place; `above` are
     the files that led here.
@@ -63,6 +53,22 @@ def read_merged(
     Raises:
         FileError, ParameterError: as `read_scenario`.
     """
+    file, changes = source
+    data = _merged(file, find, locate, above)
+    for field, value in changes.items():
+        try:
+            set_field(data, field, value, source="set")
+        except InputError as error:
+            raise FileError(VARIANTS, f"{changes['name']}.set.{field}: {error}") from error
+    return data
+
+
+def _merged(
+    path: Path,
+    find: Callable[[str], Source],
+    locate: Callable[[dict[str, Any], Path], None],
+    above: tuple[Path, ...],
+) -> dict[str, Any]:
     data = _read(path)
     if "base" not in data:
         return data
@@ -70,13 +76,14 @@ def read_merged(
     if not isinstance(name, str):
         raise ParameterError(path.name, "base", name, "a scenario's name or a path ending in .toml")
     base = _find_base(path, name, find)
+    base_file, _ = base
     chain = (*above, path.resolve())
-    if base.file.resolve() in chain:
-        raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), base.name])}")
+    if base_file.resolve() in chain:
+        raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), source_label(base)])}")
     if len(chain) > DEEPEST:
         raise FileError(path, f"must have at most {DEEPEST} bases above one another")
-    inherited = _changed(read_merged(base.file, find, locate, chain), base)
-    locate(inherited, base.file.parent)
+    inherited = read_merged(base, find, locate, chain)
+    locate(inherited, base_file.parent)
     if "controller" in data:
         state_bounds(inherited, data["controller"])
     # Group and expected verdict are not inherited.
@@ -98,9 +105,9 @@ def replaced_tables(path: Path) -> dict[str, str]:
     if "base" not in data:
         return {}
     base = _find_base(path, data["base"], scenario_source)
-    return replaced_tables(base.file) | {
-        name: f"{before!r} in {base.name}" for name, before in retyped(read_scenario(base), data).items()
-    }
+    before = retyped(read_merged(base, scenario_source, locate_files), data)
+    base_file, _ = base
+    return replaced_tables(base_file) | {name: f"{kind!r} in {source_label(base)}" for name, kind in before.items()}
 
 
 def retyped(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, str]:

@@ -225,8 +225,8 @@ def test_its_numbers_are_the_golden_ones(flight: Flight) -> None:
 
 @pytest.mark.parametrize("name", scenario_names())
 def test_a_file_is_named_for_its_scenario_and_described_in_a_line(name: str) -> None:
-    source = scenario_source(name)
-    data = {**tomllib.loads(source.file.read_text(encoding="utf-8")), **source.changes}
+    file, changes = scenario_source(name)
+    data = {**tomllib.loads(file.read_text(encoding="utf-8")), **changes}
     assert data["name"] == name
     assert "\n" not in data["description"]
     assert 20 <= len(data["description"]) <= LONGEST_DESCRIPTION

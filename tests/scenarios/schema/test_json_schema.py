@@ -19,7 +19,7 @@ VALIDATOR = Draft202012Validator(SCHEMA)
 
 @pytest.mark.parametrize("name", scenario_names())
 def test_the_library_is_valid(name: str) -> None:
-    VALIDATOR.validate(read_toml(scenario_source(name).file))
+    VALIDATOR.validate(read_toml(scenario_source(name)[0]))
     VALIDATOR.validate(tomllib.loads(load_scenario(name).to_toml()))
 
 
