@@ -18,11 +18,11 @@ from quadsim.assets import read_toml
 from quadsim.errors import QuadsimError
 from quadsim.flight import metrics
 from quadsim.state import INDEX, POSITION
-from scenarios.catalogue import scenario_path
 from scenarios.commands.app import load
 from scenarios.many import fly_many
 from scenarios.progress import Progress
 from scenarios.rollout import Rollout
+from scenarios.schema.bases import read_scenario
 from scenarios.schema.scenario import Scenario
 
 SCENARIO: Final = "paper-constrained"
@@ -77,7 +77,7 @@ def cells(quick: bool) -> list[tuple[str, str, Scenario]]:
     start = load(SCENARIO)
     if quick:
         start = start.replace({"duration": QUICK[2], "constraints": []})
-    paper = read_toml(scenario_path(SCENARIO))["controller"]
+    paper = read_scenario(SCENARIO)["controller"]
     cells_flown = []
     for condition, entry in conditions.items():
         if quick and condition not in QUICK[1]:

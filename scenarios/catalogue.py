@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, TypeAlias, get_args
 
 from quadsim.assets import read_toml, vehicle_names, vehicle_path
 from quadsim.errors import FileError, UnknownNameError
@@ -14,6 +14,7 @@ from scenarios.results import Result, Shown
 
 _LIBRARY: Final = Path(__file__).resolve().parent / "library"
 FLIGHTS, CAMPAIGNS, PAPERS = (_LIBRARY / name for name in ("flights", "campaigns", "papers"))
+VARIANTS: Final = _LIBRARY / "variants.toml"
 
 Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
 
@@ -36,18 +37,83 @@ def _names(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
-def _path(kind: str, folder: Path, name: str) -> Path:
+def _path(kind: str, folder: Path, name: str, others: Iterable[str] = ()) -> Path:
     """Return the file of a shipped name, or the path itself if it ends in `.toml`; raise if it does not exist."""
     if name.endswith(".toml"):
         if not Path(name).is_file():
             raise FileError(name, f"no such {kind} file")
         return Path(name)
     if name not in _names(folder):
-        raise UnknownNameError(kind, name, _names(folder), hint="or give a path ending in .toml")
+        raise UnknownNameError(kind, name, [*_names(folder), *others], hint="or give a path ending in .toml")
     return folder / f"{name}.toml"
 
 
-scenario_names, scenario_path = partial(_names, FLIGHTS), partial(_path, "scenario", FLIGHTS)
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """A row of `variants.toml`: a scenario file of the library with other values of some fields."""
+
+    base: str  # name of the file
+    description: str  # one sentence
+    set: Mapping[str, Any]  # values by dotted path, as after `--set`
+
+
+_ROW: Final = {"base": (str, "a text"), "description": (str, "a text"), "set": (dict, "a table")}
+
+
+def read_variants(path: Path) -> dict[str, Variant]:
+    """Read a table of variants; the fields that they set are checked where a variant is loaded.
+
+    Raises:
+        FileError: a row is malformed, has the name of a file, or a base that is none.
+    """
+    files, rows = _names(FLIGHTS), {}
+    for name, row in read_toml(path).items():
+        if name in files:
+            raise FileError(path, f"{name} must not have the name of a file in {FLIGHTS.name}/")
+        if not isinstance(row, dict) or row.keys() != _ROW.keys():
+            raise FileError(path, f"{name} must be a table of {', '.join(_ROW)}; got {row!r:.200}")
+        for key, (kind, rule) in _ROW.items():
+            if not isinstance(row[key], kind) or not row[key]:
+                raise FileError(path, f"{name}.{key} must be {rule} that is not empty; got {row[key]!r}")
+        if row["base"] not in files:
+            raise FileError(path, f"{name}.base: {UnknownNameError('scenario file', row['base'], files)}")
+        rows[name] = Variant(**row)
+    return rows
+
+
+@cache
+def variants() -> Mapping[str, Variant]:
+    """Return the variants of the library's scenarios by name, in the order of their table."""
+    return read_variants(VARIANTS)
+
+
+def scenario_names() -> list[str]:
+    """Return the names of the library's scenarios, variants included, sorted."""
+    return sorted([*_names(FLIGHTS), *variants()])
+
+
+Source: TypeAlias = tuple[Path, Mapping[str, Any]]
+"""What is read: a file, and by dotted path what a variant changes there; nothing if it is the file itself."""
+
+
+def scenario_source(name: str) -> Source:
+    """Return where a scenario of the library, or of a path ending in `.toml`, is read from.
+
+    Raises:
+        FileError, UnknownNameError: there is none.
+    """
+    row = variants().get(name)
+    if row is None:
+        return _path("scenario", FLIGHTS, name, variants()), {}
+    return FLIGHTS / f"{row.base}.toml", {**row.set, "name": name, "description": row.description}
+
+
+def source_label(source: Source) -> str:
+    """Return what messages call it: a file's name, or the table of variants and its row."""
+    file, changes = source
+    return f"{VARIANTS.name}, {changes['name']}" if changes else file.name
+
+
 campaign_names, campaign_path = partial(_names, CAMPAIGNS), partial(_path, "campaign", CAMPAIGNS)
 paper_names, paper_path = partial(_names, PAPERS), partial(_path, "paper", PAPERS)
 
@@ -59,6 +125,12 @@ class LibraryScenario:
     description: str  # one sentence
     group: Group  # its group of examples
     expect: str  # expected verdict: satisfied, violated or lost
+    variant: Variant | None = None  # its base and what it sets; None: it has a file of its own
+
+    @property
+    def line(self) -> str:
+        """Its line in the list."""
+        return self.description + _MEANT.get(self.expect, "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,20 +145,17 @@ class Catalogue(Result):
     solvers: Mapping[str, str]  # for `controller.solver`; those that are not installed are marked
 
     def shown(self) -> Shown:
-        """See `Result.shown`."""
+        """See `Result.shown`; a variant stands below its base, indented."""
         from scenarios import console
 
-        shipped = self.scenarios.items()
-        groups = {
-            f"scenarios: {group}": lines
-            for group in get_args(Group)
-            if (
-                lines := {
-                    n: entry.description + _MEANT.get(entry.expect, "") for n, entry in shipped if entry.group == group
-                }
-            )
-        }
+        groups: dict[str, dict[str, str]] = {f"scenarios: {group}": {} for group in get_args(Group)}
+        bases = {name: entry.variant.base for name, entry in self.scenarios.items() if entry.variant is not None}
+        for name, entry in self.scenarios.items():
+            if name not in bases:
+                below = {f"  {variant}": self.scenarios[variant].line for variant in bases if bases[variant] == name}
+                groups[f"scenarios: {entry.group}"] |= {name: entry.line, **below}
         others = ("campaigns", "vehicles", "controllers", "papers", "solvers")
+        groups = {title: lines for title, lines in groups.items() if lines}
         return console.listing({**groups, **{title: getattr(self, title) for title in others}})
 
     def to_json(self) -> dict[str, Any]:
@@ -94,7 +163,13 @@ class Catalogue(Result):
         shipped = self.scenarios.items()
         columns = {"scenarios": "description", "groups": "group", "expected": "expect"}
         by_field = {title: {name: getattr(entry, field) for name, entry in shipped} for title, field in columns.items()}
-        return {**by_field, **{title: value for title, value in asdict(self).items() if title != "scenarios"}}
+        rows = {name: entry.variant for name, entry in shipped if entry.variant is not None}
+        variants = {"variants": {name: {"base": row.base, "set": row.set} for name, row in rows.items()}}
+        return {
+            **by_field,
+            **variants,
+            **{title: value for title, value in asdict(self).items() if title != "scenarios"},
+        }
 
 
 def read_catalogue() -> Catalogue:
@@ -104,8 +179,11 @@ def read_catalogue() -> Catalogue:
 
     scenarios = {}
     for name in scenario_names():
-        read = {"group": "other", "expect": "satisfied"} | read_toml(scenario_path(name))
-        scenarios[name] = LibraryScenario(description=read["description"], group=read["group"], expect=read["expect"])
+        file, changes = scenario_source(name)
+        read = {"group": "other", "expect": "satisfied", **read_toml(file), **changes}
+        scenarios[name] = LibraryScenario(
+            description=read["description"], group=read["group"], expect=read["expect"], variant=variants().get(name)
+        )
     return Catalogue(
         scenarios=scenarios,
         campaigns={name: read_toml(campaign_path(name))["description"] for name in campaign_names()},

@@ -10,7 +10,7 @@ from typing import Any
 
 from quadsim.errors import FileError, InputError
 from scenarios.assembly import Assembly
-from scenarios.catalogue import FLIGHTS, scenario_path
+from scenarios.catalogue import scenario_source, source_label
 from scenarios.courses.csv_course import Csv
 from scenarios.results import Document
 from scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
@@ -57,31 +57,34 @@ def assemble(
 
 
 def _read(name: str, settings: Sequence[str]) -> Scenario:
-    path = scenario_path(name)
-    data = read_scenario(path, scenario_path)
+    data, (file, changes) = read_scenario(name), scenario_source(name)
+    label = source_label((file, changes))
     unchanged = copy.deepcopy(data)
     for setting in settings:
         apply_setting(data, setting)
     try:
-        return parse_scenario(data, source=path.name, directory=path.parent)
+        return parse_scenario(data, source=label, directory=file.parent)
     except ScenarioError as error:
-        raise ScenarioError(path.name, [*error.problems, *_of_types(error.problems, path, unchanged, data)]) from error
+        causes = _of_types(error.problems, name, unchanged, data)
+        raise ScenarioError(label, [*error.problems, *causes]) from error
 
 
-def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
+def _of_types(problems: Sequence[str], name: str, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
     """Explain why a table lacks fields or has too many: its type differs from that in the file."""
     unfit = (problem for problem in problems if problem.endswith(" is missing") or " is not a field of " in problem)
     wrong = {problem.partition(".")[0] for problem in unfit}
     types_before = retyped(read, data)
-    for name, before in types_before.items():
-        if name in wrong:
-            changed = f"--set changed its type from {before!r} to {data[name]['type']!r}, and all other fields stayed"
-            base = path.stem if path.parent == FLIGHTS else path.name
-            yield f'{name}: {changed}; a file with base = "{base}" and a whole [{name}] replaces them'
+    for table, before in types_before.items():
+        if table in wrong:
+            changed = f"--set changed its type from {before!r} to {data[table]['type']!r}, and all other fields stayed"
+            base = Path(name).name
+            yield f'{table}: {changed}; a file with base = "{base}" and a whole [{table}] replaces them'
     missing = {problem.partition(".")[0] for problem in problems if problem.endswith(" is missing")}
-    for name, before in replaced_tables(path, scenario_path).items():
-        if name in missing - {*types_before}:
-            yield f"{name}: of another type than that of its base ({before}), it replaces it whole and inherits nothing"
+    file, _ = scenario_source(name)
+    for table, before in replaced_tables(file).items():
+        if table in missing - {*types_before}:
+            other = f"of another type than that of its base ({before})"
+            yield f"{table}: {other}, it replaces it whole and inherits nothing"
 
 
 class ScenarioFile(Document):

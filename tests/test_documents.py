@@ -5,18 +5,21 @@ from __future__ import annotations
 import ast
 import json
 import re
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from pkgutil import resolve_name
 from types import ModuleType
 
 import drawings
+import gallery
 import matplotlib as mpl
 import pytest
 import remake
 from golden_numbers import PAPER, paper_entry, read
 from test_spine import spine
 
+from scenarios.catalogue import scenario_names, variants
 from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
@@ -57,6 +60,13 @@ def test_tables_of_golden_numbers_are_filled(document: str) -> None:
     text = (ROOT / document).read_text(encoding="utf-8")
     assert "from tests/golden/" in text
     assert remake.filled(text)[0] == text, f"{document} is out of date: make numbers"
+
+
+def test_every_scenario_in_the_gallery_opens_a_text() -> None:
+    texts, page = gallery.texts(), (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"scenarios/([\w-]+)\.txt", page)) == {*texts} == {*scenario_names()}
+    for name, row in variants().items():
+        assert tomllib.loads(texts[name]) == {name: vars(row)}
 
 
 def test_every_table_that_is_filled_is_known_and_stays_where_its_file_is_not(

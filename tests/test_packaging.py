@@ -72,6 +72,7 @@ def test_wheel_holds_every_file_of_the_packages(dist: Path) -> None:
         held = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert held == expected
     assert {"quadsim/models/quadrotor.xml", "quadsim/py.typed", "scenarios/library/flights/hover.toml"} <= held
+    assert "scenarios/library/variants.toml" in held
     assert any(name.startswith("quadsim/report/templates/") for name in held)
 
 

@@ -26,7 +26,7 @@ from quadsim.errors import InputError
 from quadsim.vehicle import VEHICLE_UNITS, load_vehicle
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import load_plan, parse_campaign, read_campaign
-from scenarios.catalogue import campaign_names, scenario_names, scenario_path
+from scenarios.catalogue import campaign_names, scenario_names
 from scenarios.commands.cli import main
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.base import fields_of
@@ -127,9 +127,9 @@ class Kind:
 
 def kinds() -> Iterator[Kind]:
     whole = scenario_schema()
-    files = [read_scenario(scenario_path(name), scenario_path) for name in scenario_names()]
+    files = [read_scenario(name) for name in scenario_names()]
     for settings in BESIDES:
-        files.append(read_scenario(scenario_path("hover"), scenario_path))
+        files.append(read_scenario("hover"))
         for setting in settings:
             apply_setting(files[-1], setting)
     files.sort(key=lambda data: len(str(data)))
@@ -394,7 +394,7 @@ FILES: dict[Callable[[Path, str], None], dict[str, str]] = {
         "failure = ['lots']": "failure has an entry 'lots' that is no event: @; did you mean 'lost'?@",
         "failure = ['rmse.q > 1']": "failure: no column named 'rmse.q'; did you mean 'rmse.z'?@",
         "failure = ['status > 0']": "failure: event 'status > 0' compares with a number; the column @ holds text",
-        "set = {duration=-1.0}": "x.toml, hover.toml: duration must be a number > 0 and <= 86400; got -1.0",
+        "set = {duration=-1.0}": "x.toml, hover: duration must be a number > 0 and <= 86400; got -1.0",
         vary("low=1.1, high=0.9"): "vary.mass.low must be below high; got 1.1 and 0.9",
         vary("low=0.01, high=1.1"): "vary.mass at 0.01: effects.load.mass_factor must be a number >= 0.05 and <= 20; "
         "got 0.01",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from itertools import islice
@@ -91,6 +90,16 @@ def film_flight(name: str) -> None:
             writer.append_data(np.asarray(picture))
 
 
+def texts() -> dict[str, str]:
+    """What the name of each scenario opens: its file, or its row in the table of variants, with comments."""
+    from scenarios.catalogue import FLIGHTS, VARIANTS
+
+    files = {path.stem: path.read_text(encoding="utf-8") for path in FLIGHTS.glob("*.toml")}
+    table = re.sub(r"^# ---- .*\n", "", VARIANTS.read_text(encoding="utf-8"), flags=re.MULTILINE)  # without headings
+    rows = re.split(r"\n\n+(?=(?:#.*\n)*\[[\w-]+\]\n)", table)[1:]
+    return files | {re.findall(r"^\[([\w-]+)\]$", row, re.MULTILINE)[0]: f"{row.strip()}\n" for row in rows}
+
+
 def main() -> None:
     """Make what is named; without off-screen OpenGL the page keeps its pictures and says so."""
     from scenarios.catalogue import scenario_names
@@ -100,8 +109,8 @@ def main() -> None:
     names = re.findall(r"films/([\w-]+)\.mp4", (DOCS / "gallery.md").read_text(encoding="utf-8"))
     for folder in (FILMS, FILES):
         folder.mkdir(exist_ok=True)
-    for file in (DOCS.parent / "scenarios" / "library" / "flights").glob("*.toml"):
-        shutil.copy(file, FILES / f"{file.stem}.txt")  # as text, which a browser shows
+    for name, text in texts().items():
+        (FILES / f"{name}.txt").write_text(text, encoding="utf-8")  # as text, which a browser shows
     try:
         with ProcessPoolExecutor(usable_cores()) as pool, reporting(True) as report:
             films = sys.argv[1:] == ["films"]

@@ -26,8 +26,6 @@ MOST_CHANGES: Final = 3000
 """Limit of active-set changes in a search; the most observed is 2507, for a state drawn far off."""
 PROBLEMS: Final = 16
 """Number of problems whose tables are cached, most recently used first."""
-WAYS: Final = (Method.FREE, Method.AXES, Method.WHOLE)
-"""Status by `enum quadsim_found`; other values mean no optimum."""
 
 Made = TypeVar("Made")
 Filled = TypeVar("Filled", bound=ctypes.Structure)
@@ -219,11 +217,12 @@ class Core:
         if self._modes is not None:
             for speeds in (self._state[N_STATES:], self._x_s[N_STATES:]):
                 speeds[:] = self._modes @ speeds
-        way = self._library.quadsim_optimise(*self._arguments) if math.isfinite(self._query.sum()) else len(WAYS)
-        if way >= len(WAYS):
+        found = self._library.quadsim_optimise(*self._arguments) if math.isfinite(self._query.sum()) else len(Method)
+        if found >= len(Method):
             return self._by_piqp(query, started)
+        method = Method(found)
         plan, slacks, multipliers, active = self._plan.copy(), self._no_slacks, self._no_multipliers, 0
-        if way:
+        if method is not Method.FREE:
             multipliers, active = self._multiplier.copy(), int(np.count_nonzero(self._side))
             if slacks.size and np.count_nonzero(violated := np.abs(self._side) == 2):
                 values = self._value + self._shift
@@ -232,9 +231,9 @@ class Core:
         return Answer(
             plan,
             slacks,
-            SOLVED if way else UNCONSTRAINED,
-            CORE if way else GAIN,
-            method=WAYS[way],
+            UNCONSTRAINED if method is Method.FREE else SOLVED,
+            GAIN if method is Method.FREE else CORE,
+            method=method,
             certificate=partial(self._certificate, query, plan, slacks, multipliers),
             stats=Statistics(iterations=self._work.changes, active=active, solve_s=clock.perf_counter() - started),
         )

@@ -7,7 +7,7 @@ import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
+from enum import IntEnum
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -143,12 +143,12 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
     return AnyOfQpsolvers(name)
 
 
-class Method(StrEnum):
-    """The part of the QP that had to be solved."""
+class Method(IntEnum):
+    """The part of the QP that had to be solved, by the codes of `enum quadsim_found`; other codes mean no optimum."""
 
-    FREE = "the unconstrained optimum"
-    AXES = "active rows of states alone"
-    WHOLE = "the whole QP"
+    FREE = 0  # none: the unconstrained optimum
+    AXES = 1  # active rows of states alone
+    WHOLE = 2
 
 
 class Answer(NamedTuple):

@@ -19,14 +19,14 @@ from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import CampaignFile, Draws, Value, Varied
 from scenarios.campaign.events import CountedEvent, parse_event
 from scenarios.campaign.rows import DRAW, TIMES, flown_row, make_schema
-from scenarios.catalogue import campaign_path, scenario_path
+from scenarios.catalogue import campaign_path, scenario_source
 from scenarios.flown import Flight
 from scenarios.loading import parse_scenario
 from scenarios.machine import processor_name
 from scenarios.many import ERROR, MEMORY, Row, fly_many
 from scenarios.plugin import Plugin
 from scenarios.rollout import Rollout
-from scenarios.schema.bases import locate_files, merge, read_scenario
+from scenarios.schema.bases import locate_files, merge, read_merged, read_scenario
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import (
@@ -191,7 +191,7 @@ def read_campaign(name: str) -> dict[str, Any]:
     """
     try:
         path = campaign_path(name)
-        data = read_scenario(path, campaign_path, locate=locate)
+        data = read_merged((path, {}), lambda base: (campaign_path(base), {}), locate)
         locate(data, path.parent)
         return data
     except OSError as error:
@@ -223,8 +223,7 @@ def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignFile:
 
 def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ()) -> Scenario:
     """The scenario of a campaign's file, with its changes and then those of the command line."""
-    file = scenario_path(spec.scenario)
-    data = merge(read_scenario(file, scenario_path), spec.set)
+    data, (file, _) = merge(read_scenario(spec.scenario), spec.set), scenario_source(spec.scenario)
     note_changes(data, spec.set)
     owners = {"seed": "give --seed"}
     owners |= {
@@ -236,7 +235,7 @@ def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ())
             raise ParameterError("", "--set", setting, rule)
         apply_setting(data, setting)
     try:
-        scenario = parse_scenario(data, source=f"{path.name}, {file.name}", directory=file.parent)
+        scenario = parse_scenario(data, source=f"{path.name}, {Path(spec.scenario).name}", directory=file.parent)
     except OSError as error:
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
     Assembly(scenario).check()

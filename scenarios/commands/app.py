@@ -663,8 +663,9 @@ def catalogue() -> Catalogue:
     """List scenarios, campaigns, vehicles, controllers, papers and solvers, one per line.
 
     Returns:
-        Mappings by name: `scenarios`, with `description`, `group` and the expected verdict, `expect`; and `campaigns`,
-        `vehicles`, `controllers`, `papers` and `solvers`, with a sentence.
+        Mappings by name: `scenarios`, with `description`, `group`, the expected verdict, `expect`, and `variant`, the
+        `base` that it changes and what it has `set`, or None; and `campaigns`, `vehicles`, `controllers`, `papers` and
+        `solvers`, with a sentence.
 
     Examples:
         >>> import quadsim

@@ -17,8 +17,9 @@ from mpc.codegen.source import CHANGES, DATA, CController, part
 from mpc.codegen.targets import TARGETS, Machine
 from mpc.core.library import MIRRORS
 from mpc.core.numbers import Exportable, exportable
-from mpc.core.solver import WAYS, CoreProblem, core_library
+from mpc.core.solver import CoreProblem, core_library
 from mpc.ocp import Problem
+from mpc.solvers import Method
 from quadsim.controller import ROTORS
 from quadsim.errors import ExportError, ParameterError
 from quadsim.outputs import absolute, reserving, writing
@@ -75,7 +76,7 @@ class _Search:
 
     def solves(self, *arguments: Array) -> bool:
         self._library.quadsim_work_reset(self._at)
-        return self._library.quadsim_optimise(self._at, *(part.ctypes.data for part in arguments)) < len(WAYS)
+        return self._library.quadsim_optimise(self._at, *(part.ctypes.data for part in arguments)) < len(Method)
 
 
 def reach(problem: Problem, room: int, changes: int) -> Reach:

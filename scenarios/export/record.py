@@ -24,8 +24,7 @@ from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 MPC = LinearMPC | UnconstrainedMPC
-METHOD_CODES: Final = {Method.FREE: 0, Method.AXES: 1, Method.WHOLE: 2}
-REFUSED: Final = 3  # least status of a period without an optimum
+REFUSED: Final = len(Method)  # least status of a period without an optimum
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +112,7 @@ def _answers(
             command = law.step(StepInputs(time=k * period, acting=acting), state, reference)
             if command.status in ACCEPTED:
                 assert law.answer is not None
-                answer = METHOD_CODES[law.answer.method], command.speeds
+                answer = law.answer.method, command.speeds
                 if command.answered_by not in (GAIN, CORE):
                     break
         answers.append(answer)

@@ -22,7 +22,7 @@ from quadsim.report.film.camera import Camera
 from quadsim.sim.physics import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array, wrapped
 from scenarios.assembly import Assembly, preferring_core
-from scenarios.catalogue import scenario_names, scenario_path
+from scenarios.catalogue import scenario_names
 from scenarios.commands.rooms import commands_of
 from scenarios.flown import Flight
 from scenarios.gym.spaces import USUAL, Action, Actions, Observations
@@ -364,7 +364,7 @@ def environment_id(name: str) -> str:
 def register_library() -> None:
     """Register the shipped scenarios, without checking them."""
     for name in scenario_names():
-        scenario = Scenario.parse(read_scenario(scenario_path(name), scenario_path))
+        scenario = Scenario.parse(read_scenario(name))
         gymnasium.registry.setdefault(environment_id(name), _specification(scenario, scenario=name))
 
 

@@ -17,7 +17,7 @@ from quadsim.fields import NonNegative, Number, Positive
 from quadsim.input_limits import MOST_ENTRIES
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
 from scenarios.assembly import Assembly
-from scenarios.catalogue import paper_path, scenario_path
+from scenarios.catalogue import paper_path, scenario_source
 from scenarios.commands.junit import Cases
 from scenarios.loading import parse_scenario
 from scenarios.progress import Progress, silent
@@ -102,9 +102,9 @@ class Paper(PaperFile):
         """Return the scenario of a number."""
         beside = self.path.parent / number.scenario
         own_file = number.scenario.endswith(".toml") and beside.is_file()
-        path = scenario_path(str(beside) if own_file else number.scenario)
-        data = merge(read_scenario(path, scenario_path), number.set)
-        scenario = parse_scenario(data, source=f"{number.name}: {path.name}", directory=path.parent)
+        name = str(beside) if own_file else number.scenario
+        data, (file, _) = merge(read_scenario(name), number.set), scenario_source(name)
+        scenario = parse_scenario(data, source=f"{number.name}: {number.scenario}", directory=file.parent)
         Assembly(scenario).check()
         return scenario
 

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.assets import DEEPEST, read_toml
-from quadsim.errors import FileError, ParameterError
+from quadsim.errors import FileError, InputError, ParameterError
+from scenarios.catalogue import VARIANTS, Source, scenario_source, source_label
 from scenarios.plugin import located
-from scenarios.schema.settings import note_changes, state_bounds
+from scenarios.schema.settings import note_changes, set_field, state_bounds
 
 _TOLERANCES: Final = ("tolerance", "tolerance_sampled")
 
@@ -27,22 +28,47 @@ def locate_files(data: dict[str, Any], directory: Path) -> None:
         data["forces"] = [located(force, directory) for force in data["forces"]]
 
 
-def read_scenario(
-    path: Path,
-    find: Callable[[str], Path],
-    *,
-    locate: Callable[[dict[str, Any], Path], None] = locate_files,
-    above: tuple[Path, ...] = (),
-) -> dict[str, Any]:
-    """Return a scenario file's tables, merged over its base, the base of that, and so on.
-
-    `find` gives the file that a name means; `locate` makes the paths in a base independent of its folder, in place;
-    `above` are the files that led here.
+def read_scenario(name: str) -> dict[str, Any]:
+    """Return a scenario's tables, by its name or file: merged over its base, and so on; those of a variant changed.
 
     Raises:
-        FileError: a file is missing, too large, is not TOML, or is its own base in the end.
+        FileError: a file is missing, too large, is not TOML, or is its own base in the end; a variant sets what cannot
+            be set.
         ParameterError: `base` is not a text.
     """
+    return read_merged(scenario_source(name), scenario_source, locate_files)
+
+
+def read_merged(
+    source: Source,
+    find: Callable[[str], Source],
+    locate: Callable[[dict[str, Any], Path], None],
+    above: tuple[Path, ...] = (),
+) -> dict[str, Any]:
+    """Return tables, merged over their base, the base of that, and so on.
+
+    `find` gives what a name means; `locate` makes the paths in a base independent of its folder, in place; `above` are
+    the files that led here.
+
+    Raises:
+        FileError, ParameterError: as `read_scenario`.
+    """
+    file, changes = source
+    data = _merged(file, find, locate, above)
+    for field, value in changes.items():
+        try:
+            set_field(data, field, value, source="set")
+        except InputError as error:
+            raise FileError(VARIANTS, f"{changes['name']}.set.{field}: {error}") from error
+    return data
+
+
+def _merged(
+    path: Path,
+    find: Callable[[str], Source],
+    locate: Callable[[dict[str, Any], Path], None],
+    above: tuple[Path, ...],
+) -> dict[str, Any]:
     data = _read(path)
     if "base" not in data:
         return data
@@ -50,13 +76,14 @@ def read_scenario(
     if not isinstance(name, str):
         raise ParameterError(path.name, "base", name, "a scenario's name or a path ending in .toml")
     base = _find_base(path, name, find)
+    base_file, _ = base
     chain = (*above, path.resolve())
-    if base.resolve() in chain:
-        raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), base.name])}")
+    if base_file.resolve() in chain:
+        raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), source_label(base)])}")
     if len(chain) > DEEPEST:
         raise FileError(path, f"must have at most {DEEPEST} bases above one another")
-    inherited = read_scenario(base, find, locate=locate, above=chain)
-    locate(inherited, base.parent)
+    inherited = read_merged(base, find, locate, chain)
+    locate(inherited, base_file.parent)
     if "controller" in data:
         state_bounds(inherited, data["controller"])
     # Group and expected verdict are not inherited.
@@ -66,21 +93,21 @@ def read_scenario(
     return merged
 
 
-def _find_base(path: Path, name: str, find: Callable[[str], Path]) -> Path:
-    """Return the path of a base: beside the file that names it, or in the library."""
+def _find_base(path: Path, name: str, find: Callable[[str], Source]) -> Source:
+    """Return where a base is: beside the file that names it, or in the library."""
     beside = path.parent / name
-    return beside if name.endswith(".toml") and beside.is_file() else find(name)
+    return find(str(beside) if name.endswith(".toml") and beside.is_file() else name)
 
 
-def replaced_tables(path: Path, find: Callable[[str], Path]) -> dict[str, str]:
+def replaced_tables(path: Path) -> dict[str, str]:
     """Return, by name, tables that replace the base's because their `type` differs: the old type and its file."""
     data = _read(path)
     if "base" not in data:
         return {}
-    base = _find_base(path, data["base"], find)
-    return replaced_tables(base, find) | {
-        name: f"{before!r} in {base.name}" for name, before in retyped(read_scenario(base, find), data).items()
-    }
+    base = _find_base(path, data["base"], scenario_source)
+    before = retyped(read_merged(base, scenario_source, locate_files), data)
+    base_file, _ = base
+    return replaced_tables(base_file) | {name: f"{kind!r} in {source_label(base)}" for name, kind in before.items()}
 
 
 def retyped(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, str]:

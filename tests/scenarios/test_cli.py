@@ -21,7 +21,7 @@ from quadsim.errors import RenderingUnavailableError
 from quadsim.flight import rundir
 from scenarios import flown
 from scenarios.campaign.plan import read_campaign
-from scenarios.catalogue import campaign_names, scenario_names
+from scenarios.catalogue import campaign_names, scenario_names, variants
 from scenarios.commands.app import app
 from scenarios.commands.cli import main
 from scenarios.commands.doctor import capabilities
@@ -62,13 +62,28 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert lines == {line.split()[0]: line.split(maxsplit=1)[1:] for line in printed.splitlines() if line}
     assert main(["list", "--json"]) == EXIT_DONE
     listed = json.loads(capsys.readouterr().out)
-    titles = ["scenarios", "groups", "expected", "campaigns", "vehicles", "controllers", "papers", "solvers"]
+    titles = [
+        "scenarios",
+        "groups",
+        "expected",
+        "variants",
+        "campaigns",
+        "vehicles",
+        "controllers",
+        "papers",
+        "solvers",
+    ]
     assert list(listed) == titles
     assert list(listed["scenarios"]) == list(listed["groups"]) == list(listed["expected"]) == scenario_names()
     checked = [load_scenario(name) for name in scenario_names()]
     assert listed["scenarios"] == {scenario.name: scenario.description for scenario in checked}
     assert listed["groups"] == {scenario.name: scenario.group for scenario in checked}
     assert listed["expected"] == {scenario.name: scenario.expect for scenario in checked}
+    assert listed["variants"] == {name: {"base": row.base, "set": row.set} for name, row in variants().items()}
+    shown = re.findall(r"^  (  )?([\w.-]+) ", printed, re.MULTILINE)
+    below = [(name, shown[:i]) for i, (indented, name) in enumerate(shown) if indented]
+    bases = {name: next(other for indented, other in reversed(above) if not indented) for name, above in below}
+    assert bases == {name: row.base for name, row in variants().items()}
     assert listed["campaigns"] == {name: read_campaign(name)["description"] for name in campaign_names()}
     assert list(listed["campaigns"]) == campaign_names()
     assert list(listed["solvers"]) == list(solver_entries())

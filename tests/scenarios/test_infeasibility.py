@@ -28,7 +28,7 @@ from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
 from scenarios import infeasibility, remedies
 from scenarios.assembly import Assembly
-from scenarios.catalogue import scenario_path
+from scenarios.catalogue import FLIGHTS
 from scenarios.flown import Flight
 from scenarios.infeasibility import diagnose
 from scenarios.loading import load_scenario, parse_scenario
@@ -140,7 +140,7 @@ class Queried:
 @pytest.fixture(scope="session")
 def file(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A hover whose file names no solver, so that its law may be another, and with a short horizon."""
-    text = scenario_path("hover").read_text(encoding="utf-8")
+    text = (FLIGHTS / "hover.toml").read_text(encoding="utf-8")
     path = tmp_path_factory.mktemp("diagnosis") / "hover.toml"
     short = text.replace('solver = "piqp-multistage"\n', "").replace("horizon = 50 ", f"horizon = {HORIZON} ")
     assert short.count(f"horizon = {HORIZON}") == 1

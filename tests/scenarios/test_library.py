@@ -20,7 +20,7 @@ from quadsim.flight.audit import worst_finding
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from quadsim.report.comparison import comparison_rows
 from scenarios.campaign.rows import flown_row
-from scenarios.catalogue import CONTROLLERS, FLIGHTS, scenario_names
+from scenarios.catalogue import CONTROLLERS, scenario_names, scenario_source
 from scenarios.flown import Flight, summarise
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.rollout import Rollout
@@ -225,7 +225,8 @@ def test_its_numbers_are_the_golden_ones(flight: Flight) -> None:
 
 @pytest.mark.parametrize("name", scenario_names())
 def test_a_file_is_named_for_its_scenario_and_described_in_a_line(name: str) -> None:
-    data = tomllib.loads((FLIGHTS / f"{name}.toml").read_text(encoding="utf-8"))
+    file, changes = scenario_source(name)
+    data = {**tomllib.loads(file.read_text(encoding="utf-8")), **changes}
     assert data["name"] == name
     assert "\n" not in data["description"]
     assert 20 <= len(data["description"]) <= LONGEST_DESCRIPTION

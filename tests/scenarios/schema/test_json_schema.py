@@ -9,7 +9,7 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from quadsim.assets import read_toml
-from scenarios.catalogue import scenario_names, scenario_path
+from scenarios.catalogue import scenario_names, scenario_source
 from scenarios.loading import load_scenario
 from scenarios.schema.json_schema import scenario_schema
 
@@ -19,7 +19,7 @@ VALIDATOR = Draft202012Validator(SCHEMA)
 
 @pytest.mark.parametrize("name", scenario_names())
 def test_the_library_is_valid(name: str) -> None:
-    VALIDATOR.validate(read_toml(scenario_path(name)))
+    VALIDATOR.validate(read_toml(scenario_source(name)[0]))
     VALIDATOR.validate(tomllib.loads(load_scenario(name).to_toml()))
 
 
