@@ -66,22 +66,32 @@ def system_compiler() -> list[str]:
     return shlex.split(os.environ.get("CC", "")) or [path for path in map(shutil.which, COMPILERS) if path][:1]
 
 
+def to_publish() -> str:
+    """Return the platform tag of a wheel to publish; an empty text without one.
+
+    Raises:
+        CompilationError: it is not one of `TARGETS`.
+    """
+    platform = os.environ.get(PLATFORM, "")
+    if platform and platform not in TARGETS:
+        raise CompilationError(f"{PLATFORM} must be one of {', '.join(TARGETS)}; got {platform!r}")
+    return platform
+
+
 def requirements() -> list[str]:
     """Return the packages needed to compile: none if the system's compiler is used."""
-    return [] if system_compiler() and not os.environ.get(PLATFORM) else [ZIG]
+    return [ZIG] if to_publish() or not system_compiler() else []
 
 
 def compiler() -> list[str]:
     """Return the command of the compiler: the system's, else zig's.
 
     Raises:
-        CompilationError: there is none, or the platform is not one of `TARGETS`.
+        CompilationError: there is none.
     """
     if not requirements():
         return system_compiler()
-    platform = os.environ.get(PLATFORM)
-    if platform and platform not in TARGETS:
-        raise CompilationError(f"{PLATFORM} must be one of {', '.join(TARGETS)}; got {platform!r}")
+    platform = to_publish()
     if importlib.util.find_spec("ziglang") is None:
         lacking = f"{PLATFORM} needs the package" if platform else f"no C compiler ({', '.join(COMPILERS)}), nor"
         raise CompilationError(f"{lacking} {ZIG}")
@@ -92,7 +102,7 @@ def compiler() -> list[str]:
 
 def platform_tag() -> str:
     """Return the platform tag of the wheel that holds the library."""
-    return os.environ.get(PLATFORM) or sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    return to_publish() or sysconfig.get_platform().replace("-", "_").replace(".", "_")
 
 
 def compile_library(root: Path = ROOT) -> Path:
