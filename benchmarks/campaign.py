@@ -8,7 +8,7 @@ from pathlib import Path
 
 from timing import Record, options, run
 
-from mpc.core.library import why_missing
+from scenarios.commands.app import load
 from scenarios.assembly import Assembly
 from scenarios.campaign.campaign import fly_campaign
 from scenarios.campaign.campaign_file import CampaignFile
@@ -44,9 +44,9 @@ def campaign(scenario: Scenario, solver: str, flights: int, workers: int) -> Rec
 
 
 def measure(quick: bool, report: Progress) -> list[Record]:
-    """Campaigns by one worker and by two, by PIQP and by the core where there is one, in turns."""
+    """Campaigns by one worker and by two, by PIQP and by the core, in turns."""
     rounds, flights = (1, 2) if quick else (2, 12)
-    solvers = ["piqp", "core"] if why_missing() is None else ["piqp"]
+    solvers = ("piqp", "core")
     cases = (("paper-constrained", 1), ("paper-constrained", 2), ("robust", 2))
     results: list[Record] = []
     for _ in range(rounds):

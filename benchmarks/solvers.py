@@ -18,7 +18,7 @@ from timing import Record, options, run, step_quantiles, time_in_turns
 from mpc.constrained import Constrained
 from mpc.robust.settings import Robust
 from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
-from quadsim.errors import FlightError, InputError, MissingCoreError, MissingPackageError
+from quadsim.errors import FlightError, InputError, MissingPackageError
 from quadsim.flight.log import ControlLog
 from quadsim.state import Array, make_state
 from scenarios.assembly import Assembly
@@ -71,7 +71,7 @@ def entries(scenario: Scenario, solvers: Sequence[str]) -> dict[str, Scenario]:
     for name, changed in entries.items():
         try:
             Assembly(changed).controller()
-        except (MissingPackageError, MissingCoreError):
+        except MissingPackageError:
             continue
         usable[name] = changed
     return usable

@@ -25,7 +25,7 @@ from mpc.model import SHORTEST_LAG, hover_model
 from mpc.obstacles import AvoidanceSettings, Shape, Space
 from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
-from mpc.solvers import ALIASES, CORE_OR_PIQP, SOLVERS, Solver, find_solver
+from mpc.solvers import ALIASES, SOLVERS, Solver, find_solver
 from mpc.solvers.by_name import make_solver
 from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ParameterError, UnknownNameError
@@ -396,7 +396,7 @@ class Bounded(Weighted):
     ] = None
     solver: Annotated[
         str, doc("QP solver used where the unconstrained optimum violates a constraint, by its name in `quadsim list`")
-    ] = field(default="piqp", metadata={"json_schema_extra": {"examples": [*ALIASES, *SOLVERS, CORE, CORE_OR_PIQP]}})
+    ] = field(default="piqp", metadata={"json_schema_extra": {"examples": [*ALIASES, *SOLVERS, CORE]}})
     kkt_every: KktEvery = KKT_EVERY
 
     def __post_init__(self) -> None:
@@ -445,7 +445,7 @@ class Bounded(Weighted):
         if space is not None and self.solver == CORE:
             rule = "a QP solver such as 'piqp' with controller.avoidance, whose half-spaces differ from step to step"
             raise ParameterError("controller", "solver", CORE, rule)
-        return make_solver("piqp" if space is not None and self.solver == CORE_OR_PIQP else self.solver, problem)
+        return make_solver(self.solver, problem)
 
 
 def rows_of(polytopes: Sequence[Polytope]) -> tuple[Constraint, ...]:

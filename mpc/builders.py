@@ -19,7 +19,7 @@ from mpc.obstacles import Shape
 from mpc.pilot import Pilot
 from mpc.robust.settings import Robust
 from quadsim.controller import ROTORS, Controller
-from quadsim.errors import InputError, MissingCoreError
+from quadsim.errors import InputError
 from quadsim.vehicle import Vehicle
 
 
@@ -84,16 +84,11 @@ def _compiled(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequence
     """Return the law in C.
 
     Raises:
-        MissingCoreError: the library is missing.
         ExportError: C does not implement this law.
     """
     from mpc.core.law import CompiledMPC
-    from mpc.core.library import why_missing
     from mpc.core.numbers import exportable
 
-    reason = why_missing()
-    if reason is not None:
-        raise MissingCoreError(reason, instead="leave out controller.compiled")
     return CompiledMPC(exportable(table, vehicle, period, shapes))
 
 

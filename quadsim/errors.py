@@ -79,14 +79,6 @@ class ExportError(InputError):
         self.reason = reason
 
 
-class MissingCoreError(InputError):
-    """The compiled core was requested but is missing; the message says why."""
-
-    def __init__(self, reason: str, instead: str = "choose controller.solver = 'piqp'") -> None:
-        super().__init__(f"there is no core here: {reason}; or {instead}")
-        self.reason = reason
-
-
 class UnknownNameError(InputError):
     """A name outside a known set.
 

@@ -20,10 +20,9 @@ from mpc.builders import build
 from mpc.flatness import motion_along
 from mpc.nonlinear.settings import Nonlinear
 from mpc.pilot import Pilot
-from mpc.solvers import CORE_OR_PIQP
 from quadsim.assets import vehicle_path
 from quadsim.border import user_code
-from quadsim.controller import ROTORS
+from quadsim.controller import CORE, ROTORS
 from quadsim.errors import InputError, ParameterError, QuadsimError
 from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
@@ -613,11 +612,16 @@ def stated_autopilot(path: Path, stated: AutopilotSettings | None = None) -> Aut
 
 
 def preferring_core(scenario: Scenario) -> Scenario:
-    """Replace `piqp`, the default, by `core-or-piqp`, where the time of a step matters."""
+    """Replace `piqp`, the default, by the core if that takes the problem: where the time of a step matters."""
     controller = scenario.controller
-    if isinstance(controller, Bounded) and controller.solver == "piqp":
-        return scenario.replace({"controller.solver": CORE_OR_PIQP})
-    return scenario
+    if not isinstance(controller, Bounded) or controller.solver != "piqp":
+        return scenario
+    preferred = scenario.replace({"controller.solver": CORE})
+    try:
+        Assembly(preferred).controller()
+    except ParameterError:
+        return scenario
+    return preferred
 
 
 def make_fault(event: SensorFaultEvent) -> SensorFault:

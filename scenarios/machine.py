@@ -11,7 +11,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from mpc.core.library import why_missing
 from quadsim.assets import models_dir
 
 PACKAGES: Final = ("mujoco", "numpy", "scipy", "piqp", "rerun-sdk", "imageio", "pyarrow", "matplotlib")
@@ -51,9 +50,8 @@ def usable_cores() -> int:
 
 @cache
 def code_digest() -> str:
-    """Return the SHA-256 of all quadsim files that affect numbers: code, models, scenarios, and the core's presence."""
-    code = digest_below([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
-    return code if why_missing() is None else f"{code}, without the core"
+    """Return the SHA-256 of all quadsim files that affect numbers: code, models, scenarios."""
+    return digest_below([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
 
 
 def digest_below(roots: Iterable[Path]) -> str:

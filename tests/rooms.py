@@ -23,6 +23,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
+from quadsim.core.build import LIBRARY
 from scenarios.commands.rooms import ROOMS
 
 ROOT: Final = Path(__file__).resolve().parent.parent
@@ -86,8 +87,8 @@ def copy_without(rooms: Iterable[str], folder: Path) -> None:
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
-    for library in (ROOT / "mpc" / "core").glob("_core.so*"):
-        shutil.copy2(library, folder / "mpc" / "core")
+    if (ROOT / LIBRARY).is_file():
+        shutil.copy2(ROOT / LIBRARY, folder / LIBRARY)
     for room in rooms:
         for part in (f"scenarios/{room}", f"tests/scenarios/{room}", *PARTS[room]):
             path = folder / part

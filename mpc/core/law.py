@@ -11,7 +11,6 @@ from typing import Final, NoReturn
 import numpy as np
 
 from mpc.answer import ActuatorBounds
-from mpc.core.library import check_mirrors
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
 from mpc.core.solver import PROBLEMS, Key, Work, core_library, core_problem
 from mpc.equilibrium import Trim
@@ -33,6 +32,7 @@ from quadsim.controller import (
     StepInputs,
     stopped,
 )
+from quadsim.core.library import check_sizes
 from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -81,7 +81,7 @@ class _MPC(ctypes.Structure):
 @cache
 def _library() -> ctypes.CDLL:
     library = core_library()
-    check_mirrors(quadsim_robust=_Robust, quadsim_controller=_Controller, quadsim_mpc=_MPC)
+    check_sizes(quadsim_robust=_Robust, quadsim_controller=_Controller, quadsim_mpc=_MPC)
     library.quadsim_mpc_reals.restype, library.quadsim_mpc_reals.argtypes = ctypes.c_long, [_AT]
     library.quadsim_mpc_start.restype, library.quadsim_mpc_start.argtypes = None, [_AT] * 3
     library.quadsim_mpc_reset.restype, library.quadsim_mpc_reset.argtypes = None, [_AT] * 2
@@ -123,7 +123,7 @@ class CompiledMPC:
     """A law run by the library; it falls back as the C does on a target.
 
     Raises:
-        MissingCoreError: there is no library.
+        FileError: the library cannot be compiled or loaded.
         ParameterError: the core cannot take the problem.
     """
 

@@ -13,12 +13,12 @@ from typing import Any, Final, Generic, NoReturn, TypeVar
 import numpy as np
 
 from mpc.condensing import Condensed
-from mpc.core.library import check_mirrors, load_library
 from mpc.core.tables import members, tables
 from mpc.ocp import Problem, Query
 from mpc.qp import QP, Solution
 from mpc.solvers import Answer, Method, QPSolver
 from quadsim.controller import CORE, GAIN, SOLVED, UNCONSTRAINED, Statistics
+from quadsim.core.library import check_sizes, load_library
 from quadsim.state import N_STATES, Array, read_only
 from quadsim.vehicle import N_ROTORS
 
@@ -79,7 +79,7 @@ class Work(ctypes.Structure):
 def core_library() -> ctypes.CDLL:
     """Return the library with its functions declared."""
     library = load_library()
-    check_mirrors(quadsim_axis=_Axis, quadsim_row=_Row, quadsim_term=_Term, quadsim_problem=_Problem, quadsim_work=Work)
+    check_sizes(quadsim_axis=_Axis, quadsim_row=_Row, quadsim_term=_Term, quadsim_problem=_Problem, quadsim_work=Work)
     library.quadsim_work_reals.restype, library.quadsim_work_reals.argtypes = ctypes.c_long, [_AT]
     library.quadsim_work_start.argtypes = [_AT, _AT, _AT]
     library.quadsim_work_reset.argtypes = [_AT]
@@ -161,7 +161,8 @@ class Core:
     gives up or finds infeasible, and `answered_by` names it.
 
     Raises:
-        MissingCoreError: there is no library.
+        FileError: the library cannot be compiled or loaded.
+        ParameterError: the core cannot take the problem.
     """
 
     name: Final = CORE

@@ -41,7 +41,7 @@ from mpc.nonlinear.rigidbody import RATE_SCALE
 from mpc.observer import ObserverSettings
 from mpc.obstacles import Shape, Space
 from mpc.qp import KKT_EVERY
-from mpc.solvers import CORE_OR_PIQP, SOLVERS
+from mpc.solvers import SOLVERS
 from quadsim.controller import CORE, ROTORS
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Positive, Weight
@@ -185,7 +185,7 @@ class Nonlinear(ControllerTable):
     def __post_init__(self) -> None:
         if self.solver is not None:
             require_solver(self.solver)
-            if self.solver in (CORE, CORE_OR_PIQP):
+            if self.solver == CORE:
                 rule = "a QP solver: the core takes no models that change"
                 raise ParameterError("", "solver", self.solver, rule)
         require_lag(self.rotor_lag)

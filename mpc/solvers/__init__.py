@@ -52,11 +52,6 @@ class SolverEntry:
 
     @property
     def _missing(self) -> str:
-        if self.package == CORE:
-            from mpc.core.library import why_missing
-
-            reason = why_missing()
-            return "" if reason is None else f"no core: {reason}"
         installed = importlib.util.find_spec(self.package) is not None
         return "" if installed else f"not installed: pip install 'quadsim[{self.extra}]'"
 
@@ -75,13 +70,10 @@ SOLVERS: Final = {
 
 COMPILED: Final = SolverEntry(
     description="the compiled core: the exact optimum where matrices are fixed; PIQP answers what it gives up",
-    package=CORE,
+    package="mpc.core",
 )
 
 ALIASES: Final = {"piqp": "piqp-multistage"}
-
-CORE_OR_PIQP: Final = "core-or-piqp"
-"""The core if it is compiled and takes the problem, else PIQP."""
 
 INVALID_DATA: Final = "invalid_data"
 """Status of a query with numbers that no back end receives."""
@@ -94,7 +86,7 @@ infinite."""
 def find_solver(name: str) -> SolverEntry:
     """Return the solver of a name: the core, one of `SOLVERS` or of qpsolvers; `UnknownNameError` if there is none."""
     name = ALIASES.get(name, name)
-    if name in (CORE, CORE_OR_PIQP, *SOLVERS):
+    if name in (CORE, *SOLVERS):
         return SOLVERS.get(name, COMPILED)
     entries = solver_entries()
     if name not in entries:
@@ -123,7 +115,7 @@ def solver_entries() -> dict[str, SolverEntry]:
 
 def make_backend(name: str, *, changing: bool = False) -> Backend:
     """Return a new back end of a named QP solver; raises `UnknownNameError`, or `MissingPackageError`."""
-    if name in (CORE, CORE_OR_PIQP):
+    if name == CORE:
         raise UnknownNameError("QP solver", name, SOLVERS, "use make_solver")
     entry = find_solver(name)
     if not entry.installed:

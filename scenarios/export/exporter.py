@@ -15,9 +15,8 @@ from mpc.bounded import Weighted
 from mpc.codegen.ctext import CText, Precision
 from mpc.codegen.source import CHANGES, DATA, CController, part
 from mpc.codegen.targets import TARGETS, Machine
-from mpc.core.library import MIRRORS
 from mpc.core.numbers import Exportable, exportable
-from mpc.core.solver import CoreProblem, core_library
+from mpc.core.solver import WAYS, CoreProblem, Work, core_library
 from mpc.ocp import Problem
 from mpc.solvers import Method
 from quadsim.controller import ROTORS
@@ -67,10 +66,9 @@ class _Search:
         self._library, self._shared = core_library(), shared
         self._problem = type(shared.struct).from_buffer_copy(shared.struct)
         self._problem.room, self._problem.changes = room, changes
-        at, sizes = ctypes.addressof(self._problem), (ctypes.c_size_t * len(MIRRORS))()
-        self._library.quadsim_library_sizes(sizes)
+        at = ctypes.addressof(self._problem)
         self._memory = np.zeros(self._library.quadsim_work_reals(at))
-        self._work = np.zeros(sizes[MIRRORS.index("quadsim_work")], np.uint8)
+        self._work = np.zeros(ctypes.sizeof(Work), np.uint8)
         self._at = self._work.ctypes.data
         self._library.quadsim_work_start(self._at, at, self._memory.ctypes.data)
 
@@ -86,7 +84,7 @@ def reach(problem: Problem, room: int, changes: int) -> Reach:
     begins without an active set.
 
     Raises:
-        MissingCoreError: the core was not compiled here.
+        FileError: the library cannot be compiled or loaded.
     """
     shared, rng = CoreProblem(problem), np.random.default_rng(0)
     whole, limited = _Search(shared, shared.struct.room, shared.struct.changes), _Search(shared, room, changes)
@@ -141,7 +139,6 @@ def export(
 
     Raises:
         ExportError: this controller cannot be exported; the message gives the reason.
-        MissingCoreError: there is no core here, which computes the exact answers.
         InputError: something else is wrong with the input.
         OutputError: the directory cannot be written.
 

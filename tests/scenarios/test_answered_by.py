@@ -14,6 +14,7 @@ from mpc.ocp import Query, predicted
 from mpc.qp import KKT_EVERY
 from mpc.solvers import QPSolver
 from mpc.solvers.piqp import Piqp
+from scenarios.assembly import preferring_core
 from scenarios.flown import summarise
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
@@ -82,3 +83,25 @@ def test_infeasibility_is_the_largest_violation_of_a_row_step_by_step() -> None:
             checked, refused = result(problem, query, answer, None)
             assert checked.stats.infeasibility == pytest.approx(expected, rel=1e-9, abs=1e-11)
             assert (refused == "infeasible_answer") == (expected > INFEASIBLE)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "solver"),
+    [
+        ("paper-constrained", (), "core"),
+        ("paper-constrained", ("controller.solver=daqp",), "daqp"),
+        ("paper-constrained", ("controller.horizon=900",), "piqp"),  # whose responses are too many for the core
+        ("pillar", (), "piqp"),  # whose half-spaces differ from step to step
+        ("hover", (), "core"),
+    ],
+)
+def test_the_core_is_preferred_to_the_default_where_it_takes_the_problem(
+    name: str, settings: tuple[str, ...], solver: str
+) -> None:
+    preferred = preferring_core(load_scenario(name, settings))
+    assert preferred.controller.solver == solver
+
+
+def test_a_controller_without_that_choice_stays_as_it_is() -> None:
+    scenario = load_scenario("paper-unconstrained")
+    assert preferring_core(scenario) is scenario

@@ -14,9 +14,12 @@ from xml.etree import ElementTree
 import pytest
 
 import quadsim
+from mpc.core import solver
 from mpc.solvers import SOLVERS, solver_entries
 from quadsim import __version__
 from quadsim.assets import vehicle_names
+from quadsim.core import library
+from quadsim.core.build import LIBRARY
 from quadsim.errors import RenderingUnavailableError
 from quadsim.flight import rundir
 from scenarios import flown
@@ -147,7 +150,23 @@ def test_doctor_tries_every_solver(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(result["solvers"]) == list(solver_entries())
     for name, line in result["solvers"].items():
         installed = solver_entries()[name].installed
-        assert line.startswith(("works: ", "fails: ") if installed else ("not installed: ", "not compiled: ")), name
+        assert line.startswith(("works: ", "fails: ") if installed else "not installed: "), name
+    assert result["solvers"]["core"].startswith("works: ")
+
+
+def test_without_the_library_doctor_and_a_flight_by_the_core_say_what_compiles_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(library, "ROOT", tmp_path)
+    monkeypatch.setattr(solver, "load_library", library.load_library.__wrapped__)
+    monkeypatch.setattr(solver, "core_library", solver.core_library.__wrapped__)
+    expected = f"{tmp_path / LIBRARY}: is missing, and it cannot be compiled ("
+    line = capabilities()["solvers"]["core"]
+    assert line.startswith(expected)
+    assert line.endswith("; run: pip install --force-reinstall --no-deps quadsim")
+    command = ["run", "hover", *TABLES, "--out", str(tmp_path / "run"), "--set", "controller.solver=core"]
+    assert main(command) == EXIT_WRONG_INPUT
+    assert expected in " ".join(capsys.readouterr().err.split())
 
 
 def test_doctor_reports_a_package_that_does_not_work_and_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:

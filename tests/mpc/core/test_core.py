@@ -19,16 +19,14 @@ from hypothesis import strategies as st
 from support import flight_queries, paper_problem, random_axes, random_problem
 
 from mpc.constraints import Constraint, Penalty
-from mpc.core import library
-from mpc.core import solver as module
 from mpc.core.axes import axes
-from mpc.core.solver import PROBLEMS, Core, core_library, core_problem
+from mpc.core.solver import PROBLEMS, Core, core_problem
 from mpc.ocp import Equilibrium, Problem, Query, lqr_terminal_weight
 from mpc.qp import kkt_residuals
-from mpc.solvers import Answer, Method, QPSolver, solver_entries
+from mpc.solvers import Answer, Method, QPSolver
 from mpc.solvers.by_name import make_solver
 from quadsim.controller import ACCEPTED, CORE, GAIN, SOLVED, UNCONSTRAINED
-from quadsim.errors import MissingCoreError, ParameterError
+from quadsim.errors import ParameterError
 from quadsim.state import Array
 from scenarios.assembly import Assembly
 from scenarios.flown import Flight
@@ -295,16 +293,6 @@ def test_a_core_is_neither_copied_nor_pickled() -> None:
     for attempt in (copy.copy, copy.deepcopy, pickle.dumps):
         with pytest.raises(TypeError, match="cannot be copied or pickled: make another from its problem"):
             attempt(core)
-
-
-def test_without_a_library_the_reason_is_named_and_piqp(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(library, "_load", lambda: "it was not compiled")
-    monkeypatch.setattr(module, "core_library", core_library.__wrapped__)
-    assert solver_entries()[CORE].line == "no core: it was not compiled"
-    scenario = load_scenario("hover", [f"controller.solver={CORE}"])
-    with pytest.raises(MissingCoreError, match=r"it was not compiled; or choose controller\.solver = 'piqp'"):
-        Assembly(scenario).controller()
-    assert Rollout(load_scenario("hover", ["duration=0.2"])).fly().satisfied
 
 
 def test_half_spaces_are_no_matter_for_the_core() -> None:

@@ -10,15 +10,12 @@ import pytest
 
 import quadsim
 from mpc.codegen.source import CController
-from mpc.core import library
 from mpc.core.law import CompiledMPC
 from mpc.core.numbers import robust_numbers
 from quadsim.controller import CORE, FALLBACK, GAIN, Command, Phase, StepInputs
-from quadsim.errors import ExportError, MissingCoreError
+from quadsim.errors import ExportError
 from quadsim.state import INDEX, N_STATES, Array
 from scenarios.export.exporter import exported_law
-
-pytestmark = pytest.mark.skipif(library.why_missing() is not None, reason="no core")
 
 COMPILED = {"controller.compiled": True}
 FLIGHTS = (
@@ -178,13 +175,6 @@ def test_the_struct_has_all_numbers_in_place() -> None:
 def test_copying_is_refused(mpc: CompiledMPC) -> None:
     with pytest.raises(TypeError, match="cannot be copied or pickled"):
         copy.deepcopy(mpc)
-
-
-def test_a_missing_library_gives_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(library, "_load", lambda: "it was not compiled: install a C compiler")
-    message = r"there is no core here: it was not compiled: install a C compiler; or leave out controller\.compiled"
-    with pytest.raises(MissingCoreError, match=message):
-        quadsim.fly(quadsim.load("hover", {**COMPILED, "duration": 0.2}), progress=False)
 
 
 def test_unexportable_controllers_cannot_be_compiled() -> None:

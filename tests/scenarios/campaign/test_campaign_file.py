@@ -146,7 +146,7 @@ def test_the_campaigns_on_a_battery_differ_in_what_the_observer_estimates() -> N
 def test_the_nominal_campaign_is_of_small_errors_at_the_papers_own_tolerance() -> None:
     """Its controller, its bounds and its tolerance at them; lag to 8 ms, mass within 5 %, perfect sensors."""
     nominal, paper = load_plan("paper-nominal"), load_scenario("paper-constrained")
-    assert nominal.scenario.controller == paper.replace({"controller.solver": "core-or-piqp"}).controller
+    assert nominal.scenario.controller == paper.replace({"controller.solver": "core"}).controller
     assert nominal.scenario.sensors == paper.sensors
     tilts = {limit.name: limit for limit in paper.constraints if limit.name in ("roll", "pitch", "speed", "slew")}
     assert {limit.name: limit for limit in nominal.scenario.constraints if limit.name in tilts} == tilts

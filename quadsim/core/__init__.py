@@ -1,0 +1,1 @@
+"""quadsim's C: one shared library of the sources in `quadsim` and `mpc`, compiled where it is missing or stale."""

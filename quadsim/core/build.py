@@ -1,0 +1,134 @@
+"""Compile the library beside this file: run by the build hook, by the loader, or by hand as a script.
+
+It needs only the standard library and imports nothing of quadsim: the hook runs it in a separate environment.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+"""The folder of the packages: a checkout, or `site-packages`."""
+FOLDERS: Final = ("quadsim/core", "mpc/core/c")
+"""Every C file in them is compiled into the library."""
+LIBRARY: Final = "quadsim/core/_core.so"  # the suffix is free for ctypes; macOS takes .so as well
+FLAGS: Final = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
+"""Without contraction, results are bitwise equal on all processors and at all optimisation levels."""
+COMPILERS: Final = ("cc", "gcc", "clang")
+"""The system's, in this order; `$CC` comes before them."""
+ZIG: Final = "ziglang==0.17.1"
+"""The wheel with a C compiler, for machines without one and for wheels to publish."""
+PLATFORM: Final = "QUADSIM_PLATFORM"
+"""Environment variable with the platform tag of a wheel to publish, of `TARGETS`; unset for this machine's."""
+TARGETS: Final = {
+    "manylinux_2_17_x86_64": "x86_64-linux-gnu.2.17",
+    "manylinux_2_17_aarch64": "aarch64-linux-gnu.2.17",
+    "macosx_11_0_x86_64": "x86_64-macos.11.0",
+    "macosx_11_0_arm64": "aarch64-macos.11.0",
+}
+"""zig's targets by platform tag, each for every processor and system that pip installs the tag on."""
+
+
+class CompilationError(RuntimeError):
+    """There is no compiler, or it fails; the message ends with what it printed."""
+
+
+def sources(root: Path = ROOT) -> list[Path]:
+    """Return the C files and headers."""
+    return [file for folder in FOLDERS for file in sorted((root / folder).glob("*.[ch]"))]
+
+
+def stamp(root: Path = ROOT) -> str:
+    """Return a text that identifies all that determines the library's bits but the compiler: flags and sources."""
+    digest = hashlib.sha256(" ".join(FLAGS).encode())
+    for file in sources(root):
+        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    return f"quadsim sources {digest.hexdigest()[:16]}"
+
+
+def is_current(root: Path = ROOT) -> bool:
+    """Return whether the library is of the sources beside it; a stale one need not be loaded to be recognised."""
+    return not sources(root) or stamp(root).encode() in (root / LIBRARY).read_bytes()
+
+
+def system_compiler() -> list[str]:
+    """Return the command of `$CC`, else of the system's compiler; an empty list if there is none."""
+    return shlex.split(os.environ.get("CC", "")) or [path for path in map(shutil.which, COMPILERS) if path][:1]
+
+
+def to_publish() -> str:
+    """Return the platform tag of a wheel to publish; an empty text without one.
+
+    Raises:
+        CompilationError: it is not one of `TARGETS`.
+    """
+    platform = os.environ.get(PLATFORM, "")
+    if platform and platform not in TARGETS:
+        raise CompilationError(f"{PLATFORM} must be one of {', '.join(TARGETS)}; got {platform!r}")
+    return platform
+
+
+def requirements() -> list[str]:
+    """Return the packages needed to compile: none if the system's compiler is used."""
+    return [ZIG] if to_publish() or not system_compiler() else []
+
+
+def compiler() -> list[str]:
+    """Return the command of the compiler: the system's, else zig's.
+
+    Raises:
+        CompilationError: there is none.
+    """
+    if not requirements():
+        return system_compiler()
+    platform = to_publish()
+    if importlib.util.find_spec("ziglang") is None:
+        lacking = f"{PLATFORM} needs the package" if platform else f"no C compiler ({', '.join(COMPILERS)}), nor"
+        raise CompilationError(f"{lacking} {ZIG}")
+    # Without either, zig compiles for the processor at hand.
+    target = ("-target", TARGETS[platform]) if platform else ("-mcpu=baseline",)
+    return [sys.executable, "-m", "ziglang", "cc", *target]
+
+
+def platform_tag() -> str:
+    """Return the platform tag of the wheel that holds the library."""
+    return to_publish() or sysconfig.get_platform().replace("-", "_").replace(".", "_")
+
+
+def compile_library(root: Path = ROOT) -> Path:
+    """Compile the library; it replaces an older one atomically, and running processes keep theirs.
+
+    Raises:
+        CompilationError: there is no compiler, it fails, or the folder cannot be written.
+    """
+    library = root / LIBRARY
+    units = [str(file) for file in sources(root) if file.suffix == ".c"]
+    command = [*compiler(), *FLAGS, f'-DQUADSIM_SOURCES="{stamp(root)}"', *units, "-o"]
+    try:
+        with tempfile.TemporaryDirectory(dir=library.parent, prefix=f"{library.name}.") as scratch:
+            partial = Path(scratch) / library.name
+            environment = {"ZIG_GLOBAL_CACHE_DIR": scratch, **os.environ}  # which is 70 MB
+            done = subprocess.run([*command, str(partial)], env=environment, capture_output=True, text=True)
+            if done.returncode:
+                raise CompilationError(f"{shlex.join(command[:1])} fails:\n{done.stderr}")
+            partial.replace(library)
+    except OSError as error:
+        raise CompilationError(str(error)) from error
+    return library
+
+
+if __name__ == "__main__":
+    try:
+        sys.stdout.write(f"{compile_library()}\n")
+    except CompilationError as error:
+        sys.exit(str(error))

@@ -1,0 +1,214 @@
+"""The library of quadsim's C: who compiles it, and what happens to one that is missing, stale or broken."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from quadsim.core import build, library
+from quadsim.core.build import LIBRARY, PLATFORM, TARGETS, ZIG, CompilationError
+from quadsim.core.library import load_from, load_library
+from quadsim.errors import FileError
+
+ANSWER = "mpc/core/c/answer.c"
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """A folder of packages with a C function that answers 1; no library is there."""
+    for folder in build.FOLDERS:
+        (tmp_path / folder).mkdir(parents=True)
+    shutil.copy2(build.ROOT / "quadsim/core/sources.c", tmp_path / "quadsim/core")
+    answering(tmp_path, 1)
+    return tmp_path
+
+
+def answering(tree: Path, answer: int) -> None:
+    (tree / ANSWER).write_text(f"int answer(void);\nint answer(void)\n{{\n    return {answer};\n}}\n")
+
+
+@pytest.fixture
+def no_compiler(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The only folder of the PATH, which is empty; there is no package ziglang either."""
+    empty = tmp_path_factory.mktemp("bin")
+    for name in ("CC", PLATFORM):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PATH", str(empty))
+    monkeypatch.setattr(build.importlib.util, "find_spec", lambda name: None)
+    return empty
+
+
+@pytest.fixture
+def only_zig(no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build.importlib.util, "find_spec", lambda name: object() if name == "ziglang" else None)
+
+
+def program(folder: Path, name: str) -> str:
+    path = folder / name
+    path.write_text("#!/bin/sh\n")
+    path.chmod(0o755)
+    return str(path)
+
+
+# Who compiles
+
+
+def test_the_system_s_compiler_comes_before_zig(no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("clang", "gcc", "cc"):
+        path = program(no_compiler, name)
+        assert (build.compiler(), build.requirements()) == ([path], [])
+    monkeypatch.setenv("CC", "ccache gcc-14 -m64")
+    assert (build.compiler(), build.requirements()) == (["ccache", "gcc-14", "-m64"], [])
+
+
+@pytest.mark.usefixtures("only_zig")
+def test_without_one_zig_compiles_for_every_processor() -> None:
+    assert build.requirements() == [ZIG]
+    assert build.compiler() == [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
+
+
+@pytest.mark.parametrize("platform", TARGETS)
+@pytest.mark.usefixtures("only_zig")
+def test_zig_compiles_what_is_published(platform: str, no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program(no_compiler, "cc")
+    assert build.requirements() == []
+    monkeypatch.setenv(PLATFORM, platform)
+    assert (build.requirements(), build.platform_tag()) == ([ZIG], platform)
+    assert build.compiler()[1:] == ["-m", "ziglang", "cc", "-target", TARGETS[platform]]
+
+
+@pytest.mark.parametrize(
+    ("platform", "message"),
+    [
+        ("", rf"no C compiler \(cc, gcc, clang\), nor {ZIG}"),
+        ("macosx_11_0_arm64", f"QUADSIM_PLATFORM needs the package {ZIG}"),
+        ("win_amd64", r"QUADSIM_PLATFORM must be one of manylinux_2_17_x86_64, .*; got 'win_amd64'"),
+    ],
+)
+@pytest.mark.usefixtures("no_compiler")
+def test_what_is_missing_is_named(platform: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(PLATFORM, platform)
+    with pytest.raises(CompilationError, match=message):
+        build.compiler()
+
+
+@pytest.mark.parametrize("kind", ["wheel", "editable"])
+def test_pip_is_told_to_fetch_zig(kind: str, no_compiler: Path) -> None:
+    code = f"import hatchling.build as b; print(b.get_requires_for_build_{kind}())"
+
+    def required() -> str:
+        command = [sys.executable, "-c", code]
+        return subprocess.run(command, cwd=build.ROOT, capture_output=True, text=True, check=True).stdout
+
+    assert ZIG in required()
+    program(no_compiler, "cc")
+    assert "ziglang" not in required()
+
+
+# What is loaded
+
+
+def test_a_missing_library_is_compiled(tree: Path) -> None:
+    assert load_from(tree).answer() == 1
+    assert [file.name for file in (tree / LIBRARY).parent.iterdir() if "_core" in file.name] == ["_core.so"]
+
+
+def test_a_stale_library_is_replaced_and_not_overwritten(tree: Path) -> None:
+    path = build.compile_library(tree)
+    assert build.is_current(tree)
+    answering(tree, 2)
+    assert not build.is_current(tree)
+    before = path.read_bytes()
+    with path.open("rb") as mapped:
+        assert load_from(tree).answer() == 2
+        assert mapped.read() == before
+    assert build.is_current(tree)
+
+
+def flag(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build, "FLAGS", (*build.FLAGS, "-DONE"))
+
+
+def header(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tree / ANSWER).with_name("answer.h").touch()
+
+
+def rename(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tree / ANSWER).rename((tree / ANSWER).with_name("reply.c"))
+
+
+@pytest.mark.parametrize("change", [flag, header, rename])
+def test_flags_headers_and_names_count_as_sources(
+    change: Callable[[Path, pytest.MonkeyPatch], None], tree: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build.compile_library(tree)
+    change(tree, monkeypatch)
+    assert not build.is_current(tree)
+
+
+def test_without_sources_nothing_is_compared(tree: Path) -> None:
+    build.compile_library(tree)
+    for file in build.sources(tree):
+        file.unlink()
+    assert load_from(tree).answer() == 1
+
+
+def test_a_library_of_another_machine_is_compiled_anew(tree: Path) -> None:
+    (tree / LIBRARY).write_bytes(b"\xcf\xfa\xed\xfe" + build.stamp(tree).encode())
+    assert build.is_current(tree)
+    assert load_from(tree).answer() == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [(None, "is missing"), (b"\x7fELF", "was compiled from other sources"), ("stamp", r"cannot be loaded \(.*\)")],
+)
+@pytest.mark.usefixtures("no_compiler")
+def test_what_cannot_be_compiled_is_refused(content: bytes | str | None, problem: str, tree: Path) -> None:
+    if content is not None:
+        (tree / LIBRARY).write_bytes(content if isinstance(content, bytes) else build.stamp(tree).encode())
+    lacking = rf"and it cannot be compiled \(no C compiler \(cc, gcc, clang\), nor {ZIG}\)"
+    with pytest.raises(FileError, match=rf"_core\.so: {problem}, {lacking}; run: pip install --force-reinstall --no-"):
+        load_from(tree)
+    (tree / "hatch_build.py").touch()
+    with pytest.raises(FileError, match=rf"run: pip install --editable {tree}$"):
+        load_from(tree)
+
+
+def test_the_compiler_s_first_error_is_shown(tree: Path) -> None:
+    (tree / ANSWER).write_text("#warning first\nint answer(void) { return one; }\n")
+    with pytest.raises(FileError, match=r"answer\.c:2:\d+: error: .*one") as caught:
+        load_from(tree)
+    assert "\n" not in str(caught.value)
+    assert not (tree / LIBRARY).exists()
+
+
+def test_a_compiler_that_does_not_exist_is_named(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(FileError, match=r"cannot be compiled \(.*'no-such-compiler'\)"):
+        load_from(tree)
+
+
+def test_the_script_prints_the_library_or_all_that_the_compiler_says(tree: Path) -> None:
+    script = shutil.copy2(build.__file__, tree / "quadsim" / "core")
+
+    def run() -> subprocess.CompletedProcess[str]:
+        return subprocess.run([sys.executable, script], capture_output=True, text=True)
+
+    assert run().stdout == f"{tree / LIBRARY}\n"
+    (tree / ANSWER).write_text("int answer(void) { return one + two; }\n")
+    done = run()
+    assert done.returncode == 1
+    assert done.stderr.count("error: ") == 2
+    assert "Traceback" not in done.stderr
+
+
+def test_this_library_is_of_these_sources() -> None:
+    assert load_library() is load_library()
+    assert build.is_current()
+    assert library.ROOT == build.ROOT == Path(__file__).parents[3]
