@@ -8,7 +8,6 @@ from pathlib import Path
 
 from timing import Record, options, run
 
-from scenarios.commands.app import load
 from scenarios.assembly import Assembly
 from scenarios.campaign.campaign import fly_campaign
 from scenarios.campaign.campaign_file import CampaignFile

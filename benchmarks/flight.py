@@ -1,66 +1,126 @@
-"""Where the time of a flight goes: physics, the controller's solver and the rest of it, measurement, log."""
+"""Processor time of whole flights, with and without their controllers, beside that of MuJoCo's step alone."""
 
 from __future__ import annotations
 
+import time as clock
+from collections.abc import Mapping
 from functools import partial
+from typing import Any, Final
 
+import mujoco
 import numpy as np
 from timing import Record, Stopwatch, options, run, undisturbed
 
-from quadsim.sim.loop import complete
+from quadsim.core.structs import SAMPLE, TrackStruct, plant_library
+from quadsim.errors import FlightError
 from scenarios.assembly import Assembly
 from scenarios.commands.app import load
 from scenarios.progress import Progress
-from scenarios.rollout import closed_loop
+from scenarios.rollout import Rollout
+from scenarios.schema.scenario import Scenario
+
+SHORT: Final = 10.0  # [s] that is flown of a longer flight
+GUSTY: Final = {
+    "effects.rotors": {},
+    "effects.air": {"rotor_drag": 1e-5, "turbulence": {"wind_speed_20ft": 5.0, "airspeed": 3.0}},
+    "effects.ground": {"effect": True, "contact": False, "rotor_radius": 0.1},
+}
+MOTION_CAPTURE: Final = {
+    **{"sensors.position.rate": 100.0, "sensors.position.noise": 0.01},
+    **{"sensors.attitude.rate": 100.0, "sensors.attitude.noise": 0.26, "estimator.type": "error_state"},
+}
+FLIGHTS: Final[dict[str, tuple[str, Mapping[str, Any]]]] = {
+    "paper-unconstrained": ("paper-unconstrained", {}),
+    "paper-constrained": ("paper-constrained", {}),
+    "robust": ("robust", {}),
+    "robust; rotors, drag, turbulence, ground effect": ("robust", GUSTY),
+    "battery": ("battery", {}),
+    "autopilot, 1 kHz gyro": ("autopilot", {}),
+    "autopilot; motion capture, Kalman filter": ("autopilot", MOTION_CAPTURE),
+    "motion-capture; 1 kHz gyro": ("motion-capture", {"sensors.rates.rate": 1000.0}),
+    "landing-by-estimate, 500 Hz gyro": ("landing-by-estimate", {}),
+    "torrente-loop8-all, own Runge-Kutta step": ("torrente-loop8-all", {}),
+}
+"""Flights by what a row says: a scenario, and what is changed of it."""
 
 
-def measure(name: str, quick: bool, report: Progress) -> list[Record]:
-    """Seconds of each part, the median over flights by turns with and without clocks around the parts."""
-    scenario = load(name).replace({"duration": 2.0, "constraints": []}) if quick else load(name)
-    assembly = Assembly(scenario)
-    controller = assembly.controller()
-    reference = assembly.reference(scenario.periods + controller.horizon)
-    pieces = Stopwatch()
-    walls: list[float] = []
-    parts: list[Record] = []
-    with assembly.plant() as plain, assembly.plant() as watched, undisturbed():
-        pieces.watch(watched, "advance", "physics")
-        pieces.watch(watched, "state", "measurement")
-        rounds = 1 if quick else 5
-        for i in range(rounds):
-            for plant in (plain, watched):
-                report("flights", 2 * i + (plant is watched), 2 * rounds)
-                for laps in pieces.laps.values():
-                    laps.clear()
-                navigation, watch = assembly.navigation(), Stopwatch()
-                loop = closed_loop(assembly, plant, controller, reference, navigation=navigation)
-                complete(loop, periods=scenario.periods)
-                log = loop.log()
-                wall = watch.elapsed
-                if plant is plain:
-                    walls.append(wall)
-            solver, step = 1e-3 * float(log.timing.solve_ms.sum()), 1e-3 * float(log.timing.step_ms.sum())
-            spent = {part: sum(laps) for part, laps in pieces.laps.items()}
-            parts.append(
+def flown(scenario: Scenario) -> tuple[float, float, int]:
+    """Processor time of a flight without its controller, and of all of it [s]; and the physics steps flown."""
+    with Rollout(scenario) as flight:
+        watch = Stopwatch(clock.thread_time)
+        watch.watch(flight.loop.controller, "step", "controller")
+        try:
+            while not flight.done:
+                flight.loop.step()
+        except FlightError:
+            pass
+        whole = watch.elapsed
+        return whole - sum(watch.laps["controller"]), whole, round(flight.loop.time / scenario.plant.timestep)
+
+
+def measure(quick: bool, report: Progress) -> list[Record]:
+    """The best of rounds, of each flight."""
+    rounds, records = 1 if quick else 3, []
+    with undisturbed():
+        for i, (name, (scenario_name, changes)) in enumerate(FLIGHTS.items()):
+            report("flights", i, len(FLIGHTS))
+            scenario = load(scenario_name)
+            length = min(scenario.duration, 1.0 if quick else SHORT)
+            scenario = scenario.replace({**changes, "duration": length, "constraints": []})
+            times = [flown(scenario) for _ in range(rounds)]
+            without, whole, steps = (min(column) for column in zip(*times, strict=True))
+            seconds = steps * scenario.plant.timestep
+            records.append(
                 {
-                    "physics": spent["physics"],
-                    "controller: optimum": solver,
-                    "controller: the rest": step - solver,
-                    "measurement": spent["measurement"],
-                    "log and loop": wall - step - sum(spent.values()),
+                    "flight": name,
+                    "without_the_controller_ms_per_s": 1e3 * without / seconds,
+                    "whole_ms_per_s": 1e3 * whole / seconds,
+                    "whole_us_per_step": 1e6 * whole / steps,
                 }
             )
-    simulated, wall = log.control.t.size * scenario.control_period, float(np.median(walls))
-    medians = {part: float(np.median([part_times[part] for part_times in parts])) for part in parts[0]}
-    whole = sum(medians.values())
-    rows = [{"part": part, "seconds": spent, "share_%": 100.0 * spent / whole} for part, spent in medians.items()]
-    return [*rows, {"part": f"the whole, without clocks; {simulated / wall:.0f} times real time", "seconds": wall}]
+        records.append({"flight": "MuJoCo's step alone", "whole_us_per_step": 1e6 * _mujoco_step(rounds)})
+        records.append({"flight": "a sample of the Kalman filter", "whole_us_per_step": 1e6 * _filter_sample(rounds)})
+    return records
+
+
+def _mujoco_step(rounds: int, steps: int = 2000) -> float:
+    with Assembly(load("paper-constrained")).plant() as plant:
+        data = mujoco.MjData(plant.model)
+        return min(_timed(partial(mujoco.mj_step, plant.model, data, nstep=steps)) for _ in range(rounds)) / steps
+
+
+def _filter_sample(rounds: int, samples: int = 1000) -> float:
+    """Prediction over a step of 1 ms, and update by a gyro's sample."""
+    assembly = Assembly(load("motion-capture"))
+    navigation = assembly.navigation()
+    assert navigation is not None
+    with assembly.plant() as plant:
+        navigation.reset(plant.physics, plant.hover_speeds)
+        commands, grounded = np.tile(plant.hover_speeds, (samples, 1)), np.zeros(samples, np.uint8)
+    estimator = navigation.filter
+    assert estimator is not None
+    taken = np.zeros(samples, SAMPLE)
+    taken["taken"], taken["kind"] = np.arange(1, samples + 1), 3
+    taken["value"] = 0.01 * np.random.default_rng(0).standard_normal((samples, 3))
+
+    def use() -> None:
+        track = TrackStruct.from_buffer_copy(estimator.track)
+        given = taken.ctypes.data, samples, commands.ctypes.data, grounded.ctypes.data, 0, -1
+        plant_library().quadsim_filter_run(estimator.struct, track, *given)
+
+    return min(_timed(use) for _ in range(rounds)) / samples
+
+
+def _timed(call: Any) -> float:
+    started = clock.thread_time()
+    call()
+    return clock.thread_time() - started
 
 
 def main() -> None:
     """Fly, print and write."""
-    chosen = options(__doc__, scenario={"default": "paper-constrained", "help": "default: %(default)s"})
-    run(partial(measure, chosen.scenario, chosen.quick), f"A flight of {chosen.scenario}", chosen.json)
+    chosen = options(__doc__)
+    run(partial(measure, chosen.quick), "Processor time of flights", chosen.json)
 
 
 if __name__ == "__main__":

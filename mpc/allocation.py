@@ -14,15 +14,12 @@ approximated in two stages:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
+from quadsim.core.structs import InnerStruct, fill, plant_library
 from quadsim.state import Array, read_only
-from quadsim.vehicle import Vehicle
-
-WEIGHTS: Final = (30.0, 1000.0, 1000.0, 1.0)
-"""Weights of thrust, roll, pitch and yaw in stage 2.  Squared, they differ by a factor of about 1000."""
+from quadsim.vehicle import N_ROTORS, Vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,36 +49,22 @@ def thrust_to_command(largest: float, weight: float, share: float) -> float:
     return min(largest, max(share * largest, 0.5 * (weight + largest)))
 
 
+def allocation_struct(allocation: Allocation, lower: Array, upper: Array) -> InnerStruct:
+    """Return what the core takes for an allocation within `lower` and `upper` (4,) [rad/s], which are finite."""
+    struct = InnerStruct()
+    fill(struct.effect, allocation.M)
+    fill(struct.inverse, allocation.inverse)
+    struct.scale[:], struct.least[:], struct.most[:] = allocation.scale, lower, upper
+    return struct
+
+
 def allocate(allocation: Allocation, wrench: Array, lower: Array, upper: Array) -> Array:
     """Return the rotor speeds (4,) within `lower` and `upper` (4,) [rad/s] whose wrench is closest to the one demanded.
 
-    The wrench (4,) is thrust [N] along body z and torques [N m] about the body axes; the bounds are finite.
+    The wrench (4,) is thrust [N] along body z and torques [N m] about the body axes; the bounds are finite.  The core
+    computes it; stage 2 is the best of all choices of rotors at their lower or upper bound.
     """
-    low, high = lower**2, upper**2
-    squares = allocation.inverse @ wrench
-    if not ((low <= squares) & (squares <= high)).all():
-        squares_less_yaw = _less_yaw(squares, allocation.inverse[:, 3], low, high)
-        squares = _nearest(allocation, wrench, low, high) if squares_less_yaw is None else squares_less_yaw
-    return np.asarray(np.clip(np.sqrt(np.maximum(squares, 0.0)), lower, upper))
-
-
-def _less_yaw(squares: Array, yaw: Array, low: Array, high: Array) -> Array | None:
-    """Return the point of the line along `yaw` closest to `squares` and within the bounds; None if there is none."""
-    rounding = 1e-9 * max(float(high.max()), 1.0)  # rounding must not exclude a corner of the bounds
-    ends = np.sort(np.stack([(low - rounding - squares) / yaw, (high + rounding - squares) / yaw]), axis=0)
-    first, last = ends[0].max(), ends[1].min()
-    return squares + np.clip(0.0, first, last) * yaw if first <= last else None
-
-
-def _nearest(allocation: Allocation, wrench: Array, low: Array, high: Array) -> Array:
-    from scipy.optimize import lsq_linear  # slow to import, and not needed to read settings
-
-    unit = max(float(high.max()), 1.0)  # scales the squares, so that the solver works with numbers near 1
-    weights = np.array(WEIGHTS) / allocation.scale
-    wrench = wrench.copy()  # a thrust out of range would dominate the torques in the squared error
-    wrench[0] = np.clip(wrench[0], allocation.M[0] @ low, allocation.M[0] @ high)
-    wide = np.maximum(high, low + 1e-9 * unit)  # the solver needs a gap between bounds
-    fit = lsq_linear(
-        weights[:, None] * allocation.M * unit, weights * wrench, (low / unit, wide / unit), method="bvls", tol=1e-14
-    )
-    return np.asarray(fit.x * unit)
+    demanded, speeds = np.ascontiguousarray(wrench, np.float64), np.empty(N_ROTORS)
+    struct = allocation_struct(allocation, lower, upper)
+    plant_library().quadsim_allocate(struct, demanded.ctypes.data, speeds.ctypes.data)
+    return speeds

@@ -20,22 +20,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 from annotated_types import doc
 
-from mpc.allocation import allocate, make_allocation
+from mpc.allocation import allocation_struct, make_allocation
+from quadsim.core.inner import CompiledLoop
+from quadsim.core.structs import LoopKind, fill
 from quadsim.fields import Positive
-from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from mpc.answer import ActuatorBounds
     from mpc.disturbance import RampSettings
-
-DAMPING: Final = math.sqrt(0.5)
-"""Damping of the second-order Butterworth low-pass filter, as in Tal and Karaman."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,44 +53,26 @@ def require_one_scale(indi: INDISettings | None, disturbance: RampSettings | Non
         raise ValueError("disturbance.thrust_scale must be false where indi is given: both make up for torque lost")
 
 
-class TorqueIncrement:
+class TorqueIncrement(CompiledLoop):
     """The inner loop: corrects the commanded rotor speeds so that the vehicle turns as the law's model predicts.
 
-    See `quadsim.controller.InnerLoop`.
+    See `quadsim.controller.InnerLoop`.  The core computes it: the filter y'' = omega^2 (value - y) - 2 zeta omega y',
+    Butterworth's damping as in Tal and Karaman, implicit, so that it is stable at any rate; and the allocation.
     """
 
     def __init__(self, vehicle: Vehicle, settings: INDISettings, bounds: ActuatorBounds) -> None:
         self.rate = settings.rate
-        self._allocation, self._inertia, self._bounds = make_allocation(vehicle), np.array(vehicle.inertia), bounds
-        self._omega = 2.0 * math.pi * settings.cutoff
-        self.reset()
+        struct = allocation_struct(make_allocation(vehicle), bounds.u_min, bounds.u_max)
+        struct.kind, struct.inertia[:], struct.omega = LoopKind.INDI, vehicle.inertia, 2.0 * math.pi * settings.cutoff
+        super().__init__(struct)
 
     def reset(self) -> None:
         """Clear the filter; no unmodelled torque."""
-        self._last: tuple[float, Array] | None = None
-        self._filtered, self._slope = np.zeros(3), np.zeros(3)
+        self._struct.started = 0
+        fill(self._struct.filtered, 0.0)
+        fill(self._struct.slope, 0.0)
 
     def adopt(self, other: TorqueIncrement) -> None:
         """Take over the state of another inner loop."""
-        self._last, self._filtered, self._slope = other._last, other._filtered, other._slope
-
-    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
-        """Return the rotor speeds (4,) to hold until the next call, from the demanded and the measured ones."""
-        M, J = self._allocation.M, self._inertia
-        last, self._last = self._last, (time, rates.copy())
-        if last is not None and time > last[0]:
-            step = time - last[0]
-            middle = 0.5 * (rates + last[1])
-            missed = (M @ rotors**2)[1:] - J * (rates - last[1]) / step - np.cross(middle, J * middle)
-            self._filter(missed, step)
-        wrench = M @ commanded**2
-        wrench[1:] += self._filtered
-        return allocate(self._allocation, wrench, self._bounds.u_min, self._bounds.u_max)
-
-    def _filter(self, value: Array, step: float) -> None:
-        """One step of y'' = omega^2 (value - y) - 2 zeta omega y', implicit, so that it is stable at any rate."""
-        omega = self._omega
-        slope = (self._slope + step * omega**2 * (value - self._filtered)) / (
-            1.0 + 2.0 * DAMPING * omega * step + (omega * step) ** 2
-        )
-        self._filtered, self._slope = self._filtered + step * slope, slope
+        for name in ("started", "last_time", "last_rates", "filtered", "slope"):
+            setattr(self._struct, name, getattr(other._struct, name))

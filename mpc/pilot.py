@@ -23,6 +23,8 @@ from quadsim.controller import (
     stopped,
     takes_targets,
 )
+from quadsim.core.inner import CompiledLoop
+from quadsim.core.structs import InnerStruct
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -132,14 +134,24 @@ class Pilot:
         self._target, self._fresh, self._rates = self._hover, True, None
         return stopped(self._slowest.copy(), self.horizon, now.phase)
 
-    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
-        """See `quadsim.controller.InnerLoop`; the autopilot is reset before its first call."""
+    def engage(self, command: Array, rotors: Array) -> InnerStruct | None:
+        """Let a target fly from now on, at rotor speeds (4,) [rad/s]; the autopilot is reset before its first.
+
+        Returns:
+            the autopilot's struct, where the core answers for it; None: `speeds` is to be asked.
+        """
         assert self.inner is not None
         if self._fresh:
             self.inner.reset()
             if self._rates is not None and isinstance(self.inner, Settling):
                 self.inner.settle(self._rates, rotors)
-        self._target, self._fresh = commanded, False
+        self._target, self._fresh = command, False
+        return self.inner.engage(command, rotors) if isinstance(self.inner, CompiledLoop) else None
+
+    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
+        """See `quadsim.controller.InnerLoop`."""
+        self.engage(commanded, rotors)
+        assert self.inner is not None
         return self.inner.speeds(time, commanded, rates, rotors, attitude)
 
     def predict(self, states: Array, plans: Array) -> Array | None:

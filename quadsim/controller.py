@@ -6,13 +6,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Final, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from quadsim.motion import Motion
 from quadsim.state import Array
 from quadsim.vehicle import LARGEST
+
+if TYPE_CHECKING:
+    from quadsim.core.structs import InnerStruct
 
 SOLVED: Final = "solved"  # status: a QP solver or the core computed the optimum
 UNCONSTRAINED: Final = "unconstrained"
@@ -172,6 +175,19 @@ class Settling(Protocol):
 
     def settle(self, rates: Array, rotors: Array) -> None:
         """Start at body rates (3,) and rotor speeds (4,) [rad/s], after `reset`."""
+        ...
+
+
+@runtime_checkable
+class Engaging(Protocol):
+    """An inner loop that the compiled core may answer for."""
+
+    def engage(self, command: Array, rotors: Array) -> InnerStruct | None:
+        """Let a command fly from now on, at rotor speeds (4,) [rad/s].
+
+        Returns:
+            the struct that answers in the core; None where `speeds` is to be asked.
+        """
         ...
 
 

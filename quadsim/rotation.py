@@ -92,24 +92,14 @@ def quaternion_to_euler(quaternion: Array) -> Array:
 def euler_to_quaternion(euler: Array) -> Array:
     """Unit quaternions (..., 4), scalar first, body to world, of roll, pitch, yaw (..., 3) [rad]."""
     half = 0.5 * np.asarray(euler, float)
-    return np.stack(_quaternion(np.moveaxis(np.cos(half), -1, 0), np.moveaxis(np.sin(half), -1, 0)), axis=-1)
-
-
-def of_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """The same for one attitude, in plain numbers."""
-    halves = 0.5 * roll, 0.5 * pitch, 0.5 * yaw
-    return _quaternion(map(math.cos, halves), map(math.sin, halves))
-
-
-def _quaternion(cosines: Iterable[Any], sines: Iterable[Any]) -> tuple[Any, Any, Any, Any]:
-    """The unit quaternion from cosines and sines of half the Euler angles, arrays or plain numbers."""
-    (cr, cp, cy), (sr, sp, sy) = cosines, sines
-    return (
+    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(half), -1, 0), np.moveaxis(np.sin(half), -1, 0)
+    components = (
         cr * cp * cy + sr * sp * sy,
         sr * cp * cy - cr * sp * sy,
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
     )
+    return np.stack(components, axis=-1)
 
 
 def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:

@@ -37,8 +37,7 @@ from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics, Ro
 from quadsim.sim.effects.wind import Air, Gust, WindChange, WindField
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import physics_to_state
-from quadsim.sim.plant import Plant
-from quadsim.sim.rigid_body import check_free
+from quadsim.sim.plant import Plant, check_free
 from quadsim.sim.sensing import AXES, FaultKind, Sensor, SensorFault, SensorName, in_si
 from quadsim.space import Corridor, Fence, Region
 from quadsim.state import (

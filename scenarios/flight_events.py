@@ -117,7 +117,7 @@ class FlightEvents:
         elif isinstance(event, Stall):
             self._loop.computation = assembly.computation(self._spec)
         elif isinstance(event, SensorFaultEvent):
-            if self._navigation is None or not self._navigation.watches(SensorName(event.sensor)):
+            if self._navigation is None or not self._navigation.has(SensorName(event.sensor)):
                 raise _not_started_for(event)
             self._navigation.reschedule(assembly.faults)
         elif isinstance(event, Gust | WindChange):

@@ -45,10 +45,12 @@ def test_solvers_agree_on_the_optimum(tmp_path: Path) -> None:
 
 
 @pytest.mark.witness("benchmarks")
-def test_the_parts_of_a_flight_make_up_its_time(tmp_path: Path) -> None:
-    *parts, _ = quick("flight", tmp_path)
-    assert sum(part["share_%"] for part in parts) == pytest.approx(100.0)
-    assert all(part["seconds"] > 0.0 for part in parts)
+def test_flights_with_and_without_their_controllers(tmp_path: Path) -> None:
+    *flights, step, sample = quick("flight", tmp_path)
+    for record in flights:
+        assert 0.0 < record["without_the_controller_ms_per_s"] < record["whole_ms_per_s"]
+        assert record["whole_us_per_step"] > 0.2 * step["whole_us_per_step"]
+    assert sample["whole_us_per_step"] < 20.0
 
 
 def test_a_film_has_its_frames(tmp_path: Path) -> None:

@@ -113,7 +113,7 @@ def compile_library(root: Path = ROOT) -> Path:
     """
     library = root / LIBRARY
     units = [str(file) for file in sources(root) if file.suffix == ".c"]
-    command = [*compiler(), *FLAGS, f'-DQUADSIM_SOURCES="{stamp(root)}"', *units, "-o"]
+    command = [*compiler(), *FLAGS, f'-DQUADSIM_SOURCES="{stamp(root)}"', *units, "-lm", "-o"]
     try:
         with tempfile.TemporaryDirectory(dir=library.parent, prefix=f"{library.name}.") as scratch:
             partial = Path(scratch) / library.name

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number
-from quadsim.flight.log import ControlLog, FlightLog, PlantLog
+from quadsim.flight.log import FlightLog, PeriodLog, PlantLog, Sampled
 from quadsim.rotation import euler_to_body_rates
 from quadsim.space import Constraining
 from quadsim.state import (
@@ -84,12 +84,12 @@ class Signal:
     """A quantity that can be limited: its unit in limits, and how to read it from a log."""
 
     unit: str  # unit of its limits, e.g. `deg`
-    sampled: Callable[[ControlLog], Array]  # log -> (K,) or (K, j) values at the control samples, in `unit`
+    sampled: Callable[[Sampled], Array]  # log -> (K,) or (K, j) values at the control samples, in `unit`
     plant: Callable[[PlantLog], Array] | None
     """log -> (M,) or (M, j) values at the physics rate, or None for a quantity that exists only at samples."""
     tolerance: Tolerance = MOTION  # default tolerances of its limits
 
-    def finest(self, log: FlightLog) -> tuple[Array, Array]:
+    def finest(self, log: FlightLog | PeriodLog) -> tuple[Array, Array]:
         """Return times [s] and values at the plant's rate, or at the control samples if the plant has none."""
         if self.plant is None:
             return log.control.t, self.sampled(log.control)
@@ -456,7 +456,7 @@ def margins_at(limit: Limit, t: Array, values: Array) -> Array:
     return np.where(limit.holds_at(t), limit.margin(values), np.nan)
 
 
-def smallest_margins(log: FlightLog, limits: Sequence[Limit]) -> dict[str, float]:
+def smallest_margins(log: FlightLog | PeriodLog, limits: Sequence[Limit]) -> dict[str, float]:
     """Smallest signed margin of each limit, by name, at the highest available rate; NaN outside its window."""
     return {limit.name: _worst(limit, *limit.source.finest(log))[1] for limit in limits}
 

@@ -102,8 +102,64 @@ def stacked(periods: Sequence[LoggedSignals]) -> dict[str, tuple[str, Array]]:
     }
 
 
+class Sampled:
+    """What follows from states, references and commands at the control samples, whatever else is logged of them."""
+
+    t: Array
+    state: Array
+    reference: Array
+    speeds: Array
+    speeds_before: Array
+    truth: Array
+    attitude: Array | None
+    body_rates: Array | None
+    target: Array | None
+
+    @property
+    def tracking_error(self) -> Array:
+        """(K, 4) true state less reference: x, y, z [m], yaw [rad] in (-pi, pi]."""
+        error = self.truth[:, REFERENCE_STATES] - self.reference
+        error[:, REFERENCE_NAMES.index("yaw")] = wrapped(error[:, REFERENCE_NAMES.index("yaw")])
+        return error
+
+    @property
+    def measured_error(self) -> Array:
+        """(K, 12) measured less true state; a logged attitude gives a rotation vector and body rates, body axes.
+
+        Without one, it is the difference of Euler angles and of their rates.
+        """
+        error = self.state - self.truth
+        error[:, INDEX["yaw"]] = wrapped(error[:, INDEX["yaw"]])
+        if self.attitude is not None and self.body_rates is not None:
+            angles, rates = self.truth[:, ANGLES], self.truth[:, ANGLE_RATES]
+            turn = multiply(conjugate(euler_to_quaternion(angles)), self.attitude)
+            error[:, ANGLES] = 2.0 * np.copysign(1.0, turn[:, :1]) * turn[:, 1:]
+            error[:, ANGLE_RATES] = self.body_rates - euler_to_body_rates(angles, rates)
+        return error
+
+    @property
+    def slews(self) -> Array:
+        """(K, 4) command steps u(k) - u(k-1) [rad/s per period], Eq. (15)."""
+        return np.diff(self.speeds, axis=0, prepend=self.speeds_before[None, :])
+
+
 @dataclass(frozen=True, kw_only=True)
-class ControlLog:
+class Samples(Sampled):
+    """The fields of a `ControlLog` on which signals depend: what the margins of a single period take."""
+
+    t: Array
+    state: Array
+    reference: Array
+    speeds: Array
+    speeds_before: Array
+    truth: Array
+    attitude: Array | None = None
+    body_rates: Array | None = None
+    target: Array | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlLog(Sampled):
     """One row per control period k, taken at t_k; K rows.  Its fields are the columns of flight.parquet, in order."""
 
     t: Array = field(metadata=columns("s"))  # (K,)
@@ -153,36 +209,9 @@ class ControlLog:
         return self.state is self.truth or bool(np.array_equal(self.state, self.truth))
 
     @property
-    def tracking_error(self) -> Array:
-        """(K, 4) true state less reference: x, y, z [m], yaw [rad] in (-pi, pi]."""
-        error = self.truth[:, REFERENCE_STATES] - self.reference
-        error[:, REFERENCE_NAMES.index("yaw")] = wrapped(error[:, REFERENCE_NAMES.index("yaw")])
-        return error
-
-    @property
-    def measured_error(self) -> Array:
-        """(K, 12) measured less true state; a logged attitude gives a rotation vector and body rates, body axes.
-
-        Without one, it is the difference of Euler angles and of their rates.
-        """
-        error = self.state - self.truth
-        error[:, INDEX["yaw"]] = wrapped(error[:, INDEX["yaw"]])
-        if self.attitude is not None and self.body_rates is not None:
-            angles, rates = self.truth[:, ANGLES], self.truth[:, ANGLE_RATES]
-            turn = multiply(conjugate(euler_to_quaternion(angles)), self.attitude)
-            error[:, ANGLES] = 2.0 * np.copysign(1.0, turn[:, :1]) * turn[:, 1:]
-            error[:, ANGLE_RATES] = self.body_rates - euler_to_body_rates(angles, rates)
-        return error
-
-    @property
     def crashed(self) -> bool:
         """Whether anything but the feet touched the ground."""
         return str(Phase.CRASHED) in self.phase
-
-    @property
-    def slews(self) -> Array:
-        """(K, 4) command steps u(k) - u(k-1) [rad/s per period], Eq. (15)."""
-        return np.diff(self.speeds, axis=0, prepend=self.speeds_before[None, :])
 
 
 COLUMNS: Final = frozenset(name for one in columns_of(ControlLog).values() for name in one.units)
@@ -225,6 +254,13 @@ class PlantLog:
         """Return every `stride`-th row, starting with the first."""
         thinned: dict[str, Any] = {name: None if rows is None else rows[::stride] for name, rows in vars(self).items()}
         return PlantLog(**thinned)
+
+
+class PeriodLog(NamedTuple):
+    """One control period: its sample, and the plant's rows from its start to its end, both included."""
+
+    control: Samples
+    plant: PlantLog
 
 
 @dataclass(frozen=True, kw_only=True)

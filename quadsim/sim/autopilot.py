@@ -17,7 +17,6 @@ Gains that a file does not state follow from the vehicle (`AutopilotSettings.res
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Final
@@ -26,9 +25,10 @@ import numpy as np
 from annotated_types import Len, doc
 
 from quadsim.controller import AutopilotLoop
+from quadsim.core.inner import CompiledLoop
+from quadsim.core.structs import InnerStruct, LoopKind, fill
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Fraction, NonNegative, Positive, filled
-from quadsim.rotation import conjugate, multiply
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.physics import PHYSICS, inner_steps, whole
@@ -114,11 +114,11 @@ class AutopilotSettings:
         )
 
 
-class Autopilot:
+class Autopilot(CompiledLoop):
     """The autopilot of a vehicle (`quadsim.controller.AutopilotLoop`), for a controller's targets.
 
     A target is a row: collective thrust [N] and body rates [rad/s], (4,); with an attitude (wxyz, body to world) after
-    them, (8,), the attitude is held, and the rates are fed forward.
+    them, (8,), the attitude is held, and the rates are fed forward.  Its equations are computed by the core.
 
     Attributes:
         settings: resolved.
@@ -138,89 +138,38 @@ class Autopilot:
         assert settings.rate is not None
         assert settings.delay is not None
         assert settings.largest_rate is not None
-        self.rate, self._step = settings.rate, 1.0 / settings.rate
-        self._p, self._i, self._d, self._i_max, self._attitude = (
-            np.array(gains) for gains in (settings.p, settings.i, settings.d, settings.i_max, settings.attitude)
-        )
-        self._largest = np.radians(settings.largest_rate)
-        rule = f"a whole number of periods of {self._step:g} s"
-        self._delay = whole("autopilot", "delay", settings.delay, settings.delay * settings.rate, rule, smallest=0)
-        self._gyro_share, self._d_share = (
-            1.0 - math.exp(-math.tau * cutoff * self._step) if cutoff else 1.0
-            for cutoff in (settings.gyro_cutoff, settings.d_cutoff)
-        )
-        self._inertia, self._coefficient = np.array(vehicle.inertia), vehicle.thrust_coefficient
-        self._to_thrusts = np.linalg.inv(vehicle.allocation / vehicle.thrust_coefficient)
         assert settings.idle is not None
+        self.rate, step = settings.rate, 1.0 / settings.rate
+        rule = f"a whole number of periods of {step:g} s"
+        delay = whole("autopilot", "delay", settings.delay, settings.delay * settings.rate, rule, smallest=0)
         if settings.idle * vehicle.speed_max >= vehicle.hover_speed:
             share = vehicle.hover_speed / vehicle.speed_max
             raise ParameterError("autopilot", "idle", settings.idle, f"below {share:.3g}, at which it hovers")
         slowest, fastest = speeds or (settings.idle * vehicle.speed_max, vehicle.speed_max)
-        self._range = self._coefficient * slowest**2, self._coefficient * fastest**2
+        a = InnerStruct(kind=LoopKind.AUTOPILOT, measures=1, step=step, airmode=bool(settings.airmode))
+        a.p[:], a.i[:], a.d[:], a.i_max[:] = settings.p, settings.i, settings.d, settings.i_max
+        a.attitude[:], a.largest[:] = settings.attitude, np.radians(settings.largest_rate)
+        a.gyro_share, a.d_share = (
+            1.0 - math.exp(-math.tau * cutoff * step) if cutoff else 1.0
+            for cutoff in (settings.gyro_cutoff, settings.d_cutoff)
+        )
+        a.inertia[:], a.coefficient = vehicle.inertia, vehicle.thrust_coefficient
+        fill(a.to_thrusts, np.linalg.inv(vehicle.allocation / vehicle.thrust_coefficient))
+        a.low, a.high = a.coefficient * slowest**2, a.coefficient * fastest**2
+        super().__init__(a, delay=delay)
         self._hover = np.full(N_ROTORS, vehicle.hover_speed)
         self.reset()
 
     def reset(self) -> None:
         """Start anew: no integral, filters at rest, rotors at hover."""
-        self._integral = np.zeros(3)
+        fill(self._struct.integral, 0.0)
         self.settle(np.zeros(3), self._hover)
 
     def settle(self, rates: Array, rotors: Array) -> None:
         """Settle the filters at body rates (3,) [rad/s], and the commands under way at rotor speeds (4,) [rad/s]."""
-        self._filtered, self._slope = rates.copy(), np.zeros(3)
-        self._queue: deque[Array] = deque([rotors.copy()] * self._delay)
-
-    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
-        """Return the rotor speeds (4,) [rad/s] until the next call, for the target `commanded` (4,) or (8,)."""
-        target = commanded[1:4]
-        if commanded.size > N_ROTORS:
-            turning = target + self._attitude * body_attitude_error(attitude, commanded[4:])
-            target = np.minimum(np.maximum(turning, -self._largest), self._largest)
-        before, self._filtered = self._filtered, self._filtered + self._gyro_share * (rates - self._filtered)
-        y = self._filtered
-        self._slope = self._slope + self._d_share * ((y - before) / self._step - self._slope)
-        error = target - y
-        momentum = self._inertia * y
-        gyroscopic = np.array(
-            [
-                y[1] * momentum[2] - y[2] * momentum[1],
-                y[2] * momentum[0] - y[0] * momentum[2],
-                y[0] * momentum[1] - y[1] * momentum[0],
-            ]
-        )
-        torque = self._inertia * (self._p * error + self._integral - self._d * self._slope) + gyroscopic
-        thrusts, cut = self.mix(float(commanded[0]), torque)
-        integral = self._integral + self._step * self._i * error
-        self._integral = np.where(cut, self._integral, np.minimum(np.maximum(integral, -self._i_max), self._i_max))
-        self._queue.append(np.sqrt(thrusts / self._coefficient))
-        return self._queue.popleft()
-
-    def mix(self, thrust: float, torque: Array) -> tuple[Array, Array]:
-        """Return the rotors' thrusts (4,) [N] for a collective thrust [N] and a torque (3,) [N m], and the axes cut.
-
-        Each thrust is within the rotors' range; `cut` (3,) says which torques are smaller than demanded.
-        """
-        low, high = self._range
-        level, yaw = self._to_thrusts[:, 1:3] @ torque[:2], self._to_thrusts[:, 3] * torque[2]
-        base, airmode = min(max(0.25 * thrust, low), high), self.settings.airmode
-        reserve = high - low if airmode else min(base - low, high - base)
-        extent = float(level.max() - level.min()) if airmode else float(np.abs(level).max())
-        share = min(1.0, reserve / extent) if extent else 1.0
-        level = share * level
-        # With airmode the parts need room for their differences alone: the collective thrust yields.
-        rows = [*zip(level.tolist(), yaw.tolist(), strict=True)]
-        pairs = [(a - c, b - d) for a, b in rows for c, d in rows] if airmode else [*rows, *((-a, -b) for a, b in rows)]
-        turn = max(min([1.0, *((reserve - part) / change for part, change in pairs if change > 0.0)]), 0.0)
-        parts = level + turn * yaw
-        if airmode:
-            base = min(max(base, low - float(parts.min())), high - float(parts.max()))
-        return np.minimum(np.maximum(base + parts, low), high), np.array([share < 1.0, share < 1.0, turn < 1.0])
-
-
-def body_attitude_error(attitude: Array, target: Array) -> Array:
-    """(3,) 2 vec(q* q_c), the shorter way: the rotation from q to q_c, wxyz, about body axes [rad], to first order."""
-    w, *vector = multiply(conjugate(tuple(attitude.tolist())), tuple(target.tolist()))
-    return math.copysign(2.0, w) * np.array(vector)
+        fill(self._struct.filtered, rates)
+        fill(self._struct.slope, 0.0)
+        self._queue[:], self._struct.oldest = rotors, 0
 
 
 STEPS: Final = (0.1, 1.0, 1.0, 0.5)
@@ -258,23 +207,28 @@ def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float
 
 def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
     """(WINDOW / timestep,) the share of a step of a target, 0 thrust, 1 to 3 body rates, that is reached."""
-    vehicle, stride = plant.vehicle, inner_steps(autopilot.rate, plant.timestep, "autopilot")
+    vehicle, count = plant.vehicle, round(FIT_WINDOW / plant.timestep)
+    stride = inner_steps(autopilot.rate, plant.timestep, "autopilot")
     weight = vehicle.mass * vehicle.gravity
     target, size = np.array([weight, 0.0, 0.0, 0.0]), STEPS[axis] * (weight if axis == 0 else 1.0)
     plant.reset(np.zeros(N_STATES))
     autopilot.reset()
-    reached = []
     target[axis] += size
-    for _ in range(0, round(FIT_WINDOW / plant.timestep), stride):
+
+    def answer() -> Array:
         attitude, rates = plant.attitude
-        speeds = autopilot.speeds(plant.time, target, rates, plant.speeds, attitude)
-        steps = plant.advance(speeds, stride)
-        if axis:
-            reached.append(steps["physics"][:, PHYSICS["body_rates"]][:, axis - 1] / size)
-        else:
-            ends = np.concatenate([steps["speeds"][1:], plant.speeds[None]])
-            reached.append((vehicle.thrust_coefficient * np.square(ends).sum(axis=1) - weight) / size)
-    return np.concatenate(reached)[: round(FIT_WINDOW / plant.timestep)]
+        return autopilot.speeds(plant.time, target, rates, plant.speeds, attitude)
+
+    struct = autopilot.engage(target, plant.speeds) if isinstance(autopilot, CompiledLoop) else None
+    loop = struct or InnerStruct(kind=LoopKind.OUTSIDE)
+    loop.until, loop.stride = 0, stride
+    plant.begin(count)
+    plant.hold(target, count, loop=loop, ask=answer)
+    if axis:
+        reached: Array = plant.flown["physics"][:, PHYSICS["body_rates"]][:, axis - 1] / size
+        return reached
+    ends = np.concatenate([plant.flown["speeds"][1:], plant.speeds[None]])
+    return np.asarray((vehicle.thrust_coefficient * np.square(ends).sum(axis=1) - weight) / size)
 
 
 @cache

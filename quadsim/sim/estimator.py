@@ -1,47 +1,100 @@
-"""The error-state extended Kalman filter over time: it uses samples in the order they were taken, however late.
+"""The error-state extended Kalman filter: it uses samples in the order they were taken, however late.
+
+An estimate is a mean on the manifold of poses and rates, and the covariance of its small error e = [dp dv dtheta domega
+db], 15 numbers: position and velocity in the world frame, attitude as a rotation vector in the body frame (q_true = q *
+exp(dtheta)), body rates and gyro bias.  Solà 2017, Secs.  5.1.1 and 5.3.1; multiplicative in the sense of Markley,
+"Attitude error representations for Kalman filtering", JGCD 26 (2003).
+
+Prediction, the modelled vehicle as a rigid body driven by its rotor speeds, and the growth of the error with time:
+
+    dp/dt = v            dv/dt = R(q) [0, 0, U/m] - [0, 0, g] + w_a      dq/dt = q * [0, omega] / 2
+    domega/dt = I^-1 (tau - omega x I omega) + w_alpha                   db/dt = w_b
+
+with white w_a, w_alpha, w_b, and to first order in the error, F(t) of de/dt = F e + w (Solà 2017, Eqs. (238)-(240), the
+vehicle's model in place of an accelerometer):
+
+    dv: -R [a]x dtheta      dtheta: -[omega]x dtheta + domega      domega: I^-1 ([I omega]x - [omega]x I) domega
+
+On the ground, rotor speeds alone would let the vehicle fall.  The ground carries the rest of the weight, so nothing
+moves: p, q and the gyro's bias stay, v = 0 and omega = 0, a zero-velocity update (Groves, "Principles of GNSS,
+Inertial, and Multisensor Integrated Navigation Systems", 2nd ed.  2013, Sec.  15.3) at every step.  Legs that yield and
+slide a little keep v and omega as white noise: sigma at any instant, forgotten after tau, so that position and attitude
+walk randomly with densities sigma sqrt(tau).
+
+The update of an estimate by a sample, and the test for outliers:
+
+    r = z - h(x)    S = H P H' + R    K = P H' S^-1    e = K r    P <- P - K H P
+
+The innovation of an attitude is the rotation vector from the estimate to the sample, so it is as good upside down as
+level (Trawny and Roumeliotis, "Indirect Kalman filter for 3D attitude estimation", 2005, Sec. 3).  The normalised
+innovation squared, r' S^-1 r, is chi-square with three degrees of freedom where model and noise are as stated.
 
 The filter runs at the fusion horizon, now less the largest delay: every sample taken before it has arrived and has been
-used, in the order of time stamps.  Later samples are stored; each request for an estimate uses them on copies that run
-up to now, so a late sample corrects the past it belongs to.  The copies after these samples are kept as starting points
-of the next estimate, until a sample arrives that was taken earlier.  Rotor speeds, and contact with the ground, are
-stored for each step since the horizon as well.
+used, in the order of time stamps.  Later samples wait; a copy of the filter uses them and runs up to now, so a late
+sample corrects the past it belongs to.  Rotor speeds, and contact with the ground, are stored for each step since the
+horizon as well.  A vehicle on the ground leaves it once the modelled thrust exceeds its weight.
+
+A single prediction is at most 10 ms long, while rotor speeds do not change.  A mean or sample above 1e6 in its SI unit,
+or not a number, carries no information; an estimate beyond that, or with a variance of 1e15 in all, is lost: the mean
+of before is kept with the initial covariance, for the sensors to correct.  The equations are computed by the core
+(`quadsim/core/quadsim_filter.c`).
 """
 
 from __future__ import annotations
 
-import bisect
+import ctypes
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Final
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final
 
 import numpy as np
+from annotated_types import Gt, Lt, doc
+from numpy.typing import NDArray
 
+from quadsim.core.structs import SAMPLE, FilterStruct, TrackStruct, fill, plant_library
 from quadsim.errors import ParameterError
-from quadsim.sim.error_state import (
-    N_ERRORS,
-    Drive,
-    Estimate,
-    EstimatorSettings,
-    drive,
-    inflate,
-    lifts,
-    motion_model,
-    predict_estimate,
-    retract,
-    stand,
-    update,
-)
-from quadsim.sim.sensing import AXES, Sample, Sensor, SensorName, in_si
+from quadsim.fields import NonNegative
+from quadsim.rotation import exponential, multiply, normalise
+from quadsim.sim.sensing import KINDS, Sensor, SensorName, in_si
 from quadsim.state import Array
-from quadsim.vehicle import Vehicle
+from quadsim.vehicle import N_ROTORS, Vehicle
 
+N_ERRORS: Final = 15
+MEAN_QUATERNION: Final = slice(6, 10)
+MEAN_RATES: Final = slice(10, 13)
+MEAN_GYRO_BIAS: Final = slice(13, 16)
 LONGEST_STEP: Final = 0.01  # longest single prediction [s]
 NEEDED: Final = (SensorName.POSITION, SensorName.ATTITUDE)
 """Sensors without which position or heading would drift without bound."""
-_NAMES: Final = list(SensorName)
-_LARGEST: Final = 1e6  # A mean or sample above this magnitude [SI units], or not a number, carries no information
-_LARGEST_VARIANCE: Final = 1e15  # the same for the trace of a covariance
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimatorSettings:
+    """Tuning of the error-state filter.
+
+    Densities are those of white noise, equal on all three axes: integrated for a time t they give the standard
+    deviation density sqrt(t). The gate is the chi-square test of a sample's innovation.
+    """
+
+    acceleration_noise: Annotated[NonNegative, doc("[m/s^2/sqrt(Hz)] unmodelled white acceleration")] = 0.3
+    angular_acceleration_noise: Annotated[
+        NonNegative, doc("[rad/s^2/sqrt(Hz)] unmodelled white angular acceleration")
+    ] = 1.0
+    gyro_bias_walk: Annotated[NonNegative, doc("[deg/s/sqrt(s)] random walk of the gyro's bias")] = 0.002
+    initial_position: Annotated[NonNegative, doc("[m] standard deviation of the first estimate's error, per axis")] = (
+        0.05
+    )
+    initial_velocity: Annotated[NonNegative, doc("[m/s] same")] = 0.05
+    initial_attitude: Annotated[NonNegative, doc("[deg] same, about each body axis")] = 1.0
+    initial_rates: Annotated[NonNegative, doc("[deg/s] same")] = 1.0
+    initial_gyro_bias: Annotated[NonNegative, doc("[deg/s] same, for a bias initialised to zero")] = 0.5
+    gate: Annotated[float, Gt(0.0), Lt(1.0), doc("[-] probability that a valid sample passes the innovation test")] = (
+        0.9999
+    )
+    patience: Annotated[
+        NonNegative, doc("[s] time of uninterrupted rejection after which a sensor is accepted again; 0 for never")
+    ] = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,31 +107,16 @@ class Tally:
     """Sum of the normalised innovations squared of those used; on average three per sample with a correct model."""
 
 
-@dataclass(kw_only=True)
-class _Track:
-    """A filter at one instant; `refused` is the step since which every sample of a sensor has been rejected."""
-
-    step: int
-    estimate: Estimate
-    refused: dict[SensorName, int] = field(default_factory=dict)
-    tallies: dict[SensorName, Tally] = field(default_factory=dict)
-
-    def branch(self) -> _Track:
-        return _Track(step=self.step, estimate=self.estimate, refused=dict(self.refused), tallies=dict(self.tallies))
-
-    def count(self, name: SensorName, *, accepted: int = 0, rejected: int = 0, nis: float = 0.0) -> None:
-        """Add to a sensor's tally."""
-        old = self.tallies[name]
-        self.tallies[name] = Tally(
-            accepted=old.accepted + accepted, rejected=old.rejected + rejected, nis=old.nis + nis
-        )
-
-
 class ErrorStateFilter:
     """Turns samples and rotor speeds into an estimate.  It never raises in flight and never returns NaN.
 
+    An estimate's mean (16,) is position [m] and velocity [m/s], world, quaternion wxyz, body rates and the gyro's bias
+    [rad/s].
+
     Attributes:
         settings: its tuning.
+        struct: the core's filter.
+        track: the core's filter at the fusion horizon.
     """
 
     def __init__(
@@ -99,14 +137,22 @@ class ErrorStateFilter:
             if min(noise) <= 0.0:
                 rule = "positive on every axis, for the estimator to weigh it"
                 raise ParameterError(f"sensors.{name}", "noise", sensors[name].noise, rule)
-        self.settings = settings
-        self._timestep = timestep
-        self._model = motion_model(vehicle, settings)
-        self._variances = {name: np.diag(np.square(noise)) for name, noise in noises.items()}
+        self.settings, self._names = settings, tuple(sensors)
         self._horizon = max(sensor.latency(name, timestep) for name, sensor in sensors.items())
-        self._gate = float(chdtri(len(AXES), 1.0 - settings.gate))
-        self._patience = settings.patience / timestep
-        self._stride = max(1, int(LONGEST_STEP / timestep + 1e-9))
+        f = self.struct = FilterStruct(timestep=timestep, mass=vehicle.mass, gravity=vehicle.gravity)
+        f.inertia[:] = vehicle.inertia
+        fill(f.allocation, vehicle.allocation)
+        deviations = settings.acceleration_noise, settings.angular_acceleration_noise
+        f.density[1], f.density[3] = (deviation**2 for deviation in deviations)
+        f.density[4] = math.radians(settings.gyro_bias_walk) ** 2
+        for name, noise in noises.items():
+            f.variance[KINDS[name]][:] = np.square(noise)
+        turned = map(math.radians, (settings.initial_attitude, settings.initial_rates, settings.initial_gyro_bias))
+        self._initial = np.repeat([settings.initial_position, settings.initial_velocity, *turned], 3)
+        f.initial[:] = self._initial
+        f.gate = float(chdtri(3, 1.0 - settings.gate))
+        f.patience = settings.patience / timestep
+        f.stride = max(1, int(LONGEST_STEP / timestep + 1e-9))
 
     def reset(self, mean: Array, speeds: Array, rng: np.random.Generator) -> None:
         """Start at step 0, with rotor speeds (4,) in force [rad/s].
@@ -114,105 +160,54 @@ class ErrorStateFilter:
         The first estimate differs from the truth, a mean (16,) with zero gyro bias, by an error drawn from the initial
         covariance; its bias by the true bias.
         """
-        error = self._initial() * rng.standard_normal(N_ERRORS)
-        error[12:] = 0.0
-        estimate = Estimate(mean=retract(mean, error), covariance=np.diag(np.square(self._initial())))
-        tallies = {name: Tally() for name in self._variances}
-        self._track = _Track(step=0, estimate=estimate, tallies=tallies)
-        self._starts, self._speeds, self._on_ground = [0], speeds.copy(), False
-        self._drives: list[Drive | None] = [drive(self._model, speeds)]
-        self._waiting: list[Sample] = []
-        self._ahead: list[_Track] = []  # one after each of the first waiting samples
-
-    def _initial(self) -> Array:
-        s = self.settings
-        turned = map(math.radians, (s.initial_attitude, s.initial_rates, s.initial_gyro_bias))
-        return np.repeat([s.initial_position, s.initial_velocity, *turned], 3)
+        error = self._initial * rng.standard_normal(N_ERRORS)
+        t = self.track = TrackStruct()
+        t.refused[:] = [-1] * len(KINDS)
+        fill(t.P, np.diag(np.square(self._initial)))
+        moved = np.concatenate([mean[:10], mean[10:13] + error[9:12], mean[13:]])
+        moved[:6] += error[:6]
+        w, x, y, z = mean[MEAN_QUATERNION].tolist()
+        a, b, c = error[6:9].tolist()
+        moved[MEAN_QUATERNION] = normalise(multiply((w, x, y, z), exponential((a, b, c))))
+        t.mean[:] = moved
+        self._step, self._base = 0, 0
+        self._commands, self._grounded = np.empty((0, N_ROTORS)), np.empty(0, np.uint8)
+        self._waiting = np.empty(0, SAMPLE)
 
     @property
     def tallies(self) -> dict[SensorName, Tally]:
         """Counts of each sensor's samples; those after the fusion horizon are not yet included."""
-        return dict(self._track.tallies)
+        t, kinds = self.track, {name: KINDS[name] for name in self._names}
+        return {name: Tally(accepted=t.accepted[k], rejected=t.rejected[k], nis=t.nis[k]) for name, k in kinds.items()}
 
-    def advance(self, commands: Array, samples: Iterable[Sample], first: int, *, on_ground: bool = False) -> None:
+    def advance(self, commands: Array, samples: Sequence[NDArray[np.void]], *, on_ground: bool = False) -> None:
         """Record a segment of flight and run the filter up to the fusion horizon.
 
         Args:
             commands: (M, 4) rotor speeds in force during each physics step [rad/s].
-            samples: what has arrived meanwhile, in any order.
-            first: number of the first of these physics steps.
-            on_ground: whether a land detector saw the vehicle on the ground at the start of the segment; it leaves the
-                ground once the modelled thrust exceeds its weight.
+            samples: what has arrived meanwhile, arrays of `SAMPLE`, in any order.
+            on_ground: whether a land detector saw the vehicle on the ground at the start of the segment.
         """
-        changed = np.any(commands != np.vstack([self._speeds, commands[:-1]]), axis=1)
-        changed[:1] |= on_ground is not self._on_ground
-        for i in np.flatnonzero(changed).tolist():
-            driven = drive(self._model, commands[i])
-            self._starts.append(first + i)
-            self._drives.append(None if on_ground and not lifts(self._model, driven) else driven)
-        if len(commands):
-            self._speeds, self._on_ground = commands[-1].copy(), on_ground
-        horizon = first + len(commands) - self._horizon
-        before = self._waiting.copy()
-        for sample in samples:
-            if np.abs(sample.value).max() < _LARGEST:  # false for NaN
-                self._waiting.append(sample)
-            else:
-                for track in (self._track, *self._ahead):
-                    track.count(sample.sensor, rejected=1)
-        self._waiting.sort(key=lambda sample: (sample.taken, _NAMES.index(sample.sensor)))
-        moved = (i for i, (one, other) in enumerate(zip(before, self._waiting, strict=False)) if one is not other)
-        del self._ahead[next(moved, len(before)) :]
-        ripe = bisect.bisect_right(self._waiting, horizon, key=lambda sample: sample.taken)
-        used = min(ripe, len(self._ahead))
-        if used:
-            self._track = self._ahead[used - 1]
-        for sample in self._waiting[used:ripe]:
-            self._take(self._track, sample)
-        del self._waiting[:ripe], self._ahead[:ripe]
-        first = bisect.bisect_right(self._starts, self._track.step) - 1
-        del self._starts[:first], self._drives[:first]
+        self._step += len(commands)
+        self._commands = np.concatenate([self._commands, commands])
+        self._grounded = np.concatenate([self._grounded, np.full(len(commands), on_ground, np.uint8)])
+        waiting = np.concatenate([self._waiting, *samples])
+        waiting = waiting[np.lexsort((waiting["kind"], waiting["taken"]))]
+        ripe = int(np.searchsorted(waiting["taken"], self._step - self._horizon, side="right"))
+        self._run(self.track, waiting[:ripe], until=-1)
+        self._waiting = waiting[ripe:]
+        used = self.track.step - self._base
+        self._commands, self._grounded = self._commands[used:], self._grounded[used:]
+        self._base = self.track.step
 
-    def estimate(self, step: int) -> Estimate:
-        """Return the estimate at a physics step, no earlier than the previous request."""
-        track = self._ahead[-1] if self._ahead else self._track
-        for sample in self._waiting[len(self._ahead) :]:
-            track = track.branch()
-            self._take(track, sample)
-            self._ahead.append(track)
-        track = track.branch()
-        self._predict(track, step)
-        return track.estimate
+    def estimate(self) -> tuple[Array, Array]:
+        """Return mean (16,) and covariance (15, 15) now."""
+        ahead = TrackStruct.from_buffer_copy(self.track)
+        self._run(ahead, self._waiting, until=self._step)
+        return np.array(ahead.mean), np.array(ahead.P)
 
-    def _take(self, track: _Track, sample: Sample) -> None:
-        self._predict(track, sample.taken)
-        self._use(track, sample)
-
-    def _predict(self, track: _Track, step: int) -> None:
-        while track.step < step:
-            i = bisect.bisect_right(self._starts, track.step) - 1
-            until = min(step, track.step + self._stride, *self._starts[i + 1 : i + 2])
-            driven, duration = self._drives[i], (until - track.step) * self._timestep
-            if driven is None:
-                after = stand(self._model, track.estimate, duration)
-            else:
-                after = predict_estimate(self._model, track.estimate, driven, duration)
-            size, spread = after.mean @ after.mean, after.covariance.trace()
-            if not (size < _LARGEST**2 and spread < _LARGEST_VARIANCE):
-                # The estimate is lost: keep the mean, restore the initial covariance, and let the sensors correct it.
-                after = Estimate(mean=track.estimate.mean, covariance=np.diag(np.square(self._initial())))
-            track.estimate, track.step = after, until
-
-    def _use(self, track: _Track, sample: Sample) -> None:
-        name = sample.sensor
-        refused = sample.taken - track.refused.get(name, sample.taken)
-        if refused >= self._patience > 0.0:
-            track.estimate = inflate(track.estimate, name, sample.value, refused * self._timestep)
-        after, distance = update(track.estimate, name, sample.value, self._variances[name], self._gate)
-        if after is track.estimate:
-            track.count(name, rejected=1)
-            track.refused.setdefault(name, sample.taken)
-            return
-        track.estimate = after
-        track.refused.pop(name, None)
-        track.count(name, accepted=1, nis=distance)
+    def _run(self, track: TrackStruct, samples: NDArray[np.void], *, until: int) -> None:
+        """Use samples, then predict to a step, unless that is past."""
+        flown = self._commands.ctypes.data, self._grounded.ctypes.data
+        given = ctypes.byref(self.struct), ctypes.byref(track), samples.ctypes.data, len(samples)
+        plant_library().quadsim_filter_run(*given, *flown, self._base, until)

@@ -21,21 +21,22 @@ from quadsim.controller import (
     Beginning,
     Command,
     Controller,
+    Engaging,
     InnerLoop,
     Phase,
     Predicting,
     StepInputs,
     takes_targets,
 )
+from quadsim.core.structs import InnerStruct, SensingStruct
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError, described
 from quadsim.flight.log import FlightLog, LoggedSignals
 from quadsim.flight.phase import check_loss
 from quadsim.motion import Motion
 from quadsim.sim.computation import Computation, physics_steps
-from quadsim.sim.physics import Observation, Period, PhysicsSteps, flight_log, inner_steps, physics_to_state
+from quadsim.sim.physics import Observation, Period, flight_log, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, POSITION, REFERENCE_NAMES, Array, ReferenceTurns
-from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
     from quadsim.flight.phase import PhaseMonitor
@@ -164,8 +165,7 @@ class ClosedLoop:
         held: list[Hold] = [(self._inner, self._acting, steps_per_period)]
         self._schedule: deque[list[Hold]] = deque([held] * self._under_way)
         self._speeds = self._initial_speeds  # the rotor speeds commanded last
-        self._called: InnerLoop | None = None  # the inner loop called last, its answer, and the steps until its next
-        self._answer, self._until_call = self._initial_speeds, 0
+        self._flying: _Flying | None = None  # the inner loop called last
         self._plan, self._age = self._acting[None], 0  # the last plan that came in time, and how many periods ago
         self._observed: Observation | None = None
         self._samples: list[Period] | None = [] if recorded else None
@@ -355,16 +355,16 @@ class ClosedLoop:
             holds.append((self._inner, acting, steps - wait))
         self._schedule.append(holds)
         before, on_ground = plant.physics, now.phase in (Phase.LANDED, Phase.ARMED)
-        flown = []
+        plant.begin(steps)
+        sensing = None if self._navigation is None else self._navigation.begin(steps)
         for loop, row, count in self._schedule.popleft():
-            for part, speeds in self._hold(loop, row, count):
-                if self._navigation is not None:
-                    held = np.broadcast_to(speeds, (len(part), N_ROTORS))
-                    self._navigation.advance(part["physics"], held, on_ground=on_ground)
-                flown.append(part)
+            if count > 0:
+                self._hold(loop, row, count, sensing)
+        if self._navigation is not None:
+            self._navigation.record(plant.flown, on_ground=on_ground)
         self._acting = acting
         piloted = takes_targets(self._inner)
-        self._speeds = speeds if piloted else acting
+        self._speeds = plant.flown["commands"][-1].copy() if piloted else acting
         return Period(
             observation=observed,
             command=command,
@@ -374,33 +374,46 @@ class ClosedLoop:
             missed=missed,
             step_s=step_s,
             before=before,
-            steps=flown[0] if len(flown) == 1 else np.concatenate(flown),
+            steps=plant.flown,
             rotors=plant.speeds,
         )
 
-    def _hold(self, inner: InnerLoop | None, row: Array, steps: int) -> Iterator[tuple[PhysicsSteps, Array]]:
-        """Advance under a command: physics steps in parts, each with the rotor speeds (4,) commanded during it [rad/s].
+    def _hold(self, inner: InnerLoop | None, row: Array, steps: int, sensing: SensingStruct | None) -> None:
+        """Fly physics steps under a command, by an inner loop if there is one.
 
         Raises:
             RaisedError: the inner loop raised, or its period is not a whole number of physics steps.
         """
         plant = self._plant
         if inner is None:
-            if steps > 0:
-                yield plant.advance(row, steps), plant.applied(row)
+            plant.hold(row, steps, sensing=sensing)
             return
         with _ending_flight(plant.time):
-            stride = inner_steps(inner.rate, plant.timestep)
-        measured = self._navigation if takes_targets(inner) else None
-        while steps > 0:
-            if self._called is not inner or self._until_call == 0:
-                attitude, rates = plant.attitude if measured is None else measured.sensed()
-                with _ending_flight(plant.time):
-                    self._answer = np.array(inner.speeds(plant.time, row.copy(), rates, plant.speeds, attitude))
-                self._called, self._until_call = inner, stride
-            count = min(self._until_call, steps)
-            self._until_call, steps = self._until_call - count, steps - count
-            yield plant.advance(self._answer, count), plant.applied(self._answer)
+            flying, fresh = self._flying, self._flying is None or self._flying.inner is not inner
+            if fresh:
+                self._flying = flying = _Flying(inner, inner_steps(inner.rate, plant.timestep))
+            assert flying is not None
+            struct = flying.struct if flying.engage is None else flying.engage(row, plant.speeds) or flying.struct
+        measured = self._navigation if flying.measures else None
+
+        def ask() -> Array:
+            attitude, rates = plant.attitude if measured is None else measured.sensed(plant.physics)
+            with _ending_flight(plant.time):
+                return np.array(inner.speeds(plant.time, row.copy(), rates, plant.speeds, attitude))
+
+        struct.stride = flying.stride
+        if fresh:
+            struct.until = 0
+        plant.hold(row, steps, loop=struct, sensing=sensing, ask=ask)
+
+
+class _Flying:
+    """An inner loop in force: its stride, whether it measures, and its place in the core where that does not answer."""
+
+    def __init__(self, inner: InnerLoop, stride: int) -> None:
+        self.inner, self.stride, self.struct = inner, stride, InnerStruct()
+        self.measures = takes_targets(inner)
+        self.engage = inner.engage if isinstance(inner, Engaging) else None
 
 
 def fly(

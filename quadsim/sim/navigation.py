@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import copy
+import ctypes
 from collections.abc import Mapping, Sequence
-from operator import attrgetter
 
 import numpy as np
+from numpy.typing import NDArray
 
+from quadsim.core.structs import SAMPLE, Fate, SensingStruct, SensorStruct, plant_library
 from quadsim.errors import ParameterError
-from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
-from quadsim.sim.error_state import MEAN_GYRO_BIAS, MEAN_QUATERNION, MEAN_RATES, EstimatorSettings
-from quadsim.sim.estimator import ErrorStateFilter, Tally
-from quadsim.sim.physics import PHYSICS
-from quadsim.sim.sensing import Sample, Sampler, Sensor, SensorFault, SensorName, truth
-from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
+from quadsim.rotation import body_to_euler_rates, euler_to_quaternion
+from quadsim.sim.estimator import (
+    MEAN_GYRO_BIAS,
+    MEAN_QUATERNION,
+    MEAN_RATES,
+    ErrorStateFilter,
+    EstimatorSettings,
+    Tally,
+)
+from quadsim.sim.physics import PHYSICS, PhysicsSteps, physics_to_state
+from quadsim.sim.sensing import KINDS, MEASURED, Sampler, Sensor, SensorFault, SensorName, truth
+from quadsim.state import ANGLE_RATES, ANGLES, INDEX, Array, YawTurns
 from quadsim.vehicle import Vehicle
 
 
@@ -28,6 +36,7 @@ class Navigation:
     Attributes:
         attitude: quaternion (4,), wxyz, body to world, sign continuous, and body rates (3,) [rad/s], of the last
             `state`.
+        filter: the estimator; None without one.
 
     Each sensor has its own random generator, so that adding a sensor, or noise, does not change the others' draws.
     """
@@ -61,22 +70,21 @@ class Navigation:
             rule = f"on a sensor that the estimator has ({', '.join(sensors)})"
             raise ParameterError("fault", "sensor", str(min(faulty)), rule)
         perfect = {name: Sensor(rate=1.0 / timestep) for name in sorted(faulty)}
+        self._timestep = timestep
         self._rng, *others = rng.spawn(1 + len(SensorName))
         generators = dict(zip(SensorName, others, strict=True))
         self._samplers = tuple(
             Sampler(name, sensor, timestep=timestep, faults=tuple(faults), rng=generators[name])
             for name, sensor in {**sensors, **perfect}.items()
         )
-        sensed = {sampler.name for sampler in self._samplers}
-        self._perfect = tuple(name for name in SensorName if name not in sensed)
-        self._filter = None if estimator is None else ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
+        self.filter = None if estimator is None else ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
 
-    def watches(self, sensor: SensorName) -> bool:
-        """Whether a sensor has had a fault in view from the start, and so may have another."""
-        return any(sampler.watched for sampler in self._samplers if sampler.name is sensor)
+    def has(self, sensor: SensorName) -> bool:
+        """Whether a sensor takes samples, and so may fail."""
+        return any(sampler.name is sensor for sampler in self._samplers)
 
     def reschedule(self, faults: Sequence[SensorFault]) -> None:
-        """Replace the faults of watched sensors; samples already taken stay."""
+        """Replace the faults of the sensors that there are; samples already taken stay."""
         for sampler in self._samplers:
             sampler.reschedule(faults)
 
@@ -84,95 +92,106 @@ class Navigation:
         """Restart at MuJoCo's state (14,) and rotor speeds [rad/s] with the same draws; yaw is near `yaw` [rad]."""
         self._step, self._yaw, self._physics = 0, YawTurns(yaw), physics.copy()
         self.attitude: tuple[Array, Array] = physics[PHYSICS["attitude"]].copy(), physics[PHYSICS["body_rates"]].copy()
-        self._held = {name: truth(name, physics[None])[0] for name in SensorName}
-        self._bias, self._sensed = np.zeros(3), self.attitude
-        self._in_flight: list[Sample] = []
-        for sampler in self._samplers:
+        samplers = self._samplers
+        self._structs = (SensorStruct * max(len(samplers), 1))()
+        self._sensing = SensingStruct(sensors=ctypes.addressof(self._structs), count=len(samplers))
+        self._sensing.attitude[:], self._sensing.rates[:] = self.attitude
+        self._samples = [(np.empty((0, 3)), np.empty(0, np.uint8)) for _ in samplers]
+        self._passed = [0] * len(samplers)  # samples that the filter has
+        for sampler, struct in zip(samplers, self._structs, strict=False):
             sampler.reset()
-        if self._filter is not None:
+            struct.kind, struct.stride, struct.latency = KINDS[sampler.name], sampler.stride, sampler.latency
+            struct.held[:] = truth(sampler.name, physics[None])[0]
+        if self.filter is not None:
             known = [physics[PHYSICS[name]] for name in ("position", "velocity", "attitude", "body_rates")]
-            mean = np.concatenate([*known, np.zeros(3)])
-            self._filter.reset(mean, speeds, copy.deepcopy(self._rng))
-        self._receive(physics[None], first=0)
-        if self._filter is not None:
-            self._filter.advance(np.empty((0, len(speeds))), self._hear(), first=0)
+            self.filter.reset(np.concatenate([*known, np.zeros(3)]), speeds, copy.deepcopy(self._rng))
+        self._prepare(0, 1)
+        motion = np.ascontiguousarray(physics[1:])
+        plant_library().quadsim_sense(self._sensing, 0, motion.ctypes.data)
+        self._hear(0, physics)
+        if self.filter is not None:
+            self.filter.advance(np.empty((0, len(speeds))), self._arrived())
 
-    def advance(self, physics: Array, commands: Array, *, on_ground: bool = False) -> None:
-        """Record a segment of flight: (M, 14) true states after each physics step, (M, 4) rotor speeds [rad/s].
+    def begin(self, steps: int) -> SensingStruct:
+        """Draw the errors of the samples of the next physics steps; return what takes them."""
+        self._prepare(self._step + 1, self._step + 1 + steps)
+        return self._sensing
 
-        `on_ground` is the land detector's state at the start of the segment.
-        """
-        if not len(physics):
+    def record(self, flown: PhysicsSteps, *, on_ground: bool = False) -> None:
+        """Record the flight since `begin`; `on_ground` is the land detector's state at its start."""
+        if not len(flown):
             return
-        first, self._step, self._physics = self._step, self._step + len(physics), physics[-1].copy()
-        self._receive(physics, first + 1)
-        if self._filter is not None:
-            self._filter.advance(commands, self._hear(), first, on_ground=on_ground)
+        self._step, self._physics = self._step + len(flown), flown["physics"][-1].copy()
+        self._hear(self._step, self._physics)
+        if self.filter is not None:
+            self.filter.advance(flown["commands"], self._arrived(), on_ground=on_ground)
 
-    def sensed(self) -> tuple[Array, Array]:
-        """What an autopilot measures now: attitude (4,), wxyz, body to world, and body rates (3,) [rad/s].
+    def sensed(self, physics: Array) -> tuple[Array, Array]:
+        """What an autopilot measures at MuJoCo's state (14,): attitude (4,), wxyz, body to world, body rates [rad/s].
 
-        The newest finite sample of each sensor, the true value where there is none; with an estimator, rates less their
-        last estimated bias, and the attitude that it estimates where no sensor measures it.
+        The newest finite sample of each sensor, the true value where there is none; with an estimator, rates less the
+        bias that it estimated at the last control instant.
         """
-        if self._filter is None:
-            self._hear()
-        attitude, rates = self._physics[PHYSICS["attitude"]], self._physics[PHYSICS["body_rates"]]
-        if SensorName.RATES not in self._perfect:
-            rates = self._held[SensorName.RATES] - self._bias
-        if SensorName.ATTITUDE not in self._perfect:
-            attitude = euler_to_quaternion(self._held[SensorName.ATTITUDE])
-        elif self._filter is not None:
-            attitude = self._filter.estimate(self._step).mean[MEAN_QUATERNION]
-        pairs = zip((attitude, rates), self._sensed, strict=True)
-        new, rate = (now if np.isfinite(now).all() else before for now, before in pairs)
-        self._sensed = new, rate
-        return self._sensed
+        self._hear(round(float(physics[0]) / self._timestep), physics)
+        return np.array(self._sensing.attitude), np.array(self._sensing.rates)
 
     def state(self) -> Array:
         """Return (12,) the state that the controller receives now: the paper's order, yaw unwrapped."""
-        if self._filter is not None:
-            mean = self._filter.estimate(self._step).mean
-            self._bias = mean[MEAN_GYRO_BIAS].copy()
-            received = {
-                SensorName.POSITION: mean[0:3],
-                SensorName.VELOCITY: mean[3:6],
-                SensorName.ATTITUDE: quaternion_to_euler(mean[MEAN_QUATERNION]),
-                SensorName.RATES: mean[MEAN_RATES],
-            }
+        row, angles = self._physics.copy(), None
+        if self.filter is not None:
+            mean, _ = self.filter.estimate()
+            self._sensing.bias[:] = mean[MEAN_GYRO_BIAS]
+            row[1:] = np.concatenate([mean[0:3], mean[MEAN_QUATERNION], mean[3:6], mean[MEAN_RATES]])
         else:
-            self._hear()
-            received = self._held | {name: truth(name, self._physics[None])[0] for name in self._perfect}
-        euler = received[SensorName.ATTITUDE].copy()
-        quaternion = euler_to_quaternion(euler) if self._filter is None else mean[MEAN_QUATERNION]
+            for sampler, struct in zip(self._samplers, self._structs, strict=False):
+                if sampler.name is SensorName.ATTITUDE:
+                    angles = np.array(struct.held)
+                    row[PHYSICS["attitude"]] = euler_to_quaternion(angles)
+                else:
+                    row[MEASURED[sampler.name]] = struct.held
+        quaternion, rates = row[PHYSICS["attitude"]], row[PHYSICS["body_rates"]]
         sign = -1.0 if quaternion @ self.attitude[0] < 0.0 else 1.0
-        self.attitude = sign * quaternion, received[SensorName.RATES].copy()
-        state = np.empty(N_STATES)
-        state[POSITIONS] = received[SensorName.POSITION]
-        state[VELOCITIES] = received[SensorName.VELOCITY]
-        state[ANGLE_RATES] = body_to_euler_rates(euler, received[SensorName.RATES])
-        euler[2] = self._yaw.unwrapped(euler)
-        state[ANGLES] = euler
+        self.attitude = sign * quaternion, rates
+        state: Array = physics_to_state(row[None])[0]
+        if angles is not None:  # as they were measured: one that is no number leaves the others alone
+            state[ANGLES], state[ANGLE_RATES] = angles, body_to_euler_rates(angles, rates)
+        state[INDEX["yaw"]] = self._yaw.unwrapped(state[ANGLES])
         return state
 
     @property
     def tallies(self) -> dict[SensorName, Tally]:
         """Counts of each sensor's samples in the estimator; empty without one."""
-        return {} if self._filter is None else self._filter.tallies
+        return {} if self.filter is None else self.filter.tallies
 
-    def _receive(self, physics: Array, first: int) -> None:
-        for sampler in self._samplers:
-            self._in_flight += sampler.sample(physics, first)
+    def _prepare(self, start: int, stop: int) -> None:
+        """Make room for the samples taken in these physics steps, with their errors; drop those no longer needed."""
+        for k, sampler in enumerate(self._samplers):
+            struct, (values, fates) = self._structs[k], self._samples[k]
+            first, end = -(-start // struct.stride), -(-stop // struct.stride)
+            heard = struct.heard if self.filter is None else min(struct.heard, self._passed[k])
+            drop = max(min(heard, first) - struct.first, 0)
+            errors, fresh = sampler.draw(first, end - first)
+            values, fates = np.concatenate([values[drop:], errors]), np.concatenate([fates[drop:], fresh])
+            self._samples[k], struct.first = (values, fates), struct.first + drop
+            struct.values, struct.fate = values.ctypes.data, fates.ctypes.data
 
-    def _hear(self) -> list[Sample]:
-        """Hold the newest value of each sensor, and return the samples that have arrived since the last call."""
-        arrived = self._arrived()
-        for sample in arrived:
-            self._held[sample.sensor] = sample.value
+    def _hear(self, step: int, physics: Array) -> None:
+        """Hold the newest sample of each sensor to arrive by a physics step, at MuJoCo's state (14,)."""
+        motion = np.ascontiguousarray(physics[1:])
+        plant_library().quadsim_hear(self._sensing, step, motion.ctypes.data)
+
+    def _arrived(self) -> list[NDArray[np.void]]:
+        """Return the samples that have arrived since the last call, without lost ones."""
+        arrived = []
+        for k, (values, fates) in enumerate(self._samples):
+            struct, passed = self._structs[k], self._passed[k]
+            last = (self._step - struct.latency) // struct.stride + 1
+            if last <= passed:
+                continue
+            rows = slice(passed - struct.first, last - struct.first)
+            fresh = np.empty(last - passed, SAMPLE)
+            fresh["taken"], fresh["kind"] = struct.stride * np.arange(passed, last), struct.kind
+            fresh["value"] = values[rows]
+            arrived.append(fresh[fates[rows] & Fate.LOST == 0])
+            self._passed[k] = last
         return arrived
-
-    def _arrived(self) -> list[Sample]:
-        """Return the samples that have arrived since the last call, oldest first; the others stay in transit."""
-        arrived = [sample for sample in self._in_flight if sample.arrival <= self._step]
-        self._in_flight = [sample for sample in self._in_flight if sample.arrival > self._step]
-        return sorted(arrived, key=attrgetter("taken"))

@@ -11,10 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadsim.controller import FALLBACK, MISSED, Command, Phase, Statistics, StepInputs
+from quadsim.core.structs import plant_library
 from quadsim.errors import ParameterError
-from quadsim.flight.log import ControlLog, FlightLog, LoggedSignals, PlantLog, TimingLog, stacked
-from quadsim.rotation import body_to_euler_rates, quaternion_to_euler
-from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, TURN, VELOCITIES, Array, whole_turns
+from quadsim.flight.log import (
+    ControlLog,
+    FlightLog,
+    LoggedSignals,
+    PeriodLog,
+    PlantLog,
+    Samples,
+    TimingLog,
+    stacked,
+)
+from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 
 PHYSICS: Final = {
@@ -26,7 +35,7 @@ PHYSICS: Final = {
 """Columns of MuJoCo's state (14,), whose first is the time [s]."""
 PhysicsSteps = NDArray[np.void]
 """Physics steps, a row each, with the fields of `steps_type`."""
-Integrator = Literal["mujoco", "rk4"]  # integrator of the physics steps: MuJoCo, or `quadsim.sim.rigid_body`
+Integrator = Literal["mujoco", "rk4"]  # integrator of the physics steps: MuJoCo, or the core's own method
 
 
 def whole(owner: str, name: str, value: float, count: float, rule: str, *, smallest: int = 1) -> int:
@@ -64,16 +73,18 @@ def inner_steps(rate: float, timestep: float, owner: str = "controller.inner") -
 def steps_type(*, wrench: bool = False, wind: bool = False, battery: bool = False) -> np.dtype[np.void]:
     """Return the type of a row of `PhysicsSteps`; fields that nothing causes are absent.
 
-    `physics` (14,) is MuJoCo's state after the step; `speeds` (4,) are the rotor speeds at its start [rad/s]; `thrust`
-    is the collective thrust in its middle [N]; `wrench` (6,) is the force, world [N], and torque, body frame about its
-    origin [N m], of all effects but contact over the step; `wind` (3,) is the velocity of the air in its middle, world
-    [m/s]; `battery` (2,) is the voltage over the step [V] and the charge at its start [-].
+    `physics` (14,) is MuJoCo's state after the step; `speeds` (4,) are the rotor speeds at its start, `commands` (4,)
+    those commanded during it, saturated [rad/s]; `thrust` is the collective thrust in its middle [N]; `wrench` (6,) is
+    the force, world [N], and torque, body frame about its origin [N m], of all effects but contact over the step;
+    `wind` (3,) is the velocity of the air in its middle, world [m/s]; `battery` (2,) is the voltage over the step [V]
+    and the charge at its start [-].
     """
     optional = {"wrench": (6, wrench), "wind": (3, wind), "battery": (2, battery)}
     return np.dtype(
         [
             ("physics", float, 14),
             ("speeds", float, N_ROTORS),
+            ("commands", float, N_ROTORS),
             ("thrust", float),
             *((name, float, size) for name, (size, there) in optional.items() if there),
         ]
@@ -89,24 +100,12 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
         physics: (M, 14) time, position (world), quaternion wxyz, velocity (world), angular rates (body).
         yaw: the first row's yaw is unwrapped to the turn nearest to it [rad].
     """
-    state = np.empty((physics.shape[0], N_STATES))
-    euler = quaternion_to_euler(physics[:, PHYSICS["attitude"]])
-    state[:, POSITIONS] = physics[:, PHYSICS["position"]]
-    state[:, VELOCITIES] = physics[:, PHYSICS["velocity"]]
-    state[:, ANGLE_RATES] = body_to_euler_rates(euler, physics[:, PHYSICS["body_rates"]])
-    if len(euler) > 1:
-        euler[:, 2] = np.unwrap(euler[:, 2])
-    if len(euler) and math.isfinite(euler[0, 2]):
-        euler[:, 2] -= TURN * whole_turns(float(euler[0, 2]) - yaw)
-    upright = np.cos(euler[:, 0]) * np.cos(euler[:, 1]) >= 0.0
-    last = yaw
-    for first in np.flatnonzero(np.diff(upright)) + 1:  # as `quadsim.state.YawTurns`
-        if not upright[first]:
-            last = float(euler[first - 1, 2])
-        elif math.isfinite(euler[first, 2]):
-            euler[first:, 2] -= TURN * whole_turns(float(euler[first, 2]) - last)
-    state[:, ANGLES] = euler
-    return state
+    if physics.strides[1:] != (8,):
+        physics = np.ascontiguousarray(physics, np.float64)
+    states = np.empty((len(physics), N_STATES))
+    width = physics.strides[0] // 8
+    plant_library().quadsim_states(physics.ctypes.data, len(physics), width, yaw, states.ctypes.data)
+    return states
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,16 +191,33 @@ def flight_log(
     return FlightLog(control=control, timing=_timing_log(samples, control.t), plant=plant)
 
 
-def one_period(sample: Period, timestep: float) -> FlightLog:
-    """Convert one control period to a log: one row, and the plant's rows from its start to its end, both included."""
-    moment = sample.observation.moment
+def one_period(sample: Period, timestep: float) -> PeriodLog:
+    """Return what the margins of a control period take."""
+    observed, moment, steps = sample.observation, sample.observation.moment, sample.steps
     assert moment.acting is not None
-    yaw = float(sample.observation.truth[INDEX["yaw"]])
-    log = flight_log([sample], sample.before, moment.acting, yaw, 0.0, timestep)
-    t = _times(2, moment.time)[1:]
-    control, timing = replace(log.control, t=t), replace(log.timing, t=t)
-    return replace(
-        log, control=control, timing=timing, plant=replace(log.plant, t=np.round(moment.time + log.plant.t, 9))
+    target = None if sample.target is None else sample.target[None, :4]
+    t = moment.time + timestep * np.arange(len(steps) + 1)
+    thrust = None
+    if target is not None:
+        thrust = np.append(steps["thrust"], steps["thrust"][-1:])
+    return PeriodLog(
+        control=Samples(
+            t=np.round(t[:1], 9),
+            state=observed.state[None],
+            truth=observed.truth[None],
+            reference=observed.reference[None],
+            speeds=sample.speeds[None],
+            speeds_before=moment.acting,
+            target=target,
+        ),
+        plant=PlantLog(
+            t=np.round(t, 9),
+            state=physics_to_state(
+                np.concatenate([sample.before[None], steps["physics"]]), float(observed.truth[INDEX["yaw"]])
+            ),
+            speeds=np.concatenate([steps["speeds"], sample.rotors[None]]),
+            thrust=thrust,
+        ),
     )
 
 

@@ -6,32 +6,36 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
-from operator import add
-from typing import Final, assert_never
+from typing import Final, Protocol, assert_never
 
 import mujoco
 import numpy as np
-from mujoco.rollout import Rollout
 
 from quadsim.border import numbers_of, user_code
-from quadsim.controller import check_command
+from quadsim.controller import LARGEST_SPEED, check_command
+from quadsim.core.stepping import addresses, step_address
+from quadsim.core.structs import (
+    End,
+    InnerStruct,
+    SensingStruct,
+    StepsStruct,
+    VehicleStruct,
+    fill,
+    plant_library,
+)
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError, RaisedError
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
 from quadsim.sim.effects import LOADING, Change, Effects, Force, PushChange
-from quadsim.sim.effects.forces import StepForces
 from quadsim.sim.effects.load import Load, MassChange, Payload, PayloadDrop, apply_mass, mass_properties
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import PHYSICS, Integrator, PhysicsSteps, physics_to_state, steps_type
-from quadsim.sim.rigid_body import FreeBody, check_free
 from quadsim.space import Obstacle
 from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 _FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
-_CONTROL: Final = int(mujoco.mjtState.mjSTATE_CTRL)
 _PLAUSIBLE: Final = 1e6
 """Largest magnitude of time [s], position [m], speed [m/s] or rate [rad/s] that is not divergence."""
 _NUMERICAL_WARNINGS: Final = (
@@ -43,19 +47,29 @@ _NUMERICAL_WARNINGS: Final = (
 _CALM: Final = Effects()
 _AS_IN_THE_FILE: Final = Load()
 
+
 if all(getattr(mujoco, name)() is None for name in dir(mujoco) if name.startswith("get_mjcb_")):
     # Its Python bindings time each part of each step, which takes two fifths of a step's time.
     mujoco.mj_resetCallbacks()
 
 
+class Answers(Protocol):
+    """Answers for an inner loop in Python."""
+
+    def __call__(self) -> Array:
+        """Return the rotor speeds (4,) to hold until the next call [rad/s]."""
+        ...
+
+
 class Plant:
     """A vehicle in MuJoCo: fourth-order Runge-Kutta at a fixed step, commands held in between.
 
-    With `integrator="rk4"`, `quadsim.sim.rigid_body` takes the steps instead.
+    The steps of a hold are taken by the compiled core (`quadsim/core/quadsim_plant.h`), which calls MuJoCo's own.
+    With `integrator="rk4"`, the core integrates a free rigid body itself, with forces evaluated at each stage.
 
-    Without effects, rotors have their commanded speed at once, and a whole hold is one call of MuJoCo.  With effects
-    that depend on the motion, steps are taken one by one, with forces evaluated at mid-step (second order). Use it as a
-    context manager; it owns native memory.
+    Without effects, rotors have their commanded speed at once.  Forces that depend on the motion are evaluated at
+    mid-step (second order).  A step depends on the state at its start alone: results have the same bits however time is
+    cut into holds.
 
     Attributes:
         vehicle: the vehicle flown, as in its file.
@@ -97,22 +111,26 @@ class Plant:
         self._speed_range = (vehicle.speed_min, vehicle.speed_max) if limit_speeds else (0.0, math.inf)
         self._data = mujoco.MjData(self.model)
         mujoco.set_mju_user_warning(_discard)
-        self._rollout = Rollout(nthread=0)
         self._physics = np.zeros((1, mujoco.mj_stateSize(self.model, _FULL)))
         self._yaw = YawTurns(0.0)
         self._wind, self._own = wind, tuple(forces)
         if integrator == "rk4":
             check_free(effects, changes, obstacles)
         self._integrator = integrator
-        self._by_step = effects.follows_state or wind is not None or bool(self._own)
-        self._by_step = self._by_step or bool(self._moving) or integrator == "rk4"
-        self._by_step = self._by_step or any(isinstance(change, PushChange) for change in changes)
-        self._steps_type = steps_type(wrench=self._by_step, wind=wind is not None, battery=effects.battery is not None)
+        pushed = any(isinstance(change, PushChange) for change in changes)
+        self._follows_motion = effects.follows_state or wind is not None or bool(self._own) or pushed
+        self._follows_motion = self._follows_motion or bool(self._moving) or integrator == "rk4"
+        self._steps_type = steps_type(
+            wrench=self._follows_motion, wind=wind is not None, battery=effects.battery is not None
+        )
         bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
-        self._mocaps = self.model.body_mocapid[bodies]
+        assert self.model.body_mocapid[bodies].tolist() == list(range(len(bodies)))  # the core writes them in order
         self._changes = self._scheduled(changes)
-        self._rng = rng if rng is not None else np.random.default_rng(0)
-        self._rng_start = self._rng.bit_generator.state
+        rng = rng if rng is not None else np.random.default_rng(0)
+        # A generator each, so that neither draw changes the other's, however time is cut.
+        self._generators = rng, rng.spawn(1)[0]
+        self._starts = [generator.bit_generator.state for generator in self._generators]
+        self._struct = self._make_struct()
         self.reset(np.zeros(N_STATES))
 
     def __enter__(self) -> Plant:
@@ -122,8 +140,9 @@ class Plant:
         self.close()
 
     def close(self) -> None:
-        """Free native memory."""
-        self._rollout.close()
+        """Free native memory; the plant cannot fly on."""
+        for name in ("_struct", "_data", "model"):
+            self.__dict__.pop(name, None)
 
     @property
     def wind(self) -> WindField | None:
@@ -172,26 +191,73 @@ class Plant:
         self._speeds = self.hover_speeds if speeds is None else np.array(speeds, float)
         self._efficiency = np.array(self._rotors.efficiency)
         self._charge = 0.0 if self.effects.battery is None else self.effects.battery.charge
-        self._velocity_before = self._physics[0, 8:].tolist()
+        struct = self._struct
+        if self._integrator == "mujoco":
+            mujoco.mj_setState(self.model, self._data, self._physics[0], _FULL)
+        else:
+            self._motion[:] = self._physics[0, 1:]
+        struct.now, struct.time, struct.charge = 0, 0.0, self._charge
+        struct.speeds[:], struct.before[:] = self._speeds, self._physics[0, 8:]
+        self._pushes: Array = np.empty((0, 6))
+        self._tell()
         if self._reweighed:
             self._carry(self._load.payloads, self._load.mass_factor)
-        if self._by_step:
-            self._forces.push(())
-        self._rng.bit_generator.state = self._rng_start
+        for generator, start in zip(self._generators, self._starts, strict=True):
+            generator.bit_generator.state = start
         if self._wind is not None:
             self._wind.reset()
         for force in self._own:
             getattr(force, "reset", lambda: None)()
 
-    @cached_property
-    def _forces(self) -> StepForces:
-        """The forces of each step, if steps are taken one by one."""
-        shape = outline(self.vehicle)
-        return StepForces(self.vehicle, self.effects, timestep=self.timestep, floor=shape.floor, disc=shape.disc)
+    def _make_struct(self) -> VehicleStruct:
+        """Return the core's vehicle, with all that does not change."""
+        v, vehicle, effects, data = VehicleStruct(), self.vehicle, self.effects, self._data
+        v.timestep, v.plausible, v.fastest_valid = self.timestep, _PLAUSIBLE, LARGEST_SPEED
+        v.mass, v.gravity, v.inertia[:] = vehicle.mass, vehicle.gravity, vehicle.inertia
+        v.coefficient, v.hover = vehicle.thrust_coefficient, vehicle.hover_speed
+        v.slowest, v.fastest = self._speed_range
+        v.spin[:] = [float(spin) for spin in vehicle.rotor_spins]
+        fill(v.place, vehicle.rotor_positions[:, :2])
+        fill(v.torque_of_thrust, vehicle.allocation[1:] / vehicle.thrust_coefficient)
+        v.follows_motion = self._follows_motion
+        if effects.rotors is not None:
+            v.rotor_inertia = effects.rotors.inertia or 0.0
+        if (air := effects.air) is not None:
+            v.rotor_drag = air.rotor_drag or 0.0
+            v.linear_drag[:], v.quadratic_drag[:] = air.linear_drag, air.quadratic_drag
+        if (ground := effects.ground) is not None and ground.effect:
+            shape = outline(vehicle)
+            v.floor, v.disc, v.radius = shape.floor, shape.disc, ground.rotor_radius
+        if (noise := effects.thrust_noise) is not None:
+            v.loss, v.deviation = noise.loss, noise.deviation
+            v.largest = vehicle.thrust_coefficient * vehicle.speed_max**2
+        if (battery := effects.battery) is not None:
+            self._curve = np.array(battery.curve)
+            v.curve, v.points = self._curve.ctypes.data, len(self._curve)
+            v.cells, v.capacity, v.resistance = battery.cells, battery.capacity, battery.resistance
+            v.hover_current, v.idle_current = battery.hover_current, battery.idle_current
+            v.reference_voltage, v.exponent = battery.reference_voltage, battery.exponent
+        if self._integrator == "rk4":
+            self._motion = np.zeros(13)
+            v.motion, v.velocity = self._motion.ctypes.data, self._motion[7:].ctypes.data
+            return v
+        v.step = step_address()
+        v.model, v.data = addresses(self.model, data)
+        v.motion, v.velocity = data.qpos.ctypes.data, data.qvel.ctypes.data
+        v.applied, v.control = data.qfrc_applied.ctypes.data, data.ctrl.ctypes.data
+        if air is not None and air.body_drag is not None:
+            v.fluid = data.qfrc_fluid.ctypes.data
+            v.wind = self.model.opt.wind.ctypes.data if self._wind is not None else None
+        if self._moving:
+            v.obstacles, v.mocaps = data.mocap_pos.ctypes.data, len(self._moving)
+        return v
 
-    @cached_property
-    def _body(self) -> FreeBody:
-        return FreeBody(self.vehicle, self._forces, self.timestep)
+    def _tell(self) -> None:
+        """Tell the core what events change."""
+        v, rotors = self._struct, self._rotors
+        v.rise, v.fall, v.acceleration = rotors.rise or 0.0, rotors.fall or 0.0, rotors.acceleration or 0.0
+        v.at_once, v.efficiency[:] = rotors.at_once, self._efficiency
+        v.pushes, v.pushing = self._pushes.ctypes.data, len(self._pushes)
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""
@@ -205,10 +271,6 @@ class Plant:
         physics = self._physics[0]
         return physics[PHYSICS["attitude"]].copy(), physics[PHYSICS["body_rates"]].copy()
 
-    def applied(self, speeds: Array) -> Array:
-        """Return the command (4,) [rad/s], saturated at the rotors' limits and at zero."""
-        return np.clip(speeds, *self._speed_range)
-
     def advance(self, speeds: Array, steps: int) -> PhysicsSteps:
         """Hold commanded rotor speeds (4,) [rad/s] for M physics steps, at least 1; return these (M,).
 
@@ -216,21 +278,118 @@ class Plant:
             CommandError: the command is not four finite numbers; nothing moved.
             DivergenceError: the state is no longer finite or plausible.
         """
-        problem = check_command(speeds)
-        if problem is not None:
+        self.begin(steps)
+        self.hold(speeds, steps)
+        return self.flown
+
+    def begin(self, steps: int) -> None:
+        """Begin a period of M physics steps: `hold` fills its rows."""
+        flown, rows = np.empty(steps, self._steps_type), StepsStruct()
+        assert flown.dtype.fields is not None
+        at = flown.ctypes.data
+        for name, (_, offset, *_) in flown.dtype.fields.items():
+            setattr(rows, name, at + offset)
+        rows.width = flown.itemsize // 8
+        drawn: dict[str, Array] = {}
+        if self.effects.thrust_noise is not None:
+            drawn["noise"] = np.empty((steps, N_ROTORS))
+        if self.effects.disturbance is not None or self._own:
+            drawn["disturbance"] = np.zeros((steps, 6))
+        if self._moving:
+            drawn["obstacles"] = np.empty((steps, 3 * len(self._moving)))
+        for name, array in drawn.items():
+            setattr(rows, name, array.ctypes.data)
+        self.flown, self._rows, self._drawn = flown, rows, drawn
+
+    def hold(
+        self,
+        command: Array,
+        steps: int,
+        *,
+        loop: InnerStruct | None = None,
+        sensing: SensingStruct | None = None,
+        ask: Answers | None = None,
+    ) -> None:
+        """Fly some steps of the period that `begin` began.
+
+        Args:
+            command: (4,) rotor speeds [rad/s], where there is no inner loop.
+            steps: their number.
+            loop: the inner loop that flies a command.
+            sensing: what takes samples after each step.
+            ask: answers for an inner loop that is not in the core.
+
+        Raises:
+            CommandError: a command is not four finite numbers.
+            DivergenceError: the state is no longer finite or plausible.
+            FlightError: `ask`, or a force of the user, raised.
+        """
+        if loop is None and (problem := check_command(command)) is not None:
             raise CommandError(problem, time=self.time)
-        target = self.applied(speeds)
-        parts, end = [], self._step + steps
+        command, end = np.ascontiguousarray(command, dtype=np.float64), self._step + steps
         while self._step < end:
             self._change()
             until = min(end, self._pending[0][0]) if self._pending else end
-            parts.append(self._hold(target, until - self._step))
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+            self._draw(until - self._step)
+            while self._step < until:
+                if self._own:
+                    self._drawn["disturbance"][self._rows.row] += self._own_wrench()
+                self._fly(self._step + 1 if self._own else until, command, loop, sensing, ask)
+
+    def _fly(
+        self,
+        end: int,
+        command: Array,
+        loop: InnerStruct | None,
+        sensing: SensingStruct | None,
+        ask: Answers | None,
+    ) -> None:
+        """Let the core fly to a physics step while only vehicle and air change."""
+        v, rows, fly = self._struct, self._rows, plant_library().quadsim_fly
+        while self._step < end:
+            before, why = self._step, fly(v, loop, sensing, rows, command.ctypes.data, end)
+            if v.now > before:
+                self._physics[0] = self.flown["physics"][rows.row - 1]
+                self._step, self._charge = v.now, v.charge
+                self._speeds = np.array(v.speeds)
+            if why == End.FAILED:
+                complaint = plant_library().quadsim_complaint().decode(errors="replace")
+                raise DivergenceError(f"the plant diverged: MuJoCo reports {complaint}", time=self.time)
+            if why == End.DIVERGED:
+                raise DivergenceError("the plant diverged: its state is not finite or not plausible", time=self.time)
+            self._check_warnings()
+            if why == End.INVALID:
+                assert loop is not None
+                problem = check_command(np.array(loop.answer))
+                raise CommandError(str(problem), time=self.time)
+            if why == End.DUE:
+                assert loop is not None
+                assert ask is not None
+                answer = np.asarray(ask())
+                if (problem := check_command(answer)) is not None:
+                    raise CommandError(problem, time=self.time)
+                loop.answer[:], loop.until = answer, loop.stride
+
+    def _draw(self, steps: int) -> None:
+        """Draw for the next steps of the period."""
+        rows, drawn = slice(self._rows.row, self._rows.row + steps), self._drawn
+        of_noise, of_disturbance = self._generators
+        if self._wind is not None:
+            self.flown["wind"][rows] = self._wind.advance(steps)
+        if "noise" in drawn:
+            drawn["noise"][rows] = of_noise.standard_normal((steps, N_ROTORS))
+        if self.effects.disturbance is not None:
+            drawn["disturbance"][rows] = self.effects.disturbance.draw(steps, self.timestep, of_disturbance)
+        if self._moving:
+            times = self.timestep * np.arange(self._step, self._step + steps, dtype=np.float64)
+            positions = np.stack([obstacle.positions(times) for obstacle in self._moving], axis=1)
+            drawn["obstacles"][rows] = positions.reshape(steps, -1)
 
     def allows(self, changes: Sequence[Change]) -> bool:
         """Return whether it was built for changes of these kinds."""
         weighing = not self._reweighed and any(isinstance(change, LOADING) for change in changes)
-        return not (weighing or (not self._by_step and any(isinstance(change, PushChange) for change in changes)))
+        pushing = not self._follows_motion and any(isinstance(change, PushChange) for change in changes)
+        return not (weighing or pushing)
 
     def reschedule(self, changes: Sequence[Change]) -> None:
         """Schedule these changes, of kinds that it `allows`; past ones are ignored."""
@@ -243,6 +402,8 @@ class Plant:
 
     def _change(self) -> None:
         """Apply the changes due before the next step."""
+        if not (self._pending and self._pending[0][0] <= self._step):
+            return
         while self._pending and self._pending[0][0] <= self._step:
             _, change = self._pending.popleft()
             if isinstance(change, RotorChange):
@@ -252,152 +413,30 @@ class Plant:
             elif isinstance(change, LagChange):
                 self._rotors = self._rotors.lagging(change)
             elif isinstance(change, PushChange):
-                self._forces.push(change.pushes)
+                pushes = [(*push.force, *push.point) for push in change.pushes if any(push.force)]
+                self._pushes = np.array(pushes, float).reshape(-1, 6)
             elif isinstance(change, Payload):
                 self._carry((*self._payloads, change), self._mass_factor)
             elif isinstance(change, PayloadDrop):
                 self._carry((), self._mass_factor)
             else:
                 assert_never(change)
+        self._tell()
 
     def _carry(self, payloads: tuple[Payload, ...], mass_factor: float) -> None:
         self._payloads, self._mass_factor = payloads, mass_factor
         load = replace(self._load, mass_factor=mass_factor)
         apply_mass(self.model, BODY, mass_properties(self.vehicle, load, payloads))
 
-    def _hold(self, target: Array, steps: int) -> PhysicsSteps:
-        """Advance while only vehicle and air change."""
-        rotors, timestep = self._rotors, self.timestep
-        if rotors.at_once:
-            before = middle = np.broadcast_to(target, (steps, N_ROTORS))
-            slopes = np.zeros((steps, N_ROTORS))
-            self._speeds = target
-        else:
-            edges = timestep * np.arange(steps + 1, dtype=np.float64)
-            times = np.concatenate([edges, edges[:-1] + 0.5 * timestep])
-            speeds, slopes = rotors.respond(self._speeds, target, times)
-            before, self._speeds = speeds[:steps].copy(), speeds[steps].copy()
-            middle, slopes = speeds[steps + 1 :], slopes[steps + 1 :]
-        thrusts = self._efficiency * self.vehicle.thrust_coefficient * np.square(middle)
-        battery = None
-        if self.effects.battery is not None:
-            ratio = middle / self.vehicle.hover_speed
-            demands = (self._efficiency * ratio * np.square(ratio)).mean(axis=1).tolist()
-            rows, self._charge = self.effects.battery.discharge(self._charge, demands, timestep)
-            battery = np.array(rows)
-            thrusts = thrusts * np.array([[self.effects.battery.factor(voltage)] for voltage, _ in rows])
-        if self.effects.thrust_noise is not None:
-            largest = self.vehicle.thrust_coefficient * self.vehicle.speed_max**2
-            thrusts = self.effects.thrust_noise.applied(thrusts, largest, self._rng)
-        wrench = wind = None
-        if self._by_step:
-            wind = None if self._wind is None else self._wind.advance(steps)
-            take = self._take_steps if self._integrator == "mujoco" else self._integrate
-            trajectory, wrench = take(thrusts, middle, slopes, wind)
-        else:
-            trajectory = self._run(thrusts)
-        self._check(trajectory)
-        self._physics[0] = trajectory[-1]
-        self._step += steps
-        flown = np.empty(steps, self._steps_type)
-        flown["physics"], flown["speeds"], flown["thrust"] = trajectory, before, thrusts.sum(axis=1)
-        for name, part in (("wrench", wrench), ("wind", wind), ("battery", battery)):
-            if part is not None:
-                flown[name] = part
-        return flown
-
-    def _run(self, thrusts: Array) -> Array:
-        """Take all steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""
-        steps = len(thrusts)
-        states = np.empty((1, steps, self._physics.shape[1]))
-        self._rollout.rollout(
-            [self.model],
-            [self._data],
-            self._physics,
-            np.ascontiguousarray(thrusts[None]),
-            control_spec=_CONTROL,
-            skip_checks=True,
-            nstep=steps,
-            state=states,
-            sensordata=np.empty((1, steps, self.model.nsensordata)),
-        )
-        return states[0]
-
-    def _take_steps(self, thrusts: Array, speeds: Array, slopes: Array, wind: Array | None) -> tuple[Array, Array]:
-        """Take steps one by one, each with the forces of its middle: states (M, 14) and wrenches (M, 6)."""
-        model, data, steps = self.model, self._data, len(thrusts)
-        mujoco.mj_setState(model, data, self._physics[0], _FULL)
-        trajectory, wrench = np.empty((steps, self._physics.shape[1])), np.empty((steps, 6))
-        noises = self._noises(steps)
-        air = np.zeros((steps, 3)) if wind is None else wind
-        drags = self.effects.air is not None and self.effects.air.body_drag is not None
-        moving_air = wind is not None and drags
-        of_rotors = self._of_rotors(speeds, slopes)
-        forces, step, velocity_before = self._forces.midway, mujoco.mj_step, self._velocity_before
-        qpos, qvel, applied, control = data.qpos, data.qvel, data.qfrc_applied, data.ctrl  # looked up once
-        if self._moving:
-            times = self.time + self.timestep * np.arange(steps, dtype=np.float64)
-            positions = np.stack([obstacle.positions(times) for obstacle in self._moving], axis=1)
-        for i, (thrust, rotors, breeze) in enumerate(zip(thrusts.tolist(), of_rotors, air.tolist(), strict=True)):
-            velocity = qvel.tolist()
-            acting: Sequence[float] = forces(qpos.tolist(), velocity, velocity_before, thrust, rotors, breeze)
-            velocity_before = velocity
-            if noises is not None:
-                acting = list(map(add, acting, noises[i]))
-            if self._own:
-                acting = list(map(add, acting, self._own_wrench(i * self.timestep, [*qpos, *qvel])))
-            applied[:] = wrench[i] = acting
-            control[:] = thrust
-            if moving_air:
-                model.opt.wind[:] = breeze
-            if self._moving:
-                data.mocap_pos[self._mocaps] = positions[i]
-            step(model, data)
-            trajectory[i, 1:8], trajectory[i, 8:] = qpos, qvel
-            if drags:
-                wrench[i] += data.qfrc_fluid
-        self._velocity_before = velocity_before
-        trajectory[:, 0] = self._clock(steps)
-        return trajectory, wrench
-
-    def _integrate(self, thrusts: Array, speeds: Array, slopes: Array, wind: Array | None) -> tuple[Array, Array]:
-        """Do the same as `_take_steps` without MuJoCo, with forces evaluated at each stage of the step."""
-        steps = len(thrusts)
-        noises, of_rotors = self._noises(steps) or [[0.0] * 6] * steps, self._of_rotors(speeds, slopes)
-        air = [[0.0] * 3] * steps if wind is None else wind.tolist()
-        state, states, wrenches = self._physics[0, 1:].tolist(), [], []
-        for i, (thrust, rotors, breeze, held) in enumerate(zip(thrusts.tolist(), of_rotors, air, noises, strict=True)):
-            if self._own:
-                held = list(map(add, held, self._own_wrench(i * self.timestep, state)))
-            state, acted = self._body.advance(state, thrust, rotors, breeze, held)
-            states.append(state)
-            wrenches.append(acted)
-        return np.column_stack([self._clock(steps), states]), np.array(wrenches)
-
-    def _clock(self, steps: int) -> Array:
-        """(M,) times after each of the next steps [s], added up as MuJoCo does."""
-        times: Array = np.add.accumulate(np.concatenate([self._physics[0, :1], np.full(steps, self.timestep)]))[1:]
-        return times
-
-    def _noises(self, steps: int) -> list[list[float]] | None:
-        disturbance = self.effects.disturbance
-        return None if disturbance is None else disturbance.draw(steps, self.timestep, self._rng).tolist()
-
-    def _of_rotors(self, speeds: Array, slopes: Array) -> list[list[float]]:
-        there = self._efficiency > 0.0  # a lost propeller has neither drag nor momentum
-        return self._forces.of_rotors(speeds * there, slopes * there).tolist()
-
-    def _own_wrench(self, since: float, motion: Sequence[float]) -> list[float]:
-        """Return the sum of the user-defined forces, world [N] and body frame [N m], a time [s] after the hold's start.
-
-        `motion` (13,) is MuJoCo's state then, without the time.
+    def _own_wrench(self) -> Array:
+        """Return the sum (6,) of the user-defined forces now, world [N] and body frame [N m].
 
         Raises:
             ForceError: a force is not six finite numbers.
             RaisedError: a force raised an exception.
         """
-        physics, time = np.array([0.0, *motion]), self.time + since
-        state, total = physics_to_state(physics[None])[0], np.zeros(6)
+        time, total = self.time, np.zeros(6)
+        state = physics_to_state(self._physics)[0]
         for force in self._own:
             name = getattr(force, "__name__", type(force).__name__)
             with user_code(lambda error, name=name: RaisedError(f"the force {name}", error, time=time)):  # type: ignore[misc]
@@ -406,17 +445,29 @@ class Plant:
                 shown = f"{wrench.tolist()!r:.80}"
                 raise ForceError(f"the force {name} must give six finite numbers [N, N m]; got {shown}", time=time)
             total += wrench
-        return total.tolist()
+        return total
 
-    def _check(self, trajectory: Array) -> None:
-        if not np.abs(trajectory).max() < _PLAUSIBLE:  # false for NaN
-            plausible = (np.abs(trajectory) < _PLAUSIBLE).all(axis=1)
-            time = self.time + self.timestep * (1 + int(np.argmin(plausible)))
-            raise DivergenceError("the plant diverged: its state is not finite or not plausible", time=time)
+    def _check_warnings(self) -> None:
         counts = self._data.warning.number
         if counts.any() and (raised := [kind.name for kind in _NUMERICAL_WARNINGS if counts[int(kind)]]):
             raise DivergenceError(f"the plant diverged: MuJoCo reports {', '.join(raised)}", time=self.time)
 
 
+def check_free(effects: Effects, changes: Sequence[Change], obstacles: Sequence[Obstacle] = ()) -> None:
+    """Refuse features that the integrator `rk4` lacks.
+
+    Raises:
+        ParameterError: there is a floor or an obstacle to touch, a load, or MuJoCo's drag.
+    """
+    unknown = {
+        "contact with the ground": effects.ground is not None and effects.ground.contact,
+        "obstacles": bool(obstacles),
+        "a load": effects.load not in (None, Load()) or any(isinstance(change, LOADING) for change in changes),
+        "effects.air.body_drag": effects.air is not None and effects.air.body_drag is not None,
+    }
+    if names := [name for name, present in unknown.items() if present]:
+        raise ParameterError("plant", "integrator", "rk4", f"mujoco with {' and '.join(names)}")
+
+
 def _discard(message: str) -> None:
-    """Swallow MuJoCo's warnings, which `Plant._check` reads as counts; else they go to the terminal and a log file."""
+    """Swallow MuJoCo's warnings, which `Plant` reads as counts; else they go to the terminal and a log file."""

@@ -7,14 +7,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final
 
 import numpy as np
 from annotated_types import Ge, Le, Len, doc
 from numpy.typing import NDArray
 
+from quadsim.core.structs import Fate
 from quadsim.fields import Fraction, NonNegative, Number
-from quadsim.rotation import Vector3, exponential, multiply, quaternion_to_euler
+from quadsim.rotation import Vector3, quaternion_to_euler
 from quadsim.sim.physics import PHYSICS, whole
 from quadsim.state import Array
 
@@ -32,6 +33,10 @@ class SensorName(StrEnum):
     ATTITUDE = "attitude"
     """Roll, pitch, yaw [rad]; errors are rotation vectors in the body frame, q_measured = q * exp(error)."""
     RATES = "rates"  # p, q, r [rad/s], body: a rate gyro
+
+
+KINDS: Final = {name: kind for kind, name in enumerate(SensorName)}
+"""The sensors' numbers in the core."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,27 +130,19 @@ class SensorFault:
 
 
 Flags = NDArray[np.bool_]
+Fates = NDArray[np.uint8]
+"""What befalls samples: sums of `Fate`s."""
 Steps = NDArray[np.int64]
 
 
-class Sample(NamedTuple):
-    """One sample."""
-
-    sensor: SensorName  # the sensor
-    taken: int  # physics step at which it was taken, its time stamp
-    arrival: int  # physics step at which it becomes available
-    value: Array  # (3,) in the unit of the sensor's name
+MEASURED: Final = {name: PHYSICS["body_rates" if name is SensorName.RATES else name.value] for name in SensorName}
+"""The columns of MuJoCo's state that each sensor measures."""
 
 
 def truth(name: SensorName, physics: Array) -> Array:
     """Return a perfect sensor's samples (M, 3) of MuJoCo's states (M, 14)."""
-    values = _of(name, physics)
+    values = physics[:, MEASURED[name]]
     return quaternion_to_euler(values) if name is SensorName.ATTITUDE else values.copy()
-
-
-def _of(name: SensorName, physics: Array) -> Array:
-    """Return a sensor's quantity of MuJoCo's states (M, 14): (M, 3), or attitudes (M, 4)."""
-    return physics[:, PHYSICS["body_rates" if name is SensorName.RATES else name.value]]
 
 
 class Sampler:
@@ -164,19 +161,14 @@ class Sampler:
         rng: np.random.Generator,
     ) -> None:
         self.name, self._sensor = name, sensor
-        self._stride = sensor.stride(name, timestep)
-        self._latency = sensor.latency(name, timestep)
+        self.stride = sensor.stride(name, timestep)
+        self.latency = sensor.latency(name, timestep)
         self._noise, self._bias = np.array(in_si(name, sensor.noise)), np.array(in_si(name, sensor.bias))
-        self._step = np.array(in_si(name, sensor.bias_walk)) * math.sqrt(self._stride * timestep)
+        self._step = np.array(in_si(name, sensor.bias_walk)) * math.sqrt(self.stride * timestep)
         self._timestep = timestep
         self.reschedule(faults)
         self._initial = tuple(rng.spawn(4))
         self.reset()
-
-    @property
-    def watched(self) -> bool:
-        """Whether it has any fault, and so tracks the sample that a frozen sensor repeats."""
-        return bool(self._faults)
 
     def reschedule(self, faults: Sequence[SensorFault]) -> None:
         """Replace the faults; those of other sensors are ignored."""
@@ -187,48 +179,29 @@ class Sampler:
         """Restart with the same draws."""
         self._of_noise, self._of_bias, self._of_dropout, self._of_outliers = copy.deepcopy(self._initial)
         self._walked: Array | None = None
-        self._through: Array | None = None
 
-    def sample(self, physics: Array, first: int) -> list[Sample]:
-        """Return the samples taken during a segment of motion, without lost ones.
+    def draw(self, first: int, count: int) -> tuple[Array, Fates]:
+        """Draw the errors (count, 3) of the samples from number `first` on, and what befalls each (count,).
 
-        The segment is given by MuJoCo's states (M, 14) at successive physics steps from step `first`; segments follow
-        one another from step 0.
+        An attitude's error is a rotation vector in the body frame.  Calls follow one another from sample 0.
         """
-        first_row = -first % self._stride
-        rows = physics[first_row :: self._stride]
-        count = len(rows)
         if not count:
-            return []
-        taken = np.arange(first + first_row, first + len(physics), self._stride)
+            return np.empty((0, 3)), np.empty(0, np.uint8)
         errors = self._walk(count) + self._draw_noise(count) + 0.0  # turns -0 into 0
-        lost = self._of_dropout.random(count) < self._sensor.dropout
-        affected = [(fault, _within(taken, window)) for fault, window in self._faults]
-        offset, frozen = np.zeros((count, 3)), np.zeros(count, dtype=bool)
-        for fault, within in affected:
+        fates = (self._of_dropout.random(count) < self._sensor.dropout).astype(np.uint8) * np.uint8(Fate.LOST)
+        taken = self.stride * np.arange(first, first + count)
+        for fault, window in self._faults:
+            within = _within(taken, window)
             match fault.kind:
                 case FaultKind.BIAS:
-                    offset[within] += fault.offset
+                    errors[within] += fault.offset
                 case FaultKind.DROPOUT:
-                    lost |= within
+                    fates[within] |= Fate.LOST
                 case FaultKind.FREEZE:
-                    frozen |= within
-        values = self._measure(rows, errors + offset)
-        if affected:
-            for value, gone, stuck in zip(values, lost, frozen, strict=True):
-                if stuck and self._through is not None:
-                    value[:] = self._through
-                elif not gone:
-                    self._through = value.copy()
-        for fault, within in affected:
-            if fault.kind is FaultKind.NAN:
-                values[np.ix_(np.flatnonzero(within), np.array(fault.axes))] = np.nan
-        name, latency = self.name, self._latency
-        return [
-            Sample(name, step, step + latency, value)
-            for step, value, gone in zip(taken.tolist(), values, lost.tolist(), strict=True)
-            if not gone
-        ]
+                    fates[within] |= Fate.FROZEN
+                case FaultKind.NAN:
+                    fates[within] |= sum(Fate.NO_NUMBER << axis for axis in fault.axes)
+        return errors, fates
 
     def _walk(self, count: int) -> Array:
         """Return (count, 3) the bias at each sample: constant at the first of all, then a random walk."""
@@ -247,16 +220,6 @@ class Sampler:
         if outliers is not None:
             noise[draws < outliers.probability] *= outliers.size
         return noise
-
-    def _measure(self, rows: Array, errors: Array) -> Array:
-        name = self.name
-        if name is not SensorName.ATTITUDE:
-            return _of(name, rows) + errors
-        turned = [
-            multiply((w, x, y, z), exponential((a, b, c)))
-            for (w, x, y, z), (a, b, c) in zip(_of(name, rows).tolist(), errors.tolist(), strict=True)
-        ]
-        return quaternion_to_euler(np.array(turned))
 
 
 def _within(taken: Steps, window: tuple[int, int | None]) -> Flags:

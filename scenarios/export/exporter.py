@@ -16,7 +16,7 @@ from mpc.codegen.ctext import CText, Precision
 from mpc.codegen.source import CHANGES, DATA, CController, part
 from mpc.codegen.targets import TARGETS, Machine
 from mpc.core.numbers import Exportable, exportable
-from mpc.core.solver import WAYS, CoreProblem, Work, core_library
+from mpc.core.solver import CoreProblem, Work, core_library
 from mpc.ocp import Problem
 from mpc.solvers import Method
 from quadsim.controller import ROTORS

@@ -17,7 +17,7 @@ from gymnasium.vector import VectorEnv
 from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import FlightError, ParameterError
 from quadsim.flight.audit import Limit
-from quadsim.flight.log import FlightLog
+from quadsim.flight.log import FlightLog, PeriodLog
 from quadsim.report.film.camera import Camera
 from quadsim.sim.physics import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array, wrapped
@@ -338,7 +338,7 @@ class Agent:
         raise NotImplementedError
 
 
-def _margins(limits: Sequence[Limit], log: FlightLog, first: int = 0) -> tuple[Array, Array]:
+def _margins(limits: Sequence[Limit], log: FlightLog | PeriodLog, first: int = 0) -> tuple[Array, Array]:
     """(m,) smallest margins of a log, from this row of the plant on, and at its end; inf where there is none."""
     smallest = np.full((2, len(limits)), np.inf)
     for i, limit in enumerate(limits):

@@ -20,7 +20,7 @@ import numpy as np
 from annotated_types import doc
 
 from quadsim.errors import ParameterError
-from quadsim.sim.error_state import EstimatorSettings
+from quadsim.sim.estimator import EstimatorSettings
 from quadsim.sim.sensing import Sensor, SensorName
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
 
 from mpc.allocation import Allocation, allocate, make_allocation, thrust_to_command
 from quadsim.assets import vehicle_path
@@ -89,3 +90,22 @@ def test_the_thrust_that_is_commanded_carries_the_weight_wherever_the_rotors_do(
         assert commanded - weight >= (0.5 - 1e-9) * (largest - weight)
     if share * largest >= 0.5 * (weight + largest):
         assert commanded == share * largest
+
+
+@settings(max_examples=100)
+@given(name=NAMES, seed=st.integers(0, 10**6), size=st.sampled_from([0.5, 3.0, 30.0]))
+def test_where_roll_and_pitch_do_not_fit_it_is_the_weighted_least_squares(name: str, seed: int, size: float) -> None:
+    """Against scipy's bounded-variable solver, with the thrust first clipped to its range."""
+    allocation, (lower, upper) = ALLOCATIONS[name], box(name, seed)
+    wrench = size * np.random.default_rng(seed).normal(size=4) * allocation.scale
+    answer = allocate(allocation, wrench, lower, upper)
+    if np.abs(missed(allocation, wrench, answer)[:3]).max() < 1e-6:
+        return  # it fits, at most with less yaw
+    weights, unit = np.array([30.0, 1000.0, 1000.0, 1.0]) / allocation.scale, float(upper.max()) ** 2
+    low, high = lower**2, np.maximum(upper**2, lower**2 + 1e-9 * unit)
+    wrench[0] = np.clip(wrench[0], allocation.M[0] @ low, allocation.M[0] @ high)
+    best = lsq_linear(
+        weights[:, None] * allocation.M * unit, weights * wrench, (low / unit, high / unit), method="bvls", tol=1e-14
+    )
+    cost = 0.5 * float(np.square(weights * (allocation.M @ answer**2 - wrench)).sum())
+    assert cost <= best.cost * (1.0 + 1e-6) + 1e-9

@@ -108,16 +108,21 @@ class RotorPyPlant:
         self._yaw = float(state[EULER[2]])
         return state
 
-    def applied(self, speeds: Array) -> Array:
-        """The rotor speeds (4,) [rad/s] that a command makes."""
-        return np.maximum(speeds, 0.0)
+    def begin(self, steps: int) -> None:
+        """Begin a period, whose steps `hold` appends to `flown`."""
+        self.flown = np.empty(0, steps_type())
+
+    def hold(self, command: Array, steps: int, **nothing: None) -> None:
+        """Hold a command (4,) [rad/s]; there is no inner loop, and there are no sensors."""
+        assert not any(nothing.values())
+        self.flown = np.concatenate([self.flown, self.advance(command, steps)])
 
     def advance(self, speeds: Array, steps: int) -> PhysicsSteps:
         """Hold rotor speeds (4,) [rad/s], and return the states in MuJoCo's order.
 
         RotorPy's `step` integrates the same function in the same way, but gives the end of the hold alone.
         """
-        held = self.applied(speeds)
+        held = np.maximum(speeds, 0.0)
         self._vector[16:] = held
         t = self.timestep * np.arange(1, steps + 1)
         solution = solve_ivp(
@@ -132,7 +137,7 @@ class RotorPyPlant:
         physics = _to_physics(self._time + t, vectors)
         self._time, self._vector = float(physics[-1, 0]), vectors[-1].copy()
         flown = np.empty(steps, steps_type())
-        flown["physics"], flown["speeds"], flown["thrust"] = physics, held, math.nan
+        flown["physics"], flown["speeds"], flown["commands"], flown["thrust"] = physics, held, held, math.nan
         return flown
 
 

@@ -158,10 +158,10 @@ def test_a_run_whose_product_fails_keeps_all_else_and_names_it(
 def test_a_defect_of_our_own_is_not_taken_for_a_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only typed flight errors and Ctrl-C become a reason; a bug must be seen, and leave nothing behind."""
 
-    def broken(*_: object) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(loop.Plant, "advance", broken)
+    monkeypatch.setattr(loop.Plant, "hold", broken)
     with pytest.raises(ZeroDivisionError):
         run(tmp_path / "new" / "run", SHORT)
     assert list(tmp_path.iterdir()) == []

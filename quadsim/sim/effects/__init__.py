@@ -1,4 +1,31 @@
-"""The effects on the plant beyond the paper's model; each is off unless a scenario sizes it."""
+"""The effects on the plant beyond the paper's model; each is off unless a scenario sizes it.
+
+The compiled core evaluates the forces that follow from how the vehicle moves (`quadsim/core/quadsim_plant.c`):
+
+- Rotor drag, F_i = -k w_i (v_air,i - (v_air,i . z_b) z_b): blade flapping and induced drag hold each rotor back in its
+  own plane in proportion to its speed and to the air's (Martin & Salaun 2010, "The true role of accelerometer feedback
+  in quadrotor control"; RotorS, Furrer et al. 2016).  MuJoCo's fluid forces know neither rotors nor forces linear in
+  the air speed at these Reynolds numbers.
+- Gyroscopic and spin-up torque of rotors with inertia, -(d/dt + rates x) h z_b, with the angular momentum
+  h = -sum_i spin_i J_r w_i of rotors that turn against their reaction torque.
+- Ground effect: what each rotor's thrust gains, by the height z of its own disc above the ground,
+
+      T / T_inf = 1 / (1 - (R / (4 z))^2)
+
+  at the same power, so its torque gains nothing.  The ground acts as an image of the rotor below it, whose outflow
+  slows the inflow: I. C. Cheeseman, W. E. Bennett, "The Effect of the Ground on a Helicopter Rotor in Forward Flight",
+  ARC R&M 3021, 1955.  Singular at z = R / 4 and good for z > R / 2 alone (J. G. Leishman, "Principles of Helicopter
+  Aerodynamics", Sec. 5.8): lower heights are taken for z = R / 2, where the ratio is 4/3.  Left out are forward speed,
+  which weakens the effect, and what neighbouring rotors add to it; the ratio is applied at equal rotor speeds, as
+  simulators commonly do.
+- Drag of the body along its axes, F_i = -(l_i + k_i |v_i|) v_i, v its velocity through the air in the body frame, as
+  simplified simulations have it (Torrente et al. 2021, "Data-Driven MPC for Quadrotors").
+- Pushes: each a force F in the world frame, and the torque r x R' F of its point r of the body.
+
+They are evaluated half a step ahead, where the motion follows from this step's and the last one's, and held for the
+step: that acts as the changing force would, up to the third power of the step.  With `rk4` they are evaluated at each
+stage.  The quadratic drag of `Air.body_drag` is MuJoCo's own; see `quadsim.sim.airframe.compile_model`.
+"""
 
 from __future__ import annotations
 
@@ -71,13 +98,6 @@ class ThrustNoise:
     deviation: Annotated[
         NonNegative, doc("[-] standard deviation per physics step at full thrust; proportional to sqrt(u)")
     ] = 0.0
-
-    def applied(self, thrusts: Array, largest: float, rng: np.random.Generator) -> Array:
-        """Return the actual thrusts (M, 4) [N] over M steps for commanded ones, at most `largest` [N]."""
-        share = thrusts / largest
-        lost = self.loss * np.square(share) + self.deviation * np.sqrt(share) * rng.standard_normal(share.shape)
-        remaining: Array = largest * np.clip(share - lost, 0.0, 1.0)
-        return remaining
 
 
 @dataclass(frozen=True, kw_only=True)

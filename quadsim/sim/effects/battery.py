@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Final
@@ -82,34 +80,3 @@ class Battery:
         power = (vehicle.mass * vehicle.gravity) ** 1.5 / math.sqrt(2.0 * SEA_LEVEL_DENSITY * discs)
         assert battery.reference_voltage is not None
         return filled(battery, hover_current=power / EFFICIENCY / battery.reference_voltage)
-
-    def open_circuit(self, charge: float) -> float:
-        """E(s) [V] at a charge s [-]."""
-        last = len(self.curve) - 1
-        k = bisect_right(self.curve, charge, 1, last, key=lambda pair: pair[0])
-        (low, empty), (high, full) = self.curve[k - 1 : k + 1]
-        return self.cells * (empty + (charge - low) / (high - low) * (full - empty))
-
-    def discharge(self, charge: float, demands: Iterable[float], timestep: float) -> tuple[list[list[float]], float]:
-        """Voltage [V] and charge [-] over each of M steps of `timestep` [s], and the charge [-] after them.
-
-        Args:
-            charge: before the first step [-].
-            demands: (M,) sum_i e_i (w_i / w_hover)^3 / 4 in each step.
-            timestep: of the physics [s].
-        """
-        assert self.hover_current is not None
-        assert self.reference_voltage is not None
-        rows, per_step = [], timestep / (3600.0 * self.capacity)
-        for demand in demands:
-            conductance = self.hover_current * demand / self.reference_voltage**2  # (i - i_idle) / V^2
-            rest = max(self.open_circuit(charge) - self.resistance * self.idle_current, 0.0)
-            voltage = 2.0 * rest / (1.0 + math.sqrt(1.0 + 4.0 * self.resistance * conductance * rest))
-            rows.append([voltage, charge])
-            charge = max(charge - per_step * (conductance * voltage**2 + self.idle_current), 0.0)
-        return rows, charge
-
-    def factor(self, voltage: float) -> float:
-        """(V / V0)^n, of thrust and reaction torque at a voltage V [V]."""
-        assert self.reference_voltage is not None
-        return float((voltage / self.reference_voltage) ** self.exponent)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
-import numpy as np
 from annotated_types import Ge, Gt, Le, Len, doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Fraction, Instant, NonNegative, Positive, filled
-from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 
@@ -77,28 +74,6 @@ class RotorDynamics:
         if self.inertia and not self.acceleration and not (self.rise and self.fall):
             rule = "0 where rotors change their speed at once: that would take an infinite torque"
             raise ParameterError("effects.rotors", "inertia", self.inertia, rule)
-
-    def respond(self, speeds: Array, target: Array, elapsed: Array) -> tuple[Array, Array]:
-        """Speeds (M, 4) [rad/s] and accelerations (M, 4) [rad/s^2] at times `elapsed` (M,) [s] after a command.
-
-        Args:
-            speeds: (4,) rotor speeds when the command came [rad/s].
-            target: (4,) the command, within what the rotors can hold [rad/s].
-            elapsed: (M,) times since then [s].
-        """
-        gap = target - speeds
-        sign, distance = np.sign(gap), np.abs(gap)
-        lag, steepest = np.where(gap >= 0.0, self.rise or 0.0, self.fall or 0.0), self.acceleration or math.inf
-        eased = distance if math.isinf(steepest) else np.minimum(distance, steepest * lag)
-        ramp_end = (distance - eased) / steepest  # the slope is limited until then; 0 without a limit
-        t = elapsed[:, None]
-        ramping = t < ramp_end
-        rate = np.divide(1.0, lag, out=np.zeros_like(lag), where=lag > 0.0)
-        decay = np.where(lag > 0.0, np.exp(-rate * np.maximum(t - ramp_end, 0.0)), 0.0)
-        limit = steepest if math.isfinite(steepest) else 0.0
-        after = np.where(ramping, speeds + sign * limit * t, target - sign * eased * decay)
-        slope = np.where(ramping, sign * limit, sign * eased * rate * decay)
-        return after, slope
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ _Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
 
 @dataclass(frozen=True, kw_only=True)
 class Air:
-    """Drag, and the wind; see `quadsim.sim.effects.forces` and `quadsim.sim.effects.wind`."""
+    """Drag, and the wind; see `quadsim.sim.effects` and `quadsim.sim.effects.wind`."""
 
     density: Annotated[Positive, doc("[kg/m^3] of the air, for the drag of the body")] = SEA_LEVEL_DENSITY
     rotor_drag: Annotated[

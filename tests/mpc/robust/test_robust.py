@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy_laws import respond
 from support import constrained_mpc, derivative, paper_problem, paper_reference, robust_mpc, robust_table
 
 from mpc.bounded import InputWeights, Soft
@@ -129,7 +130,7 @@ def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle, delay: floa
         phase = Phase.LANDED if k == 5 else Phase.FLYING
         # Since the last call's end, `before` has acted to the end of its period, as has `acting` since its beginning.
         controller.step(StepInputs(acting=acting, phase=phase), state, HOLD)
-        speeds = rotors.respond(speeds, acting, np.array([PERIOD]))[0][0]
+        speeds = respond(rotors, speeds, acting, np.array([PERIOD]))[0][0]
         np.testing.assert_allclose(preparation_of(controller)._turning, speeds, atol=1e-9)
         before = acting
     assert np.abs(speeds - before).max() > 0.1

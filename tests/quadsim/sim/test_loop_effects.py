@@ -19,6 +19,7 @@ from quadsim.sim.effects import Effects, Ground
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.loop import TAKEOFF_LEAD, fly
 from quadsim.sim.navigation import Navigation
+from quadsim.sim.physics import PhysicsSteps
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing import FaultKind, Sensor, SensorFault, SensorName
 from quadsim.state import Array, make_state
@@ -206,9 +207,9 @@ def test_the_estimator_receives_the_saturated_command(vehicle: Vehicle) -> None:
     received: list[Array] = []
 
     class Witness(Navigation):
-        def advance(self, physics: Array, commands: Array, *, on_ground: bool = False) -> None:
-            received.append(commands[0].copy())
-            super().advance(physics, commands, on_ground=on_ground)
+        def record(self, flown: PhysicsSteps, *, on_ground: bool = False) -> None:
+            received.append(flown["commands"][0].copy())
+            super().record(flown, on_ground=on_ground)
 
     navigation = Witness(vehicle, timestep=1e-3, sensors={}, rng=np.random.default_rng(0))
     with Plant(vehicle, limit_speeds=True) as plant:

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sensor_samples import follow
 
 from quadsim.errors import ParameterError
-from quadsim.sim.error_state import EstimatorSettings
+from quadsim.sim.estimator import EstimatorSettings
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import physics_to_state
 from quadsim.sim.plant import Plant
@@ -46,7 +47,7 @@ def observed(navigation: Navigation, physics: Array, speeds: Array, *, chunk: in
     navigation.reset(physics[0], speeds, yaw)
     states = [navigation.state()]
     for step in range(0, STEPS, chunk):
-        navigation.advance(physics[step + 1 : step + chunk + 1], np.tile(speeds, (chunk, 1)))
+        follow(navigation, physics[step + 1 : step + chunk + 1], np.tile(speeds, (chunk, 1)), step)
         if (step + chunk) % 50 == 0:
             states.append(navigation.state())
     return np.array(states)
@@ -152,7 +153,7 @@ def test_the_estimator_alone_minds_that_the_feet_stand(on_ground: bool, vehicle:
     for estimator in (None, EstimatorSettings()):
         navigation = build(vehicle, SENSORS, estimator=estimator)
         navigation.reset(ground[0], cold[0])
-        navigation.advance(ground[1:], cold, on_ground=on_ground)
+        follow(navigation, ground[1:], cold, 0, on_ground=on_ground)
         falls = navigation.state()[INDEX["vz"]] < -0.3
         assert falls == (estimator is not None and not on_ground)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -12,8 +13,15 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from quadsim.errors import CommandError, DivergenceError, ParameterError
-from quadsim.sim.physics import physics_to_state
+from quadsim.core.stepping import step_address
+from quadsim.errors import CommandError, DivergenceError, InputError, ParameterError
+from quadsim.sim.autopilot import Autopilot
+from quadsim.sim.effects import Disturbance, Effects, Ground, ThrustNoise
+from quadsim.sim.effects.battery import Battery
+from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects.turbulence import Dryden
+from quadsim.sim.effects.wind import Air, Gust, WindField
+from quadsim.sim.physics import Integrator, physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -163,12 +171,11 @@ def test_rotors_saturate_only_where_the_scenario_limits_them(vehicle: Vehicle) -
     with Plant(vehicle) as free, Plant(vehicle, limit_speeds=True) as limited:
         for plant, speed in ((free, 300.0), (limited, vehicle.speed_max)):
             plant.reset(make_state())
-            np.testing.assert_array_equal(plant.applied(fast), np.full(4, speed))
-            plant.advance(fast, 100)
+            np.testing.assert_array_equal(plant.advance(fast, 100)["commands"], np.full((100, 4), speed))
             thrust = 4 * vehicle.thrust_coefficient * speed**2
             climb = 0.5 * (thrust / vehicle.mass - vehicle.gravity) * 0.1**2
             assert plant.state()[4] == pytest.approx(climb, rel=1e-9)
-        np.testing.assert_array_equal(free.applied(-fast), np.zeros(4))  # a rotor cannot push down
+        np.testing.assert_array_equal(free.advance(-fast, 1)["commands"], np.zeros((1, 4)))  # none pushes down
 
 
 @pytest.mark.parametrize("state", [np.zeros(11), np.full(12, np.nan)])
@@ -201,3 +208,73 @@ def test_callbacks_of_the_users_own_stay() -> None:
         "assert mujoco.get_mjcb_control() is print; mujoco.set_mjcb_control(None)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_fatal_error_of_mujoco_ends_the_flight_and_not_the_process(vehicle: Vehicle) -> None:
+    """In its bindings it stays the exception that it is."""
+    with Plant(vehicle) as plant:
+        plant.advance(plant.hover_speeds, 5)
+        before, integrator = plant.physics, plant.model.opt.integrator
+        plant.model.opt.integrator = 99
+        with pytest.raises(DivergenceError, match=r"at t = 0.005 s: the plant diverged: MuJoCo reports mj_step: inval"):
+            plant.advance(plant.hover_speeds, 5)
+        assert np.array_equal(plant.physics, before)
+        with pytest.raises(mujoco.FatalError, match="invalid integrator"):
+            mujoco.mj_step(plant.model, mujoco.MjData(plant.model))
+        plant.model.opt.integrator = integrator
+        plant.reset(make_state())
+        assert np.array_equal(plant.advance(plant.hover_speeds, 5)["physics"][-1], before)
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_a_target_that_is_no_number_is_refused(vehicle: Vehicle, number: int) -> None:
+    autopilot = Autopilot(vehicle)
+    target = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
+    target[number] = math.nan
+    with Plant(vehicle) as plant:
+        loop = autopilot.engage(target, plant.speeds)
+        loop.stride = 1
+        plant.begin(20)
+        with pytest.raises(CommandError, match=r"at t = 0.001 s: the command is not finite"):  # after its delay
+            plant.hold(target, 20, loop=loop)
+
+
+def test_a_release_of_mujoco_that_lacks_what_is_needed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    step_address.cache_clear()
+    monkeypatch.setattr(mujoco, "__file__", "/nowhere/__init__.py")
+    with pytest.raises(InputError, match=r"MuJoCo \d.* cannot be stepped from C \(.*\): install a release that pyproj"):
+        step_address()
+    monkeypatch.undo()
+    assert step_address() > 0
+
+
+@pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
+def test_results_have_the_same_bits_however_time_is_cut(vehicle: Vehicle, integrator: Integrator) -> None:
+    """Holds of 20 steps and of 1, with all that changes from step to step, down to the ground and past an obstacle."""
+    contact = integrator == "mujoco"
+    effects = Effects(
+        rotors=RotorDynamics(rise=0.02, fall=0.04, acceleration=4e3, inertia=5e-5),
+        air=Air(rotor_drag=1e-3, linear_drag=(0.1, 0.1, 0.1), body_drag=(0.02, 0.02, 0.03) if contact else None),
+        ground=Ground(contact=contact, effect=True, rotor_radius=0.12),
+        disturbance=Disturbance(force=(0.1, 0.0, 0.0), force_noise=0.01, torque_noise=1e-4),
+        thrust_noise=ThrustNoise(loss=0.02, deviation=0.01),
+        battery=Battery(cells=4, capacity=0.05, hover_current=40.0, reference_voltage=16.0),
+    )
+    wind = WindField(
+        mean=(2.0, 1.0, 0.0),
+        gusts=(Gust(at=0.1, duration=0.2, velocity=(3.0, 0.0, 0.0)),),
+        turbulence=Dryden(wind_speed_20ft=8.0, airspeed=4.0),
+        timestep=1e-3,
+        rng=np.random.default_rng(1),
+    )
+    commands = vehicle.hover_speed * np.random.default_rng(2).uniform(0.6, 1.0, (40, 4))
+    flights = []
+    for steps in (20, 1):
+        with Plant(
+            vehicle, effects=effects, wind=wind, rng=np.random.default_rng(3), limit_speeds=True, integrator=integrator
+        ) as plant:
+            plant.reset(make_state(position=(0.0, 0.0, 0.3)))
+            parts = [plant.advance(command, steps) for command in commands for _ in range(20 // steps)]
+            flights.append(np.concatenate(parts))
+    assert flights[0].tobytes() == flights[1].tobytes()
+    assert (flights[0]["physics"][:, 3].min() < 0.01) == contact  # it stood on the ground

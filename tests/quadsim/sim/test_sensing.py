@@ -8,11 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from sensor_samples import follow, sampler_of, taken
 
 from quadsim.rotation import euler_to_quaternion
-from quadsim.sim.sensing import FaultKind, Outliers, Sample, Sampler, Sensor, SensorFault, SensorName, truth
+from quadsim.sim.navigation import Navigation
+from quadsim.sim.sensing import KINDS, FaultKind, Outliers, Sensor, SensorFault, SensorName, truth
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
 
 TIMESTEP = 1e-3
 STEPS = 20_000
@@ -29,25 +33,24 @@ def physics() -> Array:
     return rows
 
 
-def sampler(name: SensorName, sensor: Sensor, *faults: SensorFault, seed: int = 0) -> Sampler:
-    return Sampler(name, sensor, timestep=TIMESTEP, faults=faults, rng=np.random.default_rng(seed))
+def sampled(name: SensorName, sensor: Sensor, *faults: SensorFault, of: Array, seed: int = 0) -> NDArray[np.void]:
+    return taken(sampler_of(name, sensor, *faults, seed=seed), of)
 
 
-def errors(samples: list[Sample], physics: Array) -> Array:
+def errors(samples: NDArray[np.void], physics: Array) -> Array:
     """(n, 3) what samples say beyond the truth; rotation vectors for attitude."""
-    taken = [sample.taken for sample in samples]
-    values = np.array([sample.value for sample in samples])
-    name = samples[0].sensor
+    at, values = samples["taken"], samples["value"]
+    name = list(SensorName)[samples["kind"][0]]
     if name is not SensorName.ATTITUDE:
-        return values - truth(name, physics[taken])
+        return np.asarray(values - truth(name, physics[at]))
     measured = Rotation.from_euler("ZYX", values[:, ::-1])
-    return (Rotation.from_quat(physics[taken, 4:8], scalar_first=True).inv() * measured).as_rotvec()
+    return np.asarray((Rotation.from_quat(physics[at, 4:8], scalar_first=True).inv() * measured).as_rotvec())
 
 
 @pytest.mark.parametrize("name", list(SensorName))
 def test_a_perfect_sensor_reports_the_truth(name: SensorName, physics: Array) -> None:
-    samples = sampler(name, Sensor(rate=100.0)).sample(physics, 0)
-    assert [sample.taken for sample in samples] == list(range(0, STEPS + 1, 10))
+    samples = sampled(name, Sensor(rate=100.0), of=physics)
+    assert samples["taken"].tolist() == list(range(0, STEPS + 1, 10))
     assert np.abs(errors(samples, physics)).max() < 1e-12
 
 
@@ -56,7 +59,7 @@ def test_noise_and_bias_are_as_stated_on_each_axis(name: SensorName, physics: Ar
     noise, bias = np.array([0.01, 0.02, 0.05]), np.array([0.1, -0.2, 0.05])
     stated = [np.degrees(v) if name in ("attitude", "rates") else v for v in (noise, bias)]
     sensor = Sensor(rate=1000.0, noise=tuple(stated[0]), bias=tuple(stated[1]))
-    result = errors(sampler(name, sensor).sample(physics, 0), physics)
+    result = errors(sampled(name, sensor, of=physics), physics)
     np.testing.assert_allclose(result.mean(0), bias, atol=4 * noise.max() / np.sqrt(STEPS))
     np.testing.assert_allclose(result.std(0), noise, rtol=4 / np.sqrt(2 * STEPS))  # of a standard deviation, 4 sigma
     corr = np.corrcoef(result[1:].T, result[:-1].T)
@@ -66,9 +69,7 @@ def test_noise_and_bias_are_as_stated_on_each_axis(name: SensorName, physics: Ar
 def test_the_variance_of_a_walking_bias_grows_as_time() -> None:
     rest = np.zeros((101, 14))
     sensor = Sensor(rate=20.0, bias=(0.3, 0.0, 0.0), bias_walk=(0.1, 0.2, 0.4))
-    walks = np.array(
-        [[s.value for s in sampler(SensorName.VELOCITY, sensor, seed=seed).sample(rest, 0)] for seed in range(1000)]
-    )
+    walks = np.array([sampled(SensorName.VELOCITY, sensor, seed=seed, of=rest)["value"] for seed in range(1000)])
     assert walks[:, 0].tolist() == [[0.3, 0.0, 0.0]] * 1000
     t = 0.05 * np.arange(1, walks.shape[1])
     expected = np.outer(t, np.square(sensor.bias_walk))
@@ -76,20 +77,21 @@ def test_the_variance_of_a_walking_bias_grows_as_time() -> None:
 
 
 def test_rates_and_delays_are_exact(physics: Array) -> None:
-    samples = sampler(SensorName.POSITION, Sensor(rate=40.0, delay=0.11)).sample(physics[:101], 0)
-    assert [(sample.taken, sample.arrival) for sample in samples] == [(25 * i, 25 * i + 110) for i in range(5)]
+    samples = sampled(SensorName.POSITION, Sensor(rate=40.0, delay=0.11), of=physics[:101])
+    assert samples["taken"].tolist() == [25 * i for i in range(5)]
+    assert sampler_of(SensorName.POSITION, Sensor(rate=40.0, delay=0.11)).latency == 110
 
 
 def test_the_share_lost_is_as_stated(physics: Array) -> None:
-    samples = sampler(SensorName.RATES, Sensor(rate=1000.0, dropout=0.3)).sample(physics, 0)
+    samples = sampled(SensorName.RATES, Sensor(rate=1000.0, dropout=0.3), of=physics)
     assert len(samples) / STEPS == pytest.approx(0.7, abs=4 * np.sqrt(0.3 * 0.7 / STEPS))
-    assert not sampler(SensorName.RATES, Sensor(rate=1000.0, dropout=1.0)).sample(physics, 0)
+    assert not len(sampled(SensorName.RATES, Sensor(rate=1000.0, dropout=1.0), of=physics))
 
 
 def test_outliers_widen_the_noise_of_their_share_of_samples(physics: Array) -> None:
     sensor, name = Sensor(rate=1000.0, noise=0.1, outliers=Outliers(probability=0.1, size=20.0)), SensorName.POSITION
-    result = errors(sampler(name, sensor).sample(physics, 0), physics)
-    clean = errors(sampler(name, replace(sensor, outliers=None)).sample(physics, 0), physics)
+    result = errors(sampled(name, sensor, of=physics), physics)
+    clean = errors(sampled(name, replace(sensor, outliers=None), of=physics), physics)
     widened = np.isclose(result, 20.0 * clean, rtol=1e-6, atol=1e-9)
     assert np.all(widened | np.isclose(result, clean, rtol=1e-6, atol=1e-9))
     assert np.all(widened.all(axis=1) == widened.any(axis=1))  # all axes of a sample together
@@ -98,28 +100,41 @@ def test_outliers_widen_the_noise_of_their_share_of_samples(physics: Array) -> N
 
 @pytest.mark.parametrize("name", [SensorName.POSITION, SensorName.ATTITUDE])
 @pytest.mark.parametrize("cuts", [(1,), (7,), (50,), (13, 200, 1)])
-def test_samples_do_not_depend_on_how_time_is_cut(name: SensorName, cuts: tuple[int, ...], physics: Array) -> None:
+def test_the_core_hears_each_sample_when_it_arrives_however_time_is_cut(
+    name: SensorName, cuts: tuple[int, ...], physics: Array, vehicle: Vehicle
+) -> None:
     sensor = Sensor(
         rate=200.0,
         noise=0.1,
         bias_walk=0.1,
         dropout=0.2,
+        delay=0.02,
         outliers=Outliers(probability=0.2, size=5.0),
     )
     freeze = SensorFault(sensor=name, kind=FaultKind.FREEZE, start=0.1, stop=0.2)
-    whole = sampler(name, sensor, freeze).sample(physics[:401], 0)
-    pieces, at, first, again = [], 0, 0, sampler(name, sensor, freeze)
-    again.sample(physics[:100], 0)
-    again.reset()
-    while first < 401:
-        count = cuts[at % len(cuts)]
-        pieces += again.sample(physics[first : min(first + count, 401)], first)
-        first, at = first + count, at + 1
-    assert [(s.taken, s.arrival, s.value.tolist()) for s in pieces] == [
-        (s.taken, s.arrival, s.value.tolist()) for s in whole
-    ]
-    other = sampler(name, sensor, freeze, seed=1).sample(physics[:401], 0)
-    assert [s.value.tolist() for s in other] != [s.value.tolist() for s in whole]
+    blank = SensorFault(sensor=name, kind=FaultKind.NAN, start=0.3, stop=0.35, axes=(1,))
+    lost = SensorFault(sensor=name, kind=FaultKind.DROPOUT, start=0.15, stop=0.25)
+    faults = freeze, blank, lost
+    navigation = Navigation(
+        vehicle, timestep=TIMESTEP, sensors={name: sensor}, rng=np.random.default_rng(0), faults=faults
+    )
+    generators = np.random.default_rng(0).spawn(1 + len(SensorName))
+    expected = taken(sampler_of(name, sensor, *faults, rng=generators[1 + KINDS[name]]), physics[:401])
+    for _ in range(2):  # and the same again after a reset
+        navigation.reset(physics[0], np.zeros(4))
+        first, at = 0, 0
+        while first < 400:
+            count = min(cuts[at % len(cuts)], 400 - first)
+            follow(navigation, physics[first + 1 : first + 1 + count], np.zeros((count, 4)), first)
+            first, at = first + count, at + 1
+            heard = expected[expected["taken"] + 20 <= first]
+            state = navigation.state()[[0, 2, 4] if name is SensorName.POSITION else [6, 8, 10]]
+            if len(heard):
+                value = heard["value"][-1]
+                turns = np.array([0.0, 0.0, 2.0 * math.pi * round((state[2] - value[2]) / (2.0 * math.pi))])
+                if name is SensorName.POSITION:
+                    turns[:] = 0.0
+                np.testing.assert_allclose(state, value + turns, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -128,8 +143,8 @@ def test_samples_do_not_depend_on_how_time_is_cut(name: SensorName, cuts: tuple[
 )
 def test_one_imperfection_leaves_the_draws_of_the_others_alone(change: dict[str, Any], physics: Array) -> None:
     sensor, name = Sensor(rate=100.0, dropout=0.5), SensorName.POSITION
-    plain = sampler(name, sensor).sample(physics, 0)
-    assert [s.taken for s in sampler(name, replace(sensor, **change)).sample(physics, 0)] == [s.taken for s in plain]
+    plain = sampled(name, sensor, of=physics)
+    assert np.array_equal(sampled(name, replace(sensor, **change), of=physics)["taken"], plain["taken"])
 
 
 # --- faults --------------------------------------------------------------------------------------------------------
@@ -137,8 +152,8 @@ def test_one_imperfection_leaves_the_draws_of_the_others_alone(change: dict[str,
 
 def befallen(physics: Array, kind: FaultKind, **more: Any) -> dict[int, Array]:
     fault = SensorFault(sensor=SensorName.POSITION, kind=kind, start=0.1, stop=0.2, **more)
-    samples = sampler(SensorName.POSITION, Sensor(rate=100.0), fault).sample(physics[:301], 0)
-    return {sample.taken: sample.value for sample in samples}
+    samples = sampled(SensorName.POSITION, Sensor(rate=100.0), fault, of=physics[:301])
+    return dict(zip(samples["taken"].tolist(), samples["value"], strict=True))
 
 
 def test_faults_hold_from_their_start_until_before_their_end(physics: Array) -> None:
@@ -158,13 +173,13 @@ def test_faults_hold_from_their_start_until_before_their_end(physics: Array) -> 
 
 def test_a_sensor_frozen_from_the_start_repeats_its_first_sample(physics: Array) -> None:
     fault = SensorFault(sensor=SensorName.POSITION, kind=FaultKind.FREEZE, start=0.0)
-    samples = sampler(SensorName.POSITION, Sensor(rate=100.0), fault).sample(physics[:301], 0)
-    assert all(np.array_equal(sample.value, physics[0, 1:4]) for sample in samples)
+    samples = sampled(SensorName.POSITION, Sensor(rate=100.0), fault, of=physics[:301])
+    assert np.array_equal(samples["value"], np.tile(physics[0, 1:4], (31, 1)))
 
 
 def test_the_fault_of_another_sensor_changes_nothing(physics: Array) -> None:
     fault = SensorFault(sensor=SensorName.VELOCITY, kind=FaultKind.NAN, start=0.0)
-    samples = sampler(SensorName.POSITION, Sensor(rate=100.0), fault).sample(physics[:301], 0)
+    samples = sampled(SensorName.POSITION, Sensor(rate=100.0), fault, of=physics[:301])
     assert len(samples) == 31
     assert np.abs(errors(samples, physics)).max() == 0.0
 

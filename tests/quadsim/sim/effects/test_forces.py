@@ -6,12 +6,14 @@ import math
 
 import numpy as np
 import pytest
+from numpy_laws import LOWEST_RATIO, axis_drag, ground_effect, pushed, respond, rotor_drag, thrust_ratio
+from scipy.spatial.transform import Rotation
 
-from quadsim.sim.airframe import added_mass, compile_model, semi_axes
-from quadsim.sim.effects import Disturbance, Effects, Ground
-from quadsim.sim.effects.forces import LOWEST_RATIO, thrust_ratio
+from quadsim.sim.airframe import added_mass, compile_model, outline, semi_axes
+from quadsim.sim.effects import Disturbance, Effects, Ground, Push, PushChange
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.wind import Air, Gust, WindField
+from quadsim.sim.physics import Integrator
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -208,15 +210,44 @@ def test_forces_are_of_second_order_in_the_step(vehicle: Vehicle) -> None:
     assert errors[-1] < 3e-5
 
 
-def test_a_plant_taken_step_by_step_flies_as_in_one_call(vehicle: Vehicle) -> None:
-    """A drag of next to nothing switches the other way of stepping on: the states are those of the plain plant."""
-    commands = vehicle.hover_speed + np.random.default_rng(2).uniform(-8.0, 8.0, (10, 4))
-    ends = []
-    for effects in (Effects(), Effects(air=Air(rotor_drag=1e-300))):
-        with Plant(vehicle, effects=effects) as plant:
-            plant.reset(make_state())
-            ends.append(np.concatenate([plant.advance(command, 50)["physics"] for command in commands]))
-    np.testing.assert_allclose(ends[1], ends[0], rtol=0.0, atol=1e-13)
+@pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
+def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: Integrator) -> None:
+    """From random motions, at the middle of the step: drag of two kinds, spinning rotors, pushes, ground effect."""
+    rng, radius, drag, inertia, step = np.random.default_rng(6), 0.15, 3e-3, 2e-4, 1e-6
+    linear, quadratic = (0.3, 0.2, 0.05), (0.08, 0.1, 0.12)
+    dynamics = RotorDynamics(rise=0.03, fall=0.05, inertia=inertia)
+    effects = Effects(
+        air=Air(rotor_drag=drag, linear_drag=linear, quadratic_drag=quadratic),
+        ground=Ground(contact=False, effect=True, rotor_radius=radius),
+        rotors=dynamics,
+    )
+    push = Push(at=0.0, duration=1.0, force=(0.5, -0.3, 0.2), point=(0.1, -0.05, 0.02))
+    wind, shape = (2.0, -1.0, 0.5), outline(vehicle)
+    changes = (PushChange(at=0.0, pushes=(push,)),)
+    with Plant(
+        vehicle, timestep=step, effects=effects, changes=changes, wind=still_air(wind), integrator=integrator
+    ) as plant:
+        for _ in range(20):
+            state = make_state(position=(0.0, 0.0, rng.uniform(-0.1, 0.6)), euler=tuple(rng.uniform(-0.8, 0.8, 3)))
+            state[[1, 3, 5, 7, 9, 11]] = rng.normal(size=6)
+            speeds, target = vehicle.hover_speed * rng.uniform(0.7, 1.3, (2, 4))
+            plant.reset(state, speeds)
+            before = plant.physics
+            wrench = plant.advance(target, 1)["wrench"][0]
+            turn, rates = Rotation.from_quat(before[4:8], scalar_first=True), before[11:14]
+            (middle,), (slopes,) = respond(dynamics, speeds, target, np.array([0.5 * step]))
+            air = before[8:11] - wind
+            expected = rotor_drag(vehicle, drag, middle, turn, air, rates) + pushed(push, turn)
+            expected[:3] += axis_drag(linear, quadratic, turn, air)
+            momentum = -inertia * np.array(vehicle.rotor_spins) @ middle
+            expected[3:] += [
+                -rates[1] * momentum,
+                rates[0] * momentum,
+                inertia * slopes @ np.array(vehicle.rotor_spins),
+            ]
+            thrusts = vehicle.thrust_coefficient * middle**2
+            expected += ground_effect(vehicle, radius, thrusts, turn, before[3], shape.floor, shape.disc)
+            np.testing.assert_allclose(wrench, expected, atol=1e-4)  # what changes in half a step
 
 
 @pytest.mark.parametrize(("ratio", "expected"), [(0.5, 4.0 / 3.0), (1.0, 16.0 / 15.0), (2.0, 64.0 / 63.0)])

@@ -7,6 +7,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
+from numpy_laws import respond
 from scipy.integrate import solve_ivp
 
 from quadsim.sim.effects import Effects
@@ -36,29 +37,60 @@ def integrated(dynamics: RotorDynamics, elapsed: Array) -> Array:
 def test_speeds_follow_the_differential_equation(acceleration: float) -> None:
     dynamics = RotorDynamics(rise=0.03, fall=0.07, acceleration=acceleration)
     elapsed = np.linspace(0.0, 0.5, 200)
-    speeds, slopes = dynamics.respond(START, TARGET, elapsed)
+    speeds, slopes = respond(dynamics, START, TARGET, elapsed)
     np.testing.assert_allclose(speeds, integrated(dynamics, elapsed), atol=1e-5)
     step = 1e-7
-    later, _ = dynamics.respond(START, TARGET, elapsed + step)
+    later, _ = respond(dynamics, START, TARGET, elapsed + step)
     kinks = np.isclose(np.abs(slopes), acceleration)
     np.testing.assert_allclose(((later - speeds) / step)[~kinks], slopes[~kinks], rtol=1e-3, atol=1e-2)
     assert np.abs(slopes).max() <= acceleration
 
 
 def test_a_rotor_without_lag_is_there_at_once_or_along_a_ramp() -> None:
-    at_once, _ = RotorDynamics().respond(START, TARGET, np.array([0.0, 0.1]))
+    at_once, _ = respond(RotorDynamics(), START, TARGET, np.array([0.0, 0.1]))
     np.testing.assert_array_equal(at_once, [TARGET, TARGET])
-    ramp, slopes = RotorDynamics(acceleration=100.0).respond(START, TARGET, np.array([0.5]))
+    ramp, slopes = respond(RotorDynamics(acceleration=100.0), START, TARGET, np.array([0.5]))
     np.testing.assert_allclose(ramp, [[150.0, 150.0, 150.0, 250.0]])
     np.testing.assert_allclose(slopes, [[100.0, 0.0, -100.0, 0.0]])
 
 
 def test_an_answer_in_two_parts_is_the_answer_in_one() -> None:
     dynamics = RotorDynamics(rise=0.02, fall=0.05, acceleration=900.0)
-    first, _ = dynamics.respond(START, TARGET, np.array([0.03]))
-    second, _ = dynamics.respond(first[0], TARGET, np.array([0.04]))
-    whole, _ = dynamics.respond(START, TARGET, np.array([0.07]))
+    first, _ = respond(dynamics, START, TARGET, np.array([0.03]))
+    second, _ = respond(dynamics, first[0], TARGET, np.array([0.04]))
+    whole, _ = respond(dynamics, START, TARGET, np.array([0.07]))
     np.testing.assert_allclose(second, whole, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "dynamics",
+    [
+        RotorDynamics(),
+        RotorDynamics(rise=0.03, fall=0.07),
+        RotorDynamics(acceleration=1500.0),
+        RotorDynamics(rise=0.03, fall=0.07, acceleration=1500.0, inertia=1e-4),
+        RotorDynamics(rise=0.02, acceleration=3000.0),
+    ],
+)
+def test_the_rotors_of_the_plant_follow_that_law(vehicle: Vehicle, dynamics: RotorDynamics) -> None:
+    """Their speeds, and by the torque about z their accelerations, as commands change."""
+    commands = vehicle.hover_speed + np.random.default_rng(3).uniform(-40.0, 40.0, (4, 4))
+    edges, speeds = 1e-3 * np.arange(31), START
+    with Plant(vehicle, effects=Effects(rotors=dynamics)) as plant:
+        plant.reset(make_state(position=(0.0, 0.0, 50.0)), START)
+        for command in commands:
+            flown = plant.advance(command, 30)
+            rows, _ = respond(dynamics, speeds, command, edges)
+            _, slopes = respond(dynamics, speeds, command, edges[:-1] + 5e-4)
+            expected = rows[:-1]
+            if dynamics.at_once:
+                expected = np.tile(command, (30, 1))
+            np.testing.assert_allclose(flown["speeds"], expected, rtol=1e-11)
+            if dynamics.inertia:
+                torque = dynamics.inertia * slopes @ np.array(vehicle.rotor_spins)
+                np.testing.assert_allclose(flown["wrench"][:, 5], torque, atol=1e-12)
+            speeds = plant.speeds
+            np.testing.assert_allclose(speeds, rows[-1], rtol=1e-11)
 
 
 def test_the_plant_climbs_as_its_lagging_rotors_do(vehicle: Vehicle) -> None:
@@ -128,7 +160,7 @@ def test_gyroscopic_and_spin_up_torque_are_those_of_real_rotors(vehicle: Vehicle
     with Plant(vehicle, effects=Effects(rotors=dynamics)) as plant:
         plant.reset(state, speeds)
         wrench = plant.advance(target, 1)["wrench"]
-    (middle,), (slopes,) = dynamics.respond(speeds, target, np.array([5e-4]))
+    (middle,), (slopes,) = respond(dynamics, speeds, target, np.array([5e-4]))
     expected = spinning_bodies(vehicle, inertia, rates, middle, slopes)
     bare = -np.cross(rates, np.array(vehicle.inertia) * rates) / vehicle.inertia
     np.testing.assert_allclose(wrench[0, 3:] / vehicle.inertia + bare, expected, rtol=1e-5)

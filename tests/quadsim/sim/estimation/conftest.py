@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy_filter import difference
 from scipy.spatial.transform import Rotation
+from sensor_samples import sampler_of, taken
 
-from quadsim.sim.error_state import EstimatorSettings, difference
-from quadsim.sim.estimator import ErrorStateFilter
-from quadsim.sim.sensing import Sampler, Sensor, SensorName
+from quadsim.sim.estimator import ErrorStateFilter, EstimatorSettings
+from quadsim.sim.sensing import KINDS, Sensor, SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -100,28 +101,30 @@ def run(
         name: replace(s, bias=tuple(np.degrees(bias))) if name is SensorName.RATES else s for name, s in sensors.items()
     }
     generators = rng.spawn(len(SensorName))
-    samplers = [
-        Sampler(name, s, timestep=TIMESTEP, faults=faults.get("faults", ()), rng=g)
-        for (name, s), g in zip(known.items(), generators, strict=False)
-    ]
+    samples = np.concatenate(
+        [
+            taken(sampler_of(name, s, *faults.get("faults", ()), rng=g), motion.physics[seed])
+            for (name, s), g in zip(known.items(), generators, strict=False)
+        ]
+    )
+    latency = np.zeros(len(SensorName), int)
+    for name, sensor in known.items():
+        latency[KINDS[name]] = sensor.latency(name, TIMESTEP)
+    arrival = samples["taken"] + latency[samples["kind"]]
     filter_ = ErrorStateFilter(vehicle, believed or sensors, settings, timestep=TIMESTEP)
     filter_.reset(motion.bias_free_mean(seed, 0), motion.commands[0], rng)
-    in_flight = [sample for sampler in samplers for sample in sampler.sample(motion.physics[seed, :1], 0)]
     errors, deviations, nees = [], [], []
     for first in range(0, len(motion.commands), chunk):
         stop = first + chunk
-        rows = motion.physics[seed, first + 1 : stop + 1]
-        in_flight += [sample for sampler in samplers for sample in sampler.sample(rows, first + 1)]
-        arrived = [s for s in in_flight if s.arrival <= stop]
-        filter_.advance(motion.commands[first:stop], arrived, first, on_ground=first in standing)
-        in_flight = [s for s in in_flight if s.arrival > stop]
-        estimate = filter_.estimate(stop)
+        arrived = samples[(arrival > (first if first else -1)) & (arrival <= stop)]
+        filter_.advance(motion.commands[first:stop], [arrived], on_ground=first in standing)
+        mean, covariance = filter_.estimate()
         true = motion.bias_free_mean(seed, stop)
         true[13:] = bias
-        error = difference(true, estimate.mean)
+        error = difference(true, mean)
         errors.append(error)
-        deviations.append(np.sqrt(np.diag(estimate.covariance)))
-        nees.append(float(error @ np.linalg.solve(estimate.covariance, error)))
+        deviations.append(np.sqrt(np.diag(covariance)))
+        nees.append(float(error @ np.linalg.solve(covariance, error)))
     return filter_, np.array(errors), np.array(deviations), nees
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from quadsim.sim.error_state import EstimatorSettings
+from quadsim.sim.estimator import EstimatorSettings
 from quadsim.sim.sensing import Sensor, SensorName
 from quadsim.vehicle import Vehicle
 

@@ -6,12 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
-
-from quadsim.sim.error_state import (
+from numpy_filter import (
     Estimate,
-    EstimatorSettings,
     MotionModel,
     difference,
     drive,
@@ -19,6 +15,10 @@ from quadsim.sim.error_state import (
     predict_estimate,
     retract,
 )
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from quadsim.sim.estimator import EstimatorSettings
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle

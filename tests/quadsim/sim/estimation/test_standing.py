@@ -9,19 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from quadsim.sim.error_state import (
+from numpy_filter import (
     STILL_RATE,
     STILL_TIME,
     STILL_VELOCITY,
     Estimate,
-    EstimatorSettings,
     MotionModel,
     drive,
     lifts,
     motion_model,
     stand,
 )
+
+from quadsim.sim.estimator import EstimatorSettings
 from quadsim.sim.sensing import Sensor, SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy_filter import OBSERVATION, Estimate, difference, inflate, innovation, retract, update
 from scipy.spatial.transform import Rotation
 
-from quadsim.sim.error_state import OBSERVATION, Estimate, difference, inflate, innovation, retract, update
 from quadsim.sim.sensing import SensorName
 from quadsim.state import Array
 

@@ -1,46 +1,20 @@
-"""The equations of the error-state Kalman filter: an estimate, its prediction in time, and its update by a sample.
+"""The equations of `quadsim.sim.estimator` in NumPy, against which the compiled filter is tested.
 
-An estimate is a mean on the manifold of poses and rates, and the covariance of its small error e = [dp dv dtheta domega
-db], 15 numbers: position and velocity in the world frame, attitude as a rotation vector in the body frame (q_true = q *
-exp(dtheta)), body rates and gyro bias.  Solà 2017, Secs.  5.1.1 and 5.3.1; multiplicative in the sense of Markley,
-"Attitude error representations for Kalman filtering", JGCD 26 (2003).
-
-Prediction, the modelled vehicle as a rigid body driven by its rotor speeds, and the growth of the error with time:
-
-    dp/dt = v            dv/dt = R(q) [0, 0, U/m] - [0, 0, g] + w_a      dq/dt = q * [0, omega] / 2
-    domega/dt = I^-1 (tau - omega x I omega) + w_alpha                   db/dt = w_b
-
-with white w_a, w_alpha, w_b, and to first order in the error, F(t) of de/dt = F e + w (Solà 2017, Eqs. (238)-(240), the
-vehicle's model in place of an accelerometer):
-
-    dv: -R [a]x dtheta      dtheta: -[omega]x dtheta + domega      domega: I^-1 ([I omega]x - [omega]x I) domega
-
-On the ground, rotor speeds alone would let the vehicle fall.  The ground carries the rest of the weight, so nothing
-moves: p, q and the gyro's bias stay, v = 0 and omega = 0, a zero-velocity update (Groves, "Principles of GNSS,
-Inertial, and Multisensor Integrated Navigation Systems", 2nd ed.  2013, Sec.  15.3) at every step.  Legs that yield and
-slide a little keep v and omega as white noise: sigma at any instant, forgotten after tau, so that position and attitude
-walk randomly with densities sigma sqrt(tau).
-
-The update of an estimate by a sample, and the test for outliers:
-
-    r = z - h(x)    S = H P H' + R    K = P H' S^-1    e = K r    P <- P - K H P
-
-The innovation of an attitude is the rotation vector from the estimate to the sample, so it is as good upside down as
-level (Trawny and Roumeliotis, "Indirect Kalman filter for 3D attitude estimation", 2005, Sec. 3).  The normalised
-innovation squared, r' S^-1 r, is chi-square with three degrees of freedom where model and noise are as stated.
+They are written as matrices, from the equations, and are tested themselves: against MuJoCo, finite differences, Van
+Loan and Joseph's form.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Final
 
 import numpy as np
-from annotated_types import Gt, Lt, doc
 
-from quadsim.fields import NonNegative, Vector
-from quadsim.rotation import conjugate, exponential, logarithm, multiply, normalise, of_euler
+from quadsim.fields import Vector
+from quadsim.rotation import conjugate, euler_to_quaternion, exponential, logarithm, multiply, normalise
+from quadsim.sim.estimator import EstimatorSettings
 from quadsim.sim.sensing import SensorName
 from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
@@ -55,34 +29,6 @@ N_ERRORS: Final = 15
 MEAN_QUATERNION: Final = slice(6, 10)
 MEAN_RATES: Final = slice(10, 13)
 MEAN_GYRO_BIAS: Final = slice(13, 16)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EstimatorSettings:
-    """Tuning of the error-state filter.
-
-    Densities are those of white noise, equal on all three axes: integrated for a time t they give the standard
-    deviation density sqrt(t). The gate is the chi-square test of a sample's innovation.
-    """
-
-    acceleration_noise: Annotated[NonNegative, doc("[m/s^2/sqrt(Hz)] unmodelled white acceleration")] = 0.3
-    angular_acceleration_noise: Annotated[
-        NonNegative, doc("[rad/s^2/sqrt(Hz)] unmodelled white angular acceleration")
-    ] = 1.0
-    gyro_bias_walk: Annotated[NonNegative, doc("[deg/s/sqrt(s)] random walk of the gyro's bias")] = 0.002
-    initial_position: Annotated[NonNegative, doc("[m] standard deviation of the first estimate's error, per axis")] = (
-        0.05
-    )
-    initial_velocity: Annotated[NonNegative, doc("[m/s] same")] = 0.05
-    initial_attitude: Annotated[NonNegative, doc("[deg] same, about each body axis")] = 1.0
-    initial_rates: Annotated[NonNegative, doc("[deg/s] same")] = 1.0
-    initial_gyro_bias: Annotated[NonNegative, doc("[deg/s] same, for a bias initialised to zero")] = 0.5
-    gate: Annotated[float, Gt(0.0), Lt(1.0), doc("[-] probability that a valid sample passes the innovation test")] = (
-        0.9999
-    )
-    patience: Annotated[
-        NonNegative, doc("[s] time of uninterrupted rejection after which a sensor is accepted again; 0 for never")
-    ] = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,8 +231,8 @@ def innovation(name: SensorName, mean: Array, value: Array) -> Array:
     """(3,) a sample (3,) less its prediction from the mean (16,), in the sensor's unit."""
     if name is SensorName.ATTITUDE:
         w, x, y, z = mean[MEAN_QUATERNION].tolist()
-        roll, pitch, yaw = value.tolist()
-        return np.array(logarithm(multiply(conjugate((w, x, y, z)), of_euler(roll, pitch, yaw))))
+        a, b, c, d = euler_to_quaternion(value).tolist()
+        return np.array(logarithm(multiply(conjugate((w, x, y, z)), (a, b, c, d))))
     if name is SensorName.RATES:
         return value - mean[MEAN_RATES] - mean[MEAN_GYRO_BIAS]
     return value - mean[_BLOCKS[name][0]]

@@ -145,17 +145,23 @@ def test_drag_along_the_axes_alone_slows_a_fall_as_its_closed_form(torrente: Veh
             assert plant.state()[5] == pytest.approx(-terminal * math.tanh(9.81 * 1.5 / terminal), rel=1e-6)
 
 
-def test_thrust_noise_has_the_mean_and_the_deviation_that_are_stated() -> None:
-    noise, rng = ThrustNoise(loss=0.06, deviation=0.02), np.random.default_rng(1)
-    for share in (0.1, 0.5, 0.9):
-        given = noise.applied(np.full((100_000, 4), 20.0 * share), 20.0, rng) / 20.0
-        assert (share - given).mean() == pytest.approx(0.06 * share**2, abs=3e-4 * math.sqrt(share))
-        assert given.std() == pytest.approx(0.02 * math.sqrt(share), rel=0.01)
-        assert abs(np.corrcoef(given.T) - np.eye(4)).max() < 0.02
-    extremes = noise.applied(np.array([[0.0, 20.0, 1e-6, 25.0]] * 500), 20.0, rng)
-    assert (extremes >= 0.0).all()
-    assert (extremes <= 20.0).all()
-    np.testing.assert_array_equal(extremes[:, 0], 0.0)
+def test_thrust_noise_has_the_mean_and_the_deviation_that_are_stated(torrente: Vehicle) -> None:
+    """Of the collective thrust: its share has a quarter of the variance of one rotor's, as these are independent."""
+    noisy, count = Effects(thrust_noise=ThrustNoise(loss=0.06, deviation=0.02)), 20_000
+    full = 4.0 * torrente.thrust_coefficient * torrente.speed_max**2
+    with Plant(torrente, effects=noisy, timestep=1e-4, integrator="rk4") as plant:
+        for share in (0.1, 0.5, 0.9):
+            plant.reset(np.zeros(12))
+            given = plant.advance(np.full(4, torrente.speed_max * math.sqrt(share)), count)["thrust"] / full
+            assert (share - given).mean() == pytest.approx(0.06 * share**2, abs=3e-4 * math.sqrt(share))
+            assert given.std() == pytest.approx(0.5 * 0.02 * math.sqrt(share), rel=0.02)
+            assert abs(np.corrcoef(given[1:], given[:-1])[0, 1]) < 0.03
+        for speed in (0.0, 1e-3, torrente.speed_max, 1.2 * torrente.speed_max):
+            plant.reset(np.zeros(12))
+            given = plant.advance(np.full(4, speed), 500)["thrust"] / full
+            assert given.min() >= 0.0
+            assert given.max() <= 1.0
+            assert speed > 0.0 or not given.any()
 
 
 def test_thrust_noise_is_drawn_anew_in_each_step_and_again_after_a_reset(torrente: Vehicle) -> None:

@@ -1,0 +1,539 @@
+/* A vehicle over a control period, physics step by physics step. */
+#include "quadsim_plant.h"
+
+#include <setjmp.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "quadsim_rotation.h"
+
+#ifdef _MSC_VER
+#define THREAD_LOCAL __declspec(thread)
+#else
+#define THREAD_LOCAL __thread
+#endif
+
+static const double LOWEST_RATIO = 0.5; /* lowest height of a rotor, in radii, at which the ground effect grows */
+
+/* What a step's rotors give whatever the motion: drag coefficient and its moments, angular momentum, spin-up torque. */
+typedef struct {
+    double thrust[ROTORS], drag, drag_x, drag_y, drag_xy, momentum, spin_up;
+} rotor_state;
+
+static double clip(double number, double low, double high) /* what is no number stays so */
+{
+    return number < low ? low : number > high ? high : number;
+}
+
+/* ---- rotors ------------------------------------------------------------------------------------------------------ */
+
+/* A speed and its slope a time `t` after a command: a straight line, then an exponential. */
+static double respond(const quadsim_vehicle *v, double speed, double target, double t, double *slope)
+{
+    const double gap = target - speed, distance = fabs(gap), sign = gap > 0.0 ? 1.0 : gap < 0.0 ? -1.0 : 0.0;
+    const double lag = gap >= 0.0 ? v->rise : v->fall, steepest = v->acceleration;
+    const double eased = steepest > 0.0 ? fmin(distance, steepest * lag) : distance;
+    const double ramp_end = steepest > 0.0 ? (distance - eased) / steepest : 0.0;
+    if (t < ramp_end) {
+        *slope = sign * steepest;
+        return speed + sign * steepest * t;
+    }
+    if (lag <= 0.0) {
+        *slope = 0.0;
+        return target;
+    }
+    const double rate = 1.0 / lag, decay = exp(-rate * (t - ramp_end));
+    *slope = sign * eased * rate * decay;
+    return target - sign * eased * decay;
+}
+
+static void turn(quadsim_vehicle *v, double *at_start, double *midway, double *slope)
+{
+    double unused;
+    for (int i = 0; i < ROTORS; i++) {
+        if (v->at_once) {
+            at_start[i] = midway[i] = v->speeds[i] = v->target[i];
+            slope[i] = 0.0;
+            continue;
+        }
+        const double speed = v->speeds[i], target = v->target[i];
+        at_start[i] = respond(v, speed, target, 0.0, &unused);
+        midway[i] = respond(v, speed, target, 0.5 * v->timestep, &slope[i]);
+        v->speeds[i] = respond(v, speed, target, v->timestep, &unused);
+    }
+}
+
+static double open_circuit(const quadsim_vehicle *v)
+{
+    int64_t k = 1;
+    while (k < v->points - 1 && v->curve[2 * k] <= v->charge) {
+        k++;
+    }
+    const double *low = v->curve + 2 * (k - 1), *high = low + 2;
+    return v->cells * (low[1] + (v->charge - low[0]) / (high[0] - low[0]) * (high[1] - low[1]));
+}
+
+/* The share of thrust that the battery's voltage leaves; it discharges for a step. */
+static double discharge(quadsim_vehicle *v, const double *speeds, double *row)
+{
+    double demand = 0.0;
+    for (int i = 0; i < ROTORS; i++) {
+        const double ratio = speeds[i] / v->hover;
+        demand += v->efficiency[i] * ratio * (ratio * ratio);
+    }
+    const double conductance = v->hover_current * (demand / ROTORS) / (v->reference_voltage * v->reference_voltage);
+    const double rest = fmax(open_circuit(v) - v->resistance * v->idle_current, 0.0);
+    const double voltage = 2.0 * rest / (1.0 + sqrt(1.0 + 4.0 * v->resistance * conductance * rest));
+    const double current = conductance * (voltage * voltage) + v->idle_current;
+    row[0] = voltage, row[1] = v->charge;
+    v->charge = fmax(v->charge - v->timestep / (3600.0 * v->capacity) * current, 0.0);
+    return pow(voltage / v->reference_voltage, v->exponent);
+}
+
+static double noisy(const quadsim_vehicle *v, double thrust, double draw)
+{
+    const double share = thrust / v->largest;
+    const double left = share - (v->loss * (share * share) + v->deviation * sqrt(share) * draw);
+    return v->largest * clip(left, 0.0, 1.0);
+}
+
+/* Turn the rotors for a step; it writes speeds, thrust and battery. */
+static rotor_state drive_rotors(quadsim_vehicle *v, const quadsim_steps *rows, int64_t row)
+{
+    rotor_state state = {{0.0}, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+    double midway[ROTORS], slope[ROTORS], factor = 1.0, total = 0.0;
+    turn(v, rows->speeds + rows->width * row, midway, slope);
+    if (v->cells > 0.0) {
+        factor = discharge(v, midway, rows->battery + rows->width * row);
+    }
+    for (int i = 0; i < ROTORS; i++) {
+        double thrust = v->efficiency[i] * v->coefficient * (midway[i] * midway[i]) * factor;
+        if (v->largest > 0.0) {
+            thrust = noisy(v, thrust, rows->noise[ROTORS * row + i]);
+        }
+        state.thrust[i] = thrust;
+        total += thrust;
+        if (v->efficiency[i] > 0.0) { /* a lost propeller has neither drag nor momentum */
+            const double x = v->place[i][0], y = v->place[i][1], k = v->rotor_drag, inertia = v->rotor_inertia;
+            state.drag += midway[i] * k;
+            state.drag_x += midway[i] * (k * x);
+            state.drag_y += midway[i] * (k * y);
+            state.drag_xy += midway[i] * (k * (x * x + y * y));
+            state.momentum += midway[i] * (-inertia * v->spin[i]);
+            state.spin_up += slope[i] * (inertia * v->spin[i]);
+        }
+    }
+    rows->thrust[rows->width * row] = total;
+    return state;
+}
+
+/* ---- forces ------------------------------------------------------------------------------------------------------ */
+
+static double thrust_ratio(double height, double radius)
+{
+    const double image = 0.25 * radius / fmax(height, LOWEST_RATIO * radius);
+    return 1.0 / (1.0 - image * image);
+}
+
+static void add_along_axes(const quadsim_vehicle *v, double R[3][3], const double *air, double *force)
+{
+    for (int axis = 0; axis < 3; axis++) {
+        const double along = R[0][axis] * air[0] + R[1][axis] * air[1] + R[2][axis] * air[2];
+        const double pull = -(v->linear_drag[axis] + v->quadratic_drag[axis] * fabs(along)) * along;
+        for (int i = 0; i < 3; i++) {
+            force[i] += pull * R[i][axis];
+        }
+    }
+}
+
+static void add_pushes(const quadsim_vehicle *v, double R[3][3], double *wrench)
+{
+    for (int64_t k = 0; k < v->pushing; k++) {
+        const double *f = v->pushes[k].force;
+        double body[3], torque[3];
+        for (int i = 0; i < 3; i++) {
+            wrench[i] += f[i];
+            body[i] = R[0][i] * f[0] + R[1][i] * f[1] + R[2][i] * f[2];
+        }
+        cross(v->pushes[k].point, body, torque);
+        for (int i = 0; i < 3; i++) {
+            wrench[3 + i] += torque[i];
+        }
+    }
+}
+
+static void add_ground_effect(const quadsim_vehicle *v, double R[3][3], double height, const double *thrust, double *wrench)
+{
+    const double above = height - v->floor + R[2][2] * v->disc;
+    double lift = 0.0;
+    for (int i = 0; i < ROTORS; i++) {
+        const double x = v->place[i][0], y = v->place[i][1];
+        const double gain = thrust[i] * (thrust_ratio(above + R[2][0] * x + R[2][1] * y, v->radius) - 1.0);
+        lift += gain;
+        wrench[3] += y * gain;
+        wrench[4] -= x * gain;
+    }
+    for (int i = 0; i < 3; i++) {
+        wrench[i] += R[i][2] * lift;
+    }
+}
+
+/* Force, world, and torque, body, of a pose (7) and a velocity (6). */
+static void forces_at(const quadsim_vehicle *v, const double *pose, const double *velocity, const rotor_state *rotors,
+                      const double *wind, double *wrench)
+{
+    const double *rate = velocity + 3;
+    double R[3][3], air[3];
+    to_matrix(pose + 3, R);
+    for (int i = 0; i < 3; i++) {
+        air[i] = velocity[i] - wind[i];
+        wrench[i] = wrench[3 + i] = 0.0;
+    }
+    wrench[5] = rotors->spin_up;
+    if (v->rotor_drag > 0.0) {
+        const double ax = R[0][0] * air[0] + R[1][0] * air[1] + R[2][0] * air[2];
+        const double ay = R[0][1] * air[0] + R[1][1] * air[1] + R[2][1] * air[2];
+        const double bx = rotors->drag_y * rate[2] - rotors->drag * ax, by = -rotors->drag_x * rate[2] - rotors->drag * ay;
+        wrench[5] += rotors->drag_y * ax - rotors->drag_x * ay - rotors->drag_xy * rate[2];
+        for (int i = 0; i < 3; i++) {
+            wrench[i] = R[i][0] * bx + R[i][1] * by;
+        }
+    }
+    add_along_axes(v, R, air, wrench);
+    wrench[3] = -rate[1] * rotors->momentum;
+    wrench[4] = rate[0] * rotors->momentum;
+    add_pushes(v, R, wrench);
+    if (v->radius > 0.0) {
+        add_ground_effect(v, R, pose[2], rotors->thrust, wrench);
+    }
+}
+
+/* The same half a step ahead, by this step's motion and the last one's. */
+static void forces_midway(quadsim_vehicle *v, const rotor_state *rotors, const double *wind, double *wrench)
+{
+    const double half = 0.5 * v->timestep, *pose = v->motion, *q = pose + 3;
+    double velocity[6], ahead[7];
+    for (int i = 0; i < 6; i++) {
+        velocity[i] = v->velocity[i] + 0.5 * (v->velocity[i] - v->before[i]);
+        v->before[i] = v->velocity[i];
+    }
+    const double w = q[0], x = q[1], y = q[2], z = q[3], quarter = 0.5 * half;
+    const double a = velocity[3], b = velocity[4], c = velocity[5];
+    ahead[2] = pose[2] + half * velocity[2];
+    ahead[3] = w - quarter * (x * a + y * b + z * c);
+    ahead[4] = x + quarter * (w * a + y * c - z * b);
+    ahead[5] = y + quarter * (w * b + z * a - x * c);
+    ahead[6] = z + quarter * (w * c + x * b - y * a);
+    forces_at(v, ahead, velocity, rotors, wind, wrench);
+}
+
+/* ---- the step ---------------------------------------------------------------------------------------------------- */
+
+static void step_mujoco(quadsim_vehicle *v, const rotor_state *rotors, const double *wind, const double *disturbance,
+                        double *wrench)
+{
+    memcpy(v->control, rotors->thrust, sizeof rotors->thrust);
+    if (v->follows_motion) {
+        forces_midway(v, rotors, wind, wrench);
+        for (int i = 0; disturbance && i < WRENCH; i++) {
+            wrench[i] += disturbance[i];
+        }
+        memcpy(v->applied, wrench, WRENCH * sizeof *wrench);
+    }
+    v->step(v->model, v->data);
+    for (int i = 0; v->fluid && i < WRENCH; i++) {
+        wrench[i] += v->fluid[i];
+    }
+}
+
+static void derive(const quadsim_vehicle *v, const double *x, const rotor_state *rotors, const double *wind,
+                   const double *held, double *wrench, double *rate)
+{
+    const double *q = x + 3, *w = x + 10, *T = rotors->thrust, *J = v->inertia, m = v->mass;
+    double torque[3], load[WRENCH];
+    const double lift = T[0] + T[1] + T[2] + T[3];
+    forces_at(v, x, x + 7, rotors, wind, wrench);
+    for (int i = 0; i < 3; i++) {
+        const double *row = v->torque_of_thrust[i];
+        torque[i] = row[0] * T[0] + row[1] * T[1] + row[2] * T[2] + row[3] * T[3];
+        load[i] = wrench[i] + held[i];
+        load[3 + i] = wrench[3 + i] + held[3 + i];
+        rate[i] = x[7 + i];
+    }
+    rate[3] = -0.5 * (q[1] * w[0] + q[2] * w[1] + q[3] * w[2]);
+    rate[4] = 0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1]);
+    rate[5] = 0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2]);
+    rate[6] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0]);
+    rate[7] = (2.0 * (q[1] * q[3] + q[0] * q[2]) * lift + load[0]) / m;
+    rate[8] = (2.0 * (q[2] * q[3] - q[0] * q[1]) * lift + load[1]) / m;
+    rate[9] = ((1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2])) * lift + load[2]) / m - v->gravity;
+    rate[10] = (torque[0] + load[3] - (J[2] - J[1]) * w[1] * w[2]) / J[0];
+    rate[11] = (torque[1] + load[4] - (J[0] - J[2]) * w[2] * w[0]) / J[1];
+    rate[12] = (torque[2] + load[5] - (J[1] - J[0]) * w[0] * w[1]) / J[2];
+}
+
+static void step_runge_kutta(quadsim_vehicle *v, const rotor_state *rotors, const double *wind, const double *disturbance,
+                             double *wrench)
+{
+    static const double PART[4] = {0.0, 0.5, 0.5, 1.0}, ZERO[WRENCH] = {0.0};
+    const double h = v->timestep, *held = disturbance ? disturbance : ZERO;
+    double k[4][MOTION], acted[4][WRENCH], x[MOTION];
+    for (int stage = 0; stage < 4; stage++) {
+        for (int i = 0; i < MOTION; i++) {
+            x[i] = stage ? v->motion[i] + PART[stage] * h * k[stage - 1][i] : v->motion[i];
+        }
+        derive(v, x, rotors, wind, held, acted[stage], k[stage]);
+    }
+    for (int i = 0; i < MOTION; i++) {
+        v->motion[i] += h / 6.0 * (k[0][i] + 2.0 * k[1][i] + 2.0 * k[2][i] + k[3][i]);
+    }
+    const double *q = v->motion + 3, norm = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+    for (int i = 3; i < 7; i++) {
+        v->motion[i] /= norm;
+    }
+    for (int i = 0; i < WRENCH; i++) {
+        wrench[i] = held[i] + (acted[0][i] + 2.0 * acted[1][i] + 2.0 * acted[2][i] + acted[3][i]) / 6.0;
+    }
+}
+
+/* ---- sensors ----------------------------------------------------------------------------------------------------- */
+
+static const int COLUMN[SENSORS] = {0, 7, 3, 10}; /* of a sensor's quantity in the motion */
+
+static void motion_of(const quadsim_vehicle *v, double *motion)
+{
+    memcpy(motion, v->motion, 7 * sizeof *motion);
+    memcpy(motion + 7, v->velocity, 6 * sizeof *motion);
+}
+
+static void take(quadsim_sensor *s, int64_t j, const double *motion)
+{
+    double *value = s->values + 3 * (j - s->first), turned[4];
+    const double *truth = motion + COLUMN[s->kind];
+    const int fate = s->fate[j - s->first];
+    if (s->kind == ATTITUDE) {
+        exponential(value, turned);
+        multiply(truth, turned, turned);
+        to_euler(turned, value);
+    } else {
+        for (int i = 0; i < 3; i++) {
+            value[i] += truth[i];
+        }
+    }
+    if ((fate & FROZEN) && s->passed) {
+        memcpy(value, s->through, sizeof s->through);
+    } else if (!(fate & LOST)) {
+        memcpy(s->through, value, sizeof s->through);
+        s->passed = 1;
+    }
+    for (int i = 0; i < 3; i++) {
+        value[i] = fate & (NO_NUMBER << i) ? NAN : value[i];
+    }
+}
+
+void quadsim_sense(quadsim_sensing *sensed, int64_t now, const double *motion)
+{
+    for (int64_t k = 0; k < sensed->count; k++) {
+        quadsim_sensor *s = sensed->sensors + k;
+        if (now % s->stride == 0) {
+            take(s, now / s->stride, motion);
+        }
+    }
+}
+
+static int all_finite(const double *numbers, int count)
+{
+    for (int i = 0; i < count; i++) {
+        if (!isfinite(numbers[i])) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* What an inner loop measures now: the newest finite sample of each sensor, else the true value. */
+void quadsim_hear(quadsim_sensing *sensed, int64_t now, const double *motion)
+{
+    double attitude[4], rates[3];
+    memcpy(attitude, motion + 3, sizeof attitude);
+    memcpy(rates, motion + 10, sizeof rates);
+    for (int64_t k = 0; k < sensed->count; k++) {
+        quadsim_sensor *s = sensed->sensors + k;
+        for (; s->heard * s->stride + s->latency <= now; s->heard++) {
+            if (!(s->fate[s->heard - s->first] & LOST)) {
+                memcpy(s->held, s->values + 3 * (s->heard - s->first), sizeof s->held);
+            }
+        }
+        if (s->kind == ATTITUDE) {
+            of_euler(s->held, attitude);
+        }
+        for (int i = 0; s->kind == RATES && i < 3; i++) {
+            rates[i] = s->held[i] - sensed->bias[i];
+        }
+    }
+    if (all_finite(attitude, 4)) {
+        memcpy(sensed->attitude, attitude, sizeof attitude);
+    }
+    if (all_finite(rates, 3)) {
+        memcpy(sensed->rates, rates, sizeof rates);
+    }
+}
+
+/* Let the inner loop answer if it is due. */
+static int64_t answer(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *sensed)
+{
+    if (loop->until == 0) {
+        const double *attitude = v->motion + 3, *rates = v->velocity + 3;
+        if (loop->kind == OUTSIDE) {
+            return QUADSIM_DUE;
+        }
+        if (loop->measures && sensed) {
+            double motion[MOTION];
+            motion_of(v, motion);
+            quadsim_hear(sensed, v->now, motion);
+            attitude = sensed->attitude, rates = sensed->rates;
+        }
+        quadsim_answer(loop, v->time, rates, v->speeds, attitude);
+        loop->until = loop->stride;
+    }
+    for (int i = 0; i < ROTORS; i++) {
+        if (!(fabs(loop->answer[i]) <= v->fastest_valid)) { /* also not a number */
+            return QUADSIM_INVALID;
+        }
+    }
+    loop->until--;
+    return QUADSIM_DONE;
+}
+
+/* ---- a part of a control period ---------------------------------------------------------------------------------- */
+
+static int plausible(const quadsim_vehicle *v, const double *row)
+{
+    for (int i = 0; i < PHYSICS; i++) {
+        if (!(fabs(row[i]) < v->plausible)) { /* also not a number */
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* Take a step with the target speeds; the rows are written from its row on. */
+static void advance(quadsim_vehicle *v, const quadsim_steps *rows, int64_t row)
+{
+    static const double STILL[3] = {0.0};
+    const int64_t at = rows->width * row;
+    const double *wind = rows->wind ? rows->wind + at : STILL;
+    const double *disturbance = rows->disturbance ? rows->disturbance + WRENCH * row : NULL;
+    const rotor_state rotors = drive_rotors(v, rows, row);
+    double wrench[WRENCH] = {0.0};
+    memcpy(rows->commands + at, v->target, sizeof v->target);
+    if (v->wind) {
+        memcpy(v->wind, wind, 3 * sizeof *wind);
+    }
+    if (v->obstacles) {
+        memcpy(v->obstacles, rows->obstacles + 3 * v->mocaps * row, 3 * (size_t)v->mocaps * sizeof *v->obstacles);
+    }
+    (v->step ? step_mujoco : step_runge_kutta)(v, &rotors, wind, disturbance, wrench);
+    v->time += v->timestep;
+    v->now++;
+    rows->physics[at] = v->time;
+    motion_of(v, rows->physics + at + 1);
+    if (rows->wrench) {
+        memcpy(rows->wrench + at, wrench, sizeof wrench);
+    }
+}
+
+static int64_t fly(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *sensed, quadsim_steps *rows,
+                   const double *command, int64_t end)
+{
+    while (v->now < end) {
+        const int64_t row = rows->row, why = loop ? answer(v, loop, sensed) : QUADSIM_DONE;
+        const double *physics = rows->physics + rows->width * row;
+        if (why != QUADSIM_DONE) {
+            return why;
+        }
+        for (int i = 0; i < ROTORS; i++) {
+            v->target[i] = clip(loop ? loop->answer[i] : command[i], v->slowest, v->fastest);
+        }
+        advance(v, rows, row);
+        rows->row++;
+        if (!plausible(v, physics)) {
+            return QUADSIM_DIVERGED;
+        }
+        if (sensed) {
+            quadsim_sense(sensed, v->now, physics + 1);
+        }
+    }
+    return QUADSIM_DONE;
+}
+
+/* ---- the paper's state ------------------------------------------------------------------------------------------- */
+
+static double nearest_turn(double angle, double to)
+{
+    static const double TURN = 6.283185307179586, TIE = 1e-6; /* as `quadsim.state.whole_turns` */
+    return angle + TURN * floor(0.5 + TIE - (angle - to) / TURN);
+}
+
+void quadsim_states(const double *physics, int64_t count, int64_t width, double yaw, double *states)
+{
+    double last = yaw, upright = yaw;
+    for (int64_t k = 0; k < count; k++) {
+        const double *row = physics + width * k, *rate = row + 11;
+        double *x = states + 12 * k, euler[3];
+        to_euler(row + 4, euler);
+        const double sin_roll = sin(euler[0]), cos_roll = cos(euler[0]), cos_pitch = cos(euler[1]);
+        const double lateral = rate[1] * sin_roll + rate[2] * cos_roll;
+        for (int i = 0; i < 3; i++) {
+            x[2 * i] = row[1 + i];
+            x[2 * i + 1] = row[8 + i];
+        }
+        if (isfinite(euler[0] + euler[1] + euler[2])) {
+            const int up = cos_roll * cos_pitch >= 0.0;
+            euler[2] = last = nearest_turn(euler[2], up ? upright : last);
+            upright = up ? last : upright;
+        }
+        x[6] = euler[0];
+        x[7] = rate[0] + lateral * tan(euler[1]);
+        x[8] = euler[1];
+        x[9] = rate[1] * cos_roll - rate[2] * sin_roll;
+        x[10] = euler[2];
+        x[11] = lateral / cos_pitch;
+    }
+}
+
+/* ---- MuJoCo's fatal errors --------------------------------------------------------------------------------------- */
+
+static THREAD_LOCAL jmp_buf *landing; /* where a fatal error lands; NULL outside quadsim_fly */
+static THREAD_LOCAL char complaint[256];
+
+void quadsim_trap(const char *message)
+{
+    if (!landing) {
+        fprintf(stderr, "ERROR: %s\n", message);
+        exit(EXIT_FAILURE);
+    }
+    snprintf(complaint, sizeof complaint, "%s", message);
+    longjmp(*landing, 1);
+}
+
+const char *quadsim_complaint(void)
+{
+    return complaint;
+}
+
+int64_t quadsim_fly(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *sensed, quadsim_steps *rows,
+                    const double *command, int64_t end)
+{
+    jmp_buf here;
+    int64_t why;
+    if (setjmp(here)) {
+        landing = NULL;
+        return QUADSIM_FAILED;
+    }
+    landing = &here;
+    why = fly(v, loop, sensed, rows, command, end);
+    landing = NULL;
+    return why;
+}
