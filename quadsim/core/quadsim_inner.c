@@ -161,7 +161,8 @@ static void fit(double A[ROTORS][4], const int *free, double *rest, double *x)
 }
 
 /* Weighted least squares within the bounds: the best of all choices of rotors at their lower or upper bound. */
-static void nearest(const quadsim_inner *a, const double *demanded, const double *low, const double *high, double *squares)
+static void nearest(const quadsim_inner *a, const double *demanded, const double *low, const double *high,
+                    double *squares)
 {
     double unit = 1.0, A[ROTORS][4], b[4], least = INFINITY, thrust[2] = {0.0, 0.0};
     for (int j = 0; j < ROTORS; j++) {
@@ -218,7 +219,7 @@ void quadsim_allocate(const quadsim_inner *a, const double *wrench, double *spee
         nearest(a, wrench, low, high, squares);
     }
     for (int i = 0; i < ROTORS; i++) {
-        speeds[i] = clip(sqrt(fmax(squares[i], 0.0)), a->least[i], a->most[i]);
+        speeds[i] = clip(sqrt(squares[i] < 0.0 ? 0.0 : squares[i]), a->least[i], a->most[i]); /* NaN stays so */
     }
 }
 

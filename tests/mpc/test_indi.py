@@ -12,6 +12,7 @@ from mpc.baselines.geometric import Geometric, GeometricController
 from mpc.indi import INDISettings, TorqueIncrement
 from mpc.pilot import Pilot
 from quadsim.controller import Phase, StepInputs
+from quadsim.errors import CommandError
 from quadsim.flight.log import FlightLog
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics
@@ -112,3 +113,15 @@ def test_a_rate_that_is_no_whole_number_of_steps_ends_the_flight(vehicle: Vehicl
     log = flown(vehicle, Effects(), INDISettings(rate=300.0), periods=1)
     assert log.aborted
     assert "controller.inner.rate must be such that 1 / rate is a whole multiple" in str(log.reason)
+
+
+def test_a_command_that_is_no_number_is_refused(vehicle: Vehicle) -> None:
+    """The allocation makes no numbers of it."""
+    inner = TorqueIncrement(vehicle, INDISettings(rate=1000.0), ActuatorBounds.of_vehicle(vehicle))
+    with Plant(vehicle) as plant:
+        struct = inner.engage(np.array([math.nan, 200.0, 200.0, 200.0]), plant.speeds)
+        assert struct is not None
+        struct.stride = 1
+        plant.begin(1)
+        with pytest.raises(CommandError, match="the command is not finite"):
+            plant.hold(np.zeros(4), 1, loop=struct)
