@@ -332,28 +332,6 @@ def solvers(data: Any) -> str:
     return markdown(("scenario", "solver", "p50 [ms]", "p99 [ms]", "p50, ratio", "p99, ratio"), rows)
 
 
-def interfaces(data: Any) -> str:
-    """How each law does through each interface."""
-    rows = []
-    for row in _records(data):
-        errors = (_with_half(row[course], row[f"{course}_half"]) for course in ("circle", "steps"))
-        lost = f"{row['lost']} of {row['flights']}, {interval(row['lost_from'], row['lost_to'])}"
-        held = f"{100.0 * row['violated']:.0f} %", f"{row['worst_margin']:+.1f}"
-        rows.append(
-            (row["vehicle"], row["controller"], *errors, lost, *held, *(f"{row[k]:.1f}" for k in ("p50_ms", "p99_ms")))
-        )
-    head = (
-        "vehicle",
-        "controller",
-        "circle [cm]",
-        "steps [cm]",
-        "lost, 95 % interval",
-        "tilt violated",
-        "worst margin [deg]",
-    )
-    return markdown((*head, "step: median [ms]", "p99 [ms]"), rows)
-
-
 def identification(data: Any) -> str:
     """How the same vehicles fly by controllers that are made from each file."""
     rows = []
@@ -440,7 +418,6 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "campaigns": campaigns,
     "battery": batteries,
     "solvers": solvers,
-    "interfaces": interfaces,
     "identification": identification,
     "intervals": intervals,
     **dict.fromkeys(("flight", "film", "campaign", "autopilots"), records),
