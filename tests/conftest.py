@@ -33,8 +33,9 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 # Examples are not timed: a busy machine is no failure.  On CI they are the same ones each time.
-settings.register_profile("quadsim", deadline=None, derandomize="CI" in os.environ)
-settings.load_profile("quadsim")
+settings.register_profile("thorough", deadline=None, derandomize="CI" in os.environ)
+settings.register_profile("quick", settings.get_profile("thorough"), max_examples=25)  # of `make test`
+settings.load_profile("thorough")
 
 LONG = (
     *("test_benchmarks.py", "test_commands.py", "quadsim/report/test_comparison_page.py"),
@@ -110,10 +111,10 @@ def vehicle() -> Vehicle:
 
 
 @pytest.fixture(scope="session")
-def short_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def short_run(fly_once: Fly, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Six seconds of the constrained flight in a run directory with its summary, scenario and Parquet files."""
     directory = tmp_path_factory.mktemp("short") / "paper-constrained"
-    Rollout(load_scenario("paper-constrained", ["duration=6.0"])).fly().save(directory, **NO_PRODUCTS)
+    fly_once("paper-constrained", "duration=6.0").save(directory, **NO_PRODUCTS)
     return rundir.load_run(directory)
 
 

@@ -182,7 +182,7 @@ def test_an_event_that_depends_on_a_number_is_found_and_a_rare_one_by_chance_is_
 def test_the_p_value_of_xi_has_its_nominal_level() -> None:
     """Of few and many pairs, of numbers, of rare events, and of a varied parameter with few values."""
     rng = np.random.default_rng(3)
-    for n, runs in ((15, 30), (60, 100), (300, 60)):
+    for n, runs in ((15, 30), (60, 50), (300, 20)):
         for y_of in (lambda size: rng.normal(size=size), lambda size: (rng.random(size) < 0.1) * 1.0):
             for x_of in (lambda size: rng.uniform(size=size), lambda size: rng.integers(0, 4, size) * 1.0):
                 result = [dependence(x_of(n), y_of(n), rng) for _ in range(runs)]
