@@ -11,7 +11,7 @@ PY := $(VENV)/bin/python
 QUADSIM := $(VENV)/bin/quadsim
 RUNS := runs
 OPTIONS ?=
-WORKERS ?= $(shell cores=$$(nproc); echo $$((cores < 8 ? cores + 1 : 8)))
+WORKERS ?= $(shell cores=$$(nproc); echo $$((cores < 8 ? cores : 8)))
 
 SUPPORTED := import sys; sys.exit(sys.version_info < (3, 11))
 CANDIDATES := python3.13 python3.12 python3.11 python3

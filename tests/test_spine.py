@@ -22,6 +22,8 @@ from test_architecture import imports_of, modules
 ROOT = Path(__file__).resolve().parent.parent
 MOST_ENTERED, MOST_LOADED, MOST_FRAMES, LONGEST_CHAIN, SPINE_LINES = 85, 146, 8, 20, 2450
 MOST_DATA_TYPES, MOST_CLASSES = 16, 74  # may only fall
+pytestmark = pytest.mark.slow("spine")
+
 COUNTED = "import runpy; runpy.run_path('tests/count_types.py', run_name='__main__')"
 HELP = "import scenarios.commands.cli; scenarios.commands.cli.main(['--help'])"
 WATCHED = """
@@ -133,6 +135,7 @@ def _lines_of_tokens(text: str) -> Iterator[int]:
             yield from range(token.start[0], token.end[0] + 1)
 
 
+@pytest.mark.witness("spine")
 def test_the_spine_is_short() -> None:
     """Lines of code; of `app.py`, the last, what takes part in `quadsim run`."""
     files = spine()
@@ -145,6 +148,7 @@ def test_the_spine_is_short() -> None:
     assert sum(lengths.values()) <= SPINE_LINES, lengths
 
 
+@pytest.mark.witness("spine")
 def test_the_longest_chain_of_imports_is_short() -> None:
     ours = modules()
     graph = {
@@ -160,6 +164,7 @@ def test_the_longest_chain_of_imports_is_short() -> None:
     assert len(longest) <= LONGEST_CHAIN, longest
 
 
+@pytest.mark.witness("spine")
 @pytest.mark.parametrize(
     ("code", "most"), [("import quadsim", 0.1), ("import scenarios.commands.cli as c; c.main(['-h'])", 0.3)]
 )

@@ -125,3 +125,14 @@ def test_margins_tighten_both_bounds_of_each_step() -> None:
     unbounded = Constraint(name="above", lower=np.full(1, -np.inf), upper=np.ones(1), C=np.ones((1, 3)))
     np.testing.assert_array_equal(tightened(unbounded, np.full((3, 1), 0.5)).upper, np.full((3, 1), 0.5))
     assert np.isneginf(tightened(unbounded, np.full((3, 1), 0.5)).lower).all()
+
+
+def test_a_row_of_outputs_has_the_name_of_a_state_where_it_is_one() -> None:
+    bounds = paper_problem().bounds
+    assert bounds is not None
+    C_c = np.zeros((4, 12))
+    C_c[0, 6], C_c[1, 6], C_c[2, [6, 8]], C_c[3, 5] = 1.0, 2.0, 1.0, 1.0
+    rows = [replace(bounds, C_c=C_c, y_min=np.full(4, -1.0), y_max=np.ones(4)).output(i) for i in range(4)]
+    assert [row.name for row in rows] == ["roll", "row 1 of C_c", "row 2 of C_c", "vz"]
+    assert [row.field for row in rows] == ["controller.output_bounds.roll", "", "", "controller.output_bounds.vz"]
+    assert rows[0].factor == pytest.approx(180.0 / np.pi)

@@ -30,7 +30,7 @@ def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: s
     formulation, backend = SOLVERS[name].formulate(problem), make_backend(name)
     backend.setup(formulation.qp)
     active = 0
-    for query in flight_queries(constrained_flight, problem, stride=20):
+    for query in flight_queries(constrained_flight, problem, stride=40):
         qp = formulation.assemble(Query(*query)).qp
         solution = backend.solve(qp)
         assert solution.status == SOLVED
@@ -40,7 +40,7 @@ def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: s
         assert residuals.complementarity < 1e-4  # multipliers reach 1e3
         assert residuals.dual == 0.0
         active += solution.stats.active
-    assert active > 100  # the flight does press against its bounds
+    assert active > 50  # the flight does press against its bounds
 
 
 def solved(formulation: Formulation, backend: Backend, query: Query) -> tuple[QP, Solution]:

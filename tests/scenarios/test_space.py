@@ -220,6 +220,7 @@ def test_who_does_not_avoid_touches_and_who_does_keeps_clear() -> None:
     assert cleared(flight)[0].worst_margin > 0.04  # of a margin of 0.05, between the samples
 
 
+@pytest.mark.slow("obstacles")
 def test_no_answer_among_obstacles_is_explained_by_their_names() -> None:
     thrown = {
         **BALL,

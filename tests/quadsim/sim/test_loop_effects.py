@@ -377,3 +377,9 @@ def test_a_stall_holds_back_what_it_meets(time: float, expected: float) -> None:
 def test_stalls_follow_one_another_whatever_their_order() -> None:
     stalls = (Stall(at=0.02, duration=0.03), Stall(at=0.0, duration=0.02))
     assert delay(Computation(stalls=stalls)) == delay(Computation(stalls=stalls[::-1])) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(("delay", "periods"), [(0.0, 0), (0.02, 0), (0.05, 0), (0.051, 1), (0.1, 1), (0.101, 2)])
+def test_a_command_spends_the_periods_before_its_own_under_way(delay: float, periods: int) -> None:
+    """One that takes a whole period arrives at its end: none before that."""
+    assert Computation(delay=delay).whole_periods(50, 1e-3) == periods

@@ -138,7 +138,6 @@ def test_a_polynomial_of_reflection_coefficients_is_stable_and_complete() -> Non
         assert np.abs(np.roots(_polynomial(reflections))).max() < 1.0
 
 
-@pytest.mark.witness("identification")
 def test_an_eight_with_yaw_steps_gives_all_but_the_body_s_drag() -> None:
     found = of_the_eight()
     assert not wrong(found)
@@ -159,6 +158,7 @@ def test_a_torque_that_the_loop_answers_biases_output_error_and_not_the_estimate
     assert found.cross_check["inertia_x"] > 1.08
 
 
+@pytest.mark.witness("identification")
 def test_hover_refuses_yaw_and_drag_and_says_what_to_fly() -> None:
     found = identify(record_of(flown(course="hover")))
     assert not wrong(found)
