@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scripted_controller import PERIOD, advance, level, model, random_state
 
-from mpc.fallback.completion import PLAUSIBLE, StateCompletion
+from mpc.fallback.completion import ACCELERATION, PLAUSIBLE, StateCompletion
 from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array
 
 
@@ -109,3 +110,10 @@ def test_nothing_measured_ever_stays_finite() -> None:
         seen = rng.normal(size=12) if k % 250 == 0 else np.zeros(3)
         known = completion.complete(seen, rng.uniform(-1e5, 1e5, 4), level())
         assert (np.abs(known) <= PLAUSIBLE).all()
+
+
+def test_the_process_noise_is_an_acceleration_constant_over_a_period() -> None:
+    """White from one period to the next, along each coordinate and about each angle."""
+    gain = np.array([[0.5 * PERIOD**2], [PERIOD]])
+    pairs = [sigma**2 * gain @ gain.T for sigma in ACCELERATION]
+    np.testing.assert_allclose(StateCompletion(model())._process, block_diag(*3 * pairs[:1], *3 * pairs[1:]))
