@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support import paper_problem, random_problem
 
-from mpc.constraints import Constraint, Penalty, tightened
+from mpc.constraints import Constraint, Origin, Penalty, tightened
 from mpc.ocp import Objective, Problem
 from quadsim.errors import ParameterError
 from quadsim.state import Array
@@ -136,3 +136,13 @@ def test_a_row_of_outputs_has_the_name_of_a_state_where_it_is_one() -> None:
     assert [row.name for row in rows] == ["roll", "row 1 of C_c", "row 2 of C_c", "vz"]
     assert [row.field for row in rows] == ["controller.output_bounds.roll", "", "", "controller.output_bounds.vz"]
     assert rows[0].factor == pytest.approx(180.0 / np.pi)
+
+
+def test_a_side_of_a_bound_is_an_entry_of_the_file() -> None:
+    pair, listed = Origin("roll", field="controller.output_bounds.roll"), Origin("p", field="controller.p", row=2)
+    assert [pair.place(upper=upper)[1] for upper in (False, True)] == [0, 1]
+    assert [listed.place(upper=upper) for upper in (False, True)] == [
+        ("controller.p.lower", 2),
+        ("controller.p.upper", 2),
+    ]
+    assert Origin("row").place(upper=True)[0] == ""

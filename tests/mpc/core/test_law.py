@@ -166,6 +166,19 @@ def test_a_disturbance_is_learned_in_flight_alone() -> None:
         assert (mpc.trim.speeds.mean() > mpc.problem.model.u_bar.mean() + 1.0) == learned
 
 
+def test_the_largest_violation_of_a_soft_bound_is_reported_on_either_side() -> None:
+    """Tilted by 0.2 rad where 0.087 are allowed, it takes more than a period to come back."""
+    mpc, slacks = CompiledMPC(exported_law(quadsim.load("robust"))), []
+    for side in (-1.0, 1.0):
+        mpc.reset(mpc.problem.model.u_bar)
+        tilted = np.zeros(N_STATES)
+        tilted[INDEX["roll"]] = 0.2 * side
+        command = mpc.step(StepInputs(time=0.0, phase=Phase.FLYING), tilted, np.zeros((mpc.horizon, 4)))
+        slacks.append(command.stats.slack)
+    assert slacks[0] == pytest.approx(slacks[1], rel=1e-6)
+    assert 0.08 < slacks[0] < 0.2 - np.radians(5.0) + 0.01
+
+
 def test_equal_laws_share_their_numbers() -> None:
     law = exported_law(quadsim.load("robust"))
     first, again = CompiledMPC(law), CompiledMPC(exported_law(quadsim.load("robust")))
