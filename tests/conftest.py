@@ -47,7 +47,15 @@ LONG = (
     *("scenarios/test_nothing_lost.py", "mpc/robust/test_robust.py", "scenarios/papers/test_reproduction.py"),
     *("scenarios/test_any_scenario.py", "mpc/test_partial_condensing.py"),
     *("scenarios/test_run.py", "scenarios/test_cli.py", "scenarios/test_reaudit.py", "test_packaging.py"),
-    *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/core/test_core.py"),
+    *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/core/test_core.py", "mpc/nonlinear/test_rates.py"),
+    *("test_spine.py", "test_rooms.py", "quadsim/sim/test_autopilot.py", "quadsim/sim/estimation/test_estimator.py"),
+    *(
+        "scenarios/test_piloted.py",
+        "scenarios/test_take_off.py",
+        "scenarios/test_space.py",
+        "scenarios/test_verdicts.py",
+    ),
+    *("scenarios/identify/test_identify_fit.py", "scenarios/papers/test_beyond.py"),
 )
 """Modules that take longest."""
 collect_ignore = [module for module, used in USING.items() if not {*used} <= {*ROOMS}]
