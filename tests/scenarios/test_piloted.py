@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -199,6 +199,19 @@ def test_a_late_target_leaves_the_one_in_force_to_the_autopilot(scenario: quadsi
     held = later.plant.t < 0.03  # hover's rotor speeds stay in force until the first arrives
     np.testing.assert_allclose(later.plant.speeds[held], later.plant.speeds[0, 0], rtol=1e-12)
     assert (np.ptp(later.plant.speeds[~held], axis=1) > 0.0).any()
+
+
+def test_a_law_is_told_the_target_in_force_which_is_hover_at_first(scenario: quadsim.Scenario) -> None:
+    class Noting(Rates):
+        told: ClassVar[list[Array]] = []
+
+        def step(self, now: StepInputs, state: State, reference: Array) -> Any:
+            assert now.acting is not None
+            self.told.append(np.array(now.acting))
+            return [7.0, 0.0, 0.1, 0.2]
+
+    quadsim.fly(scenario.replace({"duration": 0.06}), controller=Noting, progress=False)
+    np.testing.assert_allclose(Noting.told, [[0.716 * 9.81, 0.0, 0.0, 0.0], *2 * [[7.0, 0.0, 0.1, 0.2]]], rtol=1e-3)
 
 
 def test_what_the_gyro_measures_reaches_the_autopilot(scenario: quadsim.Scenario) -> None:
