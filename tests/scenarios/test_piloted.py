@@ -335,6 +335,17 @@ def test_a_controller_that_takes_over_leaves_the_autopilot_flying(scenario: quad
     assert autopilot.resets == 1 + 4 + 1  # built, identified, flown
 
 
+def test_an_autopilot_starts_anew_when_it_takes_off() -> None:
+    law = {"type": "geometric", "commands": "rates", "inner_lag": OF_TARGETS["inner_lag"]}
+    take_off = quadsim.load("take-off-and-landing").replace({"controller": law, "autopilot": {}, "duration": 2.0})
+    autopilot = Counting(Assembly(take_off).vehicle)
+    before = autopilot.resets
+    flight = quadsim.fly(take_off, autopilot=autopilot, progress=False)
+    assert flight.log.control.phase[0] == "landed"
+    assert autopilot.calls > 0
+    assert autopilot.resets == before + 1
+
+
 def test_a_law_of_targets_takes_over_from_the_law_and_not_from_its_autopilot(scenario: quadsim.Scenario) -> None:
     class Heir(Rates):
         seen: object = None
