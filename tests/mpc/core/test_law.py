@@ -155,14 +155,20 @@ def test_numbers_out_of_hand_are_answered_with_the_command_in_force(mpc: Compile
     assert ask(mpc, 1, state, hover).fallback == 0
 
 
-def test_a_disturbance_is_learned_in_flight_alone() -> None:
-    law = exported_law(quadsim.load("robust"))
-    for phase, learned in ((Phase.FLYING, True), (Phase.ARMED, False)):
+def test_a_disturbance_is_learned_in_flight_alone_and_from_what_is_measured() -> None:
+    law, predicted = exported_law(quadsim.load("robust")), np.zeros(N_STATES)
+    predicted[INDEX["vz"]] = 1.0
+    for phase, unseen, learned in (
+        (Phase.FLYING, np.zeros(N_STATES), True),
+        (Phase.ARMED, None, False),
+        (Phase.FLYING, predicted, False),
+    ):
         mpc = CompiledMPC(law)
         for k in range(3):
             falling = np.zeros(N_STATES)
             falling[INDEX["vz"]] = -0.1 * k
-            mpc.step(StepInputs(time=k * law.problem.model.period, phase=phase), falling, np.zeros((mpc.horizon, 4)))
+            now = StepInputs(time=k * law.problem.model.period, phase=phase, unseen=unseen)
+            mpc.step(now, falling, np.zeros((mpc.horizon, 4)))
         assert (mpc.trim.speeds.mean() > mpc.problem.model.u_bar.mean() + 1.0) == learned
 
 
