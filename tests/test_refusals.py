@@ -257,7 +257,7 @@ def test_a_number_of_a_vehicle_is_accepted_as_declared_or_named_with_what_was_gi
     path = tmp_path / FILE
     text = vehicle_path("lopes2011").read_text(encoding="utf-8")
     allowed = [0] if name == "speed_min" else []
-    for junk in JUNK:
+    for junk in JUNK[::2]:
         table = tomllib.loads(text)
         table[name] = {"unit": VEHICLE_UNITS[name], "source": "a guess", "value": junk}
         path.write_text(tomlkit.dumps(table), encoding="utf-8")

@@ -106,7 +106,6 @@ def test_capacity_is_as_requested_and_its_reach_is_stated(tmp_path: Path) -> Non
         assert 200 <= reach["feasible"] <= reach["drawn"]
 
 
-@pytest.mark.witness("export")
 def test_an_export_is_complete_and_replaces_an_earlier_one_on_request(tmp_path: Path) -> None:
     scenario = quadsim.load("hover", SHORT)
     directory = quadsim.export(scenario, tmp_path / "c")

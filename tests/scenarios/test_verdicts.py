@@ -257,6 +257,7 @@ def test_flights_that_are_audited_differently_are_compared_by_margins_until_audi
         quadsim.compare(a, b, constraints="elsewhere")
 
 
+@pytest.mark.slow("campaigns")
 def test_campaigns_that_are_audited_differently_get_no_test_of_violations(tmp_path: Path) -> None:
     mass = {"name": "m", "fields": ["actual.mass"], "distribution": "uniform", "low": 3.9, "high": 4.1}
 

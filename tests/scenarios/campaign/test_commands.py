@@ -92,6 +92,7 @@ def test_a_replay_gives_the_same_numbers(
     assert {"index.html", "campaign.png"} <= {path.name for path in (flown / "first").iterdir()}
 
 
+@pytest.mark.slow("campaigns")
 def test_a_replay_by_other_code_starts_with_a_notice(
     flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

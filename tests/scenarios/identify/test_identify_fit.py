@@ -120,6 +120,7 @@ def test_rotors_lag_as_the_plant_s_do() -> None:
     assert rotors.square[100:] == pytest.approx(np.square(middles).mean(axis=1)[100:-1], rel=3e-3)
 
 
+@pytest.mark.witness("identification")
 @pytest.mark.parametrize("delay", [0.004, 0.01, 0.013, -0.01])
 def test_a_delay_shifts_what_rotors_do(delay: float) -> None:
     commands = 450.0 + 50.0 * np.random.default_rng(0).standard_normal((60, 4))
@@ -158,7 +159,6 @@ def test_a_torque_that_the_loop_answers_biases_output_error_and_not_the_estimate
     assert found.cross_check["inertia_x"] > 1.08
 
 
-@pytest.mark.witness("identification")
 def test_hover_refuses_yaw_and_drag_and_says_what_to_fly() -> None:
     found = identify(record_of(flown(course="hover")))
     assert not wrong(found)
