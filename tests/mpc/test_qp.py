@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from polish import polish
-from support import flight_queries, paper_problem, paper_reference
+from support import flight_queries, paper_problem, paper_reference, random_problem
 
 from mpc.condensing import Condensed
-from mpc.constraints import Constraint
+from mpc.constraints import Constraint, Penalty
 from mpc.ocp import Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Backend, Solution, kkt_residuals
@@ -113,3 +113,15 @@ def test_multipliers_of_rows_are_those_of_the_qp_and_back() -> None:
     back = form.solution(form.inputs(optimum.x), form.slacks(optimum.x), rows)
     np.testing.assert_array_equal(back.z, optimum.z)
     np.testing.assert_array_equal(back.z_box, optimum.z_box)
+
+
+def test_a_slack_has_the_multiplier_that_makes_its_gradient_zero() -> None:
+    """l1 + 2 l2 e - |z| of each, none where that vanishes: at an optimum, wherever a bound is violated."""
+    problem = random_problem(np.random.default_rng(0), horizon=4)
+    assert problem.bounds is not None
+    penalty = Penalty(l1=np.array([3.0]), l2=np.array([2.0]))
+    form = Condensed(replace(problem, bounds=replace(problem.bounds, penalty=penalty)))
+    multipliers, slacks = np.zeros((4, len(problem.rows.D))), np.array([[0.0], [1.0], [1.0], [1.0]])
+    multipliers[:, 0] = [-2.0, 0.0, 5.0, 7.0]
+    z_slacks = form.solution(np.zeros((4, 2)), slacks, multipliers).z_box[8:]
+    np.testing.assert_allclose(z_slacks, [-1.0, -7.0, -2.0, 0.0])
