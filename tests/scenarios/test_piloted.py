@@ -149,7 +149,15 @@ def test_a_saved_flight_keeps_its_targets(flight: quadsim.Flight, tmp_path: Path
     assert reaudit(tmp_path / "run").satisfied == flight.satisfied
 
 
-@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.slow("autopilot")
+@pytest.mark.parametrize(
+    "table",
+    [
+        pytest.param("geometric of attitudes", marks=pytest.mark.witness("autopilot")),
+        "geometric of rates",
+        "nonlinear of rates",
+    ],
+)
 def test_what_it_asks_for_on_the_ground_reaches_nobody_and_is_not_bounded(table: str) -> None:
     take_off = quadsim.load("take-off-and-landing").replace({"controller": TABLES[table], "duration": 2.0})
     log = (flight := quadsim.fly(take_off, progress=False)).log
