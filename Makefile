@@ -11,7 +11,7 @@ PY := $(VENV)/bin/python
 QUADSIM := $(VENV)/bin/quadsim
 RUNS := runs
 OPTIONS ?=
-WORKERS ?= $(shell cores=$$(nproc); echo $$((cores < 8 ? cores + 1 : 8)))
+WORKERS ?= $(shell cores=$$(nproc); echo $$((cores < 8 ? cores : 8)))
 
 SUPPORTED := import sys; sys.exit(sys.version_info < (3, 11))
 CANDIDATES := python3.13 python3.12 python3.11 python3
@@ -51,7 +51,7 @@ test test-all rooms peers firmware betaflight numbers reproduce: export OMP_NUM_
 test test-all rooms peers firmware betaflight numbers reproduce: export OPENBLAS_NUM_THREADS := 1
 test test-all rooms peers firmware betaflight numbers reproduce: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## all tests but the slow groups, of which it runs a witness each (OPTIONS="-k audit" for some)
-	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope -m "not slow or witness" $(OPTIONS)
+	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope -m "not slow or witness" --hypothesis-profile=quick $(OPTIONS)
 
 test-all: setup $(VENV)/.browser  ## run every test that needs no peer
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)

@@ -33,8 +33,9 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 # Examples are not timed: a busy machine is no failure.  On CI they are the same ones each time.
-settings.register_profile("quadsim", deadline=None, derandomize="CI" in os.environ)
-settings.load_profile("quadsim")
+settings.register_profile("thorough", deadline=None, derandomize="CI" in os.environ)
+settings.register_profile("quick", settings.get_profile("thorough"), max_examples=25)  # of `make test`
+settings.load_profile("thorough")
 
 LONG = (
     *("test_benchmarks.py", "test_commands.py", "quadsim/report/test_comparison_page.py"),
@@ -46,7 +47,15 @@ LONG = (
     *("scenarios/test_nothing_lost.py", "mpc/robust/test_robust.py", "scenarios/papers/test_reproduction.py"),
     *("scenarios/test_any_scenario.py", "mpc/test_partial_condensing.py"),
     *("scenarios/test_run.py", "scenarios/test_cli.py", "scenarios/test_reaudit.py", "test_packaging.py"),
-    *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/core/test_core.py"),
+    *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/core/test_core.py", "mpc/nonlinear/test_rates.py"),
+    *("test_spine.py", "test_rooms.py", "quadsim/sim/test_autopilot.py", "quadsim/sim/estimation/test_estimator.py"),
+    *(
+        "scenarios/test_piloted.py",
+        "scenarios/test_take_off.py",
+        "scenarios/test_space.py",
+        "scenarios/test_verdicts.py",
+    ),
+    *("scenarios/identify/test_identify_fit.py", "scenarios/papers/test_beyond.py"),
 )
 """Modules that take longest."""
 collect_ignore = [module for module, used in USING.items() if not {*used} <= {*ROOMS}]
@@ -110,10 +119,10 @@ def vehicle() -> Vehicle:
 
 
 @pytest.fixture(scope="session")
-def short_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def short_run(fly_once: Fly, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Six seconds of the constrained flight in a run directory with its summary, scenario and Parquet files."""
     directory = tmp_path_factory.mktemp("short") / "paper-constrained"
-    Rollout(load_scenario("paper-constrained", ["duration=6.0"])).fly().save(directory, **NO_PRODUCTS)
+    fly_once("paper-constrained", "duration=6.0").save(directory, **NO_PRODUCTS)
     return rundir.load_run(directory)
 
 

@@ -43,17 +43,17 @@ def method_of(frame: FrameType) -> tuple[type, str] | None:
 def watching(kinds: set[type], *, made: bool) -> Iterator[None]:
     """Add the classes that are met inside; only those that are `made`, if so."""
 
-    def watch(frame: FrameType, event: str, _: object) -> None:
-        if event == "call" and (method := method_of(frame)) is not None:
+    def watch(frame: FrameType, event: str, _: object) -> None:  # of calls alone, as it returns no function for lines
+        if (method := method_of(frame)) is not None:
             kind, name = method
             if not made or name in ("__init__", "__new__"):
                 kinds.add(kind)
 
-    sys.setprofile(watch)
+    sys.settrace(watch)
     try:
         yield
     finally:
-        sys.setprofile(None)
+        sys.settrace(None)
 
 
 def types_of_a_period() -> set[type]:

@@ -1,11 +1,12 @@
 """Take rooms away and see the rest pass: `make rooms`.
 
 In a copy of the checkout each room loses its folders, its tests, its pages and its lines in the two lists of rooms,
-`scenarios/commands/rooms.py` and `quadsim/__init__.py`; then `quadsim list`, `quadsim run hover` and the remaining
-quick tests are run there.
+`scenarios/commands/rooms.py` and `quadsim/__init__.py`.  There `quadsim list` and `quadsim run hover` have to work.
+Without all rooms, the remaining quick tests are run too; without a single one, all of them are collected, which imports
+them, and those of the architecture are run.  What a test uses of rooms when it runs, `test_rooms.py` holds to `USING`.
 
     python tests/rooms.py                # each room by itself, then all at once
-    python tests/rooms.py live campaign  # these two at once
+    python tests/rooms.py live campaign  # these two at once, with all quick tests
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ import argparse
 import ast
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -43,6 +44,10 @@ USING: Final = {
     "mpc/core/test_law.py": ("export",),
     "quadsim/test_palette.py": ("live",),
     "quadsim/test_plausibility.py": ("design",),
+    "scenarios/gym/test_environment.py": ("campaign",),
+    "scenarios/identify/test_identify.py": ("design",),
+    "scenarios/identify/test_identify_fit.py": ("design",),
+    "scenarios/identify/test_identify_logs.py": ("design",),
     "scenarios/test_answer_first.py": ("campaign", "design", "identify"),
     "scenarios/test_api.py": EVERY,
     "scenarios/test_bounded_input.py": ("campaign", "identify"),
@@ -73,6 +78,12 @@ COMMANDS: Final = (
     ("scenarios.commands.entry", "run", "hover", "--no-video", "--no-recording", "--no-figures", "--overwrite"),
 )
 """What has to work without any room."""
+QUICK: Final = (
+    *("pytest", "-q", "-n", "2", "--dist", "loadscope", "-m", "not slow or witness", "--hypothesis-profile=quick"),
+)
+"""As `make test`."""
+COLLECTED: Final = ("pytest", "-q", "-n", "0", "-k", "test_architecture")
+"""Every test is collected, and those of the architecture are run."""
 
 
 def copy_without(rooms: Iterable[str], folder: Path) -> None:
@@ -125,22 +136,25 @@ def main() -> int:
     """Take away each room, or those that are named; returns 1 if something fails without them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rooms", nargs="*", metavar="ROOM", help=", ".join(ROOMS))
-    parser.add_argument(
-        "--tests", default="-m 'not slow or witness'", help="arguments of pytest (default: %(default)s)"
-    )
     chosen = parser.parse_args()
     if unknown := {*chosen.rooms} - {*ROOMS}:
         parser.error(f"ROOM must be of {', '.join(ROOMS)}; got {', '.join(unknown)}")
-    failed = False
-    for rooms in [chosen.rooms] if chosen.rooms else [*([room] for room in ROOMS), [*ROOMS]]:
-        with tempfile.TemporaryDirectory() as scratch:
-            folder = Path(scratch).resolve()
-            copy_without(rooms, folder)
-            tests = ["pytest", "-q", "-n", "2", "--dist", "loadscope", *shlex.split(chosen.tests)]
-            failure = failure_of([*COMMANDS, tests], folder)
-        print(f"without {', '.join(rooms)}: {'passes' if failure is None else failure}", flush=True)
-        failed |= failure is not None
-    return int(failed)
+    passed = []
+    if not chosen.rooms:
+        with ThreadPoolExecutor(2) as pool:
+            passed += pool.map(lambda room: _passes([room], COLLECTED), ROOMS)
+    passed.append(_passes(chosen.rooms or [*ROOMS], QUICK))
+    return int(not all(passed))
+
+
+def _passes(rooms: Sequence[str], tests: Sequence[str]) -> bool:
+    """Return whether the commands, and then the tests, work in a copy without some rooms; print it."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch).resolve()
+        copy_without(rooms, folder)
+        failure = failure_of([*COMMANDS, tests], folder)
+    print(f"without {', '.join(rooms)}: {'passes' if failure is None else failure}", flush=True)
+    return failure is None
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from ocp_peer import Period
 from scipy.linalg import block_diag
 
@@ -39,6 +40,11 @@ from scenarios.schema.scenario import Scenario
 
 NO_PRODUCTS = {"video": False, "recording": False, "figures": False}
 """Of a flight that is saved."""
+
+
+def fewer(share: float) -> settings:
+    """Settings for a property whose examples are dear: a share of as many as the profile draws."""
+    return settings(max_examples=round(share * settings.default.max_examples))
 
 
 def fly_here(patch: pytest.MonkeyPatch) -> None:

@@ -10,6 +10,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import TypeGuard
@@ -65,6 +66,12 @@ class Import:
         return self.imported.partition(".")[0]
 
 
+@cache
+def parsed(source: str) -> ast.Module:
+    """A module's tree, which several tests walk."""
+    return ast.parse(source)
+
+
 def modules() -> dict[str, Path]:
     """Our modules by dotted name."""
     files = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
@@ -89,7 +96,7 @@ def imports_of(importer: str, source: str, ours: set[str]) -> Iterator[Import]:
             if not isinstance(child, ast.expr):  # none of which holds an import
                 yield from visit(child, at_start and not later)
 
-    yield from visit(ast.parse(source), True)
+    yield from visit(parsed(source), True)
 
 
 @pytest.fixture(scope="module")
@@ -233,7 +240,7 @@ def public_names(source: str) -> set[str]:
     def named(node: ast.AST) -> TypeGuard[ast.Name]:
         return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
 
-    return {name for name in names(ast.parse(source).body) if not name.startswith("_")}
+    return {name for name in names(parsed(source).body) if not name.startswith("_")}
 
 
 def test_a_public_name_is_one_that_a_module_defines() -> None:
@@ -274,7 +281,7 @@ def unwritten(source: str) -> Iterator[str]:
     It counts `getattr` and `hasattr` on `OF_CONTROLLERS`.  Optional parts are protocols of `quadsim.controller` and its
     like in `mpc`, asked for by `isinstance`, and class attributes of `mpc.bounded.ControllerTable`.
     """
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "hasattr"):
             owner, name = map(ast.unparse, node.args[:2])
             if isinstance(node.args[1], ast.Constant) and OF_CONTROLLERS.search(owner):
@@ -294,7 +301,7 @@ OUTPUTS = "quadsim.outputs"
 
 def removals(source: str) -> Iterator[str]:
     """Calls that remove or replace files, of `os`, `shutil` and `pathlib`; `text.replace` has two arguments."""
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             name, owner = node.func.attr, ast.unparse(node.func.value)
             if name == "replace":

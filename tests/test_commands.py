@@ -66,23 +66,27 @@ def arguments_of(line: str) -> list[str]:
 
 @pytest.fixture
 def workplace(
+    line: str,
+    request: pytest.FixtureRequest,
     fly_known: Callable[..., Flight],
     flown: Path,
-    campaign: Path,
-    eight: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The working directory after `make demo`, with a shorter flight in the place of both, and after a campaign.
+    """The working directory after `make demo`, with a shorter flight in the place of both.
 
-    Scenarios of the library that are flown as they are have been flown once.
+    Scenarios of the library that are flown as they are have been flown once.  A log and a campaign are there for the
+    commands that read them.
     """
-    for place in (f"campaigns/{campaign.name}", "mine", "other"):
-        shutil.copytree(campaign, tmp_path / "runs" / place)
+    if "eight.csv" in line:
+        shutil.copy(request.getfixturevalue("eight"), tmp_path)
+    if re.search(r"runs/(campaigns|mine|other)", line):
+        campaign = request.getfixturevalue("campaign")
+        for place in (f"campaigns/{campaign.name}", "mine", "other"):
+            shutil.copytree(campaign, tmp_path / "runs" / place)
     (tmp_path / "mine.toml").write_text('base = "paper-nominal"\nname = "mine"\nfailure = ["lost"]\n')
     for name in ("mine-vehicle", "start", "identified"):
         (tmp_path / f"{name}.toml").write_text(quadsim.vehicle_report(template=True).content)
-    shutil.copy(eight, tmp_path)
     (tmp_path / "first.toml").write_text('base = "hover"\n')  # in the place of the one made for that vehicle
     (tmp_path / "push.toml").write_text(
         'duration = 0.2\ninputs = [{ at = 0.1, type = "pull", to = [1.0, 0.0, 1.0] }]\n'

@@ -9,16 +9,17 @@ from pathlib import Path
 TESTS = Path(__file__).parent
 
 
-def marked(mark: str) -> Iterator[tuple[str, Path]]:
-    """The group of every `pytest.mark.MARK("group")`, and its file."""
+def marked() -> Iterator[tuple[str, str, Path]]:
+    """The mark and group of every `pytest.mark.MARK("group")` of these, and its file."""
     for path in sorted(TESTS.rglob("test_*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) == f"pytest.mark.{mark}":
-                (group,) = (ast.literal_eval(argument) for argument in node.args)
-                yield group, path
+            match node:
+                case ast.Call(func=ast.Attribute(attr="slow" | "witness" as mark), args=[ast.Constant(value=group)]):
+                    yield mark, group, path
 
 
 def test_every_slow_group_has_a_witness_among_the_quick_tests() -> None:
-    slow, witnesses = set(marked("slow")), set(marked("witness"))
+    marks = {*marked()}
+    slow, witnesses = ({(group, path) for mark, group, path in marks if mark == kind} for kind in ("slow", "witness"))
     assert {group for group, _ in witnesses} == {group for group, _ in slow}
     assert witnesses <= slow, "a witness is a test of its group"

@@ -36,6 +36,7 @@ def beside(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow("process")
 def test_files_of_these_names_beside_a_script_are_not_imported_in_their_place(beside: Path) -> None:
     done = run(FLY + MANY, beside)
     assert done.stdout.splitlines() == ["satisfied", "['satisfied', 'satisfied']"], done.stderr

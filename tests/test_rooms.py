@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ast
 import inspect
+from functools import cache
 from pathlib import Path
 
 import pytest
 import rooms as taking
 from test_architecture import PACKAGES, Import, imports_of, modules
 
+import quadsim
 from scenarios.commands.rooms import ROOMS, commands_of
 
 MOST_USED = 277
@@ -62,6 +64,50 @@ def test_rooms_use_few_names_of_the_core() -> None:
     assert 0 < len(used) <= MOST_USED, sorted(used)
 
 
+TESTS = Path(taking.__file__).resolve().parent
+COMMANDS = {word: room for room, entry in ROOMS.items() for word in entry.commands}
+NAMED = {
+    **{f"scenarios.{room}": room for room in ROOMS},
+    **{f"quadsim.{name}": room for name, module in quadsim._PUBLIC.items() if (room := room_of(module))},
+    **{"mpc.codegen": "export", "quadsim.gym": "gym"},
+}
+"""Rooms by the dotted names that lead into them."""
+
+
+@cache
+def used_by(test: Path) -> frozenset[str]:
+    """The rooms that a module of tests names: in imports, its helpers' too, as `quadsim.NAME`, as a command's word."""
+    names: set[str] = set()
+    words: set[object] = set()
+    for node in ast.walk(ast.parse(test.read_text(encoding="utf-8"))):
+        match node:
+            case ast.ImportFrom(module=str(module)):
+                names |= {module, *(f"{module}.{item.name}" for item in node.names)}
+            case ast.Import():
+                names |= {item.name for item in node.names}
+            case ast.Attribute(value=ast.Name(id="quadsim"), attr=name):
+                names.add(f"quadsim.{name}")
+            case ast.Call(func=ast.Name(id="main"), args=[ast.List(elts=[ast.Constant(value=word), *_]), *_]):
+                words.add(word)
+    rooms = {room for start, room in NAMED.items() if any(f"{name}.".startswith(f"{start}.") for name in names)}
+    helpers = {path for name in names - {test.stem, "rooms"} if (path := TESTS / f"{name}.py").is_file()}
+    return frozenset(rooms.union({COMMANDS[word] for word in words & {*COMMANDS}}, *map(used_by, helpers)))
+
+
+def test_what_tests_use_of_other_rooms_is_stated() -> None:
+    """So that they are left out without it; `taking.USING` states it."""
+    apart = {TESTS / "peers", TESTS / "firmware"}
+    parts = {room: {TESTS.parent / part for part in (f"tests/scenarios/{room}", *taking.PARTS[room])} for room in ROOMS}
+    missing = {}
+    for path in TESTS.rglob("test_*.py"):
+        name, folders = path.relative_to(TESTS).as_posix(), {path, *path.parents}
+        own = {room for room in ROOMS if folders & parts[room]}
+        rooms = used_by(path) - own - {*taking.USING.get(name, ())}
+        if rooms and not folders & apart:
+            missing[name] = sorted(rooms)
+    assert missing == {}
+
+
 def test_the_list_of_commands_says_what_the_rooms_say() -> None:
     for name, room in ROOMS.items():
         for command in room.commands.values():
@@ -71,10 +117,11 @@ def test_the_list_of_commands_says_what_the_rooms_say() -> None:
             assert {"owns", "check_advice", "compare_directories"} <= set(dir(commands_of(name)))
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_without_a_room_the_rest_imports(room: str, tmp_path: Path) -> None:
-    """The command and its list, in a copy; `make rooms` runs its tests too."""
-    taking.copy_without([room], tmp_path)
-    assert not (tmp_path / "scenarios" / room).exists()
-    assert room not in (tmp_path / "scenarios" / "commands" / "rooms.py").read_text().split("ROOMS")[1].split('"')
+def test_without_any_room_the_rest_lists_and_flies(tmp_path: Path) -> None:
+    """In a copy; `make rooms` takes each away by itself, and runs the tests too."""
+    taking.copy_without(ROOMS, tmp_path)
+    rooms = (tmp_path / "scenarios" / "commands" / "rooms.py").read_text().split("ROOMS")[1].split('"')
+    for room in ROOMS:
+        assert not (tmp_path / "scenarios" / room).exists()
+        assert room not in rooms
     assert taking.failure_of(taking.COMMANDS, tmp_path) is None

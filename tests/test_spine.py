@@ -22,24 +22,31 @@ from test_architecture import imports_of, modules
 ROOT = Path(__file__).resolve().parent.parent
 MOST_ENTERED, MOST_LOADED, MOST_FRAMES, LONGEST_CHAIN, SPINE_LINES = 87, 149, 8, 20, 2480
 MOST_DATA_TYPES, MOST_CLASSES = 16, 74  # may only fall
+pytestmark = pytest.mark.slow("spine")
+
 COUNTED = "import runpy; runpy.run_path('tests/count_types.py', run_name='__main__')"
 HELP = "import scenarios.commands.cli; scenarios.commands.cli.main(['--help'])"
 WATCHED = """
-import json, sys
+import json, os, sys
 from collections import Counter
+PACKAGES = ("quadsim", "mpc", "scenarios")
+FOLDERS = tuple(os.path.join(os.getcwd(), package, "") for package in PACKAGES)
 entered, loaded, calls, frames, importing = set(), set(), Counter(), [], 0
 
 def ours(frame):
     name = frame.f_globals.get("__name__", "")
-    return name if name.partition(".")[0] in ("quadsim", "mpc", "scenarios") else ""
+    return name if name.partition(".")[0] in PACKAGES else ""
 
-def watch(frame, event, _):
+def watch(frame, event, _):  # a call
     global importing
     code = frame.f_code
-    if code.co_name == "<module>":
-        importing += {"call": 1, "return": -1}.get(event, 0)
-    if event != "call" or not (name := ours(frame)):
+    if not code.co_filename.startswith(FOLDERS) or not (name := ours(frame)):
         return
+    if code.co_name == "<module>":
+        importing += 1
+        loaded.add(code.co_filename)
+        frame.f_trace_lines = False
+        return leave
     (loaded if importing else entered).add(code.co_filename)
     if importing:
         return
@@ -49,11 +56,16 @@ def watch(frame, event, _):
             frames.extend([f"{ours(frame)}.{frame.f_code.co_qualname}"] if ours(frame) else [])
             frame = frame.f_back
 
+def leave(frame, event, _):
+    global importing
+    importing -= event == "return"
+    return leave
+
 sys.argv = ["quadsim", *sys.argv[1:]]
-sys.setprofile(watch)
+sys.settrace(watch)
 from scenarios.commands.entry import main
 status = main()
-sys.setprofile(None)
+sys.settrace(None)
 print(json.dumps([status, sorted(entered), sorted(loaded | entered), calls, frames]), file=sys.stderr)
 """
 
@@ -123,6 +135,7 @@ def _lines_of_tokens(text: str) -> Iterator[int]:
             yield from range(token.start[0], token.end[0] + 1)
 
 
+@pytest.mark.witness("spine")
 def test_the_spine_is_short() -> None:
     """Lines of code; of `app.py`, the last, what takes part in `quadsim run`."""
     files = spine()
@@ -135,6 +148,7 @@ def test_the_spine_is_short() -> None:
     assert sum(lengths.values()) <= SPINE_LINES, lengths
 
 
+@pytest.mark.witness("spine")
 def test_the_longest_chain_of_imports_is_short() -> None:
     ours = modules()
     graph = {
@@ -150,11 +164,12 @@ def test_the_longest_chain_of_imports_is_short() -> None:
     assert len(longest) <= LONGEST_CHAIN, longest
 
 
+@pytest.mark.witness("spine")
 @pytest.mark.parametrize(
     ("code", "most"), [("import quadsim", 0.1), ("import scenarios.commands.cli as c; c.main(['-h'])", 0.3)]
 )
 def test_what_answers_at_once_does(code: str, most: float) -> None:
-    """Processor time of the fastest of five, without the interpreter's own; twice that on a busy machine."""
+    """Processor time of the fastest of three, without the interpreter's own; twice that on a busy machine."""
 
     def seconds(text: str) -> float:
         before = os.times()
@@ -162,4 +177,4 @@ def test_what_answers_at_once_does(code: str, most: float) -> None:
         after = os.times()
         return after.children_user + after.children_system - before.children_user - before.children_system
 
-    assert min(seconds(code) for _ in range(5)) - min(seconds("pass") for _ in range(5)) <= 2.0 * most
+    assert min(seconds(code) for _ in range(3)) - min(seconds("pass") for _ in range(3)) <= 2.0 * most

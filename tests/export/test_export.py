@@ -27,6 +27,8 @@ from scenarios.export.exporter import FACTS, c_controller, export, exported_law,
 from scenarios.export.record import record
 from scenarios.loading import load_scenario
 
+pytestmark = pytest.mark.slow("export")
+
 SHORT = {"duration": 1.0}
 NUMBER = re.compile(r"(?<![\w.])-?(\d[\d.e+-]*)\b(?!F?\])")
 NOT_EXPORTED = {
@@ -36,7 +38,6 @@ NOT_EXPORTED = {
 }
 
 
-@pytest.mark.slow("export")
 def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
     exported, refused, seen = 0, {}, set()
     for name in read_catalogue().scenarios:
@@ -74,7 +75,6 @@ def test_the_core_is_exported_byte_for_byte(tmp_path: Path) -> None:
         assert (directory / name).read_bytes() == (folder / name).read_bytes()
 
 
-@pytest.mark.slow("export")
 def test_the_same_export_twice_is_the_same_bytes(tmp_path: Path) -> None:
     scenario = quadsim.load("robust", SHORT)
     for name in ("one", "two"):
@@ -83,6 +83,7 @@ def test_the_same_export_twice_is_the_same_bytes(tmp_path: Path) -> None:
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
 
 
+@pytest.mark.witness("export")
 def test_both_precisions_have_the_same_numbers() -> None:
     double, single = (c_controller(load_scenario("hover"), precision).files[DATA] for precision in ("double", "float"))
     numbers = [text[text.index("static const") :].split() for text in (double, single)]
@@ -105,7 +106,6 @@ def test_capacity_is_as_requested_and_its_reach_is_stated(tmp_path: Path) -> Non
         assert 200 <= reach["feasible"] <= reach["drawn"]
 
 
-@pytest.mark.witness("export")
 def test_an_export_is_complete_and_replaces_an_earlier_one_on_request(tmp_path: Path) -> None:
     scenario = quadsim.load("hover", SHORT)
     directory = quadsim.export(scenario, tmp_path / "c")
@@ -156,6 +156,7 @@ def test_a_problem_with_too_many_numbers_is_refused() -> None:
         _ = c_controller(load_scenario("paper-constrained", ["controller.horizon=900"])).files
 
 
+@pytest.mark.witness("export")
 @pytest.mark.parametrize(
     ("value", "text"), [(1.5, "1.5"), (-0.1, "-0.1"), (1e-39, "0.0"), (-5e-324, "0.0"), (1.2e-38, "1.2e-38")]
 )
@@ -187,6 +188,7 @@ def optimum(axis: AxisTables, start: Array, reference: Array) -> Array:
     return w
 
 
+@pytest.mark.witness("export")
 @pytest.mark.parametrize("settings", [[], ["controller.terminal=lqr"], ["controller.horizon=10"]])
 def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None:
     scenario = load_scenario("paper-constrained", settings)
@@ -202,6 +204,7 @@ def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None
         np.testing.assert_allclose(w[0], desired[axis.first : axis.first + axis.inputs], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.witness("export")
 @pytest.mark.parametrize("name", ["paper-constrained", "robust", "polytopes"])
 def test_responses_are_those_of_the_condensed_problem(name: str) -> None:
     scenario = load_scenario(name, ["controller.horizon=8"])
@@ -228,6 +231,7 @@ def _keys(rows: object) -> list[list[bytes]]:
     return [[np.ascontiguousarray(row).tobytes() for row in getattr(rows, name)] for name in ("C", "D", "E")]
 
 
+@pytest.mark.witness("export")
 def test_inputs_fall_into_axes_without_loss() -> None:
     """Also where some inputs move nothing that costs."""
     scenario = load_scenario("paper-constrained")

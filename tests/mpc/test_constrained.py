@@ -7,8 +7,8 @@ import pytest
 from support import constrained_mpc, paper_problem, paper_reference
 
 from mpc.ocp import Query
-from mpc.solvers import Answer, QPSolver
-from quadsim.controller import Command, StepInputs
+from mpc.solvers import INVALID_DATA, Answer, QPSolver
+from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import PlanExhaustedError
 
 STATE = np.zeros(12)
@@ -110,3 +110,32 @@ def test_slews_count_from_the_command_that_acts() -> None:
     after = controller.step(StepInputs(time=0.05, acting=acting), STATE, reference).speeds
     assert problem.bounds is not None
     np.testing.assert_allclose(after, acting + problem.bounds.delta_max, atol=1e-6)  # it climbs as fast as it may
+
+
+def test_on_the_ground_the_plan_is_forgotten() -> None:
+    solver = FaultySolver({1: "numerics"})
+    controller, reference = constrained_mpc(solver.problem, solver), paper_reference(51)[1:]
+    controller.step(StepInputs(), STATE, reference)
+    controller.step(StepInputs(time=0.05, phase=Phase.LANDED), STATE, reference)
+    with pytest.raises(PlanExhaustedError, match="with no plan to hold"):
+        controller.step(StepInputs(time=0.1), STATE, reference)
+
+
+def test_the_heir_of_a_held_plan_holds_the_rest_of_it() -> None:
+    reference = paper_reference(55)
+    first, heir = (
+        constrained_mpc(solver.problem, solver)
+        for solver in (FaultySolver({1: "numerics"}), FaultySolver({0: "numerics"}))
+    )
+    plan = first.step(StepInputs(), STATE, reference[1:51]).plan
+    first.step(StepInputs(time=0.05), STATE, reference[2:52])
+    heir.adopt(first)
+    command = heir.step(StepInputs(time=0.1, acting=plan[1]), STATE, reference[3:53])
+    np.testing.assert_allclose(command.speeds, plan[2], atol=1e-6)
+
+
+def test_what_was_not_measured_is_no_infeasible_period() -> None:
+    controller, reference = constrained_mpc(paper_problem()), paper_reference(51)[1:]
+    controller.step(StepInputs(), STATE, reference)
+    assert controller.step(StepInputs(time=0.05), STATE * np.nan, reference).status == INVALID_DATA
+    assert controller.infeasible_period is None

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import ocp_peer
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
-from support import changing_period, random_problem, with_terms
+from support import changing_period, fewer, random_problem, with_terms
 
 from mpc.constraints import Constraint, Penalty
 from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
@@ -53,7 +53,6 @@ RANDOM = {
 
 
 @given(**RANDOM)
-@settings(max_examples=40)
 def test_violation_is_zero_if_and_only_if_the_qp_is_feasible(
     seed: int, terms: tuple[str, ...], changing: bool, far: float
 ) -> None:
@@ -73,7 +72,7 @@ def test_violation_is_zero_if_and_only_if_the_qp_is_feasible(
 @example(seed=164, terms=TERMS[-1], changing=False, far=0.1)  # multipliers down to 1e-8 along a chain of bounds,
 @example(seed=179393, terms=TERMS[-1], changing=False, far=0.1)  # and to less than the solver resolves
 @example(seed=60885742, terms=("constraints",), changing=True, far=0.1)  # the simplex method fails
-@settings(max_examples=15)
+@fewer(0.3)
 def test_what_is_named_is_a_conflict_by_itself_and_each_part_of_it_is_needed(
     seed: int, terms: tuple[str, ...], changing: bool, far: float
 ) -> None:
@@ -95,7 +94,7 @@ def test_what_is_named_is_a_conflict_by_itself_and_each_part_of_it_is_needed(
 
 
 @given(**RANDOM)
-@settings(max_examples=15)
+@fewer(0.3)
 def test_the_smallest_widening_is_enough_and_no_less_is(
     seed: int, terms: tuple[str, ...], changing: bool, far: float
 ) -> None:

@@ -81,13 +81,13 @@ def test_another_kind_of_controller_takes_over_the_disturbance() -> None:
 
 
 def test_a_contract_s_level_of_fallback_goes_on() -> None:
-    """Half a second without a position is level 2 of the fallback, before and after a change."""
+    """Long without a position, and level hover's time is over: it descends, before and after a change."""
     events = "events=[{type='sensor_fault', sensor='position', fault='nan', at=1.0, duration=3.0}]"
-    with Rollout(load_scenario("robust", [events])) as started:
+    with Rollout(load_scenario("robust", [events, "controller.fallback.hover=0.3"])) as started:
         while started.k < 60:
             started.step()
         before = started.loop.last
         started.apply({"type": "controller", "fields": {"output_weights.x": 11.0}})
         after = started.step()
     assert before is not None
-    assert before.command.fallback == after.command.fallback >= 2
+    assert before.command.fallback == after.command.fallback == 3

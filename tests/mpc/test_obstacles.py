@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support import paper_problem
 
@@ -94,7 +94,6 @@ def by_dense_qp(problem: Problem, posed: Query, normals: Array, bounds: Array) -
 numbers = st.floats(-2.0, 2.0)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     at=st.tuples(numbers, numbers, numbers),
     axis=st.tuples(numbers, numbers, st.floats(0.3, 1.0)),

@@ -10,7 +10,7 @@ import numpy as np
 import ocp_peer
 import pytest
 import scipy.optimize
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from ocp_peer import Period
 from polish import polish
@@ -87,7 +87,6 @@ def exact(form: Formulation, query: tuple[Array, Array, Array, Equilibrium]) -> 
     return form.inputs(optimum.x), form.slacks(optimum.x), kkt_residuals(qp, optimum).worst / size
 
 
-@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     horizon=st.integers(1, 12),
@@ -151,7 +150,7 @@ def test_products_of_rounding_are_left_out() -> None:
 # Models that change from step to step
 
 
-@pytest.mark.parametrize("horizon", [1, 3, 7, 10])
+@pytest.mark.parametrize("horizon", [1, 7])
 @pytest.mark.parametrize("soft", [False, True, "largest"])
 @pytest.mark.parametrize("terms", [(), ("Q_d", "margins"), ("P", "constraints")])
 def test_systems_that_change_agree_with_a_peer(horizon: int, soft: bool | str, terms: tuple[str, ...]) -> None:
@@ -188,9 +187,9 @@ def test_systems_that_change_agree_with_a_peer(horizon: int, soft: bool | str, t
         whole = QPSolver("piqp-dense", problem, changing=True).solve(now.query)
         np.testing.assert_allclose(whole.plan, peer.plan, atol=2e-4)
         np.testing.assert_allclose(whole.slacks, peer.slacks, atol=2e-4)
-        if solved == 3:
+        if solved == 2:
             break
-    assert solved >= 2
+    assert solved == 2
 
 
 @pytest.mark.parametrize("soft", [False, True])

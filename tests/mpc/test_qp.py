@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from polish import polish
-from support import flight_queries, paper_problem, paper_reference
+from support import flight_queries, paper_problem, paper_reference, random_problem
 
 from mpc.condensing import Condensed
-from mpc.constraints import Constraint
+from mpc.constraints import Constraint, Penalty
 from mpc.ocp import Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Backend, Solution, kkt_residuals
@@ -30,7 +30,7 @@ def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: s
     formulation, backend = SOLVERS[name].formulate(problem), make_backend(name)
     backend.setup(formulation.qp)
     active = 0
-    for query in flight_queries(constrained_flight, problem, stride=20):
+    for query in flight_queries(constrained_flight, problem, stride=40):
         qp = formulation.assemble(Query(*query)).qp
         solution = backend.solve(qp)
         assert solution.status == SOLVED
@@ -40,7 +40,7 @@ def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: s
         assert residuals.complementarity < 1e-4  # multipliers reach 1e3
         assert residuals.dual == 0.0
         active += solution.stats.active
-    assert active > 100  # the flight does press against its bounds
+    assert active > 50  # the flight does press against its bounds
 
 
 def solved(formulation: Formulation, backend: Backend, query: Query) -> tuple[QP, Solution]:
@@ -88,7 +88,7 @@ def test_first_inputs_are_exact_over_the_flight(constrained_flight: Flight) -> N
     """Within 1e-3 rad/s of an active-set solver's, which ends at a vertex and not near one."""
     problem = paper_problem()
     ours, exact = QPSolver("piqp-multistage", problem), QPSolver("daqp", problem)
-    queries = flight_queries(constrained_flight, problem, stride=5)
+    queries = flight_queries(constrained_flight, problem, stride=15)
     errors = [np.abs(ours.solve(Query(*query)).plan[0] - exact.solve(Query(*query)).plan[0]).max() for query in queries]
     assert max(errors) < 1e-3
 
@@ -113,3 +113,15 @@ def test_multipliers_of_rows_are_those_of_the_qp_and_back() -> None:
     back = form.solution(form.inputs(optimum.x), form.slacks(optimum.x), rows)
     np.testing.assert_array_equal(back.z, optimum.z)
     np.testing.assert_array_equal(back.z_box, optimum.z_box)
+
+
+def test_a_slack_has_the_multiplier_that_makes_its_gradient_zero() -> None:
+    """l1 + 2 l2 e - |z| of each, none where that vanishes: at an optimum, wherever a bound is violated."""
+    problem = random_problem(np.random.default_rng(0), horizon=4)
+    assert problem.bounds is not None
+    penalty = Penalty(l1=np.array([3.0]), l2=np.array([2.0]))
+    form = Condensed(replace(problem, bounds=replace(problem.bounds, penalty=penalty)))
+    multipliers, slacks = np.zeros((4, len(problem.rows.D))), np.array([[0.0], [1.0], [1.0], [1.0]])
+    multipliers[:, 0] = [-2.0, 0.0, 5.0, 7.0]
+    z_slacks = form.solution(np.zeros((4, 2)), slacks, multipliers).z_box[8:]
+    np.testing.assert_allclose(z_slacks, [-1.0, -7.0, -2.0, 0.0])

@@ -291,7 +291,7 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
 @pytest.mark.parametrize("soft", [False, True])
 def test_models_that_change_from_step_to_step_hold_it(soft: bool, solver: str) -> None:
     solved = 0
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         problem = random_problem(rng, horizon=7, n=3, nu=2, n_c=2)
         row = random_rows(rng, problem, soft=soft)
@@ -307,4 +307,4 @@ def test_models_that_change_from_step_to_step_hold_it(soft: bool, solver: str) -
         np.testing.assert_allclose(
             ocp_peer.violation(row, given, answer.plan), answer.slacks if soft else 0.0, atol=1e-5
         )
-    assert solved >= 4
+    assert solved >= 2

@@ -9,7 +9,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from quadsim.errors import InputError
@@ -73,7 +73,6 @@ def holds(obstacle: AnyObstacle, points: Array) -> np.ndarray:
     return inside
 
 
-@settings(max_examples=60, deadline=None)
 @given(obstacle=obstacles, points=st.lists(vectors, min_size=4, max_size=4))
 def test_the_nearest_point_is_of_the_surface(obstacle: AnyObstacle, points: list[tuple[float, float, float]]) -> None:
     p = 2.0 * np.array(points)
@@ -90,7 +89,6 @@ def test_the_nearest_point_is_of_the_surface(obstacle: AnyObstacle, points: list
     assert not holds(obstacle, foot + 1e-5 * normal)[far].any()
 
 
-@settings(max_examples=60, deadline=None)
 @given(obstacle=obstacles, point=vectors, step=vectors)
 def test_the_normal_is_the_gradient_and_the_distance_no_steeper(
     obstacle: AnyObstacle, point: tuple[float, ...], step: tuple[float, ...]
@@ -110,7 +108,6 @@ def test_the_normal_is_the_gradient_and_the_distance_no_steeper(
             np.testing.assert_allclose(slope, normal[0], atol=1e-4)
 
 
-@settings(max_examples=60, deadline=None)
 @given(obstacle=obstacles, point=vectors)
 def test_distances_are_those_of_mujoco(obstacle: AnyObstacle, point: tuple[float, ...]) -> None:
     spec = mujoco.MjSpec()
@@ -190,7 +187,6 @@ def test_a_window_of_the_path_is_one_of_time() -> None:
         Corridor(name="c", position=(0, 0, 0), size=(1, 1, 1), path=(4.5, 5.0)).timed(t, positions)
 
 
-@settings(max_examples=20, deadline=None)
 @given(shapes=st.lists(obstacles, min_size=1, max_size=5))
 def test_many_are_measured_as_each_alone(shapes: list[AnyObstacle]) -> None:
     t, p = np.linspace(0.0, 3.0, 9), np.random.default_rng(0).normal(scale=2.0, size=(9, 3))
@@ -202,7 +198,6 @@ def test_many_are_measured_as_each_alone(shapes: list[AnyObstacle]) -> None:
         np.testing.assert_allclose(result, desired, atol=1e-14)
 
 
-@settings(max_examples=40, deadline=None)
 @given(obstacle=st.one_of(boxes, round_ones))
 def test_footprints_are_as_wide_as_the_solid(obstacle: AnyObstacle) -> None:
     for solid, angle in itertools.product(obstacle.solids, np.linspace(0.0, math.pi, 5)):

@@ -32,6 +32,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, campaigns_here: None) 
     return tmp_path
 
 
+@pytest.mark.slow("campaigns")
 def test_a_campaign_whose_figure_fails_has_its_summary_its_page_and_a_line(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -46,6 +47,7 @@ def test_a_campaign_whose_figure_fails_has_its_summary_its_page_and_a_line(
         assert "campaign.png" not in files
 
 
+@pytest.mark.slow("campaigns")
 def test_a_campaign_whose_report_fails_is_complete_all_the_same(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

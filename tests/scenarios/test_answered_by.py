@@ -26,10 +26,7 @@ from scenarios.rollout import Rollout
     [
         ("paper-constrained", (), {"gain": 607, "piqp-multistage": 593}),
         ("paper-constrained", ("controller.solver=core",), {"gain": 607, "core": 593}),
-        pytest.param(
-            *("robust", ("controller.solver=core",), {"gain": 196, "core": 404}),
-            marks=pytest.mark.witness("core"),
-        ),
+        ("robust", ("controller.solver=core",), {"gain": 196, "core": 404}),
     ],
 )
 def test_as_many_periods_are_a_solvers_as_it_had_calls(
@@ -45,12 +42,15 @@ def test_as_many_periods_are_a_solvers_as_it_had_calls(
     assert (counted["iterations"] is None) == (not calls)
 
 
-def test_a_period_in_fallback_or_too_late_is_answered_by_the_fallback() -> None:
-    for name in ("worn-rotor-hard-bounds", "stalled-solver"):
-        control = Rollout(load_scenario(name)).fly().log.control
-        fallback = control.fallback > 0
-        assert fallback.any()
-        np.testing.assert_array_equal(np.array(control.answered_by) == "fallback", fallback)
+@pytest.mark.slow("core")
+@pytest.mark.parametrize(
+    "name", ["worn-rotor-hard-bounds", pytest.param("stalled-solver", marks=pytest.mark.witness("core"))]
+)
+def test_a_period_in_fallback_or_too_late_is_answered_by_the_fallback(name: str) -> None:
+    control = Rollout(load_scenario(name)).fly().log.control
+    fallback = control.fallback > 0
+    assert fallback.any()
+    np.testing.assert_array_equal(np.array(control.answered_by) == "fallback", fallback)
 
 
 @pytest.mark.parametrize("every", [1, 7, KKT_EVERY])

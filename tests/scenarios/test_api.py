@@ -396,16 +396,18 @@ def test_a_notebook_shows_tables_and_a_small_plot(hover: Scenario, flight: Fligh
     ("typed", "offered", "withheld"),
     [
         ('flight.state["', ["x", "yaw_rate"], []),
-        ('flight.margins["', ["hold_x", "roll"], []),
+        ('flight.margins["', ["arrival_x", "roll"], []),
         ("flight.", ["outcome", "state", "margins", "to_pandas", "plot"], []),
         ("scenario.", ["controller", "duration", "replace", "fly", "to_toml"], ["altered", "require_consistent"]),
         ("quadsim.", ["fly", "sweep", "Scenario"], ["importlib", "TYPE_CHECKING", "annotations"]),
     ],
 )
-def test_ipython_with_jedi_completes(hover: Scenario, typed: str, offered: list[str], withheld: list[str]) -> None:
+def test_ipython_with_jedi_completes(
+    hover: Scenario, flight: Flight, typed: str, offered: list[str], withheld: list[str]
+) -> None:
     from IPython.core.completer import IPCompleter, provisionalcompleter
 
-    names = {"flight": quadsim.fly(hover, progress=False), "scenario": hover, "quadsim": quadsim}
+    names = {"flight": flight, "scenario": hover, "quadsim": quadsim}
     completer = IPCompleter(namespace=names, use_jedi=True)
     completer.jedi_compute_type_timeout = 0
     with provisionalcompleter():

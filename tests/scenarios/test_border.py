@@ -170,6 +170,7 @@ def law(now, state, reference):
 """
 
 
+@pytest.mark.slow("process")
 def test_stdout_has_the_result_alone_as_json_whatever_user_code_prints(tmp_path: Path) -> None:
     (tmp_path / "printing.py").write_text(PRINTING)
     (tmp_path / "s.toml").write_text(SCENARIO.format(module="printing"))

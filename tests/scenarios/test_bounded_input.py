@@ -60,13 +60,13 @@ def test_as_many_obstacles_as_allowed_are_read(tmp_path: Path) -> None:
     assert "o999.position" in scenario.description
 
 
-def test_thousands_of_problems_are_counted_and_some_described() -> None:
-    events = [{"type": "push", "at": 1.0, "duration": 1.0, "force": [0.0, 0.0, 0.0], "odd": 1} for _ in range(5000)]
+def test_many_problems_are_counted_and_some_described() -> None:
+    events = [{"type": "push", "at": 1.0, "duration": 1.0, "force": [0.0, 0.0, 0.0], "odd": 1} for _ in range(1500)]
     started = clock.process_time()
-    with pytest.raises(ScenarioError, match="and 4980 more") as caught:
+    with pytest.raises(ScenarioError, match="and 1480 more") as caught:
         parse_scenario({**plain(load_scenario("hover")), "events": events})
-    assert len(caught.value.problems) == 5000
-    assert clock.process_time() - started < 20.0
+    assert len(caught.value.problems) == 1500
+    assert clock.process_time() - started < 6.0
 
 
 def write_zeros(path: Path, rows: int, columns: str) -> None:

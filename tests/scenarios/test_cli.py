@@ -315,6 +315,7 @@ def test_compare_leaves_out_what_it_is_told_to_and_names_its_columns(
     assert ">A</h3>" in (here / "page" / "index.html").read_text()
 
 
+@pytest.mark.slow("commands")
 def test_compare_prints_markdown(hover_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", str(hover_directory), "--out", "page", "--markdown"]) == EXIT_DONE
     assert capsys.readouterr().out.startswith("| ")
@@ -409,7 +410,7 @@ def test_a_full_disk_is_status_2_and_leaves_nothing(
     assert left_in(here) == []
 
 
-@pytest.mark.parametrize("command", [["check"], ["campaign"], ["vehicle"], ["live", "hover", "--script"]])
+@pytest.mark.parametrize("command", [["check"], ["live", "hover", "--script"]])
 def test_a_file_that_is_nested_too_deep_is_refused_before_it_takes_memory(
     command: list[str], here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -12,6 +13,7 @@ import quadsim
 from quadsim.flight.audit import UNAUDITED_ADVICE, Limit
 from scenarios.assembly import Assembly
 from scenarios.commands.cli import main
+from scenarios.limits import flyable
 from scenarios.live.session import Session
 from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
@@ -178,3 +180,25 @@ def test_steps_of_the_command_have_no_value_between_the_samples() -> None:
     flight = quadsim.fly(hover())
     assert entry_of(flight.summary, "slew")["peak_plant"] is None
     assert entry_of(flight.summary, "slew")["worst_margin"] is not None
+
+
+def test_a_bound_on_speed_is_what_the_rotors_can_do_of_it() -> None:
+    vehicle = replace(quadsim.load_vehicle("lopes2011"), speed_min=50.0, speed_max=250.0)
+    roll = {"roll": (-5.0, 5.0)}
+    assert flyable({"speed": (0.0, 300.0), **roll}, vehicle) == {"speed": (50.0, 250.0), **roll}
+    assert flyable({"speed": (60.0, 200.0)}, vehicle) == {"speed": (60.0, 200.0)}
+    assert flyable({"speed": (300.0, 400.0)}, vehicle) == {"speed": (50.0, 250.0)}
+
+
+def test_a_difference_is_noted_from_when_it_is_there() -> None:
+    """A change of the controller that leaves its bound brings no second note."""
+    entry = {"name": "roll", "signal": "roll", "lower": -4.0, "upper": 4.0}
+    events = [
+        {"type": "controller", "at": 0.1, "fields": {"horizon": 21}},
+        {"type": "controller", "at": 0.2, "fields": {"output_bounds": {"roll": [-3.0, 3.0]}}},
+    ]
+    notes = Assembly(hover(constraints=[entry], events=events)).audit_notes
+    assert [note for note in notes if note.startswith("roll")] == [
+        "roll: audited against ±4 deg, the controller bounds ±5 deg",
+        "roll: audited against ±4 deg, the controller bounds ±3 deg from 0.2 s",
+    ]

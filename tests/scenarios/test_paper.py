@@ -73,6 +73,7 @@ def test_unconstrained_flight_tracks_and_leaves_every_bound(unconstrained_flight
     assert entries["speed"]["worst_margin"] == pytest.approx(-121.7, abs=0.1)
 
 
+@pytest.mark.slow("paper")
 def test_clipped_flight_shows_what_a_real_rotor_would_do(fly_once: Callable[..., Flight]) -> None:
     flight = fly_once("paper-unconstrained-clipped")
     assert flight.log.control.speeds.max() > 300.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -149,7 +149,15 @@ def test_a_saved_flight_keeps_its_targets(flight: quadsim.Flight, tmp_path: Path
     assert reaudit(tmp_path / "run").satisfied == flight.satisfied
 
 
-@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.slow("autopilot")
+@pytest.mark.parametrize(
+    "table",
+    [
+        pytest.param("geometric of attitudes", marks=pytest.mark.witness("autopilot")),
+        "geometric of rates",
+        "nonlinear of rates",
+    ],
+)
 def test_what_it_asks_for_on_the_ground_reaches_nobody_and_is_not_bounded(table: str) -> None:
     take_off = quadsim.load("take-off-and-landing").replace({"controller": TABLES[table], "duration": 2.0})
     log = (flight := quadsim.fly(take_off, progress=False)).log
@@ -199,6 +207,19 @@ def test_a_late_target_leaves_the_one_in_force_to_the_autopilot(scenario: quadsi
     held = later.plant.t < 0.03  # hover's rotor speeds stay in force until the first arrives
     np.testing.assert_allclose(later.plant.speeds[held], later.plant.speeds[0, 0], rtol=1e-12)
     assert (np.ptp(later.plant.speeds[~held], axis=1) > 0.0).any()
+
+
+def test_a_law_is_told_the_target_in_force_which_is_hover_at_first(scenario: quadsim.Scenario) -> None:
+    class Noting(Rates):
+        told: ClassVar[list[Array]] = []
+
+        def step(self, now: StepInputs, state: State, reference: Array) -> Any:
+            assert now.acting is not None
+            self.told.append(np.array(now.acting))
+            return [7.0, 0.0, 0.1, 0.2]
+
+    quadsim.fly(scenario.replace({"duration": 0.06}), controller=Noting, progress=False)
+    np.testing.assert_allclose(Noting.told, [[0.716 * 9.81, 0.0, 0.0, 0.0], *2 * [[7.0, 0.0, 0.1, 0.2]]], rtol=1e-3)
 
 
 def test_what_the_gyro_measures_reaches_the_autopilot(scenario: quadsim.Scenario) -> None:
@@ -320,6 +341,17 @@ def test_a_controller_that_takes_over_leaves_the_autopilot_flying(scenario: quad
     identified = autopilot.calls - 400
     assert identified == 4 * 300  # once, before the flight
     assert autopilot.resets == 1 + 4 + 1  # built, identified, flown
+
+
+def test_an_autopilot_starts_anew_when_it_takes_off() -> None:
+    law = {"type": "geometric", "commands": "rates", "inner_lag": OF_TARGETS["inner_lag"]}
+    take_off = quadsim.load("take-off-and-landing").replace({"controller": law, "autopilot": {}, "duration": 2.0})
+    autopilot = Counting(Assembly(take_off).vehicle)
+    before = autopilot.resets
+    flight = quadsim.fly(take_off, autopilot=autopilot, progress=False)
+    assert flight.log.control.phase[0] == "landed"
+    assert autopilot.calls > 0
+    assert autopilot.resets == before + 1
 
 
 def test_a_law_of_targets_takes_over_from_the_law_and_not_from_its_autopilot(scenario: quadsim.Scenario) -> None:

@@ -109,7 +109,7 @@ def test_the_audit_sees_the_physics_rate_whatever_the_log_rate(tmp_path: Path) -
 
 
 def test_a_flight_that_cannot_begin_is_recorded_with_its_reason(tmp_path: Path) -> None:
-    flown = run(tmp_path / "run", UPSIDE)
+    flown = run(tmp_path / "run", UPSIDE, "controller.horizon=10")
     reason = "at t = 0.000 s: the solver answered 'primal_infeasible' with no plan to hold"
     assert (flown.summary["status"], flown.summary["reason"]) == ("aborted", reason)
     assert (flown.log.status, flown.log.reason) == ("aborted", reason)

@@ -150,7 +150,15 @@ def test_the_robust_controller_keeps_clear_in_any_heading() -> None:
     assert abs(flight.state["y"]).max() > 0.1
 
 
-@pytest.mark.parametrize("more", [{}, {"node": 0.1, "iterations": 2}, {"rotor_lag": 0.02, "offset_free": {}}])
+@pytest.mark.slow("obstacles")
+@pytest.mark.parametrize(
+    "more",
+    [
+        pytest.param({}, marks=pytest.mark.witness("obstacles")),
+        {"node": 0.1, "iterations": 2},
+        {"rotor_lag": 0.02, "offset_free": {}},
+    ],
+)
 def test_the_nonlinear_controller_keeps_clear(more: Mapping[str, Any]) -> None:
     nonlinear = {"type": "nonlinear", "horizon": 30, "terminal": "lqr", "avoidance": {"soft": {}}, **more}
     pillar = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}]}
@@ -174,8 +182,15 @@ def offset_at(speed: float) -> dict[str, Any]:
     return {"corridors": [{**OFFSET, "path": [0.9, 1.3]}], "reference.speed": speed, "duration": duration}
 
 
+@pytest.mark.slow("obstacles")
 @pytest.mark.parametrize(
-    ("law", "speed"), [("constrained", 0.5), ("constrained", 0.8), ("robust", 0.5), ("nonlinear", 0.8)]
+    ("law", "speed"),
+    [
+        pytest.param("constrained", 0.5, marks=pytest.mark.witness("obstacles")),
+        ("constrained", 0.8),
+        ("robust", 0.5),
+        ("nonlinear", 0.8),
+    ],
 )
 def test_a_corridor_along_the_path_holds_where_the_reference_is(law: str, speed: float) -> None:
     laws: dict[str, dict[str, Any]] = {
@@ -205,6 +220,7 @@ def test_who_does_not_avoid_touches_and_who_does_keeps_clear() -> None:
     assert cleared(flight)[0].worst_margin > 0.04  # of a margin of 0.05, between the samples
 
 
+@pytest.mark.slow("obstacles")
 def test_no_answer_among_obstacles_is_explained_by_their_names() -> None:
     thrown = {
         **BALL,

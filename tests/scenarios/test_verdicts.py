@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from quadsim.flight.audit import (
 )
 from quadsim.flight.rundir import findings_of
 from scenarios.commands.cli import main
+from scenarios.flown import Flight
 from scenarios.law_bounds import law_limits
 from scenarios.schema.bases import merge
 from scenarios.schema.scenario import Scenario
@@ -37,8 +38,15 @@ def paper(**changes: Any) -> Scenario:
     return quadsim.load("paper-constrained").replace({"duration": 12.0, "constraints": [], **changes})
 
 
+@cache
+def paper_flight(entries: str) -> Flight:
+    """It is audited by no entry, by `stated` ones, or by `strict` ones, without tolerance."""
+    strict = [{**entry, "tolerance": 0.0} for entry in ENTRIES]
+    return quadsim.fly(paper(constraints={"none": [], "stated": ENTRIES, "strict": strict}[entries]))
+
+
 def test_a_bound_has_the_same_verdict_whether_the_controller_or_an_entry_states_it() -> None:
-    derived, stated = quadsim.fly(paper()), quadsim.fly(paper(constraints=ENTRIES))
+    derived, stated = paper_flight("none"), paper_flight("stated")
     assert (derived.command == stated.command).all()
     assert [finding.limit.tolerances for finding in derived.audit] == [f.limit.tolerances for f in stated.audit]
     assert derived.outcome == stated.outcome == "satisfied"
@@ -102,7 +110,7 @@ def test_no_other_module_compares_a_margin_with_a_tolerance() -> None:
 
 
 def test_the_worst_finding_is_the_smallest_share_of_the_band_with_ties_by_name() -> None:
-    flight = quadsim.fly(paper())
+    flight = paper_flight("none")
     by_name = {finding.limit.name: finding for finding in flight.audit}
     assert worst_finding(flight.audit) is by_name["pitch"]
     assert by_name["pitch"].share == pytest.approx(by_name["pitch"].margin / 5.0)
@@ -235,8 +243,7 @@ def test_rows_that_combine_states_become_sums() -> None:
 
 
 def test_flights_that_are_audited_differently_are_compared_by_margins_until_audited_alike() -> None:
-    strict = [{**entry, "tolerance": 0.0} for entry in ENTRIES]
-    a, b = (quadsim.fly(paper(constraints=each)) for each in (ENTRIES, strict))
+    a, b = paper_flight("stated"), paper_flight("strict")
     assert (a.outcome, b.outcome) == ("satisfied", "violated")
     different = quadsim.compare(a, b)
     first = different.text().splitlines()[0]
@@ -250,6 +257,7 @@ def test_flights_that_are_audited_differently_are_compared_by_margins_until_audi
         quadsim.compare(a, b, constraints="elsewhere")
 
 
+@pytest.mark.slow("campaigns")
 def test_campaigns_that_are_audited_differently_get_no_test_of_violations(tmp_path: Path) -> None:
     mass = {"name": "m", "fields": ["actual.mass"], "distribution": "uniform", "low": 3.9, "high": 4.1}
 

@@ -154,7 +154,7 @@ def test_any_state_gets_a_command_within_speeds_and_slews(
 def test_default_bounds_are_the_vehicles(law: str, craft: Vehicle, build: Build, size: float) -> None:
     rng, controller = np.random.default_rng(0), build(law, craft)
     extremes = []
-    for _ in range(30):
+    for _ in range(12):
         state, pose = size * rng.normal(size=12), size * rng.normal(size=4)
         extremes.append(controller.step(StepInputs(), state, held(controller, pose)).speeds)
     assert np.min(extremes) >= craft.speed_min

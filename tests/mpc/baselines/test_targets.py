@@ -140,9 +140,15 @@ def test_the_inner_loop_makes_the_lag_a_pole_beside_those_of_the_gains(
     assert allowed.k_attitude == pytest.approx([1.0 / 0.33, 1.0 / 0.33, gains.k_attitude[2]])
 
 
-@pytest.mark.witness("targets")
-@LAGS
-@COMMANDS
+@pytest.mark.parametrize(
+    ("lag", "commands"),
+    [
+        pytest.param(FAST, "attitude", marks=pytest.mark.witness("targets")),
+        pytest.param(SLOW, "rates", marks=pytest.mark.witness("targets")),
+        (FAST, "rates"),
+        (SLOW, "attitude"),
+    ],
+)
 def test_it_recovers_from_30_degrees(vehicle: Vehicle, lag: tuple[float, ...], commands: str) -> None:
     law, start = geometric(vehicle, lag, commands), Rotation.from_euler("ZX", [0.4, math.radians(30.0)])
     flown = fly(law, vehicle, at_rest, 200, lag=lag, start=start)

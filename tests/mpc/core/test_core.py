@@ -54,7 +54,7 @@ def worst(problem: Problem, answer: Answer) -> float:
     return max(residuals.primal, residuals.dual, residuals.stationarity / scale, residuals.complementarity / scale)
 
 
-@pytest.mark.parametrize(("name", "draws"), [("paper-constrained", 100), ("robust", 100), ("robust-lag50", 20)])
+@pytest.mark.parametrize(("name", "draws"), [("paper-constrained", 70), ("robust", 40), ("robust-lag50", 10)])
 def test_drawn_states_are_answered_cold_and_warm_as_by_daqp(name: str, draws: int) -> None:
     """Warm, from the active set of another state altogether."""
     rng, problem = np.random.default_rng(1), paper_problem(name)
@@ -146,7 +146,7 @@ def test_every_way_ends_at_the_peers_optimum(seed: int, terms: set[str], size: f
 def test_every_way_is_taken(terms: tuple[str, ...]) -> None:
     """What the test above rests on; and that these terms leave the axes apart."""
     methods = []
-    for seed in range(30):
+    for seed in range(15):
         rng = np.random.default_rng(seed)
         size, wider = float(rng.choice([0.05, 2.0])), float(rng.choice([1.0, 1000.0]))
         problem, query = drawn(rng, terms, size=size, wider=wider)
@@ -156,7 +156,7 @@ def test_every_way_is_taken(terms: tuple[str, ...]) -> None:
         if answer.status in ACCEPTED:
             free = answer.method is Method.FREE
             assert (answer.status, answer.answered_by) == ((UNCONSTRAINED, GAIN) if free else (SOLVED, CORE))
-    assert min(methods.count(method) for method in Method) >= 2
+    assert {*methods} == {*Method}
 
 
 def test_moves_that_tie_the_axes_leave_one_piece() -> None:

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scripted_controller import PERIOD, advance, level, model, random_state
 
-from mpc.fallback.completion import PLAUSIBLE, StateCompletion
+from mpc.fallback.completion import ACCELERATION, PLAUSIBLE, StateCompletion
 from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array
 
 
@@ -92,7 +93,7 @@ def test_a_vehicle_at_rest_or_on_the_ground_is_not_frozen() -> None:
 
 def test_channels_missing_for_long_are_recovered_from_the_rest() -> None:
     completion = StateCompletion(model())
-    for _ in range(4000):
+    for _ in range(1000):
         completion.complete(np.full(12, math.nan), model().u_bar, level())
     states, speeds = moving(100)
     tilting = [INDEX[name] for name in ("roll", "roll_rate", "pitch", "pitch_rate")]  # seen in how it moves
@@ -105,7 +106,14 @@ def test_channels_missing_for_long_are_recovered_from_the_rest() -> None:
 
 def test_nothing_measured_ever_stays_finite() -> None:
     completion, rng = StateCompletion(model()), np.random.default_rng(7)
-    for k in range(3000):
-        seen = rng.normal(size=12) if k % 500 == 0 else np.zeros(3)
+    for k in range(1000):
+        seen = rng.normal(size=12) if k % 250 == 0 else np.zeros(3)
         known = completion.complete(seen, rng.uniform(-1e5, 1e5, 4), level())
         assert (np.abs(known) <= PLAUSIBLE).all()
+
+
+def test_the_process_noise_is_an_acceleration_constant_over_a_period() -> None:
+    """White from one period to the next, along each coordinate and about each angle."""
+    gain = np.array([[0.5 * PERIOD**2], [PERIOD]])
+    pairs = [sigma**2 * gain @ gain.T for sigma in ACCELERATION]
+    np.testing.assert_allclose(StateCompletion(model())._process, block_diag(*3 * pairs[:1], *3 * pairs[1:]))

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scripted_controller import Scripted, bounds, guard, model
 
@@ -39,7 +39,6 @@ ACTING = st.one_of(st.none(), st.lists(NUMBERS, min_size=4, max_size=4).map(np.a
 STEPS = st.tuples(ANSWERS, STATES, ACTING, st.sampled_from([*Phase]), CHANNEL)
 
 
-@settings(max_examples=100)
 @given(steps=st.lists(STEPS, min_size=1, max_size=8), hover=st.sampled_from([0.1, 5.0]))
 def test_no_invalid_command_leaves(steps: list[Any], hover: float) -> None:
     class Adversary(Scripted):

@@ -410,5 +410,6 @@ def test_no_disturbance_within_the_stated_bounds_tilts_it_further(
     assert 0.9 * LIMIT < peak <= LIMIT
 
 
+@pytest.mark.slow("tightening")
 def test_margins_for_the_disturbance_alone_do_not_cover_a_wrong_estimate(vehicle: Vehicle) -> None:
     assert pushed_tilt(vehicle, ALL, rotor_lag=LAG, delay=0.05, estimated=False) > 1.01 * LIMIT

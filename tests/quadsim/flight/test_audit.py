@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import logged, small_log
 
-from quadsim.flight.audit import SIGNALS, Finding, Limit, audit, margins_sampled
+from quadsim.flight.audit import SIGNALS, Finding, Limit, audit, margins_sampled, worst_finding
 from quadsim.flight.log import FlightLog
 
 Z = Limit(name="height", signal="z", lower=-1.0, upper=2.0)
@@ -147,3 +147,10 @@ def test_steps_of_the_command_are_audited_from_the_first_on() -> None:
     for name in ("x", "slew"):
         always = find(log, Limit(name=name, signal=name, lower=1e8))
         assert always.time_violated == pytest.approx(log.plant.t[-1])
+
+
+def test_the_worst_finding_is_a_required_one_unless_none_is() -> None:
+    log = logged("z", samples=SAMPLES, plant=PLANT)
+    tight, roomy = replace(Z, name="tight", required=False), replace(Z, name="roomy", lower=-9.0, upper=9.0)
+    assert worst_finding(audit(log, (tight, roomy))) == find(log, roomy)
+    assert worst_finding(audit(log, (tight, replace(roomy, required=False)))) == find(log, tight)

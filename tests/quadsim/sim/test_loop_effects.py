@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from quadsim.sim.airframe import outline
 from quadsim.sim.computation import Computation, Stall
 from quadsim.sim.effects import Effects, Ground
 from quadsim.sim.effects.rotors import RotorDynamics
-from quadsim.sim.loop import TAKEOFF_LEAD, fly
+from quadsim.sim.loop import TAKEOFF_LEAD, ClosedLoop, fly
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import PhysicsSteps
 from quadsim.sim.plant import Plant
@@ -378,3 +378,41 @@ def test_a_stall_holds_back_what_it_meets(time: float, expected: float) -> None:
 def test_stalls_follow_one_another_whatever_their_order() -> None:
     stalls = (Stall(at=0.02, duration=0.03), Stall(at=0.0, duration=0.02))
     assert delay(Computation(stalls=stalls)) == delay(Computation(stalls=stalls[::-1])) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(("delay", "periods"), [(0.0, 0), (0.02, 0), (0.05, 0), (0.051, 1), (0.1, 1), (0.101, 2)])
+def test_a_command_spends_the_periods_before_its_own_under_way(delay: float, periods: int) -> None:
+    """One that takes a whole period arrives at its end: none before that."""
+    assert Computation(delay=delay).whole_periods(50, 1e-3) == periods
+
+
+def test_the_latest_arrival_of_a_command_is_not_forgotten_with_an_earlier_one(vehicle: Vehicle, speeds: Array) -> None:
+    """The first takes 120 ms, those after it 40: they arrive before it."""
+
+    class Slowly(Scripted):
+        def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
+            iterations = 12 if not self.moments else 4
+            return replace(super().step(now, state, reference), stats=Statistics(iterations=iterations))
+
+    with Plant(vehicle) as plant:
+        loop = ClosedLoop(
+            plant,
+            Slowly(speeds),
+            np.zeros((20, 4)),
+            initial_state=make_state(position=(0.0, 0.0, 10.0)),
+            initial_speeds=plant.hover_speeds,
+            steps_per_period=STEPS,
+            computation=Computation(per_iteration=0.01),
+        )
+        answered = [(loop.step(), loop.answered)[1] for _ in range(3)]
+    assert answered == pytest.approx([0.12, 0.12, 0.14])
+
+
+def test_depth_is_below_the_lowest_height_so_far(vehicle: Vehicle, speeds: Array) -> None:
+    """A course that climbs faster than the vehicle makes it no deeper; one that was lower allows as much."""
+    for course, limit, lost in (([50.0], 5.0, False), ([-20.0, *7 * [50.0]], 5.0, False), ([10.0], -0.5, True)):
+        reference = np.zeros((20, 4))
+        reference[:, 2] = np.pad(course, (0, 20 - len(course)), mode="edge")
+        with Plant(vehicle) as plant:
+            log = fly_scripted(plant, Scripted(speeds), reference=reference, loss={"depth": limit})
+        assert (log.lost == "depth") == lost

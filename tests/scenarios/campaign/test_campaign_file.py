@@ -200,12 +200,13 @@ NORMAL = {"distribution": "normal", "mean": 3.0, "deviation": 0.5}
 CUT = NORMAL | {"low": 2.8, "high": 4.0}
 
 
+@pytest.mark.slow("statistics")
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 @pytest.mark.parametrize(
     ("entry", "expected"),
     [
         (UNIFORM, stats.uniform(2.0, 3.0)),
-        (LOG_UNIFORM, stats.loguniform(0.1, 10.0)),
+        pytest.param(LOG_UNIFORM, stats.loguniform(0.1, 10.0), marks=pytest.mark.witness("statistics")),
         (NORMAL, stats.norm(3.0, 0.5)),
         (CUT, stats.truncnorm(-0.4, 2.0, loc=3.0, scale=0.5)),
     ],

@@ -70,7 +70,6 @@ def without_scripts(page: str) -> str:
     return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
 
 
-@pytest.mark.witness("campaigns")
 def test_the_page_shows_what_the_flights_show(estimated: CampaignSummary, reported: Path) -> None:
     directory = reported
     text = without_scripts((directory / "index.html").read_text())

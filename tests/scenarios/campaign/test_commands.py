@@ -81,6 +81,7 @@ def test_a_requirement_decides_the_exit_status(file: Path, capsys: pytest.Captur
     assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
 
 
+@pytest.mark.slow("campaigns")
 def test_a_replay_gives_the_same_numbers(
     flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -91,6 +92,7 @@ def test_a_replay_gives_the_same_numbers(
     assert {"index.html", "campaign.png"} <= {path.name for path in (flown / "first").iterdir()}
 
 
+@pytest.mark.slow("campaigns")
 def test_a_replay_by_other_code_starts_with_a_notice(
     flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

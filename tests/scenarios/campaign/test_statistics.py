@@ -179,6 +179,7 @@ def test_an_event_that_depends_on_a_number_is_found_and_a_rare_one_by_chance_is_
     assert rare.p_xi > 0.05 > stats.chatterjeexi(x, np.isin(x, (50.0, 51.0, 140.0)) * 1.0).pvalue
 
 
+@pytest.mark.slow("statistics")
 def test_the_p_value_of_xi_has_its_nominal_level() -> None:
     """Of few and many pairs, of numbers, of rare events, and of a varied parameter with few values."""
     rng = np.random.default_rng(3)
@@ -410,6 +411,7 @@ def test_both_measures_are_corrected_together() -> None:
     assert least[f"{key}_holm"] == pytest.approx(16 * least[key])
 
 
+@pytest.mark.slow("statistics")
 def test_noise_is_taken_for_a_driver_in_one_campaign_of_twenty_at_most() -> None:
     """Over 60 campaigns in which nothing matters: any claim, of any measure, varied parameter or outcome."""
     rng = np.random.default_rng(6)

@@ -51,6 +51,7 @@ def test_a_course_that_is_too_fast_is_reported_with_the_speed_at_which_it_fits()
     assert shortfalls(load_scenario("hummingbird-figure-eight"), HUMMINGBIRD) == ()
 
 
+@pytest.mark.slow("first flights")
 @pytest.mark.parametrize("law", DESIGNED_LAWS)
 @pytest.mark.parametrize("course", COURSES)
 def test_a_first_scenario_suits_its_vehicle(course: str, law: str) -> None:

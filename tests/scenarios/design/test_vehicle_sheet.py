@@ -167,6 +167,7 @@ def test_a_vehicle_whose_autopilot_has_no_lag_is_reported_and_flies(
         _ = Assembly(load_scenario("hover").replace({"vehicle.file": str(file)})).inner_lag
 
 
+@pytest.mark.slow("figures")
 def test_the_portrait_shows_the_vehicle(tmp_path: Path) -> None:
     try:
         rendering_backend()

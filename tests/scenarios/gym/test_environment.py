@@ -85,10 +85,13 @@ def test_actions_are_within_the_controllers_bounds_or_the_vehicles() -> None:
     assert free.action_space.high.tolist() == [vehicle.speed_max] * 4
 
 
-@pytest.mark.witness("gym")
 @pytest.mark.parametrize(
     ("name", "action"),
-    [("motion-capture", "deviations"), ("late-commands", "speeds"), ("torrente-loop4-drag", "speeds")],
+    [
+        pytest.param("motion-capture", "deviations", marks=pytest.mark.witness("gym")),
+        ("late-commands", "speeds"),
+        ("torrente-loop4-drag", "speeds"),
+    ],
 )
 def test_an_episode_of_the_own_controller_has_the_bytes_of_a_run(name: str, action: str, tmp_path: Path) -> None:
     scenario = short(name)

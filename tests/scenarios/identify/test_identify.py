@@ -263,7 +263,6 @@ REFUSED: list[tuple[str, str]] = [
 ]
 
 
-@pytest.mark.witness("identification")
 @pytest.mark.parametrize(("words", "message"), REFUSED, ids=[words for words, _ in REFUSED])
 def test_wrong_input_gives_one_message_and_leaves_nothing_behind(
     words: str, message: str, here: Path, capsys: pytest.CaptureFixture[str]

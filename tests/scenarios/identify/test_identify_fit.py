@@ -120,6 +120,7 @@ def test_rotors_lag_as_the_plant_s_do() -> None:
     assert rotors.square[100:] == pytest.approx(np.square(middles).mean(axis=1)[100:-1], rel=3e-3)
 
 
+@pytest.mark.witness("identification")
 @pytest.mark.parametrize("delay", [0.004, 0.01, 0.013, -0.01])
 def test_a_delay_shifts_what_rotors_do(delay: float) -> None:
     commands = 450.0 + 50.0 * np.random.default_rng(0).standard_normal((60, 4))
@@ -138,7 +139,6 @@ def test_a_polynomial_of_reflection_coefficients_is_stable_and_complete() -> Non
         assert np.abs(np.roots(_polynomial(reflections))).max() < 1.0
 
 
-@pytest.mark.witness("identification")
 def test_an_eight_with_yaw_steps_gives_all_but_the_body_s_drag() -> None:
     found = of_the_eight()
     assert not wrong(found)

@@ -330,7 +330,6 @@ SPOILT: dict[str, Spoil] = {
 }
 
 
-@pytest.mark.witness("identification")
 @pytest.mark.parametrize("name", SPOILT)
 def test_spoilt_logs_are_refused_by_name(eight: Record, hummingbird: Vehicle, name: str) -> None:
     with pytest.raises(InputError, match=name) as error:

@@ -260,6 +260,7 @@ def test_paused_it_flies_single_periods(session: Session) -> None:
     assert session.k == 2
 
 
+@pytest.mark.slow("live")
 @pytest.mark.usefixtures("undrawn")
 def test_the_script_on_the_page_is_saved_as_a_run_that_flies_to_the_same_bytes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

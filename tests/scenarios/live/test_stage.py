@@ -26,6 +26,8 @@ from tests.scenarios.live.test_page import PATIENCE, browser
 
 __all__ = ["browser"]  # a fixture
 
+pytestmark = pytest.mark.slow("live")
+
 PERIODS = 30
 
 

@@ -35,6 +35,7 @@ def test_the_circle_at_8_m_s_is_flown_better_than_by_learned_models(
     assert np.linalg.norm(flight.log.control.truth[:, VELOCITIES], axis=1).max() > 8.0
 
 
+@pytest.mark.slow("papers")
 def test_nonlinear_mpc_with_indi_hardly_feels_a_constant_torque(fly_once: Fly) -> None:
     alone = error(fly_once("torrente-loop4-ideal", TORQUE, "duration=3"))
     assert alone > 0.02

@@ -21,7 +21,7 @@ from quadsim.sim.estimator import EstimatorSettings
 from quadsim.sim.sensing import Sensor, SensorName
 from quadsim.vehicle import Vehicle
 
-SEEDS = 60
+SEEDS = 30
 FEW = 20
 """That are enough to see a noise that is wrong by half."""
 STEPS = 1000

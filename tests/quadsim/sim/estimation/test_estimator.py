@@ -70,10 +70,10 @@ def test_late_samples_are_weighted_by_their_time_stamp(
     vehicle: Vehicle, simulate_motion: SIMULATE, run_filter: SIMULATE
 ) -> None:
     """Falling, a tenth of a second is worth many times the noise; the naive filter does not know the delay."""
-    motion = simulate_motion(SETTINGS, 0.9 * hover(vehicle, 2000), seeds=4, rng=np.random.default_rng(2))
+    motion = simulate_motion(SETTINGS, 0.9 * hover(vehicle, 2000), seeds=2, rng=np.random.default_rng(2))
     late = SENSORS | {name: replace(SENSORS[name], delay=0.1) for name in (SensorName.POSITION, SensorName.VELOCITY)}
     prompt, fused, naive = (
-        rms([run_filter(motion, sensors, SETTINGS, seed=s, believed=believed)[1][20:] for s in range(4)], slice(0, 3))
+        rms([run_filter(motion, sensors, SETTINGS, seed=s, believed=believed)[1][20:] for s in range(2)], slice(0, 3))
         for sensors, believed in ((SENSORS, SENSORS), (late, late), (late, SENSORS))
     )
     assert fused < 1.5 * prompt
