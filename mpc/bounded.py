@@ -49,6 +49,8 @@ IN_DEGREES: Final = frozenset(
 TERMS: Final = (*STATE_NAMES, *(f"speed_{i + 1}" for i in range(N_ROTORS)))
 """The quantities that the rows of a polytope may combine."""
 LARGEST_HORIZON: Final = 1000
+USUAL_SOLVER: Final = "piqp"
+"""The QP solver of a law in Python whose table states none."""
 LEAST_THRUST, MOST_THRUST = 0.5, 0.9
 """Default bounds on a target of collective thrust: shares of the weight, and of the largest; see `TargetBounds`."""
 Range = tuple[float, float]
@@ -360,7 +362,13 @@ class Weighted(ControllerTable):
         Literal["lqr"] | None,
         doc("weight of the last predicted state: lqr: from the Riccati equation; absent: the weight of all others"),
     ] = None
-    compiled: Annotated[bool, doc("true: run the whole controller in the compiled C core instead of Python")] = False
+    compiled: Annotated[
+        bool | None,
+        doc(
+            "true: run the whole law in the compiled C core; false: in Python; absent: true for robust where C "
+            "implements it and no solver but core is stated, else false"
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
         require_states(self.output_weights, "output_weights")
@@ -395,8 +403,12 @@ class Bounded(Weighted):
         doc("absent: the controller ignores obstacles, corridors and fence; the audit does not"),
     ] = None
     solver: Annotated[
-        str, doc("QP solver used where the unconstrained optimum violates a constraint, by its name in `quadsim list`")
-    ] = field(default="piqp", metadata={"json_schema_extra": {"examples": [*ALIASES, *SOLVERS, CORE]}})
+        str | None,
+        doc(
+            "QP solver used where the unconstrained optimum violates a constraint, by its name in `quadsim list`; "
+            f"absent: {CORE} where compiled, else {USUAL_SOLVER}"
+        ),
+    ] = field(default=None, metadata={"json_schema_extra": {"examples": [*ALIASES, *SOLVERS, CORE]}})
     kkt_every: KktEvery = KKT_EVERY
 
     def __post_init__(self) -> None:
@@ -404,7 +416,10 @@ class Bounded(Weighted):
         require_states(self.output_bounds, "output_bounds")
         for name, pair in self.output_bounds.items():
             require_ordered(f"output_bounds.{name}", pair)
-        require_solver(self.solver)
+        if self.solver is not None:
+            require_solver(self.solver)
+        if self.compiled and self.solver not in (None, CORE):
+            raise ParameterError("", "solver", self.solver, f'absent, or "{CORE}", where compiled = true')
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `ControllerTable.audited`."""
@@ -445,7 +460,7 @@ class Bounded(Weighted):
         if space is not None and self.solver == CORE:
             rule = "a QP solver such as 'piqp' with controller.avoidance, whose half-spaces differ from step to step"
             raise ParameterError("controller", "solver", CORE, rule)
-        return make_solver(self.solver, problem)
+        return make_solver(self.solver or USUAL_SOLVER, problem)
 
 
 def rows_of(polytopes: Sequence[Polytope]) -> tuple[Constraint, ...]:

@@ -7,10 +7,12 @@ need one of them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from mpc.bounded import Bounded, ControllerTable, Weighted, law_of, require_lags
+from mpc.bounded import USUAL_SOLVER, Bounded, ControllerTable, Weighted, law_of, require_lags
 from mpc.constrained import Constrained
 from mpc.fallback.contract import Guard
 from mpc.model import hover_model, target_model
@@ -18,9 +20,18 @@ from mpc.nonlinear.settings import Nonlinear
 from mpc.obstacles import Shape
 from mpc.pilot import Pilot
 from mpc.robust.settings import Robust
-from quadsim.controller import ROTORS, Controller
-from quadsim.errors import InputError
+from quadsim.controller import CORE, ROTORS, Controller
+from quadsim.errors import ExportError, InputError, ParameterError
 from quadsim.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from mpc.core.law import CompiledPreparation
+    from mpc.linear import LinearMPC, Preparation
+    from mpc.obstacles import Space
+    from mpc.solvers import Solver
+
+
+AnyTable = TypeVar("AnyTable", bound=ControllerTable)
 
 
 def build(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Pilot:
@@ -32,10 +43,8 @@ def build(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Seque
         InputError: no controller can be built from these numbers.
     """
     try:
-        if isinstance(table, Weighted) and table.compiled:
-            law = _compiled(table, vehicle, period, shapes)
-        else:
-            law = law_of(table, vehicle, period, shapes)
+        preparation = _in_c(table, vehicle, period, shapes)
+        law = law_of(table, vehicle, period, shapes) if preparation is None else _compiled(table, preparation)
     except np.linalg.LinAlgError as error:
         raise InputError(
             "the controller's gain cannot be computed: its weights and the vehicle's numbers are too many orders "
@@ -59,20 +68,61 @@ def guard_of(table: ControllerTable, vehicle: Vehicle, period: float) -> Guard |
     return Guard(hover_model(vehicle, period), bounds=bounds, settings=settings)
 
 
-@law_of.register(Constrained)
-@law_of.register(Robust)
-def _linear(table: Bounded, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    from mpc.linear import LinearMPC, NominalPreparation, Preparation
+def stated(table: AnyTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> AnyTable:
+    """Return a table with the values of `compiled` and `solver` that hold where they are absent.
 
-    problem, space = table.problem(vehicle, period), table.space(shapes, vehicle, period)
-    preparation: Preparation = NominalPreparation(problem)
-    if isinstance(table, Robust):
-        from mpc.robust.controller import RobustPreparation
+    Raises:
+        InputError: no controller can be built from these numbers.
+    """
+    if not isinstance(table, Weighted):
+        return table
+    compiled = _in_c(table, vehicle, period, shapes) is not None
+    if isinstance(table, Bounded):
+        return replace(table, compiled=compiled, solver=table.solver or (CORE if compiled else USUAL_SOLVER))
+    return replace(table, compiled=compiled)
 
-        preparation = RobustPreparation(vehicle, problem, table)
+
+def _in_c(
+    table: ControllerTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape]
+) -> CompiledPreparation | None:
+    """Return the preparation in C of a law that C flies; None of one that flies in Python.
+
+    The field `compiled` decides.  Where it is absent, C flies `robust` with the solver `core`, or none stated, if C
+    implements it.
+
+    Raises:
+        ExportError: C does not implement a law with `compiled = true`.
+    """
+    if not isinstance(table, Weighted) or table.compiled is False:
+        return None
+    if table.compiled is None and not (isinstance(table, Robust) and table.solver in (None, CORE)):
+        return None
+    from mpc.core.law import CompiledPreparation
+    from mpc.core.numbers import exportable
+
+    try:
+        return CompiledPreparation(exportable(table, vehicle, period, shapes))
+    except (ExportError, ParameterError):
+        if table.compiled is None:
+            return None
+        raise
+
+
+def _compiled(table: ControllerTable, preparation: CompiledPreparation) -> Controller:
+    """Return the law in C."""
+    from mpc.core.law import CompiledGain, CompiledSolver
+
+    if not isinstance(table, Bounded):
+        return CompiledGain(preparation)
+    return _linear(table, preparation, CompiledSolver(preparation))
+
+
+def _linear(table: Bounded, preparation: Preparation, solver: Solver, space: Space | None = None) -> LinearMPC:
+    from mpc.linear import LinearMPC
+
     return LinearMPC(
         preparation,
-        table.make_solver(problem, space),
+        solver,
         name=table.type,
         holds=isinstance(table, Constrained),
         space=space,
@@ -80,16 +130,18 @@ def _linear(table: Bounded, vehicle: Vehicle, period: float, shapes: Sequence[Sh
     )
 
 
-def _compiled(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    """Return the law in C.
+@law_of.register(Constrained)
+@law_of.register(Robust)
+def _in_python(table: Bounded, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+    from mpc.linear import NominalPreparation
 
-    Raises:
-        ExportError: C does not implement this law.
-    """
-    from mpc.core.law import CompiledMPC
-    from mpc.core.numbers import exportable
+    problem, space = table.problem(vehicle, period), table.space(shapes, vehicle, period)
+    preparation: Preparation = NominalPreparation(problem)
+    if isinstance(table, Robust):
+        from mpc.robust.controller import RobustPreparation
 
-    return CompiledMPC(exportable(table, vehicle, period, shapes))
+        preparation = RobustPreparation(vehicle, problem, table)
+    return _linear(table, preparation, table.make_solver(problem, space), space)
 
 
 @law_of.register(Nonlinear)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,6 +17,19 @@ from mpc.solvers import INVALID_DATA, Answer, Solver
 from quadsim.controller import GROUNDED, Command, StepInputs, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import INDEX, Array, ReferenceTurns
+
+
+class Remembered(NamedTuple):
+    """What a preparation remembers of its vehicle, for another one to take over in flight."""
+
+    delay: float  # [s] from t_k to the instant of x(k)
+    rotors: Array  # (4,) speeds when the next command takes over [rad/s]
+    turning: Array  # (4,) and when the last one sent does
+    sent: tuple[Array, ...]  # the last commands sent (4,), oldest first [rad/s]
+    ahead: Array | None  # (12,) state there; None if it is not known
+    called_at: float  # [s] time of the last call
+    measured: float  # [s] and of the last measured state
+    estimate: Array | None  # (6,) of `mpc.observer.DisturbanceObserver`; None without one
 
 
 class Preparation(Protocol):
@@ -51,8 +64,13 @@ class Preparation(Protocol):
         """Restart after the command u(-1) (4,) [rad/s]."""
         ...
 
-    def adopt(self, previous: Preparation | None, disturbance: Array | None) -> None:
-        """Take over what the previous law has learnt: its preparation, if any, and its `disturbance`."""
+    @property
+    def memory(self) -> Remembered | None:
+        """What another preparation may take over; None for nothing."""
+        ...
+
+    def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
+        """Take over what the previous law has learnt: its preparation's memory, if any, and its `disturbance`."""
         ...
 
     def stand(self, now: StepInputs, acting: Array) -> None:
@@ -79,7 +97,7 @@ class NominalPreparation:
     """The paper's query: the measured state, and the reference on the turn of its yaw, about hover."""
 
     delay = yaw = 0.0
-    trim = disturbance = None
+    trim = disturbance = memory = None
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self._turns = problem, ReferenceTurns()
@@ -88,7 +106,7 @@ class NominalPreparation:
         """Forget the turn of the heading, its only state."""
         self._turns.reset()
 
-    def adopt(self, previous: Preparation | None, disturbance: Array | None) -> None:
+    def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
         """Take over nothing: there is no estimate."""
 
     def stand(self, now: StepInputs, acting: Array) -> None:
@@ -168,7 +186,7 @@ class LinearMPC:
         law = previous if isinstance(previous, LinearMPC) else None
         if law is not None and law._plan is not None and self._holds:
             self._plan, self._held = resized(law._plan, self.horizon), law._held
-        self.preparation.adopt(None if law is None else law.preparation, disturbance_of(previous))
+        self.preparation.adopt(None if law is None else law.preparation.memory, disturbance_of(previous))
 
     @property
     def trim(self) -> Trim | None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from mpc.baselines.geometric import Geometric
 from mpc.bounded import Bounded, Weighted
-from mpc.builders import build
+from mpc.builders import build, stated
 from mpc.flatness import motion_along
 from mpc.nonlinear.settings import Nonlinear
 from mpc.pilot import Pilot
@@ -64,7 +64,7 @@ from scenarios.courses.followed import FollowedCourse
 from scenarios.courses.steps import Steps, switches
 from scenarios.limits import audit_notes, flyable, signal_limits, space_limits, sum_limits, with_law_bounds
 from scenarios.plugin import import_plugin, make_force, reason_of
-from scenarios.schema.events import Event, SensorFaultEvent, SetpointEvent
+from scenarios.schema.events import ControllerEvent, Event, SensorFaultEvent, SetpointEvent
 from scenarios.schema.problems import parse_table
 from scenarios.schema.writing import plain
 
@@ -126,7 +126,8 @@ class Assembly:
     @property
     def resolved(self) -> Assembly:
         """The assembly of the scenario with all numbers of its vehicle: its file alone then defines the flight."""
-        return self.of(self.with_vehicle.altered(effects=self.effects))
+        controller, events = self._stated_laws()
+        return self.of(self.with_vehicle.altered(effects=self.effects, controller=controller, events=events))
 
     @property
     def with_vehicle(self) -> Scenario:
@@ -325,6 +326,30 @@ class Assembly:
             spec = replace(spec, inner_lag=self.inner_lag)
         shapes = (*self.scenario.obstacles, *self.regions)
         return self.with_autopilot(build(spec, self.vehicle, self.scenario.control_period, shapes))
+
+    def _stated_laws(self) -> tuple[AnyController, tuple[Event, ...]]:
+        """Return controller and events with `compiled` and `solver` of each law stated, to fly as without."""
+        controller = law = self._stated_law(self.scenario.controller)
+        changed: dict[int, Event] = {}
+        events = [event for event in self.scenario.events if isinstance(event, ControllerEvent)]
+        ordered = sorted(events, key=attrgetter("at"))
+        for event, (_, spec) in zip(ordered, self.scenario.controller_changes, strict=True):
+            before, law = law, self._stated_law(spec)
+            if "type" in event.fields:  # a whole table, which states itself as the first does
+                continue
+            differing = {
+                name: getattr(law, name)
+                for name in ("compiled", "solver")
+                if name not in event.fields and getattr(law, name, None) != getattr(before, name, None)
+            }
+            if differing:
+                changed[id(event)] = replace(event, fields=event.fields | differing)
+        return controller, tuple(changed.get(id(event), event) for event in self.scenario.events)
+
+    def _stated_law(self, spec: AnyController) -> AnyController:
+        """See `mpc.builders.stated`."""
+        shapes = (*self.scenario.obstacles, *self.regions)
+        return stated(spec, self.vehicle, self.scenario.control_period, shapes)
 
     def with_autopilot(self, pilot: Pilot) -> Pilot:
         """Return a pilot with the autopilot that flies its law's commands; itself where these are rotor speeds."""
@@ -611,9 +636,9 @@ def stated_autopilot(path: Path, stated: AutopilotSettings | None = None) -> Aut
 
 
 def preferring_core(scenario: Scenario) -> Scenario:
-    """Replace `piqp`, the default, by the core if that takes the problem: where the time of a step matters."""
+    """State the core as solver where none is stated and it takes the problem: where the time of a step matters."""
     controller = scenario.controller
-    if not isinstance(controller, Bounded) or controller.solver != "piqp":
+    if not isinstance(controller, Bounded) or controller.solver is not None:
         return scenario
     preferred = scenario.replace({"controller.solver": CORE})
     try:

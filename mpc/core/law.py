@@ -1,30 +1,32 @@
-"""The whole law in C: the library's controllers instead of Python's step."""
+"""The whole law in C: predictor, observer and QP in one call per period, instead of Python's preparation and solver."""
 
 from __future__ import annotations
 
 import ctypes
 import math
 import time as clock
+from dataclasses import replace
 from functools import cache, lru_cache
 from typing import Final, NoReturn
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds
+from mpc.condensing import Condensed
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
-from mpc.core.solver import PROBLEMS, Key, Work, core_library, core_problem
+from mpc.core.solver import PROBLEMS, Key, Optimum, Work, core_library, core_problem
+from mpc.core.tables import with_constraints
 from mpc.equilibrium import Trim
 from mpc.heading import predict_in_heading_frame
+from mpc.linear import Remembered
 from mpc.model import hover_model
 from mpc.nonlinear.model import SUBSTEPS
+from mpc.ocp import Equilibrium, Query
 from mpc.paper import rollout
 from mpc.robust.settings import LONGEST_SPAN
+from mpc.solvers import Answer
 from quadsim.controller import (
-    CORE,
-    FALLBACK,
     GAIN,
     GROUNDED,
-    SOLVED,
     UNCONSTRAINED,
     Command,
     Phase,
@@ -36,12 +38,8 @@ from quadsim.core.library import check_sizes
 from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS
 
-STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before")
-"""Log entries for the values of `enum quadsim_status`."""
-ANSWERERS: Final = (GAIN, CORE, CORE, FALLBACK, FALLBACK, FALLBACK)
-"""The matching `answered_by`."""
-LEVELS: Final = (0, 0, 0, 1, 2, 3)
-"""The matching fallback level."""
+NOT_FINITE: Final = 5
+"""The `quadsim_status` of a query with numbers that are not finite, or implausible."""
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _SAME_TIME: Final = 1e-6  # [s]
 _INT, _REAL, _AT = ctypes.c_int, ctypes.c_double, ctypes.c_void_p
@@ -72,7 +70,8 @@ class _Controller(ctypes.Structure):
 class _MPC(ctypes.Structure):
     _fields_ = [
         *(("controller", _AT), ("work", Work), ("wanted", _AT), ("sent", _AT)),
-        *(*_arrays(before=4), ("age", _INT), ("headed", _INT), ("heading", _REAL), ("known", _INT)),
+        *_arrays(state=16, rest=16, resting=4, before=4),
+        *(("age", _INT), ("headed", _INT), ("heading", _REAL), ("known", _INT)),
         *_arrays(rotors=4, ahead=12, turning=4, estimate=6),
         *_arrays(trim=4, lift=3, twist=3, effectiveness=16),
     ]
@@ -85,7 +84,9 @@ def _library() -> ctypes.CDLL:
     library.quadsim_mpc_reals.restype, library.quadsim_mpc_reals.argtypes = ctypes.c_long, [_AT]
     library.quadsim_mpc_start.restype, library.quadsim_mpc_start.argtypes = None, [_AT] * 3
     library.quadsim_mpc_reset.restype, library.quadsim_mpc_reset.argtypes = None, [_AT] * 2
-    library.quadsim_mpc_step.argtypes = [_AT] * 5
+    library.quadsim_mpc_stand.restype, library.quadsim_mpc_stand.argtypes = None, [_AT] * 2
+    library.quadsim_mpc_learn.restype, library.quadsim_mpc_learn.argtypes = None, [_AT] * 2
+    library.quadsim_mpc_solve.argtypes = [_AT] * 4
     return library
 
 
@@ -94,14 +95,13 @@ class _Shared:
 
     def __init__(self, law: Exportable) -> None:
         self.nominal = hover_model(law.vehicle, law.problem.model.period)
-        self.bounds = ActuatorBounds.of_problem(law.problem) if law.problem.every_constraint else None
         self.problem = core_problem(law.problem)
         numbers, robust = controller_numbers(law), None
         self._C_r = np.ascontiguousarray(numbers.pop("C_r"))
         if law.settings is not None:
             members = robust_numbers(law, self.problem.tables.modes)
             robust = _Robust(**{name: _plain(value) for name, value in members.items()})
-        self._robust = robust
+        self.robust = robust
         self.struct = _Controller(
             problem=ctypes.addressof(self.problem.struct),
             robust=None if robust is None else ctypes.addressof(robust),
@@ -119,117 +119,142 @@ def _plain(value: float | Array) -> float | tuple[float, ...]:
     return tuple(value.ravel().tolist()) if isinstance(value, np.ndarray) else value
 
 
-class CompiledMPC:
-    """A law run by the library; it falls back as the C does on a target.
+class CompiledPreparation:
+    """The preparation of a law in C, which solves each query as it makes it; see `mpc.linear.Preparation`.
+
+    `yaw` is not known here; only obstacles, which C does not have, would need it.
+
+    Attributes:
+        problem: the optimal control problem; one without constraints gets one that bounds nothing.
+        delay: from t_k to the instant of x(k) [s].
 
     Raises:
         FileError: the library cannot be compiled or loaded.
         ParameterError: the core cannot take the problem.
     """
 
-    solver: Final = "compiled"
-    """Stands for a solver's name."""
+    yaw: Final = 0.0
 
     def __init__(self, law: Exportable) -> None:
-        library, shared = _library(), _shared(Key.to(law))
-        self.name, self.problem, self.horizon = law.name, law.problem, law.problem.horizon
-        self._shared, self._robust = shared, law.settings is not None
-        self._unbounded = shared.bounds is None  # this law is the gain: no status reports a free optimum
+        self._library, shared = _library(), _shared(Key.to(law))
+        self._shared, self._robust, self.problem = shared, shared.robust, with_constraints(law.problem)
+        self.delay = 0.0 if law.settings is None else law.settings.delay
         controller = ctypes.addressof(shared.struct)
         # The struct and its views point into this memory.
-        self._memory, self._mpc = np.zeros(library.quadsim_mpc_reals(controller)), _MPC()
-        at = ctypes.addressof(self._mpc)
-        library.quadsim_mpc_start(at, controller, self._memory.ctypes.data)
-        work, N, rows = self._mpc.work, self.horizon, self.horizon * shared.problem.struct.step_rows
-        self._plan = _view(work.plan, N * N_ROTORS).reshape(N, N_ROTORS)
-        self._value, self._shift = (_view(start, rows) for start in (work.value, work.shift))
-        self._side = np.ctypeslib.as_array((ctypes.c_int8 * rows).from_address(work.last))
-        self._trim, self._lift, self._twist = map(
-            np.ctypeslib.as_array, (self._mpc.trim, self._mpc.lift, self._mpc.twist)
-        )
-        tables = shared.problem.tables
-        self._soft = any(math.isfinite(row.l1) for row in tables.rows)
-        self._lower, self._upper = (
-            np.broadcast_to(bound, (N, bound.shape[1])).ravel() for bound in (tables.lower, tables.upper)
-        )
-        self._state, self._path, self._acting, self._command = (
-            np.zeros(shape) for shape in (N_STATES, (N, 4), N_ROTORS, N_ROTORS)
-        )
-        arrays = self._state, self._path, self._acting, self._command
-        self._arguments = at, *(array.ctypes.data for array in arrays)
-        self._step, self._restart = library.quadsim_mpc_step, library.quadsim_mpc_reset
+        self._memory, self._mpc = np.zeros(self._library.quadsim_mpc_reals(controller)), _MPC()
+        mpc, N, n = self._mpc, law.problem.horizon, law.problem.model.n
+        self._at = ctypes.addressof(mpc)
+        self._library.quadsim_mpc_start(self._at, controller, self._memory.ctypes.data)
+        self.optimum = Optimum(self.problem, shared.problem, mpc.work)
+        parts = (mpc.resting, mpc.turning, mpc.rotors, mpc.ahead, mpc.estimate, mpc.trim, mpc.lift, mpc.twist)
+        self._u_s, self._turning, self._rotors, self._ahead, self._estimate, *trim = map(np.ctypeslib.as_array, parts)
+        self._trim, self._lift, self._twist = trim
+        self._x, self._x_s = (np.ctypeslib.as_array(part)[:n] for part in (mpc.state, mpc.rest))
+        self._wanted = _view(mpc.wanted, N * len(self.problem.objective.C_r)).reshape(N, -1)
+        whole = 0 if self._robust is None else self._robust.under_way
+        self._sent = _view(mpc.sent, whole * N_ROTORS).reshape(whole, N_ROTORS)
+        self._state, self._path, self._acting = (np.zeros(shape) for shape in (N_STATES, (N, 4), N_ROTORS))
+        self._arguments = self._at, *(array.ctypes.data for array in (self._state, self._path, self._acting))
+        self.found, self.started = NOT_FINITE, 0.0
         self.reset(shared.nominal.u_bar)
 
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
-        raise TypeError("a CompiledMPC cannot be copied or pickled: make another")
-
-    def reset(self, speeds: Array) -> None:
-        """See `quadsim.controller.Controller.reset`."""
-        self._before = np.array(speeds, float)
-        self._restart(self._arguments[0], self._before.ctypes.data)
-        self._called_at = self._measured = -math.inf
+        raise TypeError("a law in C cannot be copied or pickled: make another")
 
     @property
-    def trim(self) -> Trim:
-        """The equilibrium under the estimated disturbance."""
-        if self._robust:
-            return Trim(speeds=self._trim.copy(), lift=self._lift.copy(), twist=self._twist.copy())
-        return Trim(speeds=self._shared.nominal.u_bar, lift=np.array([0.0, 0.0, 1.0]))
+    def condensed(self) -> Condensed:
+        """The QP to which the KKT residuals of an optimum refer."""
+        return self._shared.problem.condensed
 
-    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """See `quadsim.controller.Controller.step`."""
-        acting = self._before if now.acting is None else now.acting
-        if now.phase in GROUNDED:
-            return self._stop(acting, now.phase)
-        self._state[:], self._acting[:], self._path[:] = state, acting, reference
-        if self._robust and not self._may_learn(now):
+    def reset(self, speeds: Array) -> None:
+        """Restart after the command u(-1) (4,) [rad/s]."""
+        self._acting[:] = speeds
+        self._library.quadsim_mpc_reset(self._at, self._acting.ctypes.data)
+        self._called_at = self._measured = -math.inf
+        self._made: Trim | None = None  # of the estimate now, if it has been asked for
+
+    def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
+        """See `mpc.linear.Preparation`."""
+        if self._robust is None:
+            return
+        if memory is not None:
+            self._rotors[:], self._turning[:] = memory.rotors, memory.turning
+            for row, sent in zip(self._sent[::-1], memory.sent[::-1], strict=False):
+                row[:] = sent
+            self._called_at, self._measured = memory.called_at, memory.measured
+            if memory.ahead is not None and memory.delay == self.delay:
+                self._ahead[:], self._mpc.known = memory.ahead, 1
+            disturbance = disturbance if memory.estimate is None else memory.estimate
+        if disturbance is not None:
+            estimate = np.array(disturbance, float)
+            self._library.quadsim_mpc_learn(self._at, estimate.ctypes.data)
+            self._made = None
+
+    @property
+    def memory(self) -> Remembered | None:
+        """See `mpc.linear.Preparation`."""
+        if self._robust is None:
+            return None
+        return Remembered(
+            delay=self.delay,
+            rotors=self._rotors.copy(),
+            turning=self._turning.copy(),
+            sent=tuple(self._sent.copy()),
+            ahead=self._ahead.copy() if self._mpc.known else None,
+            called_at=self._called_at,
+            measured=self._measured,
+            estimate=self._estimate.copy() if self._robust.observes else None,
+        )
+
+    @property
+    def trim(self) -> Trim | None:
+        """See `mpc.linear.Preparation`."""
+        if self._robust is None:
+            return None
+        if self._made is None:
+            self._made = Trim(speeds=self._trim.copy(), lift=self._lift.copy(), twist=self._twist.copy())
+        return self._made
+
+    @property
+    def disturbance(self) -> Array | None:
+        """See `mpc.linear.Preparation`."""
+        if self._robust is None:
+            return None
+        x, y, up = self._lift.tolist()
+        return np.array([-x, -y, self._robust.gravity - up, *(math.hypot(x, y, up) * self._twist)])
+
+    def stand(self, now: StepInputs, acting: Array) -> None:
+        """See `mpc.linear.Preparation`."""
+        self._acting[:], self._called_at, self._made = acting, now.time, None
+        self._library.quadsim_mpc_stand(self._at, self._acting.ctypes.data)
+
+    def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query | None:
+        """See `mpc.linear.Preparation`."""
+        self._state[:], self._path[:], self._acting[:] = state, reference, acting
+        if self._robust is not None and not self._may_learn(now):
             self._mpc.known = 0
-        started = clock.perf_counter()
-        status = self._step(*self._arguments)
-        spent_s = clock.perf_counter() - started
-        self._before = self._command.copy()
+        self._made, self.started = None, clock.perf_counter()
+        self.found = self._library.quadsim_mpc_solve(*self._arguments)
         if now.phase is not Phase.FLYING:  # the ground holds the vehicle, so its motion shows no disturbance
             self._mpc.known = 0
-        accepted = LEVELS[status] == 0
-        plan = self._plan.copy() if accepted else np.empty_like(self._plan)
-        plan[0 if accepted else slice(None)] = self._before
-        active = int(np.count_nonzero(self._side)) if accepted else 0
-        return Command(
-            speeds=self._before.copy(),
-            plan=plan,
-            status=UNCONSTRAINED if self._unbounded else STATUSES[status],
-            answered_by=GAIN if self._unbounded else ANSWERERS[status],
-            fallback=LEVELS[status],
-            stats=Statistics(
-                iterations=self._mpc.work.changes,
-                active=active,
-                slack=self._most_slack() if active and self._soft else 0.0,
-                solve_s=spent_s,
-            ),
-        )
+        objective = self.problem.objective
+        if self.found == NOT_FINITE:
+            return None if self._robust is not None else Query(state, objective.desired(reference), acting)
+        x, x_s, u_s = self._x.copy(), self._x_s.copy(), self._u_s.copy()
+        if x.size > N_STATES:  # C has the modes of rotor speeds here
+            x[N_STATES:], x_s[N_STATES:] = self._turning, u_s
+        return Query(x, self._wanted + objective.C_r @ x_s, acting, Equilibrium(x_s, u_s))
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
-        if self._robust:
-            return predict_in_heading_frame(self._shared.nominal, states, plans, self.trim)
+        if (trim := self.trim) is not None:
+            return predict_in_heading_frame(self._shared.nominal, states, plans, replace(trim, speeds=self._u_s.copy()))
         return rollout(self.problem.model, states, plans)
-
-    def _most_slack(self) -> float:
-        """Return the largest violation of a soft bound by the optimum."""
-        beyond = np.flatnonzero(np.abs(self._side) == 2)
-        values = self._value[beyond] + self._shift[beyond]
-        return float(np.maximum(values - self._upper[beyond], self._lower[beyond] - values).max(initial=0.0))
-
-    def _stop(self, acting: Array, phase: Phase) -> Command:
-        bounds = self._shared.bounds
-        speeds = np.zeros(N_ROTORS) if bounds is None else bounds.reach(acting)[0]
-        self.reset(speeds)
-        return stopped(speeds.copy(), self.horizon, phase)
 
     def _may_learn(self, now: StepInputs) -> bool:
         """Return whether the observer may compare the state with its prediction, as `RobustPreparation` does."""
-        if abs(now.time - self._called_at - self._shared.nominal.period) > _SAME_TIME:
+        if abs(now.time - self._called_at - self.problem.model.period) > _SAME_TIME:
             self._measured = -math.inf
         self._called_at = now.time
         if now.unseen is not None and now.unseen[_MOVING].any():
@@ -238,5 +263,62 @@ class CompiledMPC:
         return span - _SAME_TIME <= LONGEST_SPAN and now.phase is Phase.FLYING
 
 
+class CompiledSolver:
+    """Reads the answer to the query that a preparation in C made last; see `mpc.solvers.Solver`."""
+
+    name: Final = "compiled"
+
+    def __init__(self, preparation: CompiledPreparation) -> None:
+        self._preparation = preparation
+
+    @property
+    def formulation(self) -> Condensed:
+        """See `mpc.solvers.Solver`."""
+        return self._preparation.condensed
+
+    def reset(self) -> None:
+        """See `mpc.solvers.Solver`."""
+        self._preparation.optimum.reset()
+
+    def solve(self, query: Query) -> Answer:
+        """See `mpc.solvers.Solver`; the query is the last one prepared."""
+        preparation = self._preparation
+        return preparation.optimum.answer(preparation.found, query, preparation.started)
+
+
+class CompiledGain:
+    """The paper's unconstrained law in C, as `mpc.unconstrained.UnconstrainedMPC` without constant gains."""
+
+    name: Final = "unconstrained"
+    solver: Final = CompiledSolver.name
+
+    def __init__(self, preparation: CompiledPreparation) -> None:
+        self._preparation, self._solver = preparation, CompiledSolver(preparation)
+        self.problem, self.horizon = preparation.problem, preparation.problem.horizon
+
+    def reset(self, speeds: Array) -> None:
+        """See `quadsim.controller.Controller.reset`."""
+        self._preparation.reset(speeds)
+
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
+        """The optimum, rotors off while landed; see `quadsim.controller.Controller.step`."""
+        if now.phase in GROUNDED:
+            return stopped(np.zeros(N_ROTORS), self.horizon, now.phase)
+        query = self._preparation.prepare(now, state, reference, self.problem.model.u_bar)
+        assert query is not None
+        plan, spent_s = np.full((self.horizon, N_ROTORS), math.nan), 0.0  # of numbers that are not finite
+        if self._preparation.found != NOT_FINITE:
+            answer = self._solver.solve(query)
+            plan, spent_s = answer.plan, answer.stats.solve_s
+        stats = Statistics(solve_s=spent_s)
+        return Command(speeds=plan[0].copy(), plan=plan, status=UNCONSTRAINED, answered_by=GAIN, stats=stats)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return self._preparation.predict(states, plans)
+
+
 def _view(address: int, count: int) -> Array:
+    if not count:
+        return np.empty(0)
     return np.ctypeslib.as_array((_REAL * count).from_address(address))

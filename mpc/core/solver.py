@@ -154,71 +154,38 @@ def _core_problem(key: Key[Problem]) -> CoreProblem:
     return CoreProblem(key.of)
 
 
-class Core:
-    """Computes a problem's optimum with the compiled core; see `mpc.solvers.Solver`.
+class Optimum:
+    """Reads the answers in a `quadsim_work`; PIQP gives those that the core gives up or finds infeasible.
 
-    The search starts from the last optimum's active set, shifted by one step.  PIQP answers the problems that the core
-    gives up or finds infeasible, and `answered_by` names it.
-
-    Raises:
-        FileError: the library cannot be compiled or loaded.
-        ParameterError: the core cannot take the problem.
+    The work and its views point into memory that the caller keeps.
     """
 
-    name: Final = CORE
-
-    def __init__(self, problem: Problem) -> None:
-        self._library, self._shared = core_library(), core_problem(problem)
-        self.formulation = self._shared.condensed
-        self._problem, self._equilibrium, self._C_r = problem, problem.equilibrium, problem.objective.C_r
-        self._modes = self._shared.tables.modes if problem.model.n > N_STATES else None
+    def __init__(self, problem: Problem, shared: CoreProblem, work: Work) -> None:
+        self._problem, self._shared, self._work = problem, shared, work
         self._piqp: QPSolver | None = None
-        p, rows = self._shared.struct, problem.rows
+        rows = problem.rows
         self._upper, self._lower, self._soft = rows.upper, rows.lower, rows.soft
         self._no_slacks, self._no_multipliers = (
             read_only(np.zeros((problem.horizon, count))) for count in (rows.soft.size, len(rows.D))
         )
-        # The work struct and its views point into this memory.
-        self._memory = np.zeros(self._library.quadsim_work_reals(ctypes.addressof(p)))
-        self._work = Work()
-        self._at = ctypes.addressof(self._work)
-        self._library.quadsim_work_start(self._at, ctypes.addressof(p), self._memory.ctypes.data)
-        self._plan = self._view(self._work.plan, _REAL, N_ROTORS)
+        step_rows = shared.struct.step_rows
+        self._plan = self._view(work.plan, _REAL, N_ROTORS)
         self._multiplier, self._value, self._shift = (
-            self._view(at, _REAL, p.step_rows) for at in (self._work.multiplier, self._work.value, self._work.shift)
+            self._view(at, _REAL, step_rows) for at in (work.multiplier, work.value, work.shift)
         )
-        self._side = self._view(self._work.last, ctypes.c_int8, p.step_rows)
-        sizes = p.states, p.horizon * p.regulated, p.states, N_ROTORS, N_ROTORS
-        self._query = np.zeros(sum(sizes))
-        parts = np.split(self._query, np.cumsum(sizes[:-1]))
-        self._state, desired, self._x_s, self._u_s, self._before = parts
-        self._desired = desired.reshape(p.horizon, -1)
-        self._arguments = self._at, *(part.ctypes.data for part in parts)
+        self._side = self._view(work.last, ctypes.c_int8, step_rows)
 
     def _view(self, address: int, kind: type[ctypes.c_double | ctypes.c_int8], columns: int) -> Array:
         shape = self._problem.horizon, columns
         return np.ctypeslib.as_array((kind * math.prod(shape)).from_address(address)).reshape(shape)
 
-    def __reduce__(self) -> NoReturn:
-        """Refuse: addresses are useless in a copy or another process."""
-        raise TypeError("a Core cannot be copied or pickled: make another from its problem")
-
     def reset(self) -> None:
-        """See `mpc.solvers.Solver.reset`."""
-        self._library.quadsim_work_reset(self._at)
+        """Clear the last answer of PIQP."""
         if self._piqp is not None:
             self._piqp.reset()
 
-    def solve(self, query: Query) -> Answer:
-        """See `mpc.solvers.Solver.solve`."""
-        started, (state, desired, u_before, rest, _) = clock.perf_counter(), query
-        x_s, u_s = self._equilibrium if rest is None else rest
-        self._state[:], self._x_s[:], self._u_s[:], self._before[:] = state, x_s, u_s, u_before
-        np.subtract(desired, 0.0 if rest is None else self._C_r @ x_s, out=self._desired)
-        if self._modes is not None:
-            for speeds in (self._state[N_STATES:], self._x_s[N_STATES:]):
-                speeds[:] = self._modes @ speeds
-        found = self._library.quadsim_optimise(*self._arguments) if math.isfinite(self._query.sum()) else len(Method)
+    def answer(self, found: int, query: Query, started: float) -> Answer:
+        """Return the answer to a query that the core `found` so, or PIQP's; `started` on the performance counter."""
         if found >= len(Method):
             return self._by_piqp(query, started)
         method = Method(found)
@@ -241,7 +208,8 @@ class Core:
 
     def _certificate(self, query: Query, plan: Array, slacks: Array, multipliers: Array) -> tuple[QP, Solution]:
         """Return the condensed QP of a query, and a plan as its solution."""
-        return self.formulation.assemble(query).qp, self.formulation.solution(plan, slacks, multipliers)
+        form = self._shared.condensed
+        return form.assemble(query).qp, form.solution(plan, slacks, multipliers)
 
     def _by_piqp(self, query: Query, started: float) -> Answer:
         if self._piqp is None:
@@ -249,3 +217,57 @@ class Core:
         spent_s = clock.perf_counter() - started
         answer = self._piqp.solve(query)
         return answer._replace(stats=answer.stats._replace(solve_s=spent_s + answer.stats.solve_s))
+
+
+class Core:
+    """Computes a problem's optimum with the compiled core; see `mpc.solvers.Solver`.
+
+    The search starts from the last optimum's active set, shifted by one step.  PIQP answers the problems that the core
+    gives up or finds infeasible, and `answered_by` names it.
+
+    Raises:
+        FileError: the library cannot be compiled or loaded.
+        ParameterError: the core cannot take the problem.
+    """
+
+    name: Final = CORE
+
+    def __init__(self, problem: Problem) -> None:
+        self._library, self._shared = core_library(), core_problem(problem)
+        self.formulation = self._shared.condensed
+        self._equilibrium, self._C_r = problem.equilibrium, problem.objective.C_r
+        self._modes = self._shared.tables.modes if problem.model.n > N_STATES else None
+        p = self._shared.struct
+        # The work struct and its views point into this memory.
+        self._memory = np.zeros(self._library.quadsim_work_reals(ctypes.addressof(p)))
+        self._work = Work()
+        self._at = ctypes.addressof(self._work)
+        self._library.quadsim_work_start(self._at, ctypes.addressof(p), self._memory.ctypes.data)
+        self._optimum = Optimum(problem, self._shared, self._work)
+        sizes = p.states, p.horizon * p.regulated, p.states, N_ROTORS, N_ROTORS
+        self._query = np.zeros(sum(sizes))
+        parts = np.split(self._query, np.cumsum(sizes[:-1]))
+        self._state, desired, self._x_s, self._u_s, self._before = parts
+        self._desired = desired.reshape(p.horizon, -1)
+        self._arguments = self._at, *(part.ctypes.data for part in parts)
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse: addresses are useless in a copy or another process."""
+        raise TypeError("a Core cannot be copied or pickled: make another from its problem")
+
+    def reset(self) -> None:
+        """See `mpc.solvers.Solver.reset`."""
+        self._library.quadsim_work_reset(self._at)
+        self._optimum.reset()
+
+    def solve(self, query: Query) -> Answer:
+        """See `mpc.solvers.Solver.solve`."""
+        started, (state, desired, u_before, rest, _) = clock.perf_counter(), query
+        x_s, u_s = self._equilibrium if rest is None else rest
+        self._state[:], self._x_s[:], self._u_s[:], self._before[:] = state, x_s, u_s, u_before
+        np.subtract(desired, 0.0 if rest is None else self._C_r @ x_s, out=self._desired)
+        if self._modes is not None:
+            for speeds in (self._state[N_STATES:], self._x_s[N_STATES:]):
+                speeds[:] = self._modes @ speeds
+        found = self._library.quadsim_optimise(*self._arguments) if math.isfinite(self._query.sum()) else len(Method)
+        return self._optimum.answer(found, query, started)

@@ -24,7 +24,7 @@ from mpc.bounded import resolved_lag
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE
 from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, with_limited_yaw
-from mpc.linear import Preparation
+from mpc.linear import Remembered
 from mpc.model import hover_model
 from mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
 from mpc.observer import DisturbanceObserver, thrust_axis
@@ -74,16 +74,30 @@ class RobustPreparation:
         self._turns.reset()
         self._forget()
 
-    def adopt(self, previous: Preparation | None, disturbance: Array | None) -> None:
+    @property
+    def memory(self) -> Remembered:
+        """See `mpc.linear.Preparation`."""
+        return Remembered(
+            delay=self.delay,
+            rotors=self._rotors.copy(),
+            turning=self._turning.copy(),
+            sent=tuple(self._sent),
+            ahead=self._ahead,
+            called_at=self._called_at,
+            measured=self._measured,
+            estimate=None if self._observer is None else self._observer.estimate,
+        )
+
+    def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
         """Take over the rotor speeds, the commands under way and the disturbance of the previous law."""
-        if isinstance(previous, RobustPreparation):
-            self._rotors, self._turning = previous._rotors.copy(), previous._turning.copy()
-            self._sent.extend(previous._sent)
-            self._called_at, self._measured = previous._called_at, previous._measured
-            if self.delay == previous.delay:
-                self._ahead = previous._ahead
-            if previous._observer is not None:
-                disturbance = previous._observer.estimate
+        if memory is not None:
+            self._rotors, self._turning = memory.rotors, memory.turning
+            self._sent.extend(memory.sent)
+            self._called_at, self._measured = memory.called_at, memory.measured
+            if self.delay == memory.delay:
+                self._ahead = memory.ahead
+            if memory.estimate is not None:
+                disturbance = memory.estimate
         if self._observer is not None and disturbance is not None:
             self._observer.adopt(disturbance)
             self._update_trim()

@@ -26,9 +26,19 @@ import numpy as np
 from mpc.answer import ActuatorBounds
 from mpc.codegen.ctext import Precision
 from mpc.codegen.targets import EMULATOR, TARGETS, Machine
-from mpc.core.law import ANSWERERS, LEVELS, STATUSES
 from mpc.ocp import Problem
-from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Phase, StepInputs, stopped
+from quadsim.controller import (
+    CORE,
+    FALLBACK,
+    GAIN,
+    GROUNDED,
+    SOLVED,
+    UNCONSTRAINED,
+    Command,
+    Phase,
+    StepInputs,
+    stopped,
+)
 from quadsim.errors import FlightError, MissingProgramError, QuadsimError
 from quadsim.flight.audit import COMMAND_SIGNALS, Limit
 from quadsim.outputs import reserving
@@ -42,6 +52,12 @@ from scenarios.progress import Progress, reporting
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
+STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before")
+"""Log entries for the values of `enum quadsim_status`."""
+ANSWERERS: Final = (GAIN, CORE, CORE, FALLBACK, FALLBACK, FALLBACK)
+"""The matching `answered_by`."""
+LEVELS: Final = (0, 0, 0, 1, 2, 3)
+"""The matching fallback level."""
 CROSS_PACKAGES: Final = "make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 HOST_PACKAGES: Final = "make gcc libc6-dev"
 LONGEST_ANSWER: Final = 120.0

@@ -5,7 +5,6 @@
 
 #include "quadsim_math.h"
 
-enum { MOST_STATES = 16 }; /* of a problem: 12, and 4 rotor speeds where these lag */
 enum { X = 0, VX = 1, Y = 2, VY = 3, Z = 4, VZ = 5, ROLL = 6, PITCH = 8, YAW = 10 };
 
 /* ---- what is answered -------------------------------------------------------------------------------------------- */
@@ -97,18 +96,17 @@ static real next_turns(const real *reference, int i, real turns)
 /* Level rest at a state's place and yaw. */
 static void rest_at(const real *state, real *rest)
 {
-    memset(rest, 0, MOST_STATES * sizeof(real));
+    memset(rest, 0, QUADSIM_LAW_STATES * sizeof(real));
     rest[X] = state[X];
     rest[Y] = state[Y];
     rest[Z] = state[Z];
     rest[YAW] = state[YAW];
 }
 
-/* The optimum for what is wanted, as the work's plan, and how it was found. */
-static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const real *rest, const real *speeds,
-                                    const real *acting)
+/* The optimum of the query, as the work's plan, and how it was found. */
+static enum quadsim_status optimise(quadsim_mpc *mpc, const real *acting)
 {
-    return (enum quadsim_status)quadsim_optimise(&mpc->work, state, mpc->wanted, rest, speeds, acting);
+    return (enum quadsim_status)quadsim_optimise(&mpc->work, mpc->state, mpc->wanted, mpc->rest, mpc->resting, acting);
 }
 
 /* ---- the vehicle's model ----------------------------------------------------------------------------------------- */
@@ -354,14 +352,15 @@ static void put_modes(const quadsim_controller *c, const real *speeds, real *sta
 }
 
 /* Where the model rests: x_s at the present place, u_s with what balances the torque that thrust twists now. */
-static void find_rest(const quadsim_mpc *mpc, const real *state, real sine, real cosine, real *rest, real *speeds)
+static void find_rest(quadsim_mpc *mpc, real sine, real cosine)
 {
     const quadsim_robust *r = mpc->controller->robust;
+    real *rest = mpc->rest, *speeds = mpc->resting;
     const real forward = cosine * mpc->lift[0] + sine * mpc->lift[1];
     const real left = cosine * mpc->lift[1] - sine * mpc->lift[0];
     real excess_thrust = R(0.0);
     int j;
-    rest_at(state, rest);
+    rest_at(mpc->state, rest);
     rest[ROLL] = -angle_of(left, square_root(forward * forward + mpc->lift[2] * mpc->lift[2]));
     rest[PITCH] = angle_of(forward, mpc->lift[2]);
     for (j = 0; j < NU; j++) {
@@ -379,7 +378,7 @@ static enum quadsim_status solve_ahead(quadsim_mpc *mpc, const real *ahead, cons
                                        const real *acting)
 {
     const quadsim_controller *c = mpc->controller;
-    real state[MOST_STATES], rest[MOST_STATES], speeds[NU], sine = R(0.0), cosine = R(1.0);
+    real *state = mpc->state, sine = R(0.0), cosine = R(1.0);
     memcpy(state, ahead, 12 * sizeof(real));
     if (c->robust->heading) {
         sin_cos(ahead[YAW], &sine, &cosine);
@@ -390,10 +389,10 @@ static enum quadsim_status solve_ahead(quadsim_mpc *mpc, const real *ahead, cons
         state[YAW] = R(0.0);
     }
     put_modes(c, mpc->turning, state);
-    find_rest(mpc, state, sine, cosine, rest, speeds);
-    want_rest(mpc, rest);
+    find_rest(mpc, sine, cosine);
+    want_rest(mpc, mpc->rest);
     want_seen(mpc, reference, turns, ahead[YAW], sine, cosine);
-    return optimise(mpc, state, rest, speeds, acting);
+    return optimise(mpc, acting);
 }
 
 /* The i-th of the commands that act one after the other until this period's does: in force, under way. */
@@ -490,17 +489,19 @@ static int is_usable(const quadsim_controller *c, const real *state, const real 
 static enum quadsim_status solve_paper(quadsim_mpc *mpc, const real *state, const real *reference, const real *acting)
 {
     const quadsim_controller *c = mpc->controller;
-    real rest[MOST_STATES], row[4], turns = first_turns(mpc, reference, state[YAW]);
+    real row[4], turns = first_turns(mpc, reference, state[YAW]);
     int i;
-    rest_at(state, rest); /* hover is an equilibrium anywhere and at any yaw: here there is least to round */
-    want_rest(mpc, rest);
+    memcpy(mpc->state, state, 12 * sizeof(real));
+    memcpy(mpc->resting, c->hover, sizeof(mpc->resting));
+    rest_at(state, mpc->rest); /* hover is an equilibrium anywhere and at any yaw: here there is least to round */
+    want_rest(mpc, mpc->rest);
     for (i = 0; i < c->problem->horizon; i++) {
         turns = next_turns(reference, i, turns);
         memcpy(row, reference + i * 4, sizeof(row));
         row[3] -= TURN * turns;
         want(c, row, mpc->wanted + i * c->problem->regulated);
     }
-    return optimise(mpc, state, rest, c->hover, acting);
+    return optimise(mpc, acting);
 }
 
 /* Numbers of the commands that are remembered. */
@@ -540,23 +541,62 @@ void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
     quadsim_work_reset(&mpc->work);
     mpc->age = -1;
     mpc->known = mpc->headed = 0;
+    memcpy(mpc->resting, mpc->controller->hover, sizeof(mpc->resting));
     if (mpc->controller->robust != NULL) {
         believe(mpc);
     }
 }
 
-enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, const quadsim_real state[12], const quadsim_real *reference,
-                                     const quadsim_real acting[4], quadsim_real command[4])
+/* The command in force: the last one where what is given is not finite. */
+static void find_in_force(const quadsim_mpc *mpc, const real *acting, real in_force[NU])
 {
-    enum quadsim_status found = QUADSIM_BEFORE;
+    memcpy(in_force, is_finite(acting, NU) ? acting : mpc->before, NU * sizeof(real));
+}
+
+void quadsim_mpc_stand(quadsim_mpc *mpc, const quadsim_real acting[4])
+{
+    real in_force[NU];
+    find_in_force(mpc, acting, in_force);
+    if (mpc->controller->robust != NULL) {
+        (void)solve_robust(mpc, NULL, NULL, in_force, 0);
+        memset(mpc->estimate, 0, sizeof(mpc->estimate));
+        believe(mpc);
+    }
+    memcpy(mpc->before, in_force, sizeof(mpc->before));
+    mpc->age = -1;
+}
+
+void quadsim_mpc_learn(quadsim_mpc *mpc, const quadsim_real estimate[6])
+{
+    const quadsim_robust *r = mpc->controller->robust;
+    int i;
+    if (r == NULL || !r->observes || !is_finite(estimate, 6)) {
+        return;
+    }
+    for (i = 0; i < 6; i++) {
+        mpc->estimate[i] = clipped(estimate[i], -r->largest[i], r->largest[i]);
+    }
+    believe(mpc);
+}
+
+enum quadsim_status quadsim_mpc_solve(quadsim_mpc *mpc, const quadsim_real state[12], const quadsim_real *reference,
+                                      const quadsim_real acting[4])
+{
     const int usable = is_usable(mpc->controller, state, reference, acting);
     real in_force[NU];
     mpc->work.changes = 0;
-    memcpy(in_force, is_finite(acting, NU) ? acting : mpc->before, sizeof(in_force));
+    find_in_force(mpc, acting, in_force);
     if (mpc->controller->robust != NULL) {
-        found = solve_robust(mpc, state, reference, in_force, usable);
-    } else if (usable) {
-        found = solve_paper(mpc, state, reference, in_force);
+        return solve_robust(mpc, state, reference, in_force, usable);
     }
+    return usable ? solve_paper(mpc, state, reference, in_force) : QUADSIM_BEFORE;
+}
+
+enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, const quadsim_real state[12], const quadsim_real *reference,
+                                     const quadsim_real acting[4], quadsim_real command[4])
+{
+    const enum quadsim_status found = quadsim_mpc_solve(mpc, state, reference, acting);
+    real in_force[NU];
+    find_in_force(mpc, acting, in_force);
     return answer(mpc, found, in_force, command);
 }

@@ -21,7 +21,8 @@
 extern "C" {
 #endif
 
-enum { QUADSIM_SUBSTEPS = 2 }; /* Runge-Kutta steps of a prediction */
+enum { QUADSIM_SUBSTEPS = 2 };     /* Runge-Kutta steps of a prediction */
+enum { QUADSIM_LAW_STATES = 16 }; /* of a problem: 12, and 4 that stand for rotor speeds where these lag */
 
 /* The robust controller's numbers besides those of its problem.  Matrices are row by row. */
 typedef struct quadsim_robust {
@@ -72,6 +73,9 @@ typedef struct quadsim_mpc {
     quadsim_work work;
     quadsim_real *wanted;           /* [N][n_r] y_d - C_r x_s */
     quadsim_real *sent;             /* robust: [under_way][4] the commands before the last, oldest first [rad/s] */
+    quadsim_real state[QUADSIM_LAW_STATES]; /* the query: x(k), seen from axes that may be turned by the yaw */
+    quadsim_real rest[QUADSIM_LAW_STATES];  /* where the model rests, x_s */
+    quadsim_real resting[4];                 /* and at which speeds, u_s [rad/s] */
     quadsim_real before[4];         /* the last command [rad/s] */
     int age;                        /* periods since the last optimum; negative: there is none yet */
     int headed;                     /* whether a heading has been followed */
@@ -95,6 +99,16 @@ void quadsim_mpc_start(quadsim_mpc *mpc, const quadsim_controller *controller, q
 
 /* Restart after the command u(-1) [rad/s]. */
 void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4]);
+
+/* Start from an estimate of the disturbance, as of `estimate`; without an observer nothing changes. */
+void quadsim_mpc_learn(quadsim_mpc *mpc, const quadsim_real estimate[6]);
+
+/* Pass a period on the ground, where no disturbance shows and no plan is flown, with the command in force [rad/s]. */
+void quadsim_mpc_stand(quadsim_mpc *mpc, const quadsim_real acting[4]);
+
+/* The optimum of the period that starts now, as work.plan; without one a status from QUADSIM_CLIPPED on. */
+enum quadsim_status quadsim_mpc_solve(quadsim_mpc *mpc, const quadsim_real state[12], const quadsim_real *reference,
+                                      const quadsim_real acting[4]);
 
 /* The command of the period that starts now, always finite and within the bounds on rotor speeds. */
 enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, const quadsim_real state[12], const quadsim_real *reference,

@@ -217,7 +217,7 @@ def test_piqp_answers_infeasible_abandoned_and_invalid_problems(monkeypatch: pyt
     core = Core(problem)
     climb = Query(np.zeros(12), np.tile([0.0, 0.0, 5.0, 0.0], (50, 1)), problem.model.u_bar)
     assert core.solve(climb).answered_by == CORE
-    assert core._piqp is None
+    assert core._optimum._piqp is None
     for _ in range(2):
         answer = core.solve(tilted(problem))
         assert (answer.status, answer.answered_by) == ("primal_infeasible", PIQP)

@@ -70,7 +70,7 @@ def preparation_of(law: Controller) -> RobustPreparation:
 
 
 def robust(**parts: Any) -> RobustPreparation:
-    return preparation_of(built({**ROBUST, "fallback": {"enabled": False}, **parts}).law)
+    return preparation_of(built({**ROBUST, "compiled": False, "fallback": {"enabled": False}, **parts}).law)
 
 
 def same(left: object, right: object) -> bool:
@@ -158,8 +158,11 @@ def test_weights_and_bounds_arrive_in_si_units() -> None:
 
 
 def test_the_vehicles_lag_is_its_rotor_rise() -> None:
-    lag = {"rotor_lag": "vehicle", "fallback": {"enabled": False}}
-    law = built({**ROBUST, **lag, "input_bounds": {"speed": [0.0, 800.0], "slew": [-50.0, 50.0]}}, "hummingbird")
+    lag = {"compiled": False, "rotor_lag": "vehicle", "fallback": {"enabled": False}}
+    law = built(
+        {**ROBUST, **lag, "input_bounds": {"speed": [0.0, 800.0], "slew": [-50.0, 50.0]}},
+        "hummingbird",
+    )
     vehicle = Assembly(scenario(ROBUST, "hummingbird")).vehicle
     assert preparation_of(law.law)._model.rotor_lag == vehicle.rotor_rise
     assert vehicle.rotor_rise
@@ -181,7 +184,7 @@ def test_the_vehicles_lag_is_its_rotor_rise() -> None:
 def test_the_fallback_is_on_and_keeps_well_within_the_bounds_on_tilt(
     bounds: dict[str, Any], given: dict[str, Any], tilt: float
 ) -> None:
-    law = built({**ROBUST, "output_bounds": bounds, "fallback": given})
+    law = built({**ROBUST, "compiled": False, "output_bounds": bounds, "fallback": given})
     assert law.guard is not None
     preparation_of(law.law)
     assert law.guard.hover.tilt == pytest.approx(math.radians(tilt), rel=1e-12)
