@@ -14,6 +14,7 @@ from mpc.codegen.source import CController
 from mpc.core.law import CompiledPreparation, CompiledSolver
 from mpc.core.numbers import robust_numbers
 from mpc.linear import LinearMPC
+from mpc.robust.controller import RobustPreparation
 from quadsim.controller import CORE, FALLBACK, GAIN, Command, Phase, StepInputs
 from quadsim.errors import ExportError, InputError
 from quadsim.state import INDEX, N_STATES, Array
@@ -169,6 +170,51 @@ def test_a_compiled_law_predicts_through_the_commands_under_way(delay: float) ->
     law = exported_law(scenario)
     mpc = CompiledPreparation(law)
     assert mpc._memory.size == CController(law=law, asked=mpc._shared.problem.struct.room - 1).reals
+
+
+def test_both_preparations_pose_the_same_queries_and_remember_the_same() -> None:
+    """In the air, on the ground and up again, through commands under way, a pause and states that are predicted."""
+    late = {"controller.delay": 0.12, "computation.delay": 0.12}
+    scenario = quadsim.load("robust-lag50", late)
+    law = exported_law(scenario)
+    assert law.settings is not None
+    twins = RobustPreparation(law.vehicle, law.problem, law.settings), CompiledPreparation(law)
+    rng, time = np.random.default_rng(3), 0.0
+    hover, period = law.problem.model.u_bar, law.problem.model.period
+    unseen = np.zeros(N_STATES)
+    unseen[INDEX["vz"]] = 1.0
+    for twin in twins:
+        twin.reset(hover)
+        twin.adopt(None, np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.03]))
+    for k in range(40):
+        time += 3.0 * period if k == 30 else period
+        phase = Phase.LANDED if k in (10, 11) else Phase.ARMED if k == 12 else Phase.FLYING
+        now = StepInputs(time=time, phase=phase, unseen=unseen if k in (20, 21) else None)
+        state, acting = 0.1 * rng.standard_normal(N_STATES), hover + rng.uniform(-5.0, 5.0, 4)
+        reference = np.cumsum(0.05 * rng.standard_normal((law.problem.horizon, 4)), axis=0)
+        if phase is Phase.LANDED:
+            for twin in twins:
+                twin.stand(now, acting)
+        else:
+            python, c = (twin.prepare(now, state, reference, acting) for twin in twins)
+            assert python is not None
+            assert python.equilibrium is not None
+            assert c is not None
+            assert c.equilibrium is not None
+            assert c.state == pytest.approx(python.state, abs=1e-11)
+            assert c.desired == pytest.approx(python.desired, abs=1e-11)
+            assert c.equilibrium.u == pytest.approx(python.equilibrium.u, abs=1e-9)
+            there = [INDEX["roll"], INDEX["pitch"], *range(N_STATES, 16)]  # the place of rest is any
+            assert c.equilibrium.x[there] == pytest.approx(python.equilibrium.x[there], abs=1e-9)
+        expected, remembered = (twin.memory for twin in twins)
+        assert expected is not None
+        assert remembered is not None
+        assert (remembered.ahead is None) == (expected.ahead is None)
+        for name in ("rotors", "turning", "estimate", "ahead"):
+            value = getattr(expected, name)
+            assert value is None or getattr(remembered, name) == pytest.approx(value, abs=1e-11)
+        assert np.array(remembered.sent) == pytest.approx(np.array(expected.sent[-len(remembered.sent) :]))
+        assert twins[1].disturbance == pytest.approx(twins[0].disturbance, abs=1e-9)
 
 
 @pytest.fixture(params=["paper-constrained", "robust"])
