@@ -65,7 +65,7 @@ class Replayed:
 
 def entries(scenario: Scenario, solvers: Sequence[str]) -> dict[str, Scenario]:
     """The scenario with each solver that is installed, and with its whole law in C."""
-    entries = {name: scenario.replace({"controller.solver": name}) for name in solvers}
+    entries = {name: scenario.replace({"controller.solver": name, "controller.compiled": False}) for name in solvers}
     entries[LAW] = scenario.replace({"controller.compiled": True})
     usable = {}
     for name, changed in entries.items():
