@@ -19,6 +19,7 @@ from quadsim.state import Array
 
 N_ROTORS: Final = 4
 AUTOPILOT: Final = "autopilot"  # table of a vehicle file; see `quadsim.sim.autopilot.AutopilotSettings`
+PerAxis = Annotated[tuple[Number, ...], Len(2, 2)]
 OfRotors = Annotated[tuple[Number, ...], Len(N_ROTORS, N_ROTORS)]
 SMALLEST, LARGEST = 1e-12, 1e6
 """Allowed magnitudes of a vehicle's numbers; MuJoCo refuses smaller inertias, and larger numbers overflow."""
@@ -34,8 +35,10 @@ class Vehicle:
     f_i = b w_i^2 [N] and the reaction torque spin_i d w_i^2 [N m] about body +z (Sec. 2.2).
 
     Linear drag is a force -rotor_drag w v_perp on a rotor, v_perp its velocity through the air in the rotor's plane
-    (Martin and Salaun, 2010; Furrer et al., 2016).  What is in `OPTIONAL_PARAMETERS` is None where its file does
-    not give it.
+    (Martin and Salaun, 2010; Furrer et al., 2016).  The same velocity v turns the vehicle, by (rotor_moment[0] w v_y,
+    -rotor_moment[1] w v_x, 0) for each rotor: its disc flaps, and its drag acts above the centre of mass.  Turning is
+    damped by -rate_damping times the body rates.  What is in `OPTIONAL_PARAMETERS` is None where its file does not
+    give it.
 
     Raises:
         ParameterError: a value is not finite or impossible, or the vehicle cannot hover within its rotors' range.
@@ -71,6 +74,10 @@ class Vehicle:
     rotor_inertia: Annotated[float | None, doc("[kg m^2] of one rotor about its axis")] = None
     rotor_radius: Annotated[float | None, doc("[m] R, of a propeller")] = None
     rotor_drag: Annotated[float | None, doc("[N s^2/(m rad)] linear drag of one rotor")] = None
+    rotor_moment: Annotated[
+        PerAxis | None, doc("[N m s^2/(m rad)] of one rotor about its hub's x and y, per speed and air speed across it")
+    ] = None
+    rate_damping: Annotated[Vector | None, doc("[N m s/rad] of the whole vehicle about body x, y, z")] = None
     body_drag: Annotated[Vector | None, doc("[m^2] C_d A along body x, y, z")] = None
     extent: Annotated[float | None, doc("[m] radius of the ball about the centre of mass that holds all of it")] = None
 
@@ -85,6 +92,8 @@ class Vehicle:
                 object.__setattr__(self, name, tuple(value))
             for number in (value,) if length is None else value:
                 _check_number(name, number, positive=name not in _ANY_SIGN)
+        if min(self.rate_damping or (0.0,)) < 0.0:
+            self._refuse("rate_damping", ">= 0 N m s/rad about each axis")
         if self.speed_min < 0.0:
             self._refuse("speed_min", ">= 0 rad/s")
         if self.speed_min >= self.speed_max:
@@ -273,5 +282,8 @@ MEANT: Final[dict[str, tuple[str, ...]]] = {"rotor_lag": ("rotor_rise", "rotor_f
 """Parameters by other common names, where a spelling guess would name the wrong one."""
 OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if field.default is None)
 """Parameters that a vehicle file may leave out."""
-_LENGTHS: Final = {"inertia": 3, "rotor_azimuths": N_ROTORS, "rotor_spins": N_ROTORS, "body_drag": 3}
-_ANY_SIGN: Final = ("rotor_azimuths", "rotor_spins", "speed_min")
+_LENGTHS: Final = {
+    **{"inertia": 3, "rotor_azimuths": N_ROTORS, "rotor_spins": N_ROTORS},
+    **{"rotor_moment": 2, "rate_damping": 3, "body_drag": 3},
+}
+_ANY_SIGN: Final = ("rotor_azimuths", "rotor_spins", "speed_min", "rotor_moment", "rate_damping")

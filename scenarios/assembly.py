@@ -81,6 +81,8 @@ _SIZES: Final = {
     "rotor_fall": ("rotors", "fall", RotorDynamics),
     "rotor_inertia": ("rotors", "inertia", RotorDynamics),
     "rotor_drag": ("air", "rotor_drag", Air),
+    "rotor_moment": ("air", "rotor_moment", Air),
+    "rate_damping": ("air", "rate_damping", Air),
     "body_drag": ("air", "body_drag", Air),
     "rotor_radius": ("ground", "rotor_radius", None),
 }

@@ -72,6 +72,17 @@ def rotor_drag(vehicle: Vehicle, coefficient: float, speeds: Array, turn: Rotati
     return np.concatenate([turn.apply(force), torque])
 
 
+def rotor_moment(
+    vehicle: Vehicle, moment: tuple[float, float], speeds: Array, turn: Rotation, air: Array, rates: Array
+) -> Array:
+    """(m_x w_i v_y, -m_y w_i v_x, 0), v each rotor's velocity through the air, body (3,)."""
+    torque = np.zeros(3)
+    for place, speed in zip(vehicle.rotor_positions, speeds, strict=True):
+        across = turn.inv().apply(air) + np.cross(rates, place * [1.0, 1.0, 0.0])
+        torque += speed * np.array([moment[0] * across[1], -moment[1] * across[0], 0.0])
+    return torque
+
+
 def axis_drag(linear: Sequence[float], quadratic: Sequence[float], turn: Rotation, air: Array) -> Array:
     """F_i = -(l_i + k_i |v_i|) v_i along the body's axes, world (3,)."""
     along = turn.inv().apply(air)

@@ -16,9 +16,10 @@
 
 static const double LOWEST_RATIO = 0.5; /* lowest height of a rotor, in radii, at which the ground effect grows */
 
-/* What a step's rotors give whatever the motion: drag coefficient and its moments, angular momentum, spin-up torque. */
+/* What a step's rotors give whatever the motion: sums of their speeds, and of speed by place; drag about z, angular
+ * momentum, spin-up torque. */
 typedef struct {
-    double thrust[ROTORS], drag, drag_x, drag_y, drag_xy, momentum, spin_up;
+    double thrust[ROTORS], drag, drag_x, drag_y, drag_xy, turning, turning_x, turning_y, momentum, spin_up;
 } rotor_state;
 
 static double clip(double number, double low, double high) /* what is no number stays so */
@@ -101,7 +102,7 @@ static double noisy(const quadsim_vehicle *v, double thrust, double draw)
 /* Turn the rotors for a step; it writes speeds, thrust and battery. */
 static rotor_state drive_rotors(quadsim_vehicle *v, const quadsim_steps *rows, int64_t row)
 {
-    rotor_state state = {{0.0}, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+    rotor_state state = {{0.0}, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     double midway[ROTORS], slope[ROTORS], factor = 1.0, total = 0.0;
     turn(v, rows->speeds + rows->width * row, midway, slope);
     if (v->cells > 0.0) {
@@ -120,6 +121,9 @@ static rotor_state drive_rotors(quadsim_vehicle *v, const quadsim_steps *rows, i
             state.drag_x += midway[i] * (k * x);
             state.drag_y += midway[i] * (k * y);
             state.drag_xy += midway[i] * (k * (x * x + y * y));
+            state.turning += midway[i];
+            state.turning_x += midway[i] * x;
+            state.turning_y += midway[i] * y;
             state.momentum += midway[i] * (-inertia * v->spin[i]);
             state.spin_up += slope[i] * (inertia * v->spin[i]);
         }
@@ -203,6 +207,15 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
     add_along_axes(v, R, air, wrench);
     wrench[3] = -rate[1] * rotors->momentum;
     wrench[4] = rate[0] * rotors->momentum;
+    if (v->rotor_moment[0] != 0.0 || v->rotor_moment[1] != 0.0) {
+        const double ax = R[0][0] * air[0] + R[1][0] * air[1] + R[2][0] * air[2];
+        const double ay = R[0][1] * air[0] + R[1][1] * air[1] + R[2][1] * air[2];
+        wrench[3] += v->rotor_moment[0] * (ay * rotors->turning + rate[2] * rotors->turning_x);
+        wrench[4] -= v->rotor_moment[1] * (ax * rotors->turning - rate[2] * rotors->turning_y);
+    }
+    for (int i = 0; i < 3; i++) {
+        wrench[3 + i] -= v->rate_damping[i] * rate[i];
+    }
     add_pushes(v, R, wrench);
     if (v->radius > 0.0) {
         add_ground_effect(v, R, pose[2], rotors->thrust, wrench);

@@ -48,7 +48,7 @@ typedef struct quadsim_vehicle {
     /* constants */
     double mass, gravity, inertia[3], torque_of_thrust[3][ROTORS]; /* of the own method */
     double coefficient, hover, slowest, fastest, place[ROTORS][2], spin[ROTORS];
-    double rotor_drag, rotor_inertia, linear_drag[3], quadratic_drag[3];
+    double rotor_drag, rotor_inertia, rotor_moment[2], rate_damping[3], linear_drag[3], quadratic_drag[3];
     double floor, disc, radius;      /* of the ground effect; radius 0: none */
     double loss, deviation, largest; /* of thrust noise; largest 0: none */
     double cells, capacity, resistance, hover_current, idle_current, reference_voltage, exponent; /* cells 0: none */

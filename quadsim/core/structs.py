@@ -57,7 +57,8 @@ class VehicleStruct(Structure):
     _fields_ = _members(
         "*step *model *data *motion *velocity *applied *control *wind *obstacles *fluid #mocaps timestep plausible "
         "fastest_valid mass gravity inertia:3 torque_of_thrust:3x4 coefficient hover slowest fastest place:4x2 spin:4 "
-        "rotor_drag rotor_inertia linear_drag:3 quadratic_drag:3 floor disc radius loss deviation largest cells "
+        "rotor_drag rotor_inertia rotor_moment:2 rate_damping:3 linear_drag:3 quadratic_drag:3 floor disc radius loss "
+        "deviation largest cells "
         "capacity resistance hover_current idle_current reference_voltage exponent *curve #points #follows_motion rise "
         "fall acceleration efficiency:4 #at_once *pushes #pushing #now time speeds:4 target:4 before:6 charge"
     )

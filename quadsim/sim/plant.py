@@ -224,6 +224,7 @@ class Plant:
             v.rotor_inertia = effects.rotors.inertia or 0.0
         if (air := effects.air) is not None:
             v.rotor_drag = air.rotor_drag or 0.0
+            v.rotor_moment[:], v.rate_damping[:] = air.rotor_moment or (0.0, 0.0), air.rate_damping or (0.0, 0.0, 0.0)
             v.linear_drag[:], v.quadratic_drag[:] = air.linear_drag, air.quadratic_drag
         if (ground := effects.ground) is not None and ground.effect:
             shape = outline(vehicle)

@@ -6,6 +6,10 @@ The compiled core evaluates the forces that follow from how the vehicle moves (`
   own plane in proportion to its speed and to the air's (Martin & Salaun 2010, "The true role of accelerometer feedback
   in quadrotor control"; RotorS, Furrer et al. 2016).  MuJoCo's fluid forces know neither rotors nor forces linear in
   the air speed at these Reynolds numbers.
+- Rotor moment, (m_x w_i v_y, -m_y w_i v_x, 0) about the hub, v rotor i's velocity through the air, body frame:
+  blade flapping tilts its disc, and its drag acts above the centre of mass (Martin & Salaun 2010; Mahony, Kumar and
+  Corke 2012, "Multirotor Aerial Vehicles", Eqs. (5)-(7)).  Rate damping, -d_i times the body rate about axis i, is what
+  the same effects leave of a rotation.
 - Gyroscopic and spin-up torque of rotors with inertia, -(d/dt + rates x) h z_b, with the angular momentum
   h = -sum_i spin_i J_r w_i of rotors that turn against their reaction torque.
 - Ground effect: what each rotor's thrust gains, by the height z of its own disc above the ground,
@@ -165,7 +169,7 @@ class Effects:
     def follows_state(self) -> bool:
         """Whether a force depends on the motion, so that physics steps are taken one by one."""
         spinning = self.rotors is not None and bool(self.rotors.inertia)
-        dragged = self.air is not None and self.air.drags
+        dragged = self.air is not None and (self.air.drags or any(self.air.rate_damping or ()))
         lifted = self.ground is not None and self.ground.effect
         return spinning or dragged or lifted or self.disturbance is not None
 

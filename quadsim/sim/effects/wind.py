@@ -14,7 +14,7 @@ from quadsim.errors import InputError
 from quadsim.fields import Instant, NonNegative, Positive, Vector, filled
 from quadsim.sim.effects.turbulence import FASTEST_AIRSPEED, SLOWEST_AIRSPEED, Dryden, Turbulence
 from quadsim.state import Array
-from quadsim.vehicle import Vehicle
+from quadsim.vehicle import PerAxis, Vehicle
 
 SEA_LEVEL_DENSITY: Final = 1.225
 """Density of air [kg/m^3] at sea level in the International Standard Atmosphere (ISO 2533)."""
@@ -31,6 +31,17 @@ class Air:
     rotor_drag: Annotated[
         NonNegative | None,
         doc("[kg/rad] drag of one rotor per speed and air speed in its plane; absent: the vehicle's, or 0"),
+    ] = None
+    rotor_moment: Annotated[
+        PerAxis | None,
+        doc(
+            "[N m s^2/(m rad)] moment of one rotor about body x and y, per speed and air speed across it; absent: the "
+            "vehicle's, or 0"
+        ),
+    ] = None
+    rate_damping: Annotated[
+        _Drag | None,
+        doc("[N m s/rad] torque against the body rates, about each body axis; absent: the vehicle's, or 0"),
     ] = None
     body_drag: Annotated[
         Annotated[tuple[Positive, ...], Len(3, 3)] | None,
@@ -59,11 +70,17 @@ class Air:
     @property
     def drags(self) -> bool:
         """Whether anything drags, once resolved: without it, wind pushes nothing."""
-        return bool(self.rotor_drag) or self.body_drag is not None or self.axis_drag
+        return bool(self.rotor_drag) or self.body_drag is not None or self.axis_drag or any(self.rotor_moment or ())
 
     def resolved(self, vehicle: Vehicle) -> Air:
         """With the sizes that are left to the vehicle, and to the mean wind."""
-        air = filled(self, rotor_drag=vehicle.rotor_drag or 0.0, body_drag=vehicle.body_drag)
+        air = filled(
+            self,
+            rotor_drag=vehicle.rotor_drag or 0.0,
+            rotor_moment=vehicle.rotor_moment or (0.0, 0.0),
+            rate_damping=vehicle.rate_damping or (0.0, 0.0, 0.0),
+            body_drag=vehicle.body_drag,
+        )
         if air.turbulence is None:
             return air
         return replace(air, turbulence=filled(air.turbulence, airspeed=math.hypot(*air.wind)))

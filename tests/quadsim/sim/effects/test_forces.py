@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from numpy_laws import LOWEST_RATIO, axis_drag, ground_effect, pushed, respond, rotor_drag, thrust_ratio
+from numpy_laws import LOWEST_RATIO, axis_drag, ground_effect, pushed, respond, rotor_drag, rotor_moment, thrust_ratio
 from scipy.spatial.transform import Rotation
 
 from quadsim.sim.airframe import added_mass, compile_model, outline, semi_axes
@@ -52,6 +52,26 @@ def test_rotor_drag_slows_a_turn(vehicle: Vehicle) -> None:
         plant.reset(moving(yaw_rate=2.0))
         plant.advance(plant.hover_speeds, 500)
         assert plant.state()[11] == pytest.approx(2.0 * math.exp(-0.5 * rate), rel=1e-6)
+
+
+def test_a_rotor_moment_lifts_the_side_that_meets_the_air(vehicle: Vehicle) -> None:
+    """Flying along x, the nose goes up, and the harder the faster: J_y dq/dt = -m_y (sum w) v."""
+    moment = 1e-5
+    rates = []
+    for speed in (0.0, 2.0, 4.0):
+        with Plant(vehicle, effects=Effects(air=Air(rotor_moment=(moment, moment)))) as plant:
+            plant.reset(moving(vx=speed))
+            rates.append(plant.advance(plant.hover_speeds, 50)["physics"][-1, 12])
+    expected = -moment * 4.0 * vehicle.hover_speed / vehicle.inertia[1] * 0.05
+    np.testing.assert_allclose(rates, [0.0, 2.0 * expected, 4.0 * expected], rtol=1e-3, atol=1e-12)
+
+
+def test_rate_damping_slows_a_turn_exponentially(vehicle: Vehicle) -> None:
+    damping = 0.1
+    with Plant(vehicle, effects=Effects(air=Air(rate_damping=(0.0, 0.0, damping)))) as plant:
+        plant.reset(moving(yaw_rate=2.0))
+        plant.advance(plant.hover_speeds, 500)
+        assert plant.state()[11] == pytest.approx(2.0 * math.exp(-0.5 * damping / vehicle.inertia[2]), rel=1e-6)
 
 
 def test_rotor_drag_carries_a_tilted_vehicle_to_its_terminal_speed(vehicle: Vehicle) -> None:
@@ -215,9 +235,12 @@ def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: I
     """From random motions, at the middle of the step: drag of two kinds, spinning rotors, pushes, ground effect."""
     rng, radius, drag, inertia, step = np.random.default_rng(6), 0.15, 3e-3, 2e-4, 1e-6
     linear, quadratic = (0.3, 0.2, 0.05), (0.08, 0.1, 0.12)
+    moment, damping = (2e-4, -3e-4), (0.02, 0.03, 0.01)
     dynamics = RotorDynamics(rise=0.03, fall=0.05, inertia=inertia)
     effects = Effects(
-        air=Air(rotor_drag=drag, linear_drag=linear, quadratic_drag=quadratic),
+        air=Air(
+            rotor_drag=drag, rotor_moment=moment, rate_damping=damping, linear_drag=linear, quadratic_drag=quadratic
+        ),
         ground=Ground(contact=False, effect=True, rotor_radius=radius),
         rotors=dynamics,
     )
@@ -239,6 +262,7 @@ def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: I
             air = before[8:11] - wind
             expected = rotor_drag(vehicle, drag, middle, turn, air, rates) + pushed(push, turn)
             expected[:3] += axis_drag(linear, quadratic, turn, air)
+            expected[3:] += rotor_moment(vehicle, moment, middle, turn, air, rates) - np.array(damping) * rates
             momentum = -inertia * np.array(vehicle.rotor_spins) @ middle
             expected[3:] += [
                 -rates[1] * momentum,
