@@ -248,7 +248,8 @@ def test_a_field_is_accepted_as_declared_or_named_with_what_was_given_and_what_i
                     wrong += [] if message == f"{FILE}: {named} is missing" else [message]
                     holder[field] = value
     assert not wrong, "\n".join(wrong)
-    assert seen == kind.tables
+    nowhere = [table.__name__ for table in kind.tables - seen]
+    assert seen == kind.tables, f"in no scenario of the library, and in no line of BESIDES: {nowhere}"
     assert allowed > 20
 
 

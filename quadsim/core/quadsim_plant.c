@@ -183,7 +183,8 @@ static void add_ground_effect(const quadsim_vehicle *v, double R[3][3], double h
     }
 }
 
-/* Force, world, and torque, body, of a pose (7) and a velocity (6). */
+/* Force, world, and torque, body, of a pose (7) and a velocity (6).  What comes before `add_pushes` sets parts of the
+ * wrench: a further force is added beside it.  The pose's x and y are not known midway. */
 static void forces_at(const quadsim_vehicle *v, const double *pose, const double *velocity, const rotor_state *rotors,
                       const double *wind, double *wrench)
 {

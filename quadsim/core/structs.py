@@ -52,7 +52,7 @@ def _members(text: str) -> list[tuple[str, Any]]:
 
 
 class VehicleStruct(Structure):
-    """A `quadsim_vehicle`."""
+    """A `quadsim_vehicle`, its members in the same order: no check but that of the size would find two exchanged."""
 
     _fields_ = _members(
         "*step *model *data *motion *velocity *applied *control *wind *obstacles *fluid #mocaps timestep plausible "

@@ -55,7 +55,7 @@ def loaded() -> dict[str, Scenario]:
 
 def flown_here() -> list[str]:
     """All but the long flights of other papers, which `quadsim reproduce` flies."""
-    return [each.name for each in loaded().values() if each.group != "papers" or each.duration <= SHORT]
+    return [name for name, each in loaded().items() if each.group != "papers" or each.duration <= SHORT]
 
 
 def flights() -> list[ParameterSet]:

@@ -87,14 +87,14 @@ def test_the_first_seconds_at_8_m_s_are_those_of_the_specification() -> None:
 @pytest.mark.witness("papers")
 def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
     assert {"quadrotor-uav", "torrente2021"} <= {*paper_names()}
-    for name in paper_names():
-        paper = load_paper(name)
+    papers = [load_paper(name) for name in paper_names()]
+    for paper in papers:
         for number in paper.numbers:
             paper.scenario_of(number)
         names = [number.name for number in paper.numbers]
         assert len(set(names)) == len(names)
-    flown = {number.scenario for number in load_paper("torrente2021").numbers}
-    assert flown == {name for name in scenario_names() if load_scenario(name).group == "papers"}
+    flown = {number.scenario for paper in papers for number in paper.numbers}
+    assert {name for name in scenario_names() if load_scenario(name).group == "papers"} <= flown
 
 
 @pytest.mark.witness("papers")
