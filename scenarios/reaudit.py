@@ -47,7 +47,7 @@ ARITHMETIC_TOLERANCE: Final = 1e-9
 """Tolerance for another machine's arithmetic, relative to 1 or to the larger number."""
 ROUNDING_TILT: Final = 1e-6  # the same for the tilt: near level, an arc cosine has half of a number's digits
 MOST_REPORTED: Final = 6  # differences that one message names
-_HOLDING: Final = ("unconstrained", "constrained", "robust", "nonlinear", "lqr", "geometric")
+_HOLDING: Final = ("unconstrained", "constrained", "robust", "nonlinear", "lqr", "pid", "geometric")
 """Laws that command rotor speeds for a whole period, unless INDI modifies them."""
 _COMMANDED: Final = tuple(columns_of(ControlLog)["speeds"].units)
 _TURNING: Final = tuple(columns_of(PlantLog)["speeds"].units)

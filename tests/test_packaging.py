@@ -24,7 +24,19 @@ pytestmark = pytest.mark.slow("packages")
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("quadsim", "mpc", "scenarios")
-DATA = ("*.py", "py.typed", "*.toml", "*.csv", "*.xml", "*.j2", "*.css", "*.js", "codegen/c/*", "core/c/*", "core/*.c")
+DATA = (
+    "*.py",
+    "py.typed",
+    "*.toml",
+    "*.csv",
+    "*.xml",
+    "*.j2",
+    "*.css",
+    "*.js",
+    "codegen/c/*",
+    "core/c/*",
+    "core/*.[ch]",
+)
 
 
 @pytest.fixture(scope="module")

@@ -183,40 +183,35 @@ static void add_ground_effect(const quadsim_vehicle *v, double R[3][3], double h
     }
 }
 
-/* Force, world, and torque, body, of a pose (7) and a velocity (6).  What comes before `add_pushes` sets parts of the
- * wrench: a further force is added beside it.  The pose's x and y are not known midway. */
+/* Force, world, and torque, body, of a pose (7) and a velocity (6). */
 static void forces_at(const quadsim_vehicle *v, const double *pose, const double *velocity, const rotor_state *rotors,
                       const double *wind, double *wrench)
 {
     const double *rate = velocity + 3;
-    double R[3][3], air[3];
+    double R[3][3], air[3], along[2];
     to_matrix(pose + 3, R);
     for (int i = 0; i < 3; i++) {
         air[i] = velocity[i] - wind[i];
-        wrench[i] = wrench[3 + i] = 0.0;
+        wrench[i] = 0.0;
+        wrench[3 + i] = -v->rate_damping[i] * rate[i];
     }
-    wrench[5] = rotors->spin_up;
+    for (int i = 0; i < 2; i++) {
+        along[i] = R[0][i] * air[0] + R[1][i] * air[1] + R[2][i] * air[2];
+    }
+    wrench[3] -= rate[1] * rotors->momentum;
+    wrench[4] += rate[0] * rotors->momentum;
+    wrench[5] += rotors->spin_up;
     if (v->rotor_drag > 0.0) {
-        const double ax = R[0][0] * air[0] + R[1][0] * air[1] + R[2][0] * air[2];
-        const double ay = R[0][1] * air[0] + R[1][1] * air[1] + R[2][1] * air[2];
-        const double bx = rotors->drag_y * rate[2] - rotors->drag * ax, by = -rotors->drag_x * rate[2] - rotors->drag * ay;
-        wrench[5] += rotors->drag_y * ax - rotors->drag_x * ay - rotors->drag_xy * rate[2];
+        const double x = rotors->drag_y * rate[2] - rotors->drag * along[0];
+        const double y = -rotors->drag_x * rate[2] - rotors->drag * along[1];
+        wrench[5] += rotors->drag_y * along[0] - rotors->drag_x * along[1] - rotors->drag_xy * rate[2];
         for (int i = 0; i < 3; i++) {
-            wrench[i] = R[i][0] * bx + R[i][1] * by;
+            wrench[i] += R[i][0] * x + R[i][1] * y;
         }
     }
     add_along_axes(v, R, air, wrench);
-    wrench[3] = -rate[1] * rotors->momentum;
-    wrench[4] = rate[0] * rotors->momentum;
-    if (v->rotor_moment[0] != 0.0 || v->rotor_moment[1] != 0.0) {
-        const double ax = R[0][0] * air[0] + R[1][0] * air[1] + R[2][0] * air[2];
-        const double ay = R[0][1] * air[0] + R[1][1] * air[1] + R[2][1] * air[2];
-        wrench[3] += v->rotor_moment[0] * (ay * rotors->turning + rate[2] * rotors->turning_x);
-        wrench[4] -= v->rotor_moment[1] * (ax * rotors->turning - rate[2] * rotors->turning_y);
-    }
-    for (int i = 0; i < 3; i++) {
-        wrench[3 + i] -= v->rate_damping[i] * rate[i];
-    }
+    wrench[3] += v->rotor_moment[0] * (along[1] * rotors->turning + rate[2] * rotors->turning_x);
+    wrench[4] -= v->rotor_moment[1] * (along[0] * rotors->turning - rate[2] * rotors->turning_y);
     add_pushes(v, R, wrench);
     if (v->radius > 0.0) {
         add_ground_effect(v, R, pose[2], rotors->thrust, wrench);
@@ -234,7 +229,9 @@ static void forces_midway(quadsim_vehicle *v, const rotor_state *rotors, const d
     }
     const double w = q[0], x = q[1], y = q[2], z = q[3], quarter = 0.5 * half;
     const double a = velocity[3], b = velocity[4], c = velocity[5];
-    ahead[2] = pose[2] + half * velocity[2];
+    for (int i = 0; i < 3; i++) {
+        ahead[i] = pose[i] + half * velocity[i];
+    }
     ahead[3] = w - quarter * (x * a + y * b + z * c);
     ahead[4] = x + quarter * (w * a + y * c - z * b);
     ahead[5] = y + quarter * (w * b + z * a - x * c);
