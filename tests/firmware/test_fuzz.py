@@ -46,7 +46,7 @@ def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Exp
     )
     (steps,) = re.findall(r"^steps: (\d+)$", done.stdout, re.MULTILINE)
     print(f"{name}: {steps} steps from arbitrary bytes")
-    assert int(steps) > 100
+    assert int(steps) > 20  # hundreds, on a machine with nothing else to do
 
 
 def test_a_command_out_of_bounds_is_detected(exported: Export, run: Run, tmp_path: Path) -> None:
