@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import Geometric, GeometricController
 from mpc.indi import INDISettings, TorqueIncrement
@@ -125,3 +126,25 @@ def test_a_command_that_is_no_number_is_refused(vehicle: Vehicle) -> None:
         plant.begin(1)
         with pytest.raises(CommandError, match="the command is not finite"):
             plant.hold(np.zeros(4), 1, loop=struct)
+
+
+def test_it_answers_as_its_equations_do(vehicle: Vehicle) -> None:
+    """A torque tau(u) + y, with y'' = omega^2 (missed - y) - 2 zeta omega y', implicit, and missed at the middle rates."""
+    rng, J, omega = np.random.default_rng(1), np.array(vehicle.inertia), 2.0 * math.pi * 30.0
+    bounds = ActuatorBounds.of_vehicle(vehicle)
+    loop = TorqueIncrement(vehicle, INDISettings(cutoff=30.0), bounds)
+    filtered, slope, last = np.zeros(3), np.zeros(3), None
+    for k in range(100):
+        commanded, rotors = vehicle.hover_speed + rng.uniform(-10.0, 10.0, (2, 4))
+        rates = rng.normal(size=3)
+        if last is not None:
+            middle = 0.5 * (rates + last)
+            missed = (vehicle.allocation @ rotors**2)[1:] - J * (rates - last) / STEP - np.cross(middle, J * middle)
+            damped = 1.0 + math.sqrt(2.0) * omega * STEP + (omega * STEP) ** 2
+            slope = (slope + STEP * omega**2 * (missed - filtered)) / damped
+            filtered = filtered + STEP * slope
+        last = rates
+        wrench = vehicle.allocation @ commanded**2 + np.concatenate([[0.0], filtered])
+        expected = allocate(make_allocation(vehicle), wrench, bounds.u_min, bounds.u_max)
+        answer = loop.speeds(k * STEP, commanded, rates, rotors, LEVEL)
+        np.testing.assert_allclose(answer, expected, rtol=1e-9)

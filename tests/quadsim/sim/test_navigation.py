@@ -163,3 +163,18 @@ def test_a_fault_of_a_sensor_that_the_estimator_lacks_is_refused(vehicle: Vehicl
     message = r"^fault.sensor must be on a sensor that the estimator has \(position, attitude, rates\); got 'velocity'"
     with pytest.raises(ParameterError, match=message):
         build(vehicle, SENSORS, estimator=EstimatorSettings(), faults=(fault,))
+
+
+def test_an_autopilot_hears_the_gyro_less_the_bias_that_was_estimated(
+    vehicle: Vehicle, physics: Array, speeds: Array
+) -> None:
+    bias = math.radians(5.0)
+    sensors = SENSORS | {SensorName.RATES: Sensor(rate=200.0, noise=0.01, bias=5.0)}
+    off = {}
+    for estimator in (None, EstimatorSettings(initial_gyro_bias=5.0)):
+        navigation = build(vehicle, sensors, estimator=estimator)
+        observed(navigation, physics, speeds)
+        off[estimator] = navigation.sensed(physics[STEPS])[1] - physics[STEPS, 11:14]
+    raw, corrected = off.values()
+    np.testing.assert_allclose(raw, [bias] * 3, atol=0.1 * bias)
+    assert np.abs(corrected).max() < 0.3 * bias

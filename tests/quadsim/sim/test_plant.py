@@ -210,6 +210,19 @@ def test_callbacks_of_the_users_own_stay() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_a_vehicle_is_lost_at_the_step_that_leaves_the_plausible(vehicle: Vehicle) -> None:
+    """1000 km away, at 2 km/s: the first state beyond a million metres ends the flight."""
+    state = make_state(position=(999_999.0, 0.0, 0.0))
+    state[1] = 2000.0
+    with Plant(vehicle) as plant:
+        plant.reset(state)
+        with pytest.raises(DivergenceError, match=r"at t = 0.001 s: the plant diverged: its state is not"):
+            plant.advance(plant.hover_speeds, 10)
+        state[0] = 999_900.0
+        plant.reset(state)
+        assert plant.advance(plant.hover_speeds, 10)["physics"][-1, 1] == pytest.approx(999_920.0)
+
+
 def test_a_fatal_error_of_mujoco_ends_the_flight_and_not_the_process(vehicle: Vehicle) -> None:
     """In its bindings it stays the exception that it is."""
     with Plant(vehicle) as plant:
