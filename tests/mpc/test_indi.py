@@ -129,7 +129,7 @@ def test_a_command_that_is_no_number_is_refused(vehicle: Vehicle) -> None:
 
 
 def test_it_answers_as_its_equations_do(vehicle: Vehicle) -> None:
-    """A torque tau(u) + y, with y'' = omega^2 (missed - y) - 2 zeta omega y', implicit, and missed at the middle rates."""
+    """A torque tau(u) + y; y'' = omega^2 (missed - y) - 2 zeta omega y', implicit, with missed at the middle rates."""
     rng, J, omega = np.random.default_rng(1), np.array(vehicle.inertia), 2.0 * math.pi * 30.0
     bounds = ActuatorBounds.of_vehicle(vehicle)
     loop = TorqueIncrement(vehicle, INDISettings(cutoff=30.0), bounds)
