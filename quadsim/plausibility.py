@@ -57,6 +57,12 @@ def _slowing(vehicle: Vehicle) -> float | None:
     return _over(vehicle.rotor_drag, vehicle.mass / (N_ROTORS * vehicle.hover_speed))
 
 
+def _turning(vehicle: Vehicle) -> float | None:
+    """Angular acceleration that the moment of the rotors takes at hover, per speed of the air [rad/(m s)]."""
+    moment = max(map(abs, vehicle.rotor_moment or (0.0,)))
+    return N_ROTORS * vehicle.hover_speed * moment / min(vehicle.inertia[:2]) if moment else None
+
+
 RATIOS: Final = (
     Ratio(of=("gravity",), text="gravity [m/s^2]", value=lambda v: v.gravity, low=1.3, high=26.0),
     Ratio(
@@ -135,6 +141,20 @@ RATIOS: Final = (
         value=_slowing,
         low=1e-3,
         high=1.2,
+    ),
+    Ratio(
+        of=("rotor_moment", "thrust_coefficient", "inertia"),
+        text="angular acceleration of rotor_moment at hover per air speed [rad/(m s)]",
+        value=_turning,
+        low=1e-3,
+        high=300.0,
+    ),
+    Ratio(
+        of=("rate_damping", "inertia"),
+        text="share of a body rate that rate_damping takes per second",
+        value=lambda v: _over(max(v.rate_damping or (0.0,)) or None, min(v.inertia)),
+        low=1e-3,
+        high=300.0,
     ),
     Ratio(
         of=("body_drag", "arm_length"),

@@ -34,7 +34,8 @@ def test_defaults_are_written_out() -> None:
     still = [0.0, 0.0, 0.0]
     at_rest = {"position": still, "euler": still, "velocity": still, "body_rates": still}
     assert table["initial"] == {**at_rest, "cold": False, "on_reference": False}
-    assert table["controller"]["solver"] == "piqp"
+    law = Assembly(parse_scenario(scenario_table())).resolved.scenario.controller
+    assert (law.solver, law.compiled) == ("piqp", False)
 
 
 def test_counts_follow_from_the_times() -> None:
