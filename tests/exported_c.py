@@ -12,12 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from mpc.codegen.ctext import Precision
+from quadsim.controller import Phase
 from quadsim.state import Array
 from scenarios.export.exporter import c_controller
 from scenarios.export.record import Recording
 from scenarios.schema.scenario import Scenario
 
 HOST = Path(__file__).parent / "firmware" / "host.c"
+PHASES = (Phase.FLYING, Phase.ARMED, Phase.LANDED)  # by `enum quadsim_phase`
 FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 
 
@@ -26,6 +28,7 @@ class Reply:
     """What the C answered."""
 
     status: int
+    fallback: int
     changes: int
     command: Array  # (4,)
     plan: Array  # (N, 4)
@@ -54,16 +57,17 @@ class Host:
         self.memory = np.zeros(self.library.host_size(ctypes.byref(right)) // 8 + 1)
         assert right.value, "the memory that the export states is not what the controller needs"
         self.horizon = scenario.controller.horizon
-        self.inputs, self.answers = np.zeros(16 + 4 * self.horizon), np.zeros(6 + 4 * self.horizon)
+        self.inputs, self.answers = np.zeros(17 + 4 * self.horizon), np.zeros(7 + 4 * self.horizon)
 
     def reset(self, speeds: Array) -> None:
         self._call(self.library.host_reset, np.array(speeds, float))
 
-    def step(self, state: Array, reference: Array, acting: Array) -> Reply:
-        self.inputs[:12], self.inputs[12:16], self.inputs[16:] = state, acting, reference.ravel()
+    def step(self, state: Array, reference: Array, acting: Array, phase: Phase = Phase.FLYING) -> Reply:
+        self.inputs[:12], self.inputs[12:16], self.inputs[17:] = state, acting, reference.ravel()
+        self.inputs[16] = PHASES.index(phase)
         self._call(self.library.host_step, self.inputs, self.answers)
         result = self.answers.copy()
-        return Reply(int(result[0]), int(result[1]), result[2:6], result[6:].reshape(-1, 4))
+        return Reply(*(int(number) for number in result[:3]), result[3:7], result[7:].reshape(-1, 4))
 
     def _call(self, function: object, *arrays: Array) -> None:
         function(*(ctypes.c_void_p(array.ctypes.data) for array in (self.memory, *arrays)))  # type: ignore[operator]

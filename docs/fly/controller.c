@@ -38,7 +38,8 @@ int changes(void) { return mpc.work.changes; }
 void reset(void) { quadsim_mpc_reset(&mpc, exchange.acting); }
 int step(void)
 {
-    return (int)quadsim_mpc_step(&mpc, exchange.state, exchange.reference, exchange.acting, exchange.command);
+    return (int)quadsim_mpc_step(&mpc, QUADSIM_PHASE_FLYING, exchange.state, exchange.reference, exchange.acting,
+                                 exchange.command);
 }
 
 /* All that the exported code needs from a C library. */

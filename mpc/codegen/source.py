@@ -9,13 +9,16 @@ from importlib import resources
 from typing import Final
 
 from mpc.codegen.ctext import CText, Precision
-from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
+from mpc.core.numbers import Exportable, controller_numbers, fallback_numbers, robust_numbers
 from mpc.core.solver import core_problem
 from mpc.core.tables import Tables, members
 from mpc.robust.settings import split_delay
 from quadsim.vehicle import N_ROTORS
 
-CORE_FILES: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_math.h", "quadsim_mpc.h", "quadsim_mpc.c")
+CORE_FILES: Final = (
+    *("quadsim_core.h", "quadsim_core.c", "quadsim_math.h"),
+    *("quadsim_mpc.h", "quadsim_mpc.c", "quadsim_guard.c"),
+)
 """Files of `mpc/core/c` to export verbatim."""
 DATA: Final = "quadsim_data.h"
 """The generated file."""
@@ -62,7 +65,7 @@ class CController:
         work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + room * (room - 1) // 2
         settings, period = self.law.settings, self.law.problem.model.period
         sent = 0 if settings is None else N_ROTORS * split_delay(settings.delay, period)[0]
-        return work + packed // self.real_bytes + 1 + N * len(problem.objective.C_r) + sent
+        return work + packed // self.real_bytes + 1 + N * (len(problem.objective.C_r) + N_ROTORS) + sent
 
     @property
     def real_bytes(self) -> int:
@@ -97,11 +100,20 @@ def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
 def _controller(text: CText, law: Exportable, tables: Tables) -> list[str]:
     """Return the numbers apart from those of the optimisation, with the `quadsim_controller` last."""
     numbers, robust = controller_numbers(law), "NULL"
-    blocks = [text.array("C_r", numbers.pop("C_r"))]
+    fallback = {name: text.value(value) for name, value in fallback_numbers(law).items()}
+    blocks = [
+        text.array("C_r", numbers.pop("C_r")),
+        text.struct("quadsim_fallback", f"{text.prefix}fallback", **fallback),
+    ]
     if law.settings is not None:
         values = {name: text.value(value) for name, value in robust_numbers(law, tables.modes).items()}
         blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **values))
         robust = f"&{text.prefix}robust"
-    addresses = {"problem": f"&{text.prefix}problem", "robust": robust, "C_r": f"{text.prefix}C_r"}
+    addresses = {
+        "problem": f"&{text.prefix}problem",
+        "robust": robust,
+        "fallback": f"&{text.prefix}fallback",
+        "C_r": f"{text.prefix}C_r",
+    }
     limits = {name: text.value(value) for name, value in numbers.items()}
     return [*blocks, text.struct("quadsim_controller", "QUADSIM_CONTROLLER", **addresses, **limits)]

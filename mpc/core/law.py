@@ -23,10 +23,12 @@ from mpc.nonlinear.model import SUBSTEPS
 from mpc.ocp import Equilibrium, Query
 from mpc.paper import rollout
 from mpc.robust.settings import LONGEST_SPAN
-from mpc.solvers import Answer
+from mpc.solvers import INVALID_DATA, Answer
 from quadsim.controller import (
     GAIN,
     GROUNDED,
+    MISSED,
+    SOLVED,
     UNCONSTRAINED,
     Command,
     Phase,
@@ -38,8 +40,12 @@ from quadsim.core.library import check_sizes
 from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS
 
-NOT_FINITE: Final = 5
-"""The `quadsim_status` of a query with numbers that are not finite, or implausible."""
+STATUSES: Final = (
+    *(UNCONSTRAINED, SOLVED, SOLVED, "primal_infeasible", "max_iterations", "no_room", INVALID_DATA, "not_finite"),
+    *("out_of_bounds", "state_unknown", "invalid_reference", str(Phase.LANDED), MISSED),
+)
+"""Recorded statuses by `enum quadsim_status`."""
+INVALID: Final = STATUSES.index(INVALID_DATA)
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _SAME_TIME: Final = 1e-6  # [s]
 _INT, _REAL, _AT = ctypes.c_int, ctypes.c_double, ctypes.c_void_p
@@ -62,25 +68,38 @@ class _Robust(ctypes.Structure):
 
 class _Controller(ctypes.Structure):
     _fields_ = [
-        *((name, _AT) for name in ("problem", "robust", "C_r")),
+        *((name, _AT) for name in ("problem", "robust", "fallback", "C_r")),
         *_arrays(hover=4, speed_min=4, speed_max=4, step_min=4, step_max=4),
+    ]
+
+
+class _Guard(ctypes.Structure):
+    """The fallback contract's, which only an export has: in flight it is `mpc.fallback.contract.Guard`."""
+
+    _fields_ = [
+        *((name, _INT) for name in ("planned", "foreseeing", "age", "hovered", "targeted", "since")),
+        ("unseen", _INT * 12),
+        *_arrays(
+            state=12, covariance=144, last=12, last_rates=3, foreseen=12, heading=2, level=2, resting=4, target=12
+        ),
     ]
 
 
 class _MPC(ctypes.Structure):
     _fields_ = [
-        *(("controller", _AT), ("work", Work), ("wanted", _AT), ("sent", _AT)),
+        *(("controller", _AT), ("work", Work), ("wanted", _AT), ("kept", _AT), ("sent", _AT)),
         *_arrays(state=16, rest=16, resting=4, before=4),
-        *(("age", _INT), ("headed", _INT), ("heading", _REAL), ("known", _INT)),
+        *(("fallback", _INT), ("headed", _INT), ("heading", _REAL), ("known", _INT)),
         *_arrays(rotors=4, ahead=12, turning=4, estimate=6),
         *_arrays(trim=4, lift=3, twist=3, effectiveness=16),
+        ("guard", _Guard),
     ]
 
 
 @cache
 def _library() -> ctypes.CDLL:
     library = core_library()
-    check_sizes(quadsim_robust=_Robust, quadsim_controller=_Controller, quadsim_mpc=_MPC)
+    check_sizes(quadsim_robust=_Robust, quadsim_controller=_Controller, quadsim_guard=_Guard, quadsim_mpc=_MPC)
     library.quadsim_mpc_reals.restype, library.quadsim_mpc_reals.argtypes = ctypes.c_long, [_AT]
     library.quadsim_mpc_start.restype, library.quadsim_mpc_start.argtypes = None, [_AT] * 3
     library.quadsim_mpc_reset.restype, library.quadsim_mpc_reset.argtypes = None, [_AT] * 2
@@ -155,7 +174,7 @@ class CompiledPreparation:
         self._sent = _view(mpc.sent, whole * N_ROTORS).reshape(whole, N_ROTORS)
         self._state, self._path, self._acting = (np.zeros(shape) for shape in (N_STATES, (N, 4), N_ROTORS))
         self._arguments = self._at, *(array.ctypes.data for array in (self._state, self._path, self._acting))
-        self.found, self.started = NOT_FINITE, 0.0
+        self.found, self.started = INVALID, 0.0
         self.reset(shared.nominal.u_bar)
 
     def __reduce__(self) -> NoReturn:
@@ -239,7 +258,7 @@ class CompiledPreparation:
         if now.phase is not Phase.FLYING:  # the ground holds the vehicle, so its motion shows no disturbance
             self._mpc.known = 0
         objective = self.problem.objective
-        if self.found == NOT_FINITE:
+        if self.found == INVALID:
             return None if self._robust is not None else Query(state, objective.desired(reference), acting)
         x, x_s, u_s = self._x.copy(), self._x_s.copy(), self._u_s.copy()
         if x.size > N_STATES:  # C has the modes of rotor speeds here
@@ -307,7 +326,7 @@ class CompiledGain:
         query = self._preparation.prepare(now, state, reference, self.problem.model.u_bar)
         assert query is not None
         plan, spent_s = np.full((self.horizon, N_ROTORS), math.nan), 0.0  # of numbers that are not finite
-        if self._preparation.found != NOT_FINITE:
+        if self._preparation.found != INVALID:
             answer = self._solver.solve(query)
             plan, spent_s = answer.plan, answer.stats.solve_s
         stats = Statistics(solve_s=spent_s)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -12,17 +13,30 @@ from mpc.answer import ActuatorBounds
 from mpc.bounded import Bounded, Weighted, resolved_lag
 from mpc.core.tables import NO_BOUND
 from mpc.equilibrium import LEAST_LIFT
-from mpc.fallback.completion import PLAUSIBLE
+from mpc.fallback.completion import (
+    NOISE,
+    PLAUSIBLE,
+    PLAUSIBLE_REFERENCE,
+    UNKNOWN,
+    UNMOVED,
+    acceleration_noise,
+)
+from mpc.fallback.hover import LARGEST_CLIMB, LARGEST_TURN, HoverLaw
+from mpc.fallback.settings import USUAL_FALLBACK, FallbackSettings
 from mpc.heading import slope
 from mpc.model import hover_model
 from mpc.nonlinear.model import SUBSTEPS, nonlinear_model
 from mpc.observer import UPRIGHT, DisturbanceObserver
 from mpc.obstacles import Shape
 from mpc.ocp import Problem
-from mpc.robust.settings import Robust, split_delay
+from mpc.robust.settings import LONGEST_SPAN, Robust, split_delay
+from quadsim.controller import LARGEST_SPEED
 from quadsim.errors import ExportError
-from quadsim.state import REFERENCE_STATES, Array
+from quadsim.state import EULER, POSITION, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
+
+MOST_PERIODS: Final = 2**30 - 1
+"""Most periods that a time of the fallback contract has in C."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +47,7 @@ class Exportable:
     problem: Problem
     vehicle: Vehicle  # the modelled vehicle
     settings: Robust | None = None  # the table of the robust controller; None for the paper's controllers
+    fallback: FallbackSettings = USUAL_FALLBACK  # with the tilt that its bounds leave
 
 
 def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
@@ -45,8 +60,13 @@ def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequenc
     if isinstance(table, Bounded) and table.avoidance is not None and shapes:
         rule = "its half-spaces around obstacles are others in each period: leave out controller.avoidance"
         raise ExportError(rule)
-    settings = table if isinstance(table, Robust) else None
-    return Exportable(name=table.type, problem=table.problem(vehicle, period), vehicle=vehicle, settings=settings)
+    return Exportable(
+        name=table.type,
+        problem=table.problem(vehicle, period),
+        vehicle=vehicle,
+        settings=table if isinstance(table, Robust) else None,
+        fallback=(table.fallback or USUAL_FALLBACK).within(table.output_bounds),
+    )
 
 
 def controller_numbers(law: Exportable) -> dict[str, Array]:
@@ -101,4 +121,45 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
         "decay_period": decay(instants * period),
         "plausible_state": PLAUSIBLE,
         "plausible_reference": PLAUSIBLE[list(REFERENCE_STATES)],
+    }
+
+
+def fallback_numbers(law: Exportable) -> dict[str, int | float | Array]:
+    """Return the members of a `quadsim_fallback`; see `mpc.fallback.contract.Guard`, which compares times [s]."""
+    settings, period, N = law.fallback, law.problem.model.period, law.problem.horizon
+    model = hover_model(law.vehicle, period)
+    assert settings.tilt is not None
+    hover, Q = HoverLaw(model, tilt=math.radians(settings.tilt)), acceleration_noise(period)
+    pairs = [Q[first : first + 2, first : first + 2][np.triu_indices(2)] for first in (POSITION[0], EULER[0])]
+
+    def periods(time: float) -> int:
+        """Return the most periods that last no longer than a time [s]."""
+        count = math.floor(time / period)
+        return min(next(n for n in (count + 1, count, count - 1) if n * period <= time), MOST_PERIODS)
+
+    return {
+        "plan_age": min(periods(settings.plan_age + 1e-9), N - 1),
+        "hover": min(math.ceil((settings.hover - 1e-9) / period), MOST_PERIODS),
+        "unseen": periods(settings.unseen),
+        "compared": periods(LONGEST_SPAN + 1e-6),
+        "sink": settings.sink,
+        "sunk": settings.sink * period,
+        "settled": settings.settled,
+        "tilt": hover.tilt,
+        "climb": LARGEST_CLIMB,
+        "turn": LARGEST_TURN,
+        "largest_speed": LARGEST_SPEED,
+        "largest_reference": PLAUSIBLE_REFERENCE,
+        "distance": settings.distance,
+        "plausible": PLAUSIBLE,
+        "unmoved": UNMOVED,
+        "noise": NOISE**2,
+        "unknown": UNKNOWN**2,
+        "process": np.concatenate(pairs),
+        "A": model.A,
+        "B": model.B,
+        "gain": hover.gain,
+        "lean": hover.lean,
+        "slope": hover.slope[0],
+        "inverse": hover.inverse,
     }

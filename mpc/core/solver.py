@@ -67,9 +67,8 @@ class Work(ctypes.Structure):
     """A `quadsim_work`."""
 
     _fields_ = [
-        *(*_of(_AT, "p"), *_of(_INT, "changes refused")),
+        *(*_of(_AT, "p"), *_of(_INT, "changes")),
         *_of(_AT, "plan multiplier value shift last side start"),
-        ("axes", _REAL * N_ROTORS),
         *(*_of(_AT, "w dw u pull push"), *_of(_INT, "count spent solved passed_over")),
         *(*_of(_REAL, "slack largest"), *_of(_AT, "row z goal forward pivot column sums factor")),
     ]

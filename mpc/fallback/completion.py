@@ -84,7 +84,7 @@ class StateCompletion:
     def __init__(self, model: LinearModel) -> None:
         self._model = model
         self._measured_covariance = read_only(np.diag(NOISE**2))
-        self._process = read_only(_process_noise(model.period))
+        self._process = read_only(acceleration_noise(model.period))
         self.reset()
 
     def reset(self) -> None:
@@ -160,7 +160,7 @@ class StateCompletion:
         self._covariance = 0.5 * (P + P.T)
 
 
-def _process_noise(period: float) -> Array:
+def acceleration_noise(period: float) -> Array:
     """(12, 12) g g' sigma^2 with g = [tau^2 / 2, tau] for each of the six pairs of a coordinate and its rate."""
     Q = np.zeros((N_STATES, N_STATES))
     gain = np.array([0.5 * period**2, period])

@@ -42,27 +42,32 @@ ACCEPTABLE: Final = by_group(0.5, 1.0, 0.2, 1.0)  # [m], [m/s], [rad], also for 
 
 
 class HoverLaw:
-    """The LQR of hover, set up once: `gain` (4, 12) is K, for errors in the heading frame, and `slope` (4, 4) is S.
+    """The LQR of hover, set up once.
 
-    `tilt` is the largest demanded tilt, of roll and pitch together [rad].
+    Attributes:
+        tilt: the largest demanded tilt, of roll and pitch together [rad].
+        gain: (4, 12) K, for errors in the heading frame.
+        slope: (4, 4) S.
+        inverse: (4, 4) of S.
+        lean: (2, 4) tilt that an error of x, vx, y, vy demands: roll, pitch.
     """
 
     def __init__(self, model: LinearModel, *, tilt: float) -> None:
         self.model, self.tilt = model, tilt
         self.slope = read_only(slope(model))
-        self._inverse = np.linalg.inv(self.slope)
-        pushed = model.B @ self._inverse  # xi(k+1) = A xi(k) + pushed acceleration
+        self.inverse = read_only(np.asarray(np.linalg.inv(self.slope), float))
+        pushed = model.B @ self.inverse  # xi(k+1) = A xi(k) + pushed acceleration
         Q, R = np.diag(ACCEPTABLE**-2.0), np.diag(np.array(ACCEPTABLE_ACCELERATION) ** -2.0)
         self.gain = read_only(lqr(model.A, pushed, Q, R))
         rows = self.gain[_ROLL_PITCH]
-        self._lean = np.linalg.solve(rows[:, _TILTS], rows[:, _SIDEWAYS])
+        self.lean = read_only(np.asarray(np.linalg.solve(rows[:, _TILTS], rows[:, _SIDEWAYS]), float))
 
     def correction(self, error: Array, yaw: float) -> Array:
         """Return the correction of the rotor speeds (4,) [rad/s] towards a moving state.
 
         The error (12,) is the measured minus the desired state, the yaw the measured one [rad].
         """
-        return self._inverse @ self._acceleration(turn_horizontally(error, np.array(-yaw)), np.zeros(2))
+        return self.inverse @ self._acceleration(turn_horizontally(error, np.array(-yaw)), np.zeros(2))
 
     def plan(
         self, state: Array, target: Array, before: Array, bounds: ActuatorBounds, horizon: int, trim: Trim
@@ -78,7 +83,7 @@ class HoverLaw:
         state, target = turn_horizontally(np.array([state, target]), np.array(-yaw))
         plan = np.empty((horizon, N_ROTORS))
         for i in range(horizon):
-            speeds = trim.speeds + self._inverse @ self._acceleration(state - target, rest[_TILTS])
+            speeds = trim.speeds + self.inverse @ self._acceleration(state - target, rest[_TILTS])
             plan[i] = before = bounds.clip(speeds, before)
             state = A @ state + B @ before + drift
             target[_POSITION] += self.model.period * target[_VELOCITY]
@@ -86,7 +91,7 @@ class HoverLaw:
 
     def _acceleration(self, error: Array, rest: Array) -> Array:
         """-K error (4,) in the heading frame, within its limits; roll and pitch (2,) at rest are not errors."""
-        lean = rest - self._lean @ error[_SIDEWAYS]
+        lean = rest - self.lean @ error[_SIDEWAYS]
         lean *= min(1.0, self.tilt / max(math.hypot(*lean), self.tilt))
         error = error.copy()
         error[_SIDEWAYS] = 0.0

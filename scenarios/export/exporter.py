@@ -247,6 +247,7 @@ state, and of the C library `memcpy` and `memset`.
 |---|---|
 | `quadsim_mpc.h` | the interface: state order, units, frames |
 | `quadsim_mpc.c`, `quadsim_core.{{h,c}}`, `quadsim_math.h` | the law and its solver, the same for every controller |
+| `quadsim_guard.c` | what is flown where the law has no answer, and the state that lacks measurements, completed |
 | `{DATA}` | this controller's numbers, and the memory that it needs |
 | `{FACTS}` | what it takes, and how far its room for active rows suffices |
 | `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
@@ -260,7 +261,7 @@ static quadsim_real memory[QUADSIM_MEMORY];
 quadsim_mpc_start(&mpc, &QUADSIM_CONTROLLER, memory);
 quadsim_mpc_reset(&mpc, speeds);          /* the command in force */
 /* every {scenario.control_period:g} s: */
-status = quadsim_mpc_step(&mpc, state, reference, acting, command);
+status = quadsim_mpc_step(&mpc, QUADSIM_PHASE_FLYING, state, reference, acting, command);
 ```
 
 {room[0].upper()}{room[1:]}.

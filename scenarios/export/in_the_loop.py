@@ -26,14 +26,13 @@ import numpy as np
 from mpc.answer import ActuatorBounds
 from mpc.codegen.ctext import Precision
 from mpc.codegen.targets import EMULATOR, TARGETS, Machine
+from mpc.core.law import STATUSES
 from mpc.ocp import Problem
 from quadsim.controller import (
     CORE,
     FALLBACK,
     GAIN,
     GROUNDED,
-    SOLVED,
-    UNCONSTRAINED,
     Command,
     Phase,
     StepInputs,
@@ -52,12 +51,8 @@ from scenarios.progress import Progress, reporting
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
-STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before")
-"""Log entries for the values of `enum quadsim_status`."""
-ANSWERERS: Final = (GAIN, CORE, CORE, FALLBACK, FALLBACK, FALLBACK)
-"""The matching `answered_by`."""
-LEVELS: Final = (0, 0, 0, 1, 2, 3)
-"""The matching fallback level."""
+ANSWERERS: Final = (GAIN, CORE, CORE)
+"""`answered_by` of an optimum, by `enum quadsim_status`."""
 CROSS_PACKAGES: Final = "make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 HOST_PACKAGES: Final = "make gcc libc6-dev"
 LONGEST_ANSWER: Final = 120.0
@@ -139,11 +134,12 @@ Solving = Literal[QueryKind.STEP, QueryKind.STAND]
 
 
 class Reply(NamedTuple):
-    """An answer: the number of its question, u(k) (4,) [rad/s], and a status of `quadsim_mpc.h`."""
+    """An answer: the number of its question, u(k) (4,) [rad/s], a status of `quadsim_mpc.h`, and the fallback level."""
 
     number: int
     command: Array
     status: int
+    fallback: int
 
 
 class Line(Protocol):
@@ -164,7 +160,7 @@ class Frames:
     def __init__(self, precision: str) -> None:
         letter = _LETTER[precision]
         self._question = struct.Struct(f"<2I{N_STATES + 2 * N_ROTORS}{letter}2I")
-        self._answer = struct.Struct(f"<2I{N_ROTORS}{letter}2I")
+        self._answer = struct.Struct(f"<2I{N_ROTORS}{letter}2HI")
 
     @property
     def answer_size(self) -> int:
@@ -180,10 +176,10 @@ class Frames:
         """Return the answer in these bytes, or None."""
         if len(data) != self._answer.size:
             return None
-        mark, number, *command, status, checksum = self._answer.unpack(data)
+        mark, number, *command, status, fallback, checksum = self._answer.unpack(data)
         if mark != MARK or checksum != zlib.crc32(data[:-4]):
             return None
-        return Reply(number, np.array(command, np.float64), status)
+        return Reply(number, np.array(command, np.float64), status, fallback)
 
 
 class SerialMPC:
@@ -265,9 +261,9 @@ class MPCInTheLoop:
         return Command(
             speeds=reply.command.copy(),
             plan=np.tile(reply.command, (self.horizon, 1)),
-            status=UNCONSTRAINED if self._bounds is None else STATUSES[reply.status],
-            answered_by=GAIN if self._bounds is None else ANSWERERS[reply.status],
-            fallback=LEVELS[reply.status],
+            status=STATUSES[reply.status],
+            answered_by=ANSWERERS[reply.status] if reply.status < len(ANSWERERS) else FALLBACK,
+            fallback=reply.fallback,
         )
 
 

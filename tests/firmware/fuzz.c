@@ -1,5 +1,5 @@
 /* Steps of a controller from arbitrary bytes, for libFuzzer: for any input, the command is finite and within every
- * bound, the status is one of six, and the active set changes no more often than it may. */
+ * bound, the status and the fallback level belong together, and the active set changes no more often than it may. */
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -71,7 +71,10 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     for (i = 0; i < STEPS && size > 0; i++) {
         const int manners = *data++;
         real state[12], acting[4], before[4];
-        enum quadsim_status status = QUADSIM_BEFORE;
+        const int place = (manners >> 3) & 7; /* on the ground in a quarter of all steps */
+        const enum quadsim_phase phase =
+            place == 7 ? QUADSIM_PHASE_LANDED : (place == 6 ? QUADSIM_PHASE_ARMED : QUADSIM_PHASE_FLYING);
+        enum quadsim_status status = QUADSIM_MISSED;
         size--;
         for (j = 0; j < 12; j++) {
             state[j] = take(&data, &size, manners & 3, R(0.0), scale[j]);
@@ -86,12 +89,16 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         }
         if ((manners & 128) != 0) {
             quadsim_mpc_reset(mpc, acting);
-            memcpy(command, own->hover, sizeof command); /* in force where acting is not finite */
+            memcpy(command, own->hover, sizeof command); /* in force where acting is none */
         }
-        memcpy(before, is_finite(acting, 4) ? acting : command, sizeof before);
-        status = quadsim_mpc_step(mpc, state, reference, acting, command);
+        memcpy(before, is_within(acting, own->fallback->largest_speed, 4) ? acting : command, sizeof before);
+        status = quadsim_mpc_step(mpc, phase, state, reference, acting, command);
         steps++;
-        require(status >= QUADSIM_FREE && status <= QUADSIM_BEFORE, "a status");
+        require(status >= QUADSIM_FREE && status < QUADSIM_MISSED, "a status");
+        require((status == QUADSIM_LANDED) == (phase == QUADSIM_PHASE_LANDED), "rotors that stop on the ground alone");
+        require((status <= QUADSIM_WHOLE || status == QUADSIM_LANDED) == (mpc->fallback == 0), "a level without optimum");
+        require(mpc->fallback >= 0 && mpc->fallback <= 3, "a level");
+        require(is_finite(mpc->guard.state, 12), "a state");
         require(is_finite(command, 4), "a finite command");
         require(mpc->work.changes >= 0, "a number of changes");
         require(mpc->work.changes <= 4 * own->problem->changes, "a limited number of changes");

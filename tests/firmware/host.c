@@ -31,20 +31,22 @@ void host_reset(host *at, const double *speeds)
     quadsim_mpc_reset(&at->mpc, start);
 }
 
-/* Inputs: state [12], acting [4], reference [N][4].  Answered: status, changes, command [4], plan [N][4]. */
+/* Inputs: state [12], acting [4], phase, reference [N][4].  Answered: status, fallback, changes, command [4],
+ * plan [N][4]. */
 void host_step(host *at, const double *inputs, double *answers)
 {
     quadsim_real state[12], acting[4], reference[QUADSIM_HORIZON * 4], command[4];
     int i;
     convert(state, inputs, 12);
     convert(acting, inputs + 12, 4);
-    convert(reference, inputs + 16, QUADSIM_HORIZON * 4);
-    answers[0] = (double)quadsim_mpc_step(&at->mpc, state, reference, acting, command);
-    answers[1] = (double)at->mpc.work.changes;
+    convert(reference, inputs + 17, QUADSIM_HORIZON * 4);
+    answers[0] = (double)quadsim_mpc_step(&at->mpc, (enum quadsim_phase)inputs[16], state, reference, acting, command);
+    answers[1] = (double)at->mpc.fallback;
+    answers[2] = (double)at->mpc.work.changes;
     for (i = 0; i < 4; i++) {
-        answers[2 + i] = (double)command[i];
+        answers[3 + i] = (double)command[i];
     }
     for (i = 0; i < QUADSIM_HORIZON * 4; i++) {
-        answers[6 + i] = (double)at->mpc.work.plan[i];
+        answers[7 + i] = (double)at->mpc.work.plan[i];
     }
 }

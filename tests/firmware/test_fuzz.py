@@ -10,7 +10,7 @@ import pytest
 from firmware.conftest import Export, Run
 
 HERE = Path(__file__).parent
-CONTROLLER = ("quadsim_mpc.c", "quadsim_core.c")
+CONTROLLER = ("quadsim_guard.c", "quadsim_mpc.c", "quadsim_core.c")
 SANITIZERS = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
 SECONDS = 8
 """Of each controller; the variable FUZZ_RUNS has a number of inputs instead, of four steps or so each."""
@@ -52,14 +52,12 @@ def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Exp
 def test_a_command_out_of_bounds_is_detected(exported: Export, run: Run, tmp_path: Path) -> None:
     """The target can fail: with a controller that does not clip, it does at once."""
     directory = exported("posix", "double", "controller.horizon=10", "duration=5")
-    text = (directory / "quadsim_mpc.c").read_text()
-    clip = "command[j] = mpc->before[j] = clipped(speeds[j], lower, upper);"
+    text = (directory / "quadsim_guard.c").read_text()
+    clip = "command[j] = clipped(speeds[j], lower, upper);"
     assert clip in text
-    (tmp_path / "quadsim_mpc.c").write_text(
-        text.replace(clip, "(void)upper, command[j] = mpc->before[j] = lower + speeds[j];")
-    )
+    (tmp_path / "quadsim_guard.c").write_text(text.replace(clip, "(void)upper, command[j] = lower + speeds[j];"))
     compile = ["clang", "-O1", "-std=c99", *SANITIZERS, "-I", tmp_path, "-I", directory]
-    sources = [HERE / "fuzz.c", tmp_path / "quadsim_mpc.c", directory / "quadsim_core.c"]
+    sources = [HERE / "fuzz.c", tmp_path / "quadsim_guard.c", *(directory / name for name in CONTROLLER[1:])]
     built = run(*compile, "-o", tmp_path / "fuzz", *sources, check=False)
     if "cannot find" in built.stderr:
         pytest.skip("clang has no sanitizers: make firmware")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from firmware.conftest import Answers, Export, Run
 
+from mpc.core.law import STATUSES
 from quadsim.state import Array
 from scenarios.export.in_the_loop import Frames, QueryKind, Reply, SerialMPC, make_program
 from scenarios.export.record import Recording, record
@@ -24,7 +25,7 @@ from flight_computer import Terminal  # noqa: E402
 
 SHORT = "duration=3.0"
 N = 50
-BEFORE = 5
+MISSED = STATUSES.index("missed")
 NOTHING = np.zeros(4)
 
 
@@ -137,7 +138,7 @@ def test_an_old_question_is_not_answered(terminal: Terminal, recorded: Recording
     fresh = pilot.send(pilot.period(1))
     pilot.line.send(old)
     late = pilot.hear()  # the watchdog's
-    assert (late.number, late.status) == (fresh.number, BEFORE)
+    assert (late.number, late.status) == (fresh.number, MISSED)
 
 
 def test_without_a_fresh_state_the_last_command_is_repeated(terminal: Terminal, recorded: Recording) -> None:
@@ -150,7 +151,7 @@ def test_without_a_fresh_state_the_last_command_is_repeated(terminal: Terminal, 
     while len(heard) < 5:
         heard.append(pilot.hear())
     assert 0.35 <= clock.monotonic() - started <= 3.0  # 0.4 s, and a busy machine
-    assert {(reply.number, reply.status) for reply in heard} == {(desired.number, BEFORE)}
+    assert {(reply.number, reply.status) for reply in heard} == {(desired.number, MISSED)}
     assert all(np.array_equal(reply.command, desired.command) for reply in heard)
     assert pilot.send(pilot.period(1)).status == recorded.status[1]
 

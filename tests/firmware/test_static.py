@@ -27,7 +27,7 @@ CPPCHECK += ["--suppress=variableScope", "--suppress=unusedStructMember"]  # of 
 ALLOWED = {"memcpy", "memset"}
 DEFINES = {"double": [], "float": ["-DQUADSIM_FLOAT"]}
 EXPORTS = {"double": ("cortex-m7", "double"), "float": ("cortex-m4f", "float")}
-CONTROLLER = ("quadsim_mpc.c", "quadsim_core.c")
+CONTROLLER = ("quadsim_guard.c", "quadsim_mpc.c", "quadsim_core.c")
 PROGRAMS = (*CONTROLLER, "main.c", "serial.c", "vectors.c")
 
 
@@ -47,7 +47,7 @@ def test_files_of_two_precisions_do_not_make_a_program(exported: Export, run: Ru
     done = run("gcc", "-DQUADSIM_FLOAT", "-c", directory / "main.c", "-o", tmp_path / "main.o", check=False)
     assert "this export is of doubles" in done.stderr
     run("gcc", "-DQUADSIM_FLOAT", "-c", directory / "quadsim_core.c", "-o", core)
-    sources = [directory / name for name in ("main.c", "vectors.c", "posix.c", "quadsim_mpc.c")]
+    sources = [directory / name for name in ("main.c", "vectors.c", "posix.c", *CONTROLLER[:2])]
     done = run("gcc", *sources, core, "-o", tmp_path / "program", check=False)
     assert "undefined reference to `quadsim_work_start'" in done.stderr
 

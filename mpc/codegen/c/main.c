@@ -36,13 +36,14 @@ int main(void)
         char line[128], *end = line;
         quadsim_real command[4];
         const int status =
-            (int)quadsim_mpc_step(&mpc, recorded->state, quadsim_vectors_path[k], recorded->acting, command);
+            (int)quadsim_mpc_step(&mpc, QUADSIM_PHASE_FLYING, recorded->state, quadsim_vectors_path[k],
+                                  recorded->acting, command);
         const uint32_t ticks = target_ticks() - started;
-        /* From QUADSIM_CLIPPED on there is no optimum to compare with. */
-        const int optimal = recorded->status < (int)QUADSIM_CLIPPED;
+        /* From QUADSIM_PRIMAL_INFEASIBLE on there is no optimum to compare with. */
+        const int optimal = recorded->status < (int)QUADSIM_PRIMAL_INFEASIBLE;
         /* In float rounding alone may make a bound active: any status of an optimum will do. */
         const int same = QUADSIM_VECTORS_ANY_OPTIMUM || status == recorded->status;
-        int wrong = optimal ? !same || status >= (int)QUADSIM_CLIPPED : status < (int)QUADSIM_CLIPPED;
+        int wrong = optimal ? !same || status >= (int)QUADSIM_PRIMAL_INFEASIBLE : status < (int)QUADSIM_PRIMAL_INFEASIBLE;
         end = put(end, &k, sizeof k);
         end = put(end, &status, sizeof status);
         end = put(end, &mpc.work.changes, sizeof mpc.work.changes);

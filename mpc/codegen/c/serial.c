@@ -3,7 +3,7 @@
  * Each is one struct, as it lies in memory, that ends with the CRC-32 of all before.  What is corrupt, cut short or old
  * is dropped; a question that comes twice is solved once and answered twice; a row of the reference that was lost is
  * replaced by the next.  Where no fresh state has come for 100 ms the last command is sent again, with the status
- * QUADSIM_BEFORE, and so each 100 ms until one comes. */
+ * QUADSIM_MISSED, and so each 100 ms until one comes. */
 #include <string.h>
 
 #include "quadsim_data.h"
@@ -29,7 +29,8 @@ struct question {
 struct answer {
     uint32_t mark, number; /* the question's */
     quadsim_real command[4]; /* u(k) [rad/s] */
-    uint32_t status, crc;
+    uint16_t status, fallback; /* as of quadsim_mpc_step, and its level */
+    uint32_t crc;
 };
 
 static quadsim_mpc mpc;
@@ -80,6 +81,13 @@ static void reply(void)
     target_write(&answer, sizeof answer);
 }
 
+/* The command before goes on. */
+static void put_missed(void)
+{
+    answer.status = QUADSIM_MISSED;
+    answer.fallback = 1;
+}
+
 /* Solve a question, unless it is old; 1 where it is a fresh state. */
 static int solve(const struct question *question)
 {
@@ -98,15 +106,14 @@ static int solve(const struct question *question)
         memcpy(window + 4 * (N - 1), question->row, sizeof question->row);
     }
     answer.number = question->number;
-    answer.status = QUADSIM_BEFORE;
+    put_missed();
     if (question->kind != STEP && question->kind != STAND) {
         return 0;
     }
     flying = 1;
-    answer.status = quadsim_mpc_step(&mpc, question->state, window, question->acting, answer.command);
-    if (question->kind == STAND) {
-        mpc.known = 0;
-    }
+    answer.status = (uint16_t)quadsim_mpc_step(&mpc, question->kind == STAND ? QUADSIM_PHASE_ARMED : QUADSIM_PHASE_FLYING,
+                                               question->state, window, question->acting, answer.command);
+    answer.fallback = (uint16_t)mpc.fallback;
     return 1;
 }
 
@@ -125,7 +132,7 @@ int main(void)
             }
         } else if (WATCHDOG_MS > 0 && flying && target_ticks() - fresh > WATCHDOG_MS * target_ticks_per_ms) {
             fresh = target_ticks();
-            answer.status = QUADSIM_BEFORE;
+            put_missed();
             reply();
         }
     }

@@ -22,7 +22,7 @@ struct quadsim_vector {
     quadsim_real state[12];  /* measured */
     quadsim_real acting[4];  /* command in force [rad/s] */
     quadsim_real command[4]; /* first command of the exact optimum; the command in force where there is none [rad/s] */
-    int status;              /* enum quadsim_status; QUADSIM_CLIPPED for all that are no optimum */
+    int status;              /* enum quadsim_status; QUADSIM_PRIMAL_INFEASIBLE for all that are no optimum */
 };
 
 extern const int quadsim_vectors_count;

@@ -41,6 +41,23 @@ static inline real magnitude(real number)
     return number < R(0.0) ? -number : number;
 }
 
+/* Whether magnitudes are at most so large, as none that is not finite is. */
+static inline int is_within(const real *numbers, real most, int count)
+{
+    int i;
+    for (i = 0; i < count; i++) {
+        if (!(numbers[i] >= -most && numbers[i] <= most)) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+static inline int is_equal(real left, real right)
+{
+    return left >= right && left <= right;
+}
+
 static inline real clipped(real number, real lower, real upper)
 {
     const real least = number > lower ? number : lower;
@@ -62,8 +79,9 @@ static inline real whole_turns(real angle)
 static inline real dot(const real *left, const real *right, int count)
 {
     real sum[4] = {R(0.0), R(0.0), R(0.0), R(0.0)};
+    const int whole = count - (count & 3);
     int i;
-    for (i = 0; i + 3 < count; i += 4) { /* four sums at a time, so that none waits for the one before */
+    for (i = 0; i < whole; i += 4) { /* four sums at a time, so that none waits for the one before */
         sum[0] += left[i] * right[i];
         sum[1] += left[i + 1] * right[i + 1];
         sum[2] += left[i + 2] * right[i + 2];
@@ -180,6 +198,36 @@ static inline real square_root(real number)
         root = R(0.5) * (root + scaled / root);
     }
     return factor * root;
+}
+
+/* ---- states: world axes, Z-Y-X Euler angles and their rates ---------------------------------------------------- */
+
+enum { X = 0, VX = 1, Y = 2, VY = 3, Z = 4, VZ = 5, ROLL = 6, PITCH = 8, YAW = 10 };
+
+static inline void sines_of(const real *state, real sine[3], real cosine[3])
+{
+    sin_cos(state[ROLL], &sine[0], &cosine[0]);
+    sin_cos(state[PITCH], &sine[1], &cosine[1]);
+    sin_cos(state[YAW], &sine[2], &cosine[2]);
+}
+
+/* Body rates (p, q, r) of Euler angles and their rates. */
+static inline void body_rates(const real *state, real rates[3])
+{
+    const real a = state[ROLL + 1], b = state[PITCH + 1], c = state[YAW + 1];
+    real s[3], k[3];
+    sines_of(state, s, k);
+    rates[0] = a - c * s[1];
+    rates[1] = b * k[0] + c * k[1] * s[0];
+    rates[2] = c * k[1] * k[0] - b * s[0];
+}
+
+/* Roll and pitch of a vehicle whose thrust points along lift (3,), upwards, at a yaw. */
+static inline void lean_of(const real lift[3], real sine, real cosine, real *roll, real *pitch)
+{
+    const real forward = cosine * lift[0] + sine * lift[1], left = cosine * lift[1] - sine * lift[0];
+    *roll = -angle_of(left, square_root(forward * forward + lift[2] * lift[2]));
+    *pitch = angle_of(forward, lift[2]);
 }
 
 #endif

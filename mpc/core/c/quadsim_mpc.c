@@ -5,48 +5,6 @@
 
 #include "quadsim_math.h"
 
-enum { X = 0, VX = 1, Y = 2, VY = 3, Z = 4, VZ = 5, ROLL = 6, PITCH = 8, YAW = 10 };
-
-/* ---- what is answered -------------------------------------------------------------------------------------------- */
-
-/* Speeds within what the bounds on them and on their steps leave after acting [rad/s]; where these leave nothing,
- * within those on the speeds. */
-static void put_command(quadsim_mpc *mpc, const real *speeds, const real *acting, real *command)
-{
-    const quadsim_controller *c = mpc->controller;
-    int j;
-    for (j = 0; j < NU; j++) {
-        const real lower = clipped(acting[j] + c->step_min[j], c->speed_min[j], c->speed_max[j]);
-        const real upper = clipped(acting[j] + c->step_max[j], c->speed_min[j], c->speed_max[j]);
-        command[j] = mpc->before[j] = clipped(speeds[j], lower, upper);
-    }
-}
-
-/* The command of an optimum, or the fallback without one. */
-static enum quadsim_status answer(quadsim_mpc *mpc, enum quadsim_status status, const real *acting, real *command)
-{
-    const real *plan = mpc->work.plan, *axes = mpc->work.axes;
-    const int N = mpc->work.p->horizon;
-    if (status <= QUADSIM_WHOLE && is_finite(plan, N * NU)) {
-        mpc->age = 0;
-        put_command(mpc, plan, acting, command);
-        return status;
-    }
-    if (mpc->age >= 0 && mpc->age < N) {
-        mpc->age++;
-    }
-    if (status == QUADSIM_CLIPPED && is_finite(axes, NU)) {
-        put_command(mpc, axes, acting, command);
-        return status;
-    }
-    if (status <= QUADSIM_SHIFTED && mpc->age >= 0 && mpc->age < N && is_finite(plan, N * NU)) {
-        put_command(mpc, plan + mpc->age * NU, acting, command);
-        return QUADSIM_SHIFTED;
-    }
-    put_command(mpc, acting, acting, command);
-    return QUADSIM_BEFORE;
-}
-
 /* ---- what is wanted ---------------------------------------------------------------------------------------------- */
 
 /* wanted [N][n_r] = -C_r x_s */
@@ -111,13 +69,6 @@ static enum quadsim_status optimise(quadsim_mpc *mpc, const real *acting)
 
 /* ---- the vehicle's model ----------------------------------------------------------------------------------------- */
 
-static void sines_of(const real *state, real sine[3], real cosine[3])
-{
-    sin_cos(state[ROLL], &sine[0], &cosine[0]);
-    sin_cos(state[PITCH], &sine[1], &cosine[1]);
-    sin_cos(state[YAW], &sine[2], &cosine[2]);
-}
-
 /* The unit vector along which rotors push, world axes. */
 static void thrust_axis(const real *state, real axis[3])
 {
@@ -126,17 +77,6 @@ static void thrust_axis(const real *state, real axis[3])
     axis[0] = c[2] * (c[0] * s[1]) + s[2] * s[0];
     axis[1] = s[2] * (c[0] * s[1]) - c[2] * s[0];
     axis[2] = c[0] * c[1];
-}
-
-/* Body rates (p, q, r) of Euler angles and their rates. */
-static void body_rates(const real *state, real rates[3])
-{
-    const real a = state[ROLL + 1], b = state[PITCH + 1], c = state[YAW + 1];
-    real s[3], k[3];
-    sines_of(state, s, k);
-    rates[0] = a - c * s[1];
-    rates[1] = b * k[0] + c * k[1] * s[0];
-    rates[2] = c * k[1] * k[0] - b * s[0];
 }
 
 /* Rates of change of a state, of U/m and I^-1 tau (4,) and a constant acceleration (3,).  Sec. 2.2. */
@@ -356,13 +296,10 @@ static void find_rest(quadsim_mpc *mpc, real sine, real cosine)
 {
     const quadsim_robust *r = mpc->controller->robust;
     real *rest = mpc->rest, *speeds = mpc->resting;
-    const real forward = cosine * mpc->lift[0] + sine * mpc->lift[1];
-    const real left = cosine * mpc->lift[1] - sine * mpc->lift[0];
     real excess_thrust = R(0.0);
     int j;
     rest_at(mpc->state, rest);
-    rest[ROLL] = -angle_of(left, square_root(forward * forward + mpc->lift[2] * mpc->lift[2]));
-    rest[PITCH] = angle_of(forward, mpc->lift[2]);
+    lean_of(mpc->lift, sine, cosine, &rest[ROLL], &rest[PITCH]);
     for (j = 0; j < NU; j++) {
         const real turning = mpc->turning[j], resting = mpc->trim[j];
         excess_thrust += r->effectiveness[j] * (turning * turning - resting * resting);
@@ -447,7 +384,7 @@ static enum quadsim_status solve_robust(quadsim_mpc *mpc, const real *state, con
     note_sent(mpc, acting);
     mpc->known = usable && is_finite(ahead, 12);
     if (!mpc->known) {
-        return QUADSIM_BEFORE;
+        return QUADSIM_INVALID_DATA;
     }
     return solve_ahead(mpc, ahead, reference, first_turns(mpc, reference, state[YAW]), acting);
 }
@@ -513,7 +450,7 @@ static int sent_reals(const quadsim_controller *controller)
 long quadsim_mpc_reals(const quadsim_controller *controller)
 {
     const quadsim_problem *p = controller->problem;
-    return quadsim_work_reals(p) + p->horizon * p->regulated + sent_reals(controller);
+    return quadsim_work_reals(p) + p->horizon * (p->regulated + NU) + sent_reals(controller);
 }
 
 void quadsim_mpc_start(quadsim_mpc *mpc, const quadsim_controller *controller, real *memory)
@@ -522,14 +459,17 @@ void quadsim_mpc_start(quadsim_mpc *mpc, const quadsim_controller *controller, r
     memset(mpc, 0, sizeof(*mpc));
     mpc->controller = controller;
     mpc->wanted = memory;
-    mpc->sent = memory + p->horizon * p->regulated;
+    mpc->kept = memory + p->horizon * p->regulated;
+    mpc->sent = mpc->kept + p->horizon * NU;
     quadsim_work_start(&mpc->work, p, mpc->sent + sent_reals(controller));
     quadsim_mpc_reset(mpc, controller->hover);
 }
 
 void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
 {
-    const real *usable = is_finite(speeds, NU) ? speeds : mpc->controller->hover;
+    const quadsim_fallback *fallback = mpc->controller->fallback;
+    const int right = fallback == NULL ? is_finite(speeds, NU) : is_within(speeds, fallback->largest_speed, NU);
+    const real *usable = right ? speeds : mpc->controller->hover;
     int i;
     memcpy(mpc->before, usable, sizeof(mpc->before));
     memcpy(mpc->rotors, usable, sizeof(mpc->rotors));
@@ -539,11 +479,15 @@ void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
     }
     memset(mpc->estimate, 0, sizeof(mpc->estimate));
     quadsim_work_reset(&mpc->work);
-    mpc->age = -1;
     mpc->known = mpc->headed = 0;
     memcpy(mpc->resting, mpc->controller->hover, sizeof(mpc->resting));
+    memcpy(mpc->trim, mpc->controller->hover, sizeof(mpc->trim));
+    mpc->lift[2] = R(1.0);
     if (mpc->controller->robust != NULL) {
         believe(mpc);
+    }
+    if (fallback != NULL) {
+        quadsim_guard_reset(mpc);
     }
 }
 
@@ -563,7 +507,6 @@ void quadsim_mpc_stand(quadsim_mpc *mpc, const quadsim_real acting[4])
         believe(mpc);
     }
     memcpy(mpc->before, in_force, sizeof(mpc->before));
-    mpc->age = -1;
 }
 
 void quadsim_mpc_learn(quadsim_mpc *mpc, const quadsim_real estimate[6])
@@ -589,14 +532,5 @@ enum quadsim_status quadsim_mpc_solve(quadsim_mpc *mpc, const quadsim_real state
     if (mpc->controller->robust != NULL) {
         return solve_robust(mpc, state, reference, in_force, usable);
     }
-    return usable ? solve_paper(mpc, state, reference, in_force) : QUADSIM_BEFORE;
-}
-
-enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, const quadsim_real state[12], const quadsim_real *reference,
-                                     const quadsim_real acting[4], quadsim_real command[4])
-{
-    const enum quadsim_status found = quadsim_mpc_solve(mpc, state, reference, acting);
-    real in_force[NU];
-    find_in_force(mpc, acting, in_force);
-    return answer(mpc, found, in_force, command);
+    return usable ? solve_paper(mpc, state, reference, in_force) : QUADSIM_INVALID_DATA;
 }

@@ -12,4 +12,5 @@ SIZE(quadsim_problem);
 SIZE(quadsim_work);
 SIZE(quadsim_robust);
 SIZE(quadsim_controller);
+SIZE(quadsim_guard);
 SIZE(quadsim_mpc);

@@ -221,7 +221,7 @@ def test_piqp_answers_infeasible_abandoned_and_invalid_problems(monkeypatch: pyt
     for _ in range(2):
         answer = core.solve(tilted(problem))
         assert (answer.status, answer.answered_by) == ("primal_infeasible", PIQP)
-        assert core._work.refused in (1, 2)
+        assert core._library.quadsim_optimise(*core._arguments) in (3, 4)  # infeasible, or given up
         core.reset()
     for place in range(3):
         given = [np.array(part) for part in climb[:3]]

@@ -1,0 +1,492 @@
+/* The fallback contract around the law: what is flown when it has no usable answer, and the state that it is given.
+ *
+ * Each period flies the first of these that there is: the law's optimum; the last one's plan, shifted, with a correction
+ * towards the states that it foresaw; level hover; descent.  Statement, sources and twin: mpc/fallback of quadsim. */
+#include "quadsim_mpc.h"
+
+#include <string.h>
+
+#include "quadsim_math.h"
+
+enum { NEVER = 1 << 30 }; /* periods */
+
+#ifdef QUADSIM_FLOAT
+static const real BOUND_TOLERANCE = 6e-2F, RATE_ROUNDING = 1e-6F; /* [rad/s] of an optimum; relative, of a body rate */
+#else
+static const real BOUND_TOLERANCE = 1e-6, RATE_ROUNDING = 1e-9;
+#endif
+
+static void count_up(int *periods)
+{
+    *periods += *periods < NEVER;
+}
+
+/* ---- the model of level hover ------------------------------------------------------------------------------------ */
+
+/* Sine and cosine of a yaw. */
+static void find_heading(real yaw, real heading[2])
+{
+    sin_cos(yaw, &heading[0], &heading[1]);
+}
+
+/* Roll and pitch at rest. */
+static void find_level(const quadsim_mpc *mpc, const real heading[2], real level[2])
+{
+    lean_of(mpc->lift, heading[0], heading[1], &level[0], &level[1]);
+}
+
+/* Turn positions and velocities about world z by the angle of a sine and a cosine. */
+static void turn(real *state, real sine, real cosine)
+{
+    int i;
+    for (i = X; i <= VX; i++) {
+        const real x = state[i], y = state[i + Y];
+        state[i] = cosine * x - sine * y;
+        state[i + Y] = sine * x + cosine * y;
+    }
+}
+
+/* A deviation from rest a period later, by the model in axes turned by the yaw, of changed speeds (4,). */
+static void respond(const quadsim_fallback *f, const real heading[2], const real *changes, real *deviation)
+{
+    real before[12];
+    int i;
+    memcpy(before, deviation, sizeof(before));
+    turn(before, -heading[0], heading[1]);
+    for (i = 0; i < 12; i++) {
+        deviation[i] = dot(f->A + i * 12, before, 12) + dot(f->B + i * NU, changes, NU);
+    }
+    turn(deviation, heading[0], heading[1]);
+}
+
+/* A state a period later, of which roll and pitch at rest are level. */
+static void respond_about(const quadsim_fallback *f, const real heading[2], const real level[2], const real *changes,
+                          real *state)
+{
+    state[ROLL] -= level[0];
+    state[PITCH] -= level[1];
+    respond(f, heading, changes, state);
+    state[ROLL] += level[0];
+    state[PITCH] += level[1];
+}
+
+/* A state a period later under a command, by the model about where the vehicle rests. */
+static void predict(const quadsim_mpc *mpc, const real heading[2], const real *command, real *state)
+{
+    const quadsim_controller *c = mpc->controller;
+    const quadsim_fallback *f = c->fallback;
+    real effect[NU], level[2], lift = R(0.0);
+    int j;
+    find_level(mpc, heading, level);
+    for (j = 0; j < NU; j++) { /* thrust has another slope there, and turns the vehicle */
+        effect[j] = mpc->trim[j] / c->hover[j] * (command[j] - mpc->trim[j]);
+        lift += f->slope[j] * effect[j];
+    }
+    for (j = 0; j < NU; j++) {
+        effect[j] += lift * dot(f->inverse + j * NU + 1, mpc->twist, 3);
+    }
+    respond_about(f, heading, level, effect, state);
+}
+
+/* ---- the state, completed by a Kalman filter --------------------------------------------------------------------- */
+
+static int is_moved(real predicted, real measured, real unmoved)
+{
+    return magnitude(predicted - measured) > unmoved;
+}
+
+/* Which channels repeat the last period's numbers; returns whether any does. */
+static int find_repeated(quadsim_guard *g, const real *measured, const int *seen, int *repeated)
+{
+    real rates[3] = {R(1e30), R(1e30), R(1e30)}; /* of no vehicle */
+    int i, any = 0, turning = 1, same = 1;
+    for (i = 0; i < 12; i++) {
+        repeated[i] = is_equal(measured[i], g->last[i]);
+        turning &= i < ROLL || seen[i];
+    }
+    if (turning) { /* a gyro's numbers, which Euler rates are made of */
+        body_rates(measured, rates);
+        for (i = 0; i < 3; i++) {
+            same &= magnitude(rates[i] - g->last_rates[i]) <= R(1e-12) + RATE_ROUNDING * magnitude(rates[i]);
+        }
+    }
+    for (i = 0; i < 12; i++) {
+        repeated[i] |= turning && same && i > ROLL && i % 2 == 1;
+        any |= repeated[i];
+    }
+    memcpy(g->last, measured, sizeof(g->last));
+    memcpy(g->last_rates, rates, sizeof(rates));
+    return any;
+}
+
+/* No longer take a group of three channels for measured that repeats its numbers though the vehicle moves. */
+static void drop_frozen(const quadsim_fallback *f, const real *predicted, const real *measured, const int *repeated,
+                        int *seen)
+{
+    int group, i;
+    for (group = 0; group < 4; group++) {
+        const int first = group / 2 * ROLL + group % 2;
+        int same = 1, moved = 0;
+        for (i = first; i <= first + 4; i += 2) {
+            same &= repeated[i];
+            moved |= is_moved(predicted[i], measured[i], f->unmoved[i]);
+        }
+        for (i = first; i <= first + 4 && same && moved; i += 2) {
+            seen[i] = 0;
+        }
+    }
+}
+
+/* The covariance of the state a period later: F P F' + Q. */
+static void spread(const quadsim_fallback *f, const real heading[2], real *covariance)
+{
+    static const real still[NU] = {R(0.0)};
+    real line[12];
+    int i, j;
+    for (j = 0; j < 12; j++) {
+        for (i = 0; i < 12; i++) {
+            line[i] = covariance[i * 12 + j];
+        }
+        respond(f, heading, still, line);
+        for (i = 0; i < 12; i++) {
+            covariance[i * 12 + j] = line[i];
+        }
+    }
+    for (i = 0; i < 12; i++) {
+        respond(f, heading, still, covariance + i * 12);
+    }
+    for (i = 0; i < 12; i += 2) {
+        const real *process = f->process + (i < ROLL ? 0 : 3);
+        real *pair = covariance + i * 12 + i;
+        pair[0] += process[0];
+        pair[1] += process[1];
+        pair[12] += process[1];
+        pair[13] += process[2];
+    }
+}
+
+/* Correct a predicted state, and its covariance, by one measured channel. */
+static void correct(const quadsim_fallback *f, int channel, real measured, real *state, real *covariance)
+{
+    real column[12], innovation = measured - state[channel], sum, share;
+    int i, j;
+    for (i = 0; i < 12; i++) {
+        column[i] = covariance[i * 12 + channel];
+    }
+    sum = (column[channel] > R(0.0) ? column[channel] : R(0.0)) + f->noise[channel];
+    share = f->noise[channel] / sum;
+    for (i = 0; i < 12; i++) {
+        state[i] += column[i] / sum * innovation;
+        for (j = 0; j < 12; j++) {
+            covariance[i * 12 + j] -= column[i] * column[j] / sum;
+        }
+    }
+    for (i = 0; i < 12; i++) { /* a difference of nearly equal numbers above */
+        covariance[i * 12 + channel] = covariance[channel * 12 + i] = share * column[i];
+    }
+}
+
+static void put_diagonal(real *covariance, const real *variances)
+{
+    int i;
+    memset(covariance, 0, 144 * sizeof(real));
+    for (i = 0; i < 12; i++) {
+        covariance[i * 13] = variances[i];
+    }
+}
+
+/* The whole state now, of what is measured of it, the others predicted under the command in force. */
+static void complete(quadsim_mpc *mpc, const real *measured, const real *acting, int flying)
+{
+    const quadsim_fallback *f = mpc->controller->fallback;
+    quadsim_guard *g = &mpc->guard;
+    real predicted[12], heading[2];
+    int seen[12], repeated[12], i, all = 1, any;
+    for (i = 0; i < 12; i++) {
+        seen[i] = is_within(measured + i, f->plausible[i], 1);
+        all &= seen[i];
+    }
+    any = find_repeated(g, measured, seen, repeated);
+    if (!all || (flying && any)) {
+        memcpy(predicted, g->state, sizeof(predicted));
+        find_heading(g->state[YAW], heading);
+        predict(mpc, heading, acting, predicted);
+        if (flying) {
+            drop_frozen(f, predicted, measured, repeated, seen);
+        }
+        for (i = 0, all = 1; i < 12; i++) {
+            all &= seen[i];
+        }
+    }
+    if (all) {
+        memcpy(g->state, measured, sizeof(g->state));
+        put_diagonal(g->covariance, f->noise);
+        memset(g->unseen, 0, sizeof(g->unseen));
+        return;
+    }
+    spread(f, heading, g->covariance);
+    for (i = 0; i < 12; i++) {
+        if (seen[i]) {
+            correct(f, i, measured[i], predicted, g->covariance);
+        }
+    }
+    if (!is_finite(g->covariance, 144)) { /* after days without a measurement */
+        put_diagonal(g->covariance, f->unknown);
+    }
+    for (i = 0; i < 12; i++) {
+        g->state[i] = seen[i] ? measured[i] : clipped(predicted[i], -f->plausible[i], f->plausible[i]);
+        count_up(&g->unseen[i]);
+        if (seen[i]) {
+            g->unseen[i] = 0;
+        }
+    }
+}
+
+/* ---- level hover by LQR ------------------------------------------------------------------------------------------ */
+
+/* Changes of speeds (4,) that an error in axes turned by the yaw demands, roll and pitch at rest being none. */
+static void demand(const quadsim_fallback *f, const real *error, const real level[2], real *change)
+{
+    real lean[2], levelled[12], acceleration[NU], length;
+    int i;
+    for (i = 0; i < 2; i++) {
+        lean[i] = level[i] - dot(f->lean + i * 4, error, 4); /* of x, vx, y, vy */
+    }
+    length = square_root(lean[0] * lean[0] + lean[1] * lean[1]);
+    memcpy(levelled, error, sizeof(levelled));
+    memset(levelled, 0, 4 * sizeof(real));
+    for (i = 0; i < 2; i++) {
+        levelled[ROLL + 2 * i] -= length > f->tilt ? lean[i] * (f->tilt / length) : lean[i];
+    }
+    for (i = 0; i < NU; i++) {
+        acceleration[i] = -dot(f->gain + i * 12, levelled, 12);
+    }
+    acceleration[0] = clipped(acceleration[0], -f->climb, f->climb);
+    acceleration[3] = clipped(acceleration[3], -f->turn, f->turn);
+    for (i = 0; i < NU; i++) {
+        change[i] = dot(f->inverse + i * NU, acceleration, NU);
+    }
+}
+
+/* ---- what is flown ----------------------------------------------------------------------------------------------- */
+
+/* Speeds within what the bounds on them and on their steps leave after a command [rad/s]; where these leave nothing,
+ * within those on the speeds. */
+static void clip(const quadsim_controller *c, const real *speeds, const real *before, real *command)
+{
+    int j;
+    for (j = 0; j < NU; j++) {
+        const real lower = clipped(before[j] + c->step_min[j], c->speed_min[j], c->speed_max[j]);
+        const real upper = clipped(before[j] + c->step_max[j], c->speed_min[j], c->speed_max[j]);
+        command[j] = clipped(speeds[j], lower, upper);
+    }
+}
+
+/* The same of the kept plan after its first row, unless its steps are within rounding of their bounds. */
+static void clip_plan(const quadsim_controller *c, real *plan)
+{
+    const int count = c->problem->horizon * NU;
+    int i, beyond = 0;
+    for (i = NU; i < count; i++) {
+        const real step = plan[i] - plan[i - NU];
+        beyond |= step - c->step_max[i % NU] > BOUND_TOLERANCE || c->step_min[i % NU] - step > BOUND_TOLERANCE;
+    }
+    for (i = NU; i < count; i += NU) {
+        int j;
+        for (j = 0; j < NU && !beyond; j++) {
+            plan[i + j] = clipped(plan[i + j], c->speed_min[j], c->speed_max[j]);
+        }
+        if (beyond) {
+            clip(c, plan + i, plan + i - NU, plan + i);
+        }
+    }
+}
+
+/* Leave all fallback levels. */
+static void forget(quadsim_guard *g)
+{
+    g->planned = g->foreseeing = g->age = g->hovered = g->targeted = 0;
+}
+
+/* The command of the last plan, corrected; 0 from when it is no longer usable. */
+static int follow_plan(quadsim_mpc *mpc, int lost, const real *acting, real *command)
+{
+    const quadsim_controller *c = mpc->controller;
+    static const real level[2] = {R(0.0), R(0.0)};
+    quadsim_guard *g = &mpc->guard;
+    real changes[NU], error[12], heading[2];
+    int i, near = 1;
+    if (!g->planned) {
+        return 0;
+    }
+    if (!g->foreseeing) { /* the paper's model is not turned */
+        g->foreseeing = 1;
+        find_heading(c->robust == NULL ? R(0.0) : g->foreseen[YAW], g->heading);
+        find_level(mpc, g->heading, g->level);
+        memcpy(g->resting, mpc->resting, sizeof(g->resting));
+    }
+    for (i = 0; i < NU; i++) {
+        changes[i] = mpc->kept[(g->age - 1) * NU + i] - g->resting[i];
+    }
+    respond_about(c->fallback, g->heading, g->level, changes, g->foreseen);
+    for (i = 0; i < 12; i++) {
+        error[i] = g->state[i] - g->foreseen[i];
+        near &= is_within(error + i, c->fallback->distance[i], 1);
+    }
+    g->planned = near && !lost && g->age <= c->fallback->plan_age;
+    if (!g->planned) {
+        return 0;
+    }
+    find_heading(g->state[YAW], heading);
+    turn(error, -heading[0], heading[1]);
+    demand(c->fallback, error, level, command);
+    for (i = 0; i < NU; i++) {
+        command[i] += mpc->kept[g->age * NU + i];
+    }
+    clip(c, command, acting, command);
+    return 1;
+}
+
+/* The command of level hover, or of the descent after it; returns its level. */
+static int hover(quadsim_mpc *mpc, const real *acting, real *command)
+{
+    const quadsim_fallback *f = mpc->controller->fallback;
+    quadsim_guard *g = &mpc->guard;
+    const real *state = g->state;
+    const int sinking = g->hovered >= f->hover;
+    real error[12], level[2], heading[2];
+    int i;
+    if (!g->targeted) {
+        g->targeted = 1;
+        memset(g->target, 0, sizeof(g->target));
+        g->target[X] = state[X];
+        g->target[Y] = state[Y];
+        g->target[Z] = state[Z];
+        g->target[YAW] = state[YAW];
+    }
+    if (square_root(state[VX] * state[VX] + state[VY] * state[VY]) > f->settled) {
+        g->target[X] = state[X];
+        g->target[Y] = state[Y];
+    }
+    if (sinking) {
+        g->target[VZ] = -f->sink;
+        g->target[Z] -= f->sunk;
+    }
+    count_up(&g->hovered);
+    for (i = 0; i < 12; i++) {
+        error[i] = state[i] - g->target[i];
+    }
+    find_heading(state[YAW], heading);
+    turn(error, -heading[0], heading[1]);
+    find_level(mpc, heading, level);
+    demand(f, error, level, command);
+    for (i = 0; i < NU; i++) {
+        command[i] += mpc->trim[i];
+    }
+    clip(mpc->controller, command, acting, command);
+    return sinking ? 3 : 2;
+}
+
+/* The law's status, that of an optimum if its plan may be flown. */
+static enum quadsim_status call_law(quadsim_mpc *mpc, enum quadsim_phase phase, const real *reference,
+                                    const real *acting)
+{
+    quadsim_guard *g = &mpc->guard;
+    const real *plan = mpc->work.plan;
+    enum quadsim_status status;
+    real flown[NU];
+    int i, moving = 1;
+    for (i = 0; i < 12; i++) { /* where and how fast the vehicle turns, and how fast it flies */
+        moving &= g->unseen[i] == 0 || i == X || i == Y || i == Z;
+    }
+    count_up(&g->since);
+    if (!moving || g->since > mpc->controller->fallback->compared || phase != QUADSIM_PHASE_FLYING) {
+        mpc->known = 0; /* nothing to learn from */
+    }
+    if (moving) {
+        g->since = 0;
+    }
+    status = quadsim_mpc_solve(mpc, g->state, reference, acting);
+    if (phase != QUADSIM_PHASE_FLYING) { /* the ground holds the vehicle */
+        mpc->known = 0;
+    }
+    if (status > QUADSIM_WHOLE) {
+        return status;
+    }
+    if (!is_finite(plan, mpc->work.p->horizon * NU)) {
+        return QUADSIM_NOT_FINITE;
+    }
+    clip(mpc->controller, plan, acting, flown);
+    for (i = 0; i < NU; i++) {
+        if (magnitude(plan[i] - flown[i]) > BOUND_TOLERANCE) {
+            return QUADSIM_OUT_OF_BOUNDS;
+        }
+    }
+    return status;
+}
+
+void quadsim_guard_reset(quadsim_mpc *mpc)
+{
+    quadsim_guard *g = &mpc->guard;
+    int i;
+    memset(g, 0, sizeof(*g));
+    put_diagonal(g->covariance, mpc->controller->fallback->unknown);
+    for (i = 0; i < 12; i++) {
+        g->unseen[i] = NEVER;
+        g->last[i] = g->last_rates[i % 3] = R(-1e30); /* what no channel repeats */
+    }
+    g->since = NEVER;
+    mpc->fallback = 0;
+}
+
+enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, enum quadsim_phase phase, const quadsim_real state[12],
+                                     const quadsim_real *reference, const quadsim_real acting[4],
+                                     quadsim_real command[4])
+{
+    const quadsim_controller *c = mpc->controller;
+    const quadsim_fallback *f = c->fallback;
+    quadsim_guard *g = &mpc->guard;
+    enum quadsim_status status = QUADSIM_STATE_UNKNOWN;
+    real in_force[NU];
+    int i, oldest = 0;
+    memcpy(in_force, is_within(acting, f->largest_speed, NU) ? acting : mpc->before, sizeof(in_force));
+    complete(mpc, state, in_force, phase == QUADSIM_PHASE_FLYING);
+    for (i = 0; i < 12; i++) {
+        oldest = g->unseen[i] > oldest ? g->unseen[i] : oldest;
+    }
+    if (oldest > f->unseen) {
+        g->since = NEVER;
+    } else if (!is_within(reference, f->largest_reference, c->problem->horizon * 4)) {
+        g->since = NEVER;
+        status = QUADSIM_INVALID_REFERENCE;
+    } else if (phase == QUADSIM_PHASE_LANDED) {
+        count_up(&g->since);
+        quadsim_mpc_stand(mpc, in_force);
+    } else {
+        status = call_law(mpc, phase, reference, in_force);
+    }
+    if (phase == QUADSIM_PHASE_LANDED) {
+        static const real slowest[NU] = {R(0.0)};
+        forget(g);
+        mpc->fallback = 0;
+        status = QUADSIM_LANDED;
+        clip(c, slowest, in_force, command);
+    } else if (status <= QUADSIM_WHOLE) {
+        forget(g);
+        mpc->fallback = 0;
+        clip(c, mpc->work.plan, in_force, command);
+        memcpy(mpc->kept, mpc->work.plan, (size_t)(c->problem->horizon * NU) * sizeof(real));
+        memcpy(mpc->kept, command, NU * sizeof(real));
+        clip_plan(c, mpc->kept);
+        memcpy(g->foreseen, g->state, sizeof(g->foreseen));
+        g->planned = 1;
+    } else {
+        count_up(&g->age);
+        mpc->fallback = 1;
+        if (!follow_plan(mpc, status == QUADSIM_STATE_UNKNOWN, in_force, command)) {
+            mpc->fallback = hover(mpc, in_force, command);
+        }
+    }
+    memcpy(mpc->before, command, sizeof(mpc->before));
+    return status;
+}

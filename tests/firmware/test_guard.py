@@ -1,0 +1,194 @@
+"""The fallback contract of exported C against `mpc.fallback`: the same failures, the same statuses and commands."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exported_c import PHASES, Host
+
+from mpc.answer import ActuatorBounds
+from mpc.builders import guard_of
+from mpc.codegen import source
+from mpc.core.law import STATUSES
+from mpc.equilibrium import Trim
+from mpc.heading import advance
+from mpc.linear import LinearMPC
+from mpc.model import hover_model
+from quadsim.controller import Command, StepInputs
+from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array
+from scenarios.assembly import Assembly
+from scenarios.loading import load_scenario
+from scenarios.schema.scenario import Scenario
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+
+HEADER = Path(__file__).parents[2] / "mpc" / "core" / "c" / "quadsim_mpc.h"
+TOLD = ("max_iterations", "no_room")
+"""Failures of the C alone: in Python PIQP answers instead."""
+SHORT = {"controller.fallback": {"unseen": 0.4, "hover": 0.5, "plan_age": 0.5}}
+CEILING = {"name": "ceiling", "of": ["vz"], "rows": [[1.0]], "upper": [0.4]}
+HARD = SHORT | {"controller.soft.linear": 1e8, "controller.polytopes": [CEILING]}
+PERIODS = 240
+
+
+@dataclass
+class Told:
+    """A law that fails as it is told to."""
+
+    law: LinearMPC
+    failure: str | None = None
+
+    def __post_init__(self) -> None:
+        self.name, self.solver, self.horizon = self.law.name, self.law.solver, self.law.horizon
+
+    def reset(self, speeds: Array) -> None:
+        self.law.reset(speeds)
+
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
+        answer = self.law.step(now, state, reference)
+        return answer if self.failure is None else replace(answer, status=self.failure)
+
+    @property
+    def trim(self) -> Trim | None:
+        return self.law.trim
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        return self.law.predict(states, plans)
+
+
+class Vehicle:
+    """A vehicle that moves as the hover model does under a constant force, measured with noise and with faults."""
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self.rng, self.state, self.measured = np.random.default_rng(seed), np.zeros(12), np.zeros(12)
+        self.model = hover_model(Assembly(scenario).vehicle, scenario.control_period)
+        self.speeds = self.model.u_bar
+        self.state[INDEX["yaw"]] = 0.4
+        self.trim = Trim(speeds=self.speeds + np.array([3.0, 4.0, 3.0, 2.0]), lift=np.array([-0.2, 0.1, 9.81]))
+
+    def move(self) -> None:
+        self.state = advance(self.model, self.state, self.speeds, self.trim)
+
+    def measure(self, k: int, frozen: Mapping[int, tuple[int, ...]], missing: Mapping[int, tuple[int, ...]]) -> Array:
+        """The state in period k; `frozen` and `missing` channels by period, the latter by turns in three ways."""
+        before, self.measured = self.measured, self.state + 1e-3 * self.rng.normal(size=12)
+        self.measured[[*frozen.get(k, ())]] = before[[*frozen.get(k, ())]]
+        seen = self.measured.copy()
+        seen[[*missing.get(k, ())]] = (math.nan, math.inf, -1e7)[k % 3]
+        return seen
+
+
+def over(channels: tuple[int, ...], *spans: range) -> dict[int, tuple[int, ...]]:
+    return dict.fromkeys((k for span in spans for k in span), channels)
+
+
+def flown(scenario: Scenario, host: Host, seed: int = 0) -> tuple[list[Command], list[tuple[str, int, Array]]]:
+    """Commands of Python and of C to the same measurements, while the vehicle flies Python's."""
+    table, period, vehicle = scenario.controller, scenario.control_period, Vehicle(scenario, seed)
+    pilot = Assembly(scenario.replace({"controller.compiled": True})).controller()
+    guard = guard_of(table, Assembly(scenario).vehicle, period)
+    assert guard is not None
+    assert isinstance(pilot.law, LinearMPC)
+    law, everything = Told(pilot.law), tuple(range(12))
+    law.reset(guard.reset(vehicle.speeds))
+    host.reset(vehicle.speeds)
+    frozen = over(VELOCITY, range(28, 34)) | over(EULER_RATE, range(36, 40)) | over(POSITION + EULER, range(44, 48))
+    missing = over(POSITION, range(52, 56), range(150, 160)) | over(everything, range(60, 63), range(80, 96))
+    missing |= over((INDEX["vx"], INDEX["roll"], INDEX["yaw_rate"]), range(100, 106))
+    path = np.zeros((PERIODS + law.horizon, 4))
+    path[62:66, 0], path[125:129, 1], path[110:, 3], path[190:, 2] = 3.0, 2.0, 1.0, 0.3
+    path += [0.0, 0.0, 0.0, 0.4]
+    python, c = list[Command](), list[tuple[str, int, Array]]()
+    for k in range(PERIODS):
+        if k in (130, 170):
+            vehicle.state[[INDEX["vz"], INDEX["vx"]]] += [2.0, 1.0]  # beyond a hard bound: infeasible
+        seen, reference, acting = vehicle.measure(k, frozen, missing), path[k : k + law.horizon].copy(), vehicle.speeds
+        reference[0, 1] = math.nan if k in (66, 67) else 1e6 if k == 68 else reference[0, 1]
+        acting = np.full(4, math.nan) if k == 24 else np.full(4, 2e6) if k == 25 else acting
+        phase = PHASES[2 if k in (0, 225, 226, 227) else 1 if k in (1, 2, 228) else 0]
+        reply = host.step(seen, reference, acting, phase)
+        status = STATUSES[reply.status]
+        law.failure = status if status in TOLD else None
+        command = guard.step(law, StepInputs(time=k * period, phase=phase, acting=acting), seen, reference)
+        python.append(command)
+        c.append((status, reply.fallback, reply.command))
+        vehicle.speeds = command.speeds
+        vehicle.move()
+    return python, c
+
+
+CASES = {
+    "infeasible": ("robust", HARD, {}, {"primal_infeasible"}),
+    "gave up": ("robust", SHORT, {"changes": 6}, {"max_iterations"}),
+    "no room": ("robust", SHORT, {"rows": 12}, {"no_room"}),
+    "delayed": ("robust-lag50", SHORT, {"rows": 12}, {"no_room"}),
+    "without heading": ("paper-constrained", SHORT, {"rows": 12}, {"no_room"}),
+}
+"""Scenario, its changes, limits of the C, and failures that occur beside those of every case."""
+ALWAYS = {"solved", "unconstrained", "state_unknown", "invalid_reference", "landed"}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_c_flies_what_python_flies(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    name, changes, limits, failures = CASES[case]
+    monkeypatch.setattr(source, "CHANGES", limits.get("changes", source.CHANGES))
+    scenario = load_scenario(name).replace(changes)
+    python, c = flown(scenario, Host(scenario, rows=limits.get("rows", 128)))
+    assert [command.status for command in python] == [status for status, _, _ in c]
+    assert [command.fallback for command in python] == [level for _, level, _ in c]
+    assert {status for status, _, _ in c} >= ALWAYS | failures
+    assert {level for _, level, _ in c} == {0, 1, 2, 3}
+    apart = np.abs(np.array([command.speeds for command in python]) - [speeds for _, _, speeds in c])
+    assert apart.max() <= 1e-12
+
+
+def test_statuses_have_the_same_names() -> None:
+    """`solved` is two in C: with rows of states alone active, or with any."""
+    text = HEADER.read_text()
+    enum = re.search(r"enum quadsim_status \{(.*?)\};", text, re.DOTALL)
+    phases = re.search(r"enum quadsim_phase \{(.*?)\};", text, re.DOTALL)
+    assert enum is not None
+    assert phases is not None
+    names = re.findall(r"QUADSIM_(\w+)(?: = QUADSIM_FOUND_\w+)?[ ,\n]", enum[1])
+    assert (*STATUSES[:3], *(name.lower() for name in names[3:])) == STATUSES
+    assert names[:3] == ["FREE", "AXES", "WHOLE"]
+    assert [name.lower() for name in re.findall(r"QUADSIM_PHASE_(\w+)", phases[1])] == [*PHASES]
+
+
+@pytest.mark.parametrize("name", ["paper-constrained", "robust", "robust-lag50", "crazyflie-steps"])
+def test_both_have_the_same_bounds(name: str) -> None:
+    """Python's contract has those of the table, the C those of the problem."""
+    scenario = load_scenario(name).replace({"controller.fallback": {}})
+    assembly = Assembly(scenario)
+    guard = guard_of(scenario.controller, assembly.vehicle, scenario.control_period)
+    assert guard is not None
+    bounds = ActuatorBounds.of_problem(assembly.problem())
+    for side in ("u_min", "u_max", "delta_min", "delta_max"):
+        np.testing.assert_array_equal(getattr(guard._bounds, side), getattr(bounds, side))
+
+
+def test_a_law_without_a_contract_in_flight_has_one_on_a_computer() -> None:
+    """`unconstrained` hovers level where its state is unknown, and sinks after 5 s."""
+    host, period = Host(load_scenario("paper-unconstrained")), load_scenario("paper-unconstrained").control_period
+    reference, hover = np.zeros((host.horizon, 4)), np.full(4, 192.8)
+    host.reset(hover)
+    assert host.step(np.zeros(12), reference, hover).fallback == 0
+    levels = [host.step(np.full(12, math.nan), reference, hover).fallback for _ in range(round(8.0 / period))]
+    assert levels == [0] * round(1.5 / period) + [2] * round(5.0 / period) + [3] * round(1.5 / period)
+
+
+@pytest.mark.parametrize("case", ["infeasible", "delayed"])
+def test_floats_fly_nearly_the_same(case: str) -> None:
+    name, changes, limits, _ = CASES[case]
+    scenario = load_scenario(name).replace(changes)
+    python, c = flown(scenario, Host(scenario, "float", rows=limits.get("rows", 128)))
+    assert [command.status for command in python] == [status for status, _, _ in c]
+    assert [command.fallback for command in python] == [level for _, level, _ in c]
+    assert np.abs(np.array([command.speeds for command in python]) - [speeds for _, _, speeds in c]).max() <= 0.02
