@@ -14,6 +14,9 @@ The law is called in every period with a known state, so it resumes automaticall
 that its slew bounds refer to the acting command, and the list of predicted channels
 (`StepInputs.unseen`).
 
+Exported laws have the same contract in C, `mpc/core/c/quadsim_guard.c`; `tests/firmware/test_guard.py` holds the two
+together.
+
 A law that estimates disturbances is `mpc.equilibrium.Trimmed`.  Levels 1 to 3, and predictions of missing channels,
 start from its equilibrium; it is held while nothing is measured.
 """

@@ -39,6 +39,31 @@ def test_a_flight_by_the_target_is_the_flight_by_python(name: str) -> None:
     assert [finding.satisfied for finding in result.findings] == [finding.satisfied for finding in desired.findings]
 
 
+FAILURES = {
+    "pushed beyond a hard bound": {
+        "controller.soft.linear": 1e8,
+        "controller.polytopes": [{"name": "ceiling", "of": ["vz"], "rows": [[1.0]], "upper": [0.4]}],
+        "events": [{"type": "push", "at": 3.0, "duration": 0.5, "force": [0, 0, 25]}],
+    },
+    "a lost sensor": {
+        "events": [{"type": "sensor_fault", "at": 2.0, "duration": 3.0, "sensor": "position", "fault": "nan"}],
+    },
+}
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+def test_without_an_answer_the_target_flies_pythons_fallback(failure: str) -> None:
+    if shutil.which("cc") is None:
+        pytest.skip("cc is not installed: make firmware")
+    scenario = load_scenario("robust").replace({"duration": 6.0} | FAILURES[failure])
+    desired = Rollout(scenario.replace({"controller.compiled": True})).fly()
+    result = fly_exported(scenario, target="posix", progress=False)
+    assert max(desired.log.control.fallback) >= 1
+    assert [*result.log.control.fallback] == [*desired.log.control.fallback]
+    assert result.log.control.status == desired.log.control.status
+    assert np.abs(result.command - desired.command).max() <= 1e-6
+
+
 def test_on_the_ground_the_target_estimates_no_disturbance() -> None:
     """From cold rotors: an observer that took the ground for a force would command otherwise for seconds."""
     if shutil.which("cc") is None:

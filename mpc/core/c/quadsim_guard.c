@@ -282,26 +282,6 @@ static void clip(const quadsim_controller *c, const real *speeds, const real *be
     }
 }
 
-/* The same of the kept plan after its first row, unless its steps are within rounding of their bounds. */
-static void clip_plan(const quadsim_controller *c, real *plan)
-{
-    const int count = c->problem->horizon * NU;
-    int i, beyond = 0;
-    for (i = NU; i < count; i++) {
-        const real step = plan[i] - plan[i - NU];
-        beyond |= step - c->step_max[i % NU] > BOUND_TOLERANCE || c->step_min[i % NU] - step > BOUND_TOLERANCE;
-    }
-    for (i = NU; i < count; i += NU) {
-        int j;
-        for (j = 0; j < NU && !beyond; j++) {
-            plan[i + j] = clipped(plan[i + j], c->speed_min[j], c->speed_max[j]);
-        }
-        if (beyond) {
-            clip(c, plan + i, plan + i - NU, plan + i);
-        }
-    }
-}
-
 /* Leave all fallback levels. */
 static void forget(quadsim_guard *g)
 {
@@ -477,7 +457,6 @@ enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, enum quadsim_phase phase,
         clip(c, mpc->work.plan, in_force, command);
         memcpy(mpc->kept, mpc->work.plan, (size_t)(c->problem->horizon * NU) * sizeof(real));
         memcpy(mpc->kept, command, NU * sizeof(real));
-        clip_plan(c, mpc->kept);
         memcpy(g->foreseen, g->state, sizeof(g->foreseen));
         g->planned = 1;
     } else {
