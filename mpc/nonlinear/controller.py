@@ -118,7 +118,6 @@ class NonlinearMPC:
 
     Attributes:
         settings: its table.
-        tolerance: `TOLERANCE`, for this law.
         infeasible_period: the first period whose QP had no answer or, if there is none, whose SQP did not converge.
     """
 
@@ -134,6 +133,7 @@ class NonlinearMPC:
         constraints: tuple[Constraint, ...] = (),
         space: Space | None = None,
         kkt_every: int = KKT_EVERY,
+        tolerance: float = TOLERANCE,
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
@@ -161,7 +161,6 @@ class NonlinearMPC:
             self._level = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._lag = lags[0] if self._targets else rotor_lag  # of actuator states [s]
         self._tilted = settings.tilt is not None
-        self.tolerance = TOLERANCE
         self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         self.problem = self._problem(constraints)
         self._check = AnswerCheck(self.problem, kkt_every)
@@ -176,7 +175,7 @@ class NonlinearMPC:
             shift=self._shift,
             iterations=settings.iterations,
             corrections=CORRECTIONS * self._targets,
-            tolerance=self.tolerance,
+            tolerance=tolerance,
             faces=0 if space is None else space.count,
             price=None if space is None else space.penalty,
         )

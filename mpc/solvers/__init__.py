@@ -16,7 +16,7 @@ from mpc.condensing import Condensed, FreeOptimum
 from mpc.ocp import Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Backend, Solution
-from quadsim.controller import ACCEPTED, CORE, GAIN, NO_STATISTICS, Statistics
+from quadsim.controller import CORE, GAIN, NO_STATISTICS, Statistics
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
 
@@ -184,8 +184,8 @@ class Solver(Protocol):
 class QPSolver:
     """Solves a problem's QP in each period with a named solver.
 
-    With `free_first`, the unconstrained optimum is tried first: if it satisfies every constraint, it is the optimum, and
-    no QP is solved.
+    With `free_first`, the unconstrained optimum is tried first: if it satisfies every constraint, it is the optimum,
+    and no QP is solved.
     """
 
     def __init__(self, name: str, problem: Problem, *, free_first: bool = False) -> None:

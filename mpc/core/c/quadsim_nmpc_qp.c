@@ -151,9 +151,6 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
         for (r = 0; held[a] && r < n; r++) {
             g[r] += both[r][first + a] * (held[a] > 0 ? p->upper[a] : p->lower[a]);
         }
-        if (moves && held[a]) {
-            g[n - NU + a] -= p->move * (held[a] > 0 ? p->upper[a] : p->lower[a]);
-        }
     }
     for (a = 0; a < NU; a++) { /* B' P A, and from it the gain */
         for (j = 0; j < 3; j++) {
@@ -470,6 +467,9 @@ INLINED void optimum_sized(quadsim_nmpc_work *work, const int actuators, const i
             const int side = work->held[i * NU + j];
             if (side != 0) {
                 work->feed[i * NU + j] = side > 0 ? p->upper[j] : p->lower[j];
+                if (moves) {
+                    g[n - NU + j] -= p->move * work->feed[i * NU + j];
+                }
             }
         }
         for (j = 0; j < n; j++) {
