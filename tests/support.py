@@ -14,9 +14,9 @@ from scipy.linalg import block_diag
 
 from mpc.constrained import Constrained
 from mpc.constraints import Bounds, Constraint, Penalty
-from mpc.core.body import Body
 from mpc.linear import LinearMPC, NominalPreparation
 from mpc.model import LinearModel
+from mpc.nonlinear.body import Body
 from mpc.nonlinear.model import NonlinearModel, next_state
 from mpc.nonlinear.rigidbody import RigidBody
 from mpc.ocp import Equilibrium, Objective, Problem, Query
@@ -224,7 +224,7 @@ def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
 
 
 def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
-    """See `mpc.core.body.Body.linearise`."""
+    """See `mpc.nonlinear.body.Body.linearise`."""
     return Body(model).linearise(x, u, frames)
 
 

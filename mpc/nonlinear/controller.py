@@ -25,11 +25,10 @@ import scipy.linalg
 from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, resized
 from mpc.bounded import resolved_lag
 from mpc.constraints import Constraint, Penalty
-from mpc.core.body import Body
-from mpc.core.sqp import SQP, SQPStatus, slack_groups
 from mpc.disturbance import RampObserver
 from mpc.equilibrium import LEAST_LIFT, Trim
 from mpc.model import LinearModel
+from mpc.nonlinear.body import Body
 from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import (
     N_BODY,
@@ -45,6 +44,7 @@ from mpc.nonlinear.rigidbody import (
     thrust_axis,
 )
 from mpc.nonlinear.settings import Nonlinear
+from mpc.nonlinear.sqp import SQP, SQPStatus, slack_groups
 from mpc.observer import DisturbanceObserver, disturbance_of
 from mpc.obstacles import HALF_SPACE_ROUNDING, SETTLED, Space, distances
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
@@ -94,7 +94,7 @@ OUTSIDE: Final = 1e-6
 CONVERGED: Final = 0.1
 """Largest dynamics defect of a converged plan (`quadsim.controller.Statistics`). Library flights exceed it in at most 9
 periods, after steps of the course and upside down; a tumbling vehicle exceeds it in all."""
-TOLERANCE: Final = 1e-6  # largest change of a state or an input at which the SQP of a period stops
+STEP_TOLERANCE: Final = 1e-6  # largest change of a state or an input at which the SQP of a period stops
 CORRECTIONS: Final = 2
 """Most further SQP steps in a period whose plan has not `CONVERGED`, where commands are targets; if it still has not,
 the next period starts from the reference. A single step from far away may leave a plan with a full turn in it, which
@@ -102,8 +102,8 @@ further steps keep: that way a stiff soft bound on tilt and unfiltered steps of 
 TILT_SIDES: Final = 12
 """Sides of the polygon that a tilt bound imposes on the thrust axis's horizontal part, inside the circle; it costs up
 to 3.4 % of the bound's sine."""
-OPTIMA: Final = {SQPStatus.FREE, SQPStatus.BOUNDED, SQPStatus.UNCONVERGED}
-FAILURES: Final = {
+_OPTIMA: Final = {SQPStatus.FREE, SQPStatus.BOUNDED, SQPStatus.UNCONVERGED}
+SQP_FAILURES: Final = {
     SQPStatus.INFEASIBLE: "primal_infeasible",
     SQPStatus.GIVEN_UP: "max_iterations",
     SQPStatus.NO_ROOM: "no_room",
@@ -133,7 +133,7 @@ class NonlinearMPC:
         constraints: tuple[Constraint, ...] = (),
         space: Space | None = None,
         kkt_every: int = KKT_EVERY,
-        tolerance: float = TOLERANCE,
+        tolerance: float = STEP_TOLERANCE,
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
@@ -165,7 +165,10 @@ class NonlinearMPC:
         self.problem = self._problem(constraints)
         self._check = AnswerCheck(self.problem, kkt_every)
         self.solver = CORE
-        self._space, self._groups = space, slack_groups(self.problem)
+        self._space, self._groups = (
+            space,
+            slack_groups(self.problem, faces=space is not None and space.penalty is not None),
+        )
         self._shift = self._stride == 1 if settings.shift is None else settings.shift
         self._sqp = SQP(
             self._model,
@@ -531,10 +534,10 @@ class NonlinearMPC:
         asked = measured, self._shares(self._acting), nodes.states, nodes.thrusts
         status = sqp.step(*asked) if self._space is None else self._among(self._space, time, asked)
         spent_s = clock.perf_counter() - started
-        if status not in OPTIMA:
+        if status not in _OPTIMA:
             nowhere = np.full((self._nodes, N_ROTORS), math.nan)
             stats = Statistics(iterations=sqp.iterations, solve_s=spent_s)
-            return Answer(nowhere, np.zeros((self._nodes, 0)), FAILURES[status], CORE, stats=stats)
+            return Answer(nowhere, np.zeros((self._nodes, 0)), SQP_FAILURES[status], CORE, stats=stats)
         free, active = status is SQPStatus.FREE, sqp.active
         stats = Statistics(
             iterations=sqp.iterations,
@@ -569,7 +572,7 @@ class NonlinearMPC:
                     break
                 sqp.half_spaces = normals, bounds
                 status, before = sqp.solve(), along
-                if status not in OPTIMA:
+                if status not in _OPTIMA:
                     break
                 along = sqp.positions
                 if np.abs(along - before).max() < SETTLED:

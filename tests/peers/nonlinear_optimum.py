@@ -14,7 +14,7 @@ from peers.do_mpc_ocp import DoMPC
 
 from mpc.answer import ActuatorBounds
 from mpc.bounded import Soft
-from mpc.nonlinear.controller import TOLERANCE, NonlinearMPC
+from mpc.nonlinear.controller import STEP_TOLERANCE, NonlinearMPC
 from mpc.nonlinear.settings import Nonlinear, Weights
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.motion import Motion
@@ -97,7 +97,7 @@ class Course:
             soft=Soft(linear=case.penalty[0], quadratic=case.penalty[1]) if any(case.penalty) else None,
         )
         return NonlinearMPC(
-            self.vehicle, period=PERIOD[case], settings=made, bounds=bounds, tolerance=tolerance or TOLERANCE
+            self.vehicle, period=PERIOD[case], settings=made, bounds=bounds, tolerance=tolerance or STEP_TOLERANCE
         )
 
     def question(self, k: int, rng: np.random.Generator, before: Array | None, rotors: Array | None) -> Question:

@@ -14,7 +14,7 @@ from support import advance_nodes
 from mpc.answer import ActuatorBounds
 from mpc.constraints import Constraint
 from mpc.diagnosis import find_conflict
-from mpc.nonlinear.controller import CONVERGED, TOLERANCE, NonlinearMPC
+from mpc.nonlinear.controller import CONVERGED, STEP_TOLERANCE, NonlinearMPC
 from mpc.nonlinear.reference import nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, rigid_body, thrust_axis
 from mpc.nonlinear.settings import Nonlinear, Weights
@@ -37,7 +37,7 @@ def law(
     bounds: ActuatorBounds | None = None, constraints: tuple[Constraint, ...] = (), **settings: Any
 ) -> NonlinearMPC:
     """Of nodes of two periods; the horizon is in nodes."""
-    nodes, tolerance = settings.pop("horizon", 10), settings.pop("tolerance", TOLERANCE)
+    nodes, tolerance = settings.pop("horizon", 10), settings.pop("tolerance", STEP_TOLERANCE)
     made = Nonlinear(horizon=2 * nodes, node=2.0 * PERIOD, **settings)
     return NonlinearMPC(
         VEHICLE, period=PERIOD, settings=made, bounds=bounds, constraints=constraints, tolerance=tolerance

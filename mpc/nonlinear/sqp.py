@@ -12,16 +12,16 @@ from typing import Any, Final, NamedTuple, NoReturn
 import numpy as np
 
 from mpc.constraints import Constraint
-from mpc.core.body import (
+from mpc.nonlinear.body import (
     AT,
     INT,
-    MOST_STATES,
     REAL,
+    STATES_ROOM,
     ProblemStruct,
     World,
     body_numbers,
-    fill,
-    members,
+    set_arrays,
+    struct_members,
     unpacked,
     width_of,
 )
@@ -31,12 +31,12 @@ from quadsim.core.library import check_sizes, load_library
 from quadsim.state import Array, Indices
 from quadsim.vehicle import N_ROTORS
 
-MOST_CHANGES: Final = 3000
+_MOST_CHANGES: Final = 3000
 """Limit of active-set changes in a search."""
-HARD: Final = 1e30
-CURVATURE: Final = 1e-5
+_HARD: Final = 1e30
+_CURVATURE: Final = 1e-5
 """Curvature of a price without one, about the optimum that the core iterates for, per l1."""
-OWN_SLACKS: Final = {"tilt": 0, "body_rates": 1, "space": 2}
+_OWN_SLACKS: Final = {"tilt": 0, "body_rates": 1, "space": 2}
 """Slacks of a node by the constraints that have them; those of all others follow."""
 _TILT_SIDES: Final = 12
 
@@ -54,17 +54,17 @@ class SQPStatus(IntEnum):
 
 
 class _Term(ctypes.Structure):
-    _fields_ = [*members(REAL, "coefficient"), *members(INT, "entry lag")]
+    _fields_ = [*struct_members(REAL, "coefficient"), *struct_members(INT, "entry lag")]
 
 
 class _Work(ctypes.Structure):
     _fields_ = [
-        *members(AT, "p"),
-        *members(INT, "planned shifted iterations count changes rounds inner patience"),
-        *members(REAL, "defect moved violation share largest least measured:21 start:21 before:4"),
-        *members(AT, "x u frame goal aim face beyond map offset end axis known gain inverse feed more s v"),
-        *members(AT, "value own response factor multiplier r d price rate origin x_before u_before last"),
-        *members(AT, "row slot free held"),
+        *struct_members(AT, "p"),
+        *struct_members(INT, "planned shifted iterations count changes rounds inner patience"),
+        *struct_members(REAL, "defect moved violation share largest least measured:21 start:21 before:4"),
+        *struct_members(AT, "x u frame goal aim face beyond map offset end axis known gain inverse feed more s v"),
+        *struct_members(AT, "value own response factor multiplier r d price rate origin x_before u_before last"),
+        *struct_members(AT, "row slot free held"),
     ]
 
 
@@ -130,7 +130,7 @@ class SQP:
         moves = problem.objective.Q_d is not None
         parts = {part.name: part for part in problem.every_constraint}
         tilt, rates = parts.get("tilt"), parts.get("body_rates")
-        prices = [_price(tilt), _price(rates), (HARD, 1.0) if price is None else _halved(*price)]
+        prices = [_price(tilt), _price(rates), (_HARD, 1.0) if price is None else _halved(*price)]
         places = N_ROTORS + 2 * (tilt is not None) + 3 * (rates is not None)
         rows = _stated(problem, places, prices)
         self._rows, self._numbers = rows, _numbers(problem)
@@ -147,29 +147,29 @@ class SQP:
             faces=faces,
             slacks=len(prices),
             room=min(at_most, 6 * self.horizon) + 1,
-            changes=MOST_CHANGES,
+            changes=_MOST_CHANGES,
             iterations=iterations,
             corrections=corrections,
             tolerance=tolerance,
             move=problem.objective.move_weight[0, 0],
         )
         size = model.n + N_ROTORS * moves
-        weights, terminal = np.zeros(MOST_STATES), np.zeros((size, size))
+        weights, terminal = np.zeros(STATES_ROOM), np.zeros((size, size))
         Q, end = problem.objective.weights[0], problem.objective.terminal_weights[0]
         weights[: model.n] = np.diag(Q)[: model.n]
         terminal[: model.n, : model.n] = end[: model.n, : model.n]
         if moves:
             weights[model.n : size] = p.move
-        fill(p, weight=weights, effort=np.diag(problem.objective.Q_u), lower=inputs[0], upper=inputs[1])
+        set_arrays(p, weight=weights, effort=np.diag(problem.objective.Q_u), lower=inputs[0], upper=inputs[1])
         if tilt is not None:
             p.tilt = float(tilt.upper[0])
         if rates is not None:
-            fill(p, turn=np.minimum(rates.upper, HARD))
+            set_arrays(p, turn=np.minimum(rates.upper, _HARD))
         terms = [term for row in rows for term in row.terms]
         first = np.cumsum([0, *(len(row.terms) for row in rows)])
         bounds = [[row.first for row in rows], [row.bound for row in rows]]
         linear, quadratic = np.array(prices).T
-        self._prices = linear, np.where(quadratic > 0.0, quadratic, CURVATURE * linear)
+        self._prices = linear, np.where(quadratic > 0.0, quadratic, _CURVATURE * linear)
         self._left, p.terminal = body_numbers(model, p), self._array(terminal)
         p.terms = self._keep((_Term * max(len(terms), 1))(*(_Term(*term) for term in terms)))
         p.first, p.slack = self._array(first, np.intc), self._array([row.slack for row in rows], np.intc)
@@ -397,7 +397,7 @@ def _halved(l1: float, l2: float) -> tuple[float, float]:
 
 def _price(part: Constraint | None) -> tuple[float, float]:
     if part is None or part.penalty is None:
-        return HARD, 1.0
+        return _HARD, 1.0
     return _halved(float(part.penalty.l1[0]), float(part.penalty.l2[0]))
 
 
@@ -432,15 +432,15 @@ def _stated(problem: Problem, places: int, prices: list[tuple[float, float]]) ->
     return stated
 
 
-def slack_groups(problem: Problem) -> Indices:
-    """Return which slack of a node each of the problem's slacks is: of tilt, body rates, then of rows as stated."""
-    rows, groups, count = problem.rows, dict[int, int](), len(OWN_SLACKS)
+def slack_groups(problem: Problem, *, faces: bool = False) -> Indices:
+    """Return which slack of a node each of the problem's slacks is, and last that of `faces`, which have one."""
+    rows, groups, count = problem.rows, dict[int, int](), len(_OWN_SLACKS)
     for i, name in enumerate(rows.names):
         slack = int(rows.slack[i])
         if slack < 0 or slack in groups:
             continue
-        if name in OWN_SLACKS:
-            groups[slack] = OWN_SLACKS[name]
+        if name in _OWN_SLACKS:
+            groups[slack] = _OWN_SLACKS[name]
         else:
             groups[slack], count = count, count + 1
-    return np.array([groups[slack] for slack in range(len(groups))], int)
+    return np.array([groups[slack] for slack in range(len(groups))] + [_OWN_SLACKS["space"]] * faces, int)

@@ -15,13 +15,13 @@ from quadsim.core.library import check_sizes, load_library
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 
-MOST_STATES: Final = 21
+STATES_ROOM: Final = 21
 INT: Final = ctypes.c_int
 REAL: Final = ctypes.c_double
 AT: Final = ctypes.c_void_p
 
 
-def members(kind: type[Any], names: str) -> list[tuple[str, Any]]:
+def struct_members(kind: type[Any], names: str) -> list[tuple[str, Any]]:
     """Return members of a struct, as `x n:3`."""
     parts = (name.partition(":") for name in names.split())
     return [(name, kind * int(size) if size else kind) for name, _, size in parts]
@@ -31,21 +31,21 @@ class ProblemStruct(ctypes.Structure):
     """A `quadsim_nmpc_problem`."""
 
     _fields_ = [
-        *members(INT, "horizon actuators targets speeds substeps difference shifts moves tilts turns places"),
-        *members(INT, "rows faces slacks room changes iterations corrections"),
-        *members(REAL, "tolerance step gravity largest effect:16 gyration:3 lead:4"),
-        *members(AT, "left"),
-        *members(REAL, "weight:21 effort:4 move"),
-        *members(AT, "terminal"),
-        *members(REAL, "lower:4 upper:4 tilt turn:3"),
-        *members(AT, "terms first bounds slack linear quadratic"),
+        *struct_members(INT, "horizon actuators targets speeds substeps difference shifts moves tilts turns places"),
+        *struct_members(INT, "rows faces slacks room changes iterations corrections"),
+        *struct_members(REAL, "tolerance step gravity largest effect:16 gyration:3 lead:4"),
+        *struct_members(AT, "left"),
+        *struct_members(REAL, "weight:21 effort:4 move"),
+        *struct_members(AT, "terminal"),
+        *struct_members(REAL, "lower:4 upper:4 tilt turn:3"),
+        *struct_members(AT, "terms first bounds slack linear quadratic"),
     ]
 
 
 class WorldStruct(ctypes.Structure):
     """A `quadsim_nmpc_world`."""
 
-    _fields_ = members(REAL, "acceleration:3 angular:3 drag:3 square_drag:3 thrust_scale")
+    _fields_ = struct_members(REAL, "acceleration:3 angular:3 drag:3 square_drag:3 thrust_scale")
 
 
 @cache
@@ -58,7 +58,7 @@ def _library() -> ctypes.CDLL:
     return library
 
 
-def fill(struct: ctypes.Structure, **arrays: Array | Sequence[float]) -> None:
+def set_arrays(struct: ctypes.Structure, **arrays: Array | Sequence[float]) -> None:
     """Set array members of a struct."""
     for name, values in arrays.items():
         getattr(struct, name)[:] = np.asarray(values, float).ravel().tolist()
@@ -90,7 +90,7 @@ def body_numbers(model: RigidBody, p: ProblemStruct) -> Array:
     ixx, iyy, izz = model.inertia.tolist()
     gyration = (0.0, 0.0, 0.0) if model.targets else ((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz)
     lag = np.array(model.lags)
-    fill(p, effect=model.effect, gyration=gyration, lead=lag / model.step)
+    set_arrays(p, effect=model.effect, gyration=gyration, lead=lag / model.step)
     instants = np.arange(2 * model.substeps + 1)[:, None] * (0.5 * model.step / model.substeps)
     left = np.where(lag > 0.0, np.exp(-instants / np.where(lag > 0.0, lag, 1.0)), 0.0)
     p.left = left.ctypes.data
