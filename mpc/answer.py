@@ -135,16 +135,16 @@ class AnswerCheck:
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a failed solver may return any number
     def __call__(
-        self, problem: Problem, query: Query, answer: Answer, refused: str | None
+        self, problem: Problem, query: Query | None, answer: Answer, refused: str | None
     ) -> tuple[Answer, str | None]:
         """Return the answer with its violation of rows and, when due, KKT residuals; and the reason to reject it.
 
-        A reason in `refused` takes precedence.
+        A reason in `refused` takes precedence.  Without a query, the answer's own violation counts.
         """
         due, self._periods = self._periods % self._every == 0, self._periods + 1
         if answer.certificate is None:
             return answer, refused
-        violation = self._infeasibility(problem, query, answer)
+        violation = answer.stats.infeasibility if query is None else self._infeasibility(problem, query, answer)
         if refused is None and not violation <= INFEASIBLE:
             refused = INFEASIBLE_ANSWER
         if due or refused is not None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -164,26 +163,6 @@ class Condensed:
         )
         return cls(replace(problem, bounds=free))
 
-    @cached_property
-    def _changing(self) -> tuple[Array, Array | None, Array, Array]:
-        """The parts that do not depend on the model.
-
-        Returns:
-            (n_r, n_r) L' of Q_y = L L'; (r, n) the same of the terminal weight, None if it is zero;
-            (N nu, N nu) the Hessian of inputs and input changes;
-            (N + 1, n + nu + 1, N nu + 1) each step's inputs and 1, as functions of all inputs and 1, below n zeros.
-        """
-        objective, model, N = self._problem.objective, self._problem.model, self._problem.horizon
-        n, nu = model.n, model.nu
-        steps = slew_matrix(N, nu)
-        moves = steps.T @ np.kron(np.eye(N), objective.move_weight) @ steps
-        S = np.zeros((N + 1, n + nu + 1, N * nu + 1))
-        S[:N, n:-1, :-1] = np.eye(N * nu).reshape(N, nu, N * nu)
-        S[:, -1, -1] = 1.0
-        H = 2.0 * (np.kron(np.eye(N), objective.Q_u) + moves)
-        factor = np.asarray(np.linalg.cholesky(objective.Q_y).T, float)
-        return factor, _root(objective.terminal_weights[0]), H, S
-
     def period(
         self, state: Array, reference: Array, u_before: Array, equilibrium: Equilibrium | None = None
     ) -> CondensedQP:
@@ -206,9 +185,7 @@ class Condensed:
         return CondensedQP(*map(np.array, (qp.P, qp.c, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)))
 
     def assemble(self, query: Query) -> PeriodQP:
-        """Return the QP of a period; without `Query.steps` its matrices are those of `qp` itself."""
-        if query.steps is not None:
-            return self._assemble_changed(query)
+        """Return the QP of a period; its matrices are those of `qp` itself."""
         terms, values, rows = self.cost, self._values, self._rows
         state, desired, u_before = query[:3]
         x_s, u_s = query.equilibrium or self._problem.equilibrium
@@ -220,48 +197,6 @@ class Condensed:
         shift[0] += rows.E @ (u_s - u_before)
         qp = replace(self._blank, c=c, h_l=(rows.lower - shift).ravel(), h_u=(rows.upper - shift).ravel())
         return PeriodQP(qp, lambda x: predicted(self._problem, query, self.inputs(x)))
-
-    def _assemble_changed(self, query: Query) -> PeriodQP:
-        """Return the same in absolute states and inputs, for a model that changes."""
-        assert query.steps is not None
-        (A, B, c), (state, desired, u_before) = query.steps, query[:3]
-        rest, blank = query.equilibrium or self._problem.equilibrium, self._blank
-        objective, rows, m = self._problem.objective, self._rows, self._inputs
-        N, n, nu = B.shape
-        (target, root_end, H, inputs), count, root = self._changing, len(rows.C), self._changing[0] @ objective.C_r
-        # Columns: the inputs of all steps, then the constant part.  Below the states of each step are its inputs and 1,
-        # so that one product with [A B c] gives the next states.
-        S, steps = np.empty_like(inputs), np.concatenate([A, B, c[:, :, None]], axis=2)
-        S[0, :n], S[:, n:] = 0.0, inputs[:, n:]
-        S[0, :n, m] = state
-        for t in range(N):
-            np.dot(steps[t], S[t], out=S[t + 1, :n])
-        S = S[:, :n]
-        R = root @ S[1:N]
-        R[:, :, -1] -= desired[:-1] @ target.T
-        stacked = R.reshape(-1, m + 1)
-        if root_end is not None:
-            end = root_end @ S[N]
-            # A terminal weight of its own penalises the distance from x_s + C_r^+ (y_d - C_r x_s).
-            terminal_target = rest.x + np.linalg.pinv(objective.C_r) @ (desired[-1] - objective.C_r @ rest.x)
-            end[:, -1] -= root_end @ terminal_target
-            stacked = np.concatenate([stacked, end])
-        square = stacked.T @ stacked
-        square *= 2.0
-        P, gradient = blank.P.copy(order="F"), self._linear.copy()
-        np.add(square.T[:m, :m], H.T, out=P[:m, :m])  # both are symmetric
-        gradient[:m] += square[:m, m]
-        gradient[:m].reshape(N, nu)[:] -= rest.u @ (2.0 * objective.Q_u)
-        gradient[:nu] -= 2.0 * objective.move_weight @ u_before
-        G, h_l, h_u = blank.G, blank.h_l, blank.h_u
-        if count:
-            values = _on_states(rows.C, rows.of_states, S)
-            values[0, :, -1] -= rows.E @ u_before
-            filled, known = np.array(blank.G, order="C"), values[:, :, m]
-            filled.reshape(N, count, -1)[:, :, :m] = _with_inputs(values[:, :, :m], rows)
-            G, h_l, h_u = np.asfortranarray(filled), (rows.lower - known).ravel(), (rows.upper - known).ravel()
-        qp = replace(blank, P=P, c=gradient, G=G, h_l=h_l, h_u=h_u)
-        return PeriodQP(qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m])
 
     def inputs(self, x: Array) -> Array:
         """Return (N, nu) the planned inputs [rad/s] of a primal point."""
@@ -280,11 +215,12 @@ class Condensed:
 
         Multipliers are positive at upper bounds and negative at lower ones.
         """
-        (z, z_box), x, soft = self._rows.split(multipliers), plan.ravel(), self._problem.rows.soft
-        if soft.size:
-            l1, l2 = self._problem.rows.l1[soft], self._problem.rows.l2[soft]
-            # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
-            z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
+        (z, z_box), x, rows = self._rows.split(multipliers), plan.ravel(), self._problem.rows
+        if rows.soft.size:
+            l1, l2 = rows.l1[rows.slacks], rows.l2[rows.slacks]
+            prices = np.abs(multipliers[:, rows.soft]) @ (rows.slack[rows.soft][:, None] == np.arange(l1.size))
+            # Stationarity of a slack: l1 + 2 l2 e - sum |z| + z_box = 0.
+            z_slacks = np.minimum(prices - l1 - 2.0 * l2 * slacks, 0.0)
             x, z_box = np.concatenate((x, slacks.ravel())), np.concatenate((z_box, z_slacks.ravel()))
         return Solution(x, self._blank.b, z, z_box)
 
@@ -292,37 +228,25 @@ class Condensed:
 class FreeOptimum:
     """The unconstrained optimum, which is the optimum of the QP if it satisfies every constraint.  Eq. (22).
 
-    The Hessian is factorised once, unless the matrices are `changing` from one QP to the next.
+    The Hessian is factorised once.
     """
 
-    def __init__(self, form: Condensed, *, changing: bool) -> None:
+    def __init__(self, form: Condensed) -> None:
         self.form, H = form, form.cost.H
-        self._inputs, self._usable, self._factor = len(H), True, None
-        if not changing:
-            self._factor, failed = lapack.dpotrf(H)
-            hold = np.ones(len(H))
-            self._usable = form.qp.P.size + form.qp.G.size <= LARGEST_QP and not failed
-            self._usable &= np.abs(lapack.dpotrs(self._factor, H @ hold)[0] - hold).max() < ILL_CONDITIONED
+        self._inputs, hold = len(H), np.ones(len(H))
+        self._factor, failed = lapack.dpotrf(H)
+        self._usable = form.qp.P.size + form.qp.G.size <= LARGEST_QP and not failed
+        self._usable &= np.abs(lapack.dpotrs(self._factor, H @ hold)[0] - hold).max() < ILL_CONDITIONED
 
     def __call__(self, qp: QP) -> Solution | None:
         """Return the optimum of a QP; None if it violates a constraint."""
         if not self._usable:
             return None
         m, x = self._inputs, np.zeros(qp.c.size)
-        if self._factor is None:
-            _, x[:m], failed = lapack.dposv(qp.P[:m, :m], -qp.c[:m])
-        else:
-            x[:m], failed = lapack.dpotrs(self._factor, -qp.c[:m])
+        x[:m], failed = lapack.dpotrs(self._factor, -qp.c[:m])
         values = np.concatenate([x, qp.G @ x])
         lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
         if failed or not ((lower <= values) & (values <= upper)).all():
             return None
         z_box = np.concatenate([np.zeros(m), -qp.c[m:]])
         return Solution(x, np.zeros(0), np.zeros(qp.h_l.size), z_box, status=UNCONSTRAINED)
-
-
-def _root(weight: Array) -> Array | None:
-    """Return (r, n) R with R' R = a weight (n, n) of rank r; None for 0."""
-    values, vectors = np.linalg.eigh(weight)
-    there = values > 1e-14 * max(values[-1], 0.0)
-    return (vectors[:, there] * np.sqrt(values[there])).T if there.any() else None

@@ -26,9 +26,10 @@ from scipy import sparse
 
 from mpc.constraints import Constraint, Penalty
 from mpc.ocp import InfeasiblePeriod, Problem, Query
-from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import Solution
 from mpc.solvers import QPSolver
+from mpc.solvers.piqp import Piqp
+from mpc.staged import Staged, steps_of
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 
@@ -127,7 +128,7 @@ def recovery(infeasible_period: InfeasiblePeriod, plan: Array) -> int | None:
     """Return after how many periods of a plan (N, nu) the model predicts an answer; None if not within the plan."""
     problem, query = infeasible_period.problem, infeasible_period.query
     is_solved, state = _set_up(problem, query), query.state
-    for i, (u, A, B, c) in enumerate(zip(plan, *_steps(problem, query), strict=True)):
+    for i, (u, A, B, c) in enumerate(zip(plan, *steps_of(problem, query), strict=True)):
         state = A @ state + B @ u + c
         if is_solved(query._replace(state=state, u_before=u)):
             return i + 1
@@ -136,8 +137,12 @@ def recovery(infeasible_period: InfeasiblePeriod, plan: Array) -> int | None:
 
 def _set_up(problem: Problem, query: Query) -> Callable[[Query], bool]:
     """Return a function that tells whether queries of this kind are solved."""
-    solver = QPSolver(DIAGNOSIS_SOLVER, problem, changing=query.steps is not None)
-    return lambda query: solver.solve(query).status == SOLVED
+    if query.steps is None:
+        solver = QPSolver(DIAGNOSIS_SOLVER, problem)
+        return lambda query: solver.solve(query).status == SOLVED
+    form, backend = Staged(problem), Piqp()
+    backend.setup(form.assemble(query).qp)
+    return lambda query: backend.solve(form.assemble(query).qp).status == SOLVED
 
 
 class _Relaxed(NamedTuple):
@@ -217,8 +222,8 @@ def _relaxed(
 
     slack = Penalty(l1=np.ones(1), l2=np.zeros(1))
     rows = tuple(replace(one, penalty=slack if side in elastic else None) for side, one in sides.items())
-    form = PartiallyCondensed(replace(problem, bounds=None, constraints=rows), changing=True)
-    qp = form.assemble(query._replace(steps=_steps(problem, query))).qp
+    form = Staged(replace(problem, bounds=None, constraints=rows))
+    qp = form.assemble(query).qp
     named, columns = (
         [side for side in sides if side in elastic],
         form.slacks(np.arange(qp.c.size, dtype=float)).astype(int),
@@ -259,12 +264,3 @@ def _relaxed(
         slacks=slacks,
         priced={side for side, priced in zip(sides, multipliers.T, strict=True) if (np.abs(priced) > PRICED).any()},
     )
-
-
-def _steps(problem: Problem, query: Query) -> tuple[Array, Array, Array]:
-    """A (N, n, n), B (N, n, nu), c (N, n) of the predicted steps."""
-    if query.steps is not None:
-        return query.steps
-    model, N, (x_s, u_s) = problem.model, problem.horizon, query.equilibrium or problem.equilibrium
-    A, B, c = model.A, model.B, x_s - model.A @ x_s - model.B @ u_s
-    return np.tile(A, (N, 1, 1)), np.tile(B, (N, 1, 1)), np.tile(c, (N, 1))

@@ -45,8 +45,6 @@ SOFT_SPACE: Final = "controller.avoidance.soft"
 """Table of a scenario file that makes half-spaces soft (`mpc.constraints.Origin.soft`)."""
 HALF_SPACE_ROUNDING: Final = 1e-6
 """Violation of a half-space [m] attributed to rounding."""
-TOUCHING: Final = 1e-2
-"""Distance from a half-space [m] within which a plan counts as touching it."""
 SETTLED: Final = 1e-2
 """Change of all predicted positions [m] below which planes are not recomputed in the same period."""
 
@@ -110,6 +108,11 @@ class Space:
         shaped = zip(self._shapes, places, strict=False)
         self._regions = [(shape, at) for shape, at in shaped if not isinstance(shape, Obstacle)]
 
+    @property
+    def count(self) -> int:
+        """Number of half-spaces at an instant."""
+        return len(self._names)
+
     def half_spaces(self, t: Array, positions: Array) -> tuple[Array, Array]:
         """Normals (S, N, 3) and bounds (S, N) [m] of normal . p >= bound, at times (N,) along positions (N, 3)."""
         normals, bounds = np.empty((len(self._names), len(t), 3)), np.empty((len(self._names), len(t)))
@@ -155,12 +158,11 @@ class ObstacleQP:
     wherever the way is clear. Elsewhere the QP is solved with the tightest half-spaces of each instant, then with twice
     as many for as long as the plan violates one that was left out.
 
-    The problem and its solver contain no half-spaces. Queries of a `changing` problem carry their own models.
+    The problem and its solver contain no half-spaces.
     """
 
-    def __init__(self, problem: Problem, solver: Solver, space: Space, *, changing: bool = False) -> None:
+    def __init__(self, problem: Problem, solver: Solver, space: Space) -> None:
         self.problem, self._solver, self._space = problem, solver, space
-        self._changing = changing
         self.reset()
 
     def reset(self) -> None:
@@ -168,38 +170,28 @@ class ObstacleQP:
         self._forms: dict[int, tuple[PartiallyCondensed, Piqp]] = {}
         self._last: Array | None = None
 
-    def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> tuple[Answer, Problem]:
-        """Return the optimum of a query, with its `Answer.states`, and the problem solved.
+    def solve(self, time: float, query: Query, yaw: float = 0.0) -> tuple[Answer, Problem]:
+        """Return the optimum of a query, and the problem solved; planes are made along the last optimum, moved on.
 
         Args:
             time: instant of its x(k) [s].
             query: the state, reference and last input.
             yaw: angle by which the states' axes x and y are turned from the world's [rad].
-            along: (N, 3) positions of the plan along which planes are made [m]; by default those of the last optimum,
-                moved on by an instant.
         """
         turn = np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         t = time + self._space.period * np.arange(1, self.problem.horizon + 1, dtype=np.float64)
         last, self._last = self._last, None
-        problem, among = self.problem, False
-        if self._changing and along is not None:
-            # Where the last plan touched half-spaces, this one is all but sure to: it is sought among them at once.
-            among = bool((_distances(*self._space.half_spaces(t, along), along) < TOUCHING).any())
-        if along is None or not among:
-            answer = self._solver.solve(query)
-            if answer.status not in ACCEPTED:
-                return answer, problem
-            answer, planned = self._predicted(query, answer, turn)
-            if along is None:
-                along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
-        else:
-            planned = along
-        for i in range(self._space.settings.iterations):
+        problem, answer = self.problem, self._solver.solve(query)
+        if answer.status not in ACCEPTED:
+            return answer, problem
+        planned = self._positions(query, answer, turn)
+        along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
+        for _ in range(self._space.settings.iterations):
             normals, bounds = self._space.half_spaces(t, along)
-            distances = _distances(normals, bounds, planned)
-            if (distances >= -HALF_SPACE_ROUNDING).all() and not (among and i == 0):
+            inside = distances(normals, bounds, planned)
+            if (inside >= -HALF_SPACE_ROUNDING).all():
                 break
-            answer, problem, planned = self._solve_with_half_spaces(query, normals, bounds, distances, turn)
+            answer, problem, planned = self._solve_with_half_spaces(query, normals, bounds, inside, turn)
             if answer.status not in ACCEPTED:
                 named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
                 constraints = (*self.problem.constraints, *named)
@@ -210,10 +202,9 @@ class ObstacleQP:
         self._last = planned
         return answer, problem
 
-    def _predicted(self, query: Query, answer: Answer, turn: Array) -> tuple[Answer, Array]:
-        """The answer with its states, and their positions in the world (N, 3)."""
-        states = predicted(self.problem, query, answer.plan)
-        return answer._replace(states=states), states[:, self._space.positions] @ turn
+    def _positions(self, query: Query, answer: Answer, turn: Array) -> Array:
+        """(N, 3) the answer's positions in the world."""
+        return np.asarray(predicted(self.problem, query, answer.plan)[:, self._space.positions] @ turn)
 
     def _with_half_spaces(self, normals: Array, bounds: Array) -> Problem:
         """The problem with chosen half-spaces (m, N, 3), (m, N) in the states' axes."""
@@ -221,40 +212,38 @@ class ObstacleQP:
         return replace(self.problem, constraints=(*self.problem.constraints, added))
 
     def _solve_with_half_spaces(
-        self, query: Query, normals: Array, bounds: Array, distances: Array, turn: Array
+        self, query: Query, normals: Array, bounds: Array, inside: Array, turn: Array
     ) -> tuple[Answer, Problem, Array]:
-        """The optimum with half-spaces of the world, and its positions; `distances` (S, N) gives the tightest."""
+        """The optimum with half-spaces of the world, and its positions; `inside` (S, N) gives the tightest."""
         count = self._space.settings.rows
         while True:
-            at = np.argsort(distances, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
+            at = np.argsort(inside, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
             problem = self._with_half_spaces(normals[at] @ turn.T, bounds[at])
             form, backend = self._form(len(at[0]))
             qp = form.assemble(query, problem).qp
             answer = Answer.of(form, qp, backend.solve(qp), SOLVER)
             if answer.status not in ACCEPTED:
                 return answer, problem, np.empty(0)
-            answer, planned = self._predicted(query, answer, turn)
-            distances = _distances(normals, bounds, planned)
-            violated = distances < -HALF_SPACE_ROUNDING
+            planned = self._positions(query, answer, turn)
+            inside = distances(normals, bounds, planned)
+            violated = inside < -HALF_SPACE_ROUNDING
             violated[at] = False
             if not violated.any():
                 return answer, problem, planned
-            distances[at] = -SWITCHED_OFF  # what was there stays
+            inside[at] = -SWITCHED_OFF  # what was there stays
             count *= 2
 
     def _form(self, count: int) -> tuple[PartiallyCondensed, Piqp]:
         """The QP with so many half-spaces at each instant, and what solves it."""
         if count not in self._forms:
             normals = np.full((count, self.problem.horizon, 3), 3.0**-0.5)  # in general position
-            form = PartiallyCondensed(
-                self._with_half_spaces(normals, np.zeros(normals.shape[:2])), changing=self._changing
-            )
+            form = PartiallyCondensed(self._with_half_spaces(normals, np.zeros(normals.shape[:2])))
             backend = Piqp(changing=True)
             backend.setup(form.qp)
             self._forms[count] = form, backend
         return self._forms[count]
 
 
-def _distances(normals: Array, bounds: Array, positions: Array) -> Array:
+def distances(normals: Array, bounds: Array, positions: Array) -> Array:
     """(S, N) how far positions (N, 3) are inside half-spaces [m]."""
     return np.asarray((normals * positions).sum(axis=2) - bounds)

@@ -1,4 +1,4 @@
-"""The partially condensed QP: the horizon in stages of a few steps, for constant and for changing matrices.
+"""The partially condensed QP: the horizon in stages of a few steps.
 
 A condensed QP is dense; one with all states as variables is large. Partial condensing lies in between: it cuts the
 horizon into stages of M steps. The variables, in stage order, are
@@ -8,11 +8,10 @@ horizon into stages of M steps. The variables, in stage order, are
 with s_j the state at the start of stage j (s_0 = x(k) is known, s_J = x(k+N)), v_j the inputs of its steps and e_j the
 slacks of soft rows.  States inside a stage are condensed; between stages s_{j+1} = Phi_M s_j + Psi_M v_j + c is an
 equality row.  All matrices are block banded, which a multistage factorisation exploits: its cost grows linearly with
-the horizon.  The model may differ from step to step,
+the horizon.
 
-    x(k+i+1) = A_i x(k+i) + B_i u(k+i) + c_i.
-
-The sparsity pattern is fixed when a `PartiallyCondensed` is built; if matrices change, only their values do.
+The sparsity pattern is fixed when a `PartiallyCondensed` is built; where rows differ from period to period, only their
+values do.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ class Pattern:
         rows = np.concatenate([np.broadcast_to(at[0][..., :, None], block.shape).ravel() for at, block in pairs])
         columns = np.concatenate([np.broadcast_to(at[1][..., None, :], block.shape).ravel() for at, block in pairs])
         order = np.lexsort((rows, columns))
-        self._order = order[np.concatenate([_present(block, rounding).ravel() for block in blocks])[order]]
+        self._order = order[np.concatenate([_present(block, BLOCK_ROUNDING).ravel() for block in blocks])[order]]
         self._rows = rows[self._order].astype(np.int32)
         counts = np.bincount(columns[self._order], minlength=shape[1])
         self._starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
@@ -152,10 +151,9 @@ class PartiallyCondensed:
         steps_per_stage: M; None for a choice by the number of inputs.  The first stage has no state among its
             variables: it takes the remainder of the horizon and, if M > 1, as many further steps as fit into blocks of
             the others' size.
-        changing: whether the model's matrices will change; then no entry that might be needed is dropped.
     """
 
-    def __init__(self, problem: Problem, *, steps_per_stage: int | None = None, changing: bool = False) -> None:
+    def __init__(self, problem: Problem, *, steps_per_stage: int | None = None) -> None:
         model, N = problem.model, problem.horizon
         steps = steps_per_stage or max(round(STEPS_OF_ONE_INPUT / math.sqrt(model.nu)), 1)
         self._problem, self._rows, soft = problem, QPRows(problem), problem.rows.slacks
@@ -166,18 +164,13 @@ class PartiallyCondensed:
         self._slack_weight = 2.0 * np.tile(problem.rows.l2[soft], at.N)[:, None, None]
         self._input_costs = {steps: self._input_cost(steps) for steps in (at.L, at.M)}
         A, B = (np.broadcast_to(part, (N, *part.shape)) for part in (model.A, model.B))
-        fixed = A, B
-        if changing:  # for matrices in general position, an entry is zero only where it always is
-            rng = np.random.default_rng(0)
-            A, B = (rng.normal(size=(N, at.n, width)) for width in (at.n, at.nu))
-        rounding = 0.0 if changing else BLOCK_ROUNDING
         head, tail = self._slopes(A, B)
         slack, numbers = at.slacks.reshape(-1, 1), np.arange(rows.lower.size).reshape(at.N, -1)
         costs = [(at.head, at.head), (at.tail, at.tail), (at.starts[-1], at.starts[-1]), (slack, slack)]
         costs += [(at.lasts, at.firsts), (at.firsts, at.lasts)]
-        self._P = Pattern((at.size, at.size), costs, self._costs(head, tail), rounding)
+        self._P = Pattern((at.size, at.size), costs, self._costs(head, tail), BLOCK_ROUNDING)
         dynamics = [(at.ends[:1], at.head), (at.ends[1:], at.tail), (at.ends, at.starts)]
-        self._A = Pattern((at.ends.size, at.size), dynamics, self._dynamics(head, tail), rounding)
+        self._A = Pattern((at.ends.size, at.size), dynamics, self._dynamics(head, tail), BLOCK_ROUNDING)
         self._later, self._now = later, now = np.flatnonzero(rows.of_states), np.flatnonzero(~rows.of_states)
         stages, cuts = len(at.tail), at.L + at.M * np.arange(len(at.tail))
         inequalities = [
@@ -189,10 +182,10 @@ class PartiallyCondensed:
             (numbers[at.L :, now].reshape(stages, at.M, now.size), at.tail[:, None]),
             (numbers[cuts][:, now], at.lasts),
         ]
-        self._G = Pattern((numbers.size, at.size), inequalities, self._inequalities(head, tail, rows), rounding)
+        self._G = Pattern((numbers.size, at.size), inequalities, self._inequalities(head, tail, rows), BLOCK_ROUNDING)
         self._linear = np.zeros(at.size)
         self._linear[at.slacks] = problem.rows.l1[soft]
-        self.fixed = self._built(*fixed)
+        self.fixed = self._built(A, B)
         self._x_l, self._x_u = np.full(at.size, -math.inf), np.full(at.size, math.inf)
         self._x_l[at.inputs], self._x_u[at.inputs] = self._rows.u_min, self._rows.u_max
         self._x_l[at.slacks] = 0.0
@@ -285,13 +278,9 @@ class PartiallyCondensed:
     def assemble(self, query: Query, problem: Problem | None = None) -> PeriodQP:
         """Return the QP of a period; `problem` may differ in the numbers of its constraints' rows."""
         rest = query.equilibrium or self._problem.equilibrium
-        if query.steps is None:
-            A, B = self._problem.model.A, self._problem.model.B
-            offset = rest.x - A @ rest.x - B @ rest.u
-            matrices, c = self.fixed, np.broadcast_to(offset, (self._at.N, offset.size))
-        else:
-            A, B, c = query.steps
-            matrices = self._built(A, B)
+        A, B = self._problem.model.A, self._problem.model.B
+        offset = rest.x - A @ rest.x - B @ rest.u
+        matrices, c = self.fixed, np.broadcast_to(offset, (self._at.N, offset.size))
         if problem is not None:
             rows = QPRows(problem)
             G = self._G.matrix(self._inequalities(matrices.head, matrices.tail, rows))

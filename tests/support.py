@@ -16,7 +16,9 @@ from mpc.constrained import Constrained
 from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.linear import LinearMPC, NominalPreparation
 from mpc.model import LinearModel
+from mpc.nonlinear.body import Body
 from mpc.nonlinear.model import NonlinearModel, next_state
+from mpc.nonlinear.rigidbody import RigidBody
 from mpc.ocp import Equilibrium, Objective, Problem, Query
 from mpc.robust.controller import RobustPreparation
 from mpc.robust.settings import Robust
@@ -25,6 +27,7 @@ from mpc.solvers.by_name import make_solver
 from quadsim.controller import Controller
 from quadsim.errors import described
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.rotation import conjugate, multiply
 from quadsim.sim.loop import complete
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
@@ -213,6 +216,21 @@ def changing_period(rng: np.random.Generator, problem: Problem) -> Period:
         u_before=model.u_bar,
         equilibrium=Equilibrium(np.zeros(model.n), model.u_bar + 0.1 * rng.normal(size=model.nu)),
     )
+
+
+def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
+    """(..., n) the states one step after states x (..., n) under inputs u (..., 4)."""
+    return Body(model).advance(x, u)
+
+
+def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
+    """See `mpc.nonlinear.body.Body.linearise`."""
+    return Body(model).linearise(x, u, frames)
+
+
+def frame(q_r: Array) -> Array:
+    """(4, 4) maps q to q_r* q."""
+    return np.stack([multiply(conjugate(q_r), unit) for unit in np.eye(4)], axis=1)
 
 
 def linearised(model: NonlinearModel, x: Array, u: Array) -> tuple[Array, Array, Array]:

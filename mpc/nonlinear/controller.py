@@ -13,10 +13,11 @@ the stored state.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+import time as clock
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -27,28 +28,44 @@ from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver
 from mpc.equilibrium import LEAST_LIFT, Trim
 from mpc.model import LinearModel
+from mpc.nonlinear.body import Body
 from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import (
     N_BODY,
     Inputs,
     P,
     Q,
+    RigidBody,
     V,
     W,
-    advance_nodes,
     drag_acceleration,
-    linearise_nodes,
     rigid_body,
     rotation,
     thrust_axis,
 )
 from mpc.nonlinear.settings import Nonlinear
+from mpc.nonlinear.sqp import SQP, SQPStatus, slack_groups
 from mpc.observer import DisturbanceObserver, disturbance_of
-from mpc.obstacles import ObstacleQP, Space
+from mpc.obstacles import HALF_SPACE_ROUNDING, SETTLED, Space, distances
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
-from mpc.qp import KKT_EVERY
-from mpc.solvers import INVALID_DATA, Answer, QPSolver
-from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, ROTORS, Command, Phase, StepInputs, stopped
+from mpc.qp import KKT_EVERY, QP, Solution
+from mpc.solvers import INVALID_DATA, Answer, Method
+from mpc.staged import Staged
+from quadsim.controller import (
+    ACCEPTED,
+    CORE,
+    GAIN,
+    GROUNDED,
+    NOT_CONVERGED,
+    ROTORS,
+    SOLVED,
+    UNCONSTRAINED,
+    Command,
+    Phase,
+    Statistics,
+    StepInputs,
+    stopped,
+)
 from quadsim.errors import ParameterError
 from quadsim.rotation import (
     body_to_euler_rates,
@@ -72,42 +89,28 @@ from quadsim.state import (
 )
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-LARGEST_CONDENSED: Final = 80
-"""Largest number of inputs and slacks over the horizon for which a condensed QP is faster than a staged one."""
 OUTSIDE: Final = 1e-6
 """Tolerance of an input's bounds, as a share of the largest input; an answer outside is moved onto them."""
-SHORTEST: Final = 0.1
-"""Smallest share of a Gauss-Newton step that Aitken's relaxation takes."""
 CONVERGED: Final = 0.1
 """Largest dynamics defect of a converged plan (`quadsim.controller.Statistics`). Library flights exceed it in at most 9
 periods, after steps of the course and upside down; a tumbling vehicle exceeds it in all."""
-TOLERANCE: Final = 1e-6  # largest change of a state or an input at which the SQP of a period stops
+STEP_TOLERANCE: Final = 1e-6  # largest change of a state or an input at which the SQP of a period stops
 CORRECTIONS: Final = 2
 """Most further SQP steps in a period whose plan has not `CONVERGED`, where commands are targets; if it still has not,
 the next period starts from the reference. A single step from far away may leave a plan with a full turn in it, which
 further steps keep: that way a stiff soft bound on tilt and unfiltered steps of the reference turned a vehicle over."""
-PATIENCE: Final = 8
-"""Steps without a new shortest one after which the largest share of a step is halved."""
 TILT_SIDES: Final = 12
 """Sides of the polygon that a tilt bound imposes on the thrust axis's horizontal part, inside the circle; it costs up
 to 3.4 % of the bound's sine."""
-_AXIS_SLOPES: Final = 2.0 * np.array(
-    [
-        [[0, 0, 1, 0], [0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0]],
-        [[0, -1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]],
-    ],
-    float,
-)
-"""Map q to the derivatives of R(q) e_z along x, 2 (x z + w y), and y, 2 (y z - w x)."""
+_OPTIMA: Final = {SQPStatus.FREE, SQPStatus.BOUNDED, SQPStatus.UNCONVERGED}
+SQP_FAILURES: Final = {
+    SQPStatus.INFEASIBLE: "primal_infeasible",
+    SQPStatus.GIVEN_UP: "max_iterations",
+    SQPStatus.NO_ROOM: "no_room",
+    SQPStatus.NOT_FINITE: INVALID_DATA,
+}
 _PLAUSIBLE: Final = 1e5
 _SAME_TIME: Final = 1e-6  # [s]
-
-
-def frames_of(q: Array) -> Array:
-    """Return (M, 4, 4) matrices that map q to q_r* q, for q_r (M, 4)."""
-    w, x, y, z = q.T
-    rows = np.array([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
-    return np.ascontiguousarray(rows.transpose(2, 0, 1))
 
 
 class NonlinearMPC:
@@ -115,7 +118,6 @@ class NonlinearMPC:
 
     Attributes:
         settings: its table.
-        tolerance: `TOLERANCE`, for this law.
         infeasible_period: the first period whose QP had no answer or, if there is none, whose SQP did not converge.
     """
 
@@ -131,6 +133,7 @@ class NonlinearMPC:
         constraints: tuple[Constraint, ...] = (),
         space: Space | None = None,
         kkt_every: int = KKT_EVERY,
+        tolerance: float = STEP_TOLERANCE,
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
@@ -158,14 +161,32 @@ class NonlinearMPC:
             self._level = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._lag = lags[0] if self._targets else rotor_lag  # of actuator states [s]
         self._tilted = settings.tilt is not None
-        self.tolerance = TOLERANCE
         self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         self.problem = self._problem(constraints)
         self._check = AnswerCheck(self.problem, kkt_every)
-        small = self.problem.horizon * (N_ROTORS + self.problem.rows.slacks.size) <= LARGEST_CONDENSED
-        self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
-        self._qp = QPSolver(self.solver, self.problem, changing=True, free_first=True)
-        self._obstacles = None if space is None else ObstacleQP(self.problem, self._qp, space, changing=True)
+        self.solver = CORE
+        self._space, self._groups = (
+            space,
+            slack_groups(self.problem, faces=space is not None and space.penalty is not None),
+        )
+        self._shift = self._stride == 1 if settings.shift is None else settings.shift
+        self._sqp = SQP(
+            self._model,
+            self.problem,
+            inputs=np.stack([self._lower, self._upper]),
+            difference=settings.attitude_error == "difference",
+            shift=self._shift,
+            iterations=settings.iterations,
+            corrections=CORRECTIONS * self._targets,
+            tolerance=tolerance,
+            faces=0 if space is None else space.count,
+            price=None if space is None else space.penalty,
+        )
+        # The same body over a control period: from measurement to measurement, and for other plans, without rotor lag.
+        period_model = replace(self._model, step=period)
+        self._of_period = Body(period_model)
+        lags = (0.0, *lags[1:])
+        self._without_lag = Body(replace(period_model, rotor_lag=None, lag=lags, substeps=1))
         observing, ramp = settings.offset_free, settings.disturbance
         self._observer = None if observing is None else DisturbanceObserver(observing, period)
         self._ramp: RampObserver | None = None
@@ -179,7 +200,6 @@ class NonlinearMPC:
                 quadratic_drag=self._model.quadratic_drag / vehicle.mass,
                 thrust_lag=self._lag if self._targets else None,
             )
-        self._shift = self._stride == 1 if settings.shift is None else settings.shift
         self.reset(self._level)
 
     def _shares(self, speeds: Array) -> Array:
@@ -207,7 +227,7 @@ class NonlinearMPC:
         hover, x = self._shares(self._level), np.zeros(model.n)
         x[3] = 1.0
         x[N_BODY:] = hover[: model.n - N_BODY]
-        A, B, _ = linearise_nodes(model, x[None], hover[None])
+        A, B, _ = Body(model).linearise(x[None], hover[None])
         rows, weights = settings.outputs()
         objective = Objective(
             C_r=np.hstack([rows, np.zeros((len(rows), model.n - N_BODY))]),
@@ -302,14 +322,12 @@ class NonlinearMPC:
         self._acting = np.array(speeds, float)
         self._rotors = self._rotors_before = self._shares(self._acting)
         self._forget()
-        if self._obstacles is not None:
-            self._obstacles.reset()
         self._check.reset()
         self.infeasible_period: InfeasiblePeriod | None = None
 
     def _forget(self) -> None:
         """Drop the plan, and assume no disturbance."""
-        self._plan: tuple[Array, Array] | None = None
+        self._sqp.reset()
         self._quaternion: Array | None = None
         self._side = 1.0
         self._turns = ReferenceTurns()
@@ -338,8 +356,9 @@ class NonlinearMPC:
                 time, x = law._last
                 self._last = time, np.concatenate([x[:N_BODY], self._rotors])[: self._model.n]
             alike = alike and self._model.n == law._model.n and self._model.step == law._model.step
-            if law._plan is not None and alike:
-                self._plan = resized(law._plan[0], self._nodes + 1), resized(law._plan[1], self._nodes)
+            plan = law._sqp.plan
+            if plan is not None and alike:
+                self._sqp.plan = resized(plan[0], self._nodes + 1), resized(plan[1], self._nodes)
             if self._ramp is not None and law._ramp is not None:
                 self._ramp.adopt(law._ramp)
         observer = None if law is None else law._observer
@@ -388,36 +407,34 @@ class NonlinearMPC:
                 self._ramp.log(now)
             self._last = now.time, measured
         nodes = self._balanced(nodes)
-        start = {"_plan": self._plan, "_acting": self._acting, "_model": self._model}
-        query, answer, problem = self._iterate(now.time, measured, nodes)
-        answer, status = self._check(problem, query, answer, self._rejection(answer))
+        last_plan = self._sqp.plan
+        answer = self._iterate(now.time, measured, nodes)
+        answer, status = self._check(self.problem, None, answer, self._rejection(answer))
+        first = self.infeasible_period
         if status is not None:
-            if status != INVALID_DATA and (
-                self.infeasible_period is None or self.infeasible_period.converges is not None
-            ):
-                self.infeasible_period = InfeasiblePeriod(problem=problem, query=query, status=status, time=now.time)
-            self._plan = None
+            if status != INVALID_DATA and (first is None or first.converges is not None):
+                self.infeasible_period = self._kept_period(now.time, status)
+            self._sqp.reset()
             return refused(self._acting, self.horizon, status, answer)
         status = answer.status
         if answer.stats.sqp_defect > CONVERGED:
             status = NOT_CONVERGED
-            if self.infeasible_period is None:
-                converges = partial(_converges, self._again, self.settings, start, now.time, measured, nodes)
-                self.infeasible_period = InfeasiblePeriod(
-                    problem=problem, query=query, status=status, time=now.time, converges=converges
-                )
+            if first is None:
+                start = _Start(last_plan, self._acting, self._model, now.time, measured, nodes)
+                converges = partial(_converges, self._again, self.settings, start)
+                self.infeasible_period = replace(self._kept_period(now.time, status), converges=converges)
         speeds = self._speeds(self._clip(answer.plan))
         self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
         return command_of(speeds[0], np.repeat(speeds, stride, axis=0), status, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the latest disturbance estimate, without rotor lag."""
-        lag = (0.0, *self._model.lag[1:])
-        model = replace(self._model, step=self._period, rotor_lag=None, lag=lag, substeps=1)
-        x, predicted = np.zeros((len(states), model.n)), np.empty((*plans.shape[:2], N_STATES))
+        self._without_lag.set_world(self._model)
+        n = N_BODY + self._targets
+        x, predicted = np.zeros((len(states), n)), np.empty((*plans.shape[:2], N_STATES))
         x[:, :N_BODY] = _body(states)
         for i in range(plans.shape[1]):
-            x = advance_nodes(model, x, self._shares(plans[:, i]))
+            x = self._without_lag.advance(x, self._shares(plans[:, i]))
             x[:, Q] /= np.linalg.norm(x[:, Q], axis=1, keepdims=True)
             euler = quaternion_to_euler(x[:, Q])
             predicted[:, i, POSITIONS], predicted[:, i, VELOCITIES] = x[:, P], x[:, V]
@@ -455,10 +472,10 @@ class NonlinearMPC:
         if not abs(time - before - self._period) <= _SAME_TIME:
             return
         assert self._observer is not None
-        model = replace(self._model, step=self._period)
         if x.size > N_BODY:
-            x = np.concatenate([x[:N_BODY], self._rotors_before])[: model.n]
-        expected = advance_nodes(model, x, self._shares(self._acting))
+            x = np.concatenate([x[:N_BODY], self._rotors_before])[: self._model.n]
+        self._of_period.set_world(self._model)
+        expected = self._of_period.advance(x, self._shares(self._acting))
         turned = np.zeros(3) if self._targets else measured[W] - expected[W]  # an inner loop balances torques
         self._observer.learn(np.concatenate([measured[V] - expected[V], turned]))
         self._update_disturbance(self._observer.estimate)
@@ -510,98 +527,94 @@ class NonlinearMPC:
         effort[:, 0], effort[:, 1:] = size[:-1] - total, -model.angular_acceleration
         return Nodes(states, thrusts + effort @ self._inverse.T)
 
-    def _reference_inputs(self, nodes: Nodes) -> tuple[Array, Array]:
-        """Return the inputs (N, 4) that hold the reference, and what the actuators do, as shares (N + 1, 4).
+    def _iterate(self, time: float, measured: Array, nodes: Nodes) -> Answer:
+        """Take SQP steps from the stored plan."""
+        sqp, started = self._sqp, clock.perf_counter()
+        sqp.set_world(self._model)
+        asked = measured, self._shares(self._acting), nodes.states, nodes.thrusts
+        status = sqp.step(*asked) if self._space is None else self._among(self._space, time, asked)
+        spent_s = clock.perf_counter() - started
+        if status not in _OPTIMA:
+            nowhere = np.full((self._nodes, N_ROTORS), math.nan)
+            stats = Statistics(iterations=sqp.iterations, solve_s=spent_s)
+            return Answer(nowhere, np.zeros((self._nodes, 0)), SQP_FAILURES[status], CORE, stats=stats)
+        free, active = status is SQPStatus.FREE, sqp.active
+        stats = Statistics(
+            iterations=sqp.iterations,
+            active=active,
+            infeasibility=sqp.violation,
+            sqp_defect=sqp.defect,
+            sqp_step=sqp.moved,
+            solve_s=spent_s,
+        )
+        return Answer(
+            sqp.inputs,
+            sqp.slacks(self._groups),
+            UNCONSTRAINED if free else SOLVED,
+            GAIN if free else CORE,
+            method=Method.FREE if free else Method.WHOLE,
+            stats=stats,
+            certificate=self._certificate,
+        )
 
-        Targets y lead their lags tau, at a node's middle: y + tau y', within their bounds.
-        """
-        model, thrusts = self._model, nodes.thrusts / self._model.thrust_scale
-        if not self._targets:
-            inputs = model.shares(thrusts)
-            return inputs, np.vstack([inputs, inputs[-1:]])
-        total = np.sum(thrusts, axis=1)
-        y = np.column_stack([np.append(total, total[-1]), nodes.states[:, W]]) / model.scale
-        return self._clip(0.5 * (y[:-1] + y[1:]) + np.array(model.lag) / model.step * np.diff(y, axis=0)), y
-
-    def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem]:
-        """Take SQP steps from the stored plan; the returned problem is that of the answer."""
-        frames, n = frames_of(nodes.states[:, Q]), self._model.n
-        inputs, actuators = self._reference_inputs(nodes)
-        start = np.hstack([nodes.states, actuators])[:, :n]
-        target, s0 = start.copy(), measured.copy()
-        target[:, Q], s0[Q] = 0.0, frames[0] @ measured[Q]
-        target[:, 3] = self.settings.attitude_error == "difference"
-        if self._tilted:
-            target = np.hstack([target, np.zeros((len(target), 2))])
-            s0 = np.append(s0, thrust_axis(measured[Q])[:2])
-        desired = target[1:] @ self.problem.objective.C_r.T
-        if self._plan is None:
-            self._plan = start, self._clip(inputs)
-        elif self._shift:
-            x, u = self._plan
-            self._plan = np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
-        rest, before = Equilibrium(target[-1], inputs), self._shares(self._acting)
-        share, largest, last, least, patience = 1.0, 1.0, np.zeros(0), math.inf, PATIENCE
-        iterations = self.settings.iterations
-        for k in range(iterations + CORRECTIONS * self._targets):
-            x, u = self._plan
-            query = Query(s0, desired, before, rest, self._steps(x, u, frames))
-            if self._obstacles is None:
-                answer, problem = self._qp.solve(query), self.problem
-            else:
-                answer, problem = self._obstacles.solve(time, query, along=x[1:, P])
-            if answer.states is None or answer.status not in ACCEPTED:
-                return query, answer, problem
-            states, plan = answer.states[:, :n], answer.plan
-            end = np.concatenate([measured[None], states])
-            end[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
-            self._plan = end, plan
-            moved = max(np.abs(end - x).max(), np.abs(plan - u).max())
-            defect = self._defect(end, plan)
-            if self._targets and k + 1 >= iterations and defect <= CONVERGED:
-                break
-            if iterations > 1:
-                if moved <= self.tolerance:
+    def _among(self, space: Space, time: float, asked: tuple[Array, Array, Array, Array]) -> SQPStatus:
+        """Take SQP steps among half-spaces: those of a program follow its optimum, a few times at most."""
+        sqp, t = self._sqp, time + space.period * np.arange(1.0, self._nodes + 1.0)
+        if not sqp.begin(*asked):
+            return SQPStatus.NOT_FINITE
+        on = True
+        while on:
+            sqp.linearise()
+            along = sqp.planned_positions
+            for i in range(space.settings.iterations):
+                normals, bounds = space.half_spaces(t, along)
+                if i and (distances(normals, bounds, along) >= -HALF_SPACE_ROUNDING).all():
                     break
-                # Full Gauss-Newton steps may oscillate.  Aitken's relaxation (Irons and Tuck 1969) takes a share of
-                # each step, from how much of the previous step it undoes; the largest share falls permanently if steps
-                # do not get shorter.
-                step = (plan - u).ravel()
-                undone = 1.0 - float(step @ last / (last @ last)) if last.size else 1.0
-                patience = PATIENCE if moved < 0.9 * least else patience - 1
-                least = min(least, moved)
-                if patience == 0:
-                    largest, patience = 0.5 * largest, PATIENCE
-                share = min(max(share / max(undone, SHORTEST), SHORTEST), largest)
-                last = step
-                self._plan = x + share * (end - x), u + share * (plan - u)
-        if self._targets and defect > CONVERGED:
-            self._plan = None
-        stats = answer.stats._replace(sqp_defect=defect, sqp_step=float(moved))
-        return query, answer._replace(stats=stats), problem
+                sqp.half_spaces = normals, bounds
+                status, before = sqp.solve(), along
+                if status not in _OPTIMA:
+                    break
+                along = sqp.positions
+                if np.abs(along - before).max() < SETTLED:
+                    break
+            status, on = sqp.keep(status)
+        return status
 
-    def _defect(self, x: Array, u: Array) -> float:
-        """Return by how much a plan of states (N + 1, n) and inputs (N, 4) misses the dynamics."""
-        return float(np.abs(x[1:] - advance_nodes(self._model, x[:-1], u)).max())
+    def _rows(self) -> Problem:
+        """The program of the last step, with the half-spaces that it had."""
+        if self._space is None:
+            return self.problem
+        added = self._space.constraint(*self._sqp.half_spaces, self.problem.model.n)
+        return replace(self.problem, constraints=(*self.problem.constraints, added))
 
-    def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:
-        """Return A, B, c along a plan of states (N + 1, n) and inputs (N, 4)."""
-        A, B, end = linearise_nodes(self._model, x[:-1], u, frames)
-        turned, end = x[:-1].copy(), end.copy()
-        turned[:, Q] = (frames[:-1] @ turned[:, Q, None])[:, :, 0]
-        end[:, Q] = (frames[1:] @ end[:, Q, None])[:, :, 0]
-        c = end - (A @ turned[:, :, None])[:, :, 0] - (B @ u[:, :, None])[:, :, 0]
-        return self._with_axis(A, B, c, x[1:, Q], frames[1:]) if self._tilted else (A, B, c)
+    def _query(self) -> Query:
+        """The data of the last step's program."""
+        sqp, goal, state = self._sqp, self._sqp.goal.copy(), self._sqp.start
+        if self._tilted:
+            goal = np.hstack([goal, np.zeros((len(goal), 2))])
+            state = np.append(state, thrust_axis(sqp.measured[Q])[:2])
+        desired = goal[1:] @ self.problem.objective.C_r.T
+        return Query(state, desired, sqp.before, Equilibrium(goal[-1], sqp.aim.copy()), sqp.steps())
 
-    def _with_axis(self, A: Array, B: Array, c: Array, q: Array, frames: Array) -> tuple[Array, Array, Array]:
-        """Add the thrust axis along world x and y as two states, linearised at quaternions q (N, 4)."""
-        slope = _AXIS_SLOPES @ q[:, None, :, None]  # (N, 2, 4, 1)
-        known = thrust_axis(q)[:, :2] - (slope[..., 0] @ q[:, :, None])[:, :, 0]
-        rows = slope[..., 0] @ frames.transpose(0, 2, 1)  # in the quaternion of the node's frame
-        N, n = c.shape
-        wide, inputs = np.zeros((N, n + 2, n + 2)), np.concatenate([B, rows @ B[:, Q]], axis=1)
-        wide[:, :n, :n], wide[:, n:, :n] = A, rows @ A[:, Q]
-        return wide, inputs, np.concatenate([c, (rows @ c[:, Q, None])[:, :, 0] + known], axis=1)
+    def _certificate(self) -> tuple[QP, Solution]:
+        """Return the last step's program, and its optimum with multipliers."""
+        problem, query, sqp = self._rows(), self._query(), self._sqp
+        form = Staged(problem)
+        qp = form.assemble(query).qp
+        groups = self._groups if problem is self.problem else slack_groups(problem)
+        multipliers = sqp.multipliers(len(problem.rows.names), len(self.problem.rows.names))
+        return qp, form.solution(query, qp, sqp.inputs, sqp.slacks(groups), multipliers)
+
+    def _kept_period(self, time: float, status: str) -> InfeasiblePeriod:
+        """Return the last program as the data of a period without an answer."""
+        return InfeasiblePeriod(problem=self._named(), query=self._query(), status=status, time=time)
+
+    def _named(self) -> Problem:
+        """The last program with the half-spaces of each obstacle by its name."""
+        if self._space is None:
+            return self.problem
+        named = self._space.constraints(*self._sqp.half_spaces, self.problem.model.n)
+        return replace(self.problem, constraints=(*self.problem.constraints, *named))
 
     def _rejection(self, answer: Answer) -> str | None:
         status, plan = answer.status, answer.plan
@@ -622,15 +635,20 @@ def _body(states: Array) -> Array:
     return x
 
 
-def _converges(
-    make: Callable[..., NonlinearMPC], settings: Nonlinear, start: Mapping[str, object], time: float,
-    measured: Array, nodes: Nodes, iterations: int,
-) -> bool:  # fmt: skip
-    """Return whether a period's plan converges within `iterations`, from a law's attributes before it.
+class _Start(NamedTuple):
+    """What a period's plan starts from: data alone, so that a flight can be pickled."""
 
-    All other arguments are data of that period, so that a flight can be pickled.
-    """
+    plan: tuple[Array, Array] | None
+    acting: Array
+    model: RigidBody
+    time: float
+    measured: Array
+    nodes: Nodes
+
+
+def _converges(make: Callable[..., NonlinearMPC], settings: Nonlinear, start: _Start, iterations: int) -> bool:
+    """Return whether a period's plan converges within `iterations`."""
     law = make(settings=replace(settings, iterations=iterations))
-    vars(law).update(start)
-    _, answer, _ = law._iterate(time, measured, nodes)
+    law._sqp.plan, law._acting, law._model = start.plan, start.acting, start.model
+    answer = law._iterate(start.time, start.measured, start.nodes)
     return law._rejection(answer) is None and answer.stats.sqp_defect <= CONVERGED

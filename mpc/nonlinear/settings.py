@@ -28,7 +28,6 @@ from mpc.bounded import (
     ranges,
     require_lag,
     require_ordered,
-    require_solver,
     require_space,
     rows_of,
     selection,
@@ -41,8 +40,7 @@ from mpc.nonlinear.rigidbody import RATE_SCALE
 from mpc.observer import ObserverSettings
 from mpc.obstacles import Shape, Space
 from mpc.qp import KKT_EVERY
-from mpc.solvers import SOLVERS
-from quadsim.controller import CORE, ROTORS
+from quadsim.controller import ROTORS
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Positive, Weight
 from quadsim.input_limits import MOST_ENTRIES
@@ -178,16 +176,8 @@ class Nonlinear(ControllerTable):
     input_bounds: RotorBounds = VEHICLES_SPEEDS
     fallback: FallbackSettings = USUAL_FALLBACK
     kkt_every: KktEvery = KKT_EVERY
-    solver: Annotated[str | None, doc("QP solver, by its name in `quadsim list`; absent: the fastest for the size")] = (
-        field(default=None, metadata={"json_schema_extra": {"examples": [*SOLVERS]}})
-    )
 
     def __post_init__(self) -> None:
-        if self.solver is not None:
-            require_solver(self.solver)
-            if self.solver == CORE:
-                rule = "a QP solver: the core takes no models that change"
-                raise ParameterError("", "solver", self.solver, rule)
         require_lag(self.rotor_lag)
         if self.attitude_error == "difference" and not isinstance(self.weights.attitude, float):
             rule = 'one number where attitude_error = "difference"'

@@ -16,7 +16,7 @@ from mpc.condensing import Condensed, FreeOptimum
 from mpc.ocp import Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Backend, Solution
-from quadsim.controller import ACCEPTED, CORE, GAIN, NO_STATISTICS, Statistics
+from quadsim.controller import CORE, GAIN, NO_STATISTICS, Statistics
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
 
@@ -34,11 +34,11 @@ class SolverEntry:
     steps_per_stage: int | None = None  # of the staged QP; None for a choice by the number of inputs
     extra: str = ""  # quadsim's extra that installs the package; empty if it is always installed
 
-    def formulate(self, problem: Problem, *, changing: bool = False) -> Formulation:
-        """Return the form of the problem that it takes, for a model that may be `changing` from period to period."""
+    def formulate(self, problem: Problem) -> Formulation:
+        """Return the form of the problem that it takes."""
         if self.dense:
             return Condensed(problem)
-        return PartiallyCondensed(problem, steps_per_stage=self.steps_per_stage, changing=changing)
+        return PartiallyCondensed(problem, steps_per_stage=self.steps_per_stage)
 
     @property
     def installed(self) -> bool:
@@ -78,10 +78,6 @@ ALIASES: Final = {"piqp": "piqp-multistage"}
 INVALID_DATA: Final = "invalid_data"
 """Status of a query with numbers that no back end receives."""
 
-LARGEST_ENTRY: Final = 1e6
-"""Largest plausible number in a changing model: beyond it, four steps multiply to 1e30, which PIQP treats as
-infinite."""
-
 
 def find_solver(name: str) -> SolverEntry:
     """Return the solver of a name: the core, one of `SOLVERS` or of qpsolvers; `UnknownNameError` if there is none."""
@@ -113,7 +109,7 @@ def solver_entries() -> dict[str, SolverEntry]:
     }
 
 
-def make_backend(name: str, *, changing: bool = False) -> Backend:
+def make_backend(name: str) -> Backend:
     """Return a new back end of a named QP solver; raises `UnknownNameError`, or `MissingPackageError`."""
     if name == CORE:
         raise UnknownNameError("QP solver", name, SOLVERS, "use make_solver")
@@ -123,7 +119,7 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
     if entry.package == "piqp":
         from mpc.solvers.piqp import Piqp
 
-        return Piqp(dense=entry.dense, changing=changing)
+        return Piqp(dense=entry.dense)
     if entry.package == "daqp":
         from mpc.solvers.daqp import DaqpDense
 
@@ -152,7 +148,6 @@ class Answer(NamedTuple):
     answered_by: str  # `gain`, `core` or the QP solver's name; see `quadsim.controller.Command`
     stats: Statistics = NO_STATISTICS  # of the solver that answered, completed by `mpc.answer.AnswerCheck`
     method: Method = Method.WHOLE  # the part of the QP that had to be solved
-    states: Array | None = None  # (N, n) predicted, if the model changes and there is an optimum
     certificate: Callable[[], tuple[QP, Solution]] | None = None  # the QP and its solution; None for invalid data
 
     @classmethod
@@ -189,33 +184,32 @@ class Solver(Protocol):
 class QPSolver:
     """Solves a problem's QP in each period with a named solver.
 
-    Queries of a `changing` problem carry their own models (`mpc.ocp.Query.steps`). With `free_first`, the unconstrained
-    optimum is tried first: if it satisfies every constraint, it is the optimum, and no QP is solved.  The staged QP of
-    a changing problem has no such shortcut.
+    With `free_first`, the unconstrained optimum is tried first: if it satisfies every constraint, it is the optimum,
+    and no QP is solved.
     """
 
-    def __init__(self, name: str, problem: Problem, *, changing: bool = False, free_first: bool = False) -> None:
-        self.name, self._changing = ALIASES.get(name, name), changing
-        self.formulation = find_solver(name).formulate(problem, changing=changing)
+    def __init__(self, name: str, problem: Problem, *, free_first: bool = False) -> None:
+        self.name = ALIASES.get(name, name)
+        self.formulation = find_solver(name).formulate(problem)
         self._free: FreeOptimum | None = None
-        if free_first and not (changing and isinstance(self.formulation, PartiallyCondensed)):
+        if free_first:
             form = self.formulation if isinstance(self.formulation, Condensed) else Condensed(problem)
-            self._free = FreeOptimum(form, changing=changing)
+            self._free = FreeOptimum(form)
         self.reset()
 
     def reset(self) -> None:
         """See `Solver.reset`: back ends that start from their last answer restart from scratch."""
-        self._backend = make_backend(self.name, changing=self._changing)
+        self._backend = make_backend(self.name)
         self._backend.setup(self.formulation.qp)
 
     def solve(self, query: Query) -> Answer:
         """See `Solver.solve`.
 
-        Data that is not finite, or beyond `LARGEST_ENTRY` in a changing model, gives the status `invalid_data`, since
-        back ends may not notice it.
+        Data that is not finite gives the status `invalid_data`, since back ends may not notice it.
         """
         form, by, method, spent_s = self.formulation, self.name, Method.WHOLE, 0.0
-        if not _usable(query):
+        state, desired, u_before = query[:3]
+        if not math.isfinite(state.sum() + desired.sum() + u_before.sum()):
             nowhere = np.full_like(form.qp.c, math.nan)
             return Answer(form.inputs(nowhere), form.slacks(nowhere), INVALID_DATA, self.name)
         period_qp, solution = None, None
@@ -230,16 +224,4 @@ class QPSolver:
         solution = self._backend.solve(period_qp.qp) if solution is None else solution
         answer = Answer.of(form, period_qp.qp, solution, by)
         stats = solution.stats._replace(solve_s=spent_s + solution.stats.solve_s)
-        answer = answer._replace(method=method, stats=stats)
-        if self._changing and answer.status in ACCEPTED and np.isfinite(answer.plan).all():
-            return answer._replace(states=period_qp.states(solution.x))
-        return answer
-
-
-def _usable(query: Query) -> bool:
-    """Return whether all numbers are finite and, in a changing model, at most `LARGEST_ENTRY`."""
-    state, desired, u_before, rest, steps = query
-    if steps is None:
-        return math.isfinite(state.sum() + desired.sum() + u_before.sum())
-    parts = (*steps, state, desired, u_before, *(() if rest is None else (rest.u,)))
-    return all(np.abs(part).max() <= LARGEST_ENTRY for part in parts)
+        return answer._replace(method=method, stats=stats)

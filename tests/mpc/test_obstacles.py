@@ -12,7 +12,7 @@ from support import paper_problem
 
 from mpc.condensing import Condensed
 from mpc.obstacles import AvoidanceSettings, ObstacleQP, Shape, Space
-from mpc.ocp import Problem, Query
+from mpc.ocp import Problem, Query, predicted
 from mpc.paper import prediction
 from mpc.qp import kkt_residuals
 from mpc.robust.tightening import TighteningSettings, position_margins
@@ -52,20 +52,23 @@ def query(problem: Problem, *, goal: float = 2.0, speed: float = 0.8) -> Query:
     return Query(state, problem.objective.desired(reference), problem.model.u_bar)
 
 
-def clearing(
-    problem: Problem, among: Space, calls: list[Answer] | None = None, *, changing: bool = False
-) -> ObstacleQP:
+def clearing(problem: Problem, among: Space, calls: list[Answer] | None = None) -> ObstacleQP:
     solver = QPSolver("piqp-multistage", problem, free_first=True)
     find = solver.solve
 
     def solve(posed: Query) -> Answer:
-        answer = find(posed._replace(steps=None))
+        answer = find(posed)
         if calls is not None:
             calls.append(answer)
         return answer
 
     solver.solve = solve  # type: ignore[method-assign]
-    return ObstacleQP(problem, solver, among, changing=changing)
+    return ObstacleQP(problem, solver, among)
+
+
+def positions(problem: Problem, posed: Query, answer: Answer) -> Array:
+    """(N, 3) of an answer."""
+    return predicted(problem, posed, answer.plan)[:, list(POSITION)]
 
 
 def by_dense_qp(problem: Problem, posed: Query, normals: Array, bounds: Array) -> Array:
@@ -128,9 +131,9 @@ def test_the_optimum_is_that_of_a_dense_qp(problem: Problem) -> None:
     assert result[0].status == SOLVED
     free = clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0))).solve(0.0, posed)
     assert np.abs(result[0].plan - free[0].plan).max() > 1.0
-    normals, bounds = among.half_spaces(PERIOD * np.arange(1, N + 1), free[0].states[:, list(POSITION)])
+    normals, bounds = among.half_spaces(PERIOD * np.arange(1, N + 1), positions(problem, posed, free[0]))
     np.testing.assert_allclose(result[0].plan, by_dense_qp(problem, posed, normals, bounds), atol=2e-3)
-    distance = (normals * result[0].states[:, list(POSITION)]).sum(axis=2) - bounds
+    distance = (normals * positions(problem, posed, result[0])).sum(axis=2) - bounds
     assert distance.min() > -1e-5
     assert distance.min() < 1e-3  # active
 
@@ -141,11 +144,13 @@ def test_rows_are_added_until_all_half_spaces_are_satisfied(problem: Problem) ->
     np.testing.assert_allclose(ours[0].plan, whole[0].plan, atol=2e-3)
     normals, bounds = few.half_spaces(
         PERIOD * np.arange(1, N + 1),
-        clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0)))
-        .solve(0.0, posed)[0]
-        .states[:, list(POSITION)],
+        positions(
+            problem,
+            posed,
+            clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0))).solve(0.0, posed)[0],
+        ),
     )
-    assert ((normals * ours[0].states[:, list(POSITION)]).sum(axis=2) - bounds).min() > -1e-4
+    assert ((normals * positions(problem, posed, ours[0])).sum(axis=2) - bounds).min() > -1e-4
 
 
 def test_where_the_way_is_clear_the_answer_is_the_solver_s(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,15 +167,15 @@ def test_a_moving_obstacle_counts_where_it_will_be(problem: Problem) -> None:
     result = clearing(problem, space(gone), calls).solve(0.0, query(problem))
     assert result[0].plan is calls[0].plan
     meeting = 22
-    x = float(result[0].states[meeting - 1, INDEX["x"]])
+    x = float(positions(problem, query(problem), result[0])[meeting - 1, 0])
     start = (x, 3.0 * meeting * PERIOD + 0.4, 0.0)
     comes = Sphere(name="comes", position=start, radius=0.2, velocity=(0.0, -3.0, 0.0))
     result = clearing(problem, space(replace(comes, velocity=(0.0, 0.0, 0.0))), calls).solve(0.0, query(problem))
     assert result[0].plan is calls[1].plan
     result = clearing(problem, space(comes, soft=True, iterations=20), calls).solve(0.0, query(problem))
     assert result[0].plan is not calls[2].plan
-    t, positions = PERIOD * np.arange(1, N + 1), result[0].states[:, list(POSITION)]
-    assert comes.clearance(t, positions).min() > RADIUS - 1e-3
+    t, places = PERIOD * np.arange(1, N + 1), positions(problem, query(problem), result[0])
+    assert comes.clearance(t, places).min() > RADIUS - 1e-3
 
 
 def test_axes_turned_by_a_yaw_make_no_difference(problem: Problem) -> None:
@@ -179,15 +184,6 @@ def test_axes_turned_by_a_yaw_make_no_difference(problem: Problem) -> None:
     plain = clearing(problem, space(PILLAR)).solve(0.0, posed)
     ours = clearing(problem, space(turned)).solve(0.0, posed, yaw)
     np.testing.assert_allclose(ours[0].plan, plain[0].plan, atol=1e-4)
-
-
-def test_steps_of_their_own_make_no_difference_where_they_are_the_model_s(problem: Problem) -> None:
-    posed, model = query(problem), problem.model
-    plain = clearing(problem, space(PILLAR)).solve(0.0, posed)
-    steps = (np.tile(model.A, (N, 1, 1)), np.tile(model.B, (N, 1, 1)), np.tile(-model.B @ model.u_bar, (N, 1)))
-    changing = clearing(problem, space(PILLAR), changing=True).solve(0.0, posed._replace(steps=steps))
-    np.testing.assert_allclose(changing[0].plan, plain[0].plan, atol=1e-3)
-    np.testing.assert_allclose(changing[0].states, plain[0].states, atol=1e-5)
 
 
 def test_soft_half_spaces_give_way_and_hard_ones_are_named(problem: Problem) -> None:

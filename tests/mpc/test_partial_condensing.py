@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import ocp_peer
@@ -30,8 +30,9 @@ from mpc.nonlinear.model import nonlinear_model
 from mpc.ocp import Equilibrium, Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Solution, kkt_residuals
-from mpc.solvers import Formulation, QPSolver
+from mpc.solvers import Formulation
 from mpc.solvers.piqp import Piqp
+from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -40,18 +41,19 @@ from scenarios.flown import Flight
 LAG = 0.05
 
 
-@dataclass(frozen=True)
 class Changing:
-    """A problem whose model changes, staged and solved again each time, in any number of steps per stage."""
+    """A problem whose model changes, with all states as variables."""
 
-    form: PartiallyCondensed
-    backend: Piqp
+    def __init__(self, problem: Problem) -> None:
+        self.form = Staged(problem)
 
     def qp(self, now: Period) -> QP:
         return self.form.assemble(now.query).qp
 
     def solve(self, now: Period) -> Solution:
-        return self.backend.solve(self.qp(now))
+        backend, qp = Piqp(), self.qp(now)
+        backend.setup(qp)
+        return backend.solve(qp)
 
     def plan(self, solution: Solution) -> Array:
         return self.form.inputs(solution.x)
@@ -61,12 +63,6 @@ class Changing:
 
     def states(self, now: Period, solution: Solution) -> Array:
         return self.form.assemble(now.query).states(solution.x)
-
-
-def changing(problem: Problem, steps: int) -> Changing:
-    form, backend = PartiallyCondensed(problem, steps_per_stage=steps, changing=True), Piqp(changing=True)
-    backend.setup(form.qp)
-    return Changing(form, backend)
 
 
 def softened(problem: Problem, l1: list[float], l2: list[float], *, largest: bool = False) -> Problem:
@@ -154,10 +150,7 @@ def test_products_of_rounding_are_left_out() -> None:
 @pytest.mark.parametrize("soft", [False, True, "largest"])
 @pytest.mark.parametrize("terms", [(), ("Q_d", "margins"), ("P", "constraints")])
 def test_systems_that_change_agree_with_a_peer(horizon: int, soft: bool | str, terms: tuple[str, ...]) -> None:
-    """Moves weighed, bounds tightened, a terminal weight and further rows: the peer rolls all of them out by itself.
-
-    In stages of one step, of two and of four.
-    """
+    """Moves weighed, bounds tightened, a terminal weight and further rows: the peer rolls all of them out by itself."""
     rng = np.random.default_rng(100 * horizon + 1)
     solved = 0
     for _ in range(8):
@@ -169,24 +162,18 @@ def test_systems_that_change_agree_with_a_peer(horizon: int, soft: bool | str, t
         problem = with_terms(rng, problem, terms)
         now = changing_period(rng, problem)
         peer = ocp_peer.optimum(problem, now)
-        for steps in (1, 2, 4):
-            solver = changing(problem, steps)
-            solution = solver.solve(now)
-            assert (solution.status == SOLVED) == (peer.solution.status == SOLVED)
-            if peer.solution.status != SOLVED:
-                continue
-            np.testing.assert_allclose(solver.plan(solution), peer.plan, atol=2e-4)
-            np.testing.assert_allclose(solver.slacks(solution), peer.slacks, atol=2e-4)
-            states = ocp_peer.trajectory(now, solver.plan(solution))[1:]
-            np.testing.assert_allclose(solver.states(now, solution), states, atol=1e-6)
-            size = max(1.0, float(np.abs(solution.z).max()))
-            assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * size
+        solver = Changing(problem)
+        solution = solver.solve(now)
+        assert (solution.status == SOLVED) == (peer.solution.status == SOLVED)
         if peer.solution.status != SOLVED:
             continue
+        np.testing.assert_allclose(solver.plan(solution), peer.plan, atol=2e-4)
+        np.testing.assert_allclose(solver.slacks(solution), peer.slacks, atol=2e-4)
+        states = ocp_peer.trajectory(now, solver.plan(solution))[1:]
+        np.testing.assert_allclose(solver.states(now, solution), states, atol=1e-6)
+        size = max(1.0, float(np.abs(solution.z).max()))
+        assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * size
         solved += 1
-        whole = QPSolver("piqp-dense", problem, changing=True).solve(now.query)
-        np.testing.assert_allclose(whole.plan, peer.plan, atol=2e-4)
-        np.testing.assert_allclose(whole.slacks, peer.slacks, atol=2e-4)
         if solved == 2:
             break
     assert solved == 2
@@ -204,7 +191,7 @@ def test_bounds_at_infinity_are_none(soft: bool) -> None:
     problem = replace(problem, bounds=bounds)
     if soft:
         problem = softened(problem, [30.0, 30.0], [0.0, 0.0])
-    now, solver = changing_period(rng, problem), changing(problem, 2)
+    now, solver = changing_period(rng, problem), Changing(problem)
     peer, solution = ocp_peer.optimum(problem, now), solver.solve(now)
     assert peer.solution.status == solution.status == SOLVED
     np.testing.assert_allclose(solver.plan(solution), peer.plan, atol=2e-4)
@@ -236,32 +223,13 @@ def along_flight(flight: Flight, vehicle: Vehicle, problem: Problem, stride: int
         yield Period(A=A, B=B, c=c, state=x0, desired=desired, u_before=before, equilibrium=rest)
 
 
-@pytest.mark.parametrize("steps", [1, 2, 5])
-def test_updated_values_solve_as_a_fresh_setup(constrained_flight: Flight, vehicle: Vehicle, steps: int) -> None:
-    """Soft bounds and lag, matrices of a tilting vehicle; hover, whose matrices have zeros elsewhere, comes last."""
-    problem = softened(lagging(paper_problem(), vehicle), [1e4, 1e4], [1e4, 1e4])
-    solver = changing(problem, steps)
-    periods = [*along_flight(constrained_flight, vehicle, problem, stride=240)]
-    nnz = set()
-    for now in [*periods[1:], periods[0]]:
-        updated, qp = solver.solve(now), solver.qp(now)
-        nnz.add((qp.P.nnz, qp.A.nnz, qp.G.nnz))  # type: ignore[union-attr]
-        fresh = changing(problem, steps).solve(now)
-        assert updated.status == SOLVED
-        np.testing.assert_allclose(solver.plan(updated), solver.plan(fresh), atol=1e-3)
-        residuals = kkt_residuals(qp, updated)
-        assert residuals.worst < 1e-4  # gradients and multipliers are of order 1e4
-        assert residuals.primal < 1e-6
-    assert len(nnz) == 1
-
-
 # Soft bounds
 
 
 def test_slack_is_zero_where_hard_bounds_cost_less_than_its_price(constrained_flight: Flight, vehicle: Vehicle) -> None:
     problem = lagging(paper_problem(), vehicle)
     price = 3e3
-    hard, soft = changing(problem, 4), changing(softened(problem, [price, price], [1e4, 1e4]), 4)
+    hard, soft = Changing(problem), Changing(softened(problem, [price, price], [1e4, 1e4]))
     pressing = dear = 0
     for now in along_flight(constrained_flight, vehicle, problem, stride=40):
         strict, lenient = hard.solve(now), soft.solve(now)
@@ -286,9 +254,9 @@ def test_slack_is_the_smallest_where_hard_bounds_are_infeasible() -> None:
     tilted[[6, 7, 9]] = np.radians([12.0, 20.0, 15.0])
     desired, u_bar = problem.objective.desired(np.zeros((50, 4))), problem.model.u_bar
     now = ocp_peer.period(problem, tilted, desired, u_bar)
-    assert changing(problem, 4).solve(now).status != SOLVED
+    assert Changing(problem).solve(now).status != SOLVED
     lenient = softened(problem, [1e6, 1e6], [0.0, 0.0])
-    solver = changing(lenient, 4)
+    solver = Changing(lenient)
     solution = solver.solve(now)
     assert solution.status == SOLVED
     plan, slacks = solver.plan(solution), solver.slacks(solution)

@@ -14,7 +14,7 @@ from peers.do_mpc_ocp import DoMPC
 
 from mpc.answer import ActuatorBounds
 from mpc.bounded import Soft
-from mpc.nonlinear.controller import NonlinearMPC
+from mpc.nonlinear.controller import STEP_TOLERANCE, NonlinearMPC
 from mpc.nonlinear.settings import Nonlinear, Weights
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.motion import Motion
@@ -79,7 +79,7 @@ class Course:
         self.stride = round(case.node / PERIOD[case])
 
     def law(self, iterations: int = 1, tolerance: float | None = None) -> NonlinearMPC:
-        """Our controller; the QPs are solved by DAQP, to rounding."""
+        """Our controller."""
         case, largest = self.case, self.vehicle.speed_max
         bounds = ActuatorBounds.of_vehicle(self.vehicle)
         if case.steps:
@@ -95,11 +95,10 @@ class Course:
             weights=Weights(**weights),
             tilt=math.degrees(case.tilt) if case.tilt else None,
             soft=Soft(linear=case.penalty[0], quadratic=case.penalty[1]) if any(case.penalty) else None,
-            solver="daqp",
         )
-        law = NonlinearMPC(self.vehicle, period=PERIOD[case], settings=made, bounds=bounds)
-        law.tolerance = law.tolerance if tolerance is None else tolerance
-        return law
+        return NonlinearMPC(
+            self.vehicle, period=PERIOD[case], settings=made, bounds=bounds, tolerance=tolerance or STEP_TOLERANCE
+        )
 
     def question(self, k: int, rng: np.random.Generator, before: Array | None, rotors: Array | None) -> Question:
         """A random state near the course at sample k, after an input, near the course's too where it is not given."""

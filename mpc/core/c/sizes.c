@@ -2,6 +2,7 @@
 #include <stddef.h>
 
 #include "quadsim_mpc.h"
+#include "quadsim_nmpc.h"
 
 #define SIZE(type) extern const size_t type##_size; const size_t type##_size = sizeof(type)
 
@@ -14,3 +15,7 @@ SIZE(quadsim_robust);
 SIZE(quadsim_controller);
 SIZE(quadsim_guard);
 SIZE(quadsim_mpc);
+SIZE(quadsim_nmpc_term);
+SIZE(quadsim_nmpc_problem);
+SIZE(quadsim_nmpc_world);
+SIZE(quadsim_nmpc_work);

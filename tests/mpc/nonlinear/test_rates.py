@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from support import advance_nodes, frame, linearise_nodes
 
 from mpc.bounded import Avoidance, Polytope, Soft, TargetBounds
 from mpc.builders import build
@@ -30,8 +31,6 @@ from mpc.nonlinear.rigidbody import (
     RigidBody,
     V,
     W,
-    advance_nodes,
-    linearise_nodes,
     rigid_body,
     rotation,
     thrust_axis,
@@ -91,12 +90,13 @@ def test_derivatives_are_those_of_finite_differences(
 
 def test_derivatives_in_frames_are_those_of_multiplied_quaternions() -> None:
     model, (x, u) = model_of(), points(3)
-    frames = np.linalg.qr(np.random.default_rng(1).normal(size=(4, 4, 4)))[0]
+    frames = np.random.default_rng(1).normal(size=(4, 4))
+    frames /= np.linalg.norm(frames, axis=1, keepdims=True)
     (A, B, end), (plain, inputs, same) = linearise_nodes(model, x, u, frames), linearise_nodes(model, x, u)
     np.testing.assert_array_equal(end, same)
     for i in range(3):
         before, after = np.eye(14), np.eye(14)
-        before[Q, Q], after[Q, Q] = frames[i], frames[i + 1]
+        before[Q, Q], after[Q, Q] = frame(frames[i]), frame(frames[i + 1])
         np.testing.assert_allclose(A[i], after @ plain[i] @ before.T, atol=1e-12)
         np.testing.assert_allclose(B[i], after @ inputs[i], atol=1e-12)
 
@@ -338,7 +338,7 @@ def test_it_keeps_the_first_period_that_its_steps_did_not_make_converge() -> Non
     period = controller.infeasible_period  # type: ignore[attr-defined]
     assert command.status == NOT_CONVERGED == period.status
     assert period.converges(1) is False
-    assert controller.law._plan is None  # type: ignore[attr-defined]
+    assert controller.law._sqp.plan is None  # type: ignore[attr-defined]
 
 
 # --- the fallback --------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import derivative
+from support import advance_nodes, derivative, frame, linearise_nodes
 
 from mpc.nonlinear.model import nonlinear_model
 from mpc.nonlinear.rigidbody import (
@@ -18,8 +18,6 @@ from mpc.nonlinear.rigidbody import (
     RigidBody,
     V,
     W,
-    advance_nodes,
-    linearise_nodes,
     rigid_body,
     rotation,
     thrust_axis,
@@ -75,13 +73,14 @@ def test_derivatives_in_frames_are_those_of_multiplied_quaternions() -> None:
     model = rigid_body(VEHICLE, 0.1)
     rng = np.random.default_rng(1)
     x, u = points(model, rng, 3)
-    frames = np.linalg.qr(rng.normal(size=(4, 4, 4)))[0]
+    frames = rng.normal(size=(4, 4))
+    frames /= np.linalg.norm(frames, axis=1, keepdims=True)
     A, B, end = linearise_nodes(model, x, u, frames)
     plain, inputs, same = linearise_nodes(model, x, u)
     np.testing.assert_array_equal(end, same)
     for i in range(3):
         before, after = np.eye(model.n), np.eye(model.n)
-        before[Q, Q], after[Q, Q] = frames[i], frames[i + 1]
+        before[Q, Q], after[Q, Q] = frame(frames[i]), frame(frames[i + 1])
         np.testing.assert_allclose(A[i], after @ plain[i] @ before.T, atol=1e-12)
         np.testing.assert_allclose(B[i], after @ inputs[i], atol=1e-12)
 

@@ -233,7 +233,6 @@ NONLINEAR: dict[str, Any] = {
     "polytopes": [{"name": "wall", "of": ["x", "y"], "rows": [[1.0, 1.0]], "upper": [4.0]}],
     "offset_free": {"force_walk": 0.3},
     "input_bounds": {"speed": [10.0, 200.0], "slew": [-30.0, 20.0]},
-    "solver": "daqp",
     "fallback": {"enabled": False},
 }  # fmt: skip
 
@@ -242,7 +241,7 @@ def test_fields_of_nonlinear_mpc_arrive() -> None:
     law = built(NONLINEAR).law
     assert isinstance(law, NonlinearMPC)
     made, x = law.settings, math.radians(1.0)
-    assert (law.horizon, law.problem.horizon, law._stride, law.solver) == (12, 4, 3, "daqp")
+    assert (law.horizon, law.problem.horizon, law._stride, law.solver) == (12, 4, 3, "core")
     assert (made.iterations, made.shift, made.substeps, made.inputs) == (3, True, 2, "speed")
     weights = Weights(position=(1.0, 2.0, 3.0), attitude=4.0, velocity=5.0, body_rates=6.0, input=7.0, move=8.0)
     assert made.weights == weights

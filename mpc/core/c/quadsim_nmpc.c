@@ -1,0 +1,292 @@
+/* Sequential quadratic programming: the reference, the start, steps and what is kept of them. */
+#include "quadsim_nmpc_math.h"
+
+static const real CONVERGED = R(0.1); /* largest defect of a plan that is kept, with targets */
+static const real SHORTEST = R(0.1);  /* share of a step that Aitken's relaxation takes */
+enum { PATIENCE = 8 }; /* steps without a new shortest one after which the largest share of a step is halved */
+
+/* Sizes of a work's arrays of reals, in the order of its pointers. */
+enum { ARRAYS = 31 };
+
+static void sizes_of(const quadsim_nmpc_problem *p, long sizes[ARRAYS])
+{
+    const long N = p->horizon, n = states_of(p), room = p->room, w = entries_of(p), width = columns_of((int)n);
+    const int iterates = p->iterations > 1;
+    const long all[ARRAYS] = {(N + 1) * n,
+                              N * NU,
+                              (N + 1) * 4,
+                              (N + 1) * n,
+                              N * NU,
+                              N * p->faces * 3,
+                              N * p->faces,
+                              N * BODY * width,
+                              N * n,
+                              N * n,
+                              p->tilts ? N * 8 : 0,
+                              p->tilts ? N * 2 : 0,
+                              N * NU * n,
+                              N * NU * NU,
+                              N * NU,
+                              N * NU,
+                              (N + 1) * n,
+                              N * NU,
+                              (N + 1) * w,
+                              (N + 1) * w,
+                              room * (N + 1) * w,
+                              room * (room + 1) / 2,
+                              room,
+                              room,
+                              room,
+                              N * p->slacks,
+                              N * p->slacks,
+                              N * p->slacks,
+                              iterates ? (N + 1) * n : 0,
+                              iterates ? N * NU : 0,
+                              iterates ? N * NU : 0};
+    memcpy(sizes, all, sizeof all);
+}
+
+long quadsim_nmpc_reals(const quadsim_nmpc_problem *problem)
+{
+    long sizes[ARRAYS], sum = 0;
+    int i;
+    sizes_of(problem, sizes);
+    for (i = 0; i < ARRAYS; i++) {
+        sum += sizes[i];
+    }
+    return sum;
+}
+
+long quadsim_nmpc_ints(const quadsim_nmpc_problem *problem)
+{
+    return 2 * problem->room + (problem->slacks + NU) * problem->horizon;
+}
+
+void quadsim_nmpc_start(quadsim_nmpc_work *work, const quadsim_nmpc_problem *problem, quadsim_real *reals, int *ints)
+{
+    quadsim_real **const arrays[ARRAYS] = {
+        &work->x,        &work->u,       &work->frame, &work->goal,   &work->aim,        &work->face,
+        &work->beyond,   &work->map,     &work->offset, &work->end,   &work->axis,       &work->known,
+        &work->gain,     &work->inverse, &work->feed,  &work->more,   &work->s,          &work->v,
+        &work->value,    &work->own,     &work->response, &work->factor, &work->multiplier, &work->r,
+        &work->d,        &work->price,   &work->rate,  &work->origin, &work->x_before, &work->u_before, &work->last};
+    long sizes[ARRAYS];
+    int i;
+    memset(work, 0, sizeof *work);
+    work->p = problem;
+    sizes_of(problem, sizes);
+    for (i = 0; i < ARRAYS; i++) {
+        *arrays[i] = reals;
+        reals += sizes[i];
+    }
+    for (i = 0; i < problem->horizon * problem->faces; i++) {
+        work->face[3 * i] = work->face[3 * i + 1] = work->face[3 * i + 2] = work->beyond[i] = R(0.0);
+    }
+    work->row = ints;
+    work->slot = work->row + problem->room;
+    work->free = work->slot + problem->room;
+    work->held = work->free + problem->slacks * problem->horizon;
+    quadsim_nmpc_reset(work);
+}
+
+void quadsim_nmpc_reset(quadsim_nmpc_work *work)
+{
+    work->planned = work->shifted = work->count = 0;
+    memset(work->free, 0, sizeof(int) * (size_t)((work->p->slacks + NU) * work->p->horizon)); /* and held */
+}
+
+/* Frames, goals of states and inputs; the reference's actuators are in goals. */
+static void follow(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, const real *states, const real *thrusts)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int N = p->horizon, n = states_of(p);
+    const real by = p->largest * world->thrust_scale;
+    int i, j;
+    for (i = 0; i <= N; i++) {
+        const real *at = states + i * BODY, *thrust = thrusts + (i < N ? i : N - 1) * NU;
+        real *goal = work->goal + i * n;
+        memcpy(goal, at, sizeof(real) * BODY);
+        memset(goal + BODY, 0, sizeof(real) * (size_t)(n - BODY));
+        memcpy(work->frame + 4 * i, at + Q, sizeof(real) * 4);
+        goal[Q] = p->difference ? R(1.0) : R(0.0);
+        goal[Q + 1] = goal[Q + 2] = goal[Q + 3] = R(0.0);
+        if (p->targets) {
+            goal[BODY] = (thrust[0] + thrust[1] + thrust[2] + thrust[3]) / by;
+            continue;
+        }
+        for (j = 0; j < NU; j++) {
+            const real share = p->speeds ? square_root(thrust[j] / by) : thrust[j] / by;
+            if (i < N) {
+                work->aim[i * NU + j] = share;
+            }
+            if (p->actuators) {
+                goal[BODY + j] = share;
+            }
+        }
+    }
+    for (i = 0; p->targets && i < N; i++) { /* targets lead their lags, at a node's middle */
+        for (j = 0; j < NU; j++) {
+            const real scale = j > 0 ? p->effect[5 * j] : R(1.0);
+            const real now = work->goal[i * n + (j > 0 ? W + j - 1 : BODY)] / scale;
+            const real next = work->goal[(i + 1) * n + (j > 0 ? W + j - 1 : BODY)] / scale;
+            const real target = R(0.5) * (now + next) + p->lead[j] * (next - now);
+            work->aim[i * NU + j] = clipped(target, p->lower[j], p->upper[j]);
+        }
+    }
+}
+
+/* A plan to start from: the reference, or the last plan, a node further on. */
+static void guess(quadsim_nmpc_work *work)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int N = p->horizon, n = states_of(p), befores = p->moves ? NU : 0;
+    int i, j;
+    work->shifted = work->planned && p->shifts;
+    if (work->shifted) {
+        memmove(work->x, work->x + n, sizeof(real) * (size_t)(N * n));
+        memmove(work->u, work->u + NU, sizeof(real) * (size_t)((N - 1) * NU));
+    }
+    if (work->planned) {
+        return;
+    }
+    for (i = 0; i < N * NU; i++) {
+        work->u[i] = clipped(work->aim[i], p->lower[i % NU], p->upper[i % NU]);
+    }
+    memcpy(work->x, work->goal, sizeof(real) * (size_t)((N + 1) * n));
+    for (i = 0; i <= N; i++) {
+        memcpy(work->x + i * n + Q, work->frame + 4 * i, sizeof(real) * 4);
+        for (j = 0; j < befores; j++) {
+            work->x[i * n + n - NU + j] = i > 0 ? work->u[(i - 1) * NU + j] : work->before[j];
+        }
+    }
+}
+
+int quadsim_nmpc_begin(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, const quadsim_real *measured,
+                       const quadsim_real *before, const quadsim_real *states, const quadsim_real *thrusts)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int N = p->horizon, n = states_of(p), known = BODY + p->actuators;
+    if (!is_finite(measured, known) || !is_finite(before, NU) || !is_finite(states, (N + 1) * BODY) ||
+        !is_finite(thrusts, N * NU)) {
+        return 0;
+    }
+    memcpy(work->before, before, sizeof work->before);
+    follow(work, world, states, thrusts);
+    guess(work);
+    memcpy(work->measured, measured, sizeof(real) * (size_t)known);
+    if (p->moves) {
+        memcpy(work->measured + known, before, sizeof(real) * NU);
+    }
+    memcpy(work->start, work->measured, sizeof(real) * (size_t)n);
+    into_frame(work->frame, measured + Q, work->start + Q);
+    work->share = work->largest = R(1.0);
+    work->least = R(1e30);
+    work->patience = PATIENCE;
+    work->iterations = 0;
+    work->defect = work->moved = R(0.0);
+    return 1;
+}
+
+static real larger(real largest, real a, real b)
+{
+    const real change = magnitude(a - b);
+    return change > largest ? change : largest;
+}
+
+/* Take a share of the step from the plan before.  Full Gauss-Newton steps may oscillate: Aitken's relaxation (Irons and
+ * Tuck 1969) finds the share from how much of the previous step a step undoes; the largest share falls for good where
+ * steps do not get shorter. */
+static void relax(quadsim_nmpc_work *work)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int N = p->horizon, states = (N + 1) * states_of(p), inputs = N * NU;
+    real undone = R(1.0), step;
+    int i;
+    if (work->iterations > 1) {
+        real product = R(0.0), square = R(0.0);
+        for (i = 0; i < inputs; i++) {
+            product += (work->u[i] - work->u_before[i]) * work->last[i];
+            square += work->last[i] * work->last[i];
+        }
+        undone = square > R(0.0) ? R(1.0) - product / square : R(1.0);
+    }
+    work->patience = work->moved < R(0.9) * work->least ? PATIENCE : work->patience - 1;
+    work->least = work->moved < work->least ? work->moved : work->least;
+    if (work->patience == 0) {
+        work->largest *= R(0.5);
+        work->patience = PATIENCE;
+    }
+    step = work->share / (undone > SHORTEST ? undone : SHORTEST);
+    step = step > SHORTEST ? step : SHORTEST;
+    work->share = step < work->largest ? step : work->largest;
+    for (i = 0; i < inputs; i++) {
+        work->last[i] = work->u[i] - work->u_before[i];
+        work->u[i] = work->u_before[i] + work->share * work->last[i];
+    }
+    for (i = 0; i < states; i++) {
+        work->x[i] = work->x_before[i] + work->share * (work->x[i] - work->x_before[i]);
+    }
+}
+
+int quadsim_nmpc_keep(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, enum quadsim_nmpc_status *status)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int N = p->horizon, n = states_of(p);
+    int i, j, on;
+    if (*status <= QUADSIM_NMPC_BOUNDED && !is_finite(work->v, N * NU)) {
+        *status = QUADSIM_NMPC_NOT_FINITE;
+    }
+    if (*status > QUADSIM_NMPC_BOUNDED) {
+        quadsim_nmpc_reset(work);
+        return 0;
+    }
+    work->iterations++;
+    work->moved = R(0.0);
+    if (p->iterations > 1) {
+        memcpy(work->x_before, work->x, sizeof(real) * (size_t)((N + 1) * n));
+        memcpy(work->u_before, work->u, sizeof(real) * (size_t)(N * NU));
+    }
+    for (i = 0; i <= N; i++) {
+        real *x = work->x + i * n, s[MOST];
+        memcpy(s, i > 0 ? work->s + i * n : work->measured, sizeof(real) * (size_t)n);
+        if (i > 0) {
+            from_frame(work->frame + 4 * i, work->s + i * n + Q, s + Q);
+        }
+        for (j = 0; j < n; j++) {
+            work->moved = larger(work->moved, s[j], x[j]);
+            x[j] = s[j];
+        }
+    }
+    for (i = 0; i < N * NU; i++) {
+        const real input = clipped(work->v[i], p->lower[i % NU], p->upper[i % NU]); /* beyond by rounding at most */
+        work->moved = larger(work->moved, input, work->u[i]);
+        work->u[i] = input;
+    }
+    work->planned = 1;
+    work->defect = quadsim_nmpc_defect(work, world);
+    on = work->iterations < p->iterations + p->corrections && !(p->iterations > 1 && work->moved <= p->tolerance) &&
+         !(p->corrections > 0 && work->iterations >= p->iterations && work->defect <= CONVERGED);
+    if (on && p->iterations > 1) {
+        relax(work);
+    }
+    if (!on && work->defect > CONVERGED) {
+        work->planned = !p->targets;
+        *status = QUADSIM_NMPC_UNCONVERGED;
+    }
+    return on;
+}
+
+enum quadsim_nmpc_status quadsim_nmpc_step(quadsim_nmpc_work *work, const quadsim_nmpc_world *world,
+                                           const quadsim_real *measured, const quadsim_real *before,
+                                           const quadsim_real *states, const quadsim_real *thrusts)
+{
+    enum quadsim_nmpc_status status;
+    if (!quadsim_nmpc_begin(work, world, measured, before, states, thrusts)) {
+        return QUADSIM_NMPC_NOT_FINITE;
+    }
+    do {
+        quadsim_nmpc_linearise(work, world);
+        status = quadsim_nmpc_solve(work);
+    } while (quadsim_nmpc_keep(work, world, &status));
+    return status;
+}

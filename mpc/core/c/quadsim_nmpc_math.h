@@ -1,0 +1,68 @@
+/* Arithmetic of the rigid body that the files of the nonlinear law share. */
+#ifndef QUADSIM_NMPC_MATH_H
+#define QUADSIM_NMPC_MATH_H
+
+#include "quadsim_math.h"
+#include "quadsim_nmpc.h"
+
+#include <string.h>
+
+/* A function whose sizes are constants wherever it is called: the compiler makes one of each size. */
+#if defined __GNUC__
+#define INLINED static inline __attribute__((always_inline))
+#else
+#define INLINED static inline
+#endif
+
+enum { BODY = QUADSIM_NMPC_BODY, MOST = QUADSIM_NMPC_MOST, P = 0, Q = 3, V = 7, W = 10 };
+
+static inline int states_of(const quadsim_nmpc_problem *p)
+{
+    return BODY + p->actuators + (p->moves ? NU : 0);
+}
+
+/* Entries of a node; see quadsim_nmpc_problem. */
+static inline int entries_of(const quadsim_nmpc_problem *p)
+{
+    return NU + (p->tilts ? 2 : 0) + (p->turns ? 3 : 0) + (p->places ? 6 : 0);
+}
+
+/* Columns of a map: all states but the position, then the inputs; padded to an even number. */
+static inline int columns_of(int n)
+{
+    return (n + 2) & ~1;
+}
+
+/* F q, or F' q, of the frame of a reference quaternion: the product with its conjugate, or with itself. */
+static inline void into_frame(const real *frame, const real *q, real *out)
+{
+    const real w = frame[0], x = frame[1], y = frame[2], z = frame[3];
+    const real a = q[0], b = q[1], c = q[2], d = q[3];
+    out[0] = w * a + x * b + y * c + z * d;
+    out[1] = -x * a + w * b + z * c - y * d;
+    out[2] = -y * a - z * b + w * c + x * d;
+    out[3] = -z * a + y * b - x * c + w * d;
+}
+
+static inline void from_frame(const real *frame, const real *q, real *out)
+{
+    const real w = frame[0], x = frame[1], y = frame[2], z = frame[3];
+    const real a = q[0], b = q[1], c = q[2], d = q[3];
+    out[0] = w * a - x * b - y * c - z * d;
+    out[1] = x * a + w * b - z * c + y * d;
+    out[2] = y * a + z * b + w * c - x * d;
+    out[3] = z * a - y * b + x * c + w * d;
+}
+
+/* R(q) e_z of a quaternion of any length. */
+static inline void thrust_axis(const real *q, real axis[3])
+{
+    axis[0] = R(2.0) * (q[1] * q[3] + q[0] * q[2]);
+    axis[1] = R(2.0) * (q[2] * q[3] - q[0] * q[1]);
+    axis[2] = R(1.0) - R(2.0) * (q[1] * q[1] + q[2] * q[2]);
+}
+
+/* quadsim_nmpc_model.c: by how much the plan misses the dynamics. */
+quadsim_real quadsim_nmpc_defect(const quadsim_nmpc_work *work, const quadsim_nmpc_world *world);
+
+#endif

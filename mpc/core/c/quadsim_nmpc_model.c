@@ -1,0 +1,507 @@
+/* The rigid body from node to node: the Runge-Kutta map and its exact derivatives.
+ *
+ * Columns of derivatives pass through the stages with the value.  Two kinds of them are apart: those that turn the
+ * attitude ("turning": of the quaternion, body rates, and what acts on these), and those of velocity and of targets of
+ * thrust, which only push ("pushing").  Actuators follow their inputs exactly. */
+#include "quadsim_nmpc_math.h"
+
+enum { PUSHING = 6, TURNING = 16 };
+
+/* What acts at an instant. */
+struct drive {
+    real thrust, angular[3];  /* T, I^-1 tau + alpha */
+    real rates[3];            /* of targets */
+    const real *left;
+};
+
+/* The slope of a state, and what its derivatives need. */
+struct slope {
+    real q[4], v[3], w[3];
+    real axis[3], by_q[3][4], by_v[3][3];
+};
+
+static struct drive drive_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u, int instant,
+                             real by_share[4][NU])
+{
+    struct drive drive;
+    int i, j;
+    drive.left = p->left + instant * NU;
+    if (p->targets) {
+        const real thrust = p->effect[0] * world->thrust_scale;
+        drive.thrust = thrust * (u[0] + drive.left[0] * (x[BODY] - u[0]));
+        for (i = 0; i < 3; i++) {
+            const real target = p->effect[5 * (i + 1)] * u[i + 1];
+            drive.rates[i] = target + drive.left[i + 1] * (x[W + i] - target);
+            drive.angular[i] = R(0.0);
+        }
+        return drive;
+    }
+    drive.thrust = R(0.0);
+    for (i = 0; i < 3; i++) {
+        drive.angular[i] = world->angular[i];
+    }
+    for (j = 0; j < NU; j++) {
+        const real now = p->actuators ? u[j] + drive.left[j] * (x[BODY + j] - u[j]) : u[j];
+        const real share = world->thrust_scale * (p->speeds ? now * now : now);
+        const real by = world->thrust_scale * (p->speeds ? R(2.0) * now : R(1.0));
+        drive.thrust += p->effect[j] * share;
+        for (i = 0; i < 3; i++) {
+            drive.angular[i] += p->effect[NU * (i + 1) + j] * share;
+        }
+        for (i = 0; i < 4; i++) {
+            by_share[i][j] = p->effect[NU * i + j] * by;
+        }
+    }
+    return drive;
+}
+
+static int has_drag(const quadsim_nmpc_world *world)
+{
+    int i, any = 0;
+    for (i = 0; i < 3; i++) {
+        any |= world->drag[i] != R(0.0) || world->square_drag[i] != R(0.0);
+    }
+    return any;
+}
+
+/* Add drag to a slope, and, where wanted, its derivatives. */
+static void add_drag(const quadsim_nmpc_world *world, const real *q, const real *v, int derive, struct slope *k)
+{
+    const real w = q[0], x = q[1], y = q[2], z = q[3];
+    const real turn[3][3] = {{R(1.0) - R(2.0) * (y * y + z * z), R(2.0) * (x * y - w * z), R(2.0) * (x * z + w * y)},
+                             {R(2.0) * (x * y + w * z), R(1.0) - R(2.0) * (x * x + z * z), R(2.0) * (y * z - w * x)},
+                             {R(2.0) * (x * z - w * y), R(2.0) * (y * z + w * x), R(1.0) - R(2.0) * (x * x + y * y)}};
+    const real slopes[4][3][3] = {{{R(0.0), -z, y}, {z, R(0.0), -x}, {-y, x, R(0.0)}},
+                                  {{R(0.0), y, z}, {y, R(-2.0) * x, -w}, {z, w, R(-2.0) * x}},
+                                  {{R(-2.0) * y, x, w}, {x, R(0.0), z}, {-w, z, R(-2.0) * y}},
+                                  {{R(-2.0) * z, -w, x}, {w, R(-2.0) * z, y}, {x, y, R(0.0)}}}; /* halves */
+    real pull[3], damped[3][3];
+    int i, j, a;
+    for (a = 0; a < 3; a++) {
+        const real body = turn[0][a] * v[0] + turn[1][a] * v[1] + turn[2][a] * v[2], size = magnitude(body);
+        const real rate = -(world->drag[a] + R(2.0) * world->square_drag[a] * size);
+        pull[a] = -(world->drag[a] + world->square_drag[a] * size) * body;
+        for (i = 0; i < 3; i++) {
+            k->v[i] += turn[i][a] * pull[a];
+            damped[i][a] = turn[i][a] * rate;
+        }
+    }
+    for (i = 0; derive && i < 3; i++) {
+        for (j = 0; j < 3; j++) {
+            k->by_v[i][j] = damped[i][0] * turn[j][0] + damped[i][1] * turn[j][1] + damped[i][2] * turn[j][2];
+        }
+    }
+    for (j = 0; derive && j < 4; j++) {
+        real air[3];
+        for (a = 0; a < 3; a++) {
+            air[a] = slopes[j][0][a] * v[0] + slopes[j][1][a] * v[1] + slopes[j][2][a] * v[2];
+        }
+        for (i = 0; i < 3; i++) {
+            real sum = R(0.0);
+            for (a = 0; a < 3; a++) {
+                sum += slopes[j][i][a] * pull[a] + damped[i][a] * air[a];
+            }
+            k->by_q[i][j] += R(2.0) * sum;
+        }
+    }
+}
+
+static void slope_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive, int drags, int derive,
+                     const real *q, const real *v, const real *w, struct slope *k)
+{
+    const real T = drive->thrust, twice = R(2.0) * T;
+    int i;
+    k->q[0] = R(0.5) * (-q[1] * w[0] - q[2] * w[1] - q[3] * w[2]);
+    k->q[1] = R(0.5) * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1]);
+    k->q[2] = R(0.5) * (q[0] * w[1] - q[1] * w[2] + q[3] * w[0]);
+    k->q[3] = R(0.5) * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0]);
+    thrust_axis(q, k->axis);
+    for (i = 0; i < 3; i++) {
+        k->v[i] = T * k->axis[i] + world->acceleration[i];
+    }
+    k->v[2] -= p->gravity;
+    k->w[0] = p->gyration[0] * w[1] * w[2] + drive->angular[0];
+    k->w[1] = p->gyration[1] * w[2] * w[0] + drive->angular[1];
+    k->w[2] = p->gyration[2] * w[0] * w[1] + drive->angular[2];
+    if (derive) {
+        const real by_q[3][4] = {{twice * q[2], twice * q[3], twice * q[0], twice * q[1]},
+                                 {-twice * q[1], -twice * q[0], twice * q[3], twice * q[2]},
+                                 {R(0.0), R(-2.0) * twice * q[1], R(-2.0) * twice * q[2], R(0.0)}};
+        memcpy(k->by_q, by_q, sizeof by_q);
+    }
+    if (drags) {
+        add_drag(world, q, v, derive, k);
+    }
+}
+
+/* Slopes of the turning columns Y: m of them, the first four of the quaternion, which leave body rates alone. */
+INLINED void turning_slopes(const quadsim_nmpc_problem *p, const struct slope *k, const real *q, const real *w, int drags,
+                            real by_share[4][NU], const int m, const int targets, const int actuators,
+                            const struct drive *drive, real Y[10][TURNING], real K[10][TURNING])
+{
+    int c, i;
+    for (c = 0; c < 4; c++) {
+        K[0][c] = R(0.5) * (-w[0] * Y[1][c] - w[1] * Y[2][c] - w[2] * Y[3][c]);
+        K[1][c] = R(0.5) * (w[0] * Y[0][c] + w[2] * Y[2][c] - w[1] * Y[3][c]);
+        K[2][c] = R(0.5) * (w[1] * Y[0][c] - w[2] * Y[1][c] + w[0] * Y[3][c]);
+        K[3][c] = R(0.5) * (w[2] * Y[0][c] + w[1] * Y[1][c] - w[0] * Y[2][c]);
+    }
+    for (c = 4; c < m; c++) {
+        const real *const a = &Y[7][c], *const b = &Y[8][c], *const d = &Y[9][c];
+        K[0][c] = R(0.5) * (-w[0] * Y[1][c] - w[1] * Y[2][c] - w[2] * Y[3][c] - q[1] * *a - q[2] * *b - q[3] * *d);
+        K[1][c] = R(0.5) * (w[0] * Y[0][c] + w[2] * Y[2][c] - w[1] * Y[3][c] + q[0] * *a + q[2] * *d - q[3] * *b);
+        K[2][c] = R(0.5) * (w[1] * Y[0][c] - w[2] * Y[1][c] + w[0] * Y[3][c] + q[0] * *b - q[1] * *d + q[3] * *a);
+        K[3][c] = R(0.5) * (w[2] * Y[0][c] + w[1] * Y[1][c] - w[0] * Y[2][c] + q[0] * *d + q[1] * *b - q[2] * *a);
+    }
+    for (i = 0; i < 3; i++) {
+        const real *by = k->by_q[i];
+        for (c = 0; c < m; c++) {
+            K[4 + i][c] = by[0] * Y[0][c] + by[1] * Y[1][c] + by[2] * Y[2][c] + by[3] * Y[3][c];
+        }
+        if (drags) {
+            const real *pull = k->by_v[i];
+            for (c = 0; c < m; c++) {
+                K[4 + i][c] += pull[0] * Y[4][c] + pull[1] * Y[5][c] + pull[2] * Y[6][c];
+            }
+        }
+    }
+    if (targets) {
+        return;
+    }
+    for (c = 4; c < m; c++) {
+        K[7][c] = p->gyration[0] * (w[1] * Y[9][c] + w[2] * Y[8][c]);
+        K[8][c] = p->gyration[1] * (w[2] * Y[7][c] + w[0] * Y[9][c]);
+        K[9][c] = p->gyration[2] * (w[0] * Y[8][c] + w[1] * Y[7][c]);
+    }
+    for (c = 0; c < NU; c++) {
+        const real left = actuators ? drive->left[c] : R(0.0);
+        for (i = 0; i < 3; i++) {
+            if (actuators) {
+                K[4 + i][7 + c] += k->axis[i] * by_share[0][c] * left;
+                K[7 + i][7 + c] += by_share[i + 1][c] * left;
+            }
+            K[4 + i][7 + actuators + c] += k->axis[i] * by_share[0][c] * (R(1.0) - left);
+            K[7 + i][7 + actuators + c] += by_share[i + 1][c] * (R(1.0) - left);
+        }
+    }
+}
+
+/* Slopes of the pushing columns Z: velocity, and with targets thrust and its target. */
+INLINED void pushing_slopes(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct slope *k,
+                            const struct drive *drive, int drags, const int targets, real Z[3][PUSHING],
+                            real K[3][PUSHING])
+{
+    const real thrust = p->effect[0] * world->thrust_scale;
+    int c, i;
+    for (i = 0; i < 3; i++) {
+        for (c = 0; c < PUSHING; c++) {
+            K[i][c] = drags ? k->by_v[i][0] * Z[0][c] + k->by_v[i][1] * Z[1][c] + k->by_v[i][2] * Z[2][c] : R(0.0);
+        }
+        if (targets) {
+            K[i][3] += k->axis[i] * thrust * drive->left[0];
+            K[i][4] += k->axis[i] * thrust * (R(1.0) - drive->left[0]);
+        }
+    }
+}
+
+/* Body rates at an instant, where targets make them known. */
+INLINED void set_rates(const quadsim_nmpc_problem *p, const struct drive *drive, real *y, real Y[10][TURNING])
+{
+    int i;
+    for (i = 0; i < 3; i++) {
+        y[7 + i] = drive->rates[i];
+        Y[7 + i][4 + i] = drive->left[i + 1];
+        Y[7 + i][7 + i] = p->effect[5 * (i + 1)] * (R(1.0) - drive->left[i + 1]);
+    }
+}
+
+/* Actuators at the end of a step, and the inputs before. */
+static void actuators_after(const quadsim_nmpc_problem *p, const real *x, const real *u, real *end)
+{
+    int i;
+    for (i = 0; i < p->actuators; i++) {
+        end[BODY + i] = u[i] + p->left[2 * p->substeps * NU + i] * (x[BODY + i] - u[i]);
+    }
+    if (p->moves) {
+        memcpy(end + BODY + p->actuators, u, sizeof(real) * NU);
+    }
+}
+
+/* One node: m turning columns, padded, with targets or not, and so many actuators. */
+INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, int drags, const real *x, const real *u,
+                            const real *frame, const real *next, const int m, const int targets, const int actuators,
+                            int n, real *map, real *end)
+{
+    static const real UNITS[4][4] = {{R(1.0)}, {R(0.0), R(1.0)}, {R(0.0), R(0.0), R(1.0)}, {R(0.0), R(0.0), R(0.0), R(1.0)}};
+    const real h = p->step / (real)p->substeps, part[4] = {R(0.0), R(0.5) * h, R(0.5) * h, h};
+    const int width = columns_of(n), turning = targets ? 10 : 11 + actuators, befores = n - BODY - actuators;
+    real Y[10][TURNING] = {{R(0.0)}}, Z[3][PUSHING] = {{R(0.0)}}, moved[3][TURNING] = {{R(0.0)}};
+    real pushed[3][PUSHING] = {{R(0.0)}}, K[10][TURNING], L[3][PUSHING], y[10], travelled[3], by_share[4][NU];
+    struct drive drive;
+    struct slope k;
+    int s, stage, i, c;
+    memset(K, 0, sizeof K);
+    memcpy(y, x + Q, sizeof y);
+    for (i = 0; i < 4; i++) { /* the quaternion starts at F' of the frame's units */
+        real column[4];
+        from_frame(frame, UNITS[i], column);
+        for (c = 0; c < 4; c++) {
+            Y[c][i] = column[c];
+        }
+    }
+    for (i = 0; i < 3; i++) {
+        Y[7 + i][4 + i] = Z[i][i] = R(1.0);
+        travelled[i] = R(0.0);
+    }
+    for (s = 0; s < p->substeps; s++) {
+        real Ys[10][TURNING], Zs[3][PUSHING], ys[10], sum[10][TURNING], push[3][PUSHING], value[10];
+        for (stage = 0; stage < 4; stage++) {
+            const real twice = stage == 1 || stage == 2 ? R(2.0) : R(1.0);
+            if (stage == 0) {
+                memcpy(Ys, Y, sizeof Y);
+                memcpy(Zs, Z, sizeof Z);
+                memcpy(ys, y, sizeof y);
+            } else {
+                const real by = part[stage];
+                for (i = 0; i < 10; i++) {
+                    for (c = 0; c < m; c++) {
+                        Ys[i][c] = Y[i][c] + by * K[i][c];
+                    }
+                }
+                for (i = 0; i < 3; i++) {
+                    for (c = 0; c < PUSHING; c++) {
+                        Zs[i][c] = Z[i][c] + by * L[i][c];
+                    }
+                    ys[i] = y[i] + by * k.q[i];
+                    ys[4 + i] = y[4 + i] + by * k.v[i];
+                    ys[7 + i] = y[7 + i] + by * k.w[i];
+                }
+                ys[3] = y[3] + by * k.q[3];
+            }
+            drive = drive_at(p, world, x, u, 2 * s + (stage + 1) / 2, by_share);
+            if (targets) {
+                set_rates(p, &drive, ys, Ys);
+            }
+            slope_at(p, world, &drive, drags, 1, ys, ys + 4, ys + 7, &k);
+            turning_slopes(p, &k, ys, ys + 7, drags, by_share, m, targets, actuators, &drive, Ys, K);
+            pushing_slopes(p, world, &k, &drive, drags, targets, Zs, L);
+            if (stage == 3) { /* of the position, whose slope is the velocity */
+                for (i = 0; i < 3; i++) {
+                    for (c = 0; c < m; c++) {
+                        moved[i][c] += h * Y[4 + i][c];
+                    }
+                    for (c = 0; c < PUSHING; c++) {
+                        pushed[i][c] += h * Z[i][c];
+                    }
+                    travelled[i] += h * y[4 + i];
+                }
+            }
+            for (i = 0; i < 10; i++) {
+                for (c = 0; c < m; c++) {
+                    sum[i][c] = stage == 0 ? K[i][c] : sum[i][c] + twice * K[i][c];
+                }
+                value[i] = (stage == 0 ? R(0.0) : value[i]) + twice * (i < 4 ? k.q[i] : i < 7 ? k.v[i - 4] : k.w[i - 7]);
+            }
+            for (i = 0; i < 3; i++) {
+                const real by = h * h / R(6.0);
+                for (c = 0; c < PUSHING; c++) {
+                    push[i][c] = stage == 0 ? L[i][c] : push[i][c] + twice * L[i][c];
+                }
+                if (stage < 3) {
+                    for (c = 0; c < m; c++) {
+                        moved[i][c] += by * K[4 + i][c];
+                    }
+                    for (c = 0; c < PUSHING; c++) {
+                        pushed[i][c] += by * L[i][c];
+                    }
+                    travelled[i] += by * k.v[i];
+                }
+            }
+        }
+        for (i = 0; i < 10; i++) {
+            for (c = 0; c < m; c++) {
+                Y[i][c] += h / R(6.0) * sum[i][c];
+            }
+            y[i] += h / R(6.0) * value[i];
+        }
+        for (i = 0; i < 3; i++) {
+            for (c = 0; c < PUSHING; c++) {
+                Z[i][c] += h / R(6.0) * push[i][c];
+            }
+        }
+    }
+    if (targets) {
+        drive = drive_at(p, world, x, u, 2 * p->substeps, by_share);
+        set_rates(p, &drive, y, Y);
+    }
+    /* The map's columns: quaternion, velocity, body rates, actuators, inputs. */
+    memset(map, 0, sizeof(real) * (size_t)(BODY * width));
+    for (c = 0; c < turning; c++) {
+        const int of_input = c >= 7 + (targets ? 0 : actuators);
+        const int at = (c < 4 ? c : targets && of_input ? c + 5 : c + 3) + (of_input ? befores : 0);
+        real q[4], turned[4];
+        for (i = 0; i < 4; i++) {
+            q[i] = Y[i][c];
+        }
+        into_frame(next, q, turned);
+        for (i = 0; i < 3; i++) {
+            map[i * width + at] = moved[i][c];
+            map[(V + i) * width + at] = Y[4 + i][c];
+            map[(W + i) * width + at] = Y[7 + i][c];
+        }
+        for (i = 0; i < 4; i++) {
+            map[(Q + i) * width + at] = turned[i];
+        }
+    }
+    for (c = 0; c < (targets ? 5 : 3); c++) {
+        const int at = c < 3 ? 4 + c : 7 + c + (c == 4 ? befores : 0);
+        for (i = 0; i < 3; i++) {
+            map[i * width + at] = pushed[i][c];
+            map[(V + i) * width + at] = Z[i][c];
+        }
+    }
+    for (i = 0; i < 3; i++) {
+        end[i] = x[i] + travelled[i];
+    }
+    memcpy(end + Q, y, sizeof y);
+    actuators_after(p, x, u, end);
+}
+
+/* The part of the next state that is neither of the state nor of the inputs. */
+static void find_offset(int n, const real *map, const real *x, const real *u, const real *frame, const real *next,
+                        const real *end, real *offset)
+{
+    const int width = columns_of(n);
+    real at[MOST + 2] = {R(0.0)};
+    int i, j;
+    into_frame(frame, x + Q, at);
+    memcpy(at + 4, x + V, sizeof(real) * (size_t)(n - V));
+    memcpy(at + n - 3, u, sizeof(real) * NU);
+    memcpy(offset, end, sizeof(real) * (size_t)n);
+    into_frame(next, end + Q, offset + Q);
+    for (i = 0; i < BODY; i++) {
+        real sum = i < 3 ? x[i] : R(0.0);
+        for (j = 0; j < n + 1; j++) {
+            sum += map[i * width + j] * at[j];
+        }
+        offset[i] -= sum;
+    }
+    for (i = BODY; i < n; i++) {
+        offset[i] = R(0.0);
+    }
+}
+
+/* The thrust axis along world x and y, at a quaternion in its frame near q: a row for each, and what is known. */
+static void find_axis(const real *q, const real *frame, real *rows, real *known)
+{
+    const real slope[2][4] = {{R(2.0) * q[2], R(2.0) * q[3], R(2.0) * q[0], R(2.0) * q[1]},
+                              {R(-2.0) * q[1], R(-2.0) * q[0], R(2.0) * q[3], R(2.0) * q[2]}};
+    real axis[3];
+    int i, j;
+    thrust_axis(q, axis);
+    for (i = 0; i < 2; i++) {
+        known[i] = axis[i];
+        for (j = 0; j < 4; j++) {
+            known[i] -= slope[i][j] * q[j];
+        }
+        into_frame(frame, slope[i], rows + 4 * i);
+    }
+}
+
+void quadsim_nmpc_slopes(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
+                         const real *frames, real *map, real *end)
+{
+    const int n = states_of(p), drags = has_drag(world);
+    if (p->targets) {
+        linearise_node(p, world, drags, x, u, frames, frames + 4, 10, 1, 1, n, map, end);
+    } else if (p->actuators) {
+        linearise_node(p, world, drags, x, u, frames, frames + 4, 16, 0, 4, n, map, end);
+    } else {
+        linearise_node(p, world, drags, x, u, frames, frames + 4, 12, 0, 0, n, map, end);
+    }
+}
+
+void quadsim_nmpc_linearise(quadsim_nmpc_work *work, const quadsim_nmpc_world *world)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int n = states_of(p), width = columns_of(n);
+    int i;
+    for (i = 0; i < p->horizon; i++) {
+        const real *x = work->x + i * n, *u = work->u + i * NU, *frame = work->frame + 4 * i;
+        real *map = work->map + i * BODY * width, *end = work->end + i * n;
+        quadsim_nmpc_slopes(p, world, x, u, frame, map, end);
+        find_offset(n, map, x, u, frame, frame + 4, end, work->offset + i * n);
+        if (p->tilts) {
+            find_axis(x + n + Q, frame + 4, work->axis + 8 * i, work->known + 2 * i);
+        }
+    }
+}
+
+/* The next state, without derivatives. */
+static void advance(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u, real *end)
+{
+    const int drags = has_drag(world);
+    const real h = p->step / (real)p->substeps, part[4] = {R(0.0), R(0.5) * h, R(0.5) * h, h};
+    real y[10], by_share[4][NU];
+    struct drive drive;
+    int s, stage, i;
+    memcpy(y, x + Q, sizeof y);
+    memcpy(end, x, sizeof(real) * 3);
+    for (s = 0; s < p->substeps; s++) {
+        real sum[10] = {R(0.0)}, ys[10];
+        struct slope k;
+        memcpy(ys, y, sizeof y);
+        for (stage = 0; stage < 4; stage++) {
+            const real twice = stage == 1 || stage == 2 ? R(2.0) : R(1.0);
+            drive = drive_at(p, world, x, u, 2 * s + (stage + 1) / 2, by_share);
+            for (i = 0; p->targets && i < 3; i++) {
+                ys[7 + i] = drive.rates[i];
+            }
+            slope_at(p, world, &drive, drags, 0, ys, ys + 4, ys + 7, &k);
+            for (i = 0; i < 3; i++) {
+                end[i] += stage < 3 ? h * h / R(6.0) * k.v[i] : h * y[4 + i];
+            }
+            for (i = 0; i < 10; i++) {
+                const real slope = i < 4 ? k.q[i] : i < 7 ? k.v[i - 4] : k.w[i - 7];
+                sum[i] += twice * slope;
+                ys[i] = stage < 3 ? y[i] + part[stage + 1] * slope : R(0.0);
+            }
+        }
+        for (i = 0; i < 10; i++) {
+            y[i] += h / R(6.0) * sum[i];
+        }
+    }
+    if (p->targets) {
+        drive = drive_at(p, world, x, u, 2 * p->substeps, by_share);
+        memcpy(y + 7, drive.rates, sizeof drive.rates);
+    }
+    memcpy(end + Q, y, sizeof y);
+    actuators_after(p, x, u, end);
+}
+
+void quadsim_nmpc_advance(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, int count, const real *states,
+                          const real *inputs, real *ends)
+{
+    const int n = states_of(p);
+    int i;
+    for (i = 0; i < count; i++) {
+        advance(p, world, states + i * n, inputs + i * NU, ends + i * n);
+    }
+}
+
+/* By how much the plan misses the dynamics. */
+real quadsim_nmpc_defect(const quadsim_nmpc_work *work, const quadsim_nmpc_world *world)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int n = states_of(p);
+    real largest = R(0.0), end[MOST];
+    int i, j;
+    for (i = 0; i < p->horizon; i++) {
+        advance(p, world, work->x + i * n, work->u + i * NU, end);
+        for (j = 0; j < n; j++) {
+            const real miss = magnitude(work->x[(i + 1) * n + j] - end[j]);
+            largest = miss > largest ? miss : largest;
+        }
+    }
+    return largest;
+}

@@ -1,0 +1,162 @@
+"""The rigid body of the nonlinear law in C: its numbers in the core's layout, and its motion from node to node."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+
+from mpc.nonlinear.rigidbody import N_BODY, Inputs, RigidBody
+from quadsim.core.library import check_sizes, load_library
+from quadsim.state import Array
+from quadsim.vehicle import N_ROTORS
+
+STATES_ROOM: Final = 21
+INT: Final = ctypes.c_int
+REAL: Final = ctypes.c_double
+AT: Final = ctypes.c_void_p
+
+
+def struct_members(kind: type[Any], names: str) -> list[tuple[str, Any]]:
+    """Return members of a struct, as `x n:3`."""
+    parts = (name.partition(":") for name in names.split())
+    return [(name, kind * int(size) if size else kind) for name, _, size in parts]
+
+
+class ProblemStruct(ctypes.Structure):
+    """A `quadsim_nmpc_problem`."""
+
+    _fields_ = [
+        *struct_members(INT, "horizon actuators targets speeds substeps difference shifts moves tilts turns places"),
+        *struct_members(INT, "rows faces slacks room changes iterations corrections"),
+        *struct_members(REAL, "tolerance step gravity largest effect:16 gyration:3 lead:4"),
+        *struct_members(AT, "left"),
+        *struct_members(REAL, "weight:21 effort:4 move"),
+        *struct_members(AT, "terminal"),
+        *struct_members(REAL, "lower:4 upper:4 tilt turn:3"),
+        *struct_members(AT, "terms first bounds slack linear quadratic"),
+    ]
+
+
+class WorldStruct(ctypes.Structure):
+    """A `quadsim_nmpc_world`."""
+
+    _fields_ = struct_members(REAL, "acceleration:3 angular:3 drag:3 square_drag:3 thrust_scale")
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    library = load_library()
+    check_sizes(quadsim_nmpc_problem=ProblemStruct, quadsim_nmpc_world=WorldStruct)
+    library.quadsim_nmpc_advance.restype = library.quadsim_nmpc_slopes.restype = None
+    library.quadsim_nmpc_slopes.argtypes = [AT] * 7
+    library.quadsim_nmpc_advance.argtypes = [AT, AT, INT, AT, AT, AT]
+    return library
+
+
+def set_arrays(struct: ctypes.Structure, **arrays: Array | Sequence[float]) -> None:
+    """Set array members of a struct."""
+    for name, values in arrays.items():
+        getattr(struct, name)[:] = np.asarray(values, float).ravel().tolist()
+
+
+class World:
+    """What a model knows of its surroundings, in the core's layout: disturbance, drag and thrust scale."""
+
+    def __init__(self, model: RigidBody) -> None:
+        self._struct = WorldStruct()
+        self.address, self._numbers = (
+            ctypes.addressof(self._struct),
+            np.ctypeslib.as_array((REAL * 13).from_buffer(self._struct)),
+        )
+        self.set(model)
+
+    def set(self, model: RigidBody) -> None:
+        """Take another disturbance, drag and thrust scale."""
+        numbers, mass = self._numbers, model.mass
+        numbers[0:3], numbers[3:6] = model.acceleration, model.angular_acceleration
+        numbers[6:9], numbers[9:12], numbers[12] = model.drag / mass, model.quadratic_drag / mass, model.thrust_scale
+
+
+def body_numbers(model: RigidBody, p: ProblemStruct) -> Array:
+    """Fill in the rigid body's numbers; return (2 substeps + 1, 4) what p.left points to, which the caller keeps."""
+    p.actuators, p.targets, p.speeds = model.actuators, model.targets, model.inputs is Inputs.SPEED
+    p.substeps, p.step, p.gravity = model.substeps, model.step, model.gravity
+    p.largest = model.mass * model.gravity if model.targets else model.largest_thrust
+    ixx, iyy, izz = model.inertia.tolist()
+    gyration = (0.0, 0.0, 0.0) if model.targets else ((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz)
+    lag = np.array(model.lags)
+    set_arrays(p, effect=model.effect, gyration=gyration, lead=lag / model.step)
+    instants = np.arange(2 * model.substeps + 1)[:, None] * (0.5 * model.step / model.substeps)
+    left = np.where(lag > 0.0, np.exp(-instants / np.where(lag > 0.0, lag, 1.0)), 0.0)
+    p.left = left.ctypes.data
+    return left
+
+
+class Body:
+    """The motion of a rigid body over one step of its model.
+
+    Args:
+        model: the rigid body; `set_world` changes its disturbance, drag and thrust scale.
+    """
+
+    def __init__(self, model: RigidBody) -> None:
+        self._p, self._n, self._library = ProblemStruct(), model.n, _library()
+        self._left = body_numbers(model, self._p)
+        self._world = World(model)
+
+    def set_world(self, model: RigidBody) -> None:
+        """Take the disturbance, drag and thrust scale of another model."""
+        self._world.set(model)
+
+    def advance(self, x: Array, u: Array) -> Array:
+        """Return the states (..., n) one step after states x (..., n) under inputs u (..., 4)."""
+        x, u, end = np.ascontiguousarray(x), np.ascontiguousarray(u), np.empty(x.shape)
+        assert x.shape == (*u.shape[:-1], self._n)
+        assert u.shape[-1] == N_ROTORS
+        at = ctypes.addressof(self._p), self._world.address, math.prod(x.shape[:-1])
+        self._library.quadsim_nmpc_advance(*at, x.ctypes.data, u.ctypes.data, end.ctypes.data)
+        return end
+
+    def linearise(self, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
+        """Linearise the step from states x (M, n) under inputs u (M, 4), as a horizon's nodes: A, B and x(k+1).
+
+        With `frames` (M + 1, 4), reference quaternions q_r, A and B refer to states with q_r* q in place of q: the
+        first M at the start of the steps, the last M at the end.
+
+        Returns:
+            (M, n, n), (M, n, 4) and (M, n): exact derivatives of the Runge-Kutta map; x(k+1) itself is in no frame.
+        """
+        x, u = np.ascontiguousarray(x), np.ascontiguousarray(u)
+        M, n = x.shape
+        if frames is None:
+            frames = np.tile([1.0, 0.0, 0.0, 0.0], (M + 1, 1))
+        slopes, end, frames = np.empty((M, N_BODY, width_of(n))), np.empty((M, n)), np.ascontiguousarray(frames)
+        for i in range(M):
+            arrays = (x[i], u[i], frames[i : i + 2], slopes[i], end[i])
+            at = ctypes.addressof(self._p), self._world.address
+            self._library.quadsim_nmpc_slopes(*at, *(array.ctypes.data for array in arrays))
+        return *unpacked(slopes, n, 0, self._left[-1]), end
+
+
+def width_of(n: int) -> int:
+    """Return the columns of a map of n states and 4 inputs: all but the position, padded to an even number."""
+    return (n + 2) & ~1
+
+
+def unpacked(slopes: Array, n: int, befores: int, left: Array) -> tuple[Array, Array]:
+    """A (M, n, n) and B (M, n, 4) from the core's maps (M, 13, W); `left` (4,) is what a step leaves of actuators.
+
+    The core's states may end with `befores` more, the inputs before.
+    """
+    M, inputs = len(slopes), n - 3 + befores
+    A, B = np.zeros((M, n, n)), np.zeros((M, n, N_ROTORS))
+    A[:, :3, :3] = np.eye(3)
+    A[:, :N_BODY, 3:], B[:, :N_BODY] = slopes[:, :, : n - 3], slopes[:, :, inputs : inputs + N_ROTORS]
+    for a in range(n - N_BODY):
+        A[:, N_BODY + a, N_BODY + a], B[:, N_BODY + a, a] = left[a], 1.0 - left[a]
+    return A, B

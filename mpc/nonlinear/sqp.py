@@ -1,0 +1,446 @@
+"""Sequential quadratic programming of the nonlinear law, in C: one program after another, each solved exactly."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+from functools import cache
+from typing import Any, Final, NamedTuple, NoReturn
+
+import numpy as np
+
+from mpc.constraints import Constraint
+from mpc.nonlinear.body import (
+    AT,
+    INT,
+    REAL,
+    STATES_ROOM,
+    ProblemStruct,
+    World,
+    body_numbers,
+    set_arrays,
+    struct_members,
+    unpacked,
+    width_of,
+)
+from mpc.nonlinear.rigidbody import N_BODY, P, RigidBody, V
+from mpc.ocp import Problem
+from quadsim.core.library import check_sizes, load_library
+from quadsim.state import Array, Indices
+from quadsim.vehicle import N_ROTORS
+
+_MOST_CHANGES: Final = 3000
+"""Limit of active-set changes in a search."""
+_HARD: Final = 1e30
+_CURVATURE: Final = 1e-5
+"""Curvature of a price without one, about the optimum that the core iterates for, per l1."""
+_OWN_SLACKS: Final = {"tilt": 0, "body_rates": 1, "space": 2}
+"""Slacks of a node by the constraints that have them; those of all others follow."""
+_TILT_SIDES: Final = 12
+
+
+class SQPStatus(IntEnum):
+    """The status of a program or plan, by the codes of `enum quadsim_nmpc_status`."""
+
+    FREE = 0
+    BOUNDED = 1
+    UNCONVERGED = 2
+    INFEASIBLE = 3
+    GIVEN_UP = 4
+    NO_ROOM = 5
+    NOT_FINITE = 6
+
+
+class _Term(ctypes.Structure):
+    _fields_ = [*struct_members(REAL, "coefficient"), *struct_members(INT, "entry lag")]
+
+
+class _Work(ctypes.Structure):
+    _fields_ = [
+        *struct_members(AT, "p"),
+        *struct_members(INT, "planned shifted iterations count changes rounds inner patience"),
+        *struct_members(REAL, "defect moved violation share largest least measured:21 start:21 before:4"),
+        *struct_members(AT, "x u frame goal aim face beyond map offset end axis known gain inverse feed more s v"),
+        *struct_members(AT, "value own response factor multiplier r d price rate origin x_before u_before last"),
+        *struct_members(AT, "row slot free held"),
+    ]
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    library = load_library()
+    check_sizes(quadsim_nmpc_term=_Term, quadsim_nmpc_problem=ProblemStruct, quadsim_nmpc_work=_Work)
+    for name in ("reals", "ints"):
+        function = getattr(library, f"quadsim_nmpc_{name}")
+        function.restype, function.argtypes = ctypes.c_long, [AT]
+    library.quadsim_nmpc_start.restype, library.quadsim_nmpc_start.argtypes = None, [AT] * 4
+    library.quadsim_nmpc_reset.restype, library.quadsim_nmpc_reset.argtypes = None, [AT]
+    library.quadsim_nmpc_step.argtypes = library.quadsim_nmpc_begin.argtypes = [AT] * 6
+    library.quadsim_nmpc_linearise.restype, library.quadsim_nmpc_linearise.argtypes = None, [AT] * 2
+    library.quadsim_nmpc_solve.argtypes = [AT]
+    library.quadsim_nmpc_keep.argtypes = [AT] * 3
+    return library
+
+
+class _StatedRow(NamedTuple):
+    """A row that the caller states, as the upper bound of a sum of terms."""
+
+    terms: list[tuple[float, int, int]]  # coefficient, entry, lag
+    first: float  # bound in the first node
+    bound: float  # in all others
+    slack: int
+    of: tuple[int, int]  # index among the problem's rows, and side: 1 upper, -1 lower
+
+
+class SQP:
+    """A program of the nonlinear law, with the plan and the active set that it remembers.
+
+    Args:
+        model: the rigid body; `set_world` changes its disturbance and drag.
+        problem: the program: bounds named `inputs`, `tilt` and `body_rates`, and any others on positions, velocities
+            and inputs.
+        inputs: (2, 4) lower and upper bounds of the inputs.
+        difference: whether the attitude error is q - q_r.
+        shift: whether the plan moves on by a node from period to period.
+        iterations: most steps in a period.
+        corrections: further steps, if the plan misses the dynamics by too much.
+        tolerance: change of a state or an input at which further steps end.
+        faces: half-spaces of positions per node.
+        price: l1 and l2 of leaving the largest of a node's half-spaces; None if they are hard.
+    """
+
+    def __init__(
+        self,
+        model: RigidBody,
+        problem: Problem,
+        *,
+        inputs: Array,
+        difference: bool,
+        shift: bool,
+        iterations: int,
+        corrections: int,
+        tolerance: float,
+        faces: int = 0,
+        price: tuple[float, float] | None = None,
+    ) -> None:
+        self._library, self._n, self.horizon = _library(), model.n, problem.horizon
+        self._kept: list[object] = []
+        moves = problem.objective.Q_d is not None
+        parts = {part.name: part for part in problem.every_constraint}
+        tilt, rates = parts.get("tilt"), parts.get("body_rates")
+        prices = [_price(tilt), _price(rates), (_HARD, 1.0) if price is None else _halved(*price)]
+        places = N_ROTORS + 2 * (tilt is not None) + 3 * (rates is not None)
+        rows = _stated(problem, places, prices)
+        self._rows, self._numbers = rows, _numbers(problem)
+        at_most = self.horizon * (N_ROTORS + 3 * (tilt is not None) + 3 * (rates is not None) + len(rows) // 2 + faces)
+        p = ProblemStruct(
+            horizon=self.horizon,
+            difference=difference,
+            shifts=shift,
+            moves=moves,
+            tilts=tilt is not None,
+            turns=rates is not None,
+            places=bool(faces) or any(entry >= places for row in rows for _, entry, _ in row.terms),
+            rows=len(rows),
+            faces=faces,
+            slacks=len(prices),
+            room=min(at_most, 6 * self.horizon) + 1,
+            changes=_MOST_CHANGES,
+            iterations=iterations,
+            corrections=corrections,
+            tolerance=tolerance,
+            move=problem.objective.move_weight[0, 0],
+        )
+        size = model.n + N_ROTORS * moves
+        weights, terminal = np.zeros(STATES_ROOM), np.zeros((size, size))
+        Q, end = problem.objective.weights[0], problem.objective.terminal_weights[0]
+        weights[: model.n] = np.diag(Q)[: model.n]
+        terminal[: model.n, : model.n] = end[: model.n, : model.n]
+        if moves:
+            weights[model.n : size] = p.move
+        set_arrays(p, weight=weights, effort=np.diag(problem.objective.Q_u), lower=inputs[0], upper=inputs[1])
+        if tilt is not None:
+            p.tilt = float(tilt.upper[0])
+        if rates is not None:
+            set_arrays(p, turn=np.minimum(rates.upper, _HARD))
+        terms = [term for row in rows for term in row.terms]
+        first = np.cumsum([0, *(len(row.terms) for row in rows)])
+        bounds = [[row.first for row in rows], [row.bound for row in rows]]
+        linear, quadratic = np.array(prices).T
+        self._prices = linear, np.where(quadratic > 0.0, quadratic, _CURVATURE * linear)
+        self._left, p.terminal = body_numbers(model, p), self._array(terminal)
+        p.terms = self._keep((_Term * max(len(terms), 1))(*(_Term(*term) for term in terms)))
+        p.first, p.slack = self._array(first, np.intc), self._array([row.slack for row in rows], np.intc)
+        p.bounds, p.linear, p.quadratic = self._array(bounds), self._array(linear), self._array(quadratic)
+        self._p, self._world = p, World(model)
+        self._make_work()
+
+    def _make_work(self) -> None:
+        p, library, N = self._p, self._library, self.horizon
+        at = ctypes.addressof(p)
+        self._memory = np.zeros(library.quadsim_nmpc_reals(at)), np.zeros(library.quadsim_nmpc_ints(at), np.intc)
+        self._work, self._status = _Work(), ctypes.c_int()
+        self._at = ctypes.addressof(self._work)
+        library.quadsim_nmpc_start(self._at, at, *(part.ctypes.data for part in self._memory))
+        self._size = self._n + N_ROTORS * bool(p.moves)
+        self._x, self._u = self._view("x", N + 1, self._size), self._view("u", N, N_ROTORS)
+        self._s, self._v = self._view("s", N + 1, self._size), self._view("v", N, N_ROTORS)
+        self.goal, self.aim = self._view("goal", N + 1, self._size)[:, : self._n], self._view("aim", N, N_ROTORS)
+        self._face, self._beyond = self._view("face", N, p.faces, 3), self._view("beyond", N, p.faces)
+        self._origin = self._view("origin", N, p.slacks)
+        self._price, self._own = self._view("price", N, p.slacks), self._view("own", N, N_ROTORS)
+        self._multiplier = self._view("multiplier", p.room)
+        self._row = self._view("row", p.room, kind=INT)
+        self._free, self._held = self._view("free", N, p.slacks, kind=INT), self._view("held", N, N_ROTORS, kind=INT)
+        self._measured, self._before = np.zeros(self._n), np.zeros(N_ROTORS)
+        self._states, self._thrusts = np.zeros((N + 1, N_BODY)), np.zeros((N, N_ROTORS))
+        inputs = (self._measured, self._before, self._states, self._thrusts)
+        self._arguments = self._at, self._world.address, *(array.ctypes.data for array in inputs)
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse: addresses are useless in a copy or another process."""
+        raise TypeError("an SQP cannot be copied or pickled: make another from its problem")
+
+    def _keep(self, memory: ctypes.Array[_Term]) -> int:
+        self._kept.append(memory)
+        return ctypes.addressof(memory)
+
+    def _array(self, values: Array | Sequence[object], kind: type = np.double) -> int:
+        array: Array = np.ascontiguousarray(values, kind)
+        self._kept.append(array)
+        return array.ctypes.data
+
+    def _view(self, name: str, *shape: int, kind: Any = REAL) -> Array:
+        count = math.prod(shape)
+        if not count:
+            return np.zeros(shape)
+        return np.ctypeslib.as_array((kind * count).from_address(getattr(self._work, name))).reshape(shape)
+
+    def set_world(self, model: RigidBody) -> None:
+        """Predict with the disturbance, drag and thrust scale of a model from now on."""
+        self._world.set(model)
+
+    def reset(self) -> None:
+        """Forget the plan and the active set."""
+        self._library.quadsim_nmpc_reset(self._at)
+
+    @property
+    def plan(self) -> tuple[Array, Array] | None:
+        """States (N + 1, n) and inputs (N, 4) of the plan; None without one."""
+        if not self._work.planned:
+            return None
+        return self._x[:, : self._n].copy(), self._u.copy()
+
+    @plan.setter
+    def plan(self, plan: tuple[Array, Array] | None) -> None:
+        self._work.planned = int(plan is not None)
+        if plan is None:
+            self.reset()
+            return
+        self._x[:, : self._n], self._u[:] = plan
+        if self._size > self._n:
+            self._x[0, self._n :], self._x[1:, self._n :] = self._before, self._u
+
+    def step(self, measured: Array, before: Array, states: Array, thrusts: Array) -> SQPStatus:
+        """Plan from a measured state (n,) after the inputs `before` (4,), along a reference; see `begin`."""
+        self._measured[:], self._before[:], self._states[:], self._thrusts[:] = measured, before, states, thrusts
+        return SQPStatus(self._library.quadsim_nmpc_step(*self._arguments))
+
+    def begin(self, measured: Array, before: Array, states: Array, thrusts: Array) -> bool:
+        """Take a measured state (n,), the inputs `before` (4,) and a reference; False if numbers are not finite.
+
+        Args:
+            measured: position, quaternion, velocity, body rates and actuators.
+            before: inputs in force.
+            states: (N + 1, 13) reference states.
+            thrusts: (N, 4) thrusts of the rotors that hold them [N].
+        """
+        self._measured[:], self._before[:], self._states[:], self._thrusts[:] = measured, before, states, thrusts
+        return bool(self._library.quadsim_nmpc_begin(*self._arguments))
+
+    def linearise(self) -> None:
+        """Make the program of the stored plan."""
+        self._library.quadsim_nmpc_linearise(self._at, self._world.address)
+
+    def solve(self) -> SQPStatus:
+        """Return the status of the program's optimum."""
+        return SQPStatus(self._library.quadsim_nmpc_solve(self._at))
+
+    def keep(self, status: SQPStatus) -> tuple[SQPStatus, bool]:
+        """Keep the optimum as the plan; return the plan's status, and whether another step should follow."""
+        self._status.value = status
+        on = self._library.quadsim_nmpc_keep(self._at, self._world.address, ctypes.addressof(self._status))
+        return SQPStatus(self._status.value), bool(on)
+
+    @property
+    def half_spaces(self) -> tuple[Array, Array]:
+        """Normals (S, N, 3) and bounds (S, N) of normal . p >= bound, for positions, from the next `solve` on."""
+        return np.asarray(-self._face.transpose(1, 0, 2)), np.asarray(-self._beyond.T)
+
+    @half_spaces.setter
+    def half_spaces(self, half_spaces: tuple[Array, Array]) -> None:
+        normals, bounds = half_spaces
+        self._face[:], self._beyond[:] = -normals.transpose(1, 0, 2), -bounds.T
+
+    @property
+    def planned_positions(self) -> Array:
+        """(N, 3) positions of the stored plan at the ends of its nodes [m]."""
+        return np.array(self._x[1:, P])
+
+    @property
+    def positions(self) -> Array:
+        """(N, 3) positions of the last optimum [m]."""
+        return np.array(self._s[1:, P])
+
+    @property
+    def inputs(self) -> Array:
+        """(N, 4) inputs of the last optimum."""
+        return np.array(self._v)
+
+    @property
+    def optimum(self) -> Array:
+        """(N, n) states of the last optimum, quaternions in the nodes' frames."""
+        return np.array(self._s[1:, : self._n])
+
+    @property
+    def start(self) -> Array:
+        """(n,) the measured state, its quaternion in the first frame."""
+        return np.array(self._work.start[: self._n])
+
+    @property
+    def measured(self) -> Array:
+        """(n,) the measured state."""
+        return self._measured.copy()
+
+    @property
+    def before(self) -> Array:
+        """(4,) the inputs in force."""
+        return self._before.copy()
+
+    @property
+    def active(self) -> int:
+        """Number of active rows at the last optimum."""
+        return int(self._work.count + np.count_nonzero(self._held))
+
+    @property
+    def iterations(self) -> int:
+        """Changes of the active set and recursions of the last program."""
+        return int(self._work.changes + self._work.rounds + self._work.inner)
+
+    @property
+    def violation(self) -> float:
+        """Largest violation of a row by the last optimum, less its slack."""
+        return float(self._work.violation)
+
+    @property
+    def defect(self) -> float:
+        """By how much the plan misses the dynamics."""
+        return float(self._work.defect)
+
+    @property
+    def moved(self) -> float:
+        """Largest change of a state or an input in the last step."""
+        return float(self._work.moved)
+
+    def slacks(self, groups: Indices) -> Array:
+        """(N, m) slacks of the last optimum, of chosen groups."""
+        linear, quadratic = self._prices
+        return np.array((self._free * (self._origin + (self._price - linear) / quadratic))[:, groups])
+
+    def multipliers(self, rows: int, faces_from: int | None = None) -> Array:
+        """(N, rows) multipliers of the problem's rows at the last optimum, as `mpc.qp.Solution` has their signs.
+
+        Those of half-spaces begin at column `faces_from`.
+        """
+        p, found = self._p, np.zeros((self.horizon, rows))
+        stated = 2 * N_ROTORS + _TILT_SIDES + 6
+        kinds = stated + p.rows + p.faces + p.slacks
+        starts = self._numbers
+        for row, by in zip(self._row[: self._work.count].tolist(), self._multiplier.tolist(), strict=False):
+            node, kind = divmod(row, kinds)
+            if kind < 2 * N_ROTORS:
+                found[node, starts["inputs"] + kind % N_ROTORS] += by if kind < N_ROTORS else -by
+            elif kind < 2 * N_ROTORS + _TILT_SIDES:
+                found[node, starts["tilt"] + kind - 2 * N_ROTORS] += by
+            elif kind < stated:
+                turn = kind - 2 * N_ROTORS - _TILT_SIDES
+                found[node, starts["body_rates"] + turn % 3] += by if turn < 3 else -by
+            elif kind < stated + p.rows:
+                index, side = self._rows[kind - stated].of
+                found[node, index] += side * by
+            elif kind < stated + p.rows + p.faces and faces_from is not None:
+                found[node, faces_from + kind - stated - p.rows] -= by
+        at = starts["inputs"]
+        found[:, at : at + N_ROTORS] -= np.where(self._held != 0, self._own, 0.0)
+        return 2.0 * found  # of the cost, of which the core minimises half
+
+    def steps(self) -> tuple[Array, Array, Array]:
+        """A (N, n, n), B (N, n, 4), c (N, n) of the program; under `tilt`, the thrust axis is two further states."""
+        p, N, n = self._p, self.horizon, self._n
+        maps, offset = self._view("map", N, N_BODY, width_of(self._size)), self._view("offset", N, self._size)
+        A, B = unpacked(maps, n, self._size - n, self._left[-1])
+        c = np.array(offset[:, :n])
+        if p.tilts:
+            axis, known = self._view("axis", N, 2, 4), self._view("known", N, 2)
+            A = np.pad(np.concatenate([A, axis @ A[:, 3:7]], axis=1), ((0, 0), (0, 0), (0, 2)))
+            B = np.concatenate([B, axis @ B[:, 3:7]], axis=1)
+            c = np.concatenate([c, (axis @ c[:, 3:7, None])[:, :, 0] + known], axis=1)
+        return A, B, c
+
+
+def _halved(l1: float, l2: float) -> tuple[float, float]:
+    """Prices of half the cost: the linear one, and the curvature."""
+    return 0.5 * l1, l2
+
+
+def _price(part: Constraint | None) -> tuple[float, float]:
+    if part is None or part.penalty is None:
+        return _HARD, 1.0
+    return _halved(float(part.penalty.l1[0]), float(part.penalty.l2[0]))
+
+
+def _numbers(problem: Problem) -> dict[str, int]:
+    """Return the first row of each constraint among the problem's rows."""
+    names = problem.rows.names
+    return {name: names.index(name) for name in dict.fromkeys(names)}
+
+
+def _stated(problem: Problem, places: int, prices: list[tuple[float, float]]) -> list[_StatedRow]:
+    """Return all rows but the bounds of inputs, tilt and body rates, and append their prices."""
+    stated: list[_StatedRow] = []
+    rows, own = problem.rows, ("inputs", "tilt", "body_rates")
+    states = {at: places + k for k, at in enumerate([*range(P.start, P.stop), *range(V.start, V.stop)])}
+    groups: dict[int, int] = {}
+    for i, name in enumerate(rows.names):
+        if name in own:
+            continue
+        lag = 0 if rows.of_states[i] else 1
+        terms = [(float(rows.C[i, k]), states[int(k)], lag) for k in np.flatnonzero(rows.C[i])]
+        terms += [(float(rows.D[i, j] + rows.E[i, j]), int(j), 0) for j in np.flatnonzero(rows.D[i] + rows.E[i])]
+        terms += [(-float(rows.E[i, j]), int(j), 1) for j in np.flatnonzero(rows.E[i])]
+        slack = int(rows.slack[i])
+        if slack >= 0 and slack not in groups:
+            groups[slack] = len(prices)
+            prices.append(_halved(float(rows.l1[i]), float(rows.l2[i])))
+        for side, bounds in ((1, rows.upper[:, i]), (-1, rows.lower[:, i])):
+            if np.isfinite(bounds[-1]):
+                signed = [(side * by, entry, lag) for by, entry, lag in terms]
+                of = (i, side)
+                stated.append(_StatedRow(signed, side * bounds[0], side * bounds[-1], groups.get(slack, -1), of))
+    return stated
+
+
+def slack_groups(problem: Problem, *, faces: bool = False) -> Indices:
+    """Return which slack of a node each of the problem's slacks is, and last that of `faces`, which have one."""
+    rows, groups, count = problem.rows, dict[int, int](), len(_OWN_SLACKS)
+    for i, name in enumerate(rows.names):
+        slack = int(rows.slack[i])
+        if slack < 0 or slack in groups:
+            continue
+        if name in _OWN_SLACKS:
+            groups[slack] = _OWN_SLACKS[name]
+        else:
+            groups[slack], count = count, count + 1
+    return np.array([groups[slack] for slack in range(len(groups))] + [_OWN_SLACKS["space"]] * faces, int)

@@ -1,0 +1,193 @@
+"""The programs of the nonlinear law, solved in C: KKT residuals, another solver, other starts, infeasible ones."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from ocp_peer import Period, dense_qp
+
+from mpc.answer import ActuatorBounds
+from mpc.bounded import Polytope, Soft
+from mpc.nonlinear.controller import SQP_FAILURES, NonlinearMPC
+from mpc.nonlinear.rigidbody import N_BODY, P, Q, V, W
+from mpc.nonlinear.settings import Nonlinear, Weights
+from mpc.nonlinear.sqp import SQPStatus
+from mpc.obstacles import AvoidanceSettings, Space
+from mpc.ocp import Query
+from mpc.qp import kkt_residuals
+from mpc.solvers.daqp import DaqpDense
+from quadsim.assets import vehicle_path
+from quadsim.controller import ACCEPTED, OPTIMAL, SOLVED, UNCONSTRAINED, Command, StepInputs
+from quadsim.space import Sphere
+from quadsim.state import N_STATES, POSITIONS, VELOCITIES, Array
+from quadsim.vehicle import load_vehicle
+
+VEHICLE, PERIOD = load_vehicle(vehicle_path("hummingbird")), 0.02
+HOVER = np.full(4, VEHICLE.hover_speed)
+RATES: dict[str, Any] = {"commands": "rates", "inner_lag": (0.03, 0.02, 0.02, 0.05), "tilt": 15.0, "body_rate": 40.0}
+FENCE = Polytope(name="fence", of=("x", "vy", "z"), rows=((1.0, 0.5, 0.0), (0.0, 0.0, 1.0)), upper=(0.3, 0.2))
+LIFT = Polytope(
+    name="lift", of=("vz", *(f"speed_{i}" for i in range(1, 5))), rows=((40.0, 1.0, 1.0, 1.0, 1.0),), upper=(2100.0,)
+)
+BOX = {"vx": (-0.5, 0.5), "y": (-0.2, 0.1)}
+MANY: dict[str, dict[str, Any]] = {
+    "inputs": {},
+    "speeds with lag": {"inputs": "speed", "rotor_lag": 0.03},
+    "moves": {"inputs": "speed", "weights": Weights(move=0.5)},
+    "moves and slews with lag": {"inputs": "speed", "rotor_lag": 0.02, "weights": Weights(move=0.5), "slew": 30.0},
+    "slews": {"inputs": "speed", "slew": 30.0},
+    "soft tilt": {"tilt": 10.0, "soft": Soft(linear=50.0, quadratic=10.0)},
+    "soft tilt and rates": {"tilt": 10.0, "body_rate": 60.0, "soft": Soft(linear=20.0, quadratic=5.0)},
+    "prices without curvature": {"tilt": 10.0, "body_rate": 60.0, "soft": Soft(linear=20.0, quadratic=0.0)},
+    "soft outputs": {"output_bounds": BOX, "soft": Soft(linear=5.0, quadratic=1.0)},
+    "polytopes": {"inputs": "speed", "polytopes": (FENCE, LIFT)},
+    "targets": RATES | {"soft": Soft(linear=20.0, quadratic=5.0)},
+    "targets and moves": RATES | {"soft": Soft(linear=20.0, quadratic=5.0), "weights": Weights(move=0.5)},
+    "drag": {"drag": (0.3, 0.3, 0.1), "quadratic_drag": (0.05, 0.05, 0.02), "terminal": "lqr", "tilt": 12.0},
+}
+
+
+def at_rest(q: Array | None = None) -> Array:
+    x = np.zeros(N_BODY)
+    x[3] = 1.0
+    if q is not None:
+        x[Q] = q / np.linalg.norm(q)
+    return x
+
+
+def call(controller: NonlinearMPC, x: Array, time: float = 0.0, reference: Array | None = None) -> Command:
+    """The answer at a state (13,)."""
+    state = np.zeros(N_STATES)
+    state[POSITIONS], state[VELOCITIES] = x[P], x[V]
+    preview = np.zeros((controller.horizon, 4)) if reference is None else reference
+    return controller.step(StepInputs(time=time, attitude=x[Q], body_rates=x[W]), state, preview)
+
+
+def law(space: Space | None = None, *, slew: float = math.inf, **settings: Any) -> NonlinearMPC:
+    made = Nonlinear(horizon=12, **settings)
+    bounds = made.actuators(VEHICLE)
+    if math.isfinite(slew):
+        bounds = ActuatorBounds.alike((0.0, VEHICLE.speed_max), (-slew, slew))
+    return NonlinearMPC(
+        VEHICLE, period=PERIOD, settings=made, bounds=bounds, constraints=made.constraints(), space=space
+    )
+
+
+def thrown(rng: np.random.Generator, size: float) -> Array:
+    """A state (13,) about hover."""
+    x = at_rest(np.array([1.0, 0.0, 0.0, 0.0]) + 0.3 * size * rng.normal(size=4))
+    x[P], x[V], x[W] = size * rng.normal(size=(3, 3)) * np.array([[0.4], [0.8], [1.0]])
+    return x
+
+
+def checked(controller: NonlinearMPC) -> int:
+    """Compare the last program's answer with its KKT conditions and with a dense active-set solver; the active rows."""
+    qp, ours = controller._certificate()
+    size = max(1.0, *(float(np.abs(part).max(initial=0.0)) for part in (ours.z, ours.z_box, ours.y)))
+    assert kkt_residuals(qp, ours).worst < 1e-8 * size
+    if controller._space is not None:
+        return controller._sqp.active  # the peer has the same rows at all steps
+    dense = dense_qp(controller._rows(), _period(controller._query()))
+    backend = DaqpDense()
+    backend.setup(dense)
+    peer = backend.solve(dense)
+    plan = controller._sqp.inputs
+    if peer.status == SOLVED:
+        np.testing.assert_allclose(peer.x[: plan.size], plan.ravel(), atol=2e-5)
+    return controller._sqp.active
+
+
+@pytest.mark.parametrize("case", MANY)
+def test_answers_are_optima(case: str) -> None:
+    """Thrown states from small to far off, from a cold start and along a flight's warm ones."""
+    active, answered = 0, 0
+    for seed, size in itertools.product(range(3), (0.1, 0.5, 1.0)):
+        rng, controller = np.random.default_rng(seed), law(**MANY[case])
+        controller.reset(HOVER if controller.commands == "rotors" else controller._level)
+        for k in range(3):
+            command = call(controller, thrown(rng, size), k * PERIOD)
+            if command.status in ACCEPTED:
+                answered += 1
+                active += checked(controller)
+            else:
+                assert command.status in SQP_FAILURES.values()
+    assert answered > 10
+    assert active > 10
+
+
+def test_half_spaces_are_rows_of_the_program() -> None:
+    pillar = Sphere(name="pillar", position=(0.6, 0.05, 0.0), radius=0.2)
+    for penalty in (None, (50.0, 10.0)):
+        space = Space(
+            [pillar], radius=0.1, period=PERIOD, horizon=12, settings=AvoidanceSettings(), penalty=penalty,
+            positions=(0, 1, 2), largest=True,
+        )  # fmt: skip
+        controller, reference = law(space, tilt=20.0, soft=Soft(linear=1e3)), np.zeros((12, 4))
+        reference[:, 0] = 0.2
+        start = at_rest()
+        start[V] = 1.2, 0.0, 0.0
+        command = call(controller, start, reference=reference)
+        assert command.status in ACCEPTED
+        assert checked(controller) > 0
+        normals, bounds = controller._sqp.half_spaces
+        inside = (normals * controller._sqp.positions).sum(axis=2) - bounds
+        assert inside.min() == pytest.approx(0.0, abs=1e-7) or penalty is not None
+        assert (command.stats.slack > 0.0) == (penalty is not None and inside.min() < -1e-9)
+
+
+def test_an_infeasible_program_is_refused_and_stated() -> None:
+    """A hard bound on body rates, broken beyond what the rotors can do in a node."""
+    controller, spinning = law(body_rate=30.0), at_rest()
+    spinning[W] = 50.0, 0.0, 0.0
+    command = call(controller, spinning)
+    assert command.status == SQP_FAILURES[SQPStatus.INFEASIBLE]
+    kept = controller.infeasible_period
+    assert kept is not None
+    qp = dense_qp(kept.problem, _period(kept.query))
+    backend = DaqpDense()
+    backend.setup(qp)
+    assert backend.solve(qp).status != SOLVED
+    assert call(controller, at_rest(), PERIOD).status in OPTIMAL
+
+
+def _period(query: Query) -> Period:
+    assert query.steps is not None
+    assert query.equilibrium is not None
+    A, B, c = query.steps
+    return Period(
+        A=A, B=B, c=c, state=query.state, desired=query.desired, u_before=query.u_before, equilibrium=query.equilibrium
+    )
+
+
+def test_the_start_makes_no_difference() -> None:
+    """A plan and active set of another state lead to the same optimum of the same program."""
+    rng, settings = np.random.default_rng(5), MANY["soft tilt and rates"]
+    for _ in range(10):
+        cold, warm, x = law(**settings), law(**settings), thrown(rng, 1.0)
+        for _ in range(2):
+            call(warm, thrown(rng, 1.0))
+        first = call(cold, x)
+        warm._sqp.plan = None  # the program is that of the reference, too, but the active set stays
+        work = warm._sqp._work
+        work.planned = 0
+        np.testing.assert_allclose(call(warm, x, PERIOD).plan, first.plan, atol=1e-6)
+
+
+@pytest.mark.slow("nonlinear")
+def test_ten_thousand_thrown_states_have_typed_answers() -> None:
+    """From near to absurd: no hang, no number that is none, no status without a name."""
+    rng = np.random.default_rng(1)
+    for case, settings in MANY.items():
+        controller = law(**settings)
+        for k in range(800):
+            size = 10.0 ** rng.uniform(-2.0, 2.0)
+            command = call(controller, thrown(rng, size), k * PERIOD)
+            assert np.isfinite(command.speeds).all(), case
+            assert np.isfinite(command.plan).all(), case
+            assert command.status in {*ACCEPTED, *SQP_FAILURES.values(), "infeasible_answer", "out_of_bounds"}, case
+            if command.status in {SOLVED, UNCONSTRAINED}:
+                assert controller._sqp.violation < 1e-6, case
