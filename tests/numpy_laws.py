@@ -64,7 +64,7 @@ def thrust_ratio(height: float, radius: float) -> float:
 def rotor_drag(vehicle: Vehicle, coefficient: float, speeds: Array, turn: Rotation, air: Array, rates: Array) -> Array:
     """F_i = -k w_i v_i in each rotor's plane, v_i the air's speed at its hub: force, world, and torque, body (6,)."""
     force, torque = np.zeros(3), np.zeros(3)
-    for place, speed in zip(vehicle.rotor_positions, speeds, strict=True):
+    for place, speed in zip(vehicle.hubs, speeds, strict=True):
         at_hub = turn.inv().apply(air) + np.cross(rates, place * [1.0, 1.0, 0.0])
         pull = -coefficient * speed * at_hub * [1.0, 1.0, 0.0]
         force += pull
@@ -77,7 +77,7 @@ def rotor_moment(
 ) -> Array:
     """(m_x w_i v_y, -m_y w_i v_x, 0), v each rotor's velocity through the air, body (3,)."""
     torque = np.zeros(3)
-    for place, speed in zip(vehicle.rotor_positions, speeds, strict=True):
+    for place, speed in zip(vehicle.hubs, speeds, strict=True):
         across = turn.inv().apply(air) + np.cross(rates, place * [1.0, 1.0, 0.0])
         torque += speed * np.array([moment[0] * across[1], -moment[1] * across[0], 0.0])
     return torque
@@ -99,7 +99,7 @@ def ground_effect(
 ) -> Array:
     """What the rotors' thrusts gain near the ground: force, world, and torque, body (6,)."""
     force, torque = 0.0, np.zeros(3)
-    for place, thrust in zip(vehicle.rotor_positions, thrusts, strict=True):
+    for place, thrust in zip(vehicle.hubs, thrusts, strict=True):
         above = height - floor + turn.apply([place[0], place[1], disc])[2]
         gain = thrust * (thrust_ratio(above, radius) - 1.0)
         force += gain

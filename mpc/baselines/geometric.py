@@ -226,12 +226,12 @@ class GeometricController(FeedbackLaw):
 
         Where the limits of tilt or lift change A, the desired attitude counts as constant.
         """
-        J, R, Omega = np.array(self._vehicle.inertia), motion.attitude, motion.rates
+        J, R, Omega = self._vehicle.momentum, motion.attitude, motion.rates
         thrust, desired = self._force(motion, target, integrals, disturbance)
         e_R, e_Omega = attitude_error(R, desired.attitude), rate_error(R, Omega, desired.attitude, desired.rates)
         R_rel = R.T @ desired.attitude
         ahead = np.cross(Omega, R_rel @ desired.rates) - R_rel @ desired.acceleration + disturbance[2]
-        moment = np.cross(Omega, J * Omega) - J * (self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
+        moment = np.cross(Omega, J(Omega)) - J(self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
         return np.concatenate([[thrust], moment]), desired
 
     def targets(

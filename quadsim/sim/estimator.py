@@ -8,12 +8,12 @@ exp(dtheta)), body rates and gyro bias.  Solà 2017, Secs.  5.1.1 and 5.3.1; mul
 Prediction, the modelled vehicle as a rigid body driven by its rotor speeds, and the growth of the error with time:
 
     dp/dt = v            dv/dt = R(q) [0, 0, U/m] - [0, 0, g] + w_a      dq/dt = q * [0, omega] / 2
-    domega/dt = I^-1 (tau - omega x I omega) + w_alpha                   db/dt = w_b
+    domega/dt = I^-1 (tau - D omega - omega x I omega) + w_alpha         db/dt = w_b
 
 with white w_a, w_alpha, w_b, and to first order in the error, F(t) of de/dt = F e + w (Solà 2017, Eqs. (238)-(240), the
 vehicle's model in place of an accelerometer):
 
-    dv: -R [a]x dtheta      dtheta: -[omega]x dtheta + domega      domega: I^-1 ([I omega]x - [omega]x I) domega
+    dv: -R [a]x dtheta      dtheta: -[omega]x dtheta + domega      domega: I^-1 ([I omega]x - [omega]x I - D) domega
 
 On the ground, rotor speeds alone would let the vehicle fall.  The ground carries the rest of the weight, so nothing
 moves: p, q and the gyro's bias stay, v = 0 and omega = 0, a zero-velocity update (Groves, "Principles of GNSS,
@@ -140,7 +140,10 @@ class ErrorStateFilter:
         self.settings, self._names = settings, tuple(sensors)
         self._horizon = max(sensor.latency(name, timestep) for name, sensor in sensors.items())
         f = self.struct = FilterStruct(timestep=timestep, mass=vehicle.mass, gravity=vehicle.gravity)
-        f.inertia[:] = vehicle.inertia
+        f.inertia[:], f.products[:] = vehicle.inertia, vehicle.products_of_inertia or (0.0, 0.0, 0.0)
+        fill(f.inverse, np.linalg.inv(vehicle.inertia_matrix))
+        f.rotor_moment[:] = vehicle.rotor_moment or (0.0, 0.0)
+        f.rate_damping[:] = vehicle.rate_damping or (0.0, 0.0, 0.0)
         fill(f.allocation, vehicle.allocation)
         deviations = settings.acceleration_noise, settings.angular_acceleration_noise
         f.density[1], f.density[3] = (deviation**2 for deviation in deviations)

@@ -156,8 +156,8 @@ class Plant:
 
     @property
     def hover_speeds(self) -> Array:
-        """(4,) omega_bar on all rotors [rad/s], u(-1) of a flight that starts at rest in the air."""
-        return np.full(N_ROTORS, self.vehicle.hover_speed)
+        """(4,) the trim [rad/s], u(-1) of a flight that starts at rest in the air."""
+        return self.vehicle.hover_speeds
 
     @property
     def physics(self) -> Array:
@@ -214,11 +214,16 @@ class Plant:
         v, vehicle, effects, data = VehicleStruct(), self.vehicle, self.effects, self._data
         v.timestep, v.plausible, v.fastest_valid = self.timestep, _PLAUSIBLE, LARGEST_SPEED
         v.mass, v.gravity, v.inertia[:] = vehicle.mass, vehicle.gravity, vehicle.inertia
-        v.coefficient, v.hover = vehicle.thrust_coefficient, vehicle.hover_speed
+        v.products[:] = vehicle.products_of_inertia or (0.0, 0.0, 0.0)
+        fill(v.inverse, np.linalg.inv(vehicle.inertia_matrix))
+        v.coefficient[:], v.hover = vehicle.coefficients, vehicle.hover_speed
+        power = vehicle.coefficients / vehicle.mean_coefficient  # of each rotor at a speed, over the mean rotor's
+        v.demand[:] = N_ROTORS * power / float(power @ (vehicle.hover_speeds / vehicle.hover_speed) ** 3)
         v.slowest, v.fastest = self._speed_range
         v.spin[:] = [float(spin) for spin in vehicle.rotor_spins]
-        fill(v.place, vehicle.rotor_positions[:, :2])
-        fill(v.torque_of_thrust, vehicle.allocation[1:] / vehicle.thrust_coefficient)
+        fill(v.place, vehicle.hubs)
+        fill(v.torque_of_thrust, vehicle.allocation[1:] / vehicle.coefficients)
+        v.raised = bool(vehicle.hubs[:, 2].any())
         v.follows_motion = self._follows_motion
         if effects.rotors is not None:
             v.rotor_inertia = effects.rotors.inertia or 0.0
@@ -231,7 +236,7 @@ class Plant:
             v.floor, v.disc, v.radius = shape.floor, shape.disc, ground.rotor_radius
         if (noise := effects.thrust_noise) is not None:
             v.loss, v.deviation = noise.loss, noise.deviation
-            v.largest = vehicle.thrust_coefficient * vehicle.speed_max**2
+            v.largest[:] = vehicle.thrusts(np.full(N_ROTORS, vehicle.speed_max))
         if (battery := effects.battery) is not None:
             self._curve = np.array(battery.curve)
             v.curve, v.points = self._curve.ctypes.data, len(self._curve)

@@ -20,11 +20,11 @@ def test_it_hovers_at_the_speed_of_table_1(vehicle: Vehicle) -> None:
     assert vehicle.hover_speed == pytest.approx(192.8, rel=1e-6)
     assert vehicle.thrust_coefficient == pytest.approx(4.0 * 9.81 / (4.0 * 192.8**2), rel=1e-6)
     assert (vehicle.mass, vehicle.gravity, vehicle.inertia) == (4.0, 9.81, (0.033, 0.033, 0.066))
-    assert vehicle.drag_coefficient == pytest.approx(0.024 * vehicle.thrust_coefficient)
+    assert (vehicle.drag_to_thrust * vehicle.thrust_coefficient) == pytest.approx(0.024 * vehicle.thrust_coefficient)
 
 
 def test_the_wrench_is_that_of_sec_2_2(vehicle: Vehicle) -> None:
-    b, d, arm = vehicle.thrust_coefficient, vehicle.drag_coefficient, vehicle.arm_length
+    b, d, arm = vehicle.thrust_coefficient, (vehicle.drag_to_thrust * vehicle.thrust_coefficient), vehicle.arm_length
     w = np.array([180.0, 190.0, 200.0, 215.0])
     w1, w2, w3, w4 = w**2
     expected = [
@@ -34,9 +34,7 @@ def test_the_wrench_is_that_of_sec_2_2(vehicle: Vehicle) -> None:
         d * (w1 - w2 + w3 - w4),
     ]
     np.testing.assert_allclose(vehicle.allocation @ w**2, expected, rtol=1e-12)
-    np.testing.assert_allclose(
-        vehicle.rotor_positions, [[arm, 0, 0], [0, -arm, 0], [-arm, 0, 0], [0, arm, 0]], atol=1e-15
-    )
+    np.testing.assert_allclose(vehicle.hubs, [[arm, 0, 0], [0, -arm, 0], [-arm, 0, 0], [0, arm, 0]], atol=1e-15)
 
 
 @pytest.mark.parametrize("name", vehicle_names())
@@ -81,10 +79,10 @@ def test_rotors_turn_as_published(name: str, turning: dict[tuple[int, int], str]
     vehicle = load_vehicle(vehicle_path(name))
     result = {
         (round(float(np.sign(x))), round(float(np.sign(y)))): "cw" if spin > 0 else "ccw"  # torque opposes turning
-        for (x, y, _), spin in zip(vehicle.rotor_positions, vehicle.rotor_spins, strict=True)
+        for (x, y, _), spin in zip(vehicle.hubs, vehicle.rotor_spins, strict=True)
     }
     assert result == turning
-    np.testing.assert_allclose(np.hypot(*vehicle.rotor_positions[:, :2].T), vehicle.arm_length)
+    np.testing.assert_allclose(np.hypot(*vehicle.hubs[:, :2].T), vehicle.arm_length)
 
 
 def test_a_vehicle_may_hover_at_the_ends_of_its_range(vehicle: Vehicle) -> None:

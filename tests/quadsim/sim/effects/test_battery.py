@@ -119,7 +119,7 @@ def test_a_weak_rotor_draws_its_share_and_its_torque_sags_with_its_thrust(vehicl
         flown = plant.advance(plant.hover_speeds, 1)
     expected, _ = discharged(SMALL, 0.25, 1)
     np.testing.assert_allclose(flown["battery"], expected, rtol=1e-14)
-    b, d = vehicle.thrust_coefficient, vehicle.drag_coefficient
+    b, d = vehicle.thrust_coefficient, (vehicle.drag_to_thrust * vehicle.thrust_coefficient)
     factor, spin = (expected[0, 0] / 16.0) ** 2, vehicle.rotor_spins[0]
     rate = spin * d / b * factor * 0.25 * vehicle.mass * vehicle.gravity / vehicle.inertia[2] * TIMESTEP
     assert flown["physics"][0, 13] == pytest.approx(rate, rel=1e-6)

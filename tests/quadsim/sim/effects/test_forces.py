@@ -178,13 +178,13 @@ def test_ground_effect_lifts_by_cheeseman_and_bennett(vehicle: Vehicle) -> None:
         plant.reset(make_state(position=(0.0, 0.0, height), euler=(roll, 0.0, 0.0)), speeds)
         flown = plant.advance(speeds, 1)
     floor, disc = -0.132, 0.034  # where the drawing has them
-    above = height - floor + disc * math.cos(roll) + vehicle.rotor_positions[:, 1] * math.sin(roll)
+    above = height - floor + disc * math.cos(roll) + vehicle.hubs[:, 1] * math.sin(roll)
     gains = vehicle.thrust_coefficient * speeds**2 * (1.0 / (1.0 - (radius / (4.0 * above)) ** 2) - 1.0)
     up = np.array([0.0, -math.sin(roll), math.cos(roll)])
     np.testing.assert_allclose(flown["wrench"][0, :3], gains.sum() * up, rtol=1e-9, atol=1e-12)
-    torque = [gains @ vehicle.rotor_positions[:, 1], -gains @ vehicle.rotor_positions[:, 0], 0.0]
+    torque = [gains @ vehicle.hubs[:, 1], -gains @ vehicle.hubs[:, 0], 0.0]
     np.testing.assert_allclose(flown["wrench"][0, 3:], torque, rtol=1e-9, atol=1e-12)
-    yaw_torque = vehicle.drag_coefficient * (np.array(vehicle.rotor_spins) @ speeds**2)
+    yaw_torque = (vehicle.drag_to_thrust * vehicle.thrust_coefficient) * (np.array(vehicle.rotor_spins) @ speeds**2)
     assert flown["physics"][0, 13] == pytest.approx(1e-3 * yaw_torque / vehicle.inertia[2], rel=1e-3)
 
 
