@@ -29,7 +29,7 @@ SMALLEST, LARGEST = 1e-12, 1e6
 """Allowed magnitudes of a vehicle's numbers; MuJoCo refuses smaller inertias, and larger numbers overflow."""
 LEAST_SHARE: Final = 1e-3
 """Least share of the weight that a rotor carries in hover."""
-ALIKE: Final = 1e-9
+BALANCED: Final = 1e-9
 """Largest torque of four equal thrusts, per arm or drag_to_thrust, that counts as none."""
 SLOWEST_ROTOR: Final = 1.0
 """Longest time constant of a rotor [s]; propellers of 30 inch have some 0.3 s."""
@@ -190,7 +190,7 @@ class Vehicle:
     def thrust_shares(self) -> Array:
         """(4,) share of the weight that each rotor carries in hover, where the torques cancel; a quarter if alike."""
         effect = self._effect_of_thrusts(self.rotor_spins)
-        if np.abs(effect[1:].sum(axis=1)).max() <= ALIKE:
+        if np.abs(effect[1:].sum(axis=1)).max() <= BALANCED:
             return read_only(np.full(N_ROTORS, 1.0 / N_ROTORS))
         return read_only(_shares(effect))
 

@@ -190,6 +190,9 @@ static void add_height(const quadsim_vehicle *v, double R[3][3], const double *a
 {
     for (int i = 0; i < ROTORS; i++) {
         const double x = v->place[i][0], y = v->place[i][1], z = v->place[i][2], drag = v->rotor_drag * speed[i];
+        if (z == 0.0) {
+            continue;
+        }
         const double back = rate[1] * z, left = -rate[0] * z; /* of the hub's velocity */
         wrench[3] += z * drag * (along[1] + rate[2] * x + left) + v->rotor_moment[0] * speed[i] * left;
         wrench[4] -= z * drag * (along[0] - rate[2] * y + back) + v->rotor_moment[1] * speed[i] * back;
@@ -229,9 +232,7 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
     add_along_axes(v, R, air, wrench);
     wrench[3] += v->rotor_moment[0] * (along[1] * rotors->turning + rate[2] * rotors->turning_x);
     wrench[4] -= v->rotor_moment[1] * (along[0] * rotors->turning - rate[2] * rotors->turning_y);
-    if (v->raised) {
-        add_height(v, R, along, rate, rotors->speed, wrench);
-    }
+    add_height(v, R, along, rate, rotors->speed, wrench);
     add_pushes(v, R, wrench);
     if (v->radius > 0.0) {
         add_ground_effect(v, R, pose[2], rotors->thrust, wrench);

@@ -56,7 +56,6 @@ typedef struct quadsim_vehicle {
     const double *curve;             /* [points][2] charge and voltage of a cell */
     int64_t points;
     int64_t follows_motion; /* 0: no force but the rotors' */
-    int64_t raised;         /* whether a hub is above or below the centre of mass */
 
     /* what events change */
     double rise, fall, acceleration, efficiency[ROTORS]; /* acceleration 0: no limit */

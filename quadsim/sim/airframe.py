@@ -143,9 +143,9 @@ def _fit_drawing(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
             geom = spec.geom(f"{part}{i}")
             geom.pos[0] *= share
             geom.fromto[[0, 3]] *= share
-            if part in ("arm", "motor", "cap"):
-                geom.pos[2] += z
+            if part in ("arm", "motor"):
                 geom.fromto[[2, 5]] += z
+        spec.geom(f"cap{i}").pos[2] += z
         spec.body(f"propeller{i}").pos[0] *= share
         spec.body(f"propeller{i}").pos[2] += z
         disc, blades = spec.geom(f"disc{i}"), spec.geom(f"blades{i}")

@@ -155,11 +155,6 @@ class Plant:
         return float(self._physics[0, 0])
 
     @property
-    def hover_speeds(self) -> Array:
-        """(4,) the trim [rad/s], u(-1) of a flight that starts at rest in the air."""
-        return self.vehicle.hover_speeds
-
-    @property
     def physics(self) -> Array:
         """(14,) copy of MuJoCo's state; see `physics_to_state`."""
         return self._physics[0].copy()
@@ -188,7 +183,7 @@ class Plant:
         self._step = 0
         self._pending = deque(self._changes)
         self._rotors = self.effects.rotors or RotorDynamics()
-        self._speeds = self.hover_speeds if speeds is None else np.array(speeds, float)
+        self._speeds = self.vehicle.hover_speeds if speeds is None else np.array(speeds, float)
         self._efficiency = np.array(self._rotors.efficiency)
         self._charge = 0.0 if self.effects.battery is None else self.effects.battery.charge
         struct = self._struct
@@ -223,7 +218,6 @@ class Plant:
         v.spin[:] = [float(spin) for spin in vehicle.rotor_spins]
         fill(v.place, vehicle.hubs)
         fill(v.torque_of_thrust, vehicle.allocation[1:] / vehicle.coefficients)
-        v.raised = bool(vehicle.hubs[:, 2].any())
         v.follows_motion = self._follows_motion
         if effects.rotors is not None:
             v.rotor_inertia = effects.rotors.inertia or 0.0

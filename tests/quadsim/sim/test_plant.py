@@ -118,7 +118,7 @@ def test_state_comes_out_with_euler_rates_and_unwrapped_yaw(vehicle: Vehicle) ->
     turning[11] = 4.0
     with Plant(vehicle) as plant:
         plant.reset(turning)
-        hover = plant.hover_speeds
+        hover = plant.vehicle.hover_speeds
         yaws = []
         rows = []
         for _ in range(80):
@@ -217,26 +217,26 @@ def test_a_vehicle_is_lost_at_the_step_that_leaves_the_plausible(vehicle: Vehicl
     with Plant(vehicle) as plant:
         plant.reset(state)
         with pytest.raises(DivergenceError, match=r"at t = 0.001 s: the plant diverged: its state is not"):
-            plant.advance(plant.hover_speeds, 10)
+            plant.advance(plant.vehicle.hover_speeds, 10)
         state[0] = 999_900.0
         plant.reset(state)
-        assert plant.advance(plant.hover_speeds, 10)["physics"][-1, 1] == pytest.approx(999_920.0)
+        assert plant.advance(plant.vehicle.hover_speeds, 10)["physics"][-1, 1] == pytest.approx(999_920.0)
 
 
 def test_a_fatal_error_of_mujoco_ends_the_flight_and_not_the_process(vehicle: Vehicle) -> None:
     """In its bindings it stays the exception that it is."""
     with Plant(vehicle) as plant:
-        plant.advance(plant.hover_speeds, 5)
+        plant.advance(plant.vehicle.hover_speeds, 5)
         before, integrator = plant.physics, plant.model.opt.integrator
         plant.model.opt.integrator = 99
         with pytest.raises(DivergenceError, match=r"at t = 0.005 s: the plant diverged: MuJoCo reports mj_step: inval"):
-            plant.advance(plant.hover_speeds, 5)
+            plant.advance(plant.vehicle.hover_speeds, 5)
         assert np.array_equal(plant.physics, before)
         with pytest.raises(mujoco.FatalError, match="invalid integrator"):
             mujoco.mj_step(plant.model, mujoco.MjData(plant.model))
         plant.model.opt.integrator = integrator
         plant.reset(make_state())
-        assert np.array_equal(plant.advance(plant.hover_speeds, 5)["physics"][-1], before)
+        assert np.array_equal(plant.advance(plant.vehicle.hover_speeds, 5)["physics"][-1], before)
 
 
 @pytest.mark.parametrize("number", [0, 2])

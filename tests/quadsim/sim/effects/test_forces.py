@@ -38,7 +38,7 @@ def test_rotor_drag_slows_a_level_glide_exponentially(vehicle: Vehicle) -> None:
     rate = 4.0 * drag * hover / vehicle.mass
     with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag))) as plant:
         plant.reset(moving(vx=3.0, vy=-1.0))
-        plant.advance(plant.hover_speeds, 2000)
+        plant.advance(plant.vehicle.hover_speeds, 2000)
         state = plant.state()
     np.testing.assert_allclose(state[[1, 3]], np.array([3.0, -1.0]) * math.exp(-2.0 * rate), rtol=1e-6)
     np.testing.assert_allclose(state[[4, 5]], [500.0, 0.0], atol=1e-9)
@@ -50,7 +50,7 @@ def test_rotor_drag_slows_a_turn(vehicle: Vehicle) -> None:
     rate = 4.0 * drag * vehicle.hover_speed * vehicle.arm_length**2 / vehicle.inertia[2]
     with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag))) as plant:
         plant.reset(moving(yaw_rate=2.0))
-        plant.advance(plant.hover_speeds, 500)
+        plant.advance(plant.vehicle.hover_speeds, 500)
         assert plant.state()[11] == pytest.approx(2.0 * math.exp(-0.5 * rate), rel=1e-6)
 
 
@@ -61,7 +61,7 @@ def test_a_rotor_moment_lifts_the_side_that_meets_the_air(vehicle: Vehicle) -> N
     for speed in (0.0, 2.0, 4.0):
         with Plant(vehicle, effects=Effects(air=Air(rotor_moment=(moment, moment)))) as plant:
             plant.reset(moving(vx=speed))
-            rates.append(plant.advance(plant.hover_speeds, 50)["physics"][-1, 12])
+            rates.append(plant.advance(plant.vehicle.hover_speeds, 50)["physics"][-1, 12])
     expected = -moment * 4.0 * vehicle.hover_speed / vehicle.inertia[1] * 0.05
     np.testing.assert_allclose(rates, [0.0, 2.0 * expected, 4.0 * expected], rtol=1e-3, atol=1e-12)
 
@@ -70,7 +70,7 @@ def test_rate_damping_slows_a_turn_exponentially(vehicle: Vehicle) -> None:
     damping = 0.1
     with Plant(vehicle, effects=Effects(air=Air(rate_damping=(0.0, 0.0, damping)))) as plant:
         plant.reset(moving(yaw_rate=2.0))
-        plant.advance(plant.hover_speeds, 500)
+        plant.advance(plant.vehicle.hover_speeds, 500)
         assert plant.state()[11] == pytest.approx(2.0 * math.exp(-0.5 * damping / vehicle.inertia[2]), rel=1e-6)
 
 
@@ -94,7 +94,7 @@ def test_body_drag_is_half_rho_area_speed_squared(vehicle: Vehicle, axis: int, n
     areas = (0.02, 0.03, 0.06)
     with Plant(vehicle, effects=Effects(air=Air(body_drag=areas, density=1.2))) as plant:
         plant.reset(moving(**{name: 8.0}))
-        wrench = plant.advance(plant.hover_speeds, 2000)["wrench"]
+        wrench = plant.advance(plant.vehicle.hover_speeds, 2000)["wrench"]
         speed = plant.state()[[1, 3, 5]][axis]
     decay = 0.5 * 1.2 * areas[axis] / vehicle.mass  # dv/dt = -decay v^2
     assert speed == pytest.approx(8.0 / (1.0 + 8.0 * decay * 2.0), rel=1e-9)
@@ -126,7 +126,7 @@ def test_only_the_air_speed_counts(vehicle: Vehicle, effects: Effects) -> None:
     """Moving with the wind is as standing in still air."""
     with Plant(vehicle, effects=effects, wind=still_air((4.0, -2.0, 0.0))) as plant:
         plant.reset(moving(vx=4.0, vy=-2.0))
-        flown = plant.advance(plant.hover_speeds, 100)
+        flown = plant.advance(plant.vehicle.hover_speeds, 100)
     np.testing.assert_allclose(flown["wrench"], 0.0, atol=1e-12)
     np.testing.assert_array_equal(flown["wind"], np.tile([4.0, -2.0, 0.0], (100, 1)))
 
@@ -137,7 +137,7 @@ def test_a_gust_pushes_by_its_integral(vehicle: Vehicle) -> None:
     gust = Gust(at=0.1, duration=1.0, velocity=(10.0, 0.0, 0.0))
     with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag)), wind=still_air((0.0, 0.0, 0.0), gust)) as plant:
         plant.reset(HIGH)
-        plant.advance(plant.hover_speeds, 1300)
+        plant.advance(plant.vehicle.hover_speeds, 1300)
         push = 4.0 * drag * vehicle.hover_speed * 10.0 * 0.5
         assert plant.state()[1] == pytest.approx(push / vehicle.mass, rel=1e-3)
 
@@ -146,7 +146,7 @@ def test_constant_force_and_torque_accelerate(vehicle: Vehicle) -> None:
     disturbance = Disturbance(force=(0.4, -0.2, 0.1), torque=(0.0, 0.0, 1e-3))
     with Plant(vehicle, effects=Effects(disturbance=disturbance)) as plant:
         plant.reset(HIGH)
-        plant.advance(plant.hover_speeds, 1000)
+        plant.advance(plant.vehicle.hover_speeds, 1000)
         state = plant.state()
     np.testing.assert_allclose(state[[1, 3, 5]], np.array([0.4, -0.2, 0.1]) / vehicle.mass, rtol=1e-9)
     assert state[11] == pytest.approx(1e-3 / vehicle.inertia[2], rel=1e-9)
@@ -159,11 +159,11 @@ def test_white_noise_walks_as_a_random_walk(vehicle: Vehicle) -> None:
         disturbance = Effects(disturbance=Disturbance(force_noise=density))
         with Plant(vehicle, effects=disturbance, rng=np.random.default_rng(seed)) as plant:
             plant.reset(HIGH)
-            plant.advance(plant.hover_speeds, 100)
+            plant.advance(plant.vehicle.hover_speeds, 100)
             ends.append(plant.state()[[1, 3, 5]])
             plant.reset(HIGH)
-            plant.advance(plant.hover_speeds, 60)
-            plant.advance(plant.hover_speeds, 40)
+            plant.advance(plant.vehicle.hover_speeds, 60)
+            plant.advance(plant.vehicle.hover_speeds, 40)
             np.testing.assert_array_equal(plant.state()[[1, 3, 5]], ends[-1])
     np.testing.assert_array_equal(ends[-1], ends[0])
     ratio = np.mean(np.square(ends[:-1])) / ((density / vehicle.mass) ** 2 * 0.1)
@@ -196,7 +196,7 @@ def test_a_lost_propeller_neither_drags_nor_carries_momentum(vehicle: Vehicle) -
     start[7] = 0.5
     with Plant(vehicle, effects=effects) as plant:
         plant.reset(start)
-        wrench = plant.advance(1.1 * plant.hover_speeds, 10)["wrench"]
+        wrench = plant.advance(1.1 * plant.vehicle.hover_speeds, 10)["wrench"]
     np.testing.assert_array_equal(wrench, np.zeros((10, 6)))
 
 
@@ -206,7 +206,7 @@ def test_a_second_flight_meets_the_same_wind(vehicle: Vehicle) -> None:
         winds = []
         for _ in range(2):
             plant.reset(HIGH)
-            winds.append(plant.advance(plant.hover_speeds, 80)["wind"])
+            winds.append(plant.advance(plant.vehicle.hover_speeds, 80)["wind"])
     np.testing.assert_array_equal(winds[0], winds[1])
     assert np.ptp(winds[0]) > 1.0
 
