@@ -237,6 +237,28 @@ class Vehicle:
         """Return U / m [m/s^2] and J^-1 tau [rad/s^2] (4, ...) of wrenches [U, tau] (4, ...) [N, N m]."""
         return np.concatenate([wrench[:1] / self.mass, self.angular_acceleration(wrench[1:].T).T])
 
+    def air_moment(self, turning: float, velocity: Array, rates: Array) -> Array:
+        """Return the torque (3,) [N m] of `rotor_moment` and `rate_damping`: (m_x W v_y, -m_y W v_x, 0) - D omega.
+
+        Args:
+            turning: W, sum of the rotors' speeds [rad/s].
+            velocity: (3,) v through the air, body axes [m/s].
+            rates: (3,) omega, body axes [rad/s].
+        """
+        m_x, m_y = self.rotor_moment or (0.0, 0.0)
+        across = np.array([m_x * velocity[1], -m_y * velocity[0], 0.0])
+        return np.asarray(turning * across - np.array(self.rate_damping or (0.0, 0.0, 0.0)) * rates)
+
+    def require_moment(self, owner: str) -> None:
+        """Refuse a model of the air's moment where nothing is known of it.
+
+        Raises:
+            ParameterError: the vehicle states neither `rotor_moment` nor `rate_damping`.
+        """
+        if self.rotor_moment is None and self.rate_damping is None:
+            rule = f"false, or {self.name} with rotor_moment or rate_damping, of which its file states neither"
+            raise ParameterError(owner, "moment", True, rule)
+
     @property
     def hubs(self) -> Array:
         """(4, 3) rotor hubs in the body frame [m]."""

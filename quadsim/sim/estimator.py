@@ -34,6 +34,10 @@ used, in the order of time stamps.  Later samples wait; a copy of the filter use
 sample corrects the past it belongs to.  Rotor speeds, and contact with the ground, are stored for each step since the
 horizon as well.  A vehicle on the ground leaves it once the modelled thrust exceeds its weight.
 
+With `moment`, tau includes the moment of the rotors in the air, (m_x W v_y, -m_y W v_x, 0) with W the sum of their
+speeds and v the mean velocity in body axes, as if there were no wind, and D is the vehicle's rate damping, otherwise 0.
+The error of the velocity is not passed on through this moment: w_alpha stands for it.
+
 A single prediction is at most 10 ms long, while rotor speeds do not change.  A mean or sample above 1e6 in its SI unit,
 or not a number, carries no information; an estimate beyond that, or with a variance of 1e15 in all, is lost: the mean
 of before is kept with the initial covariance, for the sensors to correct.  The equations are computed by the core
@@ -77,6 +81,9 @@ class EstimatorSettings:
     deviation density sqrt(t). The gate is the chi-square test of a sample's innovation.
     """
 
+    moment: Annotated[
+        bool, doc("whether the model has the vehicle's rotor_moment, at the velocity over ground, and rate_damping")
+    ] = False
     acceleration_noise: Annotated[NonNegative, doc("[m/s^2/sqrt(Hz)] unmodelled white acceleration")] = 0.3
     angular_acceleration_noise: Annotated[
         NonNegative, doc("[rad/s^2/sqrt(Hz)] unmodelled white angular acceleration")
@@ -125,7 +132,7 @@ class ErrorStateFilter:
         """Prepare for the modelled vehicle, sensors and a physics step [s]; call `reset` before use.
 
         Raises:
-            ParameterError: a sensor is missing, or has a noise of zero.
+            ParameterError: a sensor is missing, or has a noise of zero, or a moment is not stated.
         """
         from scipy.special import chdtri  # whose package takes a while to load, and few flights have an estimator
 
@@ -142,8 +149,10 @@ class ErrorStateFilter:
         f = self.struct = FilterStruct(timestep=timestep, mass=vehicle.mass, gravity=vehicle.gravity)
         f.inertia[:], f.products[:] = vehicle.inertia, vehicle.products_of_inertia or (0.0, 0.0, 0.0)
         fill(f.inverse, np.linalg.inv(vehicle.inertia_matrix))
-        f.rotor_moment[:] = vehicle.rotor_moment or (0.0, 0.0)
-        f.rate_damping[:] = vehicle.rate_damping or (0.0, 0.0, 0.0)
+        if settings.moment:
+            vehicle.require_moment("estimator")
+            f.rotor_moment[:] = vehicle.rotor_moment or (0.0, 0.0)
+            f.rate_damping[:] = vehicle.rate_damping or (0.0, 0.0, 0.0)
         fill(f.allocation, vehicle.allocation)
         deviations = settings.acceleration_noise, settings.angular_acceleration_noise
         f.density[1], f.density[3] = (deviation**2 for deviation in deviations)

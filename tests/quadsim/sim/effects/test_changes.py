@@ -82,9 +82,12 @@ def test_what_is_due_later_may_be_put_otherwise(vehicle: Vehicle) -> None:
     first, second = MassChange(at=0.05, factor=1.1), MassChange(at=0.15, factor=0.9)
     with Plant(vehicle, changes=[first, second]) as scheduled, Plant(vehicle, changes=[first]) as later:
         expected = scheduled.advance(scheduled.vehicle.hover_speeds, HOLD)["physics"]
-        begin = later.advance(later.vehicle.hover_speeds, 100)["physics"]
+        hover = later.vehicle.hover_speeds
+        begin = later.advance(hover, 100)["physics"]
         later.reschedule([first, second])
-        np.testing.assert_array_equal(np.vstack([begin, later.advance(later.vehicle.hover_speeds, 100)["physics"]]), expected)
+        np.testing.assert_array_equal(
+            np.vstack([begin, later.advance(later.vehicle.hover_speeds, 100)["physics"]]), expected
+        )
 
 
 def test_rotors_with_inertia_are_never_at_once() -> None:

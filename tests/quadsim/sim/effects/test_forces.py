@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy_laws import LOWEST_RATIO, axis_drag, ground_effect, pushed, respond, rotor_drag, rotor_moment, thrust_ratio
 from scipy.spatial.transform import Rotation
+from uneven import uneven
 
 from quadsim.sim.airframe import added_mass, compile_model, outline, semi_axes
 from quadsim.sim.effects import Disturbance, Effects, Ground, Push, PushChange
@@ -230,9 +231,11 @@ def test_forces_are_of_second_order_in_the_step(vehicle: Vehicle) -> None:
     assert errors[-1] < 3e-5
 
 
+@pytest.mark.parametrize("layout", ["even", "uneven"])
 @pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
-def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: Integrator) -> None:
+def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: Integrator, layout: str) -> None:
     """From random motions, at the middle of the step: drag of two kinds, spinning rotors, pushes, ground effect."""
+    vehicle = uneven() if layout == "uneven" else vehicle
     rng, radius, drag, inertia, step = np.random.default_rng(6), 0.15, 3e-3, 2e-4, 1e-6
     linear, quadratic = (0.3, 0.2, 0.05), (0.08, 0.1, 0.12)
     moment, damping = (2e-4, -3e-4), (0.02, 0.03, 0.01)
@@ -269,7 +272,7 @@ def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: I
                 rates[0] * momentum,
                 inertia * slopes @ np.array(vehicle.rotor_spins),
             ]
-            thrusts = vehicle.thrust_coefficient * middle**2
+            thrusts = vehicle.coefficients * middle**2
             expected += ground_effect(vehicle, radius, thrusts, turn, before[3], shape.floor, shape.disc)
             np.testing.assert_allclose(wrench, expected, atol=1e-4)  # what changes in half a step
 
