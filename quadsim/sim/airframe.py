@@ -40,6 +40,7 @@ _MEETS_OBSTACLES: Final = 2
 """Bit of contype and conaffinity for contact of obstacles and the vehicle's bounding ball."""
 _RIM: Final = 32
 """Points on the rim of a rotor disc; they miss its lowest point by at most half a percent of its radius."""
+_LEG: Final = 0.35  # where a leg meets its arm in the drawing, as a share of the arm
 DRAG: Final = "drag"
 _BLUNT: Final = (0.5, 0.0, 0.0, 0.0, 0.0)
 """Fluid coefficients that turn MuJoCo's ellipsoid drag -rho C_blunt A |v| v into -rho A |v| v / 2; added mass stays."""
@@ -143,8 +144,7 @@ def _fit_drawing(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
             geom = spec.geom(f"{part}{i}")
             geom.pos[0] *= share
             geom.fromto[[0, 3]] *= share
-            if part in ("arm", "motor"):
-                geom.fromto[[2, 5]] += z
+            geom.fromto[[2, 5]] += {"arm": (0.0, z), "motor": (z, z), "leg": (_LEG * z, 0.0)}.get(part, (0.0, 0.0))
         spec.geom(f"cap{i}").pos[2] += z
         spec.body(f"propeller{i}").pos[0] *= share
         spec.body(f"propeller{i}").pos[2] += z

@@ -216,7 +216,7 @@ def vehicle_tables(report: VehicleReport) -> list[Grid]:
             "parameters",
             ("parameter", "value", "unit", "source"),
             [
-                (name, ", ".join(f"{number:g}" for number in np.atleast_1d(value)), unit, report.sources[name])
+                (name, ", ".join(f"{number:g}" for number in np.ravel(value)), unit, report.sources[name])
                 for name, value, unit in report.parameters
             ],
             note="the vehicle file's header expands the source abbreviations",

@@ -8,6 +8,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from uneven import uneven
 
 from quadsim.assets import models_dir, vehicle_path
 from quadsim.sim.airframe import ARM_NAMES, BODY, PROPELLER_NAMES, ROTOR_NAMES, compile_model
@@ -28,7 +30,9 @@ SMALL_X = Vehicle(
     speed_max=2600.0,
 )
 LONG_ARMS = replace(LOPES, arm_length=0.5)
-VEHICLES = pytest.mark.parametrize("vehicle", [LOPES, SMALL_X, LONG_ARMS], ids=["lopes2011", "small-x", "long-arms"])
+VEHICLES = pytest.mark.parametrize(
+    "vehicle", [LOPES, SMALL_X, LONG_ARMS, uneven()], ids=["lopes2011", "small-x", "long-arms", "uneven"]
+)
 
 
 def test_the_shipped_vehicle_compiles_to_its_toml_file():
@@ -52,7 +56,9 @@ def test_the_shipped_vehicle_compiles_to_its_toml_file():
 def test_any_vehicle_compiles_to_its_own_numbers(vehicle: Vehicle, visuals: bool):
     model = compile_model(vehicle, timestep=5e-4, limit_speeds=True, visuals=visuals)
     assert model.body_subtreemass[0] == pytest.approx(vehicle.mass, rel=1e-12)
-    assert model.body(BODY).inertia == pytest.approx(vehicle.inertia)
+    axes = Rotation.from_quat(model.body(BODY).iquat, scalar_first=True).as_matrix()
+    inertia = axes @ np.diag(model.body(BODY).inertia) @ axes.T
+    np.testing.assert_allclose(inertia, vehicle.inertia_matrix, atol=1e-14)
     assert model.body(BODY).ipos == pytest.approx([0.0, 0.0, 0.0])
     assert model.opt.timestep == 5e-4
     assert model.actuator_ctrllimited.all()
@@ -80,10 +86,11 @@ def test_the_drawing_follows_the_arms(vehicle: Vehicle):
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     positions = np.array([data.body(name).xpos for name in PROPELLER_NAMES])
-    assert positions[:, :2] == pytest.approx(vehicle.hubs[:, :2], abs=1e-12)
+    height = model.body(PROPELLER_NAMES[0]).pos[2] - vehicle.hubs[0, 2]  # of the discs above their hubs
+    np.testing.assert_allclose(positions, vehicle.hubs + np.array([0.0, 0.0, height]), atol=1e-12)
     radii = np.array([model.geom(f"disc{i}").size[0] for i in range(1, 5)])
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=2) + 1e9 * np.eye(4)
-    assert 0.2 * vehicle.arm_length < radii.min()
+    assert 0.2 * vehicle.longest_arm < radii.min()
     assert radii.max() < 0.5 * gaps.min()
     forward = vehicle.hubs[:, 0] > 1e-9
     front = model.material("front").id
