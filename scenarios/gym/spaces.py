@@ -71,7 +71,7 @@ class Actions:
             settings = AutopilotSettings(rate=rate, p=BANDWIDTH, i=none, d=none, gyro_cutoff=0.0, delay=0.0)
             self._autopilot = Autopilot(vehicle, settings, speeds=(float(low[0]), float(high[0])))
             self._weight = vehicle.mass * vehicle.gravity
-            self._thrusts = [float(vehicle.thrusts(ends).sum()) for ends in (low, high)]
+            self._thrusts = [vehicle.level_thrust(float(speed)) for speed in (low.max(), high.min())]
 
     def command(self, action: Action, horizon: int) -> Command:
         """The command, a plan of this many rows, for an action."""

@@ -171,6 +171,16 @@ def test_positions_that_cannot_hover_are_refused(places: tuple[tuple[float, ...]
         dataclasses.replace(uneven(), rotor_positions=places)
 
 
+def test_what_public_files_get_wrong_is_refused_by_name() -> None:
+    """MuJoCo Menagerie's yaw gears, and RotorPy's `crazyflie_params`."""
+    with pytest.raises(
+        ParameterError, match=r"rotor_spins must be alternating .*: \(-1, 1, -1, 1\); got \(-1, 1, 1, -1\)"
+    ):
+        dataclasses.replace(published("x2"), rotor_spins=(-1, 1, 1, -1))
+    with pytest.raises(ParameterError, match="inertia must be such that no moment exceeds the sum of the other two"):
+        dataclasses.replace(published("cf-brushless"), inertia=(1.43e-5, 1.43e-5, 2.89e-5))
+
+
 def test_overrides_in_one_form_take_the_place_of_the_other() -> None:
     places = [[0.2, -0.2, 0.0], [-0.2, -0.2, 0.0], [-0.2, 0.2, 0.0], [0.2, 0.2, 0.0]]
     placed = load_vehicle(FILE, {"rotor_positions": places})
