@@ -119,9 +119,10 @@ class Vehicle:
             self._refuse("rotor_spins", "four values, each 1 or -1")
         if 2.0 * max(self.inertia) > sum(self.inertia) * (1.0 + 1e-12):
             self._refuse("inertia", "such that no moment exceeds the sum of the other two")
-        moments = np.linalg.eigvalsh(self.inertia_matrix)
-        if self.products_of_inertia is not None and not 0.0 < moments[2] <= moments[:2].sum() * (1.0 + 1e-12):
-            self._refuse("products_of_inertia", "such that no principal moment exceeds the sum of the other two")
+        if self.products_of_inertia is not None:
+            moments = np.linalg.eigvalsh(self.inertia_matrix)
+            if not moments[2] <= (moments[0] + moments[1]) * (1.0 + 1e-12):
+                self._refuse("products_of_inertia", "such that no principal moment exceeds the sum of the other two")
         self._check_layout()
         self._check_hover()
 
