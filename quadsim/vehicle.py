@@ -15,7 +15,7 @@ from annotated_types import DocInfo, Len, doc
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, ParameterError, UnknownNameError
-from quadsim.fields import Number, Vector
+from quadsim.fields import Number, Positive, Vector
 from quadsim.state import Array, read_only
 
 N_ROTORS: Final = 4
@@ -83,7 +83,7 @@ class Vehicle:
         doc("[-] 1 or -1, sign of each rotor's reaction torque about body +z"),
     ]
     thrust_coefficient: Annotated[
-        float | OfRotors, doc("[N s^2/rad^2] b, thrust b w^2; one number, or one for each rotor")
+        Positive | OfRotors, doc("[N s^2/rad^2] b, thrust b w^2; one number, or one for each rotor")
     ]
     drag_to_thrust: Annotated[float, doc("[m] d / b, reaction torque d w^2")]
     speed_min: Annotated[float, doc("[rad/s] lowest speed that a rotor holds")]
