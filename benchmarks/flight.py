@@ -95,8 +95,8 @@ def _filter_sample(rounds: int, samples: int = 1000) -> float:
     navigation = assembly.navigation()
     assert navigation is not None
     with assembly.plant() as plant:
-        navigation.reset(plant.physics, plant.hover_speeds)
-        commands, grounded = np.tile(plant.hover_speeds, (samples, 1)), np.zeros(samples, np.uint8)
+        navigation.reset(plant.physics, plant.vehicle.hover_speeds)
+        commands, grounded = np.tile(plant.vehicle.hover_speeds, (samples, 1)), np.zeros(samples, np.uint8)
     estimator = navigation.filter
     assert estimator is not None
     taken = np.zeros(samples, SAMPLE)

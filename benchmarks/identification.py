@@ -72,7 +72,7 @@ def guessed(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
     return replace(
         vehicle,
         inertia=(x, y, PLATE * (x + y)),
-        thrust_coefficient=rng.uniform(0.7, 1.4) * vehicle.thrust_coefficient,
+        thrust_coefficient=rng.uniform(0.7, 1.4) * vehicle.mean_coefficient,
         drag_to_thrust=factor() * vehicle.drag_to_thrust,
         rotor_inertia=factor() * known["rotor_inertia"],
         **guess,

@@ -81,7 +81,7 @@ def drawn(rng: np.random.Generator, *, body_drag: bool) -> Vehicle:
         base,
         rotor_azimuths=(-45.0, -135.0, 135.0, 45.0),
         rotor_spins=(-1, 1, -1, 1),
-        thrust_coefficient=base.thrust_coefficient * rng.uniform(0.8, 1.25),
+        thrust_coefficient=base.mean_coefficient * rng.uniform(0.8, 1.25),
         inertia=tuple(inertia.tolist()),
         drag_to_thrust=base.drag_to_thrust * rng.uniform(0.7, 1.4),
         rotor_rise=float(lag / math.sqrt(ratio)),
@@ -98,7 +98,7 @@ def wrong(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
     inertia[2] = 0.87 * inertia[:2].sum() * rng.uniform(0.9, 1.1)
     return replace(
         vehicle,
-        thrust_coefficient=vehicle.thrust_coefficient * rng.uniform(0.7, 1.4),
+        thrust_coefficient=vehicle.mean_coefficient * rng.uniform(0.7, 1.4),
         inertia=tuple(inertia.tolist()),
         drag_to_thrust=vehicle.drag_to_thrust * rng.uniform(0.5, 2.0),
         speed_max=1.4 * vehicle.speed_max,

@@ -101,7 +101,7 @@ def measure(name: str, solvers: Sequence[str], quick: bool, report: Progress) ->
 
         def fly_a_period() -> None:
             plant.reset(hover)
-            plant.advance(plant.hover_speeds, scenario.steps_per_period)
+            plant.advance(plant.vehicle.hover_speeds, scenario.steps_per_period)
             plant.state()
 
         times = time_in_turns(

@@ -44,7 +44,7 @@ PATIENCE = 20.0  # s, of the wall clock
 
 def motor_layout(vehicle: quadsim.Vehicle) -> tuple[str, list[int]]:
     """Return the firmware's mixer for a vehicle and its motor, 0 to 3, of each rotor; a ValueError if it has none."""
-    rotors = [*zip(np.mod(vehicle.rotor_azimuths, 360.0).tolist(), vehicle.rotor_spins, strict=True)]
+    rotors = [*zip(np.mod(np.degrees(vehicle.azimuths).round(9), 360.0).tolist(), vehicle.rotor_spins, strict=True)]
     for mixer, motors in LAYOUTS.items():
         if set(motors) == set(rotors):
             return mixer, [motors.index(rotor) for rotor in rotors]
@@ -181,7 +181,7 @@ class Betaflight:
         mixer, self._motor_of_rotor = motor_layout(vehicle)
         self.rate, self._fastest, self._idle = 1000.0, vehicle.speed_max, STOCK_IDLE if stock else 0.0
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
-        self._largest_thrust = 4.0 * vehicle.thrust_coefficient * vehicle.speed_max**2
+        self._largest_thrust = vehicle.level_thrust(vehicle.speed_max)
         self._folder = Path(tempfile.mkdtemp(prefix="betaflight-"))
         weakref.finalize(self, shutil.rmtree, self._folder)
         subprocess.run([*COMPILE, self._folder / "lockstep.so"], check=True)

@@ -151,7 +151,7 @@ class TargetBounds:
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """Return the bounds on collective thrust [N] and on each body rate [deg/s]."""
-        largest, weight = N_ROTORS * vehicle.thrust_coefficient * vehicle.speed_max**2, vehicle.mass * vehicle.gravity
+        largest, weight = vehicle.level_thrust(vehicle.speed_max), vehicle.mass * vehicle.gravity
         lower, upper = self.thrust or (LEAST_THRUST * weight, thrust_to_command(largest, weight, MOST_THRUST))
         if not lower < weight < upper:
             rule = f"below and above the weight, {weight:.4g} N"

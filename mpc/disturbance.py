@@ -100,7 +100,7 @@ class RampObserver:
 
     Commands are rotor speeds, or with `thrust_lag` [s] collective thrusts [N] that act with this lag; no torque is
     estimated then. The model knows `drag` (3,) [1/s] and `quadratic_drag` (3,) [1/m], of the square of each component,
-    in body axes.
+    in body axes, and with `moment` the vehicle's `air_moment`.
     """
 
     def __init__(
@@ -111,6 +111,7 @@ class RampObserver:
         *,
         drag: ArrayLike = (0.0, 0.0, 0.0),
         quadratic_drag: ArrayLike = (0.0, 0.0, 0.0),
+        moment: bool = False,
         thrust_lag: float | None = None,
     ) -> None:
         force = FORCE_SHARE / period if settings.force is None else settings.force
@@ -127,11 +128,11 @@ class RampObserver:
         self._vehicle, self._period, self._lag = vehicle, period, settings.rotor_lag or 0.0
         inertia = (vehicle.rotor_inertia or 0.0) if self._lag else 0.0
         self._momentum = -inertia * np.array(vehicle.rotor_spins, float)
-        self._drag, self._quadratic = np.array(drag, float), np.array(quadratic_drag, float)
+        self._drag, self._quadratic, self._moment = np.array(drag, float), np.array(quadratic_drag, float), moment
         self._decay = math.exp(-period / settings.drag_memory)
         self._ballast = FITTED_FROM**2 / (1.0 - self._decay)
         self._up = np.array([0.0, 0.0, vehicle.gravity])
-        self._rotors, self._thrust = np.full(4, vehicle.hover_speed), vehicle.mass * vehicle.gravity
+        self._rotors, self._thrust = vehicle.hover_speeds, vehicle.mass * vehicle.gravity
         self.reset(self._rotors if thrust_lag is None else self._thrust)
 
     def reset(self, acting: Array | float) -> None:
@@ -162,26 +163,29 @@ class RampObserver:
         Measured values: velocity (3,), world; attitude (3, 3), body to world; body rates (3,). The command was held
         over the period that ends: rotor speeds (4,) [rad/s], or the thrust [N] with `thrust_lag`.
         """
-        period, J = self._period, np.array(self._vehicle.inertia)
+        period, vehicle = self._period, self._vehicle
         thrust, torque = self._mean_wrench(command)
         axis, turning = attitude[:, 2], attitude @ np.array([rates[1], -rates[0], 0.0])
         v_b = attitude.T @ velocity
         drag = -attitude @ ((self._drag + self._quadratic * np.abs(v_b)) * v_b)
-        momentum = J * rates
+        momentum = vehicle.momentum(rates)
         momentum[2] += self._momentum @ self._rotors
-        now = velocity, rates, np.concatenate([axis, turning]), np.concatenate([drag, np.cross(rates, momentum)])
+        resisting = np.cross(rates, momentum)
+        if self._moment:
+            resisting -= vehicle.air_moment(float(self._rotors.sum()), v_b, rates)
+        now = velocity, rates, np.concatenate([axis, turning]), np.concatenate([drag, resisting])
         last, self._last = self._last, now
         before, self._time = self._time, time
         if last is None or abs(time - before - period) > _SAME_TIME:
             return
         # Mean over the period from its two ends; for the thrust axis also from its derivative (Euler-Maclaurin).
         b = 0.5 * (last[2][:3] + axis) + period / 12.0 * (last[2][3:] - turning)
-        drag, gyroscopic = np.split(0.5 * (last[3] + now[3]), 2)
-        lift = thrust / self._vehicle.mass * b
+        drag, resisting = np.split(0.5 * (last[3] + now[3]), 2)
+        lift = thrust / vehicle.mass * b
         missed = np.concatenate(
             [
                 (velocity - last[0]) / period + self._up - lift - drag,
-                (rates - last[1]) / period - (torque - gyroscopic) / J,
+                (rates - last[1]) / period - vehicle.angular_acceleration(torque - resisting),
             ]
         )
         holds = False

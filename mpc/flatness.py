@@ -40,8 +40,7 @@ def motion_along(
         yaw: (K,) held heading, as a direction from world x [rad]; or the initial value of a free heading [rad].
     """
     attitude, rates = attitudes(acceleration, period=period, gravity=vehicle.gravity, yaw=yaw)
-    inertia = np.array(vehicle.inertia)
-    torque = inertia * np.gradient(rates, period, axis=0) + np.cross(rates, inertia * rates)
+    torque = vehicle.momentum(np.gradient(rates, period, axis=0)) + np.cross(rates, vehicle.momentum(rates))
     collective = vehicle.mass * np.linalg.norm(_pushed(acceleration, vehicle.gravity), axis=1)
     squared = np.linalg.solve(vehicle.allocation, np.column_stack([collective, torque]).T).T
     return Motion(
@@ -50,7 +49,7 @@ def motion_along(
         acceleration=read_only(np.array(acceleration, float)),
         attitude=read_only(attitude),
         body_rates=read_only(rates),
-        thrusts=read_only(vehicle.thrust_coefficient * squared),
+        thrusts=read_only(vehicle.coefficients * squared),
     )
 
 

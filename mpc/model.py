@@ -26,7 +26,7 @@ class LinearModel:
 
     A: Array  # (n, n) state matrix
     B: Array  # (n, nu) input matrix
-    u_bar: Array  # (nu,) equilibrium input; for a quadrotor, omega_bar on all rotors [rad/s]
+    u_bar: Array  # (nu,) equilibrium input; the trim of a quadrotor, often omega_bar on all rotors [rad/s]
     period: float  # tau_s [s]
     targets: bool = (
         False  # whether the inputs are an inner loop's targets, collective thrust [N] and body rates [rad/s]
@@ -56,10 +56,9 @@ def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0) -> tuple[Array, A
         A[INDEX[name], INDEX[name] + 1] = 1.0
     A[INDEX["vx"], INDEX["pitch"]] = vehicle.gravity
     A[INDEX["vy"], INDEX["roll"]] = -vehicle.gravity
-    # [U, tau_x, tau_y, tau_z] = allocation w^2, so its slope at hover is 2 omega_bar allocation.
-    wrench_slope = 2.0 * vehicle.hover_speed * vehicle.allocation
-    resistance = np.array([vehicle.mass, *vehicle.inertia])
-    B[[INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]] = wrench_slope / resistance[:, None]
+    # [U, tau_x, tau_y, tau_z] = allocation w^2, so its slope at hover is allocation diag(2 w_bar).
+    wrench_slope = 2.0 * vehicle.hover_speeds * vehicle.allocation
+    B[[INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]] = vehicle.accelerations(wrench_slope)
     if rotor_lag == 0.0:
         return A, B
     follow = np.eye(N_ROTORS) / rotor_lag
@@ -84,8 +83,7 @@ def lqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
 def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
     """The vehicle's discrete model at hover, for a control period tau_s [s]."""
     A, B = discretise(*continuous_model(vehicle), period)
-    u_bar = np.full(N_ROTORS, vehicle.hover_speed)
-    return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(u_bar), period=period)
+    return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(vehicle.hover_speeds), period=period)
 
 
 def target_model(vehicle: Vehicle, period: float, lag: Sequence[float]) -> LinearModel:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from quadsim.errors import ParameterError
-from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
+from quadsim.vehicle import ARMS, N_ROTORS, VEHICLE_UNITS, Vehicle
 
 AIR_DENSITY: Final = 1.225  # [kg/m^3]
 UNKNOWN_RADIUS: Final = 0.5  # radius of a propeller whose file states none, in arm lengths
@@ -40,7 +40,7 @@ class Ratio:
 
 
 def _radius(vehicle: Vehicle) -> float:
-    return UNKNOWN_RADIUS * vehicle.arm_length if vehicle.rotor_radius is None else vehicle.rotor_radius
+    return UNKNOWN_RADIUS * vehicle.longest_arm if vehicle.rotor_radius is None else vehicle.rotor_radius
 
 
 def _over(value: float | None, other: float) -> float | None:
@@ -49,7 +49,7 @@ def _over(value: float | None, other: float) -> float | None:
 
 def _thrust_coefficient(vehicle: Vehicle) -> float:
     """C_T = b / (rho pi R^4)."""
-    return vehicle.thrust_coefficient / (AIR_DENSITY * math.pi * _radius(vehicle) ** 4)
+    return vehicle.mean_coefficient / (AIR_DENSITY * math.pi * _radius(vehicle) ** 4)
 
 
 def _slowing(vehicle: Vehicle) -> float | None:
@@ -68,28 +68,28 @@ RATIOS: Final = (
     Ratio(
         of=("arm_length", "mass"),
         text="mass / arm_length^3 [kg/m^3]",
-        value=lambda v: v.mass / v.arm_length**3,
+        value=lambda v: v.mass / v.longest_arm**3,
         low=8.0,
         high=3000.0,
     ),
     Ratio(
         of=("inertia", "arm_length", "mass"),
         text="the larger of Ixx and Iyy over mass arm_length^2",
-        value=lambda v: max(v.inertia[:2]) / (v.mass * v.arm_length**2),
+        value=lambda v: max(v.inertia[:2]) / (v.mass * v.longest_arm**2),
         low=0.02,
         high=1.5,
     ),
     Ratio(
         of=("inertia", "arm_length", "mass"),
         text="the smaller of Ixx and Iyy over mass arm_length^2",
-        value=lambda v: min(v.inertia[:2]) / (v.mass * v.arm_length**2),
+        value=lambda v: min(v.inertia[:2]) / (v.mass * v.longest_arm**2),
         low=0.02,
         high=1.5,
     ),
     Ratio(
         of=("inertia", "arm_length", "mass"),
         text="Izz over mass arm_length^2",
-        value=lambda v: v.inertia[2] / (v.mass * v.arm_length**2),
+        value=lambda v: v.inertia[2] / (v.mass * v.longest_arm**2),
         low=0.04,
         high=3.0,
     ),
@@ -99,6 +99,13 @@ RATIOS: Final = (
         value=lambda v: (v.speed_max / v.hover_speed) ** 2,
         low=1.0,
         high=12.0,
+    ),
+    Ratio(
+        of=("rotor_azimuths", "rotor_spins"),
+        text="largest over smallest share of the weight that a rotor carries in hover",
+        value=lambda v: v.thrust_shares.max() / v.thrust_shares.min(),
+        low=1.0,
+        high=3.0,
     ),
     Ratio(
         of=("thrust_coefficient", "rotor_radius", "arm_length"),
@@ -117,7 +124,7 @@ RATIOS: Final = (
     Ratio(
         of=("rotor_radius", "arm_length"),
         text="rotor_radius over arm_length",
-        value=lambda v: _over(v.rotor_radius, v.arm_length),
+        value=lambda v: _over(v.rotor_radius, v.longest_arm),
         low=0.12,
         high=1.0,
     ),
@@ -159,7 +166,7 @@ RATIOS: Final = (
     Ratio(
         of=("body_drag", "arm_length"),
         text="the largest body_drag over pi arm_length^2",
-        value=lambda v: _over(None if v.body_drag is None else max(v.body_drag), math.pi * v.arm_length**2),
+        value=lambda v: _over(None if v.body_drag is None else max(v.body_drag), math.pi * v.longest_arm**2),
         low=1e-3,
         high=3.0,
     ),
@@ -183,7 +190,7 @@ RATIOS: Final = (
     Ratio(
         of=("extent", "arm_length"),
         text="extent over arm_length + rotor_radius",
-        value=lambda v: _over(v.extent, v.arm_length + (v.rotor_radius or 0.0)),
+        value=lambda v: _over(v.extent, v.longest_arm + (v.rotor_radius or 0.0)),
         low=0.999,
         high=3.0,
     ),
@@ -193,8 +200,8 @@ _TIMES: Final = {"ms": 1e-3}
 _MOMENTS: Final = {"kg cm^2": 1e-4, "g cm^2": 1e-7, "kg mm^2": 1e-6, "g mm^2": 1e-9}
 _SPEEDS: Final = {"rpm": math.pi / 30.0}
 UNITS: Final[dict[str, dict[str, float]]] = {
-    **dict.fromkeys(("arm_length", "rotor_radius", "drag_to_thrust", "extent"), _LENGTHS),
-    **dict.fromkeys(("inertia", "rotor_inertia"), _MOMENTS),
+    **dict.fromkeys(("arm_length", "rotor_positions", "rotor_radius", "drag_to_thrust", "extent"), _LENGTHS),
+    **dict.fromkeys(("inertia", "products_of_inertia", "rotor_inertia"), _MOMENTS),
     **dict.fromkeys(("rotor_rise", "rotor_fall"), _TIMES),
     **dict.fromkeys(("speed_min", "speed_max"), _SPEEDS),
     "thrust_coefficient": {"N/rpm^2": (30.0 / math.pi) ** 2, "g/rpm^2": 9.80665e-3 * (30.0 / math.pi) ** 2},
@@ -210,7 +217,13 @@ def implausible(vehicle: Vehicle) -> list[str]:
     if off and (explanation := _explanation(vehicle)) is not None:
         more = "" if len(off) == 1 else f", and {len(off) - 1} more ratios are off"
         return [f"vehicle: {explanation}; as it is, {_line(off[0], vehicle)}{more}"]
-    return [f"vehicle: {_line(ratio, vehicle)}; check {', '.join(ratio.of)}" for ratio in off]
+    return [f"vehicle: {_line(ratio, vehicle)}; check {', '.join(_stated(ratio.of, vehicle))}" for ratio in off]
+
+
+def _stated(names: Sequence[str], vehicle: Vehicle) -> list[str]:
+    """Return the parameters as the vehicle states them: arms by `rotor_positions`."""
+    placed = vehicle.rotor_positions is not None
+    return ["rotor_positions" if placed and name in ARMS else name for name in names]
 
 
 def _line(ratio: Ratio, vehicle: Vehicle) -> str:
@@ -237,20 +250,23 @@ def _converted(vehicle: Vehicle) -> Iterator[tuple[str, str, Vehicle]]:
     rpm = _SPEEDS["rpm"]
     speeds: dict[str, Any] = {"speed_min": rpm * vehicle.speed_min, "speed_max": rpm * vehicle.speed_max}
     with contextlib.suppress(ParameterError):
-        together = replace(vehicle, thrust_coefficient=vehicle.thrust_coefficient / rpm**2, **speeds)
+        together = replace(vehicle, thrust_coefficient=_scaled(vehicle.thrust_coefficient, rpm**-2.0), **speeds)
         yield "speed_max", "rpm, and thrust_coefficient in N/rpm^2", together
     for name, units in UNITS.items():
         value: Any = getattr(vehicle, name)
         if value is None:
             continue
         for unit, factor in units.items():
-            other: Any = tuple(factor * entry for entry in value) if isinstance(value, tuple) else factor * value
-            changes: dict[str, Any] = {name: other}
+            changes: dict[str, Any] = {name: _scaled(value, factor)}
             try:
                 yield name, unit, replace(vehicle, **changes)
             except ParameterError:  # no vehicle at all
                 continue
 
 
+def _scaled(value: Any, factor: float) -> Any:
+    return tuple(_scaled(entry, factor) for entry in value) if isinstance(value, tuple) else factor * value
+
+
 def _shown(value: Any) -> str:
-    return ", ".join(f"{entry:.4g}" for entry in value) if isinstance(value, tuple) else f"{value:.4g}"
+    return ", ".join(_shown(entry) for entry in value) if isinstance(value, tuple) else f"{value:.4g}"

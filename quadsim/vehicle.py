@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final, NoReturn, get_type_hints
 
@@ -14,15 +15,22 @@ from annotated_types import DocInfo, Len, doc
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, ParameterError, UnknownNameError
-from quadsim.fields import Number, Vector
-from quadsim.state import Array
+from quadsim.fields import Number, Positive, Vector
+from quadsim.state import Array, read_only
 
 N_ROTORS: Final = 4
 AUTOPILOT: Final = "autopilot"  # table of a vehicle file; see `quadsim.sim.autopilot.AutopilotSettings`
 PerAxis = Annotated[tuple[Number, ...], Len(2, 2)]
 OfRotors = Annotated[tuple[Number, ...], Len(N_ROTORS, N_ROTORS)]
+Positions = Annotated[tuple[Vector, ...], Len(N_ROTORS, N_ROTORS)]
+ARMS: Final = ("arm_length", "rotor_azimuths")
+"""The parameters that `rotor_positions` replaces."""
 SMALLEST, LARGEST = 1e-12, 1e6
 """Allowed magnitudes of a vehicle's numbers; MuJoCo refuses smaller inertias, and larger numbers overflow."""
+LEAST_SHARE: Final = 1e-3
+"""Least share of the weight that a rotor carries in hover."""
+BALANCED: Final = 1e-9
+"""Largest torque of four equal thrusts, per arm or drag_to_thrust, that counts as none."""
 SLOWEST_ROTOR: Final = 1.0
 """Longest time constant of a rotor [s]; propellers of 30 inch have some 0.3 s."""
 
@@ -32,7 +40,9 @@ class Vehicle:
     """A rigid body carried by four fixed rotors, thrust along body +z; validated on construction.
 
     Body frame: x forward, y left, z up, origin at the centre of mass.  Rotor i gives the thrust
-    f_i = b w_i^2 [N] and the reaction torque spin_i d w_i^2 [N m] about body +z (Sec. 2.2).
+    f_i = b w_i^2 [N] and the reaction torque spin_i d w_i^2 [N m] about body +z (Sec. 2.2), with a b of its own where
+    `thrust_coefficient` has four numbers.  The rotors are placed by arms, or by `rotor_positions`.  They turn at
+    `hover_speeds` in hover, which are equal only where their torques then cancel.
 
     Linear drag is a force -rotor_drag w v_perp on a rotor, v_perp its velocity through the air in the rotor's plane
     (Martin and Salaun, 2010; Furrer et al., 2016).  The same velocity v turns the vehicle, by (rotor_moment[0] w v_y,
@@ -56,16 +66,25 @@ class Vehicle:
     mass: Annotated[float, doc("[kg] at take-off")]
     gravity: Annotated[float, doc("[m/s^2] where it flies")]
     inertia: Annotated[Vector, doc("[kg m^2] Ixx, Iyy, Izz, body axes")]
-    arm_length: Annotated[float, doc("[m] L, centre of mass to rotor axis")]
+    products_of_inertia: Annotated[
+        Vector | None,
+        doc("[kg m^2] Ixy, Ixz, Iyz, body axes: entries of the inertia matrix, Ixy = -integral of x y dm"),
+    ] = None
+    arm_length: Annotated[float | None, doc("[m] L, centre of mass to rotor axis")] = None
     rotor_azimuths: Annotated[
-        OfRotors, doc("[deg] direction of each arm from body +x, counter-clockwise seen from above")
-    ]
+        OfRotors | None, doc("[deg] direction of each arm from body +x, counter-clockwise seen from above")
+    ] = None
+    rotor_positions: Annotated[
+        Positions | None, doc("[m] x, y, z of each rotor's hub, body axes, in place of arm_length and rotor_azimuths")
+    ] = None
     rotor_spins: Annotated[
         tuple[int, ...],
         Len(N_ROTORS, N_ROTORS),
         doc("[-] 1 or -1, sign of each rotor's reaction torque about body +z"),
     ]
-    thrust_coefficient: Annotated[float, doc("[N s^2/rad^2] b, thrust b w^2")]
+    thrust_coefficient: Annotated[
+        Positive | OfRotors, doc("[N s^2/rad^2] b, thrust b w^2; one number, or one for each rotor")
+    ]
     drag_to_thrust: Annotated[float, doc("[m] d / b, reaction torque d w^2")]
     speed_min: Annotated[float, doc("[rad/s] lowest speed that a rotor holds")]
     speed_max: Annotated[float, doc("[rad/s] highest speed that a rotor holds")]
@@ -83,15 +102,10 @@ class Vehicle:
 
     def __post_init__(self) -> None:
         for name in VEHICLE_UNITS:
-            value, length = getattr(self, name), _LENGTHS.get(name)
+            value = getattr(self, name)
             if value is None and name in OPTIONAL_PARAMETERS:
                 continue
-            if length is not None:
-                if not isinstance(value, (tuple, list)) or len(value) != length:
-                    self._refuse(name, f"a list of {length} numbers")
-                object.__setattr__(self, name, tuple(value))
-            for number in (value,) if length is None else value:
-                _check_number(name, number, positive=name not in _ANY_SIGN)
+            object.__setattr__(self, name, _checked(name, value))
         if min(self.rate_damping or (0.0,)) < 0.0:
             self._refuse("rate_damping", ">= 0 N m s/rad about each axis")
         if self.speed_min < 0.0:
@@ -105,6 +119,10 @@ class Vehicle:
             self._refuse("rotor_spins", "four values, each 1 or -1")
         if 2.0 * max(self.inertia) > sum(self.inertia) * (1.0 + 1e-12):
             self._refuse("inertia", "such that no moment exceeds the sum of the other two")
+        if self.products_of_inertia is not None:
+            moments = np.linalg.eigvalsh(self.inertia_matrix)
+            if not moments[2] <= (moments[0] + moments[1]) * (1.0 + 1e-12):
+                self._refuse("products_of_inertia", "such that no principal moment exceeds the sum of the other two")
         self._check_layout()
         self._check_hover()
 
@@ -112,33 +130,46 @@ class Vehicle:
         raise ParameterError("vehicle", name, getattr(self, name), rule)
 
     def _check_layout(self) -> None:
+        arms = [name for name in ARMS if getattr(self, name) is not None]
+        if self.rotor_positions is not None and arms:
+            self._refuse("rotor_positions", f"left out where {' and '.join(arms)} is given: one or the other")
+        if max(map(abs, self.rotor_azimuths or (0.0,))) > 360.0:
+            self._refuse("rotor_azimuths", "within -360 and 360 deg")
+        if self.rotor_positions is None and (absent := [name for name in ARMS if name not in arms]):
+            self._refuse(absent[0], f"given with {arms[0] if arms else ARMS[1]}, or rotor_positions in place of both")
+        if not self.longest_arm >= SMALLEST:
+            self._refuse("rotor_positions", "away from the centre of mass")
         rule = self._layout_problem(self.rotor_spins)
         if rule is None:
             return
         alternating = np.empty(N_ROTORS, int)
-        alternating[np.argsort(np.mod(self.rotor_azimuths, 360.0), kind="stable")] = (1, -1, 1, -1)
+        alternating[np.argsort(np.mod(self.azimuths, math.tau), kind="stable")] = (1, -1, 1, -1)
         alternating *= alternating[0] * int(self.rotor_spins[0])
         if self._layout_problem(alternating) is None:
             expected = tuple(alternating.tolist())
             self._refuse("rotor_spins", f"alternating around the airframe, so that yaw is controlled: {expected}")
-        self._refuse("rotor_azimuths", rule)
+        self._refuse("rotor_azimuths" if self.rotor_positions is None else "rotor_positions", rule)
 
     def _layout_problem(self, spins: Sequence[float] | Array) -> str | None:
         """Return the missing property of the layout with these spins; None if it is complete."""
-        x, y, _ = self.rotor_positions.T / self.arm_length
-        unit_allocation = np.stack([np.ones(N_ROTORS), y, -x, np.array(spins, float)])
-        if abs(np.linalg.det(unit_allocation)) < 1e-9:
+        effect = self._effect_of_thrusts(spins)
+        if abs(np.linalg.det(effect)) < 1e-9:
             return "a layout that controls roll, pitch, yaw and thrust"
-        if np.abs(unit_allocation[1:].sum(axis=1)).max() > 1e-9:
-            return "a layout whose torques cancel when all rotors turn alike, so that it can hover"
+        if _shares(effect).min() < LEAST_SHARE:
+            return "a layout in which every rotor lifts while the torques cancel, so that it can hover"
         return None
 
+    def _effect_of_thrusts(self, spins: Sequence[float] | Array) -> Array:
+        """(4, 4): thrust, and torques per length of the longest arm or per drag_to_thrust, of unit thrusts."""
+        x, y, _ = self.hubs.T / self.longest_arm
+        return np.stack([np.ones(N_ROTORS), y, -x, np.array(spins, float)])
+
     def _check_hover(self) -> None:
-        hover, weight = self.hover_speed, self.mass * self.gravity
+        weight = self.mass * self.gravity
         for name, sign, side in (("speed_max", 1.0, "no lower than"), ("speed_min", -1.0, "no higher than")):
-            speed = getattr(self, name)
+            speed, hover = getattr(self, name), sign * float((sign * self.hover_speeds).max())
             if sign * (hover - speed) > 0.0:
-                lift = N_ROTORS * self.thrust_coefficient * speed**2
+                lift = self.level_thrust(speed)
                 self._refuse(
                     name,
                     f"{side} its hover speed, {hover:.6g} rad/s, or it cannot hover (rotors hold {self.speed_min:g} to "
@@ -147,21 +178,110 @@ class Vehicle:
                 )
 
     @property
-    def drag_coefficient(self) -> float:
-        """Drag coefficient d [N m s^2/rad^2]."""
-        return self.drag_to_thrust * self.thrust_coefficient
+    def coefficients(self) -> Array:
+        """(4,) thrust coefficient b of each rotor [N s^2/rad^2]."""
+        return np.broadcast_to(np.asarray(self.thrust_coefficient, np.float64), N_ROTORS).copy()
+
+    @property
+    def mean_coefficient(self) -> float:
+        """The mean of the rotors' thrust coefficients [N s^2/rad^2]."""
+        return math.fsum(self.coefficients) / N_ROTORS
+
+    @cached_property
+    def thrust_shares(self) -> Array:
+        """(4,) share of the weight that each rotor carries in hover, where the torques cancel; a quarter if alike."""
+        effect = self._effect_of_thrusts(self.rotor_spins)
+        if np.abs(effect[1:].sum(axis=1)).max() <= BALANCED:
+            return read_only(np.full(N_ROTORS, 1.0 / N_ROTORS))
+        return read_only(_shares(effect))
+
+    @property
+    def hover_speeds(self) -> Array:
+        """(4,) the rotor speeds of hover, the trim [rad/s]: b_i w_i^2 = share_i m g."""
+        return np.sqrt(self.mass * self.gravity * self.thrust_shares / self.coefficients)
 
     @property
     def hover_speed(self) -> float:
-        """omega_bar [rad/s]: the speed at which four rotors carry the weight, 4 b omega_bar^2 = m g."""
-        return math.sqrt(self.mass * self.gravity / (N_ROTORS * self.thrust_coefficient))
+        """omega_bar [rad/s]: the common speed at which four rotors carry the weight, sum b_i omega_bar^2 = m g.
+
+        The unit of speeds; where the layout needs another trim, see `hover_speeds`.
+        """
+        return math.sqrt(self.mass * self.gravity / (N_ROTORS * self.mean_coefficient))
+
+    def thrusts(self, speeds: Array) -> Array:
+        """Return the thrusts b_i w_i^2 (..., 4) [N] of rotor speeds (..., 4) [rad/s]."""
+        return np.asarray(self.coefficients * np.square(speeds))
+
+    def level_thrust(self, speed: float) -> float:
+        """Return the collective thrust [N], without torque, at which the fastest rotor has a speed [rad/s]."""
+        return float((self.coefficients * speed**2 / self.thrust_shares).min())
 
     @property
-    def rotor_positions(self) -> Array:
-        """(4, 3) rotor centres in the body frame [m]."""
-        azimuth = np.radians(self.rotor_azimuths)
-        directions = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(N_ROTORS)], axis=1)
-        return self.arm_length * directions.round(15)  # an arm along an axis lies on it exactly
+    def inertia_matrix(self) -> Array:
+        """(3, 3) J, body axes [kg m^2]."""
+        (xx, yy, zz), (xy, xz, yz) = self.inertia, self.products_of_inertia or (0.0, 0.0, 0.0)
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+    def momentum(self, rates: Array) -> Array:
+        """Return the angular momentum J omega (..., 3) [N m s] of body rates (..., 3) [rad/s]."""
+        if self.products_of_inertia is None:
+            return np.asarray(np.array(self.inertia) * rates)
+        return np.asarray(rates @ self.inertia_matrix)
+
+    def angular_acceleration(self, torque: Array) -> Array:
+        """Return the angular acceleration J^-1 tau (..., 3) [rad/s^2] of a torque (..., 3) [N m]."""
+        if self.products_of_inertia is None:
+            return np.asarray(torque / np.array(self.inertia))
+        return np.asarray(torque @ np.linalg.inv(self.inertia_matrix))
+
+    def accelerations(self, wrench: Array) -> Array:
+        """Return U / m [m/s^2] and J^-1 tau [rad/s^2] (4, ...) of wrenches [U, tau] (4, ...) [N, N m]."""
+        return np.concatenate([wrench[:1] / self.mass, self.angular_acceleration(wrench[1:].T).T])
+
+    def air_moment(self, turning: float, velocity: Array, rates: Array) -> Array:
+        """Return the torque (3,) [N m] of `rotor_moment` and `rate_damping`: (m_x W v_y, -m_y W v_x, 0) - D omega.
+
+        Args:
+            turning: W, sum of the rotors' speeds [rad/s].
+            velocity: (3,) v through the air, body axes [m/s].
+            rates: (3,) omega, body axes [rad/s].
+        """
+        m_x, m_y = self.rotor_moment or (0.0, 0.0)
+        across = np.array([m_x * velocity[1], -m_y * velocity[0], 0.0])
+        return np.asarray(turning * across - np.array(self.rate_damping or (0.0, 0.0, 0.0)) * rates)
+
+    def require_moment(self, owner: str) -> None:
+        """Refuse a model of the air's moment where nothing is known of it.
+
+        Raises:
+            ParameterError: the vehicle states neither `rotor_moment` nor `rate_damping`.
+        """
+        if self.rotor_moment is None and self.rate_damping is None:
+            rule = f"false, or {self.name} with rotor_moment or rate_damping, of which its file states neither"
+            raise ParameterError(owner, "moment", True, rule)
+
+    @property
+    def hubs(self) -> Array:
+        """(4, 3) rotor hubs in the body frame [m]."""
+        if self.rotor_positions is not None:
+            return np.array(self.rotor_positions)
+        directions = np.stack([np.cos(self.azimuths), np.sin(self.azimuths), np.zeros(N_ROTORS)], axis=1)
+        return self.longest_arm * directions.round(15)  # an arm along an axis lies on it exactly
+
+    @property
+    def azimuths(self) -> Array:
+        """(4,) direction of each rotor from body x [rad]."""
+        if self.rotor_positions is None:
+            return np.radians(np.array(self.rotor_azimuths, float))
+        return np.arctan2(self.hubs[:, 1], self.hubs[:, 0])
+
+    @property
+    def longest_arm(self) -> float:
+        """Largest distance of a rotor's axis from the centre of mass [m]: arm_length, where it is stated."""
+        if self.rotor_positions is None:
+            assert self.arm_length is not None
+            return self.arm_length
+        return max(math.hypot(x, y) for x, y, _ in self.rotor_positions)
 
     @property
     def enclosing_radius(self) -> float:
@@ -171,17 +291,69 @@ class Vehicle:
         possible: neighbours almost touch.
         """
         if self.extent is not None:
-            return max(self.extent, self.arm_length + (self.rotor_radius or 0.0))
-        apart = np.linalg.norm(self.rotor_positions[:, None] - self.rotor_positions[None], axis=2)
-        widest = 0.5 * float(apart[~np.eye(N_ROTORS, dtype=bool)].min())
-        return self.arm_length + (widest if self.rotor_radius is None else self.rotor_radius)
+            return max(self.extent, self._reach + (self.rotor_radius or 0.0))
+        return self._reach + (0.5 * self.closest_rotors if self.rotor_radius is None else self.rotor_radius)
+
+    @property
+    def _reach(self) -> float:
+        """Largest distance of a hub from the centre of mass [m]."""
+        if self.rotor_positions is None:
+            return self.longest_arm
+        return max(math.hypot(*hub) for hub in self.rotor_positions)
+
+    @property
+    def closest_rotors(self) -> float:
+        """Smallest distance between two hubs [m]."""
+        apart = np.linalg.norm(self.hubs[:, None] - self.hubs[None], axis=2)
+        return float(apart[~np.eye(N_ROTORS, dtype=bool)].min())
 
     @property
     def allocation(self) -> Array:
         """(4, 4) matrix that maps squared rotor speeds to [U, tau_x, tau_y, tau_z], in N and N m (Sec. 2.2)."""
-        b, d = self.thrust_coefficient, self.drag_coefficient
-        x, y, _ = self.rotor_positions.T
-        return np.stack([np.full(N_ROTORS, b), b * y, -b * x, d * np.array(self.rotor_spins, float)])
+        b, (x, y, _) = self.coefficients, self.hubs.T
+        return np.stack([b, b * y, -b * x, self.drag_to_thrust * b * np.array(self.rotor_spins, float)])
+
+
+def span(speeds: Array) -> str:
+    """Return speeds as text: from the least to the largest, or the one that all have."""
+    low, high = f"{speeds.min():.4g}", f"{speeds.max():.4g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _shares(effect: Array) -> Array:
+    """(4,) thrusts that add up to 1 while their torques cancel."""
+    return np.linalg.solve(effect, np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+def _checked(name: str, value: Any) -> Any:
+    """Return a parameter, its lists as tuples.
+
+    Raises:
+        ParameterError: it is not the number, or not the numbers, that it should be.
+    """
+    length = _LENGTHS.get(name)
+    if name == "thrust_coefficient" and isinstance(value, (tuple, list)):
+        length = N_ROTORS
+    if length is None:
+        _check_number(name, value, positive=name not in _ANY_SIGN)
+        return value
+    rule = f"a list of {length} {'lists of 3 numbers' if name == 'rotor_positions' else 'numbers'}"
+    entries = _entries(name, value, length, rule)
+    if name == "rotor_positions":
+        return tuple(_checked_numbers(name, _entries(name, entry, 3, rule)) for entry in entries)
+    return _checked_numbers(name, entries)
+
+
+def _entries(name: str, value: Any, length: int, rule: str) -> tuple[Any, ...]:
+    if not isinstance(value, (tuple, list)) or len(value) != length:
+        raise ParameterError("vehicle", name, value, rule)
+    return tuple(value)
+
+
+def _checked_numbers(name: str, numbers: tuple[Any, ...]) -> tuple[Any, ...]:
+    for number in numbers:
+        _check_number(name, number, positive=name not in _ANY_SIGN)
+    return numbers
 
 
 def _check_number(name: str, value: object, *, positive: bool) -> None:
@@ -207,16 +379,32 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
     """
     with _naming(path):
         texts, entries = _read_entries(path)
-    values: dict[str, Any] = {**texts, **{key: entry["value"] for key, entry in entries.items()}}
-    for key, value in (overrides or {}).items():
+    for key in overrides or {}:
         if key not in VEHICLE_UNITS:
             raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS, meant=MEANT.get(key, ()))
-        values[key] = value
-    missing = [name for name in ("name", *VEHICLE_UNITS) if name not in values and name not in OPTIONAL_PARAMETERS]
-    if missing:
+    values = overridden({**texts, **{key: entry["value"] for key, entry in entries.items()}}, overrides or {})
+    if missing := [name for name in ("name", *missing_parameters(values)) if name not in values]:
         raise FileError(path, f"lacks {', '.join(missing)}")
     with nullcontext() if overrides else _naming(path):
         return Vehicle(**values)
+
+
+def overridden(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters with some replaced; where these place all rotors, the other form of placing them is dropped."""
+    replaced = ARMS if "rotor_positions" in overrides else ("rotor_positions",) if set(ARMS) <= {*overrides} else ()
+    return {**values, **dict.fromkeys(name for name in replaced if name in values), **overrides}
+
+
+def altered(vehicle: Vehicle, overrides: Mapping[str, Any]) -> Vehicle:
+    """Return a vehicle with some parameters replaced, as `overridden`; errors as `Vehicle`."""
+    return Vehicle(**overridden({field.name: getattr(vehicle, field.name) for field in fields(vehicle)}, overrides))
+
+
+def missing_parameters(values: Mapping[str, Any]) -> list[str]:
+    """Return the parameters that these lack to make a vehicle."""
+    placed = values.get("rotor_positions") is not None
+    needed = [name for name in VEHICLE_UNITS if name not in OPTIONAL_PARAMETERS or (name in ARMS and not placed)]
+    return [name for name in needed if name not in values]
 
 
 @contextmanager
@@ -283,7 +471,10 @@ MEANT: Final[dict[str, tuple[str, ...]]] = {"rotor_lag": ("rotor_rise", "rotor_f
 OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if field.default is None)
 """Parameters that a vehicle file may leave out."""
 _LENGTHS: Final = {
-    **{"inertia": 3, "rotor_azimuths": N_ROTORS, "rotor_spins": N_ROTORS},
-    **{"rotor_moment": 2, "rate_damping": 3, "body_drag": 3},
+    **{"inertia": 3, "products_of_inertia": 3, "rotor_moment": 2, "rate_damping": 3, "body_drag": 3},
+    **{"rotor_azimuths": N_ROTORS, "rotor_positions": N_ROTORS, "rotor_spins": N_ROTORS},
 }
-_ANY_SIGN: Final = ("rotor_azimuths", "rotor_spins", "speed_min", "rotor_moment", "rate_damping")
+_ANY_SIGN: Final = (
+    *("rotor_azimuths", "rotor_positions", "rotor_spins", "speed_min"),
+    *("products_of_inertia", "rotor_moment", "rate_damping"),
+)

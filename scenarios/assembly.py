@@ -53,10 +53,11 @@ from quadsim.state import (
 from quadsim.vehicle import (
     AUTOPILOT,
     N_ROTORS,
-    OPTIONAL_PARAMETERS,
     VEHICLE_UNITS,
     Vehicle,
+    altered,
     load_vehicle,
+    missing_parameters,
     vehicle_autopilot,
 )
 from scenarios.courses.course import Course
@@ -147,7 +148,7 @@ class Assembly:
         try:
             path = vehicle_path(file)
         except InputError:
-            if not overrides.keys() >= VEHICLE_UNITS.keys() - set(OPTIONAL_PARAMETERS):
+            if missing_parameters(overrides):
                 raise
             return Vehicle(name=Path(file).stem, **overrides)
         return load_vehicle(path, overrides)
@@ -177,7 +178,7 @@ class Assembly:
         """
         modelled = self.vehicle
         try:
-            return replace(modelled, **self._stated)
+            return altered(modelled, self._stated)
         except ParameterError as error:
             raise ParameterError("actual", error.name, error.value, error.rule) from error
 
@@ -236,7 +237,7 @@ class Assembly:
         initial = self.scenario.initial
         if initial.rotor_speeds is not None:
             return np.array(initial.rotor_speeds)
-        return np.full(N_ROTORS, 0.0 if initial.cold else self.vehicle.hover_speed)
+        return np.zeros(N_ROTORS) if initial.cold else self.vehicle.hover_speeds
 
     # --- course ------------------------------------------------------------------------------------------------------
 

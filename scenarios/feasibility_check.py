@@ -18,7 +18,7 @@ from quadsim.flight.audit import Mask
 from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
 from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
-from quadsim.vehicle import Vehicle
+from quadsim.vehicle import Vehicle, span
 from scenarios.courses.course import Course
 from scenarios.courses.csv_course import Csv
 from scenarios.courses.smoothing import within_rounding
@@ -48,19 +48,19 @@ def report(assembly: Assembly) -> Feasibility:
     return replace(required, sentence=sentence, advice=advice, notes=(*hover_notes(assembly), *course.notes))
 
 
-def hover_speed(assembly: Assembly) -> float:
-    """Return the rotor speed [rad/s] at which the actual vehicle hovers, with its load at the start."""
+def hover_speeds(assembly: Assembly) -> Array:
+    """Return the rotor speeds (4,) [rad/s] at which the actual vehicle hovers, with its load at the start."""
     vehicle, load = assembly.actual, assembly.effects.load or Load()
-    return vehicle.hover_speed * math.sqrt(mass_properties(vehicle, load, load.payloads).mass / vehicle.mass)
+    return vehicle.hover_speeds * math.sqrt(mass_properties(vehicle, load, load.payloads).mass / vehicle.mass)
 
 
 def hover_notes(assembly: Assembly) -> tuple[str, ...]:
     """Return a note if hover needs rotor speeds outside the controller's bounds."""
-    hover, (lower, upper) = hover_speed(assembly), assembly.bounds.get("speed", (0.0, math.inf))
-    if lower <= hover <= upper:
+    hover, (lower, upper) = hover_speeds(assembly), assembly.bounds.get("speed", (0.0, math.inf))
+    if lower <= hover.min() and hover.max() <= upper:
         return ()
-    bound, side = (upper, "") if hover > upper else (lower, "at least ")
-    return (f"hover needs {hover:.4g} rad/s, the bound is {side}{bound:.4g}: no controller can hold altitude",)
+    bound, side = (upper, "") if hover.max() > upper else (lower, "at least ")
+    return (f"hover needs {span(hover)} rad/s, the bound is {side}{bound:.4g}: no controller can hold altitude",)
 
 
 def _sampled(scenario: Scenario) -> bool:

@@ -19,7 +19,7 @@ from quadsim.errors import InputError
 from quadsim.flight.metrics import unrecovered
 from quadsim.state import Array
 from scenarios.assembly import Assembly
-from scenarios.feasibility_check import hover_notes, hover_speed
+from scenarios.feasibility_check import hover_notes, hover_speeds
 from scenarios.flown import Flight
 from scenarios.infeasibility import Settings, change_text, changed_scenario
 from scenarios.schema.scenario import Scenario
@@ -143,10 +143,11 @@ def _predicting_lag(scenario: Scenario, assembly: Assembly) -> list[dict[str, An
 
 def _reaching_hover(scenario: Scenario, assembly: Assembly) -> list[dict[str, Any]]:
     """Return the change that gives the bound on rotor speeds room about hover, as far as the rotors have it."""
-    spec, vehicle, hover = scenario.controller, assembly.vehicle, hover_speed(assembly)
+    spec, vehicle, hover = scenario.controller, assembly.vehicle, hover_speeds(assembly)
     if not isinstance(spec, Constrained | Robust):
         return []
     lower, upper = spec.input_bounds.speed
-    low, high = (float(f"{(1.0 + side * HOVER_RESERVE) * hover:.4g}") for side in (-1.0, 1.0))
+    ends = (-1.0, float(hover.min())), (1.0, float(hover.max()))
+    low, high = (float(f"{(1.0 + side * HOVER_RESERVE) * speed:.4g}") for side, speed in ends)
     speeds = [max(min(lower, low), vehicle.speed_min), min(max(upper, high), max(upper, vehicle.speed_max))]
     return [{"settings": {_SPEED: speeds}, "after": None}]

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from quadsim.fields import Vector
 from quadsim.rotation import conjugate, euler_to_quaternion, exponential, logarithm, multiply, normalise
 from quadsim.sim.estimator import EstimatorSettings
 from quadsim.sim.sensing import SensorName
@@ -81,6 +81,7 @@ class Drive:
 
     acceleration: float
     torque: tuple[float, float, float]
+    turning: float  # sum of the rotors' speeds [rad/s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +90,9 @@ class MotionModel:
 
     mass: float  # m [kg]
     gravity: float  # g [m/s^2]
-    inertia: Vector  # (Ixx, Iyy, Izz) [kg m^2]
+    inertia: Array  # (3, 3) J [kg m^2]
+    moment: tuple[float, ...]  # m of the air [N m s^2/(m rad)]
+    damping: Array  # (3, 3) D [N m s/rad]
     allocation: Array  # (4, 4) from squared rotor speeds to thrust and torque
     noise: tuple[Array, Array, Array]
     """Three (15, 15) coefficients of h, h^2, h^3 in the noise accumulated over a time h; see `_gathered`."""
@@ -104,7 +107,9 @@ def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:
     return MotionModel(
         mass=vehicle.mass,
         gravity=vehicle.gravity,
-        inertia=vehicle.inertia,
+        inertia=vehicle.inertia_matrix,
+        moment=(settings.moment and vehicle.rotor_moment) or (0.0, 0.0),
+        damping=np.diag((settings.moment and vehicle.rate_damping) or (0.0, 0.0, 0.0)),
         allocation=read_only(vehicle.allocation),
         noise=_gathered(np.diag(density)),
     )
@@ -113,7 +118,8 @@ def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:
 def drive(model: MotionModel, speeds: Array) -> Drive:
     """Return the action of rotor speeds (4,) [rad/s]; rotors do not turn backwards."""
     thrust, x, y, z = (model.allocation @ np.square(np.maximum(speeds, 0.0))).tolist()
-    return Drive(acceleration=thrust / model.mass, torque=(x, y, z))
+    turning = float(np.maximum(speeds, 0.0).sum())
+    return Drive(acceleration=thrust / model.mass, torque=(x, y, z), turning=turning)
 
 
 def predict_estimate(model: MotionModel, estimate: Estimate, driven: Drive, duration: float) -> Estimate:
@@ -124,12 +130,16 @@ def predict_estimate(model: MotionModel, estimate: Estimate, driven: Drive, dura
     h, a = duration, driven.acceleration
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, p, q, r, *bias = estimate.mean.tolist()
     attitude = (qw, qx, qy, qz)
-    ixx, iyy, izz = model.inertia
-    kx, ky, kz = (izz - iyy) / ixx, (ixx - izz) / iyy, (iyy - ixx) / izz
-    tx, ty, tz = driven.torque[0] / ixx, driven.torque[1] / iyy, driven.torque[2] / izz
+    J, J_inverse = model.inertia, np.linalg.inv(model.inertia)
+    v_x, v_y, _ = Rotation.from_quat(attitude, scalar_first=True).inv().apply([vx, vy, vz])
+    across = driven.turning * np.array([model.moment[0] * v_y, -model.moment[1] * v_x, 0.0])
 
-    half = 0.5 * h
-    p1, q1, r1 = p + half * (tx - kx * q * r), q + half * (ty - ky * p * r), r + half * (tz - kz * p * q)
+    def turned(rates: Array) -> Array:
+        return J_inverse @ (driven.torque + across - model.damping @ rates - np.cross(rates, J @ rates))
+
+    half, rates = 0.5 * h, np.array([p, q, r])
+    halfway = rates + half * turned(rates)
+    p1, q1, r1 = halfway.tolist()
     quarter = 0.25 * h  # the mean rate of the first half, times its length
     w, x, y, z = multiply(attitude, exponential((quarter * (p + p1), quarter * (q + q1), quarter * (r + r1))))
     ax, ay, az = 2.0 * a * (x * z + w * y), 2.0 * a * (y * z - w * x), a * (1.0 - 2.0 * (x * x + y * y)) - model.gravity
@@ -142,9 +152,7 @@ def predict_estimate(model: MotionModel, estimate: Estimate, driven: Drive, dura
             vy + h * ay,
             vz + h * az,
             *normalise(multiply(attitude, exponential((h * p1, h * q1, h * r1)))),
-            p + h * (tx - kx * q1 * r1),
-            q + h * (ty - ky * p1 * r1),
-            r + h * (tz - kz * p1 * q1),
+            *(rates + h * turned(halfway)),
             *bias,
         ]
     )
@@ -159,15 +167,19 @@ def predict_estimate(model: MotionModel, estimate: Estimate, driven: Drive, dura
         [0.0, r1, -q1, 1.0, 0.0, 0.0],
         [-r1, 0.0, p1, 0.0, 1.0, 0.0],
         [q1, -p1, 0.0, 0.0, 0.0, 1.0],
-        [0.0, 0.0, 0.0, 0.0, -kx * r1, -kx * q1],
-        [0.0, 0.0, 0.0, -ky * r1, 0.0, -ky * p1],
-        [0.0, 0.0, 0.0, -kz * q1, -kz * p1, 0.0],
+        *np.zeros((3, 6)),
     ]
+    A[RATES_PART, RATES_PART] = J_inverse @ (_hat(J @ halfway) - _hat(halfway) @ J - model.damping)
     A *= h
     F = _EYE + A @ (_EYE + 0.5 * A @ (_EYE + A / 3.0))
     once, twice, thrice = model.noise
     noise = h * (once + h * (twice + h * thrice))
     return Estimate(mean=mean, covariance=F @ estimate.covariance @ F.T + noise)
+
+
+def _hat(vector: Array) -> Array:
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _gathered(density: Array) -> tuple[Array, Array, Array]:

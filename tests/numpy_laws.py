@@ -64,11 +64,11 @@ def thrust_ratio(height: float, radius: float) -> float:
 def rotor_drag(vehicle: Vehicle, coefficient: float, speeds: Array, turn: Rotation, air: Array, rates: Array) -> Array:
     """F_i = -k w_i v_i in each rotor's plane, v_i the air's speed at its hub: force, world, and torque, body (6,)."""
     force, torque = np.zeros(3), np.zeros(3)
-    for place, speed in zip(vehicle.rotor_positions, speeds, strict=True):
-        at_hub = turn.inv().apply(air) + np.cross(rates, place * [1.0, 1.0, 0.0])
+    for place, speed in zip(vehicle.hubs, speeds, strict=True):
+        at_hub = turn.inv().apply(air) + np.cross(rates, place)
         pull = -coefficient * speed * at_hub * [1.0, 1.0, 0.0]
         force += pull
-        torque += np.cross(place * [1.0, 1.0, 0.0], pull) * [0.0, 0.0, 1.0]
+        torque += np.cross(place, pull)
     return np.concatenate([turn.apply(force), torque])
 
 
@@ -77,8 +77,8 @@ def rotor_moment(
 ) -> Array:
     """(m_x w_i v_y, -m_y w_i v_x, 0), v each rotor's velocity through the air, body (3,)."""
     torque = np.zeros(3)
-    for place, speed in zip(vehicle.rotor_positions, speeds, strict=True):
-        across = turn.inv().apply(air) + np.cross(rates, place * [1.0, 1.0, 0.0])
+    for place, speed in zip(vehicle.hubs, speeds, strict=True):
+        across = turn.inv().apply(air) + np.cross(rates, place)
         torque += speed * np.array([moment[0] * across[1], -moment[1] * across[0], 0.0])
     return torque
 
@@ -99,8 +99,8 @@ def ground_effect(
 ) -> Array:
     """What the rotors' thrusts gain near the ground: force, world, and torque, body (6,)."""
     force, torque = 0.0, np.zeros(3)
-    for place, thrust in zip(vehicle.rotor_positions, thrusts, strict=True):
-        above = height - floor + turn.apply([place[0], place[1], disc])[2]
+    for place, thrust in zip(vehicle.hubs, thrusts, strict=True):
+        above = height - floor + turn.apply(place + np.array([0.0, 0.0, disc]))[2]
         gain = thrust * (thrust_ratio(above, radius) - 1.0)
         force += gain
         torque += np.cross([place[0], place[1], 0.0], [0.0, 0.0, gain])
@@ -110,25 +110,28 @@ def ground_effect(
 def mix(vehicle: Vehicle, settings: AutopilotSettings, thrust: float, torque: Array) -> tuple[Array, Array]:
     """The rotors' thrusts (4,) for a collective thrust and a torque (3,), and the axes that are cut."""
     assert settings.idle is not None
+    lift = 4.0 * vehicle.thrust_shares  # thrusts are in units of this, so that a collective thrust is the same for all
     low, high = (
-        vehicle.thrust_coefficient * speed**2 for speed in (settings.idle * vehicle.speed_max, vehicle.speed_max)
+        vehicle.coefficients * speed**2 / lift for speed in (settings.idle * vehicle.speed_max, vehicle.speed_max)
     )
-    to_thrusts = np.linalg.inv(vehicle.allocation / vehicle.thrust_coefficient)
+    to_thrusts = np.linalg.inv(vehicle.allocation / vehicle.coefficients) / lift[:, None]
     level, yaw = to_thrusts[:, 1:3] @ torque[:2], to_thrusts[:, 3] * torque[2]
-    base, airmode = min(max(0.25 * thrust, low), high), settings.airmode
-    reserve = high - low if airmode else min(base - low, high - base)
-    extent = float(np.ptp(level)) if airmode else float(np.abs(level).max())
-    share = min(1.0, reserve / extent) if extent else 1.0
+    base, airmode = min(max(0.25 * thrust, low.max()), high.min()), settings.airmode
+    signs = np.concatenate([np.eye(4), -np.eye(4)])
+    differences = np.eye(4)[:, None] - np.eye(4)
+    rows = differences.reshape(16, 4) if airmode else signs
+    rooms = (high[:, None] - low).ravel() if airmode else np.tile(np.minimum(base - low, high - base), 2)
+    parts = rows @ level
+    share = min([1.0, *(room / part for room, part in zip(rooms, parts, strict=True) if part > 0.0)])
     level = share * level
     # With airmode the parts need room for their differences alone: the collective thrust yields.
-    rows = [*zip(level.tolist(), yaw.tolist(), strict=True)]
-    pairs = [(a - c, b - d) for a, b in rows for c, d in rows] if airmode else [*rows, *((-a, -b) for a, b in rows)]
     least = 1e-9 * float(np.abs(yaw).max())  # rotors that turn alike differ by rounding
-    turn = max(min([1.0, *((reserve - part) / change for part, change in pairs if change > least)]), 0.0)
+    left = zip(rooms, rows @ level, rows @ yaw, strict=True)
+    turn = max(min([1.0, *((room - part) / change for room, part, change in left if change > least)]), 0.0)
     parts = level + turn * yaw
     if airmode:
-        base = min(max(base, low - float(parts.min())), high - float(parts.max()))
-    return np.clip(base + parts, low, high), np.array([share < 1.0, share < 1.0, turn < 1.0])
+        base = min(max(base, float((low - parts).max())), float((high - parts).min()))
+    return lift * np.clip(base + parts, low, high), np.array([share < 1.0, share < 1.0, turn < 1.0])
 
 
 class NumpyAutopilot:
@@ -139,7 +142,7 @@ class NumpyAutopilot:
         assert self.settings.rate is not None
         assert self.settings.delay is not None
         self.step = 1.0 / self.settings.rate
-        hover = np.full(4, vehicle.hover_speed)
+        hover = vehicle.hover_speeds
         self.integral, self.filtered, self.slope = np.zeros(3), np.zeros(3), np.zeros(3)
         self.queue = deque([hover] * round(self.settings.delay * self.settings.rate))
 
@@ -147,7 +150,7 @@ class NumpyAutopilot:
         return 1.0 - math.exp(-math.tau * cutoff * self.step) if cutoff else 1.0
 
     def speeds(self, target: Array, rates: Array, attitude: Array) -> Array:
-        s, J = self.settings, np.array(self.vehicle.inertia)
+        s, J = self.settings, self.vehicle.inertia_matrix
         assert s.largest_rate is not None
         demanded = target[1:4]
         if target.size > 4:
@@ -163,9 +166,9 @@ class NumpyAutopilot:
         self.filtered = before + self._share(s.gyro_cutoff) * (rates - before)
         self.slope = self.slope + self._share(s.d_cutoff) * ((self.filtered - before) / self.step - self.slope)
         error = demanded - self.filtered
-        torque = J * (np.array(s.p) * error + self.integral - np.array(s.d) * self.slope)
-        thrusts, cut = mix(self.vehicle, s, float(target[0]), torque + np.cross(self.filtered, J * self.filtered))
+        torque = J @ (np.array(s.p) * error + self.integral - np.array(s.d) * self.slope)
+        thrusts, cut = mix(self.vehicle, s, float(target[0]), torque + np.cross(self.filtered, J @ self.filtered))
         integral = np.clip(self.integral + self.step * np.array(s.i) * error, -np.array(s.i_max), np.array(s.i_max))
         self.integral = np.where(cut, self.integral, integral)
-        self.queue.append(np.sqrt(thrusts / self.vehicle.thrust_coefficient))
+        self.queue.append(np.sqrt(thrusts / self.vehicle.coefficients))
         return self.queue.popleft()

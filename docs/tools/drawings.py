@@ -52,8 +52,7 @@ def from_above(vehicle_name: str, cx: float, cy: float) -> list[str]:
     vehicle = load_vehicle(vehicle_name)
     parts = [arrow(cx, cy, cx, cy - 52), text(cx + 12, cy - 40, "x", colour=FORWARD)]
     parts += [arrow(cx, cy, cx - 52, cy), text(cx - 42, cy - 8, "y", colour=FORWARD)]
-    for i, (azimuth, spin) in enumerate(zip(vehicle.rotor_azimuths, vehicle.rotor_spins, strict=True), 1):
-        angle = math.radians(azimuth)
+    for i, (angle, spin) in enumerate(zip(vehicle.azimuths, vehicle.rotor_spins, strict=True), 1):
         x, y = cx - 95 * math.sin(angle), cy - 95 * math.cos(angle)
         parts.append(beam(cx, cy, x, y))
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="34" fill="none" stroke="{INK}" stroke-width="2"/>')

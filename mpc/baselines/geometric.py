@@ -142,7 +142,10 @@ class GeometricController(FeedbackLaw):
     def __init__(self, vehicle: Vehicle, period: float, settings: Geometric) -> None:
         self.commands, self._targets, self._vehicle = settings.commands, settings.commands != ROTORS, vehicle
         self.gains = gains = geometric_gains(vehicle, period, settings)
-        self._feedforward, self._drag = settings.feedforward, np.array(settings.drag)
+        self._feedforward, self._drag, self._moment = settings.feedforward, np.array(settings.drag), settings.moment
+        if settings.moment:
+            vehicle.require_moment("controller")
+        self._turning = float(vehicle.hover_speeds.sum())  # of all rotors [rad/s]
         self._largest_tilt, lags = math.radians(settings.tilt), settings.inner_lag or NO_LAG
         half = 0.5 * period
         self._ahead = half + (lags[0] if self._targets else 0.0)  # of the thrust that is fed forward
@@ -150,7 +153,9 @@ class GeometricController(FeedbackLaw):
         self._observer = None
         if settings.disturbance is not None:
             lag = lags[0] if self._targets else None
-            self._observer = RampObserver(settings.disturbance, vehicle, period, drag=settings.drag, thrust_lag=lag)
+            self._observer = RampObserver(
+                settings.disturbance, vehicle, period, drag=settings.drag, moment=settings.moment, thrust_lag=lag
+            )
         super().__init__(vehicle, period, settings, target_model(vehicle, period, lags) if self._targets else None)
         if settings.feedforward:
             self._operator = differentiator(settings.horizon, period, degree=PREVIEW_DEGREE)
@@ -222,16 +227,20 @@ class GeometricController(FeedbackLaw):
             - J (hat(Omega) R' R_c Omega_c - R' R_c Omega_c'),
 
         with the observed disturbance d, d_Omega.  Feed-forward adds the drag at the reference's velocity
-        (`desired_attitude`), and f is that of half a period later.
+        (`desired_attitude`), and f is that of half a period later.  With `moment`, M also balances `Vehicle.air_moment`
+        at the reference's velocity and rates, with rotor speeds as the root of f.
 
         Where the limits of tilt or lift change A, the desired attitude counts as constant.
         """
-        J, R, Omega = np.array(self._vehicle.inertia), motion.attitude, motion.rates
+        J, R, Omega = self._vehicle.momentum, motion.attitude, motion.rates
         thrust, desired = self._force(motion, target, integrals, disturbance)
         e_R, e_Omega = attitude_error(R, desired.attitude), rate_error(R, Omega, desired.attitude, desired.rates)
         R_rel = R.T @ desired.attitude
         ahead = np.cross(Omega, R_rel @ desired.rates) - R_rel @ desired.acceleration + disturbance[2]
-        moment = np.cross(Omega, J * Omega) - J * (self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
+        moment = np.cross(Omega, J(Omega)) - J(self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
+        if self._moment:
+            turning = self._turning * math.sqrt(max(thrust, 0.0) / (self._vehicle.mass * self._vehicle.gravity))
+            moment -= self._vehicle.air_moment(turning, R.T @ target.velocity, R_rel @ desired.rates)
         return np.concatenate([[thrust], moment]), desired
 
     def targets(
@@ -361,6 +370,10 @@ class Geometric(Tuned):
         Len(3, 3),
         doc("[1/s] linear drag along body x, y, z that feedforward compensates"),
     ] = (0.0, 0.0, 0.0)
+    moment: Annotated[
+        bool,
+        doc("whether feedforward balances the vehicle's rotor_moment and rate_damping, at the reference's motion"),
+    ] = False
     disturbance: Annotated[RampSettings | None, doc("absent: no disturbance observer")] = None
     indi: Annotated[INDISettings | None, doc("absent: rotors hold each command for a period")] = None
     commands: Annotated[
@@ -377,6 +390,8 @@ class Geometric(Tuned):
         require_one_scale(self.indi, self.disturbance)
         if any(self.drag) and not self.feedforward:
             raise ParameterError("", "drag", [*self.drag], "zero where feedforward is not true")
+        if self.moment and (not self.feedforward or self.commands != ROTORS):
+            raise ParameterError("", "moment", True, 'false where feedforward is not true or commands is not "rotors"')
         if self.feedforward and self.horizon <= PREVIEW_DEGREE:
             rule = f"at least {PREVIEW_DEGREE + 1} where feedforward is true"
             raise ParameterError("", "horizon", self.horizon, rule)

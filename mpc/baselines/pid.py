@@ -74,11 +74,10 @@ class CascadedPID(FeedbackLaw):
 
     def __init__(self, vehicle: Vehicle, period: float, settings: PID) -> None:
         self.gains, self._vehicle = pid_gains(vehicle, period=period, lag=settings.lag), vehicle
-        self._inertia = np.array(vehicle.inertia)
         self._largest_velocity, self._largest_tilt = settings.velocity, math.radians(settings.tilt)
         super().__init__(vehicle, period, settings)
         self.allocation = make_allocation(vehicle)
-        highest = 4.0 * vehicle.thrust_coefficient * float(self.bounds.u_max.min()) ** 2
+        highest = vehicle.level_thrust(float(self.bounds.u_max.min()))
         self._largest = thrust_to_command(highest, vehicle.mass * vehicle.gravity, LARGEST_THRUST)
 
     def reset(self, speeds: Array) -> None:
@@ -107,16 +106,17 @@ class CascadedPID(FeedbackLaw):
         Returns:
             (4,) rotor speeds [rad/s], and the loops' new state.
         """
-        motion, k, inertia, period = motion_of(state), self.gains.bandwidths, self._inertia, self._period
+        motion, k, period = motion_of(state), self.gains.bandwidths, self._period
         force, velocity_integral = self._velocity_loop(memory, motion, target)
         turning = np.zeros(3) if memory.rates is None else (motion.rates - memory.rates) / period
         error = self._desired_rates(motion, force, target) - motion.rates
         proportional = np.array([k.rate, k.rate, k.yaw_rate])
         acceleration = proportional * error + memory.rate_integral - self.gains.rate_derivative * turning
-        wrench = np.concatenate([[np.linalg.norm(force)], inertia * acceleration])
+        wrench = np.concatenate([[np.linalg.norm(force)], self._vehicle.momentum(acceleration)])
         speeds = allocate(self.allocation, wrench, lower, upper)
         # Anti-windup: an integral stops where it would ask for more than the mixer can give.
-        missed = acceleration - (self.allocation.M @ np.square(speeds))[1:] / inertia
+        given = self._vehicle.angular_acceleration((self.allocation.M @ np.square(speeds))[1:])
+        missed = acceleration - given
         windup = missed * error > 1e-9 * (1.0 + np.abs(acceleration)) * np.abs(error)
         summed = np.where(windup, 0.0, error)
         return speeds, Memory(

@@ -155,8 +155,9 @@ class NonlinearMPC:
             quadratic_drag=np.array(settings.quadratic_drag),
         )
         self._inverse = np.linalg.inv(self._model.effectiveness)
-        self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
-        self._level = np.full(N_ROTORS, vehicle.hover_speed)
+        lifts = vehicle.mass * vehicle.gravity * vehicle.thrust_shares
+        self._hover = lifts * (vehicle.mean_coefficient / vehicle.coefficients)  # of rotors with the mean coefficient
+        self._level = vehicle.hover_speeds
         if self._targets:
             self._level = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._lag = lags[0] if self._targets else rotor_lag  # of actuator states [s]
@@ -206,7 +207,7 @@ class NonlinearMPC:
         """Return the inputs for commands (..., 4): rotor speeds [rad/s] or targets [N], [rad/s]."""
         if self._targets:
             return speeds / self._model.scale
-        return self._model.shares(self._vehicle.thrust_coefficient * np.square(speeds))
+        return self._model.shares(self._vehicle.mean_coefficient * np.square(speeds))
 
     @property
     def _in_force(self) -> Array | float:
@@ -220,7 +221,7 @@ class NonlinearMPC:
         """Return the commands of inputs: rotor speeds [rad/s] or targets [N], [rad/s]."""
         if self._targets:
             return shares * self._model.scale
-        return np.sqrt(self._model.thrusts(np.maximum(shares, 0.0)) / self._vehicle.thrust_coefficient)
+        return np.sqrt(self._model.thrusts(np.maximum(shares, 0.0)) / self._vehicle.mean_coefficient)
 
     def _problem(self, constraints: tuple[Constraint, ...]) -> Problem:
         settings, model = self.settings, self._model

@@ -68,7 +68,7 @@ def nonlinear_model(
     """The vehicle's model, undisturbed; see `NonlinearModel`."""
     ixx, iyy, izz = vehicle.inertia
     return NonlinearModel(
-        effectiveness=read_only(vehicle.allocation / np.array([vehicle.mass, ixx, iyy, izz])[:, None]),
+        effectiveness=read_only(vehicle.accelerations(vehicle.allocation)),
         gyration=read_only(np.array([(iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz])),
         gravity=vehicle.gravity,
         period=period,

@@ -30,7 +30,7 @@ def nodes_of_motion(motion: Motion, horizon: int, stride: int) -> Nodes:
     return Nodes(states, motion.thrusts[with_inputs])
 
 
-def nodes_of_preview(reference: Array, horizon: int, stride: int, period: float, hover: float) -> Nodes:
+def nodes_of_preview(reference: Array, horizon: int, stride: int, period: float, hover: Array) -> Nodes:
     """Take x, y, z, yaw (N stride, 4) from t_{k+1} on: velocity by differences, level, rotor thrusts `hover` [N].
 
     The first node, which has no cost, is extrapolated from the first two samples.

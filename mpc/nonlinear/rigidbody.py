@@ -127,10 +127,9 @@ class RigidBody:
 
 def rigid_body(vehicle: Vehicle, step: float, **others: object) -> RigidBody:
     """Return the vehicle's model, undisturbed; `others` sets fields of `RigidBody`."""
-    resistance = np.array([vehicle.mass, *vehicle.inertia])
     return RigidBody(
-        effectiveness=read_only(vehicle.allocation / vehicle.thrust_coefficient / resistance[:, None]),
-        largest_thrust=vehicle.thrust_coefficient * vehicle.speed_max**2,
+        effectiveness=read_only(vehicle.accelerations(vehicle.allocation / vehicle.mean_coefficient)),
+        largest_thrust=vehicle.mean_coefficient * vehicle.speed_max**2,
         inertia=read_only(np.array(vehicle.inertia)),
         mass=vehicle.mass,
         gravity=vehicle.gravity,

@@ -32,7 +32,7 @@ from mpc.ocp import Equilibrium, Problem, Query
 from mpc.robust.settings import LONGEST_SPAN, Robust, split_delay
 from quadsim.controller import Phase, StepInputs
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, ReferenceTurns, all_true
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.vehicle import Vehicle
 
 _SAME_TIME: Final = 1e-6  # [s]
 _YAW: Final = INDEX["yaw"]
@@ -61,7 +61,7 @@ class RobustPreparation:
         observing = settings.offset_free
         self._observer = None if observing is None else DisturbanceObserver(observing, period)
         self._turns = ReferenceTurns()
-        self.reset(np.full(N_ROTORS, vehicle.hover_speed))
+        self.reset(vehicle.hover_speeds)
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""

@@ -65,14 +65,77 @@ static void horner(square A, square B, double divisor)
     memcpy(B, product, sizeof product);
 }
 
+static int is_diagonal(const quadsim_filter *f)
+{
+    return f->products[0] == 0.0 && f->products[1] == 0.0 && f->products[2] == 0.0;
+}
+
+static void turn_by_inverse(const quadsim_filter *f, const double *torque, double *result)
+{
+    for (int i = 0; i < 3; i++) {
+        result[i] = f->inverse[i][0] * torque[0] + f->inverse[i][1] * torque[1] + f->inverse[i][2] * torque[2];
+    }
+}
+
+/* Angular acceleration at body rates under a torque, damped. */
+static void turn_at(const quadsim_filter *f, const double *torque, const double *rates, double *result)
+{
+    const double *J = f->inertia, p = rates[0], q = rates[1], r = rates[2];
+    double momentum[3], gyroscopic[3], net[3];
+    for (int i = 0; i < 3; i++) {
+        net[i] = torque[i] - f->rate_damping[i] * rates[i];
+    }
+    if (is_diagonal(f)) {
+        result[0] = net[0] / J[0] - (J[2] - J[1]) / J[0] * q * r;
+        result[1] = net[1] / J[1] - (J[0] - J[2]) / J[1] * p * r;
+        result[2] = net[2] / J[2] - (J[1] - J[0]) / J[2] * p * q;
+        return;
+    }
+    times_inertia(J, f->products, rates, momentum);
+    cross(rates, momentum, gyroscopic);
+    for (int i = 0; i < 3; i++) {
+        net[i] -= gyroscopic[i];
+    }
+    turn_by_inverse(f, net, result);
+}
+
+/* The derivative of `turn_at` in the rates. */
+static void turn_slope(const quadsim_filter *f, const double *rates, double slope[3][3])
+{
+    const double *J = f->inertia, p = rates[0], q = rates[1], r = rates[2];
+    const double k[3] = {(J[2] - J[1]) / J[0], (J[0] - J[2]) / J[1], (J[1] - J[0]) / J[2]};
+    const double plain[3][3] = {{0.0, -k[0] * r, -k[0] * q}, {-k[1] * r, 0.0, -k[1] * p}, {-k[2] * q, -k[2] * p, 0.0}};
+    double momentum[3];
+    memcpy(slope, plain, sizeof plain);
+    times_inertia(J, f->products, rates, momentum);
+    for (int j = 0; j < 3; j++) {
+        if (is_diagonal(f)) {
+            slope[j][j] -= f->rate_damping[j] / J[j];
+            continue;
+        }
+        double unit[3] = {0.0}, column[3], one[3], other[3];
+        unit[j] = 1.0;
+        times_inertia(J, f->products, unit, column);
+        cross(rates, column, one);
+        cross(unit, momentum, other);
+        for (int i = 0; i < 3; i++) {
+            one[i] = -one[i] - other[i] - (i == j ? f->rate_damping[j] : 0.0);
+        }
+        turn_by_inverse(f, one, column);
+        for (int i = 0; i < 3; i++) {
+            slope[i][j] = column[i];
+        }
+    }
+}
+
 static void predict(const quadsim_filter *f, quadsim_track *t, double acceleration, const double *torque, double h)
 {
-    const double *J = f->inertia, *rate = t->mean + MEAN_RATES, a = acceleration;
+    const double *rate = t->mean + MEAN_RATES, a = acceleration;
     const double p = rate[0], q = rate[1], r = rate[2], half = 0.5 * h, quarter = 0.25 * h;
-    const double k[3] = {(J[2] - J[1]) / J[0], (J[0] - J[2]) / J[1], (J[1] - J[0]) / J[2]};
-    const double spin[3] = {torque[0] / J[0], torque[1] / J[1], torque[2] / J[2]};
-    const double p1 = p + half * (spin[0] - k[0] * q * r), q1 = q + half * (spin[1] - k[1] * p * r);
-    const double r1 = r + half * (spin[2] - k[2] * p * q);
+    double turn[3];
+    turn_at(f, torque, rate, turn);
+    const double p1 = p + half * turn[0], q1 = q + half * turn[1], r1 = r + half * turn[2];
+    const double halfway[3] = {p1, q1, r1};
     const double to_middle[3] = {quarter * (p + p1), quarter * (q + q1), quarter * (r + r1)};
     const double to_end[3] = {h * p1, h * q1, h * r1};
     double middle[4], turned[4], after[MEAN];
@@ -89,17 +152,18 @@ static void predict(const quadsim_filter *f, quadsim_track *t, double accelerati
     exponential(to_end, turned);
     multiply(t->mean + QUATERNION, turned, after + QUATERNION);
     normalise(after + QUATERNION);
-    after[MEAN_RATES] = p + h * (spin[0] - k[0] * q1 * r1);
-    after[MEAN_RATES + 1] = q + h * (spin[1] - k[1] * p1 * r1);
-    after[MEAN_RATES + 2] = r + h * (spin[2] - k[2] * p1 * q1);
+    turn_at(f, torque, halfway, turn);
+    after[MEAN_RATES] = p + h * turn[0];
+    after[MEAN_RATES + 1] = q + h * turn[1];
+    after[MEAN_RATES + 2] = r + h * turn[2];
     memcpy(t->mean, after, sizeof after);
 
     const double lift[3][2] = {{-2.0 * a * (x * y - w * z), a * (1.0 - 2.0 * (y * y + z * z))},
                                {-a * (1.0 - 2.0 * (x * x + z * z)), 2.0 * a * (x * y + w * z)},
                                {-2.0 * a * (y * z + w * x), 2.0 * a * (x * z - w * y)}};
     const double turning[3][3] = {{0.0, r1, -q1}, {-r1, 0.0, p1}, {q1, -p1, 0.0}};
-    const double spinning[3][3] = {{0.0, -k[0] * r1, -k[0] * q1}, {-k[1] * r1, 0.0, -k[1] * p1},
-                                   {-k[2] * q1, -k[2] * p1, 0.0}};
+    double spinning[3][3];
+    turn_slope(f, halfway, spinning);
     square A = {{0.0}}, F = {{0.0}};
     for (int i = 0; i < 3; i++) {
         A[P_ + i][V_ + i] = A[THETA + i][OMEGA + i] = h;
@@ -164,6 +228,16 @@ static int alike(const double *commands, const uint8_t *grounded, int64_t one, i
            && !memcmp(commands + ROTORS * one, commands + ROTORS * other, ROTORS * sizeof *commands);
 }
 
+/* The moment of the rotors at the mean's velocity, for the sum of their speeds; the covariance knows nothing of it. */
+static void add_rotor_moment(const quadsim_filter *f, const quadsim_track *t, double turning, double *torque)
+{
+    double R[3][3];
+    const double *v = t->mean + V_;
+    to_matrix(t->mean + QUATERNION, R);
+    torque[0] += f->rotor_moment[0] * turning * (R[0][1] * v[0] + R[1][1] * v[1] + R[2][1] * v[2]);
+    torque[1] -= f->rotor_moment[1] * turning * (R[0][0] * v[0] + R[1][0] * v[1] + R[2][0] * v[2]);
+}
+
 static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *commands, const uint8_t *grounded, int64_t base,
                        int64_t step)
 {
@@ -173,13 +247,15 @@ static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *
         while (length < f->stride && t->step + length < step && alike(commands, grounded, first, first + length)) {
             length++;
         }
-        double wrench[4] = {0.0}, mean[MEAN];
+        double wrench[4] = {0.0}, mean[MEAN], turning = 0.0;
         for (int i = 0; i < 4; i++) {
             for (int j = 0; j < ROTORS; j++) {
                 const double speed = fmax(commands[ROTORS * first + j], 0.0);
                 wrench[i] += f->allocation[i][j] * (speed * speed);
+                turning += i == 0 ? speed : 0.0;
             }
         }
+        add_rotor_moment(f, t, turning, wrench + 1);
         memcpy(mean, t->mean, sizeof mean);
         const double acceleration = wrench[0] / f->mass, h = (double)length * f->timestep;
         if (grounded[first] && !(acceleration > f->gravity)) {

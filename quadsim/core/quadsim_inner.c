@@ -16,45 +16,60 @@ static double clip(double number, double low, double high) /* what is no number 
 
 /* ---- autopilot --------------------------------------------------------------------------------------------------- */
 
+/* The parts of a torque need room: with airmode each pair's difference, else the size of each part, either way. */
+static double part_of(const quadsim_inner *a, const double *parts, int i, int j)
+{
+    return a->airmode ? parts[i] - parts[j] : j ? -parts[i] : parts[i];
+}
+
+static double room_of(const quadsim_inner *a, double base, int i, int j)
+{
+    return a->airmode ? a->high[i] - a->low[j] : fmin(base - a->low[i], a->high[i] - base);
+}
+
 /* Thrusts for a collective thrust and a torque; `cut` says which torques are smaller than demanded. */
 static void mix(const quadsim_inner *a, double thrust, const double *torque, double *thrusts, int *cut)
 {
-    double level[ROTORS], yaw[ROTORS], turning = 1.0, least = INFINITY, most = -INFINITY, largest = 0.0;
-    double base = clip(0.25 * thrust, a->low, a->high);
-    const double room = a->airmode ? a->high - a->low : fmin(base - a->low, a->high - base);
+    double level[ROTORS], yaw[ROTORS], share = 1.0, turning = 1.0, largest = 0.0;
+    double slowest = -INFINITY, fastest = INFINITY; /* of all rotors alike */
+    for (int i = 0; i < ROTORS; i++) {
+        slowest = fmax(slowest, a->low[i]);
+        fastest = fmin(fastest, a->high[i]);
+    }
+    double base = clip(0.25 * thrust, slowest, fastest);
     for (int i = 0; i < ROTORS; i++) {
         level[i] = a->to_thrusts[i][1] * torque[0] + a->to_thrusts[i][2] * torque[1];
         yaw[i] = a->to_thrusts[i][3] * torque[2];
         largest = fmax(largest, fabs(yaw[i]));
-        least = fmin(least, level[i]);
-        most = fmax(most, level[i]);
     }
-    const double extent = a->airmode ? most - least : fmax(most, -least);
-    const double share = extent != 0.0 ? fmin(1.0, room / extent) : 1.0;
+    for (int i = 0; i < ROTORS; i++) {
+        for (int j = 0; j < ROTORS; j++) {
+            const double extent = part_of(a, level, i, j);
+            share = extent > 0.0 ? fmin(share, room_of(a, base, i, j) / extent) : share;
+        }
+    }
     for (int i = 0; i < ROTORS; i++) {
         level[i] *= share;
     }
     for (int i = 0; i < ROTORS; i++) {
-        for (int j = 0; j < ROTORS; j++) { /* with airmode each pair's difference needs room, else each part's size */
-            const double sign = j ? -1.0 : 1.0;
-            const double part = a->airmode ? level[i] - level[j] : sign * level[i];
-            const double change = a->airmode ? yaw[i] - yaw[j] : sign * yaw[i];
+        for (int j = 0; j < ROTORS; j++) {
+            const double change = part_of(a, yaw, i, j);
             if (change > 1e-9 * largest) { /* rotors that turn alike differ by rounding */
-                turning = fmin(turning, (room - part) / change);
+                turning = fmin(turning, (room_of(a, base, i, j) - part_of(a, level, i, j)) / change);
             }
         }
     }
     turning = fmax(turning, 0.0);
-    least = INFINITY;
-    most = -INFINITY;
+    slowest = -INFINITY;
+    fastest = INFINITY;
     for (int i = 0; i < ROTORS; i++) {
         level[i] += turning * yaw[i];
-        least = fmin(least, level[i]);
-        most = fmax(most, level[i]);
+        slowest = fmax(slowest, a->low[i] - level[i]);
+        fastest = fmin(fastest, a->high[i] - level[i]);
     }
-    base = a->airmode ? clip(base, a->low - least, a->high - most) : base;
+    base = a->airmode ? clip(base, slowest, fastest) : base;
     for (int i = 0; i < ROTORS; i++) {
-        thrusts[i] = clip(base + level[i], a->low, a->high);
+        thrusts[i] = clip(base + level[i], a->low[i], a->high[i]);
     }
     cut[0] = cut[1] = share < 1.0;
     cut[2] = turning < 1.0;
@@ -62,7 +77,7 @@ static void mix(const quadsim_inner *a, double thrust, const double *torque, dou
 
 static void fly_autopilot(quadsim_inner *a, const double *rates, const double *attitude)
 {
-    double error[4], target[3], torque[3], momentum[3], gyroscopic[3], thrusts[ROTORS], answer[ROTORS];
+    double error[4], target[3], acceleration[3], torque[3], momentum[3], gyroscopic[3], thrusts[ROTORS], answer[ROTORS];
     int cut[3];
     memcpy(target, a->command + 1, sizeof target);
     if (a->holds_attitude) {
@@ -77,12 +92,16 @@ static void fly_autopilot(quadsim_inner *a, const double *rates, const double *a
         const double before = a->filtered[i];
         a->filtered[i] += a->gyro_share * (rates[i] - before);
         a->slope[i] += a->d_share * ((a->filtered[i] - before) / a->step - a->slope[i]);
-        momentum[i] = a->inertia[i] * a->filtered[i];
     }
+    times_inertia(a->inertia, a->products, a->filtered, momentum);
     cross(a->filtered, momentum, gyroscopic);
     for (int i = 0; i < 3; i++) {
         target[i] -= a->filtered[i]; /* the error from here on */
-        torque[i] = a->inertia[i] * (a->p[i] * target[i] + a->integral[i] - a->d[i] * a->slope[i]) + gyroscopic[i];
+        acceleration[i] = a->p[i] * target[i] + a->integral[i] - a->d[i] * a->slope[i];
+    }
+    times_inertia(a->inertia, a->products, acceleration, torque);
+    for (int i = 0; i < 3; i++) {
+        torque[i] += gyroscopic[i];
     }
     mix(a, a->command[0], torque, thrusts, cut);
     for (int i = 0; i < 3; i++) {
@@ -91,7 +110,7 @@ static void fly_autopilot(quadsim_inner *a, const double *rates, const double *a
         }
     }
     for (int i = 0; i < ROTORS; i++) {
-        answer[i] = sqrt(thrusts[i] / a->coefficient);
+        answer[i] = sqrt(thrusts[i] / a->coefficient[i]);
     }
     if (a->delay > 0) {
         double *oldest = a->queue + ROTORS * a->oldest;
@@ -227,20 +246,22 @@ void quadsim_allocate(const quadsim_inner *a, const double *wrench, double *spee
 
 static void invert_dynamics(quadsim_inner *a, double time, const double *rates, const double *rotors)
 {
-    double wrench[4] = {0.0}, middle[3], momentum[3], gyroscopic[3];
+    double wrench[4] = {0.0}, middle[3], change[3], gained[3], momentum[3], gyroscopic[3];
     if (a->started && time > a->last_time) {
         const double step = time - a->last_time, w = a->omega;
         for (int i = 0; i < 3; i++) {
             middle[i] = 0.5 * (rates[i] + a->last_rates[i]);
-            momentum[i] = a->inertia[i] * middle[i];
+            change[i] = rates[i] - a->last_rates[i];
         }
+        times_inertia(a->inertia, a->products, middle, momentum);
+        times_inertia(a->inertia, a->products, change, gained);
         cross(middle, momentum, gyroscopic);
         for (int i = 0; i < 3; i++) {
             double torque = 0.0;
             for (int j = 0; j < ROTORS; j++) {
                 torque += a->effect[1 + i][j] * (rotors[j] * rotors[j]);
             }
-            const double missed = torque - a->inertia[i] * (rates[i] - a->last_rates[i]) / step - gyroscopic[i];
+            const double missed = torque - gained[i] / step - gyroscopic[i];
             a->slope[i] = (a->slope[i] + step * (w * w) * (missed - a->filtered[i]))
                           / (1.0 + 2.0 * DAMPING * w * step + (w * step) * (w * step));
             a->filtered[i] += step * a->slope[i];

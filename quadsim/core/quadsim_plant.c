@@ -19,7 +19,7 @@ static const double LOWEST_RATIO = 0.5; /* lowest height of a rotor, in radii, a
 /* What a step's rotors give whatever the motion: sums of their speeds, and of speed by place; drag about z, angular
  * momentum, spin-up torque. */
 typedef struct {
-    double thrust[ROTORS], drag, drag_x, drag_y, drag_xy, turning, turning_x, turning_y, momentum, spin_up;
+    double thrust[ROTORS], speed[ROTORS], drag, drag_x, drag_y, drag_xy, turning, turning_x, turning_y, momentum, spin_up;
 } rotor_state;
 
 static double clip(double number, double low, double high) /* what is no number stays so */
@@ -81,7 +81,7 @@ static double discharge(quadsim_vehicle *v, const double *speeds, double *row)
     double demand = 0.0;
     for (int i = 0; i < ROTORS; i++) {
         const double ratio = speeds[i] / v->hover;
-        demand += v->efficiency[i] * ratio * (ratio * ratio);
+        demand += v->efficiency[i] * v->demand[i] * ratio * (ratio * ratio);
     }
     const double conductance = v->hover_current * (demand / ROTORS) / (v->reference_voltage * v->reference_voltage);
     const double rest = fmax(open_circuit(v) - v->resistance * v->idle_current, 0.0);
@@ -92,31 +92,32 @@ static double discharge(quadsim_vehicle *v, const double *speeds, double *row)
     return pow(voltage / v->reference_voltage, v->exponent);
 }
 
-static double noisy(const quadsim_vehicle *v, double thrust, double draw)
+static double noisy(const quadsim_vehicle *v, double thrust, double largest, double draw)
 {
-    const double share = thrust / v->largest;
+    const double share = thrust / largest;
     const double left = share - (v->loss * (share * share) + v->deviation * sqrt(share) * draw);
-    return v->largest * clip(left, 0.0, 1.0);
+    return largest * clip(left, 0.0, 1.0);
 }
 
 /* Turn the rotors for a step; it writes speeds, thrust and battery. */
 static rotor_state drive_rotors(quadsim_vehicle *v, const quadsim_steps *rows, int64_t row)
 {
-    rotor_state state = {{0.0}, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+    rotor_state state = {{0.0}, {0.0}, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     double midway[ROTORS], slope[ROTORS], factor = 1.0, total = 0.0;
     turn(v, rows->speeds + rows->width * row, midway, slope);
     if (v->cells > 0.0) {
         factor = discharge(v, midway, rows->battery + rows->width * row);
     }
     for (int i = 0; i < ROTORS; i++) {
-        double thrust = v->efficiency[i] * v->coefficient * (midway[i] * midway[i]) * factor;
-        if (v->largest > 0.0) {
-            thrust = noisy(v, thrust, rows->noise[ROTORS * row + i]);
+        double thrust = v->efficiency[i] * v->coefficient[i] * (midway[i] * midway[i]) * factor;
+        if (v->largest[i] > 0.0) {
+            thrust = noisy(v, thrust, v->largest[i], rows->noise[ROTORS * row + i]);
         }
         state.thrust[i] = thrust;
         total += thrust;
         if (v->efficiency[i] > 0.0) { /* a lost propeller has neither drag nor momentum */
             const double x = v->place[i][0], y = v->place[i][1], k = v->rotor_drag, inertia = v->rotor_inertia;
+            state.speed[i] = midway[i];
             state.drag += midway[i] * k;
             state.drag_x += midway[i] * (k * x);
             state.drag_y += midway[i] * (k * y);
@@ -169,10 +170,10 @@ static void add_pushes(const quadsim_vehicle *v, double R[3][3], double *wrench)
 
 static void add_ground_effect(const quadsim_vehicle *v, double R[3][3], double height, const double *thrust, double *wrench)
 {
-    const double above = height - v->floor + R[2][2] * v->disc;
     double lift = 0.0;
     for (int i = 0; i < ROTORS; i++) {
         const double x = v->place[i][0], y = v->place[i][1];
+        const double above = height - v->floor + R[2][2] * (v->disc + v->place[i][2]);
         const double gain = thrust[i] * (thrust_ratio(above + R[2][0] * x + R[2][1] * y, v->radius) - 1.0);
         lift += gain;
         wrench[3] += y * gain;
@@ -180,6 +181,25 @@ static void add_ground_effect(const quadsim_vehicle *v, double R[3][3], double h
     }
     for (int i = 0; i < 3; i++) {
         wrench[i] += R[i][2] * lift;
+    }
+}
+
+/* What the height of the hubs adds to drag and moment of the rotors, with `along` the velocity of the air along x and y. */
+static void add_height(const quadsim_vehicle *v, double R[3][3], const double *along, const double *rate,
+                       const double *speed, double *wrench)
+{
+    for (int i = 0; i < ROTORS; i++) {
+        const double x = v->place[i][0], y = v->place[i][1], z = v->place[i][2], drag = v->rotor_drag * speed[i];
+        if (z == 0.0) {
+            continue;
+        }
+        const double back = rate[1] * z, left = -rate[0] * z; /* of the hub's velocity */
+        wrench[3] += z * drag * (along[1] + rate[2] * x + left) + v->rotor_moment[0] * speed[i] * left;
+        wrench[4] -= z * drag * (along[0] - rate[2] * y + back) + v->rotor_moment[1] * speed[i] * back;
+        wrench[5] += drag * (y * back - x * left);
+        for (int j = 0; j < 3; j++) {
+            wrench[j] -= drag * (R[j][0] * back + R[j][1] * left);
+        }
     }
 }
 
@@ -212,6 +232,7 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
     add_along_axes(v, R, air, wrench);
     wrench[3] += v->rotor_moment[0] * (along[1] * rotors->turning + rate[2] * rotors->turning_x);
     wrench[4] -= v->rotor_moment[1] * (along[0] * rotors->turning - rate[2] * rotors->turning_y);
+    add_height(v, R, along, rate, rotors->speed, wrench);
     add_pushes(v, R, wrench);
     if (v->radius > 0.0) {
         add_ground_effect(v, R, pose[2], rotors->thrust, wrench);
@@ -262,7 +283,7 @@ static void derive(const quadsim_vehicle *v, const double *x, const rotor_state 
                    const double *held, double *wrench, double *rate)
 {
     const double *q = x + 3, *w = x + 10, *T = rotors->thrust, *J = v->inertia, m = v->mass;
-    double torque[3], load[WRENCH];
+    double torque[3], load[WRENCH], momentum[3], gyroscopic[3];
     const double lift = T[0] + T[1] + T[2] + T[3];
     forces_at(v, x, x + 7, rotors, wind, wrench);
     for (int i = 0; i < 3; i++) {
@@ -279,6 +300,17 @@ static void derive(const quadsim_vehicle *v, const double *x, const rotor_state 
     rate[7] = (2.0 * (q[1] * q[3] + q[0] * q[2]) * lift + load[0]) / m;
     rate[8] = (2.0 * (q[2] * q[3] - q[0] * q[1]) * lift + load[1]) / m;
     rate[9] = ((1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2])) * lift + load[2]) / m - v->gravity;
+    if (v->products[0] != 0.0 || v->products[1] != 0.0 || v->products[2] != 0.0) {
+        times_inertia(J, v->products, w, momentum);
+        cross(w, momentum, gyroscopic);
+        for (int i = 0; i < 3; i++) {
+            rate[10 + i] = 0.0;
+            for (int j = 0; j < 3; j++) {
+                rate[10 + i] += v->inverse[i][j] * (torque[j] + load[3 + j] - gyroscopic[j]);
+            }
+        }
+        return;
+    }
     rate[10] = (torque[0] + load[3] - (J[2] - J[1]) * w[1] * w[2]) / J[0];
     rate[11] = (torque[1] + load[4] - (J[0] - J[2]) * w[2] * w[0]) / J[1];
     rate[12] = (torque[2] + load[5] - (J[1] - J[0]) * w[0] * w[1]) / J[2];

@@ -46,11 +46,12 @@ typedef struct quadsim_vehicle {
     double timestep, plausible, fastest_valid; /* largest magnitudes of a state, and of an inner loop's answer */
 
     /* constants */
-    double mass, gravity, inertia[3], torque_of_thrust[3][ROTORS]; /* of the own method */
-    double coefficient, hover, slowest, fastest, place[ROTORS][2], spin[ROTORS];
+    double mass, gravity, inertia[3], products[3], inverse[3][3], torque_of_thrust[3][ROTORS]; /* of the own method */
+    double coefficient[ROTORS], hover, demand[ROTORS]; /* demand: of power at hover, over the mean rotor's */
+    double slowest, fastest, place[ROTORS][3], spin[ROTORS];
     double rotor_drag, rotor_inertia, rotor_moment[2], rate_damping[3], linear_drag[3], quadratic_drag[3];
     double floor, disc, radius;      /* of the ground effect; radius 0: none */
-    double loss, deviation, largest; /* of thrust noise; largest 0: none */
+    double loss, deviation, largest[ROTORS]; /* of thrust noise; largest 0: none */
     double cells, capacity, resistance, hover_current, idle_current, reference_voltage, exponent; /* cells 0: none */
     const double *curve;             /* [points][2] charge and voltage of a cell */
     int64_t points;
@@ -72,10 +73,10 @@ typedef struct quadsim_inner {
     int64_t kind, stride, until, measures; /* steps between calls, and to the next; whether it hears sensors */
     double command[8], answer[ROTORS];
     int64_t holds_attitude;
-    double step, inertia[3], integral[3], filtered[3], slope[3];
-    /* autopilot */
+    double step, inertia[3], products[3], integral[3], filtered[3], slope[3];
+    /* autopilot; thrusts over four times the rotor's share of the weight, so that hover is the same for all */
     double p[3], i[3], d[3], i_max[3], attitude[3], largest[3], gyro_share, d_share;
-    double to_thrusts[ROTORS][4], coefficient, low, high;
+    double to_thrusts[ROTORS][4], coefficient[ROTORS], low[ROTORS], high[ROTORS];
     int64_t airmode, delay, oldest;
     double *queue; /* [delay][4] */
     /* incremental nonlinear dynamic inversion */
@@ -137,7 +138,8 @@ void quadsim_allocate(const quadsim_inner *loop, const double *wrench, double *s
 /* ---- the error-state filter -------------------------------------------------------------------------------------- */
 
 typedef struct quadsim_filter {
-    double timestep, mass, gravity, inertia[3], allocation[4][ROTORS];
+    double timestep, mass, gravity, inertia[3], products[3], inverse[3][3], allocation[4][ROTORS];
+    double rotor_moment[2], rate_damping[3];
     double density[5]; /* of white noise on the five blocks of the error */
     double variance[SENSORS][3], initial[ERRORS], gate, patience; /* patience in steps */
     int64_t stride;    /* longest prediction, in steps */

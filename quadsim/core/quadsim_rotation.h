@@ -4,6 +4,20 @@
 
 #include <math.h>
 
+/* Angular momentum of body rates: J x, J of moments (3) and products xy, xz, yz of inertia (3). */
+static inline void times_inertia(const double *moments, const double *products, const double *x, double *result)
+{
+    const double *o = products, a = x[0], b = x[1], c = x[2];
+    result[0] = moments[0] * a;
+    result[1] = moments[1] * b;
+    result[2] = moments[2] * c;
+    if (o[0] != 0.0 || o[1] != 0.0 || o[2] != 0.0) {
+        result[0] += o[0] * b + o[1] * c;
+        result[1] += o[0] * a + o[2] * c;
+        result[2] += o[1] * a + o[2] * b;
+    }
+}
+
 static inline void multiply(const double *a, const double *b, double *product)
 {
     const double w = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3];

@@ -104,9 +104,8 @@ def demand(
     euler_rates = np.diff(euler, axis=0) / period
     body_rates = euler_to_body_rates(0.5 * (euler[1:] + euler[:-1]), euler_rates)
     smooth = ~(kinks[3:] | kinks[2:-1] | kinks[1:-2] | kinks[:-3])
-    inertia = np.array(vehicle.inertia)
     rates = 0.5 * (body_rates[1:] + body_rates[:-1])
-    torque = inertia * np.diff(body_rates, axis=0) / period + np.cross(rates, inertia * rates)
+    torque = vehicle.momentum(np.diff(body_rates, axis=0)) / period + np.cross(rates, vehicle.momentum(rates))
     torque = np.where(smooth[:, None], torque, 0.0)
 
     inner = slice(1, -1)
@@ -127,7 +126,7 @@ def demand(
         acceleration=acceleration[inner],
         thrust=wrench[:, 0],
         torque=torque,
-        thrusts=vehicle.thrust_coefficient * squared,
+        thrusts=vehicle.coefficients * squared,
         speeds=speeds,
         slews=np.where(between[:, None], np.diff(speeds, axis=0), np.nan),
     )

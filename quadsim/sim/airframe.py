@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -39,6 +40,7 @@ _MEETS_OBSTACLES: Final = 2
 """Bit of contype and conaffinity for contact of obstacles and the vehicle's bounding ball."""
 _RIM: Final = 32
 """Points on the rim of a rotor disc; they miss its lowest point by at most half a percent of its radius."""
+_LEG: Final = 0.35  # where a leg meets its arm in the drawing, as a share of the arm
 DRAG: Final = "drag"
 _BLUNT: Final = (0.5, 0.0, 0.0, 0.0, 0.0)
 """Fluid coefficients that turn MuJoCo's ellipsoid drag -rho C_blunt A |v| v into -rho A |v| v / 2; added mass stays."""
@@ -59,7 +61,7 @@ def outline(vehicle: Vehicle) -> Outline:
         foot_radius=float(model.geom(FOOT_NAMES[0]).size[0]),
         hull=np.concatenate([*discs, battery[None, :]]),
         floor=float(model.geom(FLOOR).pos[2]),
-        disc=float(data.geom(DISC_NAMES[0]).xpos[2]),
+        disc=float(data.geom(DISC_NAMES[0]).xpos[2]) - float(vehicle.hubs[0, 2]),
     )
 
 
@@ -101,10 +103,13 @@ def compile_model(
     spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
     body = spec.body(BODY)
     body.mass, body.inertia = vehicle.mass, list(vehicle.inertia)
+    if vehicle.products_of_inertia is not None:
+        body.inertia, body.fullinertia = np.zeros(3), [*vehicle.inertia, *vehicle.products_of_inertia]
     if reweighed:
         body.simple = 0
-    thrust_range = rotor_thrusts(vehicle, np.array([vehicle.speed_min, vehicle.speed_max]))
-    for name, position, spin in zip(ROTOR_NAMES, vehicle.rotor_positions, vehicle.rotor_spins, strict=True):
+    ranges = vehicle.thrusts(np.array([[vehicle.speed_min], [vehicle.speed_max]])).T
+    rotors = zip(ROTOR_NAMES, vehicle.hubs, vehicle.rotor_spins, ranges, strict=True)
+    for name, position, spin, thrust_range in rotors:
         spec.site(name).pos = position
         actuator = spec.actuator(name)
         actuator.gear = [0.0, 0.0, 1.0, 0.0, 0.0, spin * vehicle.drag_to_thrust]
@@ -121,14 +126,9 @@ def compile_model(
     return spec.compile()
 
 
-def rotor_thrusts(vehicle: Vehicle, speeds: Array) -> Array:
-    """Thrusts b w^2 [N] of rotor speeds [rad/s], any shape."""
-    return vehicle.thrust_coefficient * np.square(speeds)
-
-
 def _fit_drawing(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
-    """Scale the drawing to the arms, turn each to its rotor, size the discs as the rotors, colour what is in front."""
-    scale = vehicle.arm_length / DRAWN_ARM
+    """Scale the drawing to the arms, lead each to its rotor, size the discs as the rotors, colour what is in front."""
+    scale = vehicle.longest_arm / DRAWN_ARM
     for element in (*spec.geoms, *spec.cameras, *(spec.body(name) for name in PROPELLER_NAMES)):
         element.pos *= scale
         if isinstance(element, mujoco.MjsGeom):
@@ -136,14 +136,21 @@ def _fit_drawing(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
             element.fromto *= scale
     spec.geom(FLOOR).size = [0.0, 0.0, 1.0]  # endless whatever the scale
     spec.stat.extent *= scale
-    positions = vehicle.rotor_positions
-    gaps = np.linalg.norm(positions[:, None] - positions[None], axis=2)[~np.eye(N_ROTORS, dtype=bool)]
-    radius = min(vehicle.rotor_radius or spec.geom("disc1").size[0], _WIDEST_DISC * float(gaps.min()))
-    for i, azimuth in enumerate(np.radians(vehicle.rotor_azimuths), start=1):
-        spec.body(f"arm{i}").quat = euler_to_quaternion(np.array([0.0, 0.0, azimuth]))
+    radius = min(vehicle.rotor_radius or spec.geom("disc1").size[0], _WIDEST_DISC * vehicle.closest_rotors)
+    for i, (x, y, z) in enumerate(vehicle.hubs.tolist(), start=1):
+        spec.body(f"arm{i}").quat = euler_to_quaternion(np.array([0.0, 0.0, vehicle.azimuths[i - 1]]))
+        share = math.hypot(x, y) / vehicle.longest_arm
+        for part in ("arm", "motor", "cap", "leg", "foot"):
+            geom = spec.geom(f"{part}{i}")
+            geom.pos[0] *= share
+            geom.fromto[[0, 3]] *= share
+            geom.fromto[[2, 5]] += {"arm": (0.0, z), "motor": (z, z), "leg": (_LEG * z, 0.0)}.get(part, (0.0, 0.0))
+        spec.geom(f"cap{i}").pos[2] += z
+        spec.body(f"propeller{i}").pos[0] *= share
+        spec.body(f"propeller{i}").pos[2] += z
         disc, blades = spec.geom(f"disc{i}"), spec.geom(f"blades{i}")
         disc.size[0] = blades.size[0] = radius
-        if positions[i - 1, 0] > 0.1 * vehicle.arm_length:
+        if x > 0.1 * vehicle.longest_arm:
             spec.geom(f"arm{i}").material = "front"
             disc.material = "disc_front"
 

@@ -104,7 +104,8 @@ class AutopilotSettings:
         gains = filled(usual, p=(p, p, min(0.5 * p, 0.5 / lag)), d=(d, d, 0.0))
         assert gains.p is not None
         effect = np.abs(vehicle.allocation[1:]).sum(axis=1) / np.array(vehicle.inertia)
-        reserve = min(vehicle.hover_speed**2 - vehicle.speed_min**2, vehicle.speed_max**2 - vehicle.hover_speed**2)
+        slowest, fastest = float(vehicle.hover_speeds.min()), float(vehicle.hover_speeds.max())
+        reserve = min(slowest**2 - vehicle.speed_min**2, vehicle.speed_max**2 - fastest**2)
         return filled(
             gains,
             i=tuple(gain / INTEGRAL_TIME for gain in gains.p),
@@ -142,9 +143,9 @@ class Autopilot(CompiledLoop):
         self.rate, step = settings.rate, 1.0 / settings.rate
         rule = f"a whole number of periods of {step:g} s"
         delay = whole("autopilot", "delay", settings.delay, settings.delay * settings.rate, rule, smallest=0)
-        if settings.idle * vehicle.speed_max >= vehicle.hover_speed:
-            share = vehicle.hover_speed / vehicle.speed_max
-            raise ParameterError("autopilot", "idle", settings.idle, f"below {share:.3g}, at which it hovers")
+        if settings.idle * vehicle.speed_max >= (hover := float(vehicle.hover_speeds.min())):
+            rule = f"below {hover / vehicle.speed_max:.3g}, at which it hovers"
+            raise ParameterError("autopilot", "idle", settings.idle, rule)
         slowest, fastest = speeds or (settings.idle * vehicle.speed_max, vehicle.speed_max)
         a = InnerStruct(kind=LoopKind.AUTOPILOT, measures=1, step=step, airmode=bool(settings.airmode))
         a.p[:], a.i[:], a.d[:], a.i_max[:] = settings.p, settings.i, settings.d, settings.i_max
@@ -153,11 +154,13 @@ class Autopilot(CompiledLoop):
             1.0 - math.exp(-math.tau * cutoff * step) if cutoff else 1.0
             for cutoff in (settings.gyro_cutoff, settings.d_cutoff)
         )
-        a.inertia[:], a.coefficient = vehicle.inertia, vehicle.thrust_coefficient
-        fill(a.to_thrusts, np.linalg.inv(vehicle.allocation / vehicle.thrust_coefficient))
-        a.low, a.high = a.coefficient * slowest**2, a.coefficient * fastest**2
+        a.inertia[:], a.products[:] = vehicle.inertia, vehicle.products_of_inertia or (0.0, 0.0, 0.0)
+        share = N_ROTORS * vehicle.thrust_shares
+        fill(a.to_thrusts, np.linalg.inv(vehicle.allocation / vehicle.coefficients) / share[:, None])
+        b = vehicle.coefficients / share
+        a.coefficient[:], a.low[:], a.high[:] = b, b * slowest**2, b * fastest**2
         super().__init__(a, delay=delay)
-        self._hover = np.full(N_ROTORS, vehicle.hover_speed)
+        self._hover = vehicle.hover_speeds
         self.reset()
 
     def reset(self) -> None:
@@ -228,7 +231,8 @@ def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
         reached: Array = plant.flown["physics"][:, PHYSICS["body_rates"]][:, axis - 1] / size
         return reached
     ends = np.concatenate([plant.flown["speeds"][1:], plant.speeds[None]])
-    return np.asarray((vehicle.thrust_coefficient * np.square(ends).sum(axis=1) - weight) / size)
+    squares = np.square(ends) * (vehicle.coefficients / vehicle.mean_coefficient)
+    return np.asarray((vehicle.mean_coefficient * squares.sum(axis=1) - weight) / size)
 
 
 @cache

@@ -8,12 +8,12 @@ exp(dtheta)), body rates and gyro bias.  Solà 2017, Secs.  5.1.1 and 5.3.1; mul
 Prediction, the modelled vehicle as a rigid body driven by its rotor speeds, and the growth of the error with time:
 
     dp/dt = v            dv/dt = R(q) [0, 0, U/m] - [0, 0, g] + w_a      dq/dt = q * [0, omega] / 2
-    domega/dt = I^-1 (tau - omega x I omega) + w_alpha                   db/dt = w_b
+    domega/dt = I^-1 (tau - D omega - omega x I omega) + w_alpha         db/dt = w_b
 
 with white w_a, w_alpha, w_b, and to first order in the error, F(t) of de/dt = F e + w (Solà 2017, Eqs. (238)-(240), the
 vehicle's model in place of an accelerometer):
 
-    dv: -R [a]x dtheta      dtheta: -[omega]x dtheta + domega      domega: I^-1 ([I omega]x - [omega]x I) domega
+    dv: -R [a]x dtheta      dtheta: -[omega]x dtheta + domega      domega: I^-1 ([I omega]x - [omega]x I - D) domega
 
 On the ground, rotor speeds alone would let the vehicle fall.  The ground carries the rest of the weight, so nothing
 moves: p, q and the gyro's bias stay, v = 0 and omega = 0, a zero-velocity update (Groves, "Principles of GNSS,
@@ -33,6 +33,10 @@ The filter runs at the fusion horizon, now less the largest delay: every sample 
 used, in the order of time stamps.  Later samples wait; a copy of the filter uses them and runs up to now, so a late
 sample corrects the past it belongs to.  Rotor speeds, and contact with the ground, are stored for each step since the
 horizon as well.  A vehicle on the ground leaves it once the modelled thrust exceeds its weight.
+
+With `moment`, tau includes the moment of the rotors in the air, (m_x W v_y, -m_y W v_x, 0) with W the sum of their
+speeds and v the mean velocity in body axes, as if there were no wind, and D is the vehicle's rate damping, otherwise 0.
+The error of the velocity is not passed on through this moment: w_alpha stands for it.
 
 A single prediction is at most 10 ms long, while rotor speeds do not change.  A mean or sample above 1e6 in its SI unit,
 or not a number, carries no information; an estimate beyond that, or with a variance of 1e15 in all, is lost: the mean
@@ -77,6 +81,9 @@ class EstimatorSettings:
     deviation density sqrt(t). The gate is the chi-square test of a sample's innovation.
     """
 
+    moment: Annotated[
+        bool, doc("whether the model has the vehicle's rotor_moment, at the velocity over ground, and rate_damping")
+    ] = False
     acceleration_noise: Annotated[NonNegative, doc("[m/s^2/sqrt(Hz)] unmodelled white acceleration")] = 0.3
     angular_acceleration_noise: Annotated[
         NonNegative, doc("[rad/s^2/sqrt(Hz)] unmodelled white angular acceleration")
@@ -125,7 +132,7 @@ class ErrorStateFilter:
         """Prepare for the modelled vehicle, sensors and a physics step [s]; call `reset` before use.
 
         Raises:
-            ParameterError: a sensor is missing, or has a noise of zero.
+            ParameterError: a sensor is missing, or has a noise of zero, or a moment is not stated.
         """
         from scipy.special import chdtri  # whose package takes a while to load, and few flights have an estimator
 
@@ -140,7 +147,12 @@ class ErrorStateFilter:
         self.settings, self._names = settings, tuple(sensors)
         self._horizon = max(sensor.latency(name, timestep) for name, sensor in sensors.items())
         f = self.struct = FilterStruct(timestep=timestep, mass=vehicle.mass, gravity=vehicle.gravity)
-        f.inertia[:] = vehicle.inertia
+        f.inertia[:], f.products[:] = vehicle.inertia, vehicle.products_of_inertia or (0.0, 0.0, 0.0)
+        fill(f.inverse, np.linalg.inv(vehicle.inertia_matrix))
+        if settings.moment:
+            vehicle.require_moment("estimator")
+            f.rotor_moment[:] = vehicle.rotor_moment or (0.0, 0.0)
+            f.rate_damping[:] = vehicle.rate_damping or (0.0, 0.0, 0.0)
         fill(f.allocation, vehicle.allocation)
         deviations = settings.acceleration_noise, settings.angular_acceleration_noise
         f.density[1], f.density[3] = (deviation**2 for deviation in deviations)

@@ -155,11 +155,6 @@ class Plant:
         return float(self._physics[0, 0])
 
     @property
-    def hover_speeds(self) -> Array:
-        """(4,) omega_bar on all rotors [rad/s], u(-1) of a flight that starts at rest in the air."""
-        return np.full(N_ROTORS, self.vehicle.hover_speed)
-
-    @property
     def physics(self) -> Array:
         """(14,) copy of MuJoCo's state; see `physics_to_state`."""
         return self._physics[0].copy()
@@ -188,7 +183,7 @@ class Plant:
         self._step = 0
         self._pending = deque(self._changes)
         self._rotors = self.effects.rotors or RotorDynamics()
-        self._speeds = self.hover_speeds if speeds is None else np.array(speeds, float)
+        self._speeds = self.vehicle.hover_speeds if speeds is None else np.array(speeds, float)
         self._efficiency = np.array(self._rotors.efficiency)
         self._charge = 0.0 if self.effects.battery is None else self.effects.battery.charge
         struct = self._struct
@@ -214,11 +209,15 @@ class Plant:
         v, vehicle, effects, data = VehicleStruct(), self.vehicle, self.effects, self._data
         v.timestep, v.plausible, v.fastest_valid = self.timestep, _PLAUSIBLE, LARGEST_SPEED
         v.mass, v.gravity, v.inertia[:] = vehicle.mass, vehicle.gravity, vehicle.inertia
-        v.coefficient, v.hover = vehicle.thrust_coefficient, vehicle.hover_speed
+        v.products[:] = vehicle.products_of_inertia or (0.0, 0.0, 0.0)
+        fill(v.inverse, np.linalg.inv(vehicle.inertia_matrix))
+        v.coefficient[:], v.hover = vehicle.coefficients, vehicle.hover_speed
+        power = vehicle.coefficients / vehicle.mean_coefficient  # of each rotor at a speed, over the mean rotor's
+        v.demand[:] = N_ROTORS * power / float(power @ (vehicle.hover_speeds / vehicle.hover_speed) ** 3)
         v.slowest, v.fastest = self._speed_range
         v.spin[:] = [float(spin) for spin in vehicle.rotor_spins]
-        fill(v.place, vehicle.rotor_positions[:, :2])
-        fill(v.torque_of_thrust, vehicle.allocation[1:] / vehicle.thrust_coefficient)
+        fill(v.place, vehicle.hubs)
+        fill(v.torque_of_thrust, vehicle.allocation[1:] / vehicle.coefficients)
         v.follows_motion = self._follows_motion
         if effects.rotors is not None:
             v.rotor_inertia = effects.rotors.inertia or 0.0
@@ -231,7 +230,7 @@ class Plant:
             v.floor, v.disc, v.radius = shape.floor, shape.disc, ground.rotor_radius
         if (noise := effects.thrust_noise) is not None:
             v.loss, v.deviation = noise.loss, noise.deviation
-            v.largest = vehicle.thrust_coefficient * vehicle.speed_max**2
+            v.largest[:] = vehicle.thrusts(np.full(N_ROTORS, vehicle.speed_max))
         if (battery := effects.battery) is not None:
             self._curve = np.array(battery.curve)
             v.curve, v.points = self._curve.ctypes.data, len(self._curve)

@@ -48,18 +48,18 @@ class Authority:
 
 def authority(vehicle: Vehicle) -> Authority:
     """The figures of a vehicle."""
-    hover = vehicle.hover_speed
-    ratio = (vehicle.speed_max / hover) ** 2
+    slowest, fastest = float(vehicle.hover_speeds.min()), float(vehicle.hover_speeds.max())
+    ratio = (vehicle.speed_max / fastest) ** 2
     x, y, z = (
         min(-torque.lowest_pure, torque.highest_pure) / inertia
         for torque, inertia in zip(torque_ranges(vehicle), vehicle.inertia, strict=True)
     )
     return Authority(
         thrust_to_weight=ratio,
-        hover_share=(hover - vehicle.speed_min) / (vehicle.speed_max - vehicle.speed_min),
+        hover_share=(vehicle.hover_speed - vehicle.speed_min) / (vehicle.speed_max - vehicle.speed_min),
         steady_tilt=math.acos(min(1.0, 1.0 / ratio)),
         climb=(ratio - 1.0) * vehicle.gravity,
-        sink=(1.0 - (vehicle.speed_min / hover) ** 2) * vehicle.gravity,
+        sink=(1.0 - (vehicle.speed_min / slowest) ** 2) * vehicle.gravity,
         turning=(x, y, z),
         lag=max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0),
         munk=_munk(vehicle),

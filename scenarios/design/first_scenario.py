@@ -14,7 +14,7 @@ import numpy as np
 from mpc.baselines.bandwidths import lag_to_allow_for
 from mpc.model import SHORTEST_LAG
 from quadsim.errors import UnknownNameError, printable
-from quadsim.vehicle import Vehicle
+from quadsim.vehicle import Vehicle, span
 from scenarios.design.rules import (
     HEADING_RATIO,
     HEADING_STEP,
@@ -228,7 +228,7 @@ def _controller(law: str, vehicle: Vehicle, tuning: Design) -> str:
         return _rates(tuning)
     return f"""{_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning)}
 [controller.input_bounds]
-speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {vehicle.hover_speed:.4g}
+speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {span(vehicle.hover_speeds)}
 slew = {[*_slew(tuning)]}  # rad/s per period: what a rotor's own speed makes in one, from hover towards its limits
 """
 

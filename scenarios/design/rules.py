@@ -123,8 +123,8 @@ def design_for(vehicle: Vehicle, tilt: float | None = None) -> Design:
         speed_weight=speed,
         move_weight=speed / (MOVE_RATIO * bandwidth * period) ** 2,
         slew=(
-            -(vehicle.hover_speed - vehicle.speed_min) * _reached(period, vehicle.rotor_fall),
-            (vehicle.speed_max - vehicle.hover_speed) * _reached(period, vehicle.rotor_rise),
+            -(float(vehicle.hover_speeds.min()) - vehicle.speed_min) * _reached(period, vehicle.rotor_fall),
+            (vehicle.speed_max - float(vehicle.hover_speeds.max())) * _reached(period, vehicle.rotor_rise),
         ),
         fastest=bandwidth / can.munk if can.munk else math.inf,
     )

@@ -8,7 +8,7 @@ from typing import Final
 from mpc.baselines.law import Baseline
 from mpc.bounded import Bounded, InputBounds
 from mpc.robust.settings import Robust
-from quadsim.vehicle import Vehicle
+from quadsim.vehicle import Vehicle, span
 from scenarios.assembly import Assembly
 from scenarios.design.authority import Authority, authority
 from scenarios.feasibility_check import report
@@ -32,11 +32,12 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
         missed += _tilt("controller.tilt", spec.tilt, can)
     if isinstance(spec, Robust) and spec.rotor_lag == "vehicle" and vehicle.rotor_rise is None:
         missed.append("controller.rotor_lag is the vehicle's, whose file gives no rotor_rise: give a number of seconds")
+    slowest, fastest = float(vehicle.hover_speeds.min()), float(vehicle.hover_speeds.max())
     for limit in scenario.constraints:
-        if limit.signal == "speed" and not limit.lower <= vehicle.hover_speed <= limit.upper:
+        if limit.signal == "speed" and not (limit.lower <= slowest and fastest <= limit.upper):
             sides = f"{limit.lower:g} to {limit.upper:g}"
             missed.append(
-                f"constraint {limit.name}: hover is {vehicle.hover_speed:.4g} rad/s, the audit allows {sides}"
+                f"constraint {limit.name}: hover is {span(vehicle.hover_speeds)} rad/s, the audit allows {sides}"
             )
     if any("hover is" in line for line in missed):  # the course's rotor speeds would repeat it
         return tuple(missed)
@@ -48,11 +49,11 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
 
 def _inputs(bounds: InputBounds, vehicle: Vehicle, period: float) -> list[str]:
     lower, upper = bounds.speed
-    speed, hover, missed = "controller.input_bounds.speed", vehicle.hover_speed, []
-    if hover > upper:
-        missed.append(f"{speed}: hover is {hover:.4g} rad/s, the scenario allows {upper:g}")
-    elif hover < lower:
-        missed.append(f"{speed}: hover is {hover:.4g} rad/s, the scenario requires at least {lower:g}")
+    speed, hover, missed = "controller.input_bounds.speed", vehicle.hover_speeds, []
+    if hover.max() > upper:
+        missed.append(f"{speed}: hover is {span(hover)} rad/s, the scenario allows {upper:g}")
+    elif hover.min() < lower:
+        missed.append(f"{speed}: hover is {span(hover)} rad/s, the scenario requires at least {lower:g}")
     if upper > vehicle.speed_max:
         missed.append(f"{speed}: the scenario counts on {upper:g} rad/s, the rotors reach {vehicle.speed_max:g}")
     if lower < vehicle.speed_min:
@@ -60,7 +61,7 @@ def _inputs(bounds: InputBounds, vehicle: Vehicle, period: float) -> list[str]:
             f"{speed}: the scenario counts on {lower:g} rad/s, the rotors hold at least {vehicle.speed_min:g}"
         )
     up = bounds.slew[1]
-    needed = vehicle.speed_max - hover
+    needed = vehicle.speed_max - float(hover.max())
     if up * SLOWEST_ANSWER < needed * period:
         time = f"{needed * period / up:.3g} s" if up else "for ever"
         missed.append(

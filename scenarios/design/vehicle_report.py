@@ -47,6 +47,7 @@ class VehicleSheet:
     weight: float  # m g [N]
     hover_speed: float  # omega_bar [rad/s]
     hover_speed_rpm: float  # the same [rpm]
+    hover_speeds: tuple[float, ...]  # of each rotor, the trim [rad/s]
     speed_range_used: float  # where hover lies between the lowest speed, 0, and the highest, 1 [-]
     thrust_to_weight: float  # all rotors at their highest speed, over the weight [-]
     climb_acceleration: float  # largest upward acceleration from hover, level [m/s^2]
@@ -139,12 +140,13 @@ def make_sheet(vehicle: Vehicle) -> VehicleSheet:
         weight=vehicle.mass * vehicle.gravity,
         hover_speed=vehicle.hover_speed,
         hover_speed_rpm=_RPM * vehicle.hover_speed,
+        hover_speeds=tuple(vehicle.hover_speeds.tolist()),
         speed_range_used=can.hover_share,
         thrust_to_weight=can.thrust_to_weight,
         climb_acceleration=can.climb,
         steady_tilt=math.degrees(can.steady_tilt),
         torques=torque_ranges(vehicle),
-        thrust_slope=2.0 * vehicle.thrust_coefficient * vehicle.hover_speed,
+        thrust_slope=2.0 * vehicle.mean_coefficient * vehicle.hover_speed,
         input_slopes={
             name: float(np.abs(B_c[INDEX[name]]).max()) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
         },
@@ -174,6 +176,12 @@ def _designed(vehicle: Vehicle) -> Designed | None:
         period=tuning.period,
         delay_margin=delay_margin(vehicle, tuning),
     )
+
+
+def _trim(sheet: VehicleSheet) -> list[tuple[int, float]]:
+    """Return the number of each rotor and its speed in hover; nothing where all are alike."""
+    speeds = sheet.hover_speeds
+    return [] if len({*speeds}) == 1 else list(enumerate(speeds, start=1))
 
 
 def vehicle_tables(report: VehicleReport) -> list[Grid]:
@@ -208,7 +216,7 @@ def vehicle_tables(report: VehicleReport) -> list[Grid]:
             "parameters",
             ("parameter", "value", "unit", "source"),
             [
-                (name, ", ".join(f"{number:g}" for number in np.atleast_1d(value)), unit, report.sources[name])
+                (name, ", ".join(f"{number:g}" for number in np.ravel(value)), unit, report.sources[name])
                 for name, value, unit in report.parameters
             ],
             note="the vehicle file's header expands the source abbreviations",
@@ -233,6 +241,7 @@ def _figures(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
         ("weight", format_number(sheet.weight), "N"),
         ("hover speed", format_number(sheet.hover_speed), "rad/s"),
         ("", format_number(sheet.hover_speed_rpm), "rpm"),
+        *((f"of rotor {i}", format_number(speed), "rad/s") for i, speed in _trim(sheet)),
         ("speed range used", f"{100.0 * sheet.speed_range_used:.1f}", "%"),
         ("thrust to weight", format_number(sheet.thrust_to_weight), "-"),
         ("largest climb acceleration", format_number(sheet.climb_acceleration), "m/s^2"),

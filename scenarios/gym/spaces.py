@@ -17,7 +17,7 @@ from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.flight.log import ControlLog, columns_of
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, Array
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.vehicle import N_ROTORS, Vehicle, span
 from scenarios.schema.scenario import Scenario
 
 Action = NDArray[np.floating]
@@ -54,14 +54,14 @@ class Actions:
             bounds, owner = spec.input_bounds.actuators(vehicle), "controller.input_bounds"
         else:
             bounds, owner = ActuatorBounds.of_vehicle(vehicle), f"vehicle {vehicle.name}"
-        low, high, hover = bounds.u_min, bounds.u_max, vehicle.hover_speed
+        low, high, hover = bounds.u_min, bounds.u_max, vehicle.hover_speeds
         self._kind = kind
         if kind == "speeds":
             self.space = Box(low, high, dtype=np.float64)
             return
-        if not low.max() < hover < high.min():
+        if not (low.max() < hover.min() and hover.max() < high.min()):
             hover_bounds = [float(low[0]), float(high[0])]
-            raise ParameterError(owner, "speed", hover_bounds, f"below and above the hover speed, {hover:.4g} rad/s")
+            raise ParameterError(owner, "speed", hover_bounds, f"below and above the hover speed, {span(hover)} rad/s")
         self.space = Box(-1.0, 1.0, (N_ROTORS,), dtype=np.float32)
         self._hover, self._down, self._up = hover, hover - low, high - hover
         if kind == "rates":
@@ -71,7 +71,7 @@ class Actions:
             settings = AutopilotSettings(rate=rate, p=BANDWIDTH, i=none, d=none, gyro_cutoff=0.0, delay=0.0)
             self._autopilot = Autopilot(vehicle, settings, speeds=(float(low[0]), float(high[0])))
             self._weight = vehicle.mass * vehicle.gravity
-            self._thrusts = [vehicle.thrust_coefficient * float(np.sum(ends**2)) for ends in (low, high)]
+            self._thrusts = [vehicle.level_thrust(float(speed)) for speed in (low.max(), high.min())]
 
     def command(self, action: Action, horizon: int) -> Command:
         """The command, a plan of this many rows, for an action."""

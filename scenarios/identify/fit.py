@@ -258,7 +258,7 @@ class _Fit:
         if half > WIDEST or self.colour["yaw"] > self.most_colour:
             return told, vehicle
         gain = told.value * estimates["thrust_coefficient"].value / estimates["inertia_z"].value
-        tied = float(f"{gain * vehicle.inertia[2] / vehicle.thrust_coefficient:.5g}")
+        tied = float(f"{gain * vehicle.inertia[2] / vehicle.mean_coefficient:.5g}")
         why = f"only the yaw acceleration that it gives is identified, +-{np.expm1(half):.1%}; "
         why += f"{tied:.4g} gives it with inertia_z as kept"
         return replace(told, refused=why, advice=_TURNS), replace(vehicle, drag_to_thrust=tied)

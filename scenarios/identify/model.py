@@ -51,7 +51,7 @@ class Parameters:
         """Those of a vehicle, with `others` for what its file has no field for."""
         own: dict[str, Any] = {name: getattr(vehicle, name) or AT_ONCE for name in ("rotor_rise", "rotor_fall")}
         own |= {name: getattr(vehicle, name) or 0.0 for name in ("rotor_inertia", "rotor_drag")}
-        own |= {name: getattr(vehicle, name) for name in ("thrust_coefficient", "drag_to_thrust")}
+        own |= {"thrust_coefficient": vehicle.mean_coefficient, "drag_to_thrust": vehicle.drag_to_thrust}
         drag = np.array(vehicle.body_drag or (0.0, 0.0, 0.0))
         return cls(inertia=np.array(vehicle.inertia), body_drag=drag, **own, **others)
 
@@ -124,7 +124,7 @@ def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, 
     J dw/dt = sum r_i x f_i - w x (J w + h e_z) - dh/dt e_z with h = -sum spin_i J_r w_i, f_i = (b w_i^2 -
     inflow w_i v_axial,i) e_z - rotor_drag w_i v_perp,i; m dv/dt = R (sum f_i + body drag) - m g e_z.
     """
-    x, y, _ = vehicle.rotor_positions.T
+    x, y, _ = vehicle.hubs.T
     spin = np.array(vehicle.rotor_spins, float)
     dt, jx, jy, jz = motion.period, *p.inertia
     when = np.linspace(0.0, len(p.wind) - 1.0, len(motion.rates))

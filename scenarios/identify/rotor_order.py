@@ -41,7 +41,7 @@ def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) 
         InputError: naming the order, azimuths or spins to try.
     """
     blocks = [_moments(record, parts, lag) for lag in (LAGS if record.speeds is None else LAGS[:1])]
-    x, y, _ = vehicle.rotor_positions.T / vehicle.arm_length
+    x, y, _ = vehicle.hubs.T / vehicle.longest_arm
     usual = _best(blocks, np.stack([y, -x]))
     best, order, turn = usual, tuple(range(N_ROTORS)), 0.0
     for angle in (0.0, math.pi / 4.0):
@@ -100,9 +100,9 @@ def _named(order: Sequence[int], turn: float, vehicle: Vehicle, column: str) -> 
     if turn:
         azimuths = [0.0] * N_ROTORS
         for place, i in enumerate(order):
-            azimuths[i] = (vehicle.rotor_azimuths[place] + 45.0 + 180.0) % 360.0 - 180.0
+            azimuths[i] = (math.degrees(vehicle.azimuths[place]) + 45.0 + 180.0) % 360.0 - 180.0
         return f"the arms are 45 deg off: try rotor_azimuths = [{', '.join(f'{a:g}' for a in azimuths)}]"
-    mirrored = np.allclose(vehicle.rotor_positions[list(order)], vehicle.rotor_positions * [-1.0, 1.0, 1.0])
+    mirrored = np.allclose(vehicle.hubs[list(order)], vehicle.hubs * [-1.0, 1.0, 1.0])
     moved = [i + 1 for i in range(N_ROTORS) if order[i] != i]
     swapped = f"rotors {moved[0]} and {moved[1]} are swapped" if len(moved) == 2 else "the rotors are in another order"
     return f"{swapped}: try the order {','.join(f'{column}{i + 1}' for i in order)}" + (

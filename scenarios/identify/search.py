@@ -60,12 +60,12 @@ class Sought(NamedTuple):
 
 def _sought(vehicle: Vehicle, parts: Sequence[Stretch]) -> list[Sought]:
     """What is searched for, from the vehicle of the start file on."""
-    weight, arm = vehicle.mass * vehicle.gravity, vehicle.arm_length
+    weight, arm = vehicle.mass * vehicle.gravity, vehicle.longest_arm
     record = parts[0].record
     area = vehicle.body_drag[0] if vehicle.body_drag else 0.25 * arm**2
     lag = vehicle.rotor_rise or vehicle.rotor_fall or 0.03
     numbers = [
-        Sought("thrust_coefficient", vehicle.thrust_coefficient, None, None),
+        Sought("thrust_coefficient", vehicle.mean_coefficient, None, None),
         *(Sought(f"inertia_{axis}", value, None, None) for axis, value in zip("xyz", vehicle.inertia, strict=True)),
         Sought("drag_to_thrust", vehicle.drag_to_thrust, None, None),
         Sought("rotor_inertia", vehicle.rotor_inertia or 6e-4 * vehicle.inertia[2], None, 1.0),

@@ -27,6 +27,7 @@ from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss
 from quadsim.sim.effects.wind import Air, WindChange
 from quadsim.sim.physics import Period
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
+from quadsim.vehicle import span
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight_events import Successor
 from scenarios.flown import Flight
@@ -240,10 +241,10 @@ class Session:
         flight = self.flights[0]
         result = flight.successor(fields)
         for signal, (lower, upper) in result.spec.audited(flight.vehicle).items():
-            hover = flight.vehicle.hover_speed if signal == "speed" else 0.0
-            if signal not in REFERENCE_NAMES and not lower <= hover <= upper:
+            hover = flight.vehicle.hover_speeds if signal == "speed" else np.zeros(1)
+            if signal not in REFERENCE_NAMES and not (lower <= hover.min() and hover.max() <= upper):
                 table = "input_bounds" if signal in COMMAND_SIGNALS else "output_bounds"
-                rule = f"a range that contains {hover:.4g}, as in hover"
+                rule = f"a range that contains {span(hover)}, as in hover"
                 raise ParameterError(f"controller.{table}", signal, [lower, upper], rule)
         return result
 

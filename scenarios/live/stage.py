@@ -60,8 +60,8 @@ class Stage:
         scene.add_light_directional("/light/sun", intensity=2.0, position=(0.35, -0.25, 0.9))
         self._root = scene.add_frame(_ROOT, show_axes=False)
         vehicle = session.flights[0].actual
-        self.unit, self._weight = vehicle.arm_length, vehicle.mass * vehicle.gravity
-        self._rotors, self._coefficient = np.array(vehicle.rotor_positions), vehicle.thrust_coefficient
+        self.unit, self._weight = vehicle.longest_arm, vehicle.mass * vehicle.gravity
+        self._rotors, self._thrusts = vehicle.hubs, vehicle.thrusts
         model, alone = compile_model(vehicle, visuals=True), len(session.flights) == 1
         self._drop = float(model.geom(FLOOR).pos[2])  # from a vehicle to the floor that it stands on [m]
         self._square = look.square_side(self.unit)
@@ -119,7 +119,7 @@ class Stage:
         for i, (sample, horizon) in enumerate(zip(frame.samples, frame.horizons, strict=True)):
             if sample is None:
                 continue
-            thrusts = self._coefficient * frame.health * np.square(sample.rotors)
+            thrusts = frame.health * self._thrusts(sample.rotors)
             lengths = self.unit * len(self._rotors) / self._weight * thrusts
             sound = np.where(frame.health[:, None] == 1.0, self._colours[i], rgb(COLOUR.violated))
             self._arrows[i].colors = sound.astype(np.uint8)
@@ -218,5 +218,5 @@ def _segments(points: Array, count: int) -> Array:
 def _course(session: Session) -> Array:
     """The reference over the scenario's whole time, thinned where it is straight, and cut off where it is too long."""
     course = np.asarray(session.flights[0].loop.course.preview(0, session.scenario.periods)[:, :3])
-    rows = course[thin(course, _BEND * session.flights[0].actual.arm_length)]
+    rows = course[thin(course, _BEND * session.flights[0].actual.longest_arm)]
     return _segments(rows[: _COURSE + 1], _COURSE)

@@ -7,12 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
+from uneven import uneven
 
 from mpc.allocation import Allocation, allocate, make_allocation, thrust_to_command
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import load_vehicle
 
 VEHICLES = {name: load_vehicle(vehicle_path(name)) for name in ("lopes2011", "hummingbird", "crazyflie2")}
+VEHICLES["uneven"] = uneven()
 ALLOCATIONS = {name: make_allocation(vehicle) for name, vehicle in VEHICLES.items()}
 NAMES = st.sampled_from(sorted(VEHICLES))
 SHARES = st.lists(st.floats(0.0, 1.0), min_size=4, max_size=4).map(np.array)

@@ -67,7 +67,7 @@ def flown(vehicle: Vehicle, effects: Effects, settings: INDISettings | None, per
             controller,
             np.tile([0.0, 0.0, 5.0, 0.0], (periods + law.horizon, 1)),
             initial_state=make_state(position=(0.0, 0.0, 5.0)),
-            initial_speeds=plant.hover_speeds,
+            initial_speeds=plant.vehicle.hover_speeds,
             periods=periods,
             steps_per_period=50,
         )

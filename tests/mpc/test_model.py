@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mpc.model import continuous_model, discretise, hover_model
-from quadsim.sim.airframe import compile_model, rotor_thrusts
+from quadsim.sim.airframe import compile_model
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -20,7 +20,7 @@ MUJOCO_ORDER = [0, 6, 1, 7, 2, 8, 3, 9, 4, 10, 5, 11]
 def paper_dynamics(vehicle: Vehicle, state: Array, speeds: Array) -> Array:
     """The nonlinear model exactly as printed in Sec. 2.2."""
     _, vx, _, vy, _, vz, phi, p, theta, q, psi, r = state
-    b, d, L = vehicle.thrust_coefficient, vehicle.drag_coefficient, vehicle.arm_length
+    b, d, L = vehicle.thrust_coefficient, (vehicle.drag_to_thrust * vehicle.thrust_coefficient), vehicle.arm_length
     w1, w2, w3, w4 = speeds**2
     U = b * (w1 + w2 + w3 + w4)
     tau = b * L * (w4 - w2), b * L * (w3 - w1), d * (w1 - w2 + w3 - w4)
@@ -43,7 +43,7 @@ def mujoco_transition(vehicle: Vehicle, timestep: float) -> tuple[Array, Array]:
     model = compile_model(vehicle, timestep=timestep)
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     data = mujoco.MjData(model)
-    data.ctrl[:] = rotor_thrusts(vehicle, np.full(4, vehicle.hover_speed))
+    data.ctrl[:] = vehicle.thrusts(np.full(4, vehicle.hover_speed))
     A, B = np.zeros((12, 12)), np.zeros((12, 4))
     mujoco.mjd_transitionFD(model, data, 1e-6, True, A, B, None, None)
     A = A[np.ix_(MUJOCO_ORDER, MUJOCO_ORDER)]

@@ -85,7 +85,7 @@ def measure(vehicle: Vehicle) -> OpenLoop:
 
 def draw_speeds(vehicle: Vehicle, seed: int) -> Array:
     """(HOLDS, 4) rotor speeds [rad/s]."""
-    return vehicle.hover_speed + np.random.default_rng(seed).uniform(-AMPLITUDE, AMPLITUDE, (HOLDS, N_ROTORS))
+    return vehicle.hover_speeds + np.random.default_rng(seed).uniform(-AMPLITUDE, AMPLITUDE, (HOLDS, N_ROTORS))
 
 
 def fly_rotorpy(vehicle: Vehicle, speeds: Array) -> Path:

@@ -33,17 +33,17 @@ def make_multirotor(vehicle: Vehicle) -> Any:
     Raises:
         ParameterError: the vehicle's gravity is not the one built into RotorPy.
     """
-    ixx, iyy, izz = vehicle.inertia
+    (ixx, iyy, izz), (ixy, ixz, iyz) = vehicle.inertia, vehicle.products_of_inertia or (0.0, 0.0, 0.0)
     parameters = {
         "mass": vehicle.mass,
-        **{"Ixx": ixx, "Iyy": iyy, "Izz": izz, "Ixy": 0.0, "Ixz": 0.0, "Iyz": 0.0},
+        **{"Ixx": ixx, "Iyy": iyy, "Izz": izz, "Ixy": ixy, "Ixz": ixz, "Iyz": iyz},
         "num_rotors": N_ROTORS,
-        "rotor_pos": {f"r{i}": position for i, position in enumerate(vehicle.rotor_positions, start=1)},
+        "rotor_pos": {f"r{i}": position for i, position in enumerate(vehicle.hubs, start=1)},
         "rotor_directions": np.array(vehicle.rotor_spins),
         "rotor_speed_min": 0.0,
         "rotor_speed_max": np.inf,
         "k_eta": vehicle.thrust_coefficient,
-        "k_m": vehicle.drag_coefficient,
+        "k_m": (vehicle.drag_to_thrust * vehicle.thrust_coefficient),
         "tau_m": 1.0,
     }
     multirotor = Multirotor(

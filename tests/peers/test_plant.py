@@ -11,6 +11,7 @@ from peers import open_loop
 from peers.checks import Check
 from peers.open_loop import OpenLoop
 from peers.rotorpy_plant import RotorPyPlant, make_multirotor
+from uneven import uneven
 
 from quadsim.errors import ParameterError
 from quadsim.state import make_state
@@ -34,6 +35,16 @@ def test_the_difference_is_of_fourth_order_in_mujocos_step(measured: OpenLoop) -
     for name in ("position", "attitude"):
         errors = np.log([getattr(difference, name) for difference in measured.differences])
         np.testing.assert_allclose(np.diff(errors) / np.diff(steps), 4.0, atol=0.3)
+
+
+def test_both_fly_an_uneven_vehicle_the_same() -> None:
+    """With products of inertia, and hubs anywhere; RotorPy's rotors have one thrust coefficient."""
+    vehicle = replace(uneven(), thrust_coefficient=1.5e-5)
+    speeds = open_loop.draw_speeds(vehicle, seed=0)
+    ours, peer = open_loop.fly_mujoco(vehicle, speeds, 1e-3), open_loop.fly_rotorpy(vehicle, speeds)
+    assert peer.tilt > np.radians(30.0)
+    difference = open_loop.largest_difference([ours], [peer])
+    assert max(difference.position, difference.attitude) < 1e-8
 
 
 def test_a_wrong_inertia_is_seen(measured: OpenLoop) -> None:

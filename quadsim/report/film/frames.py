@@ -103,9 +103,9 @@ def make_footage(run: Run, times: Array) -> Footage:
     there = np.where((here * there).sum(axis=1, keepdims=True) < 0.0, -there, there)
     quaternion = (1.0 - share) * here + share * there
     position = (1.0 - share) * positions[row] + share * positions[after]
-    leash = _LEASH * run.vehicle.arm_length
+    leash = _LEASH * run.vehicle.longest_arm
     aim = np.stack([np.interp(times, plant.t, _smooth(plant.t, axis)) for axis in positions.T], axis=1)
-    tolerance = _TOLERANCE * run.vehicle.arm_length
+    tolerance = _TOLERANCE * run.vehicle.longest_arm
     seconds = np.searchsorted(plant.t, np.arange(plant.t[0], plant.t[-1]))
     path_rows = np.union1d(thin(positions, tolerance), seconds)
     steps = np.diff(plant.t, prepend=plant.t[:1])[:, None]

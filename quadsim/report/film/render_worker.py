@@ -102,7 +102,7 @@ class FilmStage:
 
     def __init__(self, run: Run, footage: Footage, *, width: int, height: int) -> None:
         self._run, self._footage = run, footage
-        self._arm = run.vehicle.arm_length
+        self._arm = run.vehicle.longest_arm
         self._obstacles = obstacles_in(run.limits)
         self._model = compile_model(run.vehicle, visuals=True, obstacles=self._obstacles)
         self._regions = list(region_edges(run))
@@ -222,14 +222,14 @@ def draw_portrait(vehicle: Vehicle, path: Path, width: int, height: int) -> None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     camera = mujoco.MjvCamera()
-    camera.distance = PORTRAIT_DISTANCE * vehicle.arm_length
+    camera.distance = PORTRAIT_DISTANCE * vehicle.longest_arm
     camera.azimuth, camera.elevation = PORTRAIT_AZIMUTH, PORTRAIT_ELEVATION
     camera.lookat[2] = 0.5 * float(model.geom(FLOOR).pos[2])
     with mujoco.Renderer(model, height, width) as renderer:
         scene = renderer.scene
         scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0  # too coarse for what is small: a disc on the floor instead
         renderer.update_scene(data, camera)
-        size, place = np.array([0.9, 0.002, 0.0]) * vehicle.arm_length, np.array([0.0, 0.0, model.geom(FLOOR).pos[2]])
+        size, place = np.array([0.9, 0.002, 0.0]) * vehicle.longest_arm, np.array([0.0, 0.0, model.geom(FLOOR).pos[2]])
         shadow = scene.geoms[scene.ngeom]
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER
         mujoco.mjv_initGeom(shadow, kind, size, place, np.eye(3).ravel(), np.array(_SHADOW_COLOUR, np.float32))
@@ -241,7 +241,7 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
     """Draw one state after the other, as `quadsim.report.film.camera.Camera` requests them, until there are no more."""
     vehicle, obstacles, width, height = pickle.load(requests)
     model = compile_model(vehicle, visuals=True, obstacles=obstacles)
-    data, camera = mujoco.MjData(model), _camera(vehicle.arm_length)
+    data, camera = mujoco.MjData(model), _camera(vehicle.longest_arm)
     floor, lowest = float(model.geom(FLOOR).pos[2]), 0.0
     with _renderer(model, width, height) as renderer:
         while len(request := requests.read(REQUEST.size)) == REQUEST.size:
@@ -252,7 +252,7 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
             camera.lookat = numbers[:3]
             renderer.update_scene(data, camera)
             scene = renderer.scene
-            sphere, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.15 * vehicle.arm_length)
+            sphere, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.15 * vehicle.longest_arm)
             colour = np.array(_COURSE_COLOUR, np.float32)
             goal = np.array(numbers[7:10])
             mujoco.mjv_initGeom(scene.geoms[scene.ngeom], sphere, size, goal, np.eye(3).ravel(), colour)

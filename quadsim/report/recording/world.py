@@ -101,8 +101,8 @@ def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
             lightened = 76 + 179 * model.mat_rgba[geom.matid[0]]  # the viewer's background may be black
             colour = colours.get(geom.name) or tuple(int(shade) for shade in lightened)
             recording.log(f"world/vehicle/body/{geom.name}", _part(solid, colour), static=True)
-    unit = vehicle.arm_length / DRAWN_ARM
-    origins = vehicle.rotor_positions + np.array([0.0, 0.0, 0.036 * unit])
+    unit = vehicle.longest_arm / DRAWN_ARM
+    origins = vehicle.hubs + np.array([0.0, 0.0, 0.036 * unit])
     arrows = rr.Arrows3D.from_fields(origins=origins, radii=0.01 * unit, colors=list(SERIES))
     recording.log("world/vehicle/body/thrust", arrows, static=True)
 
@@ -128,19 +128,19 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     """Axes and paths, how the vehicle moves through them, and what the controller predicts."""
     control, plant = run.log.control, run.log.plant
     position = plant.state[:, POSITION]
-    thickness = min(0.02, 0.06 * run.vehicle.arm_length)
+    thickness = min(0.02, 0.06 * run.vehicle.longest_arm)
     axes = rr.Arrows3D(
         origins=np.zeros((3, 3)), vectors=np.eye(3), radii=thickness, colors=AXIS_COLOURS, labels=["x", "y", "z"]
     )
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("world/axes", axes, static=True)
-    dashes = _dashes(control.reference[:, :3], _DASH * run.vehicle.arm_length)
+    dashes = _dashes(control.reference[:, :3], _DASH * run.vehicle.longest_arm)
     _log_lines(recording, "world/reference", REFERENCE, 1.2, dashes)
     _log_lines(recording, "world/path", on_screen(COLOUR.flown, 60), 1.0, [position])
 
     # The body turns below an entity that only moves: views that start there follow the vehicle without tilting.
     thrusts = np.zeros((plant.t.size, N_ROTORS, 3))
-    thrusts[..., 2] = run.vehicle.arm_length * np.square(plant.speeds / run.vehicle.hover_speed)
+    thrusts[..., 2] = run.vehicle.longest_arm * np.square(plant.speeds / run.vehicle.hover_speed)
     turned = euler_to_quaternion(plant.state[:, EULER]) if plant.attitude is None else plant.attitude
     attitude = _vector_first(turned)
     arrows = rr.Arrows3D.columns(vectors=thrusts.reshape(-1, 3)).partition([N_ROTORS] * plant.t.size)
@@ -149,11 +149,11 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     recording.send_columns("world/vehicle/body/thrust", [time_column(plant.t)], arrows)
     if plant.wrench is not None and np.any(plant.wrench[:, :3]):
         vehicle = run.vehicle
-        scale = _FORCE_SCALE * vehicle.arm_length / (vehicle.mass * vehicle.gravity / N_ROTORS)
+        scale = _FORCE_SCALE * vehicle.longest_arm / (vehicle.mass * vehicle.gravity / N_ROTORS)
         _send_arrows(recording, run, "external_force", scale * plant.wrench[:, :3], DISTURBANCE, behind=0.0)
     if plant.wind is not None and np.any(plant.wind):
         strongest = float(np.linalg.norm(plant.wind, axis=1).max())
-        drawn = _WIND_LENGTH * run.vehicle.arm_length / strongest * plant.wind
+        drawn = _WIND_LENGTH * run.vehicle.longest_arm / strongest * plant.wind
         _send_arrows(recording, run, "wind", drawn, DISTURBANCE, behind=1.3)
 
     if control.t.size:
@@ -193,7 +193,7 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
 
 def scene_views(run: Run) -> rrb.Vertical:
     """Course and vehicle in space, and the summary."""
-    behind = run.vehicle.arm_length * np.array([-3.0, -3.5, 2.2])
+    behind = run.vehicle.longest_arm * np.array([-3.0, -3.5, 2.2])
     return rrb.Vertical(
         _view("Course", "/world", *_overview(run)),
         rrb.Horizontal(
@@ -209,7 +209,7 @@ def _overview(run: Run) -> tuple[Array, Array]:
     path, course = run.log.plant.state[:, POSITION], run.log.control.reference[:, :3]
     path = path[np.isfinite(path).all(axis=1)]  # a flight that diverged ends in anything
     course = course if len(course) else path
-    low, high, least = course.min(axis=0), course.max(axis=0), 10 * run.vehicle.arm_length
+    low, high, least = course.min(axis=0), course.max(axis=0), 10 * run.vehicle.longest_arm
     slack = max(float((high - low).max()), least)
     path = np.clip(path, low - slack, high + slack)  # a lost vehicle leaves the picture
     low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
@@ -234,7 +234,7 @@ def _send_arrows(
     recording: rr.RecordingStream, run: Run, name: str, vectors: Array, colour: Colour, *, behind: float
 ) -> None:
     """Arrows (M, 3) above the rotor discs that move with the vehicle, begun by `behind` of their length before it."""
-    entity, unit = f"world/vehicle/{name}", run.vehicle.arm_length / DRAWN_ARM
+    entity, unit = f"world/vehicle/{name}", run.vehicle.longest_arm / DRAWN_ARM
     recording.log(entity, rr.Arrows3D.from_fields(radii=0.01 * unit, colors=colour), static=True)
     origins = np.array([0.0, 0.0, 0.08 * unit]) - behind * vectors
     columns = rr.Arrows3D.columns(vectors=vectors, origins=origins)

@@ -4,12 +4,13 @@ The compiled core evaluates the forces that follow from how the vehicle moves (`
 
 - Rotor drag, F_i = -k w_i (v_air,i - (v_air,i . z_b) z_b): blade flapping and induced drag hold each rotor back in its
   own plane in proportion to its speed and to the air's (Martin & Salaun 2010, "The true role of accelerometer feedback
-  in quadrotor control"; RotorS, Furrer et al. 2016).  MuJoCo's fluid forces know neither rotors nor forces linear in
-  the air speed at these Reynolds numbers.
+  in quadrotor control"; RotorS, Furrer et al. 2016).  It acts at the hub, and turns the vehicle if that is above or
+  below the centre of mass.  MuJoCo's fluid forces know neither rotors nor forces linear in the air speed at these
+  Reynolds numbers.
 - Rotor moment, (m_x w_i v_y, -m_y w_i v_x, 0) about the hub, v rotor i's velocity through the air, body frame:
   blade flapping tilts its disc, and its drag acts above the centre of mass (Martin & Salaun 2010; Mahony, Kumar and
-  Corke 2012, "Multirotor Aerial Vehicles", Eqs. (5)-(7)).  Rate damping, -d_i times the body rate about axis i, is what
-  the same effects leave of a rotation.
+  Corke 2012, "Multirotor Aerial Vehicles", Eqs. (5)-(7)): the part that the hubs' heights do not give.
+  Rate damping, -d_i times the body rate about axis i, is what the same effects leave of a rotation.
 - Gyroscopic and spin-up torque of rotors with inertia, -(d/dt + rates x) h z_b, with the angular momentum
   h = -sum_i spin_i J_r w_i of rotors that turn against their reaction torque.
 - Ground effect: what each rotor's thrust gains, by the height z of its own disc above the ground,

@@ -94,8 +94,10 @@ def mass_properties(vehicle: Vehicle, load: Load, payloads: Sequence[Payload]) -
     Raises:
         ParameterError: no rigid body has these moments of inertia.
     """
-    moments = np.diag(np.array(vehicle.inertia) * load.inertia_factor)
-    if 2.0 * moments.max() > np.trace(moments) * (1.0 + 1e-12):
+    factor = np.sqrt(load.inertia_factor)
+    moments = vehicle.inertia_matrix * np.outer(factor, factor)
+    np.fill_diagonal(moments, np.array(vehicle.inertia) * load.inertia_factor)
+    if 2.0 * np.linalg.eigvalsh(moments).max() > np.trace(moments) * (1.0 + 1e-12):
         rule = f"such that no moment of {np.diagonal(moments).tolist()} kg m^2 exceeds the sum of the other two"
         raise ParameterError("effects.load", "inertia_factor", list(load.inertia_factor), rule)
     masses = np.array([vehicle.mass * load.mass_factor, *(payload.mass for payload in payloads)])

@@ -71,7 +71,7 @@ def fly_from() -> Fly:
                 controller,
                 reference,
                 initial_state=state,
-                initial_speeds=plant.hover_speeds,
+                initial_speeds=plant.vehicle.hover_speeds,
                 periods=periods,
                 steps_per_period=50,
             )

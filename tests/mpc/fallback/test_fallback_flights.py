@@ -79,14 +79,14 @@ def fly_paper(
             controller,
             reference,
             initial_state=make_state(position=tuple(reference[0, :3])),
-            initial_speeds=plant.hover_speeds,
+            initial_speeds=plant.vehicle.hover_speeds,
             periods=periods,
             steps_per_period=50,
             navigation=Navigation(vehicle, timestep=1e-3, sensors={}, rng=rng, faults=sensors) if sensors else None,
             **options,
         )
     speeds = log.control.speeds
-    steps = np.diff(speeds, axis=0, prepend=plant.hover_speeds[None])
+    steps = np.diff(speeds, axis=0, prepend=plant.vehicle.hover_speeds[None])
     assert log.reason is None
     assert speeds.min() >= 0.0
     assert speeds.max() <= 250.0

@@ -8,9 +8,11 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from uneven import uneven
 
 from quadsim.assets import models_dir, vehicle_path
-from quadsim.sim.airframe import ARM_NAMES, BODY, PROPELLER_NAMES, ROTOR_NAMES, compile_model, rotor_thrusts
+from quadsim.sim.airframe import ARM_NAMES, BODY, PROPELLER_NAMES, ROTOR_NAMES, compile_model
 from quadsim.vehicle import Vehicle, load_vehicle
 
 LOPES = load_vehicle(vehicle_path("lopes2011"))
@@ -28,7 +30,9 @@ SMALL_X = Vehicle(
     speed_max=2600.0,
 )
 LONG_ARMS = replace(LOPES, arm_length=0.5)
-VEHICLES = pytest.mark.parametrize("vehicle", [LOPES, SMALL_X, LONG_ARMS], ids=["lopes2011", "small-x", "long-arms"])
+VEHICLES = pytest.mark.parametrize(
+    "vehicle", [LOPES, SMALL_X, LONG_ARMS, uneven()], ids=["lopes2011", "small-x", "long-arms", "uneven"]
+)
 
 
 def test_the_shipped_vehicle_compiles_to_its_toml_file():
@@ -52,14 +56,16 @@ def test_the_shipped_vehicle_compiles_to_its_toml_file():
 def test_any_vehicle_compiles_to_its_own_numbers(vehicle: Vehicle, visuals: bool):
     model = compile_model(vehicle, timestep=5e-4, limit_speeds=True, visuals=visuals)
     assert model.body_subtreemass[0] == pytest.approx(vehicle.mass, rel=1e-12)
-    assert model.body(BODY).inertia == pytest.approx(vehicle.inertia)
+    axes = Rotation.from_quat(model.body(BODY).iquat, scalar_first=True).as_matrix()
+    inertia = axes @ np.diag(model.body(BODY).inertia) @ axes.T
+    np.testing.assert_allclose(inertia, vehicle.inertia_matrix, atol=1e-14)
     assert model.body(BODY).ipos == pytest.approx([0.0, 0.0, 0.0])
     assert model.opt.timestep == 5e-4
     assert model.actuator_ctrllimited.all()
     for i, name in enumerate(ROTOR_NAMES):
-        assert model.site(name).pos == pytest.approx(vehicle.rotor_positions[i])
+        assert model.site(name).pos == pytest.approx(vehicle.hubs[i])
         assert model.actuator(name).gear[5] == vehicle.rotor_spins[i] * vehicle.drag_to_thrust
-        expected = rotor_thrusts(vehicle, np.array([vehicle.speed_min, vehicle.speed_max]))
+        expected = vehicle.coefficients[i] * np.square([vehicle.speed_min, vehicle.speed_max])
         assert model.actuator(name).ctrlrange == pytest.approx(expected)
 
 
@@ -68,7 +74,7 @@ def test_forces_and_torques_are_the_allocation_matrix(vehicle: Vehicle):
     model = compile_model(vehicle)
     data = mujoco.MjData(model)
     speeds = vehicle.hover_speed * np.array([0.9, 1.0, 1.2, 1.05])
-    data.ctrl[:] = rotor_thrusts(vehicle, speeds)
+    data.ctrl[:] = vehicle.thrusts(speeds)
     mujoco.mj_forward(model, data)
     assert data.qfrc_actuator[[2, 3, 4, 5]] == pytest.approx(vehicle.allocation @ speeds**2, rel=1e-12, abs=1e-15)
     assert data.qfrc_actuator[[0, 1]] == pytest.approx([0.0, 0.0], abs=1e-15)
@@ -80,12 +86,13 @@ def test_the_drawing_follows_the_arms(vehicle: Vehicle):
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     positions = np.array([data.body(name).xpos for name in PROPELLER_NAMES])
-    assert positions[:, :2] == pytest.approx(vehicle.rotor_positions[:, :2], abs=1e-12)
+    height = model.body(PROPELLER_NAMES[0]).pos[2] - vehicle.hubs[0, 2]  # of the discs above their hubs
+    np.testing.assert_allclose(positions, vehicle.hubs + np.array([0.0, 0.0, height]), atol=1e-12)
     radii = np.array([model.geom(f"disc{i}").size[0] for i in range(1, 5)])
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=2) + 1e9 * np.eye(4)
-    assert 0.2 * vehicle.arm_length < radii.min()
+    assert 0.2 * vehicle.longest_arm < radii.min()
     assert radii.max() < 0.5 * gaps.min()
-    forward = vehicle.rotor_positions[:, 0] > 1e-9
+    forward = vehicle.hubs[:, 0] > 1e-9
     front = model.material("front").id
     assert [model.geom(name).matid[0] == front for name in ARM_NAMES] == forward.tolist()
     assert model.geom("foot1").pos[2] - model.geom("foot1").size[0] == pytest.approx(model.geom("floor").pos[2])
@@ -104,7 +111,7 @@ def test_the_physics_model_has_nothing_to_look_at_and_flies_the_same():
     states = []
     for model in (bare, drawn):
         data = mujoco.MjData(model)
-        data.ctrl[:] = rotor_thrusts(LOPES, LOPES.hover_speed * np.array([1.0, 0.98, 1.01, 1.02]))
+        data.ctrl[:] = LOPES.thrusts(LOPES.hover_speed * np.array([1.0, 0.98, 1.01, 1.02]))
         mujoco.mj_step(model, data, nstep=500)
         states.append(np.concatenate([data.qpos, data.qvel]))
     assert states[0] == pytest.approx(states[1], abs=1e-12)
@@ -115,7 +122,7 @@ def test_sensors_agree_with_the_state():
     data = mujoco.MjData(model)
     data.qpos[:] = [1.0, -2.0, 3.0, *np.array([0.9, 0.1, -0.3, 0.2]) / np.linalg.norm([0.9, 0.1, -0.3, 0.2])]
     data.qvel[:] = [0.5, 0.6, -0.7, 0.3, -0.2, 0.1]
-    data.ctrl[:] = rotor_thrusts(LOPES, np.full(4, LOPES.hover_speed))
+    data.ctrl[:] = LOPES.thrusts(np.full(4, LOPES.hover_speed))
     mujoco.mj_forward(model, data)
     rotation = data.body(BODY).xmat.reshape(3, 3)
     assert data.sensor("position").data == pytest.approx(data.qpos[:3])

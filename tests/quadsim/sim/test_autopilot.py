@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy_laws import NumpyAutopilot, mix
 from scipy.spatial.transform import Rotation
+from uneven import uneven
 
 from quadsim.assets import vehicle_path
 from quadsim.rotation import exponential
@@ -24,13 +25,13 @@ from quadsim.vehicle import Vehicle, load_vehicle
 NONE = (0.0, 0.0, 0.0)
 
 
-@pytest.fixture(scope="module", params=["hummingbird", "crazyflie2"])
+@pytest.fixture(scope="module", params=["hummingbird", "crazyflie2", "uneven"])
 def vehicle(request: pytest.FixtureRequest) -> Vehicle:
-    return load_vehicle(vehicle_path(request.param))
+    return uneven() if request.param == "uneven" else load_vehicle(vehicle_path(request.param))
 
 
 def wrench_of(vehicle: Vehicle, thrusts: Array) -> Array:
-    return np.asarray(vehicle.allocation / vehicle.thrust_coefficient @ thrusts)
+    return np.asarray(vehicle.allocation / vehicle.coefficients @ thrusts)
 
 
 def fly(vehicle: Vehicle, autopilot: Autopilot, target: Array, seconds: float, effects: Effects | None = None) -> Array:
@@ -55,14 +56,15 @@ def hover(vehicle: Vehicle, *rates: float) -> Array:
 @pytest.mark.parametrize("airmode", [True, False])
 def test_the_mixer_gives_what_fits_and_says_what_it_cut(vehicle: Vehicle, airmode: bool) -> None:
     autopilot, rng = Autopilot(vehicle, AutopilotSettings(airmode=airmode)), np.random.default_rng(1)
-    top = vehicle.thrust_coefficient * vehicle.speed_max**2
-    lowest = vehicle.thrust_coefficient * vehicle.speed_min**2
-    reach = np.abs(vehicle.allocation[1:] / vehicle.thrust_coefficient).sum(axis=1) * top
+    lowest, top = vehicle.thrusts(np.array([[vehicle.speed_min], [vehicle.speed_max]]))
+    lift = 4.0 * vehicle.thrust_shares
+    least, most = 4.0 * float((lowest / lift).max()), vehicle.level_thrust(vehicle.speed_max)
+    reach = np.abs(vehicle.allocation[1:] / vehicle.coefficients) @ top
     for _ in range(300):
-        thrust, torque = 4.0 * top * rng.uniform(-0.1, 1.1), reach * rng.normal(size=3) * rng.choice([0.05, 0.3, 1.0])
+        thrust, torque = most * rng.uniform(-0.1, 1.1), reach * rng.normal(size=3) * rng.choice([0.05, 0.3, 1.0])
         thrusts, cut = mix(vehicle, autopilot.settings, float(thrust), torque)
-        assert thrusts.min() >= lowest * (1.0 - 1e-12)
-        assert thrusts.max() <= top * (1.0 + 1e-12)
+        assert np.all(thrusts >= lowest * (1.0 - 1e-12))
+        assert np.all(thrusts <= top * (1.0 + 1e-12))
         given, *turning = wrench_of(vehicle, thrusts)
         kept = np.array(turning) == pytest.approx(torque, abs=1e-9 * reach.max())
         assert kept or cut.any()
@@ -71,11 +73,11 @@ def test_the_mixer_gives_what_fits_and_says_what_it_cut(vehicle: Vehicle, airmod
         for axis in np.flatnonzero(cut):  # less of it, never the wrong way
             assert -1e-9 <= turning[axis] / torque[axis] < 1.0
         if not airmode:
-            assert given == pytest.approx(np.clip(thrust, 4.0 * lowest, 4.0 * top))
+            assert given == pytest.approx(np.clip(thrust, least, most))
         elif not cut.any():  # thrust moves no further than the torques need
-            parts = np.linalg.inv(vehicle.allocation / vehicle.thrust_coefficient)[:, 1:] @ torque
-            ends = 4.0 * (lowest - parts.min()), 4.0 * (top - parts.max())
-            assert given == pytest.approx(np.clip(np.clip(thrust, 4.0 * lowest, 4.0 * top), *ends))
+            parts = np.linalg.inv(vehicle.allocation / vehicle.coefficients)[:, 1:] @ torque
+            ends = 4.0 * float(((lowest - parts) / lift).max()), 4.0 * float(((top - parts) / lift).min())
+            assert given == pytest.approx(np.clip(np.clip(thrust, least, most), *ends))
 
 
 def test_yaw_is_cut_before_roll_and_pitch(vehicle: Vehicle) -> None:
@@ -85,8 +87,10 @@ def test_yaw_is_cut_before_roll_and_pitch(vehicle: Vehicle) -> None:
     thrusts, cut = mix(vehicle, autopilot.settings, vehicle.mass * vehicle.gravity, strong)
     assert cut.tolist() == [False, False, True]
     assert wrench_of(vehicle, thrusts)[1:3] == pytest.approx(strong[:2])
-    assert np.ptp(thrusts) == pytest.approx(vehicle.thrust_coefficient * (vehicle.speed_max**2 - vehicle.speed_min**2))
-    full = 4.0 * vehicle.thrust_coefficient * vehicle.speed_max**2
+    lowest, top = vehicle.thrusts(np.array([[vehicle.speed_min], [vehicle.speed_max]]))
+    assert (thrusts - lowest).min() == pytest.approx(0.0, abs=1e-12 * top.max())
+    assert (top - thrusts).min() == pytest.approx(0.0, abs=1e-12 * top.max())
+    full = vehicle.level_thrust(vehicle.speed_max)
     some = np.array([0.0, 0.0, 0.1 * vehicle.drag_to_thrust * full])  # the collective thrust yields to it
     thrusts, cut = mix(vehicle, autopilot.settings, full, some)
     assert not cut.any()
@@ -212,7 +216,13 @@ def test_a_delay_is_a_whole_number_of_periods(vehicle: Vehicle) -> None:
     rates, still = np.array([1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])
     autopilot = Autopilot(vehicle, AutopilotSettings(delay=3e-3))
     answers = [autopilot.speeds(0.0, hover(vehicle), rates, still, still) for _ in range(5)]
-    assert [bool(np.ptp(answer) > 1.0) for answer in answers] == [False, False, False, True, True]
+    assert [bool(np.ptp(answer - vehicle.hover_speeds) > 1.0) for answer in answers] == [
+        False,
+        False,
+        False,
+        True,
+        True,
+    ]
     with pytest.raises(ValueError, match=r"autopilot.delay must be a whole number of periods of 0.001 s; got 0.0015"):
         Autopilot(vehicle, AutopilotSettings(delay=1.5e-3))
 

@@ -53,7 +53,7 @@ def fly_scripted(vehicle: Vehicle, controller: Controller, *, yaw: float = 0.0) 
             controller,
             reference,
             initial_state=make_state(euler=(0.0, 0.0, yaw)),
-            initial_speeds=plant.hover_speeds,
+            initial_speeds=plant.vehicle.hover_speeds,
             periods=PERIODS,
             steps_per_period=STEPS,
         )
@@ -152,7 +152,7 @@ def fall(
             Scripted(np.zeros((PERIODS, 4))),
             reference,
             initial_state=make_state(),
-            initial_speeds=plant.hover_speeds,
+            initial_speeds=plant.vehicle.hover_speeds,
             periods=PERIODS,
             steps_per_period=STEPS,
             ground=ground,

@@ -61,7 +61,7 @@ def fly_scripted(plant: Plant, controller: Scripted, **options: Any) -> FlightLo
     values: dict[str, Any] = {
         "reference": np.zeros((periods + controller.horizon, 4)),
         "initial_state": make_state(position=(0.0, 0.0, 10.0)),
-        "initial_speeds": plant.hover_speeds,
+        "initial_speeds": plant.vehicle.hover_speeds,
     }
     return fly(plant, controller, periods=periods, steps_per_period=STEPS, **{**values, **options})
 
@@ -75,7 +75,7 @@ def test_a_late_command_acts_from_its_time_on(vehicle: Vehicle, speeds: Array) -
     controller = Scripted(speeds)
     with Plant(vehicle) as plant:
         log = fly_scripted(plant, controller, computation=Computation(delay=0.0105))
-        hover = plant.hover_speeds
+        hover = plant.vehicle.hover_speeds
     acting = log.plant.speeds[:-1].reshape(-1, STEPS, 4)
     before = np.concatenate([hover[None], speeds[:-1]])
     np.testing.assert_array_equal(acting[:, :11], np.repeat(before[:, None], 11, axis=1))  # the next whole step
@@ -133,7 +133,7 @@ def test_commands_act_shifted_by_the_delay(vehicle: Vehicle, speeds: Array, dela
     controller = Scripted(speeds)
     with Plant(vehicle) as plant:
         log = fly_scripted(plant, controller, computation=Computation(delay=delay))
-        acting = plant.hover_speeds
+        acting = plant.vehicle.hover_speeds
     queue = [(STEPS * k + int(np.ceil(1e3 * delay - 1e-6)), command) for k, command in enumerate(speeds)]
     for step, turning in enumerate(log.plant.speeds[:-1]):
         while queue and queue[0][0] <= step:
@@ -400,7 +400,7 @@ def test_the_latest_arrival_of_a_command_is_not_forgotten_with_an_earlier_one(ve
             Slowly(speeds),
             np.zeros((20, 4)),
             initial_state=make_state(position=(0.0, 0.0, 10.0)),
-            initial_speeds=plant.hover_speeds,
+            initial_speeds=plant.vehicle.hover_speeds,
             steps_per_period=STEPS,
             computation=Computation(per_iteration=0.01),
         )

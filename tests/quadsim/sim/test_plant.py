@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from uneven import uneven
 
 from quadsim.core.stepping import step_address
 from quadsim.errors import CommandError, DivergenceError, InputError, ParameterError
@@ -31,7 +32,7 @@ PERIOD, STEPS = 0.05, 50
 
 def newton_euler(vehicle: Vehicle, start: Array, holds: Array) -> Array:
     """The state (position, quaternion wxyz, velocity, body rates) after each row was held for a period, by DOP853."""
-    inertia = np.array(vehicle.inertia)
+    J = vehicle.inertia_matrix
 
     def slope(_t: float, y: Array, thrust: float, torque: Array) -> Array:
         _, quaternion, velocity, rates = np.split(y, [3, 7, 10])
@@ -42,7 +43,7 @@ def newton_euler(vehicle: Vehicle, start: Array, holds: Array) -> Array:
         spin = 0.5 * np.array(
             [-x * p - yq * q - z * r, w * p + yq * r - z * q, w * q - x * r + z * p, w * r + x * q - yq * p]
         )
-        angular = (torque - np.cross(rates, inertia * rates)) / inertia
+        angular = np.linalg.solve(J, torque - np.cross(rates, J @ rates))
         return np.concatenate([velocity, spin, acceleration, angular])
 
     y = start
@@ -52,10 +53,10 @@ def newton_euler(vehicle: Vehicle, start: Array, holds: Array) -> Array:
     return y
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_four_seconds_of_random_commands_match_newton_euler(vehicle: Vehicle, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    holds = vehicle.hover_speed + rng.uniform(-8.0, 8.0, (80, 4))
+@pytest.mark.parametrize(("seed", "layout"), [(0, "even"), (1, "even"), (2, "uneven")])
+def test_four_seconds_of_random_commands_match_newton_euler(vehicle: Vehicle, seed: int, layout: str) -> None:
+    rng, vehicle = np.random.default_rng(seed), uneven() if layout == "uneven" else vehicle
+    holds = vehicle.hover_speeds + rng.uniform(-8.0, 8.0, (80, 4))
     with Plant(vehicle) as plant:
         plant.reset(make_state(euler=(0.1, -0.2, 0.5)))
         start = plant.physics
@@ -118,7 +119,7 @@ def test_state_comes_out_with_euler_rates_and_unwrapped_yaw(vehicle: Vehicle) ->
     turning[11] = 4.0
     with Plant(vehicle) as plant:
         plant.reset(turning)
-        hover = plant.hover_speeds
+        hover = plant.vehicle.hover_speeds
         yaws = []
         rows = []
         for _ in range(80):
@@ -217,26 +218,26 @@ def test_a_vehicle_is_lost_at_the_step_that_leaves_the_plausible(vehicle: Vehicl
     with Plant(vehicle) as plant:
         plant.reset(state)
         with pytest.raises(DivergenceError, match=r"at t = 0.001 s: the plant diverged: its state is not"):
-            plant.advance(plant.hover_speeds, 10)
+            plant.advance(plant.vehicle.hover_speeds, 10)
         state[0] = 999_900.0
         plant.reset(state)
-        assert plant.advance(plant.hover_speeds, 10)["physics"][-1, 1] == pytest.approx(999_920.0)
+        assert plant.advance(plant.vehicle.hover_speeds, 10)["physics"][-1, 1] == pytest.approx(999_920.0)
 
 
 def test_a_fatal_error_of_mujoco_ends_the_flight_and_not_the_process(vehicle: Vehicle) -> None:
     """In its bindings it stays the exception that it is."""
     with Plant(vehicle) as plant:
-        plant.advance(plant.hover_speeds, 5)
+        plant.advance(plant.vehicle.hover_speeds, 5)
         before, integrator = plant.physics, plant.model.opt.integrator
         plant.model.opt.integrator = 99
         with pytest.raises(DivergenceError, match=r"at t = 0.005 s: the plant diverged: MuJoCo reports mj_step: inval"):
-            plant.advance(plant.hover_speeds, 5)
+            plant.advance(plant.vehicle.hover_speeds, 5)
         assert np.array_equal(plant.physics, before)
         with pytest.raises(mujoco.FatalError, match="invalid integrator"):
             mujoco.mj_step(plant.model, mujoco.MjData(plant.model))
         plant.model.opt.integrator = integrator
         plant.reset(make_state())
-        assert np.array_equal(plant.advance(plant.hover_speeds, 5)["physics"][-1], before)
+        assert np.array_equal(plant.advance(plant.vehicle.hover_speeds, 5)["physics"][-1], before)
 
 
 @pytest.mark.parametrize("number", [0, 2])

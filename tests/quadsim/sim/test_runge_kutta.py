@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from uneven import uneven
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import ForceError
@@ -113,6 +115,15 @@ def test_mujocos_steps_differ_by_little_at_half_a_millisecond(torrente: Vehicle)
 def test_every_other_effect_acts_as_in_mujoco(effects: Effects, torrente: Vehicle) -> None:
     ends = [flown(torrente, effects, 300, timestep=1e-3, integrator=each) for each in ("rk4", "mujoco")]
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=2e-6)
+
+
+def test_an_uneven_body_turns_as_in_mujoco() -> None:
+    """With products of inertia, rotors at four heights and as many thrust coefficients."""
+    vehicle, air = uneven(), Effects(air=Air(rotor_drag=2e-4, rotor_moment=(1e-5, 2e-5)))
+    ends = [flown(vehicle, air, 300, timestep=5e-4, integrator=each) for each in ("rk4", "mujoco")]
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=2e-6)
+    even = replace(vehicle, products_of_inertia=None)
+    assert np.abs(ends[0] - flown(even, air, 300, timestep=5e-4, integrator="rk4")).max() > 1e-2
 
 
 def test_user_defined_forces_act_too_and_are_refused_when_invalid(torrente: Vehicle) -> None:

@@ -9,8 +9,9 @@ import pytest
 
 import quadsim
 from quadsim.assets import vehicle_path
+from quadsim.errors import ParameterError
 from quadsim.sim.autopilot import AutopilotSettings
-from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
+from quadsim.vehicle import ARMS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.commands.cli import main
 from scenarios.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
 from scenarios.design.shortfalls import shortfalls
@@ -61,7 +62,13 @@ def test_a_first_scenario_suits_its_vehicle(course: str, law: str) -> None:
 
 def test_the_template_documents_every_parameter() -> None:
     tables = tomllib.loads(TEMPLATE)
-    assert [*tables] == ["name", "description", *VEHICLE_UNITS]
+    instead = tomllib.loads(TEMPLATE.partition("# [rotor_positions]\n")[2].partition("\n\n")[0].replace("# ", ""))
+    assert [*tables] == ["name", "description", *(name for name in VEHICLE_UNITS if name != "rotor_positions")]
+    tables["rotor_positions"] = instead
+    numbers = {name: table["value"] for name, table in tables.items() if isinstance(table, dict)}
+    with pytest.raises(ParameterError, match="one or the other"):
+        Vehicle(name="mine", **numbers)
+    Vehicle(name="mine", **{name: value for name, value in numbers.items() if name not in ARMS})
     text = " ".join(TEMPLATE.replace("# ", "").split())
     for name, unit in VEHICLE_UNITS.items():
         assert tables[name]["unit"] == unit

@@ -94,7 +94,7 @@ def test_a_tilt_grows_in_the_air_by_munks_moment() -> None:
         start = make_state(position=(0.0, 0.0, 500.0), euler=(0.0, tilt, 0.0))
         start[INDEX["vx"]] = 8.0
         plant.reset(start)
-        plant.advance(plant.hover_speeds, 200)
+        plant.advance(plant.vehicle.hover_speeds, 200)
         state = plant.state()
     assert state[INDEX["pitch"]] == pytest.approx(tilt * math.cosh(0.2 * rate), rel=0.02)
 

@@ -89,7 +89,7 @@ def test_the_vehicle_is_where_the_plant_was(content: Content, short_run: Run) ->
 def test_thrusts_stand_on_the_rotors_and_grow_with_squared_speeds(content: Content, short_run: Run) -> None:
     vehicle = short_run.vehicle
     origins = np.array(content.rows("/world/vehicle/body/thrust", "origins")[0])
-    np.testing.assert_allclose(origins[:, :2], vehicle.rotor_positions[:, :2], atol=1e-6)
+    np.testing.assert_allclose(origins[:, :2], vehicle.hubs[:, :2], atol=1e-6)
     arrows = np.array(content.rows("/world/vehicle/body/thrust", "vectors"))
     expected = vehicle.arm_length * (short_run.log.plant.speeds / vehicle.hover_speed) ** 2
     np.testing.assert_allclose(arrows[..., 2], expected, rtol=1e-5)

@@ -116,10 +116,10 @@ def test_thrust_has_the_factor_of_the_voltage(
 def test_a_weak_rotor_draws_its_share_and_its_torque_sags_with_its_thrust(vehicle: Vehicle) -> None:
     effects = Effects(battery=SMALL, rotors=RotorDynamics(efficiency=(1.0, 0.0, 0.0, 0.0)))
     with Plant(vehicle, effects=effects) as plant:
-        flown = plant.advance(plant.hover_speeds, 1)
+        flown = plant.advance(plant.vehicle.hover_speeds, 1)
     expected, _ = discharged(SMALL, 0.25, 1)
     np.testing.assert_allclose(flown["battery"], expected, rtol=1e-14)
-    b, d = vehicle.thrust_coefficient, vehicle.drag_coefficient
+    b, d = vehicle.thrust_coefficient, (vehicle.drag_to_thrust * vehicle.thrust_coefficient)
     factor, spin = (expected[0, 0] / 16.0) ** 2, vehicle.rotor_spins[0]
     rate = spin * d / b * factor * 0.25 * vehicle.mass * vehicle.gravity / vehicle.inertia[2] * TIMESTEP
     assert flown["physics"][0, 13] == pytest.approx(rate, rel=1e-6)
@@ -168,7 +168,7 @@ def test_without_a_battery_nothing_is_recorded_and_at_its_reference_voltage_noth
     segments = []
     for battery in (None, ideal):
         with Plant(vehicle, effects=Effects(battery=battery)) as plant:
-            segments.append(plant.advance(1.02 * plant.hover_speeds, 100))
+            segments.append(plant.advance(1.02 * plant.vehicle.hover_speeds, 100))
     assert "battery" not in (segments[0].dtype.names or ())
     np.testing.assert_array_equal(segments[0]["physics"], segments[1]["physics"])
     assert segments[1]["physics"][-1, 3] > 0.0

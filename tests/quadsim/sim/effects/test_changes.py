@@ -27,7 +27,7 @@ def pushed(force: tuple[float, float, float], point: tuple[float, float, float] 
 def test_a_push_accelerates_by_its_force_while_it_lasts(vehicle: Vehicle, integrator: Integrator) -> None:
     changes = [pushed((1.5, -0.5, 2.0)), PushChange(at=0.1, pushes=())]
     with Plant(vehicle, changes=changes, integrator=integrator) as plant:
-        flown = plant.advance(plant.hover_speeds, HOLD)
+        flown = plant.advance(plant.vehicle.hover_speeds, HOLD)
     gained = np.array([1.5, -0.5, 2.0]) / vehicle.mass * 0.1
     np.testing.assert_allclose(flown["physics"][99:, 8:11], np.tile(gained, (HOLD - 99, 1)), atol=1e-12)
     np.testing.assert_array_equal(flown["wrench"][[0, 99, 100]], [[1.5, -0.5, 2.0, 0, 0, 0]] * 2 + [[0.0] * 6])
@@ -39,7 +39,7 @@ def test_a_push_beside_the_centre_turns_the_vehicle(vehicle: Vehicle, integrator
     yaw, arm, force = 0.7, 0.2, 0.3
     with Plant(vehicle, changes=[pushed((force, 0.0, 0.0), (0.0, arm, 0.0))], integrator=integrator) as plant:
         plant.reset(make_state(euler=(0.0, 0.0, yaw)))
-        flown = plant.advance(plant.hover_speeds, 20)
+        flown = plant.advance(plant.vehicle.hover_speeds, 20)
     torque = -arm * force * math.cos(yaw)
     np.testing.assert_allclose(flown["wrench"][0, 5], torque, rtol=1e-3)
     np.testing.assert_allclose(flown["physics"][-1, 13], torque / vehicle.inertia[2] * 0.02, rtol=1e-3)
@@ -49,7 +49,7 @@ def test_a_push_of_nothing_changes_no_bit(vehicle: Vehicle) -> None:
     with Plant(vehicle) as plain, Plant(vehicle, changes=[pushed((0.0, 0.0, 0.0))]) as ready:
         for plant in (plain, ready):
             plant.reset(make_state(euler=(0.1, -0.2, 0.3)))
-        speeds = plain.hover_speeds + np.array([1.0, -2.0, 3.0, 0.5])
+        speeds = plain.vehicle.hover_speeds + np.array([1.0, -2.0, 3.0, 0.5])
         np.testing.assert_array_equal(plain.advance(speeds, HOLD)["physics"], ready.advance(speeds, HOLD)["physics"])
         assert ready.allows([pushed((1.0, 0.0, 0.0))])
         assert not plain.allows([pushed((1.0, 0.0, 0.0))])
@@ -62,7 +62,7 @@ def test_another_mass_hovers_no_more(vehicle: Vehicle) -> None:
     with Plant(vehicle, effects=effects, changes=changes) as plant:
         for _ in range(2):
             plant.reset(make_state(euler=(0.0, 0.0, 0.0)))
-            physics = plant.advance(plant.hover_speeds, HOLD)["physics"]
+            physics = plant.advance(plant.vehicle.hover_speeds, HOLD)["physics"]
             rises = [(1.0 / factor - 1.0) * vehicle.gravity for factor in (2.0, 1.25)]
             np.testing.assert_allclose(physics[[99, 199], 10], [0.1 * rises[0], 0.1 * sum(rises)], rtol=1e-9)
 
@@ -81,10 +81,13 @@ def test_what_is_due_later_may_be_put_otherwise(vehicle: Vehicle) -> None:
     """Rescheduled midway, a plant flies as one scheduled from the start; what is past is not done again."""
     first, second = MassChange(at=0.05, factor=1.1), MassChange(at=0.15, factor=0.9)
     with Plant(vehicle, changes=[first, second]) as scheduled, Plant(vehicle, changes=[first]) as later:
-        expected = scheduled.advance(scheduled.hover_speeds, HOLD)["physics"]
-        begin = later.advance(later.hover_speeds, 100)["physics"]
+        expected = scheduled.advance(scheduled.vehicle.hover_speeds, HOLD)["physics"]
+        hover = later.vehicle.hover_speeds
+        begin = later.advance(hover, 100)["physics"]
         later.reschedule([first, second])
-        np.testing.assert_array_equal(np.vstack([begin, later.advance(later.hover_speeds, 100)["physics"]]), expected)
+        np.testing.assert_array_equal(
+            np.vstack([begin, later.advance(later.vehicle.hover_speeds, 100)["physics"]]), expected
+        )
 
 
 def test_rotors_with_inertia_are_never_at_once() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy_laws import LOWEST_RATIO, axis_drag, ground_effect, pushed, respond, rotor_drag, rotor_moment, thrust_ratio
 from scipy.spatial.transform import Rotation
+from uneven import uneven
 
 from quadsim.sim.airframe import added_mass, compile_model, outline, semi_axes
 from quadsim.sim.effects import Disturbance, Effects, Ground, Push, PushChange
@@ -38,7 +39,7 @@ def test_rotor_drag_slows_a_level_glide_exponentially(vehicle: Vehicle) -> None:
     rate = 4.0 * drag * hover / vehicle.mass
     with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag))) as plant:
         plant.reset(moving(vx=3.0, vy=-1.0))
-        plant.advance(plant.hover_speeds, 2000)
+        plant.advance(plant.vehicle.hover_speeds, 2000)
         state = plant.state()
     np.testing.assert_allclose(state[[1, 3]], np.array([3.0, -1.0]) * math.exp(-2.0 * rate), rtol=1e-6)
     np.testing.assert_allclose(state[[4, 5]], [500.0, 0.0], atol=1e-9)
@@ -50,7 +51,7 @@ def test_rotor_drag_slows_a_turn(vehicle: Vehicle) -> None:
     rate = 4.0 * drag * vehicle.hover_speed * vehicle.arm_length**2 / vehicle.inertia[2]
     with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag))) as plant:
         plant.reset(moving(yaw_rate=2.0))
-        plant.advance(plant.hover_speeds, 500)
+        plant.advance(plant.vehicle.hover_speeds, 500)
         assert plant.state()[11] == pytest.approx(2.0 * math.exp(-0.5 * rate), rel=1e-6)
 
 
@@ -61,7 +62,7 @@ def test_a_rotor_moment_lifts_the_side_that_meets_the_air(vehicle: Vehicle) -> N
     for speed in (0.0, 2.0, 4.0):
         with Plant(vehicle, effects=Effects(air=Air(rotor_moment=(moment, moment)))) as plant:
             plant.reset(moving(vx=speed))
-            rates.append(plant.advance(plant.hover_speeds, 50)["physics"][-1, 12])
+            rates.append(plant.advance(plant.vehicle.hover_speeds, 50)["physics"][-1, 12])
     expected = -moment * 4.0 * vehicle.hover_speed / vehicle.inertia[1] * 0.05
     np.testing.assert_allclose(rates, [0.0, 2.0 * expected, 4.0 * expected], rtol=1e-3, atol=1e-12)
 
@@ -70,7 +71,7 @@ def test_rate_damping_slows_a_turn_exponentially(vehicle: Vehicle) -> None:
     damping = 0.1
     with Plant(vehicle, effects=Effects(air=Air(rate_damping=(0.0, 0.0, damping)))) as plant:
         plant.reset(moving(yaw_rate=2.0))
-        plant.advance(plant.hover_speeds, 500)
+        plant.advance(plant.vehicle.hover_speeds, 500)
         assert plant.state()[11] == pytest.approx(2.0 * math.exp(-0.5 * damping / vehicle.inertia[2]), rel=1e-6)
 
 
@@ -94,7 +95,7 @@ def test_body_drag_is_half_rho_area_speed_squared(vehicle: Vehicle, axis: int, n
     areas = (0.02, 0.03, 0.06)
     with Plant(vehicle, effects=Effects(air=Air(body_drag=areas, density=1.2))) as plant:
         plant.reset(moving(**{name: 8.0}))
-        wrench = plant.advance(plant.hover_speeds, 2000)["wrench"]
+        wrench = plant.advance(plant.vehicle.hover_speeds, 2000)["wrench"]
         speed = plant.state()[[1, 3, 5]][axis]
     decay = 0.5 * 1.2 * areas[axis] / vehicle.mass  # dv/dt = -decay v^2
     assert speed == pytest.approx(8.0 / (1.0 + 8.0 * decay * 2.0), rel=1e-9)
@@ -126,7 +127,7 @@ def test_only_the_air_speed_counts(vehicle: Vehicle, effects: Effects) -> None:
     """Moving with the wind is as standing in still air."""
     with Plant(vehicle, effects=effects, wind=still_air((4.0, -2.0, 0.0))) as plant:
         plant.reset(moving(vx=4.0, vy=-2.0))
-        flown = plant.advance(plant.hover_speeds, 100)
+        flown = plant.advance(plant.vehicle.hover_speeds, 100)
     np.testing.assert_allclose(flown["wrench"], 0.0, atol=1e-12)
     np.testing.assert_array_equal(flown["wind"], np.tile([4.0, -2.0, 0.0], (100, 1)))
 
@@ -137,7 +138,7 @@ def test_a_gust_pushes_by_its_integral(vehicle: Vehicle) -> None:
     gust = Gust(at=0.1, duration=1.0, velocity=(10.0, 0.0, 0.0))
     with Plant(vehicle, effects=Effects(air=Air(rotor_drag=drag)), wind=still_air((0.0, 0.0, 0.0), gust)) as plant:
         plant.reset(HIGH)
-        plant.advance(plant.hover_speeds, 1300)
+        plant.advance(plant.vehicle.hover_speeds, 1300)
         push = 4.0 * drag * vehicle.hover_speed * 10.0 * 0.5
         assert plant.state()[1] == pytest.approx(push / vehicle.mass, rel=1e-3)
 
@@ -146,7 +147,7 @@ def test_constant_force_and_torque_accelerate(vehicle: Vehicle) -> None:
     disturbance = Disturbance(force=(0.4, -0.2, 0.1), torque=(0.0, 0.0, 1e-3))
     with Plant(vehicle, effects=Effects(disturbance=disturbance)) as plant:
         plant.reset(HIGH)
-        plant.advance(plant.hover_speeds, 1000)
+        plant.advance(plant.vehicle.hover_speeds, 1000)
         state = plant.state()
     np.testing.assert_allclose(state[[1, 3, 5]], np.array([0.4, -0.2, 0.1]) / vehicle.mass, rtol=1e-9)
     assert state[11] == pytest.approx(1e-3 / vehicle.inertia[2], rel=1e-9)
@@ -159,11 +160,11 @@ def test_white_noise_walks_as_a_random_walk(vehicle: Vehicle) -> None:
         disturbance = Effects(disturbance=Disturbance(force_noise=density))
         with Plant(vehicle, effects=disturbance, rng=np.random.default_rng(seed)) as plant:
             plant.reset(HIGH)
-            plant.advance(plant.hover_speeds, 100)
+            plant.advance(plant.vehicle.hover_speeds, 100)
             ends.append(plant.state()[[1, 3, 5]])
             plant.reset(HIGH)
-            plant.advance(plant.hover_speeds, 60)
-            plant.advance(plant.hover_speeds, 40)
+            plant.advance(plant.vehicle.hover_speeds, 60)
+            plant.advance(plant.vehicle.hover_speeds, 40)
             np.testing.assert_array_equal(plant.state()[[1, 3, 5]], ends[-1])
     np.testing.assert_array_equal(ends[-1], ends[0])
     ratio = np.mean(np.square(ends[:-1])) / ((density / vehicle.mass) ** 2 * 0.1)
@@ -178,13 +179,13 @@ def test_ground_effect_lifts_by_cheeseman_and_bennett(vehicle: Vehicle) -> None:
         plant.reset(make_state(position=(0.0, 0.0, height), euler=(roll, 0.0, 0.0)), speeds)
         flown = plant.advance(speeds, 1)
     floor, disc = -0.132, 0.034  # where the drawing has them
-    above = height - floor + disc * math.cos(roll) + vehicle.rotor_positions[:, 1] * math.sin(roll)
+    above = height - floor + disc * math.cos(roll) + vehicle.hubs[:, 1] * math.sin(roll)
     gains = vehicle.thrust_coefficient * speeds**2 * (1.0 / (1.0 - (radius / (4.0 * above)) ** 2) - 1.0)
     up = np.array([0.0, -math.sin(roll), math.cos(roll)])
     np.testing.assert_allclose(flown["wrench"][0, :3], gains.sum() * up, rtol=1e-9, atol=1e-12)
-    torque = [gains @ vehicle.rotor_positions[:, 1], -gains @ vehicle.rotor_positions[:, 0], 0.0]
+    torque = [gains @ vehicle.hubs[:, 1], -gains @ vehicle.hubs[:, 0], 0.0]
     np.testing.assert_allclose(flown["wrench"][0, 3:], torque, rtol=1e-9, atol=1e-12)
-    yaw_torque = vehicle.drag_coefficient * (np.array(vehicle.rotor_spins) @ speeds**2)
+    yaw_torque = (vehicle.drag_to_thrust * vehicle.thrust_coefficient) * (np.array(vehicle.rotor_spins) @ speeds**2)
     assert flown["physics"][0, 13] == pytest.approx(1e-3 * yaw_torque / vehicle.inertia[2], rel=1e-3)
 
 
@@ -196,7 +197,7 @@ def test_a_lost_propeller_neither_drags_nor_carries_momentum(vehicle: Vehicle) -
     start[7] = 0.5
     with Plant(vehicle, effects=effects) as plant:
         plant.reset(start)
-        wrench = plant.advance(1.1 * plant.hover_speeds, 10)["wrench"]
+        wrench = plant.advance(1.1 * plant.vehicle.hover_speeds, 10)["wrench"]
     np.testing.assert_array_equal(wrench, np.zeros((10, 6)))
 
 
@@ -206,7 +207,7 @@ def test_a_second_flight_meets_the_same_wind(vehicle: Vehicle) -> None:
         winds = []
         for _ in range(2):
             plant.reset(HIGH)
-            winds.append(plant.advance(plant.hover_speeds, 80)["wind"])
+            winds.append(plant.advance(plant.vehicle.hover_speeds, 80)["wind"])
     np.testing.assert_array_equal(winds[0], winds[1])
     assert np.ptp(winds[0]) > 1.0
 
@@ -230,9 +231,11 @@ def test_forces_are_of_second_order_in_the_step(vehicle: Vehicle) -> None:
     assert errors[-1] < 3e-5
 
 
+@pytest.mark.parametrize("layout", ["even", "uneven"])
 @pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
-def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: Integrator) -> None:
+def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: Integrator, layout: str) -> None:
     """From random motions, at the middle of the step: drag of two kinds, spinning rotors, pushes, ground effect."""
+    vehicle = uneven() if layout == "uneven" else vehicle
     rng, radius, drag, inertia, step = np.random.default_rng(6), 0.15, 3e-3, 2e-4, 1e-6
     linear, quadratic = (0.3, 0.2, 0.05), (0.08, 0.1, 0.12)
     moment, damping = (2e-4, -3e-4), (0.02, 0.03, 0.01)
@@ -269,7 +272,7 @@ def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: I
                 rates[0] * momentum,
                 inertia * slopes @ np.array(vehicle.rotor_spins),
             ]
-            thrusts = vehicle.thrust_coefficient * middle**2
+            thrusts = vehicle.coefficients * middle**2
             expected += ground_effect(vehicle, radius, thrusts, turn, before[3], shape.floor, shape.disc)
             np.testing.assert_allclose(wrench, expected, atol=1e-4)  # what changes in half a step
 

@@ -34,7 +34,7 @@ def test_inertia_of_many_points_is_the_sum_over_points(vehicle: Vehicle) -> None
 def test_a_heavier_vehicle_sinks_with_the_thrust_of_its_file(vehicle: Vehicle) -> None:
     with Plant(vehicle, effects=Effects(load=Load(mass_factor=1.25))) as plant:
         plant.reset(make_state(position=(0.0, 0.0, 100.0)))
-        plant.advance(plant.hover_speeds, 1000)
+        plant.advance(plant.vehicle.hover_speeds, 1000)
         assert plant.state()[4] == pytest.approx(100.0 - 0.5 * 0.2 * vehicle.gravity, rel=1e-9)
 
 
@@ -53,7 +53,7 @@ def test_a_shifted_centre_of_mass_tips_the_vehicle(vehicle: Vehicle) -> None:
     shift = 0.01
     with Plant(vehicle, effects=Effects(load=Load(centre_of_mass=(shift, 0.0, 0.0)))) as plant:
         plant.reset(make_state(position=(0.0, 0.0, 100.0)))
-        row = plant.advance(plant.hover_speeds, 1)["physics"][0]
+        row = plant.advance(plant.vehicle.hover_speeds, 1)["physics"][0]
     weight = vehicle.mass * vehicle.gravity
     assert row[12] / 1e-3 == pytest.approx(shift * weight / vehicle.inertia[1], rel=1e-5)  # thrust behind the centre
     assert row[10] / 1e-3 == pytest.approx(
@@ -70,7 +70,7 @@ def test_payload_is_taken_up_and_let_go(vehicle: Vehicle) -> None:
     with Plant(vehicle, changes=changes) as plant:
         for _ in range(2):  # the second flight begins as the first did
             plant.reset(make_state(position=(0.0, 0.0, 100.0)))
-            slopes = np.diff(plant.advance(plant.hover_speeds, 1500)["physics"][:, 10]) / 1e-3
+            slopes = np.diff(plant.advance(plant.vehicle.hover_speeds, 1500)["physics"][:, 10]) / 1e-3
             m, g = vehicle.mass, vehicle.gravity
             for first, last, carried in ((0, 199, 0.0), (200, 499, 1.0), (500, 999, 2.0), (1000, 1498, 0.0)):
                 expected = m * g / (m + carried) - g

@@ -132,7 +132,7 @@ def spinning_bodies(vehicle: Vehicle, inertia: float, rates: Array, speeds: Arra
     body.add_freejoint()
     body.mass, body.explicitinertial = vehicle.mass, True
     body.inertia = list(np.array(vehicle.inertia) - 4.0 * inertia * np.array([0.5, 0.5, 1.0]))
-    for i, (place, spin) in enumerate(zip(vehicle.rotor_positions, vehicle.rotor_spins, strict=True)):
+    for i, (place, spin) in enumerate(zip(vehicle.hubs, vehicle.rotor_spins, strict=True)):
         rotor = body.add_body(name=f"r{i}", pos=place)
         rotor.add_joint(name=f"j{i}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0.0, 0.0, -float(spin)])
         rotor.mass, rotor.inertia, rotor.explicitinertial = 1e-9, [inertia / 2, inertia / 2, inertia], True

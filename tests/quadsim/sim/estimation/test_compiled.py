@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,10 +64,21 @@ def check(track: TrackStruct, expected: Estimate) -> None:
     np.testing.assert_allclose(np.array(track.P), expected.covariance, atol=1e-12 * size)
 
 
-@pytest.mark.parametrize("grounded", [False, True])
-def test_it_predicts(compiled: ErrorStateFilter, vehicle: Vehicle, grounded: bool) -> None:
+def uneven(vehicle: Vehicle) -> Vehicle:
+    """The same, with every number that couples its axes."""
+    return replace(
+        vehicle,
+        **{"inertia": (0.03, 0.04, 0.05), "products_of_inertia": (0.002, -0.004, 0.003)},
+        **{"rotor_moment": (1e-4, 2e-4), "rate_damping": (0.01, 0.02, 0.03)},
+    )
+
+
+@pytest.mark.parametrize(("grounded", "coupled"), [(False, False), (True, False), (False, True)])
+def test_it_predicts(vehicle: Vehicle, grounded: bool, coupled: bool) -> None:
     """Commands that change every 4 steps, and then hold for longer than the longest prediction, 10 ms."""
-    rng, model = np.random.default_rng(1), motion_model(vehicle, SETTINGS)
+    vehicle, settings = (uneven(vehicle), replace(SETTINGS, moment=True)) if coupled else (vehicle, SETTINGS)
+    compiled = ErrorStateFilter(vehicle, SENSORS, settings, timestep=TIMESTEP)
+    rng, model = np.random.default_rng(1), motion_model(vehicle, settings)
     for _ in range(20):
         pieces = [*[4] * 5, 10, 10, 6]
         rows = vehicle.hover_speed * rng.uniform(-0.1, 1.3, (6, 4))
