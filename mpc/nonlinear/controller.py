@@ -549,7 +549,7 @@ class NonlinearMPC:
             solve_s=spent_s,
         )
         return Answer(
-            sqp.inputs,
+            sqp.planned_inputs if status is SQPStatus.UNCONVERGED else sqp.inputs,
             sqp.slacks(self._groups),
             UNCONSTRAINED if free else SOLVED,
             GAIN if free else CORE,

@@ -60,7 +60,7 @@ class _Term(ctypes.Structure):
 class _Work(ctypes.Structure):
     _fields_ = [
         *struct_members(AT, "p"),
-        *struct_members(INT, "planned shifted iterations count changes rounds inner patience"),
+        *struct_members(INT, "planned shifted doubtful iterations count changes rounds inner patience"),
         *struct_members(REAL, "defect moved violation share largest least measured:21 start:21 before:4"),
         *struct_members(AT, "x u frame goal aim face beyond map offset end axis known gain inverse feed more s v"),
         *struct_members(AT, "value own response factor multiplier r d price rate origin x_before u_before last"),
@@ -293,6 +293,11 @@ class SQP:
     def positions(self) -> Array:
         """(N, 3) positions of the last optimum [m]."""
         return np.array(self._s[1:, P])
+
+    @property
+    def planned_inputs(self) -> Array:
+        """(N, 4) inputs of the stored plan."""
+        return np.array(self._u)
 
     @property
     def inputs(self) -> Array:

@@ -11,7 +11,7 @@ enum { ARRAYS = 31 };
 static void sizes_of(const quadsim_nmpc_problem *p, long sizes[ARRAYS])
 {
     const long N = p->horizon, n = states_of(p), room = p->room, w = entries_of(p), width = columns_of((int)n);
-    const int iterates = p->iterations > 1;
+    const int iterates = p->iterations > 1 || p->targets;
     const long all[ARRAYS] = {(N + 1) * n,
                               N * NU,
                               (N + 1) * 4,
@@ -91,7 +91,7 @@ void quadsim_nmpc_start(quadsim_nmpc_work *work, const quadsim_nmpc_problem *pro
 
 void quadsim_nmpc_reset(quadsim_nmpc_work *work)
 {
-    work->planned = work->shifted = work->count = 0;
+    work->planned = work->shifted = work->doubtful = work->count = 0;
     memset(work->free, 0, sizeof(int) * (size_t)((work->p->slacks + NU) * work->p->horizon)); /* and held */
 }
 
@@ -161,6 +161,109 @@ static void guess(quadsim_nmpc_work *work)
     }
 }
 
+/* ---- where targets lead far from the reference ------------------------------------------------------------------- */
+
+/* The states that follow from inputs [N][4], into the plan, with the inputs. */
+static void roll_out(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, const real *inputs)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int n = states_of(p);
+    int i;
+    memmove(work->u, inputs, sizeof(real) * (size_t)(p->horizon * NU));
+    memcpy(work->x, work->measured, sizeof(real) * (size_t)n);
+    for (i = 0; i < p->horizon; i++) {
+        quadsim_nmpc_advance(p, world, 1, work->x + i * n, work->u + i * NU, work->x + (i + 1) * n);
+    }
+}
+
+static real squared(const real *weight, const real *left, const real *right, int count)
+{
+    real sum = R(0.0);
+    int j;
+    for (j = 0; j < count; j++) {
+        sum += weight[j] * (left[j] - right[j]) * (left[j] - right[j]);
+    }
+    return sum;
+}
+
+/* What the plan costs beside rows: twice the objective, but for a constant. */
+static real cost_of(const quadsim_nmpc_work *work)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int N = p->horizon, n = states_of(p);
+    real sum = R(0.0), s[MOST], away[MOST];
+    int i, j, k;
+    for (i = 0; i < N; i++) {
+        sum += squared(p->effort, work->u + i * NU, work->aim + i * NU, NU);
+        memcpy(s, work->x + (i + 1) * n, sizeof(real) * (size_t)n);
+        into_frame(work->frame + 4 * (i + 1), work->x + (i + 1) * n + Q, s + Q);
+        if (i + 1 < N) {
+            sum += squared(p->weight, s, work->goal + (i + 1) * n, n);
+        }
+    }
+    for (j = 0; j < n; j++) {
+        away[j] = s[j] - work->goal[N * n + j];
+    }
+    for (j = 0; j < n; j++) {
+        for (k = 0; k < n; k++) {
+            sum += away[j] * p->terminal[j * n + k] * away[k];
+        }
+    }
+    return sum;
+}
+
+/* Inputs by which a geometric law follows the reference, and the states to which they lead: the thrust axis turns to the
+ * acceleration that a damped oscillator about the reference asks for. */
+static void steer(quadsim_nmpc_work *work, const quadsim_nmpc_world *world)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int N = p->horizon, n = states_of(p);
+    const real speed = R(4.0) / ((real)N * p->step), turn = R(0.5) / p->step < R(10.0) ? R(0.5) / p->step : R(10.0);
+    int i, j;
+    memcpy(work->x, work->measured, sizeof(real) * (size_t)n);
+    for (i = 0; i < N; i++) {
+        const real *x = work->x + i * n, *goal = work->goal + i * n, *next = goal + n, *q = x + Q;
+        real *u = work->u + i * NU, axis[3], pull[3], size, along, turned[4], body[4], wanted[4];
+        for (j = 0; j < 3; j++) {
+            pull[j] = (next[V + j] - goal[V + j]) / p->step + R(2.0) * speed * (goal[V + j] - x[V + j]) +
+                      speed * speed * (goal[P + j] - x[P + j]) - world->acceleration[j];
+        }
+        pull[2] += p->gravity;
+        thrust_axis(q, axis);
+        along = pull[0] * axis[0] + pull[1] * axis[1] + pull[2] * axis[2];
+        size = square_root(pull[0] * pull[0] + pull[1] * pull[1] + pull[2] * pull[2]) + R(1e-6);
+        wanted[0] = R(0.0); /* R(q)' pull is the vector part of q* (0, pull) q */
+        memcpy(wanted + 1, pull, sizeof pull);
+        into_frame(q, wanted, turned);
+        from_frame(turned, q, body);
+        u[0] = along / (p->effect[0] * world->thrust_scale);
+        u[1] = -turn * body[2] / size / p->effect[5];
+        u[2] = turn * body[1] / size / p->effect[10];
+        u[3] = goal[W + 2] / p->effect[15];
+        for (j = 0; j < NU; j++) {
+            u[j] = clipped(u[j], p->lower[j], p->upper[j]);
+        }
+        quadsim_nmpc_advance(p, world, 1, x, u, work->x + (i + 1) * n);
+    }
+}
+
+/* Take the cheaper one of two plans for the plan: the rollout of inputs [N][4], and that of the geometric law. */
+static real choose(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, const real *inputs)
+{
+    real cost, other;
+    memcpy(work->u_before, inputs, sizeof(real) * (size_t)(work->p->horizon * NU));
+    steer(work, world);
+    other = cost_of(work);
+    memcpy(work->last, work->u, sizeof(real) * (size_t)(work->p->horizon * NU));
+    roll_out(work, world, work->u_before);
+    cost = cost_of(work);
+    if (cost <= other) {
+        return cost;
+    }
+    roll_out(work, world, work->last);
+    return other;
+}
+
 int quadsim_nmpc_begin(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, const quadsim_real *measured,
                        const quadsim_real *before, const quadsim_real *states, const quadsim_real *thrusts)
 {
@@ -179,6 +282,9 @@ int quadsim_nmpc_begin(quadsim_nmpc_work *work, const quadsim_nmpc_world *world,
     }
     memcpy(work->start, work->measured, sizeof(real) * (size_t)n);
     into_frame(work->frame, measured + Q, work->start + Q);
+    if (work->doubtful) {
+        (void)choose(work, world, work->u);
+    }
     work->share = work->largest = R(1.0);
     work->least = R(1e30);
     work->patience = PATIENCE;
@@ -270,9 +376,12 @@ int quadsim_nmpc_keep(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, 
         relax(work);
     }
     if (!on && work->defect > CONVERGED) {
-        work->planned = !p->targets;
+        if (p->targets) {
+            (void)choose(work, world, work->u);
+        }
         *status = QUADSIM_NMPC_UNCONVERGED;
     }
+    work->doubtful = !on && p->targets && *status == QUADSIM_NMPC_UNCONVERGED;
     return on;
 }
 

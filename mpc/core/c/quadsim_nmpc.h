@@ -94,6 +94,7 @@ typedef struct quadsim_nmpc_work {
     const quadsim_nmpc_problem *p;
     int planned;       /* whether there is a plan */
     int shifted;       /* whether the active set is to be moved on by a node */
+    int doubtful;      /* whether the plan has not converged, where inputs are targets: it is a rollout then */
     int iterations;    /* SQP steps of the last call */
     int count;         /* active rows */
     int changes;       /* of the active set in the last program */
@@ -116,7 +117,7 @@ typedef struct quadsim_nmpc_work {
     quadsim_real *own, *response;          /* [N+1][w]; [room][N+1][w] */
     quadsim_real *factor, *multiplier, *r, *d; /* L D L' of the active rows, row by row; [room] each */
     quadsim_real *price, *rate, *origin;   /* [N][slacks] sums of multipliers, and of their slopes; see the search */
-    quadsim_real *x_before, *u_before, *last; /* the plan before a step, and [N][4] the step before, with iterations */
+    quadsim_real *x_before, *u_before, *last; /* the plan before a step, and [N][4] the step before; or candidates */
     int *row, *slot, *free;                /* [room] each; [N][slacks] whether a slack may be positive */
     int *held;                             /* [N][4] inputs at bounds: 1 above, -1 below */
 } quadsim_nmpc_work;

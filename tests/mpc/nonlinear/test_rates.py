@@ -338,7 +338,29 @@ def test_it_keeps_the_first_period_that_its_steps_did_not_make_converge() -> Non
     period = controller.infeasible_period  # type: ignore[attr-defined]
     assert command.status == NOT_CONVERGED == period.status
     assert period.converges(1) is False
-    assert controller.law._sqp.plan is None  # type: ignore[attr-defined]
+    law = controller.law  # type: ignore[attr-defined]
+    states, inputs = law._sqp.plan  # what is kept follows the model, from the measured state
+    np.testing.assert_allclose(states[1:], advance_nodes(law._model, states[:-1], inputs), atol=1e-12)
+    np.testing.assert_array_equal(states[0, Q], upside_down.attitude)
+
+
+def test_upside_down_it_comes_back_though_its_steps_do_not_converge() -> None:
+    """Each period starts from the cheaper rollout: of the last plan, or of a geometric law."""
+    controller = build(table(horizon=20, node=0.05, fallback=FallbackSettings(enabled=False)), VEHICLE, 0.05)
+    model, x = model_of(0.05), np.zeros(N_BODY + 1)
+    x[4], x[N_BODY] = 1.0, 1.0
+    unconverged = 0
+    for k in range(80):
+        state = np.zeros(N_STATES)
+        state[POSITIONS], state[VELOCITIES] = x[P], x[V]
+        given = StepInputs(time=0.05 * k, attitude=x[Q], body_rates=x[W])
+        command = controller.step(given, state, np.zeros((controller.horizon, 4)))
+        unconverged += command.status == NOT_CONVERGED
+        x = advance_nodes(model, x, command.speeds / model.scale)
+        x[Q] /= np.linalg.norm(x[Q])
+    assert unconverged > 0
+    assert np.linalg.norm(x[P]) < 0.05
+    assert thrust_axis(x[Q])[2] > 0.999
 
 
 # --- the fallback --------------------------------------------------------------------------------------------------
