@@ -107,7 +107,7 @@ def identify_records(
     if len({(record.speeds is None, record.commands is None, record.voltage is None) for record in records}) > 1:
         names = ", ".join(record.name for record in records)
         raise InputError(f"logs fitted together must have the same columns of rotors and battery; got {names}")
-    blows = wind or any(record.position is None for record in records)
+    blows = wind or any(record.position is None or record.inertial for record in records)  # or its velocity drifts
     search = Search(flown, vehicle, wind=blows)
     search.run()
     fit = _Fit(search)

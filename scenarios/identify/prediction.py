@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from quadsim.errors import InputError
@@ -32,6 +33,7 @@ IDENTIFIED, START, THRUST_ONLY = "identified", "start", "thrust only"
 QUANTITIES: Final = {"position": "m", "velocity": "m/s", "attitude": "rad", "body rates": "rad/s"}
 ROTOR_FIELDS: Final = ("commands", "throttle", "speeds", "voltage")  # what a record may say of them
 _HELD_OUT: Final = 0.2  # share of the airborne samples of a log
+_DRIFT: Final = 5.0  # [s] over which a velocity by the accelerometer is left out
 _SHOWN: Final = 10  # windows in a trace
 _VELOCITY_AND_RATES: Final = [3, 4, 5, 10, 11, 12]  # of a state
 
@@ -52,7 +54,7 @@ class PredictionErrors:
 
     windows: int
     errors: Mapping[str, Array]
-    """By model: (len(HORIZONS), 4) mean norm of the error, in the order of `QUANTITIES`; NaN without positions."""
+    """By model: (len(HORIZONS), 4) mean norm of the error, in the order of `QUANTITIES`; NaN without what they need."""
     trace: Trace
 
     def ratios(self, rival: str) -> dict[str, tuple[float, ...]]:
@@ -134,6 +136,7 @@ def predict(
             rotors = turning(_held(record), start, model)
             states = _simulate(model, start, rotors, rows, measured, record.period, turns=name != THRUST_ONLY)
             errors[name].append(_errors(states[:, at], measured[:, at]))
+            errors[name][-1][..., 1] *= np.nan if record.inertial else 1.0
             drawn_states[name] = states[drawn]
         traces.append(
             Trace(log=record.name, t=record.t[rows[: 2 * _SHOWN : 2]], measured=measured[drawn], predicted=drawn_states)
@@ -173,7 +176,10 @@ def _models(known: Identification, start: Vehicle) -> dict[str, Parameters]:
 def _measured(record: Record) -> Array:
     """(N, 13) position, velocity, attitude and body rates; positions are NaN where there are none."""
     position = np.full_like(record.velocity, np.nan) if record.position is None else record.position
-    return np.concatenate([position, record.velocity, record.attitude, record.rates], axis=1)
+    velocity = record.velocity
+    if record.inertial:  # what it drifts by is left out
+        velocity = velocity - uniform_filter1d(np.nan_to_num(velocity), round(_DRIFT / record.period), axis=0)
+    return np.concatenate([position, velocity, record.attitude, record.rates], axis=1)
 
 
 def _errors(predicted: Array, measured: Array) -> Array:

@@ -12,15 +12,18 @@ from scipy.signal import lfilter
 
 import quadsim
 from quadsim.errors import InputError
-from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
+from quadsim.rotation import conjugate, euler_to_body_rates, euler_to_quaternion
 from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.flown import Flight
 from scenarios.identify.estimate import Identification, ParameterEstimate
 from scenarios.identify.fit import MOST_COLOUR, identify_records
-from scenarios.identify.record import Record
+from scenarios.identify.prediction import predict
+from scenarios.identify.record import Record, to_record
 from scenarios.identify.rotors import lagging
 from scenarios.identify.search import _polynomial
+from scenarios.identify.series import SampledSeries
+from scenarios.identify.windows import to_world
 
 pytestmark = pytest.mark.slow("identification")
 
@@ -256,6 +259,34 @@ def test_throttle_and_speeds_give_the_rotors_answer_and_then_the_forces() -> Non
     assert not [name for name in names if known[name].refused]
     assert found.vehicle.rotor_fall == pytest.approx(0.04, rel=0.03)
     assert found.voltage == pytest.approx(15.0)
+
+
+def test_an_accelerometer_takes_the_place_of_velocity() -> None:
+    """Its noise is that of a cheap one."""
+    flight = flown(air=True)
+    record, log = record_of(flight), flight.log
+    stride = (len(log.plant.t) - 1) // len(log.control.t)
+    state, step = log.plant.state, log.plant.t[1] - log.plant.t[0]
+    change = np.gradient(state[:, VELOCITIES], step, axis=0)[:-1:stride]
+    change[:, 2] += TRUE.gravity
+    force = to_world(conjugate(euler_to_quaternion(state[:-1:stride, ANGLES])), change)
+    force += 0.1 * np.random.default_rng(0).standard_normal(force.shape)
+    fields = ("attitude", "rates", "commands")
+    series = {name: SampledSeries(t=record.t, values=np.asarray(getattr(record, name))) for name in fields}
+    read = to_record("imu", series | {"force": SampledSeries(t=record.t, values=force)})
+    assert read.inertial
+    assert read.notes == ("imu: no velocity is logged; the accelerometer stands in for it",)
+    found = identify(read)
+    moments = {f"{name}_{axis}": v for name, of in MOMENTS.items() for axis, v in zip("xyz", of, strict=False)}
+    assert not wrong(found, **moments)
+    known = by_name(found)
+    assert not [name for name in ("thrust_coefficient", "inertia_x", "inertia_y") if known[name].refused]
+    errors = predict([read], [[slice(100, 900)]], found, START).errors["identified"]
+    assert np.isnan(errors[:, :2]).all()
+    assert np.isfinite(errors[:, 2:]).all()
+    for spoilt, why in ((force / 9.81, "likely in g"), (-force, "likely z points down")):
+        with pytest.raises(InputError, match=why):
+            to_record("imu", series | {"force": SampledSeries(t=record.t, values=spoilt)})
 
 
 def test_two_logs_are_fitted_together_and_narrow_the_intervals() -> None:
