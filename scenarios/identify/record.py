@@ -20,9 +20,9 @@ from scenarios.identify.windows import to_world
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
-GRAVITY: Final = 9.81  # [m/s^2] of what an accelerometer shows at rest
-UP: Final = 0.07  # by which the mean force may differ from the weight
-FORCES: Final = ((1.0 / GRAVITY, "in g"), (-1.0, "z points down"), (-1.0 / GRAVITY, "in g, z points down"))
+_GRAVITY: Final = 9.81  # [m/s^2] of what an accelerometer shows at rest
+_UP: Final = 0.07  # by which the mean force may differ from the weight
+_FORCES: Final = ((1.0 / _GRAVITY, "in g"), (-1.0, "z points down"), (-1.0 / _GRAVITY, "in g, z points down"))
 """Mean force over the weight, and its usual causes."""
 INPUTS: Final = ("commands", "throttle", "speeds")
 
@@ -131,14 +131,14 @@ def _integrated(name: str, force: Array, attitude: Array, period: float) -> Arra
     there = np.asarray(np.isfinite(world).all(axis=1))
     if not there.any():
         return world
-    up = float(np.mean(world[there, 2])) / GRAVITY
-    if not 1.0 / (1.0 + UP) < up < 1.0 + UP:
-        likely = next((what for of, what in FORCES if abs(up / of - 1.0) < UP), "not the specific force in body axes")
+    up = float(np.mean(world[there, 2])) / _GRAVITY
+    if not 1.0 / (1.0 + _UP) < up < 1.0 + _UP:
+        likely = next((what for of, what in _FORCES if abs(up / of - 1.0) < _UP), "not the specific force in body axes")
         raise InputError(
-            f"{name}: ax, ay, az carry {up:.3g} times the weight in the mean, 1 within {UP:.0%} is allowed: likely "
+            f"{name}: ax, ay, az carry {up:.3g} times the weight in the mean, 1 within {_UP:.0%} is allowed: likely "
             f"{likely}; give the specific force in m/s^2, x forward, y left, z up"
         )
-    rest = np.where(there[:, None], world - [0.0, 0.0, GRAVITY], 0.0)
+    rest = np.where(there[:, None], world - [0.0, 0.0, _GRAVITY], 0.0)
     rest -= rest[there].mean(axis=0)
     steps = np.zeros_like(rest)
     steps[1:] = 0.5 * period * (rest[1:] + rest[:-1])

@@ -24,7 +24,7 @@ _BLOCK: Final = 3.0  # [s] that are left out in turn
 _FEWEST: Final = 6  # blocks
 
 
-class Response(NamedTuple):
+class RotorResponse(NamedTuple):
     """A number of the rotors' response, and its deviation by leaving out blocks."""
 
     value: float
@@ -32,7 +32,7 @@ class Response(NamedTuple):
     blocks: int
 
 
-def rotor_response(parts: Sequence[Stretch], vehicle: Vehicle, voltage: float) -> dict[str, Response]:
+def rotor_response(parts: Sequence[Stretch], vehicle: Vehicle, voltage: float) -> dict[str, RotorResponse]:
     """Fit the measured speeds of all stretches by the commands or the throttle.
 
     Args:
@@ -90,4 +90,4 @@ def rotor_response(parts: Sequence[Stretch], vehicle: Vehicle, voltage: float) -
     deviations = np.sqrt((len(blocks) - 1.0) * left_out.var(axis=0))
     deviations[2] = math.hypot(deviations[2], 0.25 * period)
     found.x[2] = held.get("delay", found.x[2])
-    return {name: Response(float(found.x[i]), float(deviations[i]), len(blocks)) for i, name in enumerate(start)}
+    return {name: RotorResponse(float(found.x[i]), float(deviations[i]), len(blocks)) for i, name in enumerate(start)}

@@ -305,7 +305,7 @@ REFUSED: list[tuple[str, str]] = [
         "--test must be a log that is not fitted too; got 'eight.csv'",
     ),
     ("eight.csv --vehicle start.toml --poles 14", "poles turn eRPM into speeds"),
-    ("ground.csv --vehicle start.toml --out mine.toml --page mine.html", "ground.csv: never flies"),
+    ("ground.csv --vehicle start.toml --out mine.toml --page mine.html", "ground.csv: the motors never run"),
     ("short.csv --vehicle start.toml --out mine.toml", "short.csv: flies for"),
 ]
 
