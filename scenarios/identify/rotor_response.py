@@ -18,7 +18,7 @@ from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.identify.model import Parameters, Stretch, commanded
 
-CORNER: Final = 10.0  # [Hz], a tenth of the log's rate if that is less
+CORNER: Final = 6.0  # [Hz], a tenth of the log's rate if that is less
 _EDGE: Final = 0.5  # [s] at the ends of a stretch that the filter disturbs
 _BLOCK: Final = 3.0  # [s] that are left out in turn
 _FEWEST: Final = 6  # blocks
