@@ -128,7 +128,8 @@ def identify(start: Path, true: Vehicle, seed: int) -> tuple[IdentifiedVehicle |
         log = start.with_name(controller)
         flight.write_tables(log)
         with suppress(InputError):
-            return quadsim.identify(log, vehicle=start, out=start.with_name("identified.toml")), fate
+            found = quadsim.identify(log, vehicle=start, out=start.with_name("identified.toml"), wind=True)
+            return found, fate
     return None, fate
 
 
@@ -148,7 +149,7 @@ def worth(place: int, seeds: int) -> Record:
         write(true, files["true"])
         write(guessed(true, np.random.default_rng([DRAW, place])), files["start"])
         result, fate = identify(files["start"], true, seeds + place)
-        if result is None:
+        if result is None or result.file is None:  # no log, or one whose vehicle predicts worse than the start
             files["identified"] = files["start"]
         course = first(files["true"], true)
         shared = {name: course[name] for name in ("initial", "reference", "lost", "constraints")}

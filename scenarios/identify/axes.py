@@ -16,7 +16,7 @@ import numpy as np
 from quadsim.errors import InputError
 from quadsim.rotation import conjugate
 from quadsim.state import Array
-from scenarios.identify.correlation import Pairs, aligned, correlations, likeness, moments, pairs_of, shifts, stride
+from scenarios.identify.correlation import Pairs, aligned, correlations, moments, pairs_of, shifts, stride
 from scenarios.identify.record import Record, driver
 from scenarios.identify.windows import body_z, mean, rate_over_window, to_world, turn_rate
 
@@ -24,7 +24,6 @@ WINDOW: Final = 0.1  # [s] over which rates and thrust are compared
 SLOW_WINDOW: Final = 0.2  # [s] for lateral accelerations
 LEAST_RISE: Final = 0.7
 """By which the correlations of three axes must rise: one of -0.6 negated gains 1.2, and costs 0.5."""
-SCALE: Final = 3.0  # by which rates and turning attitude may differ
 READINGS: Final[dict[str, Callable[[Array], Array]]] = {
     "": lambda q: q,
     "the quaternion is world to body: negate qx, qy, qz": conjugate,
@@ -95,12 +94,6 @@ def _check_rates(record: Record, parts: Sequence[slice]) -> None:
     readings = {reading: turning_pairs(record, parts, meant) for reading, meant in READINGS.items()}
     if better := _better(readings, ("wx", "wy", "wz"), record.period):
         raise InputError(f"{record.name}: the rates are not those at which the attitude turns: {better}")
-    _, turns, rates = moments(readings[""])
-    scale = math.sqrt(float(rates.sum()) / max(float(turns.sum()), 1e-30))
-    if likeness(readings[""]) > 0.7 and not 1.0 / SCALE < scale < SCALE:
-        raise InputError(
-            f"{record.name}: wx, wy, wz are {scale:.3g} times the rates at which the attitude turns; give them in rad/s"
-        )
 
 
 def _check_velocity(record: Record, parts: Sequence[slice], position: Array) -> None:

@@ -17,6 +17,7 @@ from scenarios.identify.clocks import check_clocks
 from scenarios.identify.columns import RPM
 from scenarios.identify.record import INPUTS, Record, driver
 from scenarios.identify.rotor_order import check_rotor_order
+from scenarios.identify.scales import check_scales
 from scenarios.identify.windows import body_z, rate_over_window
 
 SHORTEST_SPAN: Final = 2.0  # [s] of a span that is used
@@ -25,6 +26,9 @@ GROUND_MARGIN: Final = 0.5  # [s] cut beside the ground, where it still acts thr
 SLOW, CALM = 0.3, 0.5
 """Speed [m/s] and turn rate [rad/s] below which a vehicle may stand on the ground."""
 CONSTANT: Final = 3e-3  # share of the outputs below which their change in a second is none
+STILL: Final = 1e-3  # share of the largest output below which a rotor's outputs do not change
+MOST_REPEATED: Final = 0.05  # share of rows that may repeat the one before
+SLOWEST_COMMANDS: Final = 20.0  # [Hz] at which the rotors' outputs must be logged
 GOOD_RATE: Final = 50.0  # [Hz] below which lag and inertias are poor
 FACTOR: Final = 1.8  # by which hover speed in the log and by the start may differ
 NOTED_FACTOR: Final = 1.4
@@ -48,17 +52,17 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     outputs, but for a second, never flies.
 
     Raises:
-        InputError: none is 4 s long, or the motors never run.
+        InputError: none is 4 s long, the motors never run, or what was logged is not what was flown.
     """
     logged = _logged(record)
+    if np.count_nonzero(logged) > 1:
+        _check_rows(record, logged)
     shortest = round(SHORTEST_SPAN / record.period)
     aloft = _runs(logged, shortest) and _runs(logged & ~_grounded(record, logged, vehicle.gravity), shortest)
     longest = max((part.stop - part.start for part in aloft), default=0) * record.period
     if longest >= LEAST * (1.0 - 1e-6):
         return aloft
     inputs = driver(record)[logged]
-    if len(inputs) and not inputs.any():
-        raise InputError(f"{record.name}: the motors never run: the rotors' outputs stay at 0")
     swing = float(np.ptp(inputs, axis=0).max() / max(np.abs(inputs).max(), 1e-9)) if len(inputs) else 0.0
     height = (
         ""
@@ -72,6 +76,36 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     )
 
 
+def _check_rows(record: Record, logged: NDArray[np.bool_]) -> None:
+    """Refuse what stands still, rows that repeat the one before, and outputs that are logged too rarely."""
+    inputs, name = driver(record)[logged], record.name
+    still = np.ptp(inputs, axis=0) <= STILL * np.abs(inputs).max()
+    if still.all():
+        raise InputError(f"{name}: the motors never run: the rotors' outputs stay at {inputs.mean():.4g}: no flight")
+    if still.any():
+        rotors = " and ".join(str(i + 1) for i in np.flatnonzero(still))
+        raise InputError(f"{name}: the outputs of rotor {rotors} never change while the others do: log all four")
+    for field, columns in (("rates", "wx wy wz"), ("velocity", "vx vy vz")):
+        rows = getattr(record, field)[logged]
+        frozen = [c for c, moved in zip(columns.split(), np.ptp(rows, axis=0) > 0.0, strict=True) if not moved]
+        if 0 < len(frozen) < 3 and (rows[0, [columns.split().index(c) for c in frozen]] != 0.0).any():
+            raise InputError(f"{name}: {', '.join(frozen)} stands still while the others change: log all three axes")
+    moving = np.concatenate([record.rates, record.attitude], axis=1)[logged]
+    repeated = float((np.diff(moving, axis=0) == 0.0).all(axis=1).mean())
+    if repeated > MOST_REPEATED:
+        raise InputError(
+            f"{name}: {repeated:.0%} of its rows repeat rates and attitude of the one before, as a radio does that "
+            f"holds them; at most {MOST_REPEATED:.0%} may: drop such rows, or log on board"
+        )
+    rate = float((np.diff(inputs, axis=0) != 0.0).any(axis=1).mean()) / record.period
+    if record.speeds is None and rate < 0.9 * SLOWEST_COMMANDS and 1.0 / record.period > 1.5 * rate:
+        raise InputError(
+            f"{name}: the rotors' outputs change {rate:.3g} times per second, and rates are logged "
+            f"{1.0 / record.period:.3g} times: log the outputs as often as they are sent, "
+            f"{SLOWEST_COMMANDS:g} times or more"
+        )
+
+
 def check_log(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str, ...]:
     """Return notes on a log that can be used, empty if nothing is to be said.
 
@@ -79,6 +113,7 @@ def check_log(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple
         InputError: naming what is wrong: an axis, a frame, a clock, a unit, the pole count, or the rotors' order.
     """
     check_axes(record, spans, vehicle.gravity)
+    check_scales(record, spans, vehicle.gravity)
     notes = [*record.notes, *check_clocks(record, spans), *_check_units(record, spans, vehicle)]
     check_rotor_order(record, spans, vehicle)
     return (*notes, *_poor(record, spans))

@@ -23,6 +23,7 @@ NO_ERPM: Final = 65535  # of 16 bits: no value, but a gap
 SPELLINGS: Final[dict[str, tuple[str, ...]]] = {
     "position": ("x y z", "px py pz", "pos_x pos_y pos_z"),
     "velocity": ("vx vy vz", "vel_x vel_y vel_z"),
+    "force": ("ax ay az", "acc_x acc_y acc_z", "accel_x accel_y accel_z"),
     "attitude": ("qw qx qy qz", "q_w q_x q_y q_z"),
     "euler": ("roll pitch yaw",),
     "rates": ("wx wy wz", "p q r", "gyro_x gyro_y gyro_z", "body_rate_x body_rate_y body_rate_z"),
@@ -57,7 +58,7 @@ RANGES: Final = {
 }
 """Least and largest value of a quantity, and the rule."""
 NEEDED_COLUMNS: Final = {
-    "velocity": ("velocity", "position"),
+    "velocity": ("velocity", "position", "force"),
     "attitude": ("attitude", "euler"),
     "body rates": ("rates", "euler_rates"),
     "rotor commands or speeds": ("commands", "throttle", "speeds", "rpm", "erpm"),

@@ -22,6 +22,8 @@ def identify(
     page: File | None = None,
     overwrite: Flag = False,
     poles: Whole | None = None,
+    wind: Flag = False,
+    anyway: Flag = False,
 ) -> IdentifiedVehicle:
     """Identify a vehicle from flight logs: its file, with an interval for every number.
 
@@ -33,6 +35,8 @@ def identify(
         page: HTML file for the page: intervals, and measured against predicted.
         overwrite: replace existing files.
         poles: magnets of a motor, where a log has its electrical speed.
+        wind: seek the wind too; where no position is logged, that is always done.
+        anyway: write the vehicle file even where the start, or the thrust alone, predicts better.
 
     Returns:
         The `vehicle`; its `identification` (estimates with intervals and verdicts); the `prediction` of flight that was
@@ -66,4 +70,6 @@ def identify(
         raise ParameterError("", "--test", str(both[0]), "a log that is not fitted too")
     files = {name: None if path is None else Path(path) for name, path in (("out", out), ("page", page))}
     start = vehicle_path(str(vehicle))
-    return identify_logs(fitted, start, test=tested, poles=poles, overwrite=overwrite, **files)
+    return identify_logs(
+        fitted, start, test=tested, poles=poles, overwrite=overwrite, wind=wind, anyway=anyway, **files
+    )

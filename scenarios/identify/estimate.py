@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
-from quadsim.vehicle import Vehicle
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+
+_AXES = ("_x", "_y", "_z")
+
+
+def field_of(name: str) -> str:
+    """Return the field of a vehicle file that holds a parameter: `inertia` of `inertia_x`."""
+    return name[:-2] if name.endswith(_AXES) and name[:-2] in VEHICLE_UNITS else name
+
+
+def number_in(vehicle: Vehicle, name: str) -> float | None:
+    """Return what a vehicle has for a parameter; of `body_drag` the first number, as the others follow it."""
+    value = getattr(vehicle, field_of(name), None)
+    axis = name[-1] if field_of(name) != name else "x"
+    return value["xyz".index(axis)] if isinstance(value, tuple) else value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +38,14 @@ class ParameterEstimate:
     in_file: bool = True  # whether a vehicle file has a field for it
 
 
+class FlightNumbers(NamedTuple):
+    """What differs from flight to flight of one vehicle."""
+
+    delay: float
+    offset: tuple[float, float]
+    wind: tuple[float, float]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Identification:
     """The fit of one or several logs."""
@@ -31,10 +54,14 @@ class Identification:
     vehicle: Vehicle  # the start with what was identified in its place
     delay: float  # of the commands, or by which measured speeds are logged late [s]
     offset: tuple[float, float]  # x and y of the centre of mass in the rotors' frame [m]
-    wind: tuple[float, float] = (0.0, 0.0)  # mean, world x and y, where drag shows it [m/s]
+    wind: tuple[float, float] = (0.0, 0.0)  # mean, world x and y [m/s]
+    flights: tuple[FlightNumbers, ...] = ()  # of each log, what the three above are the means of
     throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle [-]
     yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
     voltage_exponent: float = 0.0  # n of thrust over voltage, (V / V0)^n [-]
     voltage: float | None = None  # V0, at which the thrust coefficient holds [V]; None without a battery in the log
     whiteness: dict[str, float] = field(default_factory=dict)  # largest |autocorrelation| of innovations by axis [-]
-    cross_check: dict[str, float] = field(default_factory=dict)  # output-error estimate over this one, by parameter [-]
+
+    def of_flight(self, flight: int) -> Identification:
+        """The same with a log's own numbers."""
+        return replace(self, **self.flights[flight]._asdict())

@@ -1,4 +1,8 @@
-"""The fit of flight logs: parameters, their intervals, and the gates that refuse what a log cannot tell."""
+"""The fit of flight logs: parameters, their intervals, and the gates that refuse what a log cannot tell.
+
+Two searches follow one another.  The first finds every number and its interval; the second finds the numbers that pass
+their gates once more, the others held at what the vehicle file will say of them, so that the file is one fit.
+"""
 
 from __future__ import annotations
 
@@ -11,97 +15,111 @@ import numpy as np
 from scipy.stats import t as student
 
 from quadsim.errors import InputError
+from quadsim.state import Array
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.identify.estimate import Identification, ParameterEstimate
-from scenarios.identify.model import INCREMENTS, Stretch, stretch
+from scenarios.identify.estimate import FlightNumbers, Identification, ParameterEstimate, field_of, number_in
+from scenarios.identify.model import INCREMENTS, stretch
 from scenarios.identify.record import Record
-from scenarios.identify.rotors import smoothed
+from scenarios.identify.rotor_response import rotor_response
 from scenarios.identify.search import LEVEL_PLATE, PLATE, Search
 
 INTERVAL_SHARE: Final = 0.95
 WIDEST: Final = 0.25
 """Half-width of an interval, in logarithms, above which a log is said not to excite a parameter."""
-WIDEST_DELAY: Final = 0.01  # the same of a delay [s]
-MOST_COLOUR: Final = 0.2  # largest autocorrelation of the innovations [-]
+MOST_COLOUR: Final = 0.2  # autocorrelation of the innovations above which intervals widen [-]
 CHANCE: Final = 3.7
 """The same times sqrt(N) that noise of N samples stays below in 99 %, at 8 lags of 6 axes: more than 0.2 if N < 342."""
 MOST_PRIOR: Final = 0.25  # share of the information on a parameter that rules and start may give
-OUTPUT_ERROR_WINDOW: Final = 0.5  # of the output-error method [s]
+UNCARRIED: Final = 0.01  # share of the weight that thrust and drag may leave over, or carry too much
 _NORMAL: Final = 1.96  # standard deviations on either side, of a normal distribution
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
-_STEPS: Final = 6  # of the output-error method
 _YAW: Final = "yaw steps of 40 deg, one per second, for 10 s"
 _GUSTS: Final = 0.015  # of drag, by wind that changes faster than its knots
+_SPUN: Final = 0.004  # of inertia: noise of the gyro shrinks what commands explain, by 0.5 % where it is loud
 _TURNS: Final = "a figure eight with yaw steps, 20 s"
+_FAST: Final = "a figure eight at 2 m/s or more, 20 s"
+_MEASURE: Final = "log the rotors' speeds too"
 
 
 class _Kind(NamedTuple):
     """How a parameter is judged and learnt."""
 
-    axes: tuple[str, ...]  # whose innovations must be white
+    axes: tuple[str, ...]  # whose innovations show it
     advice: str  # what to fly to learn it
     unit: str = ""  # where the vehicle file has none
     floor: float = 0.0015  # standard deviation, in units of the search, of what the prediction leaves out
+    widest: float | None = None  # half-width allowed in units of the search, where not in shares of the value
 
 
 _KINDS: Final = {
     "thrust_coefficient": _Kind(("vz",), "20 s in the air, climbing and sinking"),
-    "inertia_x": _Kind(("roll",), "steps to the side or a figure eight, 20 s", "kg m^2"),
-    "inertia_y": _Kind(("pitch",), "steps forward or a figure eight, 20 s", "kg m^2"),
-    "inertia_z": _Kind(("roll", "pitch", "yaw"), _TURNS, "kg m^2"),
-    "drag_to_thrust": _Kind(("yaw",), _YAW),
-    "rotor_rise": _Kind(("roll", "pitch", "yaw"), _YAW),
-    "rotor_fall": _Kind(("roll", "pitch", "yaw"), _YAW),
-    "rotor_inertia": _Kind(("yaw",), _YAW),
-    "rotor_drag": _Kind(("vx", "vy"), "a figure eight at 2 m/s or more, 20 s", floor=_GUSTS),
+    "inertia_x": _Kind(("roll",), "steps to the side or a figure eight, 20 s", "kg m^2", floor=_SPUN),
+    "inertia_y": _Kind(("pitch",), "steps forward or a figure eight, 20 s", "kg m^2", floor=_SPUN),
+    "inertia_z": _Kind(("roll", "pitch", "yaw"), _TURNS, "kg m^2", floor=_SPUN),
+    "drag_to_thrust": _Kind(("yaw",), _YAW, floor=_SPUN),
+    "rotor_rise": _Kind(("roll", "pitch", "yaw"), _YAW, floor=2.0 * _SPUN),
+    "rotor_fall": _Kind(("roll", "pitch", "yaw"), _YAW, floor=2.0 * _SPUN),
+    "rotor_inertia": _Kind(("yaw",), _YAW, floor=_SPUN),
+    "rotor_drag": _Kind(("vx", "vy"), _FAST, floor=_GUSTS),
+    "rotor_moment_x": _Kind(("roll",), _FAST, floor=0.02, widest=0.5),
+    "rotor_moment_y": _Kind(("pitch",), _FAST, floor=0.02, widest=0.5),
+    **{
+        f"rate_damping_{axis}": _Kind((of,), _TURNS, floor=0.02, widest=4.0)
+        for axis, of in zip("xyz", INCREMENTS, strict=False)
+    },
     "body_drag": _Kind(("vx", "vy"), "straight legs at the highest speed, there and back", floor=_GUSTS),
-    "delay": _Kind(("roll", "pitch", "yaw"), _TURNS, "s", floor=0.04),
-    "lateness": _Kind(("roll", "pitch", "yaw"), _TURNS, "s"),
-    "offset_x": _Kind(("pitch",), "hover, 10 s", "m", floor=0.1),
-    "offset_y": _Kind(("roll",), "hover, 10 s", "m", floor=0.1),
-    "throttle_curve": _Kind(("vz",), "climbs and descents at full and little throttle", "-"),
-    "voltage_exponent": _Kind(("vz",), "one flight from a full battery to an empty one", "-"),
+    "delay": _Kind(("roll", "pitch", "yaw"), _TURNS, "s", floor=0.04, widest=2.0),
+    "lateness": _Kind(("roll", "pitch", "yaw"), _TURNS, "s", widest=2.0),
+    "offset_x": _Kind(("pitch",), "hover, 10 s", "m", floor=0.1, widest=5.0),
+    "offset_y": _Kind(("roll",), "hover, 10 s", "m", floor=0.1, widest=5.0),
+    "throttle_curve": _Kind(("vz",), "climbs and descents at full and little throttle", "-", widest=0.5),
+    "voltage_exponent": _Kind(("vz",), "one flight from a full battery to an empty one", "-", widest=1.0),
 }
+_ANSWERS: Final = 0.015  # deviation, as a share, of what a first-order lag leaves out
+_WIDEST_ANSWER: Final = {"delay": 0.01, "throttle_curve": 0.15, "voltage_exponent": 0.5}
+_PER_FLIGHT: Final = ("delay", "lateness", "offset_x", "offset_y")
+_PER_SPEED: Final = ("thrust_coefficient", "rotor_inertia", "rotor_drag", "rotor_moment_x", "rotor_moment_y")
+"""Parameters that a log of the throttle alone shows only times a power of the rotors' highest speed."""
 
 
-def identify_records(records: Sequence[Record], spans: Sequence[Sequence[slice]], vehicle: Vehicle) -> Identification:
+def identify_records(
+    records: Sequence[Record], spans: Sequence[Sequence[slice]], vehicle: Vehicle, *, wind: bool = False
+) -> Identification:
     """Identify a vehicle from the parts of records that fly; its mass, arms and layout are taken as they are.
+
+    Args:
+        records: logs of one vehicle.
+        spans: of each, the parts that fly.
+        vehicle: the start.
+        wind: whether wind is sought where the position is logged; it always is where only a velocity is.
 
     Raises:
         InputError: nothing flies, or the records differ in what they say of rotors and battery.
         ParameterError: what was identified makes no vehicle, such as one that cannot hover.
     """
-    flown = [part_of(record, span) for record, own in zip(records, spans, strict=True) for span in own]
-    if not flown:
+    flown = [
+        stretch(part_of(record, span), flight)
+        for flight, (record, own) in enumerate(zip(records, spans, strict=True))
+        for span in own
+    ]
+    if {part.flight for part in flown} != {*range(len(records))}:
         raise InputError("no part of the logs flies")
     if len({(record.speeds is None, record.commands is None, record.voltage is None) for record in records}) > 1:
         names = ", ".join(record.name for record in records)
         raise InputError(f"logs fitted together must have the same columns of rotors and battery; got {names}")
-    search = _searched([stretch(record) for record in flown], vehicle)
-    richer = _searched(search.parts, vehicle, order=3, start=search)
-    noisier = search
-    if flown[0].commands is None and flown[0].speeds is not None:
-        noisier = _searched([stretch(_noisier(record)) for record in flown], vehicle, start=search)
-    return _Fit(search, richer, noisier).result()
-
-
-def _searched(parts: Sequence[Stretch], vehicle: Vehicle, *, order: int = 2, start: Search | None = None) -> Search:
-    search = Search(parts, vehicle, order=order)
-    if start is not None:
-        search.adopt(start)
+    blows = wind or any(record.position is None or record.inertial for record in records)  # or its velocity drifts
+    search = Search(flown, vehicle, wind=blows)
     search.run()
-    return search
-
-
-def _noisier(record: Record) -> Record:
-    """The record with the noise of its rotor speeds once more: what that changes, the noise has changed before.
-
-    Noise of an input shrinks what it explains (Cook and Stefanski, "Simulation-extrapolation estimation", 1994).
-    """
-    assert record.speeds is not None
-    rng = np.random.default_rng(0)
-    noise = np.std(record.speeds - smoothed(record.speeds), axis=0)
-    return replace(record, speeds=record.speeds + noise * rng.standard_normal(record.speeds.shape))
+    fit = _Fit(search)
+    held, found = fit.held(), search
+    while True:
+        refined = Search(flown, vehicle, wind=blows, fixed=held)
+        refined.adopt(found)
+        refined.run()
+        impossible = _impossible(refined)
+        if not impossible:
+            return fit.result(refined)
+        held, found = held | impossible, refined
 
 
 def part_of(record: Record, span: slice) -> Record:
@@ -113,168 +131,249 @@ def part_of(record: Record, span: slice) -> Record:
 _WEAK: Final = "not excited"
 _HOPELESS: Final = 1.1  # half-width above which its size is not told
 _NEARLY: Final = 2.0  # how much too wide an interval may be for more of the same flight to help
-_RELATIVE: Final = {*_KINDS} - {"delay", "lateness", "offset_x", "offset_y", "throttle_curve", "voltage_exponent"}
-"""Parameters whose interval is judged by its share of the value."""
 
 
 class _Fit:
-    """What a search found, judged."""
+    """What a search of every number found, judged."""
 
-    def __init__(self, search: Search, richer: Search, noisier: Search) -> None:
+    def __init__(self, search: Search) -> None:
         self.search, self.vehicle = search, search.vehicle
-        blocks, prior = search.blocks(), search.prior(search.x)[1]
-        H = sum((block.H for block in blocks), prior.H)
+        blocks, prior = search.blocks(), search.prior(search.x)[1].H
+        H = sum((block.H for block in blocks), prior)
         self.cov = np.linalg.inv(H)
         self.left_out = np.array([np.linalg.solve(H - block.H, block.g) for block in blocks])
         self.quantile = _quantile(len(blocks))
-        self.rests = np.diag(self.cov) * np.diag(prior.H)
-        count = len(search.sought)
-        self.moved = richer.x[:count] - search.x[:count]
-        self.drift = np.abs(noisier.x[:count] - search.x[:count])  # by the noise of measured speeds
+        self.rests = np.diag(self.cov) * np.diag(prior)
         record = search.parts[0].record
+        self._blind = record.speeds is None  # to what the rotors do
+        self._throttle = self._blind and record.commands is None
         self._alone = record.commands is None and record.throttle is None  # measured speeds, without commands
         self.colour = _colour(search)
         self.most_colour = max(MOST_COLOUR, CHANCE / min(map(len, search.innovations(search.x))) ** 0.5)
+        self.set_anew: set[str] = set()
+        """Numbers that are refused and yet sought once more: where the log speaks against the start."""
+        self.estimates = self._every_estimate()
 
-    def _deviations(self, shares: dict[int, float]) -> tuple[float, float]:
-        """Standard deviations of a sum of shares of x: what the innovations explain, and by leaving out blocks."""
+    def _half_width(self, shares: Mapping[int, float], axes: Sequence[str]) -> float:
+        """Half of the interval of a sum of shares of x, in units of the search.
+
+        It is of noise, wider where the innovations are coloured (Bartlett's variance of a mean); of the scatter by
+        leaving out blocks; and of what the prediction leaves out, together.
+        """
         row = np.zeros(len(self.search.x))
-        row[list(shares)] = list(shares.values())
+        row[[*shares]] = [*shares.values()]
         each = self.left_out @ row
-        return float(np.sqrt(row @ self.cov @ row)), float(np.sqrt((len(each) - 1) * each.var()))
+        scatter = math.sqrt((len(each) - 1) * each.var())
+        colour = max(self.colour[axis] for axis in axes)
+        widened = math.sqrt((1.0 + colour) / (1.0 - colour)) if colour > self.most_colour else 1.0
+        floor = max(_KINDS[self._kind(i)].floor for i in shares)
+        explained = math.sqrt(row @ self.cov @ row)
+        return math.hypot(_NORMAL * widened * explained, self.quantile * scatter, self.quantile * floor)
 
-    def _half_width(self, shares: dict[int, float]) -> float:
-        """Half of the interval: of noise, of the blocks' scatter, and of what the prediction leaves out, together."""
-        drift = sum(abs(share) * self.drift[i] for i, share in shares.items())
-        floor = max(_KINDS[self.search.sought[i].name].floor for i in shares)
-        explained, scatter = self._deviations(shares)
-        half = math.hypot(_NORMAL * explained, self.quantile * scatter, self.quantile * floor)
-        return half + 2.0 * float(drift)
+    def _kind(self, i: int) -> str:
+        name = self.search.sought[i].name
+        return "lateness" if name == "delay" and not self._blind else name
 
-    def result(self) -> Identification:
-        """Every estimate, and the vehicle with those that are not refused."""
-        search, x = self.search, self.search.x
-        sought = {number.name: i for i, number in enumerate(search.sought) if number.name in _KINDS}
-        late = self._delay()
-        estimates = {name: self._estimate(i) for name, i in sought.items() if name != "delay"} | {late.name: late}
-        if "rotor_rise" not in estimates:
-            estimates |= self._lags_as_stated()
-        inertia = [estimates[f"inertia_{axis}"] for axis in "xyz"]
+    def _every_estimate(self) -> dict[str, ParameterEstimate]:
+        places: dict[str, list[int]] = {}
+        for i in range(len(self.search.sought)):
+            if self._kind(i) in _KINDS:
+                places.setdefault(self._kind(i), []).append(i)
+        found = {name: self._estimate(name, at) for name, at in places.items()}
+        if not self._blind and not self._alone:
+            found |= self._response()
+        elif "rotor_rise" not in found:
+            why, lag = "the log has the rotors' speeds but not their commands", self.vehicle.rotor_rise or 0.0
+            found |= {name: self._judged(name, lag, lag, lag, why) for name in ("rotor_rise", "rotor_fall")}
+        elif lags := [name for name in ("rotor_rise", "rotor_fall") if found[name].refused]:
+            why = f"{' and '.join(lags)} tell nothing, and no lag can be told from inertia without the rotors' speeds"
+            found |= {
+                name: replace(found[name], refused=why, advice=_MEASURE)
+                for name in ("inertia_x", "inertia_y", "inertia_z")
+                if not found[name].refused
+            }
+        if self._throttle:
+            why = f"a log of the throttle shows it only for the highest speed of {self.vehicle.speed_max:g} rad/s, kept"
+            found |= {name: replace(found[name], refused=why, advice=_MEASURE) for name in _PER_SPEED}
+        inertia = [found[f"inertia_{axis}"] for axis in "xyz"]
         used = [e.start if e.refused and e.start else e.value for e in inertia]
         if not inertia[2].refused and not _is_body(used):
             why = f"no body has it beside {used[0]:.4g} and {used[1]:.4g} about x and y"
-            estimates["inertia_z"] = replace(inertia[2], refused=why, advice=_TURNS)
-        vehicle = self._assembled({name: e.value for name, e in estimates.items() if not e.refused})
-        if estimates["inertia_z"].refused:
-            estimates["drag_to_thrust"], vehicle = self._yaw_gain(estimates, vehicle)
-        first = search.parameters(x, 0)
-        return Identification(
-            estimates=tuple(estimates[name] for name in _KINDS if name in estimates),
-            vehicle=vehicle,
-            delay=late.value,
-            offset=(first.offset[0], first.offset[1]),
-            wind=(float(first.wind[:, 0].mean()), float(first.wind[:, 1].mean())),
-            throttle_curve=first.throttle_curve,
-            voltage_exponent=first.voltage_exponent,
-            voltage=search.voltage or None,
-            yaw_trim=first.yaw_trim,
-            whiteness=self.colour,
-            cross_check=_output_error(search),
-        )
+            found["inertia_z"] = replace(inertia[2], refused=why, advice=_TURNS)
+        if found["inertia_z"].refused and self._turns_by_a_known_amount():
+            why = "only the yaw acceleration that it gives is identified, with inertia_z as kept"
+            found["drag_to_thrust"] = replace(found["drag_to_thrust"], refused=why, advice=_TURNS)
+            self.set_anew |= {"drag_to_thrust"}
+        self.set_anew |= {*_PER_SPEED} if self._throttle else set()
+        return {name: found[name] for name in _KINDS if name in found}
 
-    def _estimate(self, i: int) -> ParameterEstimate:
-        number, x = self.search.sought[i], self.search.x[i]
-        half = self._half_width({i: 1.0})
+    def _response(self) -> dict[str, ParameterEstimate]:
+        """How the rotors answer, where the log has both speeds and commands."""
+        search, found = self.search, {}
+        for name, response in rotor_response(search.parts, self.vehicle, search.voltage).items():
+            kind, value = _KINDS[name], response.value
+            spread = math.hypot(response.deviation, _ANSWERS * abs(value))
+            half = _quantile(response.blocks) * spread
+            widest = _WIDEST_ANSWER.get(name, math.expm1(WIDEST) * abs(value))
+            unit = kind.unit or VEHICLE_UNITS[name]
+            why = f"{_WEAK}: the interval is +-{half:.2g} {unit}, allowed {widest:.2g}" if half > widest else ""
+            why = "no lag can be seen" if name in ("rotor_rise", "rotor_fall") and value <= 0.0 else why
+            found[name] = self._judged(name, value, value - half, value + half, why)
+        return found
+
+    def _turns_by_a_known_amount(self) -> bool:
+        shares = {"drag_to_thrust": 1.0, "thrust_coefficient": 1.0, "inertia_z": -1.0}
+        sought = {i: shares[number.name] for i, number in enumerate(self.search.sought) if number.name in shares}
+        return self._half_width(sought, ("yaw",)) <= WIDEST
+
+    def _estimate(self, name: str, places: Sequence[int]) -> ParameterEstimate:
+        """One number, or the mean of those of each flight with an interval that holds each."""
+        search, kind = self.search, _KINDS[name]
+        x, number = search.x[list(places)], search.sought[places[0]]
+        if len(places) == 1 and self._speaks_against_the_start(places[0]):
+            self.set_anew.add(name)
+        halves = np.array([self._half_width({i: 1.0}, kind.axes) for i in places])
+        middle = float(np.average(x, weights=halves**-2.0))
+        half = float(halves.min()) if len(places) == 1 else max(float(halves.min()), float(np.abs(x - middle).max()))
+        value = number.value(middle)
         found = self._judged(
-            number.name, number.value(x), number.value(x - half), number.value(x + half), self._weak(i, half)
+            name, value, number.value(middle - half), number.value(middle + half), self._weak(name, places, half, value)
         )
         if not WIDEST < half < _NEARLY * WIDEST or not found.refused.startswith(_WEAK):
             return found
         flown = sum(part.record.period * len(part.increments) for part in self.search.parts)
         return replace(found, advice=f"{found.advice}, or the same again, {flown * (half / WIDEST) ** 2:.0f} s in all")
 
-    def _weak(self, i: int, half: float) -> str:
+    def _speaks_against_the_start(self, i: int) -> bool:
+        """Whether a number is two standard deviations of what the innovations explain from the start's, or from 0."""
+        number, deviation = self.search.sought[i], math.sqrt(self.cov[i, i])
+        if number.name in ("body_drag", *_PER_FLIGHT):
+            return False
+        absent = number.scale is None and number_in(self.vehicle, number.name) is None
+        return deviation < 0.5 if absent else abs(self.search.x[i]) > 2.0 * deviation
+
+    def _weak(self, name: str, places: Sequence[int], half: float, value: float) -> str:
         """Why a number that is searched for tells nothing, or nothing."""
-        number, kind = self.search.sought[i], _KINDS[self.search.sought[i].name]
-        loud = max(kind.axes, key=self.colour.__getitem__)
-        if self.colour[loud] > self.most_colour:
-            found = f"innovations of {loud} correlate by {self.colour[loud]:.2f}"
-            return f"not white: {found}, allowed {self.most_colour:.2g}"
-        relative = half if number.scale is None else half * number.scale / abs(number.value(self.search.x[i]))
-        if relative > WIDEST and number.name in _RELATIVE:
+        number, kind = self.search.sought[places[0]], _KINDS[name]
+        scale = number.scale
+        if name == "thrust_coefficient" and abs(left := self._uncarried()) > UNCARRIED:
+            return f"with it, {left:.1%} of the weight is not carried, allowed {UNCARRIED:.0%}"
+        if kind.widest is not None and scale is not None:
+            if half > max(kind.widest, WIDEST * abs(value / scale) if name not in _PER_FLIGHT else 0.0):
+                unit = kind.unit or VEHICLE_UNITS[field_of(name)]
+                return f"{_WEAK}: the interval is +-{half * scale:.2g} {unit}, allowed {kind.widest * scale:.2g}"
+        elif (relative := half if scale is None else half * scale / abs(value)) > WIDEST:
             return _not_excited(relative)
-        if number.name == "body_drag" and self.vehicle.body_drag is None:
+        if name.startswith("rate_damping") and value < 0.0:
+            return "below 0: it would drive the turn"
+        if name == "body_drag" and self.vehicle.body_drag is None:
             return "its ratio along x, y and z is not known: give body_drag in the start file"
-        if self.rests[i] > MOST_PRIOR:
-            return f"rests on a rule of thumb for {self.rests[i]:.0%}, allowed {MOST_PRIOR:.0%}"
-        if abs(self.moved[i]) > half:
-            other = number.value(self.search.x[i] + self.moved[i])
-            return f"depends on the noise model: {other:.3g} with one of third order"
-        return ""
+        rests = max(self.rests[i] for i in places)
+        return "" if rests <= MOST_PRIOR else f"rests on a rule of thumb for {rests:.0%}, allowed {MOST_PRIOR:.0%}"
+
+    def _uncarried(self) -> float:
+        """Share of the weight that neither thrust nor drag carry, in the mean over all stretches."""
+        search = self.search
+        left = np.concatenate([search.misfit(search.x, i)[0][:, -1] for i in range(len(search.parts))])
+        return float(left.mean()) / (self.vehicle.gravity * search.parts[0].record.period)
 
     def _judged(self, name: str, value: float, low: float, high: float, refused: str) -> ParameterEstimate:
-        field, _, axis = name.partition("_") if name.startswith("inertia") else (name, "", "")
-        start = getattr(self.vehicle, field, None)
-        if axis and start is not None:
-            start = start["xyz".index(axis)]
-        elif isinstance(start, tuple):
-            start = start[0]
-        return ParameterEstimate(
+        field = field_of(name)
+        estimate = ParameterEstimate(
             name=name,
             unit=_KINDS[name].unit or VEHICLE_UNITS[field],
             value=value,
             low=min(low, high),
             high=max(low, high),
-            start=start,
+            start=None,
             refused=refused,
             advice=_KINDS[name].advice if refused else "",
             in_file=field in VEHICLE_UNITS,
         )
+        return replace(estimate, start=number_in(self.vehicle, name) if estimate.in_file else None)
 
-    def _delay(self) -> ParameterEstimate:
-        """One delay of all stretches: the mean, and an interval that holds each."""
-        search = self.search
-        every = [i for i, number in enumerate(search.sought) if number.name == "delay"]
-        delays = np.array([search.sought[i].value(search.x[i]) for i in every])
-        halves = np.array([self._half_width({i: 1.0}) * (search.sought[i].scale or 1.0) for i in every])
-        value = float(np.average(delays, weights=halves**-2.0))
-        half = max(float(halves.min()), float(np.abs(delays - value).max()))
-        refused = f"not excited: +-{1e3 * half:.0f} ms" if half > WIDEST_DELAY else ""
-        name = "lateness" if self._alone else "delay"
-        return self._judged(name, value, value - half, value + half, refused)
+    def held(self) -> dict[str, float]:
+        """What the second search does not seek: numbers that a gate refuses, at what the file will say of them."""
+        refused = {name: e for name, e in self.estimates.items() if e.refused and name not in self.set_anew}
+        held = {name: estimate.start or 0.0 for name, estimate in refused.items() if estimate.in_file}
+        held |= {name: 0.0 for name in refused if name in ("offset_x", "offset_y")}
+        held |= {"delay": 0.0} if {"delay", "lateness"} & {*refused} else {}
+        held |= {"throttle_curve": 1.0} if "throttle_curve" in refused else {}
+        held |= {"voltage_exponent": 0.0} if "voltage_exponent" in refused else {}
+        sought = {number.name for number in self.search.sought}
+        return {name: value for name, value in held.items() if name in sought} | {"inflow": 0.0}
 
-    def _lags_as_stated(self) -> dict[str, ParameterEstimate]:
-        """Rotor lag where speeds were measured and no commands."""
-        why, lag = "the log has the rotors' speeds but not their commands", self.vehicle.rotor_rise or 0.0
-        return {name: self._judged(name, lag, lag, lag, why) for name in ("rotor_rise", "rotor_fall")}
+    def result(self, refined: Search) -> Identification:
+        """Every estimate, and the vehicle with those that are not refused."""
+        first, x = refined.parameters(refined.x, 0), refined.x
+        numbers: dict[str, list[float]] = {}
+        for number, value in zip(refined.sought, x, strict=False):
+            numbers.setdefault(number.name, []).append(number.value(value))
+        values, estimates = dict(refined.fixed), []
+        values |= {name: e.value for name, e in self.estimates.items() if name.startswith("rotor_") and not e.refused}
+        for name, estimate in self.estimates.items():
+            known = name == "lateness" or (name == "delay" and not self._blind)
+            found = numbers.get("delay", ()) if name == "lateness" else () if known else numbers.get(name, ())
+            if len(found) == 1:
+                values[name] = float(f"{np.clip(found[0], estimate.low, estimate.high):.6g}")
+            if found and not estimate.refused:
+                mean = values.get(name, float(np.clip(np.mean(found), estimate.low, estimate.high)))
+                estimate = replace(estimate, value=mean)
+            estimates.append(estimate)
+        flights = tuple(self._numbers_of(refined, flight) for flight in range(refined.flights))
+        delay, offset, wind = (np.mean([numbers[i] for numbers in flights], axis=0).tolist() for i in range(3))
+        return Identification(
+            estimates=tuple(estimates),
+            vehicle=self._assembled(values),
+            delay=delay,
+            offset=tuple(offset),
+            wind=tuple(wind),
+            flights=flights,
+            throttle_curve=self._answer("throttle_curve", first.throttle_curve),
+            voltage_exponent=self._answer("voltage_exponent", first.voltage_exponent),
+            voltage=refined.voltage or None,
+            yaw_trim=first.yaw_trim,
+            whiteness=self.colour,
+        )
 
-    def _yaw_gain(
-        self, estimates: Mapping[str, ParameterEstimate], vehicle: Vehicle
-    ) -> tuple[ParameterEstimate, Vehicle]:
-        """The yaw reaction that gives the identified yaw acceleration with the inertia that the file keeps."""
-        told, share = estimates["drag_to_thrust"], {"drag_to_thrust": 1.0, "thrust_coefficient": 1.0, "inertia_z": -1.0}
-        sought = enumerate(self.search.sought)
-        half = self._half_width({i: share[number.name] for i, number in sought if number.name in share})
-        if half > WIDEST or self.colour["yaw"] > self.most_colour:
-            return told, vehicle
-        gain = told.value * estimates["thrust_coefficient"].value / estimates["inertia_z"].value
-        tied = float(f"{gain * vehicle.inertia[2] / vehicle.mean_coefficient:.5g}")
-        why = f"only the yaw acceleration that it gives is identified, +-{np.expm1(half):.1%}; "
-        why += f"{tied:.4g} gives it with inertia_z as kept"
-        return replace(told, refused=why, advice=_TURNS), replace(vehicle, drag_to_thrust=tied)
+    def _answer(self, name: str, sought: float) -> float:
+        """A number of the response to throttle and voltage, where the log has measured speeds too."""
+        estimate = self.estimates.get(name)
+        return sought if self._blind or estimate is None or estimate.refused else estimate.value
+
+    def _numbers_of(self, refined: Search, flight: int) -> FlightNumbers:
+        places = [i for i, part in enumerate(refined.parts) if part.flight == flight]
+        each = [refined.parameters(refined.x, i) for i in places]
+        wind = np.mean([p.wind.mean(axis=0) for p in each], axis=0)
+        offset = each[0].offset
+        return FlightNumbers(each[0].delay, (float(offset[0]), float(offset[1])), (float(wind[0]), float(wind[1])))
 
     def _assembled(self, values: Mapping[str, float]) -> Vehicle:
-        """The start's vehicle with other values."""
+        """The start's vehicle with other values; a vector that the start lacks is there if a number of it is known."""
+        known = {name for name, e in self.estimates.items() if e.in_file and (not e.refused or name in self.set_anew)}
+        known |= {"inertia_z"}  # which may have to suit the others
         changes: dict[str, Any] = {
-            name: value for name, value in values.items() if name in VEHICLE_UNITS and name != "body_drag"
+            name: values[name] for name in known if name in VEHICLE_UNITS and name != "body_drag" and name in values
         }
-        inertia = [values.get(f"inertia_{axis}", kept) for axis, kept in zip("xyz", self.vehicle.inertia, strict=True)]
-        if "inertia_z" not in values and not _is_body(inertia):
-            inertia[2] = PLATE[0] * (inertia[0] + inertia[1])
-        if "body_drag" in values:
-            ratio = np.array(self.vehicle.body_drag or LEVEL_PLATE)
+        for name, axes in {"inertia": "xyz", "rotor_moment": "xy", "rate_damping": "xyz"}.items():
+            if known & {*(of := [f"{name}_{axis}" for axis in axes])}:
+                changes[name] = tuple(values.get(one, number_in(self.vehicle, one) or 0.0) for one in of)
+        if "body_drag" in known:
+            ratio: Array = np.array(self.vehicle.body_drag or LEVEL_PLATE)
             changes["body_drag"] = tuple((values["body_drag"] * ratio / ratio[0]).tolist())
-        return replace(self.vehicle, inertia=tuple(inertia), **changes)
+        return replace(self.vehicle, **changes)
+
+
+def _impossible(search: Search) -> dict[str, float]:
+    """Numbers that were found and make no vehicle, with what takes their place: they are to be held at it."""
+    p = search.parameters(search.x, 0)
+    sought = {number.name for number in search.sought}
+    held = {f"rate_damping_{axis}": 0.0 for axis, value in zip("xyz", p.rate_damping, strict=True) if value < 0.0}
+    held = {name: value for name, value in held.items() if name in sought}
+    inertia = p.inertia.tolist()
+    if not _is_body(inertia) and search.fixed.get("inertia_z") != (flat := PLATE[0] * (inertia[0] + inertia[1])):
+        held["inertia_z"] = flat
+    return held
 
 
 def _is_body(inertia: Sequence[float]) -> bool:
@@ -299,36 +398,4 @@ def _colour(search: Search) -> dict[str, float]:
         e = innovations - innovations.mean(axis=0)
         for lag in range(1, 1 + max(1, round(_LONGEST_LAG / part.record.period))):
             colour = np.maximum(colour, np.abs((e[lag:] * e[:-lag]).mean(axis=0)) / (e**2).mean(axis=0))
-    return dict(zip(INCREMENTS, colour.tolist(), strict=True))
-
-
-def _output_error(search: Search) -> dict[str, float]:
-    """Estimates of the output-error method over those of the search, by parameter.
-
-    It takes all noise for the sensors': windows of `OUTPUT_ERROR_WINDOW`, each with a first sample and a constant
-    torque of its own.  A torque that the loop answers makes it wrong, by 10 to 20 % in the inertias.
-    """
-    count = len(search.sought)
-    x = search.x.copy()
-    for _ in range(_STEPS):
-        _, prior = search.prior(x)
-        H, g = prior.H[:count, :count].copy(), prior.g[:count].copy()
-        for i, part in enumerate(search.parts):
-            misfit, slopes = search.misfits(x, i)
-            n = max(4, round(OUTPUT_ERROR_WINDOW / part.record.period))
-            rows = len(misfit) // n * n
-            every = np.concatenate([misfit[:rows, :, None], slopes[:rows]], axis=2).reshape(
-                -1, n, len(INCREMENTS), count + 1
-            )
-            summed = np.cumsum(every, axis=1)
-            summed -= summed.mean(axis=1, keepdims=True)
-            slope = np.arange(n) - 0.5 * (n - 1)
-            slope /= np.linalg.norm(slope)
-            summed[:, :, :3] -= np.einsum("i,k,wkap->wiap", slope, slope, summed[:, :, :3])
-            summed /= np.sqrt((summed[..., :1] ** 2).mean(axis=(0, 1), keepdims=True))
-            residual, J = summed[..., 0].ravel(), summed[..., 1:].reshape(-1, count)
-            H += J.T @ J
-            g += J.T @ residual
-        x[:count] += np.clip(-np.linalg.solve(H, g), -0.3, 0.3)
-    found = zip(search.sought, x, search.x, strict=False)
-    return {number.name: float(np.exp(new - old)) for number, new, old in found if number.scale is None}
+    return dict(zip(INCREMENTS, np.minimum(colour, 0.99).tolist(), strict=True))

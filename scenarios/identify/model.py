@@ -14,9 +14,11 @@ from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.identify.record import Record
-from scenarios.identify.rotors import Turning, corrected, lagging, measured, smoothed
+from scenarios.identify.rotors import Turning, lagging, measured, smoothed
 
 INCREMENTS: Final = ("roll", "pitch", "yaw", "vx", "vy", "vz")
+VECTORS: Final = {"rotor_moment": 2, "rate_damping": 3, "body_drag": 3}
+"""Parameters that are vectors and that a vehicle file may leave out."""
 AT_ONCE: Final = 1e-6  # lag of rotors that have none [s]
 _SMOOTHING: Final = 0.1
 """Time constant [s] below which the attitude follows the gyro: it averages the noise of the attitude itself."""
@@ -35,12 +37,12 @@ class Parameters:
     rotor_inertia: float
     rotor_drag: float
     body_drag: Array  # (3,)
-    offset: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,) centre of mass in the rotors' frame, x and y, and how far above it rotor drag acts [m]."""
+    rotor_moment: Array  # (2,)
+    rate_damping: Array  # (3,)
+    offset: Array = field(default_factory=lambda: np.zeros(2))  # (2,) centre of mass in the rotors' frame [m]
     wind: Array = field(default_factory=lambda: np.zeros((2, 2)))
     """(W, 2) world x and y, linear between W instants from first sample to last [m/s]."""
     inflow: float = 0.0  # thrust lost per rotor speed and air speed along the axis [N s^2/(m rad)]
-    munk: float = 0.0  # mass of air that moves along body z less that along x and y [kg]
     yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
     throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle [-]
     voltage_exponent: float = 0.0  # n of thrust over voltage, (V / V0)^n
@@ -52,8 +54,8 @@ class Parameters:
         own: dict[str, Any] = {name: getattr(vehicle, name) or AT_ONCE for name in ("rotor_rise", "rotor_fall")}
         own |= {name: getattr(vehicle, name) or 0.0 for name in ("rotor_inertia", "rotor_drag")}
         own |= {"thrust_coefficient": vehicle.mean_coefficient, "drag_to_thrust": vehicle.drag_to_thrust}
-        drag = np.array(vehicle.body_drag or (0.0, 0.0, 0.0))
-        return cls(inertia=np.array(vehicle.inertia), body_drag=drag, **own, **others)
+        own |= {name: np.array(getattr(vehicle, name) or (0.0,) * n) for name, n in VECTORS.items()}
+        return cls(inertia=np.array(vehicle.inertia), **own, **others)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,11 +73,12 @@ class Stretch:
     """Part of a record that flies, with what no parameter changes."""
 
     record: Record
+    flight: int  # which of those fitted together
     increments: Array  # (N - 1, 6) of body rates [rad/s] and world velocity [m/s]
     motion: MeanMotion
 
 
-def stretch(record: Record) -> Stretch:
+def stretch(record: Record, flight: int) -> Stretch:
     """Prepare a record, all of which flies."""
     if record.speeds is not None:
         record = replace(record, speeds=smoothed(record.speeds))
@@ -84,6 +87,7 @@ def stretch(record: Record) -> Stretch:
     rates, turns, velocity = means
     return Stretch(
         record=record,
+        flight=flight,
         increments=np.diff(np.concatenate([record.rates, record.velocity], axis=1), axis=0),
         motion=MeanMotion(period=record.period, rates=rates, turn=turns, velocity=velocity),
     )
@@ -103,8 +107,14 @@ def _smoothed(record: Record) -> Array:
 
 def turning(record: Record, vehicle: Vehicle, p: Parameters) -> Turning:
     """The rotors' speeds, from whatever the record has of them."""
-    if record.speeds is not None and record.commands is None:
+    if record.speeds is not None:
         return measured(record.speeds, record.period, delay=p.delay)
+    commands = commanded(record, vehicle, p)
+    return lagging(commands, record.period, rise=p.rotor_rise, fall=p.rotor_fall, delay=p.delay)
+
+
+def commanded(record: Record, vehicle: Vehicle, p: Parameters) -> Array:
+    """(N, 4) rotor speeds that the commands or the throttle demand [rad/s]."""
     if record.commands is not None:
         commands = record.commands
     else:
@@ -112,10 +122,9 @@ def turning(record: Record, vehicle: Vehicle, p: Parameters) -> Turning:
         share = np.clip(record.throttle, 0.0, 1.0)
         slope = np.maximum(1.0 - p.throttle_curve * (1.0 - share), 1e-3)
         commands = vehicle.speed_max * np.sqrt(slope * share)
-    if record.voltage is not None:
+    if record.voltage is not None and p.voltage_exponent:
         commands = commands * (record.voltage / p.voltage)[:, None] ** (0.5 * p.voltage_exponent)
-    follower = lagging(commands, record.period, rise=p.rotor_rise, fall=p.rotor_fall, delay=p.delay)
-    return follower if record.speeds is None else corrected(follower, record.speeds, record.period)
+    return np.asarray(commands)
 
 
 def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:
@@ -143,16 +152,14 @@ def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, 
         [
             thrust @ y
             - p.offset[1] * total
-            - p.offset[2] * force[:, 1]
+            + p.rotor_moment[0] * (rotors.mean.sum(axis=1) * air[:, 1] + yaw * (rotors.mean @ x))
             - momentum * pitch
-            - (jz - jy) * pitch * yaw
-            - p.munk * air[:, 1] * air[:, 2],
+            - (jz - jy) * pitch * yaw,
             p.offset[0] * total
             - thrust @ x
-            + p.offset[2] * force[:, 0]
+            - p.rotor_moment[1] * (rotors.mean.sum(axis=1) * air[:, 0] - yaw * (rotors.mean @ y))
             + momentum * roll
-            - (jx - jz) * roll * yaw
-            + p.munk * air[:, 0] * air[:, 2],
+            - (jx - jz) * roll * yaw,
             p.drag_to_thrust * (thrust @ spin)
             + (side[1] * x - side[0] * y).sum(axis=1)
             + p.yaw_trim
@@ -160,7 +167,7 @@ def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, 
         ],
         axis=1,
     )
-    angular = dt * torque
+    angular = dt * (torque - p.rate_damping * motion.rates)
     angular[:, 2] -= spun_up
     body = force - 0.5 * SEA_LEVEL_DENSITY * p.body_drag * np.linalg.norm(air, axis=1, keepdims=True) * air
     linear = np.einsum("kij,kj->ki", motion.turn, body) / vehicle.mass - [0.0, 0.0, vehicle.gravity]

@@ -7,11 +7,13 @@ the identified thrust with the body rates of the window's start, the baseline of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from quadsim.errors import InputError
@@ -25,10 +27,13 @@ from scenarios.identify.rotors import Turning
 
 PREDICTION_WINDOW: Final = 0.5  # longest horizon [s]; windows start every half of it
 HORIZONS: Final = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)  # at which errors are taken [s]
+JUDGED: Final = (0.1, 0.25, 0.5)  # horizons of the verdict [s]
+TIE: Final = 0.05  # by which the errors of a quantity may exceed a rival's, in their geometric mean over the horizons
 IDENTIFIED, START, THRUST_ONLY = "identified", "start", "thrust only"
 QUANTITIES: Final = {"position": "m", "velocity": "m/s", "attitude": "rad", "body rates": "rad/s"}
 ROTOR_FIELDS: Final = ("commands", "throttle", "speeds", "voltage")  # what a record may say of them
 _HELD_OUT: Final = 0.2  # share of the airborne samples of a log
+_DRIFT: Final = 5.0  # [s] over which a velocity by the accelerometer is left out
 _SHOWN: Final = 10  # windows in a trace
 _VELOCITY_AND_RATES: Final = [3, 4, 5, 10, 11, 12]  # of a state
 
@@ -49,8 +54,39 @@ class PredictionErrors:
 
     windows: int
     errors: Mapping[str, Array]
-    """By model: (len(HORIZONS), 4) mean norm of the error, in the order of `QUANTITIES`; NaN without positions."""
+    """By model: (len(HORIZONS), 4) mean norm of the error, in the order of `QUANTITIES`; NaN without what they need."""
     trace: Trace
+
+    def ratios(self, rival: str) -> dict[str, tuple[float, ...]]:
+        """Errors of the identified vehicle over a rival's at `JUDGED`, by quantity that the logs have."""
+        at = [HORIZONS.index(horizon) for horizon in JUDGED]
+        ratios = self.errors[IDENTIFIED][at] / np.maximum(self.errors[rival][at], 1e-12)
+        return {
+            name: tuple(of.tolist()) for name, of in zip(QUANTITIES, ratios.T, strict=True) if np.isfinite(of).all()
+        }
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """Where a rival predicts better by more than `TIE`, in words; empty where the identified vehicle wins."""
+        return tuple(
+            f"{quantity} than {rival}, {' '.join(f'{ratio:.2f}' for ratio in of)} times its error"
+            for rival in (START, THRUST_ONLY)
+            for quantity, of in self.ratios(rival).items()
+            if math.prod(of) > (1.0 + TIE) ** len(of)
+        )
+
+    @property
+    def verdict(self) -> str:
+        """Whether the identified vehicle predicts better than its rivals, and by how much."""
+        horizons = f"at {', '.join(f'{horizon:g}' for horizon in JUDGED)} s"
+        if self.lost:
+            return f"predicts flight that was not fitted worse, {horizons}: {'; '.join(self.lost)}"
+        each = []
+        for rival in (START, THRUST_ONLY):
+            of = np.array([*self.ratios(rival).values()])
+            mean = np.exp(np.log(np.maximum(of, 1e-12)).mean(axis=0)).tolist()
+            each.append(f"{', '.join(f'{ratio:.2f}' for ratio in mean)} of the errors of {rival}")
+        return f"predicts flight that was not fitted better: {horizons}, {' and '.join(each)}"
 
 
 def hold_out(record: Record, spans: Sequence[slice]) -> tuple[list[slice], list[slice]]:
@@ -71,33 +107,23 @@ def hold_out(record: Record, spans: Sequence[slice]) -> tuple[list[slice], list[
 
 
 def predict(
-    records: Sequence[Record], spans: Sequence[Sequence[slice]], identification: Identification, start: Vehicle
+    records: Sequence[Record],
+    spans: Sequence[Sequence[slice]],
+    identification: Identification,
+    start: Vehicle,
+    *,
+    fitted: bool = False,
 ) -> PredictionErrors:
-    """Predict every window of the held-out spans of some records.
+    """Predict every window of the held-out spans of some records, with their own numbers where they were `fitted`.
 
     Raises:
         InputError: no span is as long as a window.
     """
-    known = _without_refused(identification)
-    voltage = known.voltage or 0.0
-    identified = Parameters.of(
-        known.vehicle,
-        delay=known.delay,
-        offset=np.array([*known.offset, 0.0]),
-        wind=np.array([known.wind, known.wind]),
-        yaw_trim=known.yaw_trim,
-        throttle_curve=known.throttle_curve,
-        voltage_exponent=known.voltage_exponent,
-        voltage=voltage,
-    )
-    models = {
-        IDENTIFIED: identified,
-        START: Parameters.of(start, voltage=voltage),
-        THRUST_ONLY: replace(identified, rotor_drag=0.0, body_drag=np.zeros(3)),
-    }
-    errors: dict[str, list[Array]] = {name: [] for name in models}
+    errors: dict[str, list[Array]] = {name: [] for name in (IDENTIFIED, START, THRUST_ONLY)}
     traces = []
-    for record, span in ((record, span) for record, own in zip(records, spans, strict=True) for span in own):
+    for flight, record, span in (
+        (i, record, span) for i, (record, own) in enumerate(zip(records, spans, strict=True)) for span in own
+    ):
         length = max(1, round(PREDICTION_WINDOW / record.period))
         rows = np.arange(span.start, span.stop - length, max(1, length // 2))[:, None] + np.arange(length + 1)
         if not rows.size:
@@ -106,10 +132,11 @@ def predict(
         at = np.rint(np.array(HORIZONS) / record.period).astype(int)
         drawn = np.s_[: 2 * _SHOWN : 2, :, _VELOCITY_AND_RATES]
         drawn_states = {}
-        for name, model in models.items():
+        for name, model in _models(identification.of_flight(flight) if fitted else identification, start).items():
             rotors = turning(_held(record), start, model)
             states = _simulate(model, start, rotors, rows, measured, record.period, turns=name != THRUST_ONLY)
             errors[name].append(_errors(states[:, at], measured[:, at]))
+            errors[name][-1][..., 1] *= np.nan if record.inertial else 1.0
             drawn_states[name] = states[drawn]
         traces.append(
             Trace(log=record.name, t=record.t[rows[: 2 * _SHOWN : 2]], measured=measured[drawn], predicted=drawn_states)
@@ -127,21 +154,32 @@ def predict(
     )
 
 
-def _without_refused(known: Identification) -> Identification:
-    """Return the identification without a delay or offset that a gate refuses, and without wind if it refuses drag."""
-    refused = {estimate.name for estimate in known.estimates if estimate.refused}
-    offset = (
-        0.0 if "offset_x" in refused else known.offset[0],
-        0.0 if "offset_y" in refused else known.offset[1],
+def _models(known: Identification, start: Vehicle) -> dict[str, Parameters]:
+    voltage = known.voltage or 0.0
+    identified = Parameters.of(
+        known.vehicle,
+        delay=known.delay,
+        offset=np.array(known.offset),
+        wind=np.array([known.wind, known.wind]),
+        yaw_trim=known.yaw_trim,
+        throttle_curve=known.throttle_curve,
+        voltage_exponent=known.voltage_exponent,
+        voltage=voltage,
     )
-    wind = (0.0, 0.0) if {"rotor_drag", "body_drag"} <= refused else known.wind
-    return replace(known, delay=0.0 if refused & {"delay", "lateness"} else known.delay, offset=offset, wind=wind)
+    return {
+        IDENTIFIED: identified,
+        START: Parameters.of(start, voltage=voltage),
+        THRUST_ONLY: replace(identified, rotor_drag=0.0, body_drag=np.zeros(3)),
+    }
 
 
 def _measured(record: Record) -> Array:
     """(N, 13) position, velocity, attitude and body rates; positions are NaN where there are none."""
     position = np.full_like(record.velocity, np.nan) if record.position is None else record.position
-    return np.concatenate([position, record.velocity, record.attitude, record.rates], axis=1)
+    velocity = record.velocity
+    if record.inertial:  # what it drifts by is left out
+        velocity = velocity - uniform_filter1d(np.nan_to_num(velocity), round(_DRIFT / record.period), axis=0)
+    return np.concatenate([position, velocity, record.attitude, record.rates], axis=1)
 
 
 def _errors(predicted: Array, measured: Array) -> Array:

@@ -15,10 +15,15 @@ from quadsim.state import Array
 from scenarios.identify.columns import TABLE_SUFFIXES, read_columns
 from scenarios.identify.series import SampledSeries
 from scenarios.identify.ulog import ULOGS, read_ulog
+from scenarios.identify.windows import to_world
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
+_GRAVITY: Final = 9.81  # [m/s^2] of what an accelerometer shows at rest
+_UP: Final = 0.07  # by which the mean force may differ from the weight
+_FORCES: Final = ((1.0 / _GRAVITY, "in g"), (-1.0, "z points down"), (-1.0 / _GRAVITY, "in g, z points down"))
+"""Mean force over the weight, and its usual causes."""
 INPUTS: Final = ("commands", "throttle", "speeds")
 
 
@@ -39,6 +44,8 @@ class Record:
     throttle: Array | None = None  # (N, 4) the same as a share of full throttle [-]; one of these three is there
     speeds: Array | None = None  # (N, 4) measured rotor speeds [rad/s]
     voltage: Array | None = None  # (N,) of the battery [V]
+    inertial: bool = False
+    """Whether an accelerometer stands in for the velocity, which then has its changes, but neither mean nor drift."""
     notes: tuple[str, ...] = ()  # what was derived or assumed in reading it
 
     @property
@@ -88,10 +95,16 @@ def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
     series = {field: samples for field, samples in series.items() if field != "voltage"}
     for field, samples in series.items():
         _check_clock(name, field, samples.t)
+    force = series.pop("force", None)
     optional = ("position", *INPUTS)
     series = {f: s for f, s in series.items() if f not in optional or np.isfinite(s.values).all(axis=1).any()}
     notes: tuple[str, ...] = ()
-    if "velocity" not in series:
+    inertial = not {"velocity", "position"} & {*series}
+    if inertial:
+        assert force is not None
+        series = {**series, "velocity": force}
+        notes = (f"{name}: no velocity is logged; the accelerometer stands in for it",)
+    elif "velocity" not in series:
         place = series["position"]
         slope = np.gradient(place.values, place.t, axis=0)
         series = {**series, "velocity": SampledSeries(t=place.t, values=slope)}
@@ -101,9 +114,35 @@ def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
     grid = _clock(name, series)
     values = {field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()}
     values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
+    if inertial:
+        values["velocity"] = _integrated(name, values["velocity"], values["attitude"], float(grid[1] - grid[0]))
     if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
         values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
-    return Record(name=name, t=grid, notes=notes, **values)
+    return Record(name=name, t=grid, notes=notes, inertial=inertial, **values)
+
+
+def _integrated(name: str, force: Array, attitude: Array, period: float) -> Array:
+    """Velocity (N, 3), but for its drift, by specific force (N, 3), body, and attitude (N, 4); NaN in gaps.
+
+    Raises:
+        InputError: the mean force does not carry the weight.
+    """
+    world = to_world(attitude, force)
+    there = np.asarray(np.isfinite(world).all(axis=1))
+    if not there.any():
+        return world
+    up = float(np.mean(world[there, 2])) / _GRAVITY
+    if not 1.0 / (1.0 + _UP) < up < 1.0 + _UP:
+        likely = next((what for of, what in _FORCES if abs(up / of - 1.0) < _UP), "not the specific force in body axes")
+        raise InputError(
+            f"{name}: ax, ay, az carry {up:.3g} times the weight in the mean, 1 within {_UP:.0%} is allowed: likely "
+            f"{likely}; give the specific force in m/s^2, x forward, y left, z up"
+        )
+    rest = np.where(there[:, None], world - [0.0, 0.0, _GRAVITY], 0.0)
+    rest -= rest[there].mean(axis=0)
+    steps = np.zeros_like(rest)
+    steps[1:] = 0.5 * period * (rest[1:] + rest[:-1])
+    return np.where(there[:, None], np.cumsum(steps, axis=0), np.nan)
 
 
 def _check_clock(name: str, field: str, t: Array) -> None:

@@ -23,13 +23,21 @@ from scenarios.identify.checks import check_log, spans
 from scenarios.identify.estimate import Identification, ParameterEstimate
 from scenarios.identify.fit import identify_records
 from scenarios.identify.identification_figures import horizon_figure, interval_figure, trace_figure
-from scenarios.identify.prediction import HORIZONS, QUANTITIES, PredictionErrors, hold_out, predict
+from scenarios.identify.prediction import (
+    HORIZONS,
+    JUDGED,
+    QUANTITIES,
+    START,
+    THRUST_ONLY,
+    PredictionErrors,
+    hold_out,
+    predict,
+)
 from scenarios.identify.record import read_record
 from scenarios.identify.vehicle_file import interval_text, rounded, vehicle_text, verdict
 from scenarios.results import Result, Shown, after
 
 NEEDED_PARAMETERS: Final = "mass, gravity, arm_length, rotor_azimuths, rotor_spins, speed_min and speed_max"
-_SHOWN_HORIZONS: Final = (0.1, 0.5)  # of the table of errors [s]
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -52,12 +60,16 @@ class IdentifiedVehicle(Result):
 
     @property
     def verdict(self) -> Cell:
+        """Whether the vehicle predicts flight that was not fitted better than the start and than thrust alone."""
+        return Cell(text=self.prediction.verdict, mark=Mark.BAD if self.prediction.lost else Mark.GOOD)
+
+    @property
+    def counted(self) -> str:
         """How many parameters are identified, and which are not."""
         estimates = self.identification.estimates
         kept = [estimate.name for estimate in estimates if estimate.refused]
         text = f"{len(estimates) - len(kept)} of {len(estimates)} parameters identified from {', '.join(self.logs)}"
-        tail = f"; not identified: {', '.join(kept)}" if kept else ""
-        return Cell(text=text + tail, mark=Mark.WARN if kept else Mark.GOOD)
+        return text + (f"; not identified: {', '.join(kept)}" if kept else "")
 
     @property
     def advice(self) -> dict[str, str]:
@@ -84,16 +96,15 @@ class IdentifiedVehicle(Result):
         parameters = Grid(
             key="parameters",
             title="Parameters",
-            head=("parameter", "unit", "start", "estimate", "95 % interval", "cross-check", "verdict"),
+            head=("parameter", "unit", "start", "estimate", "95 % interval", "verdict"),
             lines=tuple(_parameter(estimate, known) for estimate in known.estimates),
-            note="cross-check: what a second method finds, output error, over this value."
-            + (f" Largest autocorrelation of what is not predicted, 0 for noise: {white}." if white else ""),
+            note=f"Largest autocorrelation of what is not predicted, 0 for noise: {white}." if white else "",
         )
         held_out = ", ".join(self.test) or "the last fifth of each log, which is not fitted"
         lines = []
         for j, (quantity, si) in enumerate(QUANTITIES.items()):
             unit, scale = shown_unit(si)
-            for horizon in _SHOWN_HORIZONS:
+            for horizon in JUDGED:
                 errors = [scale * float(of[HORIZONS.index(horizon), j]) for of in self.prediction.errors.values()]
                 if all(map(math.isfinite, errors)):
                     best = min(errors)
@@ -114,6 +125,7 @@ class IdentifiedVehicle(Result):
         from scenarios import console
 
         yield console.styled((self.verdict.text, "bold"))
+        yield self.counted
         yield from console.grids(self.tables(), left=("unit", "verdict", "horizon"))
         yield from self.sentences()
 
@@ -141,8 +153,8 @@ class IdentifiedVehicle(Result):
         if self.page is not None:
             yield console.to_open(self.page)
         if self.file is None:
-            yield "no vehicle file was written: --out mine.toml writes it"
-        else:
+            yield f"no vehicle file was written: --out mine.toml{' --anyway' * bool(self.prediction.lost)} writes it"
+        elif not self.prediction.lost:
             yield console.command(f"{console.to_open(self.file, 'quadsim scenario --for')} > first.toml")
             settings = "".join(f" --set {shlex.quote(f'{name}={value}')}" for name, value in self.settings.items())
             yield console.command(f"quadsim run first.toml{settings}")
@@ -159,6 +171,8 @@ class IdentifiedVehicle(Result):
             "notes": self.notes,
             "advice": self.advice,
             "settings": self.settings,
+            "verdict": {"better": not self.prediction.lost, "text": self.prediction.verdict}
+            | {rival: self.prediction.ratios(rival) for rival in (START, THRUST_ONLY)},
             "prediction": {"windows": self.prediction.windows, "horizons": HORIZONS, "errors": errors},
             "vehicle_file": self.content,
             "written": [str(path) for path in (self.file, self.page) if path is not None],
@@ -175,6 +189,8 @@ def identify_logs(
     out: Path | None = None,
     page: Path | None = None,
     overwrite: bool = False,
+    wind: bool = False,
+    anyway: bool = False,
 ) -> IdentifiedVehicle:
     """Identify a vehicle from logs, given a start file; see `quadsim.identify`."""
     places = {name: None if path is None else require_file(path, overwrite=overwrite)
@@ -194,7 +210,7 @@ def identify_logs(
     if not tested:
         fitted, held = map(list, zip(*map(hold_out, records, fitted), strict=True))
     try:
-        identification = identify_records(records, fitted, vehicle)
+        identification = identify_records(records, fitted, vehicle, wind=wind)
     except ParameterError as error:
         if error.owner != "vehicle":
             raise
@@ -205,13 +221,15 @@ def identify_logs(
     names = tuple(record.name for record in records)
     result = IdentifiedVehicle(
         identification=identification,
-        prediction=predict(tested or records, held, identification, vehicle),
+        prediction=predict(tested or records, held, identification, vehicle, fitted=not tested),
         notes=tuple(notes),
         logs=names,
         test=tuple(record.name for record in tested),
         content=vehicle_text(identification, start, names),
         **places,
     )
+    if result.prediction.lost and not anyway:
+        result = replace(result, file=None)
     if result.file is not None:
         with writing_file(result.file, overwrite=overwrite) as new:
             new.write_text(result.content, encoding="utf-8")
@@ -239,17 +257,16 @@ def _render(result: IdentifiedVehicle) -> str:
             Section(title="Prediction of flight not fitted", plots=tuple(map(to_plot, figures)), tables=(errors,)),
         ],
         verdict=result.verdict,
-        notes=result.sentences(),
+        notes=(result.counted, *result.sentences()),
     )
 
 
 def _parameter(estimate: ParameterEstimate, known: Identification) -> tuple[Cell, ...]:
     """Return a line of the table of parameters."""
     start = ABSENT if estimate.start is None else f"{estimate.start:.4g}"
-    value, ratio = f"{rounded(estimate.value, estimate):.7g}", known.cross_check.get(estimate.name)
-    checked = ABSENT if ratio is None else f"{ratio:.3f}"
+    value = f"{rounded(estimate.value, estimate):.7g}"
     found = Cell(text=verdict(estimate, known.vehicle), mark=Mark.TEXT)
-    return line(estimate.name, estimate.unit, start, value, interval_text(estimate), checked, found)
+    return line(estimate.name, estimate.unit, start, value, interval_text(estimate), found)
 
 
 def _plain(values: Any) -> Any:

@@ -8,13 +8,12 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import make_smoothing_spline
 from scipy.linalg import solve_banded
-from scipy.signal import lfilter
 
 from quadsim.state import Array, Indices
 from quadsim.vehicle import N_ROTORS
 
 _PASSES: Final = 12  # until every step knows whether its rotor speeds up
-_CORRECTION: Final = 0.2  # time constant [s] of the correction by measured speeds
+_ROUGHNESS: Final = 0.3  # of a smoothing spline per sample: what takes less than 5 samples is noise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,16 +81,7 @@ def measured(speeds: Array, period: float, *, delay: float) -> Turning:
 def smoothed(speeds: Array) -> Array:
     """Measured speeds (N, 4) [rad/s] without their noise, which would make torques look larger than they are."""
     when = np.arange(len(speeds), dtype=float)
-    return np.stack([make_smoothing_spline(when, column)(when) for column in speeds.T], axis=1)
-
-
-def corrected(follower: Turning, speeds: Array, period: float) -> Turning:
-    """Rotors that follow their commands in a slowly changing ratio, as measured speeds (N, 4) [rad/s] show it."""
-    share = period / (period + _CORRECTION)
-    ratio = speeds / np.maximum(follower.speeds, 1e-3 * follower.speeds.max())
-    slow = lfilter([share], [1.0, share - 1.0], ratio, axis=0, zi=(1.0 - share) * ratio[:1])[0]
-    mean = 0.5 * (slow[1:] + slow[:-1])
-    return Turning(speeds=slow * follower.speeds, mean=mean * follower.mean, square=mean**2 * follower.square)
+    return np.stack([make_smoothing_spline(when, column, lam=_ROUGHNESS)(when) for column in speeds.T], axis=1)
 
 
 def _linear(speeds: Array) -> Turning:

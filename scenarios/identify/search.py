@@ -10,9 +10,8 @@ commands does not bias this estimate, as each e_k is predicted from commands and
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -33,7 +32,8 @@ _MOST_KNOTS: Final = 40
 SHORTEST_FOLD: Final = 3.0  # shortest part of a log that is left out in turn [s]
 FEWEST: Final = 6  # parts, shorter ones of a log of less than 18 s: of 2, Student's t makes intervals useless
 _MOST_BLOCKS: Final = 20
-_NOISE_AT_FIRST: Final = ((1.0, 0.0), (-1.5, 0.5))  # reflection coefficients of A and C, before tanh
+_ORDER: Final = 2  # of A and C
+_NOISE_AT_FIRST: Final = (1.0, 0.0, -1.5, 0.5)  # reflection coefficients of A and C, before tanh
 PLATE: Final = (0.87, 0.12)
 """Inertia_z over inertia_x + inertia_y, and its standard deviation in logarithms; of a plate it is 1."""
 LEVEL_PLATE: Final = (1.0, 1.0, 2.0)  # drag areas along x, y, z to each other, where the start has none
@@ -51,43 +51,46 @@ class Sought(NamedTuple):
     start: float
     scale: float | None  # None for the logarithm
     deviation: float | None  # of the prior, in units of x; None without
-    part: int | None = None  # of the stretch whose own it is; None for one of the vehicle
+    flight: int | None = None  # whose own it is; None for one of the vehicle
+    part: int | None = None  # of the stretch whose own it is
 
     def value(self, x: float) -> float:
         """The number itself."""
         return float(self.start * np.exp(x)) if self.scale is None else float(self.start + self.scale * x)
 
 
-def _sought(vehicle: Vehicle, parts: Sequence[Stretch]) -> list[Sought]:
+def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterator[Sought]:
     """What is searched for, from the vehicle of the start file on."""
-    weight, arm = vehicle.mass * vehicle.gravity, vehicle.longest_arm
+    weight, arm, hover = vehicle.mass * vehicle.gravity, vehicle.longest_arm, vehicle.hover_speed
     record = parts[0].record
-    area = vehicle.body_drag[0] if vehicle.body_drag else 0.25 * arm**2
     lag = vehicle.rotor_rise or vehicle.rotor_fall or 0.03
-    numbers = [
-        Sought("thrust_coefficient", vehicle.mean_coefficient, None, None),
-        *(Sought(f"inertia_{axis}", value, None, None) for axis, value in zip("xyz", vehicle.inertia, strict=True)),
-        Sought("drag_to_thrust", vehicle.drag_to_thrust, None, None),
-        Sought("rotor_inertia", vehicle.rotor_inertia or 6e-4 * vehicle.inertia[2], None, 1.0),
-        Sought("rotor_drag", vehicle.rotor_drag or 0.005 * weight / vehicle.hover_speed, None, 1.5),
-        Sought("body_drag", area, area, 1.0),
-        Sought("offset_x", 0.0, 0.01 * arm, 10.0),
-        Sought("offset_y", 0.0, 0.01 * arm, 10.0),
-        Sought("drag_height", 0.0, 0.1 * arm, 20.0),
-        Sought("inflow", 0.0, 0.02 * weight / (4.0 * vehicle.hover_speed), 5.0),
-        Sought("munk", 0.0, 0.001 * vehicle.mass, 2.0),
-        Sought("yaw_trim", 0.0, 0.01 * weight * vehicle.drag_to_thrust, 10.0),
-    ]
-    if record.speeds is None or record.commands is not None:
-        numbers += [Sought(name, getattr(vehicle, name) or lag, None, 1.5) for name in ("rotor_rise", "rotor_fall")]
-        if record.throttle is not None and record.commands is None:
-            numbers.append(Sought("throttle_curve", 1.0, 0.3, 1.0))
-        if record.voltage is not None:
-            numbers.append(Sought("voltage_exponent", 1.0, 0.5, 2.0))
-    for i, part in enumerate(parts):
-        numbers.append(Sought("delay", 0.0, 0.005, 4.0, i))
-        numbers += [Sought("wind", 0.0, 1.0, 2.0, i)] * (2 * _knots(part))
-    return numbers
+    yield Sought("thrust_coefficient", vehicle.mean_coefficient, None, None)
+    for axis, moment in zip("xyz", vehicle.inertia, strict=True):
+        yield Sought(f"inertia_{axis}", moment, None, None)
+    yield Sought("drag_to_thrust", vehicle.drag_to_thrust, None, None)
+    yield Sought("rotor_inertia", vehicle.rotor_inertia or 6e-4 * vehicle.inertia[2], None, 1.0)
+    area = vehicle.body_drag[0] if vehicle.body_drag else 0.25 * arm**2
+    yield Sought("rotor_drag", vehicle.rotor_drag or 0.005 * weight / hover, None, 1.5)
+    yield Sought("body_drag", area, area, 1.0)
+    for i, axis in enumerate("xy"):
+        moment = vehicle.rotor_moment[i] if vehicle.rotor_moment else 0.0
+        yield Sought(f"rotor_moment_{axis}", moment, 0.01 * weight * arm / (4.0 * hover), 10.0)
+    for i, axis in enumerate("xyz"):
+        damping = vehicle.rate_damping[i] if vehicle.rate_damping else 0.0
+        yield Sought(f"rate_damping_{axis}", damping, vehicle.inertia[i], 10.0)
+    yield Sought("inflow", 0.0, 0.02 * weight / (4.0 * hover), 5.0)
+    yield Sought("yaw_trim", 0.0, 0.01 * weight * vehicle.drag_to_thrust, 10.0)
+    if record.speeds is None:
+        yield from (Sought(name, getattr(vehicle, name) or lag, None, 1.5) for name in ("rotor_rise", "rotor_fall"))
+        if record.throttle is not None:
+            yield Sought("throttle_curve", 1.0, 0.3, 1.0)
+        if record.voltage is not None and record.throttle is None:
+            yield Sought("voltage_exponent", 1.0, 0.5, 2.0)
+    for flight in range(1 + parts[-1].flight):
+        yield Sought("delay", 0.0, 0.005, 4.0, flight)
+        yield from (Sought(f"offset_{axis}", 0.0, 0.01 * arm, 10.0, flight) for axis in "xy")
+    for i, part in enumerate(parts if wind else ()):
+        yield from (Sought("wind", 0.0, 1.0, 2.0, part.flight, i) for _ in range(2 * _knots(part)))
 
 
 def _knots(part: Stretch) -> int:
@@ -102,42 +105,53 @@ class NormalEquations(NamedTuple):
 
 
 class Search:
-    """The parameters of all stretches at once, and what their innovations say of them."""
+    """The parameters of all stretches at once, and what their innovations say of them.
 
-    def __init__(self, parts: Sequence[Stretch], vehicle: Vehicle, *, order: int = 2) -> None:
-        self.parts, self.vehicle, self.order = parts, vehicle, order
-        self.sought = _sought(vehicle, parts)
+    Args:
+        parts: the stretches, flight by flight.
+        vehicle: the start.
+        wind: whether the air may move.
+        fixed: numbers that are not searched for, by name, in SI units.
+    """
+
+    def __init__(
+        self, parts: Sequence[Stretch], vehicle: Vehicle, *, wind: bool, fixed: Mapping[str, float] | None = None
+    ) -> None:
+        self.parts, self.vehicle, self.fixed = parts, vehicle, fixed or {}
+        self.sought = [number for number in _sought(vehicle, parts, wind=wind) if number.name not in self.fixed]
         voltages = [part.record.voltage for part in parts if part.record.voltage is not None]
         self.voltage = float(np.mean(np.concatenate(voltages))) if voltages else 0.0
+        self.flights = 1 + parts[-1].flight
         self._physical = len(self.sought)
-        noise = [*itertools.chain(*([*half, *[0.0] * (order - 2)] for half in _NOISE_AT_FIRST))] * len(INCREMENTS)
+        noise = [*_NOISE_AT_FIRST] * len(INCREMENTS) * self.flights
         self._starts = self._physical + len(noise)  # where what is wrong with the first samples is
         self.x = np.concatenate([np.zeros(self._physical), noise, np.zeros(len(INCREMENTS) * len(parts))])
         self._fading = math.exp(-parts[0].record.period / LONGEST_FORCE)
         self._skip = [int(TURN_ON / part.record.period) for part in parts]
-        self.sigma = np.ones(len(INCREMENTS))  # of the innovations [rad/s, m/s]
+        self.sigma = np.ones((self.flights, len(INCREMENTS)))  # of the innovations of each flight [rad/s, m/s]
         deviations = [number.deviation for number in self.sought]
         self._weights = np.array([0.0 if sd is None else sd**-2.0 for sd in deviations] + [1 / 9.0] * len(noise))
         self._weights = np.append(self._weights, np.full(len(self.x) - self._starts, 1 / 16.0))
-        winds = [[i for i, n in enumerate(self.sought) if n.name == "wind" and n.part == k] for k in range(len(parts))]
-        self._winds = [np.reshape(wind, (-1, 2)) for wind in winds]  # (K, 2) where each stretch's wind is in `x`
+        winds = [[i for i, n in enumerate(self.sought) if n.part == k] for k in range(len(parts))]
+        self._winds = [
+            np.array(wind, int).reshape(-1, 2) for wind in winds
+        ]  # (K, 2) where each stretch's wind is in `x`
 
     def parameters(self, x: Array, part: int) -> Parameters:
         """The prediction's parameters for a stretch."""
         own: dict[str, Any] = {
-            n.name: n.value(v) for n, v in zip(self.sought, x, strict=False) if n.part in (None, part)
-        }
-        own["wind"] = x[self._winds[part]]
+            n.name: n.value(v)
+            for n, v in zip(self.sought, x, strict=False)
+            if n.flight in (None, self.parts[part].flight) and n.part is None
+        } | dict(self.fixed)
+        if len(self._winds[part]):
+            own["wind"] = x[self._winds[part]]
         area, given = own.pop("body_drag"), self.vehicle.body_drag or LEVEL_PLATE
-        return Parameters(
-            inertia=np.array([own.pop(f"inertia_{axis}") for axis in "xyz"]),
-            body_drag=area / given[0] * np.array(given),
-            offset=np.array([own.pop("offset_x"), own.pop("offset_y"), own.pop("drag_height")]),
-            voltage=self.voltage,
-            **own,
-        )
+        vectors = {"inertia": "xyz", "rotor_moment": "xy", "rate_damping": "xyz", "offset": "xy"}
+        own |= {name: np.array([own.pop(f"{name}_{axis}") for axis in axes]) for name, axes in vectors.items()}
+        return Parameters(body_drag=area / given[0] * np.array(given), voltage=self.voltage, **own)
 
-    def _misfit(self, x: Array, part: int, rotors: Turning | None = None) -> tuple[Array, Turning]:
+    def misfit(self, x: Array, part: int, rotors: Turning | None = None) -> tuple[Array, Turning]:
         """(N, 6) measured less predicted increments of a stretch, and its rotors."""
         parameters = self.parameters(x, part)
         rotors = rotors or turning(self.parts[part].record, self.vehicle, parameters)
@@ -148,24 +162,40 @@ class Search:
 
     def _polynomials(self, noise: Array, axis: int) -> tuple[Array, Array]:
         """A and C from their reflection coefficients; of a force, A forgets within `LONGEST_FORCE`."""
-        fading = self._fading ** np.arange(self.order + 1) if axis >= 3 else 1.0
-        return fading * _polynomial(np.tanh(noise[: self.order])), _polynomial(np.tanh(noise[self.order :]))
+        fading = self._fading ** np.arange(_ORDER + 1) if axis >= 3 else 1.0
+        return fading * _polynomial(np.tanh(noise[:_ORDER])), _polynomial(np.tanh(noise[_ORDER:]))
 
     def _filtered(self, misfit: Array, axis: int, noise: Array, start: float) -> Array:
-        """(N,) innovations of one axis: e = A(z) / C(z) d, the first d less what is wrong with the first sample."""
+        """(N,) innovations of one axis: e = A(z) / C(z) d, the first d less `start`, what is wrong with its sample."""
         driven = misfit[:, axis].copy()
-        driven[0] += start * self.sigma[axis]
+        driven[0] += start
         filtered: Array = lfilter(*self._polynomials(noise, axis), driven)
         return filtered
 
+    def _noise(self, part: int, axis: int) -> tuple[range, int]:
+        """Where in `x` the noise model of an axis of a stretch is, and what is wrong with its first sample."""
+        first = self._physical + 2 * _ORDER * (len(INCREMENTS) * self.parts[part].flight + axis)
+        return range(first, first + 2 * _ORDER), self._starts + len(INCREMENTS) * part + axis
+
+    def _innovations_of(self, misfit: Array, x: Array, part: int, axis: int) -> Array:
+        noise, start = self._noise(part, axis)
+        wrong = x[start] * self.sigma[self.parts[part].flight, axis]
+        return self._filtered(misfit, axis, x[noise.start : noise.stop], wrong)
+
     def _innovations(self, misfit: Array, x: Array, part: int) -> Array:
-        noise = x[self._physical : self._starts].reshape(len(INCREMENTS), 2 * self.order)
-        start = x[self._starts + len(INCREMENTS) * part :]
-        return np.stack([self._filtered(misfit, i, noise[i], start[i]) for i in range(len(INCREMENTS))], axis=1)
+        return np.stack([self._innovations_of(misfit, x, part, axis) for axis in range(len(INCREMENTS))], axis=1)
+
+    def _by_flight(self, rows: Sequence[Array]) -> list[Array]:
+        """What the stretches of each flight have, together."""
+        flights = [part.flight for part in self.parts]
+        return [
+            np.concatenate([one for one, of in zip(rows, flights, strict=True) if of == flight])
+            for flight in range(self.flights)
+        ]
 
     def innovations(self, x: Array) -> list[Array]:
         """(N, 6) of each stretch."""
-        return [self._innovations(self._misfit(x, i)[0], x, i) for i in range(len(self.parts))]
+        return [self._innovations(self.misfit(x, i)[0], x, i) for i in range(len(self.parts))]
 
     def prior(self, x: Array) -> tuple[float, NormalEquations]:
         """Half the squares of what the priors add, and their normal equations."""
@@ -183,15 +213,16 @@ class Search:
     def _rules(self, x: Array) -> Iterator[tuple[list[tuple[int, float]], float, float]]:
         """Priors on several numbers at once: slopes by index, residual, standard deviation."""
         place = {number.name: i for i, number in enumerate(self.sought)}
-        jx, jy, jz = (place[f"inertia_{axis}"] for axis in "xyz")
-        inertia = [self.sought[i].value(x[i]) for i in (jx, jy, jz)]
+        inertia = self.parameters(x, 0).inertia
         flat = inertia[0] + inertia[1]
-        yield (
-            [(jz, 1.0), (jx, -inertia[0] / flat), (jy, -inertia[1] / flat)],
-            np.log(inertia[2] / flat / PLATE[0]),
-            PLATE[1],
-        )
-        if "rotor_rise" in place:
+        shares = {"inertia_z": 1.0, "inertia_x": -inertia[0] / flat, "inertia_y": -inertia[1] / flat}
+        if "inertia_z" in place:
+            yield (
+                [(place[name], share) for name, share in shares.items() if name in place],
+                float(np.log(inertia[2] / flat / PLATE[0])),
+                PLATE[1],
+            )
+        if {"rotor_rise", "rotor_fall"} <= {*place}:
             rise, fall = place["rotor_rise"], place["rotor_fall"]
             ratio = self.sought[rise].value(x[rise]) / self.sought[fall].value(x[fall])
             yield [(rise, 1.0), (fall, -1.0)], float(np.log(ratio)), _LAG_RATIO
@@ -202,31 +233,31 @@ class Search:
 
     def cost(self, x: Array) -> float:
         """Negative logarithm of the likelihood, each axis at its most likely variance, and of the priors."""
-        misfits = [self._misfit(x, i)[0] for i in range(len(self.parts))]
-        every = np.concatenate([self._innovations(misfit, x, i) for i, misfit in enumerate(misfits)])
+        misfits = [self.misfit(x, i)[0] for i in range(len(self.parts))]
+        every = self._by_flight([self._innovations(misfit, x, i) for i, misfit in enumerate(misfits)])
         lift = np.concatenate([self._lift(misfit[:, -1], i) for i, misfit in enumerate(misfits)])
-        cost = self.prior(x)[0] + len(every) * float(np.log(np.sqrt((every**2).mean(axis=0))).sum())
+        cost = self.prior(x)[0] + sum(len(e) * 0.5 * float(np.log((e**2).mean(axis=0)).sum()) for e in every)
         cost += 0.5 * float(lift @ lift)
         return cost if np.isfinite(cost) else np.inf
 
     def misfits(self, x: Array, part: int) -> tuple[Array, Array]:
         """Misfit (N, 6) of a stretch's increments and its slopes (N, 6, P) by every number that is sought."""
-        misfit, rotors = self._misfit(x, part)
+        misfit, rotors = self.misfit(x, part)
         slopes = np.zeros((*misfit.shape, self._physical))
         for i, number in enumerate(self.sought):
-            if number.part not in (None, part) or number.name == "wind":
+            if number.flight not in (None, self.parts[part].flight) or number.part is not None:
                 continue
             step = 1e-4 if number.scale is None else 1e-2
             moved = x.copy()
             moved[i] += step
             slopes[:, :, i] = (
-                self._misfit(moved, part, None if number.name in ROTOR_PARAMETERS else rotors)[0] - misfit
+                self.misfit(moved, part, None if number.name in ROTOR_PARAMETERS else rotors)[0] - misfit
             ) / step
         when = np.linspace(0.0, 1.0, len(misfit) + self._skip[part])[self._skip[part] :]
         for wind in self._winds[part].T:  # as it is linear between its knots, so is what a change of all of them does
             moved = x.copy()
             moved[wind] += 1e-2
-            slope = (self._misfit(moved, part, rotors)[0] - misfit) / 1e-2
+            slope = (self.misfit(moved, part, rotors)[0] - misfit) / 1e-2
             for share, i in zip(np.eye(len(wind)), wind, strict=True):
                 slopes[:, :, i] = slope * np.interp(when, np.linspace(0.0, 1.0, len(wind)), share)[:, None]
         return misfit, slopes
@@ -249,21 +280,20 @@ class Search:
 
     def _slopes(self, part: int) -> tuple[Array, Array, Array, Array]:
         """Innovations (N, 6) of a stretch and their slopes (N, 6, X); its blocks' lift (B,) and its slopes (B, X)."""
-        x, physical, starts = self.x, self._physical, self._starts
+        x = self.x
         misfit, raw = self.misfits(x, part)
-        innovations, size = self._innovations(misfit, x, part), 2 * self.order
+        innovations = self._innovations(misfit, x, part)
         slopes = np.zeros((*innovations.shape, len(x)))
         for axis in range(len(INCREMENTS)):
-            own, first = physical + size * axis, starts + len(INCREMENTS) * part + axis
-            top, bottom = self._polynomials(x[own : own + size], axis)
-            slopes[:, axis, :physical] = lfilter(top, bottom, raw[:, axis], axis=0)
-            for i in (*range(own, own + size), first):
+            noise, start = self._noise(part, axis)
+            top, bottom = self._polynomials(x[noise.start : noise.stop], axis)
+            slopes[:, axis, : self._physical] = lfilter(top, bottom, raw[:, axis], axis=0)
+            for i in (*noise, start):
                 moved = x.copy()
                 moved[i] += 1e-4
-                after = self._filtered(misfit, axis, moved[own : own + size], moved[first])
-                slopes[:, axis, i] = (after - innovations[:, axis]) / 1e-4
+                slopes[:, axis, i] = (self._innovations_of(misfit, moved, part, axis) - innovations[:, axis]) / 1e-4
         lift = np.zeros((len(self._rows(part)), len(x)))
-        lift[:, :physical] = self._lift(raw[:, -1], part)
+        lift[:, : self._physical] = self._lift(raw[:, -1], part)
         return innovations, slopes, self._lift(misfit[:, -1], part), lift
 
     def blocks(self) -> list[NormalEquations]:
@@ -271,19 +301,20 @@ class Search:
         blocks = []
         for i in range(len(self.parts)):
             innovations, slopes, lift, lift_slopes = self._slopes(i)
+            sigma = self.sigma[self.parts[i].flight]
             for rows, mean, slope in zip(self._rows(i), lift, lift_slopes, strict=True):
-                J = np.vstack([(slopes[rows] / self.sigma[:, None]).reshape(-1, len(self.x)), slope])
-                blocks.append(NormalEquations(J.T @ J, J.T @ np.append((innovations[rows] / self.sigma).ravel(), mean)))
+                J = np.vstack([(slopes[rows] / sigma[:, None]).reshape(-1, len(self.x)), slope])
+                blocks.append(NormalEquations(J.T @ J, J.T @ np.append((innovations[rows] / sigma).ravel(), mean)))
         return blocks
 
     def run(self) -> None:
         """Find the parameters: Gauss-Newton steps, damped by Levenberg and Marquardt."""
         damping, cost = 1e-2, self.cost(self.x)
         for _ in range(_STEPS):
-            every = np.concatenate(self.innovations(self.x))
-            scale, self.sigma = self.sigma, np.sqrt((every**2).mean(axis=0))
+            scale, every = self.sigma, self._by_flight(self.innovations(self.x))
+            self.sigma = np.stack([np.sqrt((e**2).mean(axis=0)) for e in every])
             starts = self.x[self._starts :].reshape(-1, len(INCREMENTS))
-            starts *= scale / self.sigma  # they count in sigma
+            starts *= (scale / self.sigma)[[part.flight for part in self.parts]]  # they count in sigma
             blocks, (_, prior) = self.blocks(), self.prior(self.x)
             H, g = sum(b.H for b in blocks) + prior.H, sum(b.g for b in blocks) + prior.g
             cost = self.cost(self.x)
@@ -302,12 +333,12 @@ class Search:
                 return
 
     def adopt(self, other: Search) -> None:
-        """Begin where a search with a lower order ended."""
-        self.x[: self._physical] = other.x[: other._physical]
-        self.x[self._starts :] = other.x[other._starts :]
-        mine = self.x[self._physical : self._starts].reshape(len(INCREMENTS), 2, self.order)
-        mine[:, :, : other.order] = other.x[other._physical : other._starts].reshape(len(INCREMENTS), 2, other.order)
-        mine[:, :, other.order :] = 0.0
+        """Begin where another search of the same stretches ended."""
+        found: dict[Any, list[float]] = {(number.name, number.flight, number.part): [] for number in other.sought}
+        for number, value in zip(other.sought, other.x, strict=False):
+            found[number.name, number.flight, number.part].append(value)
+        self.x[: self._physical] = [found[n.name, n.flight, n.part].pop(0) for n in self.sought]
+        self.x[self._physical :] = other.x[other._physical :]
         self.sigma = other.sigma
 
 

@@ -11,31 +11,18 @@ import numpy as np
 import tomlkit
 
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.identify.estimate import Identification, ParameterEstimate
+from scenarios.identify.estimate import Identification, ParameterEstimate, field_of, number_in
 
-_AXES: Final = ("_x", "_y", "_z")
 _DIGITS: Final = 100.0  # the last digit is no more than this part of an interval
-
-
-def field_of(estimate: ParameterEstimate) -> str:
-    """Return the field of a vehicle file that holds an estimate: `inertia` of `inertia_x`."""
-    return estimate.name[:-2] if estimate.name.endswith(_AXES) else estimate.name
-
-
-def number_in(vehicle: Vehicle, estimate: ParameterEstimate) -> float | None:
-    """Return what a vehicle has for an estimate; of `body_drag` the first number, as the others follow it."""
-    value = getattr(vehicle, field_of(estimate))
-    axis = estimate.name[-1] if field_of(estimate) != estimate.name else "x"
-    return value["xyz".index(axis)] if isinstance(value, tuple) else value
 
 
 def verdict(estimate: ParameterEstimate, vehicle: Vehicle) -> str:
     """Return whether a number is identified, or else why it is not, and what the vehicle has."""
     if not estimate.refused:
         return "identified"
-    if not estimate.in_file or number_in(vehicle, estimate) is None:
+    if not estimate.in_file or number_in(vehicle, estimate.name) is None:
         return f"left out: {estimate.refused}"
-    number = number_in(vehicle, estimate)
+    number = number_in(vehicle, estimate.name)
     return f"kept: {estimate.refused}" if number == estimate.start else f"set to {number:.4g}: {estimate.refused}"
 
 
@@ -62,7 +49,7 @@ def vehicle_text(identification: Identification, start: Path, logs: Sequence[str
     of_field: dict[str, list[ParameterEstimate]] = {}
     for estimate in identification.estimates:
         if estimate.in_file:
-            of_field.setdefault(field_of(estimate), []).append(estimate)
+            of_field.setdefault(field_of(estimate.name), []).append(estimate)
     for name, estimates in of_field.items():
         value = getattr(identification.vehicle, name)
         if value is None:  # neither the start has it, nor is it identified

@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,16 @@ from quadsim.vehicle import load_vehicle, vehicle_sources
 from scenarios.commands.cli import main
 from scenarios.flown import Flight
 from scenarios.identify.estimate import Identification, ParameterEstimate
-from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, hold_out, predict
+from scenarios.identify.prediction import (
+    HORIZONS,
+    IDENTIFIED,
+    QUANTITIES,
+    START,
+    THRUST_ONLY,
+    PredictionErrors,
+    hold_out,
+    predict,
+)
 from scenarios.identify.record import read_record
 from scenarios.identify.report import IdentifiedVehicle
 from scenarios.identify.vehicle_file import rounded, vehicle_text
@@ -231,6 +241,43 @@ def test_the_prediction_knows_delay_offset_and_wind(place: Path) -> None:
     assert abs(end(delay=0.02) - still)[3:].max() > 0.01
 
 
+def test_a_vehicle_that_predicts_worse_is_said_to_and_written_only_anyway(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The errors of identified vehicle and thrust only are exchanged, in body rates."""
+
+    def exchanged(*arguments: Any, **options: Any) -> PredictionErrors:
+        found = predict(*arguments, **options)
+        errors = {name: of.copy() for name, of in found.errors.items()}
+        errors[IDENTIFIED][:, 3] = 2.0 * errors[THRUST_ONLY][:, 3]
+        return replace(found, errors=errors)
+
+    monkeypatch.setattr("scenarios.identify.report.predict", exchanged)
+    words = ["identify", "eight.csv", "--vehicle", "start.toml", "--out", "mine.toml"]
+    assert main(words) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert text.startswith("predicts flight that was not fitted worse, at 0.1, 0.25, 0.5 s: ")
+    assert "body rates than thrust only, 2.00 2.00 2.00 times its error" in text
+    assert "no vehicle file was written: --out mine.toml --anyway writes it" in text
+    assert not (here / "mine.toml").exists()
+    assert main([*words, "--anyway", "--overwrite"]) == 0
+    assert "quadsim run first.toml" not in capsys.readouterr().out
+    assert (here / "mine.toml").exists()
+
+
+def test_the_verdict_comes_first_with_the_errors_over_those_of_each_rival(identified: IdentifiedVehicle) -> None:
+    errors = {
+        name: np.full((len(HORIZONS), 4), of) for name, of in ((IDENTIFIED, 1.0), (START, 4.0), (THRUST_ONLY, 2.0))
+    }
+    better = replace(identified.prediction, errors=errors)
+    assert better.verdict == (
+        "predicts flight that was not fitted better: at 0.1, 0.25, 0.5 s, "
+        "0.25, 0.25, 0.25 of the errors of start and 0.50, 0.50, 0.50 of the errors of thrust only"
+    )
+    assert not better.lost
+    assert identified.verdict.text == identified.prediction.verdict
+
+
 def test_the_last_fifth_of_the_airborne_samples_is_held_out(place: Path) -> None:
     """Of 100 Hz; less than 2 s of a span are not fitted."""
     record = read_record(place / "eight.csv")
@@ -258,7 +305,7 @@ REFUSED: list[tuple[str, str]] = [
         "--test must be a log that is not fitted too; got 'eight.csv'",
     ),
     ("eight.csv --vehicle start.toml --poles 14", "poles turn eRPM into speeds"),
-    ("ground.csv --vehicle start.toml --out mine.toml --page mine.html", "ground.csv: never flies"),
+    ("ground.csv --vehicle start.toml --out mine.toml --page mine.html", "ground.csv: the motors never run"),
     ("short.csv --vehicle start.toml --out mine.toml", "short.csv: flies for"),
 ]
 
@@ -283,7 +330,7 @@ def test_wrong_input_gives_one_message_and_leaves_nothing_behind(
 def test_a_vehicle_that_cannot_be_is_refused_with_what_to_check(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where the start's moment about z is kept, and is too large beside those that were identified."""
 
-    def refuse(*_: object) -> Identification:
+    def refuse(*_: object, **__: object) -> Identification:
         raise ParameterError("vehicle", "inertia", (0.007, 0.007, 0.015), "such that no moment exceeds the others")
 
     monkeypatch.setattr("scenarios.identify.report.identify_records", refuse)

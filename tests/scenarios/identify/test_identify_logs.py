@@ -296,13 +296,48 @@ def turned_world(record: Record) -> Record:
     return replace(record, **moved)
 
 
+def scaled(**factors: Any) -> Spoil:
+    return lambda record: replace(record, **{name: getattr(record, name) * of for name, of in factors.items()})
+
+
+def held_by_a_radio(record: Record, times: int) -> Record:
+    rows = {name: np.repeat(getattr(record, name)[::times], times, axis=0) for name in FIELDS}
+    return replace(record, **rows)
+
+
 SPOILT: dict[str, Spoil] = {
     "wx is negated": negated("rates", 0),
     "wy is negated": negated("rates", 1),
     "wz is negated": negated("rates", 2),
     "wy and wz are negated": negated("rates", 1, 2),
-    "5[67].* times the rates at which the attitude turns": lambda record: replace(
-        record, rates=np.degrees(record.rates)
+    "5[67].* times the rates at which the attitude turns: likely deg/s": scaled(rates=180.0 / np.pi),
+    "wx, wy, wz are 1.1 times the rates": scaled(rates=1.1),
+    "wx, wy, wz are (2|2.01) times .*twice the full scale": scaled(rates=2.0),
+    "wz is (2|1.99|2.01) times .*twice the full scale": scaled(rates=np.array([1.0, 1.0, 2.0])),
+    "vx, vy, vz are 3.6 times the slope of the position: likely km/h": scaled(velocity=3.6),
+    "vx, vy, vz are 1.1 times the slope": scaled(velocity=1.1),
+    "x, y, z are 100 times .*likely in cm": scaled(position=100.0),
+    "vx, vy change 3.* times as fast as tilt and gravity make them: likely ft/s": lambda record: replace(
+        scaled(velocity=3.2808)(record), position=None
+    ),
+    "say that the clock runs (2|1.9.|2.0.) times as fast": scaled(t=2.0),
+    "against gravity say that the clock runs 0.[89].* times as fast": lambda record: replace(
+        scaled(t=0.9)(record), position=None
+    ),
+    "wx stands still while the others change": lambda record: replace(
+        record, rates=np.column_stack([np.full(len(record.t), 0.1), record.rates[:, 1:]])
+    ),
+    "outputs of rotor 2 never change": lambda record: replace(
+        record,
+        commands=record.commands * [1.0, 0.0, 1.0, 1.0],  # type: ignore[operator]
+    ),
+    "motors never run: the rotors' outputs stay at 0.1: no flight": lambda record: replace(
+        record, commands=None, throttle=np.full((len(record.t), 4), 0.1)
+    ),
+    "50 % of its rows repeat|50% of its rows repeat": lambda record: held_by_a_radio(record, 2),
+    "outputs change 9.89 times per second, and rates are logged 100 times": lambda record: replace(
+        record,
+        commands=np.repeat(record.commands[::10], 10, axis=0),  # type: ignore[index]
     ),
     "wx and wy are swapped": lambda record: replace(record, rates=record.rates[:, [1, 0, 2]]),
     "world to body: negate qx, qy, qz": lambda record: replace(record, attitude=conjugate(record.attitude)),
@@ -322,7 +357,7 @@ SPOILT: dict[str, Spoil] = {
     "motors never run": lambda record: replace(record, commands=np.zeros_like(record.commands)),
     "never flies.*change by 0 %, its altitude by 0": lambda record: replace(
         record,
-        commands=np.full_like(record.velocity[:, [0, 0, 1, 2]], 90.0),
+        commands=90.0 + np.sin(record.t[:, None] + np.arange(4.0)) * 0.2,
         velocity=0.02 * record.rates,
         rates=0.02 * record.rates,
         position=np.zeros_like(record.velocity),
