@@ -32,7 +32,7 @@ from typing import Any, Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds, rejection, resized, shifted
-from mpc.equilibrium import Trim, Trimmed
+from mpc.equilibrium import Trim
 from mpc.fallback.completion import PLAUSIBLE_REFERENCE, StateCompletion, completed_inputs
 from mpc.fallback.hover import HoverLaw
 from mpc.fallback.settings import USUAL_FALLBACK, USUAL_TILT, FallbackSettings
@@ -129,7 +129,7 @@ class Guard:
 
     def trim(self, law: Controller) -> Trim:
         """Return the equilibrium that the law estimates; level hover if it estimates none."""
-        trim = _tried(lambda: law.trim if isinstance(law, Trimmed) else None)
+        trim = _tried(lambda: getattr(law, "trim", None))  # one call: `isinstance` of a protocol asks for it as well
         return trim if isinstance(trim, Trim) else self._level
 
     def predict(self, law: Controller, states: Array, plans: Array) -> Array:

@@ -141,24 +141,31 @@ def rigid_body(vehicle: Vehicle, step: float, **others: object) -> RigidBody:
 
 def thrust_axis(q: Array) -> Array:
     """R(q) e_z (..., 3) of quaternions (..., 4) of any length."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    return np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
+    w, x, y, z = (q[..., i] for i in range(4))
+    axis = np.empty((*q.shape[:-1], 3))
+    axis[..., 0], axis[..., 1], axis[..., 2] = (
+        2.0 * (x * z + w * y),
+        2.0 * (y * z - w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    )
+    return axis
 
 
 def rotation(q: Array) -> Array:
     """R(q) (..., 3, 3), polynomial, of quaternions (..., 4) of any length."""
-    w, x, y, z = (q[..., i] for i in range(4))
-    rows = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    products = q[..., :, None] * (2.0 * q[..., None, :])
+    wx, wy, wz = (products[..., 0, i] for i in (1, 2, 3))
+    xx, xy, xz = (products[..., 1, i] for i in (1, 2, 3))
+    yy, yz, zz = products[..., 2, 2], products[..., 2, 3], products[..., 3, 3]
+    R = np.empty((*q.shape[:-1], 3, 3))
+    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = 1.0 - (yy + zz), xy - wz, xz + wy
+    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = xy + wz, 1.0 - (xx + zz), yz - wx
+    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = xz - wy, yz + wx, 1.0 - (xx + yy)
+    return R
 
 
-def drag_acceleration(model: RigidBody, q: Array, v: Array) -> Array:
-    """(..., 3) acceleration by drag, world [m/s^2], for quaternions (..., 4) and velocities (..., 3) [m/s]."""
-    R = rotation(q)
+def drag_acceleration(model: RigidBody, R: Array, v: Array) -> Array:
+    """(..., 3) acceleration by drag, world [m/s^2], for attitudes (..., 3, 3) and velocities (..., 3) [m/s]."""
     air = (np.swapaxes(R, -1, -2) @ v[..., None])[..., 0]
     pull = -(model.drag * air + model.quadratic_drag * np.abs(air) * air) / model.mass
     return np.asarray((R @ pull[..., None])[..., 0])
