@@ -146,7 +146,6 @@ class InnerLoop(Protocol):
         ...
 
 
-@runtime_checkable
 class TargetLoop(Protocol):
     """What an inner loop may say: that its commands are targets, not rotor speeds; see `quadsim.sim.autopilot`."""
 
@@ -158,7 +157,7 @@ class TargetLoop(Protocol):
 
 def takes_targets(inner: object) -> bool:
     """Return whether an inner loop takes targets; one that does not say so takes rotor speeds."""
-    return inner is not None and bool(getattr(inner, "takes_targets", False))
+    return bool(getattr(inner, "takes_targets", False))
 
 
 class AutopilotLoop(InnerLoop, TargetLoop, Protocol):

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, overload
+from typing import Any, Final, overload
 
 import numpy as np
 
@@ -21,6 +21,10 @@ from quadsim.state import ANGLE_RATES, ANGLES, Array
 
 Quaternion = tuple[float, float, float, float]
 Vector3 = tuple[float, float, float]
+_WITH: Final = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+"""Component of b that multiplies each of a, row by row, in each component of Hamilton's product."""
+_SIGNS: Final = np.array([[1.0, 1.0, 1.0, 1.0], [-1.0, 1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]])
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 @overload
@@ -31,7 +35,8 @@ def multiply(a: Any, b: Any) -> Any:
     """Hamilton's product of tuples of plain numbers or (..., 4): rotation b first, then a in the resulting frame."""
     if isinstance(a, tuple):
         return _product(a, b)
-    return _last_axis(_product(np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)))
+    parts = a[..., :, None] * (_SIGNS * b.take(_WITH, -1))  # row by row, what each component of a contributes
+    return parts[..., 0, :] + parts[..., 1, :] + parts[..., 2, :] + parts[..., 3, :]
 
 
 def _product(a: Iterable[Any], b: Iterable[Any]) -> tuple[Any, Any, Any, Any]:
@@ -46,17 +51,8 @@ def _product(a: Iterable[Any], b: Iterable[Any]) -> tuple[Any, Any, Any, Any]:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """The cross product of (..., 3) and (..., 3) of one shape: `numpy.cross` in a fifth of the time."""
-    (ax, ay, az), (bx, by, bz) = ((v[..., 0], v[..., 1], v[..., 2]) for v in (a, b))
-    return _last_axis((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
-
-
-def _last_axis(components: Sequence[Any]) -> Array:
-    """Components as the last axis of one array: `numpy.stack` in a third of the time."""
-    stacked = np.empty((*np.shape(components[0]), len(components)))
-    for i, component in enumerate(components):
-        stacked[..., i] = component
-    return stacked
+    """The cross product of (..., 3) and (..., 3): `numpy.cross` in a fifth of the time."""
+    return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 
 @overload

@@ -17,8 +17,8 @@ that its slew bounds refer to the acting command, and the list of predicted chan
 Exported laws have the same contract in C, `mpc/core/c/quadsim_guard.c`; `tests/firmware/test_guard.py` holds the two
 together.
 
-A law that estimates disturbances is `mpc.equilibrium.Trimmed`.  Levels 1 to 3, and predictions of missing channels,
-start from its equilibrium; it is held while nothing is measured.
+A law that estimates disturbances has a `trim`, an `mpc.equilibrium.Trim` or None.  Levels 1 to 3, and predictions of
+missing channels, start from it; it is held while nothing is measured.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class Guard:
 
     def trim(self, law: Controller) -> Trim:
         """Return the equilibrium that the law estimates; level hover if it estimates none."""
-        trim = _tried(lambda: getattr(law, "trim", None))  # one call: `isinstance` of a protocol asks for it as well
+        trim = _tried(lambda: getattr(law, "trim", None))
         return trim if isinstance(trim, Trim) else self._level
 
     def predict(self, law: Controller, states: Array, plans: Array) -> Array:

@@ -165,7 +165,7 @@ class NonlinearMPC:
         self._tilted = settings.tilt is not None
         self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         self.problem = self._problem(constraints)
-        self._check = AnswerCheck(self.problem, kkt_every)
+        self._check, self._form = AnswerCheck(self.problem, kkt_every), Staged(self.problem)
         self.solver = CORE
         self._space, self._groups = (
             space,
@@ -602,7 +602,7 @@ class NonlinearMPC:
     def _certificate(self) -> tuple[QP, Solution]:
         """Return the last step's program, and its optimum with multipliers."""
         problem, query, sqp = self._rows(), self._query(), self._sqp
-        form = Staged(problem)
+        form = self._form if problem is self.problem else Staged(problem)
         qp = form.assemble(query).qp
         groups = self._groups if problem is self.problem else slack_groups(problem)
         multipliers = sqp.multipliers(len(problem.rows.names), len(self.problem.rows.names))

@@ -45,6 +45,11 @@ RATE_SCALE: Final = 1.5
 largest would be penalised too little: where noise reaches the controller, rates then move by hundreds of deg/s, for
 which the mixer raises the thrust."""
 _q, _v, _w = slice(0, 4), slice(4, 7), slice(7, 10)
+# R(q), row by row: 1 - 2 (yy + zz), 2 (xy - wz), 2 (xz + wy), ..., by the places of its products in q q'.
+_FIRST, _SECOND = np.array([10, 6, 7, 6, 5, 11, 7, 11, 5]), np.array([15, 3, 2, 3, 15, 1, 2, 1, 10])
+_SIGN: Final = np.array([1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
+_EYE: Final = np.eye(3).ravel()
+_OUTER: Final = 1.0 - 2.0 * _EYE
 
 
 class Inputs(StrEnum):
@@ -153,15 +158,9 @@ def thrust_axis(q: Array) -> Array:
 
 def rotation(q: Array) -> Array:
     """R(q) (..., 3, 3), polynomial, of quaternions (..., 4) of any length."""
-    products = q[..., :, None] * (2.0 * q[..., None, :])
-    wx, wy, wz = (products[..., 0, i] for i in (1, 2, 3))
-    xx, xy, xz = (products[..., 1, i] for i in (1, 2, 3))
-    yy, yz, zz = products[..., 2, 2], products[..., 2, 3], products[..., 3, 3]
-    R = np.empty((*q.shape[:-1], 3, 3))
-    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = 1.0 - (yy + zz), xy - wz, xz + wy
-    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = xy + wz, 1.0 - (xx + zz), yz - wx
-    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = xz - wy, yz + wx, 1.0 - (xx + yy)
-    return R
+    products = (q[..., :, None] * (2.0 * q[..., None, :])).reshape(*q.shape[:-1], 16)
+    sums = products.take(_FIRST, -1) + _SIGN * products.take(_SECOND, -1)
+    return (_EYE + _OUTER * sums).reshape(*q.shape[:-1], 3, 3)
 
 
 def drag_acceleration(model: RigidBody, R: Array, v: Array) -> Array:
