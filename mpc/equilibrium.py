@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -56,6 +56,16 @@ class Trim:
         state[_ROLL], state[_PITCH] = self.lean(yaw)
         state[N_STATES:] = self.speeds[: n - N_STATES]
         return state
+
+
+@runtime_checkable
+class Trimmed(Protocol):
+    """A law that estimates the equilibrium of its vehicle."""
+
+    @property
+    def trim(self) -> Trim | None:
+        """The estimate; None where there is none."""
+        ...
 
 
 def twisted(effectiveness: Array, twist: Array) -> Array:

@@ -146,6 +146,7 @@ class InnerLoop(Protocol):
         ...
 
 
+@runtime_checkable
 class TargetLoop(Protocol):
     """What an inner loop may say: that its commands are targets, not rotor speeds; see `quadsim.sim.autopilot`."""
 
@@ -157,7 +158,7 @@ class TargetLoop(Protocol):
 
 def takes_targets(inner: object) -> bool:
     """Return whether an inner loop takes targets; one that does not say so takes rotor speeds."""
-    return bool(getattr(inner, "takes_targets", False))
+    return inner is not None and isinstance(inner, TargetLoop) and inner.takes_targets
 
 
 class AutopilotLoop(InnerLoop, TargetLoop, Protocol):

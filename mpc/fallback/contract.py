@@ -17,8 +17,8 @@ that its slew bounds refer to the acting command, and the list of predicted chan
 Exported laws have the same contract in C, `mpc/core/c/quadsim_guard.c`; `tests/firmware/test_guard.py` holds the two
 together.
 
-A law that estimates disturbances has a `trim`, an `mpc.equilibrium.Trim` or None.  Levels 1 to 3, and predictions of
-missing channels, start from it; it is held while nothing is measured.
+A law that estimates disturbances is `mpc.equilibrium.Trimmed`.  Levels 1 to 3, and predictions of missing channels,
+start from its equilibrium; it is held while nothing is measured.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from typing import Any, Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds, rejection, resized, shifted
-from mpc.equilibrium import Trim
+from mpc.equilibrium import Trim, Trimmed
 from mpc.fallback.completion import PLAUSIBLE_REFERENCE, StateCompletion, completed_inputs
 from mpc.fallback.hover import HoverLaw
 from mpc.fallback.settings import USUAL_FALLBACK, USUAL_TILT, FallbackSettings
@@ -76,6 +76,8 @@ class Guard:
         self._model, self._bounds, self._settings = model, bounds, settings
         self._distance = settings.distance
         self._completion = StateCompletion(model)
+        self._law: Controller | None = None  # the last that was asked for its trim
+        self._trimmed: Trimmed | None = None
         self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
         self.reset(model.u_bar)
 
@@ -129,8 +131,13 @@ class Guard:
 
     def trim(self, law: Controller) -> Trim:
         """Return the equilibrium that the law estimates; level hover if it estimates none."""
-        trim = _tried(lambda: getattr(law, "trim", None))
+        trim = _tried(lambda: self._trim(law))
         return trim if isinstance(trim, Trim) else self._level
+
+    def _trim(self, law: Controller) -> object:
+        if law is not self._law:  # asked once: a runtime protocol takes as long as ten array operations
+            self._law, self._trimmed = law, law if isinstance(law, Trimmed) else None
+        return None if self._trimmed is None else self._trimmed.trim
 
     def predict(self, law: Controller, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Predicting`; by the hover model where the law cannot."""
