@@ -9,6 +9,7 @@ import contextlib
 import ctypes
 import io
 import os
+import shutil
 import sys
 import tempfile
 import time as clock
@@ -31,10 +32,10 @@ _FAILED: Final = (1, 3, 4)  # statuses of acados: not finite, step too short, a 
 
 
 def installed() -> bool:
-    """Return whether acados and CasADi are there, from .venv/acados if from nowhere else."""
+    """Return whether acados, CasADi and what compiles their code are there; acados perhaps in .venv/acados."""
     if FOLDER.is_dir() and str(FOLDER) not in sys.path:
         sys.path.append(str(FOLDER))
-    return find_spec("acados") is not None and find_spec("casadi") is not None
+    return all(map(shutil.which, ("make", "cc"))) and all(map(find_spec, ("acados", "casadi")))
 
 
 def _dynamics(model: RigidBody, state: Any, inputs: Any) -> Any:
