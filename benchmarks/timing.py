@@ -59,14 +59,18 @@ def run(measure: Callable[[Progress], list[Record]], title: str, file: Path | No
 
 
 def show(records: Sequence[Record], title: str) -> None:
-    """Print records as a table, their keys as its head; lists are for the JSON file."""
-    table = Table(title=title, title_justify="left")
-    keys = [*dict.fromkeys(k for record in records for k in record if not isinstance(record[k], list))]
-    for key in keys:
-        table.add_column(key.replace("_", " "), overflow="fold")
+    """Print records as a table for each kind, by their first key; keys are its head, lists are for the JSON file."""
+    kinds: dict[str, list[Record]] = {}
     for record in records:
-        table.add_row(*(_cell(record.get(key)) for key in keys))
-    Console(width=None if sys.stdout.isatty() else 200).print(table)
+        kinds.setdefault(next(iter(record)), []).append(record)
+    for alike in kinds.values():
+        table = Table(title=title, title_justify="left")
+        keys = [*dict.fromkeys(k for record in alike for k in record if not isinstance(record[k], list))]
+        for key in keys:
+            table.add_column(key.replace("_", " "), overflow="fold")
+        for record in alike:
+            table.add_row(*(_cell(record.get(key)) for key in keys))
+        Console(width=None if sys.stdout.isatty() else 200).print(table)
 
 
 def _cell(value: object) -> str:

@@ -51,6 +51,7 @@ from numpy.typing import ArrayLike
 
 from quadsim.controller import StepInputs
 from quadsim.fields import NonNegative, Positive
+from quadsim.rotation import cross
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -170,7 +171,7 @@ class RampObserver:
         drag = -attitude @ ((self._drag + self._quadratic * np.abs(v_b)) * v_b)
         momentum = vehicle.momentum(rates)
         momentum[2] += self._momentum @ self._rotors
-        resisting = np.cross(rates, momentum)
+        resisting = cross(rates, momentum)
         if self._moment:
             resisting -= vehicle.air_moment(float(self._rotors.sum()), v_b, rates)
         now = velocity, rates, np.concatenate([axis, turning]), np.concatenate([drag, resisting])
@@ -180,7 +181,8 @@ class RampObserver:
             return
         # Mean over the period from its two ends; for the thrust axis also from its derivative (Euler-Maclaurin).
         b = 0.5 * (last[2][:3] + axis) + period / 12.0 * (last[2][3:] - turning)
-        drag, resisting = np.split(0.5 * (last[3] + now[3]), 2)
+        mean = 0.5 * (last[3] + now[3])
+        drag, resisting = mean[:3], mean[3:]
         lift = thrust / vehicle.mass * b
         missed = np.concatenate(
             [
@@ -198,7 +200,7 @@ class RampObserver:
         predicted = self._value + period * self._change
         surprise = missed - predicted
         value = predicted + self._gain * surprise
-        self._value = np.clip(value, -self._largest, self._largest)
+        self._value = np.minimum(np.maximum(value, -self._largest), self._largest)
         self._change = np.where(value == self._value, self._change + self._gain_of_change * surprise, 0.0)
         if holds:
             return

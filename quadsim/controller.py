@@ -158,7 +158,7 @@ class TargetLoop(Protocol):
 
 def takes_targets(inner: object) -> bool:
     """Return whether an inner loop takes targets; one that does not say so takes rotor speeds."""
-    return isinstance(inner, TargetLoop) and inner.takes_targets
+    return inner is not None and isinstance(inner, TargetLoop) and inner.takes_targets
 
 
 class AutopilotLoop(InnerLoop, TargetLoop, Protocol):

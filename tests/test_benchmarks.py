@@ -53,6 +53,21 @@ def test_flights_with_and_without_their_controllers(tmp_path: Path) -> None:
     assert sample["whole_us_per_step"] < 20.0
 
 
+def test_nonlinear_steps_alone_in_flight_and_beside_acados(tmp_path: Path) -> None:
+    records = quick("nonlinear", tmp_path)
+    flights, cases = ([record for record in records if first in record] for first in ("flight", "case"))
+    for record in flights:
+        assert 0.0 < record["C_p50_ms"] <= record["C_p99_ms"]
+        assert record["C_p50_ms"] < record["step_p50_ms"]
+        assert record["KKT_worst"] < 1e-6
+    assert max(record["most_active"] for record in flights) > 60
+    assert len(cases) == 3
+    for record in cases:
+        assert 0.0 < record["C_p50_ms"] <= record["C_p99_ms"]
+        assert record.get("inputs_differ", 0.0) < 1e-3  # of acados, where it is installed
+    assert cases[0].get("p50_ratio", 0.0) < 0.5
+
+
 def test_a_film_has_its_frames(tmp_path: Path) -> None:
     try:
         rendering_backend()

@@ -37,6 +37,7 @@ BLOCK: Final = re.compile(r"<!-- (\S+): filled by docs/tools/remake.py from (\S+
 BENCHMARKS: Final = (
     "solvers",
     "flight",
+    "nonlinear",
     "film",
     "campaign",
     "mismatch",
@@ -85,7 +86,7 @@ FILMS: Final = {
     "take-off-and-landing": "From cold rotors on the ground, up 2 m, and down again.",
 }
 """The scenarios that the gallery films, and what to see there."""
-WITHOUT_SOLVER: Final = ("film", "intervals")
+WITHOUT_SOLVER: Final = ("film", "intervals", "nonlinear")
 """Tables whose numbers come from no QP."""
 Row = Sequence[object]
 
@@ -375,10 +376,16 @@ def _with_half(mean: float | None, half: float | None) -> str:
 
 
 def records(data: Any) -> str:
-    """A benchmark's records, one a row, under their keys."""
-    rows = _records(data)
-    keys = [*dict.fromkeys(key for row in rows for key in row)]
-    return markdown([key.replace("_", " ") for key in keys], [[_cell(row.get(key)) for key in keys] for row in rows])
+    """A benchmark's records, one a row, under their keys: a table for each kind, by their first key."""
+    kinds: dict[str, list[dict[str, Any]]] = {}
+    for row in _records(data):
+        kinds.setdefault(next(iter(row)), []).append(row)
+    tables = []
+    for rows in kinds.values():
+        keys = [*dict.fromkeys(key for row in rows for key in row)]
+        cells = [[_cell(row.get(key)) for key in keys] for row in rows]
+        tables.append(markdown([key.replace("_", " ") for key in keys], cells))
+    return "\n".join(tables)
 
 
 def _records(data: Any) -> list[dict[str, Any]]:
@@ -420,7 +427,7 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "solvers": solvers,
     "identification": identification,
     "intervals": intervals,
-    **dict.fromkeys(("flight", "film", "campaign", "autopilots"), records),
+    **dict.fromkeys(("flight", "nonlinear", "film", "campaign", "autopilots"), records),
 }
 
 

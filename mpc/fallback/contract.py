@@ -76,6 +76,8 @@ class Guard:
         self._model, self._bounds, self._settings = model, bounds, settings
         self._distance = settings.distance
         self._completion = StateCompletion(model)
+        self._law: Controller | None = None  # the last that was asked for its trim
+        self._trimmed: Trimmed | None = None
         self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
         self.reset(model.u_bar)
 
@@ -129,8 +131,13 @@ class Guard:
 
     def trim(self, law: Controller) -> Trim:
         """Return the equilibrium that the law estimates; level hover if it estimates none."""
-        trim = _tried(lambda: law.trim if isinstance(law, Trimmed) else None)
+        trim = _tried(lambda: self._trim(law))
         return trim if isinstance(trim, Trim) else self._level
+
+    def _trim(self, law: Controller) -> object:
+        if law is not self._law:  # asked once: a runtime protocol takes as long as ten array operations
+            self._law, self._trimmed = law, law if isinstance(law, Trimmed) else None
+        return None if self._trimmed is None else self._trimmed.trim
 
     def predict(self, law: Controller, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Predicting`; by the hover model where the law cannot."""

@@ -69,6 +69,7 @@ from quadsim.controller import (
 from quadsim.errors import ParameterError
 from quadsim.rotation import (
     body_to_euler_rates,
+    cross,
     euler_to_body_rates,
     euler_to_quaternion,
     multiply,
@@ -86,6 +87,7 @@ from quadsim.state import (
     VELOCITIES,
     Array,
     ReferenceTurns,
+    all_true,
 )
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -164,7 +166,7 @@ class NonlinearMPC:
         self._tilted = settings.tilt is not None
         self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         self.problem = self._problem(constraints)
-        self._check = AnswerCheck(self.problem, kkt_every)
+        self._check, self._form = AnswerCheck(self.problem, kkt_every), Staged(self.problem)
         self.solver = CORE
         self._space, self._groups = (
             space,
@@ -461,10 +463,13 @@ class NonlinearMPC:
 
     def _measured(self, now: StepInputs, state: Array) -> Array:
         """(n,) the model's state."""
-        x = np.concatenate([_body(state), self._rotors])[: self._model.n]
-        for part, measured in ((Q, now.attitude), (W, now.body_rates)):
-            if measured is not None and np.isfinite(measured).all():
-                x[part] = measured
+        x = np.empty(self._model.n)
+        x[P], x[V], x[N_BODY:] = state[POSITIONS], state[VELOCITIES], self._rotors[: self._model.n - N_BODY]
+        q, w = now.attitude, now.body_rates
+        x[Q] = q if q is not None and all_true(np.isfinite(q)) else euler_to_quaternion(state[ANGLES])
+        x[W] = (
+            w if w is not None and all_true(np.isfinite(w)) else euler_to_body_rates(state[ANGLES], state[ANGLE_RATES])
+        )
         return x
 
     def _learn(self, last: tuple[float, Array], time: float, measured: Array) -> None:
@@ -507,22 +512,20 @@ class NonlinearMPC:
             return nodes
         states, thrusts = nodes.states.copy(), nodes.thrusts
         q, mass = states[:, Q], self._vehicle.mass
-        axis = thrust_axis(q)
-        total = np.sum(thrusts, axis=1) / mass
-        force = np.concatenate([total, total[-1:]])[:, None] * axis
-        thrust_acceleration = force - model.acceleration - drag_acceleration(model, q, states[:, V])
+        R = rotation(q)
+        axis = R[:, :, 2].copy()
+        total = thrusts.sum(axis=1) / mass
+        force = np.append(total, total[-1])[:, None] * axis
+        thrust_acceleration = force - model.acceleration - drag_acceleration(model, R, states[:, V])
         size = np.maximum(np.linalg.norm(thrust_acceleration, axis=1), 1e-9)
         # The least rotation from axis a to axis b is (1 + a . b, a x b), up to its length.
-        turn = np.concatenate(
-            [
-                1.0 + np.sum(axis * thrust_acceleration, axis=1)[:, None] / size[:, None],
-                np.cross(axis, thrust_acceleration) / size[:, None],
-            ],
-            axis=1,
-        )
+        turn = np.empty_like(q)
+        turn[:, 0] = 1.0 + (axis * thrust_acceleration).sum(axis=1) / size
+        turn[:, 1:] = cross(axis, thrust_acceleration) / size[:, None]
         length = np.linalg.norm(turn, axis=1)
-        turn[length < 1e-6] = (1.0, 0.0, 0.0, 0.0)
-        turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+        if (around := length < 1e-6).any():
+            turn[around], length[around] = (1.0, 0.0, 0.0, 0.0), 1.0
+        turn /= length[:, None]
         states[:, Q] = multiply(turn, q)
         effort = np.empty((len(total), 4))
         effort[:, 0], effort[:, 1:] = size[:-1] - total, -model.angular_acceleration
@@ -600,7 +603,7 @@ class NonlinearMPC:
     def _certificate(self) -> tuple[QP, Solution]:
         """Return the last step's program, and its optimum with multipliers."""
         problem, query, sqp = self._rows(), self._query(), self._sqp
-        form = Staged(problem)
+        form = self._form if problem is self.problem else Staged(problem)
         qp = form.assemble(query).qp
         groups = self._groups if problem is self.problem else slack_groups(problem)
         multipliers = sqp.multipliers(len(problem.rows.names), len(self.problem.rows.names))

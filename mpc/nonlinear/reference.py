@@ -8,7 +8,7 @@ import numpy as np
 
 from mpc.nonlinear.rigidbody import N_BODY, P, Q, V, W
 from quadsim.motion import Motion
-from quadsim.state import Array
+from quadsim.state import Array, Indices
 
 
 class Nodes(NamedTuple):
@@ -21,9 +21,11 @@ class Nodes(NamedTuple):
 def nodes_of_motion(motion: Motion, horizon: int, stride: int) -> Nodes:
     """Take the samples k, k + stride, ...; past the end repeat the last one, and for thrusts the last but one."""
     last = (len(motion) - 1) // stride
-    at, with_inputs = (
-        stride * np.minimum(np.arange(count), end) for count, end in ((horizon + 1, last), (horizon, max(last - 1, 0)))
-    )
+    at: slice | Indices = slice(0, stride * horizon + 1, stride)
+    with_inputs: slice | Indices = slice(0, stride * horizon, stride)
+    if last < horizon:
+        at = stride * np.minimum(np.arange(horizon + 1), last)
+        with_inputs = stride * np.minimum(np.arange(horizon), max(last - 1, 0))
     states = np.empty((horizon + 1, N_BODY))
     states[:, P], states[:, Q], states[:, V] = motion.position[at], motion.attitude[at], motion.velocity[at]
     states[:, W] = motion.body_rates[at]

@@ -45,6 +45,11 @@ RATE_SCALE: Final = 1.5
 largest would be penalised too little: where noise reaches the controller, rates then move by hundreds of deg/s, for
 which the mixer raises the thrust."""
 _q, _v, _w = slice(0, 4), slice(4, 7), slice(7, 10)
+# R(q), row by row: 1 - 2 (yy + zz), 2 (xy - wz), 2 (xz + wy), ..., by the places of its products in q q'.
+_FIRST, _SECOND = np.array([10, 6, 7, 6, 5, 11, 7, 11, 5]), np.array([15, 3, 2, 3, 15, 1, 2, 1, 10])
+_SIGN: Final = np.array([1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
+_EYE: Final = np.eye(3).ravel()
+_OUTER: Final = 1.0 - 2.0 * _EYE
 
 
 class Inputs(StrEnum):
@@ -140,24 +145,25 @@ def rigid_body(vehicle: Vehicle, step: float, **others: object) -> RigidBody:
 
 def thrust_axis(q: Array) -> Array:
     """R(q) e_z (..., 3) of quaternions (..., 4) of any length."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    return np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
+    w, x, y, z = (q[..., i] for i in range(4))
+    axis = np.empty((*q.shape[:-1], 3))
+    axis[..., 0], axis[..., 1], axis[..., 2] = (
+        2.0 * (x * z + w * y),
+        2.0 * (y * z - w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    )
+    return axis
 
 
 def rotation(q: Array) -> Array:
     """R(q) (..., 3, 3), polynomial, of quaternions (..., 4) of any length."""
-    w, x, y, z = (q[..., i] for i in range(4))
-    rows = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    products = (q[..., :, None] * (2.0 * q[..., None, :])).reshape(*q.shape[:-1], 16)
+    sums = products.take(_FIRST, -1) + _SIGN * products.take(_SECOND, -1)
+    return (_EYE + _OUTER * sums).reshape(*q.shape[:-1], 3, 3)
 
 
-def drag_acceleration(model: RigidBody, q: Array, v: Array) -> Array:
-    """(..., 3) acceleration by drag, world [m/s^2], for quaternions (..., 4) and velocities (..., 3) [m/s]."""
-    R = rotation(q)
+def drag_acceleration(model: RigidBody, R: Array, v: Array) -> Array:
+    """(..., 3) acceleration by drag, world [m/s^2], for attitudes (..., 3, 3) and velocities (..., 3) [m/s]."""
     air = (np.swapaxes(R, -1, -2) @ v[..., None])[..., 0]
     pull = -(model.drag * air + model.quadratic_drag * np.abs(air) * air) / model.mass
     return np.asarray((R @ pull[..., None])[..., 0])

@@ -16,6 +16,7 @@ from quadsim.rotation import (
     body_to_euler_rates,
     body_to_world,
     conjugate,
+    cross,
     euler_to_body_rates,
     euler_to_quaternion,
     exponential,
@@ -127,6 +128,12 @@ def test_a_rotation_and_its_conjugate_cancel(a: Vector3) -> None:
     q = exponential(a)
     assert multiply(q, conjugate(q)) == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-15)
     assert normalise((3.0 * q[0], 3.0 * q[1], 3.0 * q[2], 3.0 * q[3])) == pytest.approx(q, abs=1e-15)
+
+
+def test_cross_products_are_numpy_s() -> None:
+    a, b = np.random.default_rng(0).standard_normal((2, 5, 4, 3))
+    np.testing.assert_array_equal(cross(a, b), np.cross(a, b))
+    np.testing.assert_array_equal(cross(a[0, 0], b[0, 0]), np.cross(a[0, 0], b[0, 0]))
 
 
 @given(vectors=st.lists(st.tuples(vectors, vectors), min_size=1, max_size=4))
