@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from quadsim.controller import Phase, law_name
-from quadsim.errors import printable
+from quadsim.errors import ParameterError, printable
 from quadsim.flight.audit import VERDICT_TEXT, Finding, Limit, SpaceLimit, worst_finding
 from quadsim.flight.rundir import findings_of
 from quadsim.report.table import ABSENT, Cell, Mark, QuantityRow, format_number
@@ -54,6 +54,18 @@ def run_names(runs: Sequence[Run]) -> tuple[str, ...]:
     names = [part[0] + (f" ({', '.join(part[1:])})" if part[1:] else "") for part in parts]
     seen = Counter(names)
     return tuple(name if seen[name] == 1 else f"{name}, {names[: i + 1].count(name)}" for i, name in enumerate(names))
+
+
+def check_names(names: Sequence[str], count: int, field: str = "names") -> None:
+    """Reject names of flights that do not tell them apart.
+
+    Raises:
+        ParameterError: `field` is neither empty nor a different text for each of `count` targets.
+    """
+    plain = {name for name in names if isinstance(name, str) and name.strip() and printable(name) == name}
+    if names and (isinstance(names, str) or not len(names) == len(plain) == count):
+        shown = names if isinstance(names, str) else list(names)
+        raise ParameterError("", field, shown, f"{count} different texts, one for each target")
 
 
 def distinct_courses(runs: Sequence[Run]) -> list[Run]:
