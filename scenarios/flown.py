@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shlex
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -407,6 +408,9 @@ class Flight(Result):
                 yield console.to_open(self.directory / name)
         if (self.directory / rundir.RECORDING_FILE).exists():
             yield console.to_open(self.directory, "quadsim view")
+        if self.time.size:
+            words = ("quadsim", "plot", console.short_path(self.directory), "--out", f"{self.directory.name}.pdf")
+            yield console.command(shlex.join(words))
 
     def to_json(self) -> dict[str, Any]:
         """Return `summary.json`, the recorded one if the flight is on disk."""

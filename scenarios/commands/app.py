@@ -69,7 +69,7 @@ def _version() -> str:
 app: Final = App(
     name="quadsim",
     help="Fly model predictive controllers of quadrotors in MuJoCo; record, film and audit every flight.",
-    help_epilogue="exit status: 0 done; 1 a required constraint does not hold, or the flight was aborted or "
+    help_epilogue="exit status: 0 done; 1 a required constraint is violated, or the flight was aborted or "
     "interrupted; 2 wrong input",
     help_format="plaintext",
     default_parameter=Parameter(show_default=False, negative_iterable=(), allow_repeating=True),
