@@ -317,7 +317,7 @@ def test_an_input_that_is_refused_in_flight_is_named_with_its_time_and_status_1(
     assert line.startswith("hover  completed, a required constraint is violated: hold_x by ")
     assert line.endswith(" s  1.00 s flown")
     assert opened[0] == f"written to {out}"
-    assert opened[-1] == f"quadsim view {out}"
+    assert opened[-2:] == [f"quadsim view {out}", f"quadsim plot {out} --out run.pdf"]
 
 
 @pytest.mark.slow("live")
