@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from scenarios.commands.app import load as load
     from scenarios.commands.app import load_vehicle as load_vehicle
     from scenarios.commands.app import make_controller as make_controller
+    from scenarios.commands.app import plot as plot
     from scenarios.commands.app import problem as problem
     from scenarios.commands.app import read as read
     from scenarios.commands.app import run as run
@@ -102,7 +103,7 @@ _MODULES = {
     "quadsim.state": "STATE_NAMES State",
     "quadsim.vehicle": "Vehicle",
     "scenarios.commands.app": "catalogue check compare doctor feasibility film fly load load_vehicle make_controller "
-    "problem read run start view",
+    "plot problem read run start view",
     "scenarios.campaign.commands": "campaign replay sweep",
     "scenarios.design.commands": "scenario vehicle_report",
     "scenarios.export.exporter": "export",

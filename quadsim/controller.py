@@ -402,6 +402,11 @@ def law_name(recorded: str) -> str:
 
 
 def counts(answered_by: Mapping[str, int]) -> str:
-    """Return the number of periods per source, largest first: `607 gain, 593 piqp-multistage`; `280 commanded`."""
+    """Return the number of periods per source, largest first.
+
+    For example `607 periods at the unconstrained optimum, no QP; 593 by piqp-multistage`, or `280 periods commanded`.
+    """
+    texts = {GAIN: "at the unconstrained optimum, no QP", LAW: COMMANDED}
     ranked = sorted(answered_by.items(), key=lambda entry: -entry[1])
-    return ", ".join(f"{count} {COMMANDED if by == LAW else by}" for by, count in ranked)
+    parts = [f"{count}{'' if i else ' periods'} {texts.get(by, f'by {by}')}" for i, (by, count) in enumerate(ranked)]
+    return "; ".join(parts)

@@ -11,11 +11,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from quadsim.errors import ParameterError, printable
+from quadsim.errors import ParameterError
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
 from quadsim.outputs import reserving
-from quadsim.report.comparison import different_audits
+from quadsim.report.comparison import check_names, different_audits
 from quadsim.report.table import QuantityRow
 from scenarios.flown import Flight, require_rendering, worst_margin
 from scenarios.loading import load_scenario
@@ -183,14 +183,6 @@ def audited_against(run: rundir.Run, limits: Sequence[Limit]) -> rundir.Run:
         "audit_notes": [],
     }
     return replace(run, summary={**run.summary, **again}, limits=tuple(finding.limit for finding in findings))
-
-
-def check_names(names: Sequence[str], count: int) -> None:
-    """Reject column names that do not tell the targets apart."""
-    plain = {name for name in names if isinstance(name, str) and name.strip() and printable(name) == name}
-    if names and (isinstance(names, str) or not len(names) == len(plain) == count):
-        shown = names if isinstance(names, str) else list(names)
-        raise ParameterError("", "names", shown, f"{count} different texts, one for each target")
 
 
 def _check(target: Compared) -> None:

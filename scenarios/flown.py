@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shlex
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -19,7 +20,6 @@ from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import MissingPackageError, OutputError, UnknownNameError, failure_line
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import (
-    SIGNALS,
     VERDICT_TEXT,
     Finding,
     flight_verdict,
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from quadsim.flight.audit import FlightVerdict  # only here: Jedi completes no object with a property of a Literal
     from quadsim.report.figure import Figure
     from scenarios.assembly import Assembly
+    from scenarios.flight_plot import Overlay
 
 _log: Final = logging.getLogger("quadsim")
 
@@ -249,6 +250,11 @@ class Flight(Result):
         """The flight in the form that figures and pages use."""
         return self._run(self.summary)
 
+    @property
+    def undiagnosed_run(self) -> rundir.Run:
+        """`run` for figures, before a change that its diagnosis advises is flown."""
+        return self._run(self._numbers)
+
     def _run(self, summary: Mapping[str, Any]) -> rundir.Run:
         limits = tuple(finding.limit for finding in self.findings)
         directory = self.directory or Path(self.scenario.name)
@@ -277,27 +283,22 @@ class Flight(Result):
         """
         return to_pandas(self.to_arrow(table))
 
-    def plot(self, *signals: str) -> list[Any]:
-        """Draw signals over time with their references and bounds, one panel each.
+    def plot(self, *signals: str, **options: Any) -> Overlay:
+        """Draw signals over time with their references and bounds: `quadsim.plot` of this flight.
 
         Args:
-            signals: names that constraints can have, as `x`, `tilt`, `speed`, names in `logged`, and `xy` for the path
-                from above; position and attitude by default.
+            signals: as in `quadsim.plot`.
+            options: its `labels`, `width`, `out` and `overwrite`.
 
         Returns:
-            The matplotlib axes, top to bottom; `axes[0].figure` is the figure, which is pyplot's.
+            The matplotlib axes, top to bottom.
 
         Raises:
-            UnknownNameError: there is no such signal.
+            InputError: as in `quadsim.plot`.
         """
-        from quadsim.report.flight_figures import signals as draw_signals
-        from quadsim.report.to_matplotlib import draw
+        from scenarios.flight_plot import plot_runs
 
-        for name in signals:
-            if name not in (known := (*SIGNALS, "xy", *self.logged)):
-                raise UnknownNameError("signal", name, known)
-        figure = draw_signals([self._run(self._numbers)], signals or ("x", "y", "z", "roll", "pitch", "yaw"))
-        return draw(figure, interactive=True).axes
+        return plot_runs([self.undiagnosed_run], signals, **options)
 
     def save(
         self,
@@ -407,6 +408,9 @@ class Flight(Result):
                 yield console.to_open(self.directory / name)
         if (self.directory / rundir.RECORDING_FILE).exists():
             yield console.to_open(self.directory, "quadsim view")
+        if self.time.size:
+            words = ("quadsim", "plot", console.short_path(self.directory), "--out", f"{self.directory.name}.pdf")
+            yield console.command(shlex.join(words))
 
     def to_json(self) -> dict[str, Any]:
         """Return `summary.json`, the recorded one if the flight is on disk."""
@@ -416,7 +420,7 @@ class Flight(Result):
         """See `Result.small_plot`: position over time."""
         from quadsim.report.flight_figures import signals
 
-        return signals([self._run(self._numbers)], ("x", "y", "z")) if self.time.size else None
+        return signals([self.undiagnosed_run], ("x", "y", "z")) if self.time.size else None
 
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""

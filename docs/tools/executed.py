@@ -36,7 +36,7 @@ def run(source: str, names: dict[str, Any]) -> str:
     parts = [f"<pre><code>{escape(text)}</code></pre>"] if text else []
     for number in plt.get_fignums():
         image = io.BytesIO()
-        plt.figure(number).savefig(image, format="png", dpi=90)
+        plt.figure(number).savefig(image, format="png", dpi=120)
         parts.append(f'<img alt="plot" src="data:image/png;base64,{base64.b64encode(image.getvalue()).decode()}">')
     plt.close("all")
     if value is not None and not parts:

@@ -195,7 +195,7 @@ def results(flights: dict[str, Any]) -> str:
 def _bound(found: dict[str, Any], unit: str) -> str:
     margin, seconds = found["margin"], found["time_violated"]
     if found["satisfied"]:
-        return f"held ({margin:.3f} {unit})"
+        return f"holds ({margin:.3f} {unit})"
     return f"violated ({margin:.2f} {unit}), {f'{seconds:.2f} s' if seconds else 'by commands alone'}"
 
 

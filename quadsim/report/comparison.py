@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from quadsim.controller import Phase, law_name
-from quadsim.errors import printable
+from quadsim.errors import ParameterError, printable
 from quadsim.flight.audit import VERDICT_TEXT, Finding, Limit, SpaceLimit, worst_finding
 from quadsim.flight.rundir import findings_of
 from quadsim.report.table import ABSENT, Cell, Mark, QuantityRow, format_number
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 Summary = Mapping[str, Any]
 GLANCE: Final = "At a glance"
-_EXCEEDED: Final = "exceeded, not required"
+NOT_REQUIRED: Final = "violated, not required"
 _ROUNDING: Final = 1e-3  # share of its tolerance below which a margin is shown as 0
 _MOST_DIFFERENCES: Final = 4  # differences of two audits that a sentence names
 _MOST_EVENTS: Final = 12  # most events of a flight that are named
@@ -54,6 +54,18 @@ def run_names(runs: Sequence[Run]) -> tuple[str, ...]:
     names = [part[0] + (f" ({', '.join(part[1:])})" if part[1:] else "") for part in parts]
     seen = Counter(names)
     return tuple(name if seen[name] == 1 else f"{name}, {names[: i + 1].count(name)}" for i, name in enumerate(names))
+
+
+def check_names(names: Sequence[str], count: int, field: str = "names") -> None:
+    """Reject names of flights that do not tell them apart.
+
+    Raises:
+        ParameterError: `field` is neither empty nor a different text for each of `count` targets.
+    """
+    plain = {name for name in names if isinstance(name, str) and name.strip() and printable(name) == name}
+    if names and (isinstance(names, str) or not len(names) == len(plain) == count):
+        shown = names if isinstance(names, str) else list(names)
+        raise ParameterError("", field, shown, f"{count} different texts, one for each target")
 
 
 def distinct_courses(runs: Sequence[Run]) -> list[Run]:
@@ -104,7 +116,7 @@ def comparison_rows(runs: Sequence[Run]) -> list[QuantityRow]:
 
 
 def outcome(summary: Summary) -> Cell:
-    """Return the verdict with its reason, and the bounds that were exceeded but are not required."""
+    """Return the verdict with its reason, and the constraints that are violated but not required."""
     cell = verdict_cell(summary)
     if summary["status"] != "completed":
         cell = replace(cell, text=f"{cell.text}: {summary.get('reason')}")
@@ -112,11 +124,15 @@ def outcome(summary: Summary) -> Cell:
         cell = replace(cell, text=f"{cell.text}; {required(summary).text}")
     elif sentence := failed_takeoff(summary):
         cell = replace(cell, text=f"{cell.text}: {sentence}")
-    free = [finding for finding in findings_of(summary) if not finding.limit.required]
-    if exceeded := [finding.limit.name for finding in free if finding.verdict == "violated"]:
+    if violated := violated_unrequired(findings_of(summary)):
         mark = Mark.WARN if cell.mark is Mark.GOOD else cell.mark
-        cell = Cell(text=f"{cell.text}; {_EXCEEDED}: {', '.join(exceeded)}", mark=mark)
+        cell = Cell(text=f"{cell.text}; {NOT_REQUIRED}: {', '.join(violated)}", mark=mark)
     return cell
+
+
+def violated_unrequired(findings: Iterable[Finding]) -> list[str]:
+    """Return the names of the constraints that are violated but not required."""
+    return [finding.limit.name for finding in findings if finding.verdict == "violated" and not finding.limit.required]
 
 
 def _worst_constraint(summary: Summary) -> Cell:
@@ -324,13 +340,18 @@ def _verdict(finding: Finding) -> Cell:
     """
     text = VERDICT_TEXT[finding.verdict]
     if finding.verdict == "violated" and not finding.limit.required:
-        text = _EXCEEDED
+        text = NOT_REQUIRED
     if finding.verdict != "incomplete":
         margin, tolerance = finding.deciding
         at_samples = " at the samples" if margin != finding.worst_margin else ""
-        shown = 0.0 if abs(margin) < _ROUNDING * tolerance else margin
+        shown = rounded_margin(margin, tolerance)
         text += f" (margin {format_number(shown)} {finding.limit.unit}{at_samples}, tolerance {tolerance:.3g})"
     return Cell(text=text, mark=_verdict_mark(finding))
+
+
+def rounded_margin(margin: float, tolerance: float) -> float:
+    """Return a margin, or 0 if it is far smaller than its tolerance."""
+    return 0.0 if abs(margin) < _ROUNDING * tolerance else margin
 
 
 def _verdict_mark(finding: Finding) -> Mark:

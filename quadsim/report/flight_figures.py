@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from quadsim.flight.audit import SIGNALS, SpaceLimit
+from quadsim.errors import InputError, UnknownNameError
+from quadsim.flight.audit import SIGNALS, TERM_SIGNALS, SpaceLimit, margins_at
 from quadsim.flight.rundir import Run
-from quadsim.palette import COLOUR, line_colour
+from quadsim.palette import COLOUR, CYCLE, line_colour
 from quadsim.report.comparison import distinct_courses, run_names
 from quadsim.report.figure import (
     LEAST_SPANS,
@@ -49,6 +50,8 @@ _REFERENCE: Final[dict[str, Any]] = {
     "dashed": True,
     "width": 1.1,
 }
+_MARGIN: Final = "margin."  # prefix of a constraint's name: its margin
+_CLOCKS: Final = {"step_ms": "whole step", "solve_ms": "optimum alone"}  # columns of `timing.parquet`
 _NEAR: Final = 3.0  # clearance [m] below which a moving obstacle is drawn; upper limit of the curves
 _MOVES: Final = 0.1  # smallest span of a course [m] that counts as motion along an axis
 _EVERY: Final = 0.25  # time between drawings of it [s]
@@ -90,32 +93,43 @@ def page_figures(runs: Sequence[Run]) -> list[Figure | Scene]:
 
 
 def overview(runs: Sequence[Run]) -> Figure:
-    """Plot position, roll, pitch and the range of rotor speeds of runs."""
-    names = ("x", "roll", "y", "pitch", "z")
-    speeds = tuple(
-        Band(
-            x=run.log.control.t,
-            low=run.log.control.speeds.min(axis=1),
-            high=run.log.control.speeds.max(axis=1),
-            colour=line_colour(i),
-            label=name,
-            opacity=0.6,
-        )
-        for i, name, run in _flown(runs)
-    )
-    rotors = Panel(
-        title="range of rotor speeds", unit=SIGNALS["speed"].unit, bands=speeds, bounds=_bounds(runs, "speed")
-    )
-    return _timed("comparison", "", (*(_signal(runs, name) for name in names), rotors), runs)
+    """Plot position, roll, pitch and rotor speeds of runs."""
+    return replace(signals(runs, ("x", "roll", "y", "pitch", "z", "speed")), key="comparison", columns=2)
 
 
 def signals(runs: Sequence[Run], names: Sequence[str]) -> Figure:
-    """Plot signals of the audit or of the controller's log over time, and `xy`, the first run's path from above."""
-    panels = tuple(
-        _above(runs[0]) if name == "xy" else _signal(runs, name) if name in SIGNALS else _logged(runs, name)
-        for name in names
-    )
-    return _timed("signals", "", panels, runs, columns=1)
+    """Plot one panel per name over time, each with all runs that have it.
+
+    Args:
+        runs: the flights, one colour each; a single one has the colours of its rotors.
+        names: signals of the audit (`x`, `tilt`, `x_error`, `slew`, ...); `speed_1` .. `speed_4`, the acting speed of
+            one rotor; `command`, the commanded speeds; `margin.NAME`, the signed margin to a constraint; `error`, the
+            distance from the filtered reference; `step_ms` and `solve_ms`, the time of the whole controller step and
+            of the solver alone; `xy`, the paths from above; what a controller logged.
+
+    Raises:
+        UnknownNameError: no run has such a signal.
+        InputError: runs have it in different units.
+    """
+    known = _panels(runs)
+    for name in names:
+        if name not in known:
+            kind = [other for other in known if other.startswith(_MARGIN) == name.startswith(_MARGIN)]
+            raise UnknownNameError("signal", name, kind)
+    return _timed("signals", "", tuple(known[name](runs, name) for name in names), runs, columns=1)
+
+
+def _panels(runs: Sequence[Run]) -> dict[str, Callable[[Sequence[Run], str], Panel]]:
+    """What `signals` can plot of these runs: the panel of each name."""
+    return {
+        **dict.fromkeys((name for run in runs for name in run.log.control.logged), _logged),
+        **dict.fromkeys((f"{_MARGIN}{limit.name}" for run in runs for limit in run.limits), _margin),
+        **dict.fromkeys(_CLOCKS, _clock),
+        "error": _error,
+        "command": lambda runs, _: replace(_signal(runs, "speed"), title="commanded rotor speed"),
+        "xy": lambda runs, _: _above(runs),
+        **dict.fromkeys((*SIGNALS, *TERM_SIGNALS), _signal),
+    }
 
 
 def states(runs: Sequence[Run]) -> Figure:
@@ -175,22 +189,7 @@ def targets(run: Run) -> list[Figure]:
 
 def times(runs: Sequence[Run]) -> Figure:
     """Plot computation times against the deadline, iterations and active constraints."""
-    panels = []
-    for what, key in (("whole step", "step_ms"), ("optimum alone", "solve_ms")):
-        curves, title = [], what
-        for i, label, run in _flown(runs):
-            values = getattr(run.log.timing, key)
-            # a clock may read 0, which a logarithmic axis cannot show
-            shown = np.where(values > 0.0, values, np.nan)
-            curves.append(_of_run(i, label, run.log.timing.t, shown, style="points", width=2.0))
-            if len(runs) == 1:
-                p50, p99 = np.percentile(values, [50, 99])
-                title = f"{what}: median {p50:.3g}, p99 {p99:.3g}, max {values.max():.3g}"
-        deadlines = (
-            {float(run.summary["controller"]["deadline_ms"]) for _, _, run in _flown(runs)} if key == "step_ms" else ()
-        )
-        bounds = tuple(Bound(value=deadline, start=0.0, stop=_end(runs)) for deadline in sorted(deadlines))
-        panels.append(Panel(title=title, y_label="time [ms]", y_log=True, series=tuple(curves), bounds=bounds))
+    panels = [_clock(runs, key) for key in _CLOCKS]
     for title, key in (("solver iterations", "iterations"), ("active constraints", "active")):
         counts = tuple(
             _of_run(i, label, run.log.control.t, getattr(run.log.control, key).astype(float), style="steps")
@@ -198,6 +197,24 @@ def times(runs: Sequence[Run]) -> Figure:
         )
         panels.append(Panel(title=title, y_label="count", series=counts, whole=True))
     return _timed("solve_times", "time to compute a command", tuple(panels), runs)
+
+
+def _clock(runs: Sequence[Run], key: str) -> Panel:
+    """Plot a computation time per period, and the deadline of a whole step."""
+    curves, title = [], _CLOCKS[key]
+    for i, label, run in _flown(runs):
+        values = getattr(run.log.timing, key)
+        # a clock may read 0, which a logarithmic axis cannot show
+        shown = np.where(values > 0.0, values, np.nan)
+        curves.append(_of_run(i, label, run.log.timing.t, shown, style="points", width=2.0))
+        if len(runs) == 1:
+            p50, p99 = np.percentile(values, [50, 99])
+            title = f"{title}: median {p50:.3g}, p99 {p99:.3g}, max {values.max():.3g}"
+    deadlines = (
+        {float(run.summary["controller"]["deadline_ms"]) for _, _, run in _flown(runs)} if key == "step_ms" else ()
+    )
+    bounds = tuple(Bound(value=deadline, start=0.0, stop=_end(runs)) for deadline in sorted(deadlines))
+    return Panel(title=title, y_label="time [ms]", y_log=True, series=tuple(curves), bounds=bounds)
 
 
 def effects(run: Run) -> list[Figure]:
@@ -233,7 +250,7 @@ def space(run: Run) -> list[Figure]:
     ends = (min(0.0, low) - 0.1, min(high, _NEAR) + 0.1)
     clear = Panel(title="clearance", unit="m", series=tuple(curves), bounds=(Bound(value=0.0),), y_range=ends,
                   legend=True, height=1.5)  # fmt: skip
-    return [_timed("space", "from above, and clearances", (_above(run), clear), [run], columns=1)]
+    return [_timed("space", "from above, and clearances", (_above([run]), clear), [run], columns=1)]
 
 
 def xy(run: Run) -> list[Figure]:
@@ -241,35 +258,39 @@ def xy(run: Run) -> list[Figure]:
     course = run.log.control.reference[:, :3]
     spans = course.max(axis=0) - course.min(axis=0)
     planar = spans[:2].min() > _MOVES and spans[2] < LEAST_SPANS["m"]
-    return [_timed("xy", "path", (_above(run),), [run], columns=1)] if planar and not space(run) else []
+    return [_timed("xy", "path", (_above([run]),), [run], columns=1)] if planar and not space(run) else []
 
 
-def _above(run: Run) -> Panel:
-    """Plot a flight and its course from above, with obstacles and the edges of regions."""
-    areas = []
-    for limit in run.limits:
-        if not isinstance(limit, SpaceLimit) or not isinstance(limit.shape, Obstacle):
-            continue
-        t, values = limit.source.finest(run.log)
-        near = t[values < _NEAR]
-        for instant in np.arange(near[0], near[-1], _EVERY) if limit.shape.moves and near.size else [0.0]:
-            for outline in outlines(limit.shape, instant):
-                opacity = 0.3 if limit.shape.moves else 0.55
-                areas.append(Area(outline=outline, colour=COLOUR.obstacle, opacity=opacity, label="obstacle"))
-    regions = [
-        Series(x=edge[:, 0], y=edge[:, 1], colour=COLOUR.bound, label="region", dashed=True, width=0.9)
-        for _, edges in region_edges(run)
-        for edge in edges
-    ]
-    course, position = run.log.control.reference, run.log.plant.state[:, POSITION]
-    lines = [
-        Series(x=course[:, 0], y=course[:, 1], **_REFERENCE),
-        Series(x=position[:, 0], y=position[:, 1], colour=COLOUR.flown, label="flight"),
-        _point(position[0], "start", COLOUR.flown, width=9.0),
-        _point(position[-1], "end", COLOUR.flown, width=5.0, marker="square"),
-    ]
+def _above(runs: Sequence[Run]) -> Panel:
+    """Plot flights and their courses from above, with obstacles and the edges of regions."""
+    areas, regions = [], []
+    for run in {run.limits: run for run in reversed(runs)}.values():  # the first run with these limits
+        for limit in run.limits:
+            if not isinstance(limit, SpaceLimit) or not isinstance(limit.shape, Obstacle):
+                continue
+            t, values = limit.source.finest(run.log)
+            near = t[values < _NEAR]
+            for instant in np.arange(near[0], near[-1], _EVERY) if limit.shape.moves and near.size else [0.0]:
+                for outline in outlines(limit.shape, instant):
+                    opacity = 0.3 if limit.shape.moves else 0.55
+                    areas.append(Area(outline=outline, colour=COLOUR.obstacle, opacity=opacity, label="obstacle"))
+        regions += [
+            Series(x=edge[:, 0], y=edge[:, 1], colour=COLOUR.bound, label="region", dashed=True, width=0.9)
+            for _, edges in region_edges(run)
+            for edge in edges
+        ]
+    courses = (run.log.control.reference for run in distinct_courses(runs))
+    lines = [Series(x=course[:, 0], y=course[:, 1], **_REFERENCE) for course in courses]
+    ends = []
+    for i, label, run in _flown(runs):
+        position = run.log.plant.state[:, POSITION]
+        lines.append(_of_run(i, label, position[:, 0], position[:, 1]))
+        ends += [
+            _point(position[0], "start", line_colour(i), width=9.0),
+            _point(position[-1], "end", line_colour(i), width=5.0, marker="square"),
+        ]
     return Panel(title="from above", x_label="x [m]", y_label="y [m]", equal=True, height=2.0, areas=tuple(areas),
-                 series=(*regions, *lines))  # fmt: skip
+                 series=(*regions, *lines, *ends))  # fmt: skip
 
 
 def _point(place: Array, label: str, colour: str, **looks: Any) -> Series:
@@ -296,8 +317,11 @@ def path(runs: Sequence[Run]) -> Scene:
 
 
 def _signal(runs: Sequence[Run], name: str) -> Panel:
-    """Plot a signal of the audit with reference and bounds; for a single run also the measured state if it differs."""
-    signal, curves = SIGNALS[name], []
+    """Plot a signal of the audit with reference and bounds; for a single run also the measured state if it differs.
+
+    What every rotor has is a curve per rotor for a single run, and for several the range over the rotors of each.
+    """
+    signal, curves, bands = {**TERM_SIGNALS, **SIGNALS}[name], [], []
     for run in distinct_courses(runs) if name in REFERENCE_NAMES else ():
         curves.append(Series(x=run.log.control.t, y=reference_curve(run.log.control, name), **_REFERENCE))
     for i, label, run in _flown(runs):
@@ -306,26 +330,65 @@ def _signal(runs: Sequence[Run], name: str) -> Panel:
         if len(runs) == 1 and name in STATE_NAMES and not control.measured_perfectly:
             t, values = break_at_wraps(control.t, signal.sampled(replace(control, truth=control.state)), signal.unit)
             curves.append(Series(x=t, y=values, colour=COLOUR.measured, label="measured", width=0.7))
-        if sampled.ndim == 1 and signal.plant is not None:
+        if sampled.ndim == 2 and len(runs) > 1:
+            low, high = sampled.min(axis=1), sampled.max(axis=1)
+            bands.append(Band(x=control.t, low=low, high=high, colour=line_colour(i), label=label, opacity=0.6))
+        elif sampled.ndim == 2:
+            for j, values in enumerate(sampled.T):  # equal curves of several rotors stay visible beneath one another
+                curve = _of_run(i, label, control.t, values, style="steps")
+                curves.append(replace(curve, colour=line_colour(j), label=f"rotor {j + 1}", width=2.2 - 0.5 * j))
+        elif signal.plant is not None:
             curves.append(_of_run(i, label, *break_at_wraps(run.log.plant.t, signal.plant(run.log.plant), signal.unit)))
-            continue
-        for j, values in enumerate(np.atleast_2d(sampled.T)):
-            curve = _of_run(i, label, control.t, values, style="steps")
-            if sampled.ndim == 2:  # equal curves of several rotors stay visible beneath one another
-                curve = replace(curve, colour=line_colour(j), label=f"rotor {j + 1}", width=2.2 - 0.5 * j)
-            curves.append(curve)
-    return Panel(title=name, unit=signal.unit, series=tuple(curves), bounds=_bounds(runs, name))
+        else:
+            curves.append(_of_run(i, label, control.t, sampled, style="steps"))
+    title = f"{name}, all rotors" if bands else name
+    bounds = _bounds(runs, name if name in SIGNALS else "speed")
+    return Panel(title=title, unit=signal.unit, series=tuple(curves), bands=tuple(bands), bounds=bounds)
 
 
 def _of_run(i: int, label: str, x: Array, y: Array, **looks: Any) -> Series:
-    return Series(x=x, y=y, colour=line_colour(i), label=label, group=f"run{i}", **looks)
+    """Return a curve of the i-th run; where the colours repeat, it is dashed."""
+    dashed = i // len(CYCLE) % 2 == 1
+    return Series(x=x, y=y, colour=line_colour(i), label=label, group=f"run{i}", dashed=dashed, **looks)
+
+
+def _error(runs: Sequence[Run], name: str) -> Panel:
+    """Plot the distance of the true position from the filtered reference."""
+    curves = tuple(
+        _of_run(i, label, run.log.control.t, np.linalg.norm(run.log.control.tracking_error[:, :3], axis=1))
+        for i, label, run in _flown(runs)
+    )
+    return Panel(title="position error", unit="m", series=curves)
+
+
+def _margin(runs: Sequence[Run], name: str) -> Panel:
+    """Plot the signed margin to a constraint, negative beyond its bound, at the highest rate of its signal."""
+    curves, units = [], []
+    for i, label, run in _flown(runs):
+        for limit in run.limits:
+            if f"{_MARGIN}{limit.name}" == name:
+                t, values = limit.source.finest(run.log)
+                style = "steps" if limit.source.plant is None else "line"
+                curves.append(_of_run(i, label, t, margins_at(limit, t, values), style=style))
+                units.append(limit.unit)
+    bound = Bound(value=0.0, start=0.0, stop=_end(runs))
+    title = f"margin of {name.removeprefix(_MARGIN)}"
+    return Panel(title=title, unit=_one_unit(name, units), series=tuple(curves), bounds=(bound,))
 
 
 def _logged(runs: Sequence[Run], name: str) -> Panel:
     """Plot a signal that the controller logged."""
     logs = [(i, label, run.log.control) for i, label, run in _flown(runs) if name in run.log.control.logged]
     curves = tuple(_of_run(i, label, log.t, log.logged[name][1]) for i, label, log in logs)
-    return Panel(title=name, unit=logs[0][2].logged[name][0] if logs else "", series=curves)
+    return Panel(title=name, unit=_one_unit(name, [log.logged[name][0] for _, _, log in logs]), series=curves)
+
+
+def _one_unit(name: str, units: Sequence[str]) -> str:
+    """Return the unit that the runs have in common; none without a run."""
+    if len(distinct := dict.fromkeys(units)) > 1:
+        shown = " and ".join(f"[{unit}]" for unit in distinct)
+        raise InputError(f"{name} is in {shown}, which one axis cannot show; plot these flights apart")
+    return next(iter(distinct), "")
 
 
 def _several(title: str, unit: str, t: Array, values: Array, names: Sequence[str]) -> Panel:
@@ -356,8 +419,8 @@ def _end(runs: Sequence[Run]) -> float:
 
 
 def _flown(runs: Sequence[Run]) -> Iterator[tuple[int, str, Run]]:
-    """Return number, name and run of runs that flew a period; a single run is named `flight`."""
-    names = ("flight",) if len(runs) == 1 else run_names(runs)
+    """Return number, name and run of runs that flew a period; a single run without a label is named `flight`."""
+    names = ("flight",) if len(runs) == 1 and runs[0].label is None else run_names(runs)
     return ((i, name, run) for i, (name, run) in enumerate(zip(names, runs, strict=True)) if run.log.control.t.size)
 
 

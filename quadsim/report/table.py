@@ -11,6 +11,8 @@ from typing import Final
 from quadsim.errors import printable
 
 ABSENT: Final = "-"
+_NEGLIGIBLE: Final = {"m": (1e-9, "< 1 nm"), "deg": (1e-6, "0"), "rad/s": (1e-6, "0")}
+"""By unit: below which magnitude a number is rounding, and what is shown instead."""
 
 
 class Mark(StrEnum):
@@ -101,3 +103,13 @@ def format_number(value: float | None) -> str:
     if 1e4 <= size < 1e7:
         return f"{value:.0f}"
     return f"{value:.4g}" if size == 0.0 or 1e-3 <= size < 1e7 else f"{value:.1e}"
+
+
+def short_number(value: float, unit: str = "") -> str:
+    """Three significant digits for a table to glance at, without what is only rounding in its unit; `-` for NaN."""
+    if math.isnan(value):
+        return ABSENT
+    least, text = _NEGLIGIBLE.get(unit, (0.0, "0"))
+    if value and abs(value) < least:
+        return text
+    return f"{value + 0.0:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value + 0.0:.3g}".replace("e-0", "e-")

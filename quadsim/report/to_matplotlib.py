@@ -46,9 +46,25 @@ STYLE: Final[dict[RcKeyType, Any]] = {
     "ytick.labelcolor": "#1c1e21",
 }
 """What is drawn unlike matplotlib's defaults; texts are literal, `$` included."""
+JOURNAL: Final[dict[RcKeyType, Any]] = {
+    "axes.labelsize": 8.0,
+    "axes.linewidth": 0.6,
+    "axes.titlesize": 8.0,
+    "font.size": 8.0,
+    "grid.linewidth": 0.5,
+    "legend.fontsize": 8.0,
+    "pdf.fonttype": 42,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+}
+"""What a figure of a stated width has besides: texts of 8 pt, and fonts that journals accept."""
+JOURNAL_DPI: Final = 300
+SUFFIXES: Final = (".pdf", ".svg", ".png")
 _WIDTH, _ROW, _HEAD = 9.6, 1.95, 0.7  # of a figure, of a row of panels and of what stands above and below them [in]
+_LETTERS: Final = 26  # characters beside a vertical axis
+_JOURNAL_ROW, _JOURNAL_HEAD, _JOURNAL_LETTERS = 1.2, 0.5, 17  # the same of a figure of a stated width
 _LARGEST_SVG, _NOTEBOOK_DPI = 40_000, 55
-_LABEL: Final = 26  # characters beside a vertical axis
+_LETTER, _HANDLE = 0.55, 4.5  # of a legend: width of a letter, and of a line with the spaces about it [font size]
 _DASHES: Final = (0, (5, 2))
 _MARKERS: Final = {
     **{"circle": "o", "diamond": "D", "square": "s", "x": "x", "cross": "P"},
@@ -97,10 +113,39 @@ def figure_html(figure: Figure) -> str:
     return f'<img alt="{figure.key}" src="data:image/png;base64,{png}">'
 
 
-def draw(figure: Figure, *, interactive: bool = False) -> Canvas:
-    """The figure as matplotlib's, which notebooks and `pyplot.show` show where it is interactive."""
-    with _style():
-        return _draw(figure, interactive=interactive)
+def write_figure(figure: Figure, path: Path, *, width: float) -> list[Axes]:
+    """Write a figure for a journal as PDF, SVG or PNG, by the suffix of its path; the same numbers give the same bytes.
+
+    Returns:
+        Its axes, panel by panel.
+    """
+    metadata: dict[str, Any] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix, {})
+    with _style({**JOURNAL, "svg.hashsalt": figure.key}):
+        canvas = _draw(figure, interactive=False, width=width)
+        canvas.savefig(path, metadata=metadata, dpi=JOURNAL_DPI)
+    return canvas.axes
+
+
+def show_window(canvas: Canvas) -> bool:
+    """Show an interactive figure until its window is closed; False at once where there is no display."""
+    from matplotlib import pyplot
+
+    if type(canvas.canvas).required_interactive_framework is None:
+        return False
+    pyplot.show()
+    return True
+
+
+def draw(figure: Figure, *, interactive: bool = False, width: float | None = None) -> Canvas:
+    """The figure as matplotlib's.
+
+    Args:
+        figure: what to draw.
+        interactive: whether notebooks and `pyplot.show` show it.
+        width: its width [in], in the style of a journal; None: as wide as a page of ours.
+    """
+    with _style({} if width is None else JOURNAL):
+        return _draw(figure, interactive=interactive, width=width)
 
 
 @contextlib.contextmanager
@@ -119,12 +164,13 @@ def _style(more: dict[RcKeyType, Any] | None = None) -> Iterator[None]:
         notices.setLevel(level)
 
 
-def _draw(figure: Figure, *, interactive: bool) -> Canvas:
+def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
     from matplotlib.figure import Figure as Canvas
 
     rows = [figure.panels[i : i + figure.columns] for i in range(0, len(figure.panels), figure.columns)]
     heights = [max(panel.height for panel in row) for row in rows]
-    size = (_WIDTH, _HEAD + _ROW * sum(heights))
+    row, head, letters = (_ROW, _HEAD, _LETTERS) if width is None else (_JOURNAL_ROW, _JOURNAL_HEAD, _JOURNAL_LETTERS)
+    size = (width or _WIDTH, head + row * sum(heights))
     if interactive:
         from matplotlib import pyplot
 
@@ -135,13 +181,13 @@ def _draw(figure: Figure, *, interactive: bool) -> Canvas:
     shown: dict[str, Artist] = {}
     timed: list[Axes] = []
     for axes, panel in zip(grid.flat, figure.panels, strict=False):
-        entries = _draw_panel(axes, panel)
+        entries = _draw_panel(axes, panel, letters)
         if panel.legend and entries:
             beside = {} if panel.y_label else {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
             axes.legend(entries.values(), entries, loc="lower right", ncols=1 if panel.y_label else 4,
                         fontsize=8.0, columnspacing=1.0, handletextpad=0.4, **beside)  # fmt: skip
         else:
-            shown |= entries
+            shown |= {label: artist for label, artist in entries.items() if label not in shown}
         if not panel.x_label:
             timed.append(axes)
     for axes in grid.flat[len(figure.panels) :]:
@@ -151,8 +197,18 @@ def _draw(figure: Figure, *, interactive: bool) -> Canvas:
     if figure.title:
         canvas.suptitle(figure.title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
     if shown:
-        canvas.legend(list(shown.values()), list(shown), loc="outside lower right", ncols=6)
+        canvas.legend(
+            list(shown.values()), list(shown), loc="outside lower right", ncols=_legend_columns(shown, size[0])
+        )
     return canvas
+
+
+def _legend_columns(labels: Iterable[str], width: float) -> int:
+    """How many labels fit beside one another in so many inches, at most six."""
+    from matplotlib import rcParams
+
+    longest = max(map(len, labels)) * _LETTER + _HANDLE
+    return min(6, max(1, int(72.0 * width / (longest * rcParams["font.size"]))))
 
 
 def _share_time(panels: list[Axes], figure: Figure) -> None:
@@ -168,8 +224,8 @@ def _share_time(panels: list[Axes], figure: Figure) -> None:
         panels[0].set_xlim(-0.008 * figure.end, figure.end or 1.0)
 
 
-def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
-    """Draw a panel; the legend's entries."""
+def _draw_panel(axes: Axes, panel: Panel, letters: int) -> dict[str, Artist]:
+    """Draw a panel whose vertical label has so many characters a line; the legend's entries."""
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     shown: dict[str, Artist] = {}
@@ -200,7 +256,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
         axes.set_ylim(*ends)
     if panel.y_label:
         axes.set_title(panel.heading)
-    axes.set(xlabel=panel.x_label, ylabel=panel.y_label or textwrap.fill(panel.heading, _LABEL))
+    axes.set(xlabel=panel.x_label, ylabel=panel.y_label or textwrap.fill(panel.heading, letters))
     shown.pop("", None)
     return shown
 

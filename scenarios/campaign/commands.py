@@ -308,11 +308,12 @@ def compare_directories(
         OutputError: the directory cannot be written.
     """
     from quadsim.flight.audit import limit_differences
+    from quadsim.report.comparison import check_names
     from scenarios.campaign.again import judged_by
     from scenarios.campaign.paired import compare_pairs
     from scenarios.campaign.plan import plan_differences
     from scenarios.campaign.store import FLIGHTS_FILE, read_flights, stored_plan
-    from scenarios.flight_comparison import check_names, place_of
+    from scenarios.flight_comparison import place_of
     from scenarios.results import after
 
     if len(directories) != 2:

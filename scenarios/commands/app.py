@@ -22,8 +22,12 @@ from scenarios.commands.arguments import (
     File,
     Flag,
     Flown,
+    Inches,
+    Labels,
     Names,
+    Plotted,
     ScenarioName,
+    SignalName,
     UserCode,
     UserForces,
     UserReference,
@@ -40,13 +44,14 @@ if TYPE_CHECKING:
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
     from scenarios.catalogue import Catalogue
+    from scenarios.flight_plot import Overlay
     from scenarios.flown import Flight
     from scenarios.reaudit import Reaudit
     from scenarios.results import Listing, Result
     from scenarios.rollout import Rollout
     from scenarios.schema.scenario import Scenario
 else:
-    Catalogue = Flight = Listing = Reaudit = Result = Any
+    Catalogue = Flight = Listing = Overlay = Reaudit = Result = Any
 
 
 def _examples(*lines: str) -> str:
@@ -64,7 +69,7 @@ def _version() -> str:
 app: Final = App(
     name="quadsim",
     help="Fly model predictive controllers of quadrotors in MuJoCo; record, film and audit every flight.",
-    help_epilogue="exit status: 0 done; 1 a required constraint does not hold, or the flight was aborted or "
+    help_epilogue="exit status: 0 done; 1 a required constraint is violated, or the flight was aborted or "
     "interrupted; 2 wrong input",
     help_format="plaintext",
     default_parameter=Parameter(show_default=False, negative_iterable=(), allow_repeating=True),
@@ -527,6 +532,58 @@ def compare(
         with reporting(progress) as report:
             compared = compare_flights(targets, page, report, overwrite=overwrite, **options)
     return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared
+
+
+@app.command(
+    help_epilogue=_examples(
+        "quadsim plot runs/paper-constrained --signals x pitch margin.pitch step_ms",
+        "quadsim plot runs/mine runs/other --signals error speed --labels mine theirs --out fig.pdf",
+    )
+)
+def plot(
+    flights: Plotted,
+    /,
+    *signals: SignalName,
+    labels: Labels = (),
+    width: Inches = 7.16,
+    out: File | None = None,
+    overwrite: Flag = False,
+) -> Overlay:
+    """Draw signals of one or several flights over one another, with references and bounds.
+
+    Args:
+        flights: run directories; in Python also flights, one or several.
+        signals: one panel each: names that constraints can have (x, pitch, tilt, x_error, speed, slew, ...), speed_1 to
+            speed_4 (one rotor), command (commanded rotor speeds), margin.NAME (of a constraint), error (distance from
+            the filtered reference), step_ms and solve_ms (computing time), xy (path from above), or what a controller
+            logged (default: position and attitude).
+        labels: names in the legend, one for each flight (default: scenario, and what tells its flights apart).
+        width: of the figure [in]; 3.5 is one column of a journal, the default two.
+        out: PDF, SVG or PNG file, with texts of 8 pt; without it a window opens.
+        overwrite: replace an existing file.
+
+    Returns:
+        The matplotlib axes, top to bottom; `axes[0].figure` is the figure, which is pyplot's unless `out` is given.
+
+    Raises:
+        InputError: a directory is not a run, no flight has such a signal, or the labels are wrong.
+        OutputError: the file exists, or cannot be written.
+
+    Examples:
+        >>> import quadsim
+        >>> hover = quadsim.load("hover").replace({"duration": 1.0})
+        >>> pid = hover.replace({"controller": {"type": "pid"}})
+        >>> axes = quadsim.plot([quadsim.fly(hover), quadsim.fly(pid)], "z", "margin.roll", labels=["MPC", "PID"])
+        >>> axes[0].get_ylabel(), len(axes)
+        ('z [m]', 2)
+    """
+    from scenarios.flight_plot import plot_runs
+    from scenarios.flown import Flight
+    from scenarios.reaudit import stored_run
+
+    each = [flights] if isinstance(flights, Flight | str | Path) else flights
+    runs = [flight.undiagnosed_run if isinstance(flight, Flight) else stored_run(Path(flight)) for flight in each]
+    return plot_runs(runs, signals, labels=labels, width=width, out=out, overwrite=overwrite)
 
 
 @app.command(

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     ComparedName: TypeAlias = Flight | ScenarioName
     Changes: TypeAlias = Mapping[Any, Any] | Sequence[str]
     Names: TypeAlias = Sequence[str]
+    Labels: TypeAlias = Sequence[str]
+    Plotted: TypeAlias = Flight | File | Sequence[Flight | File]
+    SignalName = str
+    Inches = float
     Whole = int
     Flag = bool
     UserCode = object
@@ -55,6 +59,9 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
     ComparedName = ScenarioName = one_of(scenario_names)
     Changes = Annotated[Sequence[str], Parameter(name="--set")]
     Names = Annotated[Sequence[str], Parameter(name="--name")]
+    Labels = Annotated[Sequence[str], Parameter(consume_multiple=True)]
+    Plotted, Inches = Files, float
+    SignalName = Annotated[str, Parameter(name="--signals", consume_multiple=True)]
     Whole = Annotated[int, Parameter(converter=_whole)]
     Flag = Annotated[bool, Parameter(negative="")]
     UserCode = UserForces = UserReference = Fields = Watched = Flown = Annotated[Any, Parameter(parse=False)]

@@ -1,6 +1,6 @@
 """The `quadsim` command: it parses the line, calls a function of `scenarios.commands.app`, and shows the result.
 
-Exit status: 0 done; 1 a required constraint does not hold, or the flight was aborted or interrupted; 2 invalid input.
+Exit status: 0 done; 1 a required constraint is violated, or the flight was aborted or interrupted; 2 invalid input.
 """
 
 from __future__ import annotations

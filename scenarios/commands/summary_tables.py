@@ -14,13 +14,18 @@ from quadsim.controller import OPTIMAL, Phase, counts, law_name
 from quadsim.flight.audit import VERDICT_TEXT, Finding
 from quadsim.flight.rundir import findings_of
 from quadsim.report.comparison import (
+    NOT_REQUIRED,
     crash,
     event_sentences,
     failure_sentences,
     required,
+    rounded_margin,
     tolerance_text,
+    tracking_values,
     violated_otherwise,
+    violated_unrequired,
 )
+from quadsim.report.table import ABSENT, short_number
 from scenarios import console
 
 _NAMED: Final = 3  # violated constraints named in the first line
@@ -28,25 +33,24 @@ _SPARE: Final = ("beyond", "sampled", "plant", "bounds")  # columns that a narro
 
 
 def summary_tables(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
-    """Yield the tables and sentences of a summary."""
+    """Yield the tables and sentences of a summary: the verdict and its reasons, audit, tracking, timing, the rest."""
     simulated = console.styled(f"  {summary['duration']:.2f} s flown")
     yield console.styled((summary["scenario"], "bold"), "  ") + outcome_line(summary) + simulated
     if summary.get("description"):
         yield summary["description"]
     yield from summary.get("traceback", ())
-    if "course" in summary:
-        yield f"{summary['course']['sentence']} {summary['course'].get('advice', '')}".rstrip()
-        yield from summary["course"].get("notes", ())
-    if summary["tracking"]:
-        yield _tracking_table(summary["tracking"])
+    yield from failure_sentences(summary)
     if summary["constraints"]:
         yield audit_table(findings_of(summary))
     yield from summary.get("audit_notes", ())
-    yield from summary.get("model_notes", ())
     if summary["tracking"]:
+        yield _tracking_table(summary)
         yield from _controller_lines(summary)
+    if "course" in summary:
+        yield f"{summary['course']['sentence']} {summary['course'].get('advice', '')}".rstrip()
+        yield from summary["course"].get("notes", ())
+    yield from summary.get("model_notes", ())
     yield from _effect_lines(summary)
-    yield from failure_sentences(summary)
     if "reaudit" in summary:
         again = summary["reaudit"]
         phrase = "as recorded" if again["satisfied"] == summary["satisfied"] else "a different verdict than recorded"
@@ -69,7 +73,10 @@ def outcome_line(summary: Mapping[str, Any]) -> Text:
         return console.styled((f"{verdict}, {what}{remark}", colour))
     phrase = "every required constraint holds" if summary["satisfied"] else _violations(findings_of(summary))
     phrase = violated_otherwise(summary) or phrase
-    return console.styled((f"{crash(summary) or 'completed'}, {phrase}{remark}", colour))
+    line = console.styled((f"{crash(summary) or 'completed'}, {phrase}{remark}", colour))
+    if violated := violated_unrequired(findings_of(summary)):
+        line += console.styled("; ", (f"{NOT_REQUIRED}: {', '.join(violated)}", "yellow"))
+    return line
 
 
 def _violations(findings: Sequence[Finding]) -> str:
@@ -81,48 +88,55 @@ def _violations(findings: Sequence[Finding]) -> str:
             by = ""
             if math.isfinite(margin):
                 when = f"{finding.worst_time:.2f} s" if margin == finding.worst_margin else "the samples"
-                by = f" by {_number(-margin)} {finding.limit.unit} at {when}"
+                by = f" by {short_number(-margin)} {finding.limit.unit} at {when}"
             violated.append(f"{finding.limit.name}{by}")
     more = f" and {len(violated) - _NAMED} more" if len(violated) > _NAMED else ""
-    return ": ".join(filter(None, ["a required constraint does not hold", ", ".join(violated[:_NAMED]) + more]))
+    return ": ".join(filter(None, ["a required constraint is violated", ", ".join(violated[:_NAMED]) + more]))
 
 
 def audit_table(findings: Sequence[Finding]) -> Table:
     """Return every constraint with its bounds, peaks, smallest margin, tolerances and verdict."""
-    caption = (
-        "margin: the smallest, negative = beyond the bound; tolerance: at the physics rate and at the samples (s); "
-        "beyond: time outside bound and tolerance [s]; -: no value"
-    )
-    if any(not finding.limit.required for finding in findings):
-        caption += "; *: reported only, not required"
+    margins = [rounded_margin(finding.margin, finding.limit.tolerances[0]) for finding in findings]
+    tolerances = [tolerance_text(finding.limit) for finding in findings]
     head = ("constraint", "bounds", "sampled", "plant", "margin", "tolerance", "beyond", "verdict")
     lines = [
         (
             f"{finding.limit.name} [{finding.limit.unit}]",
             _range(finding.limit.lower, finding.limit.upper),
-            *(_number(peak) for peak in (finding.peak_sampled, finding.peak_plant)),
-            _number(finding.margin),
-            tolerance_text(finding.limit).replace(" at the samples", " s"),
-            _number(finding.time_violated),
+            *(short_number(peak, finding.limit.unit) for peak in (finding.peak_sampled, finding.peak_plant)),
+            short_number(margin),
+            tolerance.replace(" at the samples", " s"),
+            short_number(finding.time_violated),
             _verdict(finding),
         )
-        for finding in findings
+        for finding, margin, tolerance in zip(findings, margins, tolerances, strict=True)
     ]
+    occurring = {
+        "margin: the smallest, negative = beyond the bound": any(margin < 0.0 for margin in margins),
+        "tolerance: at the physics rate and at the samples (s)": any("samples" in text for text in tolerances),
+        "beyond: time outside bound and tolerance [s]": any(finding.time_violated for finding in findings),
+        "-: no value": any(ABSENT in line for line in lines),
+        "*: reported, not required": bool(violated_unrequired(findings)),
+    }
+    caption = "; ".join(text for text, occurs in occurring.items() if occurs) or None
     return console.table("audit at the physics rate", head, lines, caption=caption, left=("verdict",), spare=_SPARE)
 
 
 def _verdict(finding: Finding) -> Text:
+    text = VERDICT_TEXT[finding.verdict]
     if finding.verdict == "violated":
-        return console.styled(("VIOLATED", "red") if finding.limit.required else ("exceeded*", "yellow"))
-    return console.styled((VERDICT_TEXT[finding.verdict], "green" if finding.verdict == "satisfied" else "yellow"))
+        return console.styled((text, "red") if finding.limit.required else (f"{text}*", "yellow"))
+    return console.styled((text, "green" if finding.verdict == "satisfied" else "yellow"))
 
 
-def _tracking_table(tracking: Mapping[str, Any]) -> Table:
-    head = ["", *(f"{channel} [{unit}]" for channel, unit in tracking["unit"].items())]
-    lines = [
-        (name.replace("_", " "), *(f"{tracking[name][channel]:.4g}" for channel in tracking["unit"]))
-        for name in ("rmse", "max_error", "final_error", "overshoot")
-    ]
+def _tracking_table(summary: Mapping[str, Any]) -> Table:
+    channels, lines = [*summary["tracking"]["unit"]], []
+    for measure in ("rmse", "max_error", "final_error", "overshoot"):
+        columns = [tracking_values([summary], measure, channel) for channel in channels]
+        head = ["", *(f"{channel} [{unit}]" for channel, (unit, _) in zip(channels, columns, strict=True))]
+        numbers = (math.nan if value is None else value for _, (value,) in columns)
+        cells = (short_number(number, unit) for number, (unit, _) in zip(numbers, columns, strict=True))
+        lines.append((measure.replace("_", " ").replace("rmse", "RMS error"), *cells))
     return console.table("tracking, real minus filtered reference", head, lines)
 
 
@@ -133,13 +147,18 @@ def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     where = f" ({controller['solver']})" if controller["solver"].startswith("C99") else ""
     yield (
         f"{law_name(controller['name'])}{where}: {counts(controller['answered_by'])}"
-        f"{f' ({refused})' if refused else ''}; "
-        f"step p50 {times['p50']:.3f}, p99 {times['p99']:.3f}, max {times['max']:.3f} ms "
-        f"of {controller['deadline_ms']:g} ms"
+        f"{f' ({refused})' if refused else ''}"
     )
     yield (
-        f"commanded speeds {control['speed_min']:.2f} .. {control['speed_max']:.2f} rad/s, "
-        f"steps {control['slew_min']:.2f} .. {control['slew_max']:.2f} rad/s per period; "
+        f"whole step: median {times['p50']:.3g}, p99 {times['p99']:.3g}, max {times['max']:.3g} ms, "
+        f"deadline {controller['deadline_ms']:g} ms"
+    )
+    speeds, steps = (
+        " .. ".join(short_number(control[f"{what}_{end}"], "rad/s") for end in ("min", "max"))
+        for what in ("speed", "slew")
+    )
+    yield (
+        f"commanded speeds {speeds} rad/s, steps {steps} rad/s per period; "
         f"simulated in {summary['wall_s']['simulate']:.2f} s"
     )
 
@@ -174,13 +193,7 @@ def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"RMS error of the measured state: {lengths} m; {angles} deg"
 
 
-def _number(value: float) -> str:
-    if math.isnan(value):
-        return "-"
-    return f"{value:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value:.3g}".replace("e-0", "e-")
-
-
 def _range(lower: float, upper: float) -> str:
     if lower == -upper:
-        return f"±{_number(upper)}"
-    return "..".join(_number(bound) if math.isfinite(bound) else "-" for bound in (lower, upper))
+        return f"±{short_number(upper)}"
+    return "..".join(short_number(bound) if math.isfinite(bound) else "-" for bound in (lower, upper))

@@ -25,8 +25,13 @@ FLIGHTS = {
     "torrente-loop8-flatness": {"duration": 1.0},
     "battery": {"duration": 1.0},
     "thrown-ball": {"duration": 2.0},
+    "nonlinear": {"controller.tilt": 12.0, "controller.body_rate": 20.0, "controller.soft": {"quadratic": 0.0}},
+    "inverted-start": {"controller.iterations": 3, "duration": 1.0},
+    "corridor": {"duration": 7.0},
+    "torrente-loop8-all": {"duration": 1.0},
 }
-"""Among them every effect, both integrators, the autopilot, INDI, the filter, sensor faults and obstacles that move."""
+"""Among them every effect, both integrators, the autopilot, INDI, the filter, sensor faults and obstacles that move; of
+nonlinear MPC targets and rotors, lag, moves, slews, soft rows, half-spaces and drag."""
 FLY = """
 import ctypes, sys
 import quadsim.core.library as core

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import io
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from rich.text import Text
 
 from quadsim.errors import printable
 from quadsim.flight.rundir import findings_of
-from quadsim.report.table import Cell, Grid, Mark, QuantityRow, to_markdown
+from quadsim.report.table import Cell, Grid, Mark, QuantityRow, short_number, to_markdown
 from scenarios import console
 from scenarios.commands.junit import write_cases
 from scenarios.commands.summary_tables import audit_table, summary_tables
@@ -79,7 +80,7 @@ def test_sentences_break_at_spaces_and_paths_and_commands_stay_whole(short_run: 
 @pytest.mark.parametrize("width", [60, 80, 120, 160])
 def test_a_verdict_is_never_cut_and_names_the_tolerance_that_it_needs(short_run: Any, width: int) -> None:
     roll, *others = copy.deepcopy(short_run.summary["constraints"])
-    roll |= {"name": "roll_of_the_" + "vehicle" * 5, "worst_margin": -0.04, "worst_margin_sampled": 0.0}
+    roll |= {"name": "roll_of_the_" + "vehicle" * 6, "worst_margin": -0.04, "worst_margin_sampled": 0.0}
     table = audit_table(findings_of({"constraints": [roll, *others]}))
     text = "\n".join(lines := shown([table], width))
     assert "0.05, 0.01 s" in text
@@ -87,6 +88,56 @@ def test_a_verdict_is_never_cut_and_names_the_tolerance_that_it_needs(short_run:
     assert text.count("not reached") == 4
     assert max(map(len, lines)) <= width
     assert ("beyond verdict" in text) == (width == 160)
+
+
+def test_the_legend_of_an_audit_explains_only_what_occurs(short_run: Any) -> None:
+    (roll, *_), slew = short_run.summary["constraints"], short_run.summary["constraints"][3]
+    assert (slew["name"], roll["name"]) == ("slew", "roll")
+    roll = roll | {"worst_margin": 2.0, "worst_margin_sampled": 2.0, "peak_plant": 3.0, "peak_sampled": 3.0}
+    violated = roll | {"worst_margin": -2.0, "time_violated": 0.3, "required": False, "peak_plant": math.nan}
+
+    def legend(*entries: Any) -> str:
+        return audit_table(findings_of({"constraints": [*entries]})).caption or ""  # type: ignore[return-value]
+
+    assert legend(roll) == "tolerance: at the physics rate and at the samples (s)"
+    assert legend(slew | {"worst_margin": 1.0, "worst_margin_sampled": 1.0}) == "-: no value"
+    assert [part.partition(":")[0] for part in legend(violated).split("; ")] == [
+        *("margin", "tolerance", "beyond", "-", "*"),
+    ]
+
+
+def test_a_summary_begins_with_its_verdict_and_shows_deg_and_no_rounding(short_run: Any) -> None:
+    summary = copy.deepcopy(short_run.summary)
+    summary["tracking"]["rmse"] |= {"x": -3e-11, "y": 0.56712, "yaw": math.radians(4.64)}
+    summary["control"] |= {"slew_min": -1e-9, "slew_max": 0.0}
+    summary["controller"]["answered_by"] = {"piqp-multistage": 3, "gain": 197}
+    verdict, *lines = shown(summary_tables(summary), 120)
+    text = "\n".join(lines)
+    assert verdict.startswith("paper-constrained  ")
+    titles = ["audit at the physics rate", "tracking, real minus", "constrained MPC: ", "whole step: median"]
+    assert sorted(map(text.index, titles)) == list(map(text.index, titles))
+    (row,) = (line.split() for line in lines if line.startswith(" RMS error"))
+    assert (row[2:6], row[-1]) == (["<", "1", "nm", "0.567"], "4.64")
+    assert "yaw [deg]" in text
+    assert "steps 0 .. 0 rad/s per period" in text
+    assert "197 periods at the unconstrained optimum, no QP; 3 by piqp-multistage" in text
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        *(
+            (1e-11, "m", "< 1 nm"),
+            (-1e-11, "deg", "0"),
+            (-0.0, "s", "0"),
+            (math.nan, "m", "-"),
+            (-0.03771, "deg", "-0.0377"),
+        ),
+        *((1234.5, "rad/s", "1234"), (3.46e-5, "m", "3.46e-5"), (0.0, "m", "0")),
+    ],
+)
+def test_a_number_is_rounded_to_what_a_person_uses(value: float, unit: str, text: str) -> None:
+    assert short_number(value, unit) == text
 
 
 @pytest.mark.parametrize("nasty", [*NASTY, "\x0b", "\uffff", "\ufffe"])

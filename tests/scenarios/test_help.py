@@ -19,6 +19,7 @@ COMMANDS = [
     "identify",
     "list",
     "live",
+    "plot",
     "replay",
     "reproduce",
     "run",

@@ -269,7 +269,7 @@ def test_permanent_fallback_is_no_success_and_reports_why(stuck: Path, capsys: p
     assert (summary["satisfied"], summary["as_expected"], summary["controller"]["unrecovered"]) == (False, False, 10)
     assert main(["check", str(stuck), "--junit", str(stuck.parent / "verdicts.xml")]) == EXIT_FAILED
     output = capsys.readouterr().out
-    assert "completed, but in permanent fallback  0.50 s flown" in output
+    assert "completed, but in permanent fallback; violated, not required: " in output
     assert "10 periods in fallback, never recovered\n" in output
     assert "cannot hold together: left upper at +0.05 s .. +2.50 s by " in output
     assert "flown until 0.5 s, no change prevents it: controller." in " ".join(output.split())

@@ -85,9 +85,7 @@ def test_the_extent_is_the_vehicle_s_or_the_scenario_s() -> None:
 
 def test_a_touch_is_a_crash_at_the_distance_that_the_audit_measures(crashed: Flight) -> None:
     assert crashed.outcome == "violated"
-    assert outcome_line(crashed.summary).plain.startswith(
-        "crashed, touched pillar, a required constraint does not hold"
-    )
+    assert outcome_line(crashed.summary).plain.startswith("crashed, touched pillar, a required constraint is violated")
     assert not cleared(crashed)[0].satisfied
     log, limit = crashed.log, cleared(crashed)[0].limit
     clearance = limit.source.finest(log)[1]

@@ -191,7 +191,7 @@ static real cost_of(const quadsim_nmpc_work *work)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int N = p->horizon, n = states_of(p);
-    real sum = R(0.0), s[MOST], away[MOST];
+    real sum = R(0.0), s[MOST] = {R(0.0)}, away[MOST];
     int i, j, k;
     for (i = 0; i < N; i++) {
         sum += squared(p->effort, work->u + i * NU, work->aim + i * NU, NU);

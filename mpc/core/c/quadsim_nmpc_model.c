@@ -134,34 +134,34 @@ static void slope_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wo
     }
 }
 
-/* Slopes of the turning columns Y: m of them, the first four of the quaternion, which leave body rates alone. */
+/* Slopes of the turning columns D: m of them, the first four of the quaternion, which leave body rates alone. */
 INLINED void turning_slopes(const quadsim_nmpc_problem *p, const struct slope *k, const real *q, const real *w, int drags,
                             real by_share[4][NU], const int m, const int targets, const int actuators,
-                            const struct drive *drive, real Y[10][TURNING], real K[10][TURNING])
+                            const struct drive *drive, real D[10][TURNING], real K[10][TURNING])
 {
     int c, i;
     for (c = 0; c < 4; c++) {
-        K[0][c] = R(0.5) * (-w[0] * Y[1][c] - w[1] * Y[2][c] - w[2] * Y[3][c]);
-        K[1][c] = R(0.5) * (w[0] * Y[0][c] + w[2] * Y[2][c] - w[1] * Y[3][c]);
-        K[2][c] = R(0.5) * (w[1] * Y[0][c] - w[2] * Y[1][c] + w[0] * Y[3][c]);
-        K[3][c] = R(0.5) * (w[2] * Y[0][c] + w[1] * Y[1][c] - w[0] * Y[2][c]);
+        K[0][c] = R(0.5) * (-w[0] * D[1][c] - w[1] * D[2][c] - w[2] * D[3][c]);
+        K[1][c] = R(0.5) * (w[0] * D[0][c] + w[2] * D[2][c] - w[1] * D[3][c]);
+        K[2][c] = R(0.5) * (w[1] * D[0][c] - w[2] * D[1][c] + w[0] * D[3][c]);
+        K[3][c] = R(0.5) * (w[2] * D[0][c] + w[1] * D[1][c] - w[0] * D[2][c]);
     }
     for (c = 4; c < m; c++) {
-        const real *const a = &Y[7][c], *const b = &Y[8][c], *const d = &Y[9][c];
-        K[0][c] = R(0.5) * (-w[0] * Y[1][c] - w[1] * Y[2][c] - w[2] * Y[3][c] - q[1] * *a - q[2] * *b - q[3] * *d);
-        K[1][c] = R(0.5) * (w[0] * Y[0][c] + w[2] * Y[2][c] - w[1] * Y[3][c] + q[0] * *a + q[2] * *d - q[3] * *b);
-        K[2][c] = R(0.5) * (w[1] * Y[0][c] - w[2] * Y[1][c] + w[0] * Y[3][c] + q[0] * *b - q[1] * *d + q[3] * *a);
-        K[3][c] = R(0.5) * (w[2] * Y[0][c] + w[1] * Y[1][c] - w[0] * Y[2][c] + q[0] * *d + q[1] * *b - q[2] * *a);
+        const real *const a = &D[7][c], *const b = &D[8][c], *const d = &D[9][c];
+        K[0][c] = R(0.5) * (-w[0] * D[1][c] - w[1] * D[2][c] - w[2] * D[3][c] - q[1] * *a - q[2] * *b - q[3] * *d);
+        K[1][c] = R(0.5) * (w[0] * D[0][c] + w[2] * D[2][c] - w[1] * D[3][c] + q[0] * *a + q[2] * *d - q[3] * *b);
+        K[2][c] = R(0.5) * (w[1] * D[0][c] - w[2] * D[1][c] + w[0] * D[3][c] + q[0] * *b - q[1] * *d + q[3] * *a);
+        K[3][c] = R(0.5) * (w[2] * D[0][c] + w[1] * D[1][c] - w[0] * D[2][c] + q[0] * *d + q[1] * *b - q[2] * *a);
     }
     for (i = 0; i < 3; i++) {
         const real *by = k->by_q[i];
         for (c = 0; c < m; c++) {
-            K[4 + i][c] = by[0] * Y[0][c] + by[1] * Y[1][c] + by[2] * Y[2][c] + by[3] * Y[3][c];
+            K[4 + i][c] = by[0] * D[0][c] + by[1] * D[1][c] + by[2] * D[2][c] + by[3] * D[3][c];
         }
         if (drags) {
             const real *pull = k->by_v[i];
             for (c = 0; c < m; c++) {
-                K[4 + i][c] += pull[0] * Y[4][c] + pull[1] * Y[5][c] + pull[2] * Y[6][c];
+                K[4 + i][c] += pull[0] * D[4][c] + pull[1] * D[5][c] + pull[2] * D[6][c];
             }
         }
     }
@@ -169,9 +169,9 @@ INLINED void turning_slopes(const quadsim_nmpc_problem *p, const struct slope *k
         return;
     }
     for (c = 4; c < m; c++) {
-        K[7][c] = p->gyration[0] * (w[1] * Y[9][c] + w[2] * Y[8][c]);
-        K[8][c] = p->gyration[1] * (w[2] * Y[7][c] + w[0] * Y[9][c]);
-        K[9][c] = p->gyration[2] * (w[0] * Y[8][c] + w[1] * Y[7][c]);
+        K[7][c] = p->gyration[0] * (w[1] * D[9][c] + w[2] * D[8][c]);
+        K[8][c] = p->gyration[1] * (w[2] * D[7][c] + w[0] * D[9][c]);
+        K[9][c] = p->gyration[2] * (w[0] * D[8][c] + w[1] * D[7][c]);
     }
     for (c = 0; c < NU; c++) {
         const real left = actuators ? drive->left[c] : R(0.0);
@@ -186,16 +186,16 @@ INLINED void turning_slopes(const quadsim_nmpc_problem *p, const struct slope *k
     }
 }
 
-/* Slopes of the pushing columns Z: velocity, and with targets thrust and its target. */
+/* Slopes of the pushing columns E: velocity, and with targets thrust and its target. */
 INLINED void pushing_slopes(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct slope *k,
-                            const struct drive *drive, int drags, const int targets, real Z[3][PUSHING],
+                            const struct drive *drive, int drags, const int targets, real E[3][PUSHING],
                             real K[3][PUSHING])
 {
     const real thrust = p->effect[0] * world->thrust_scale;
     int c, i;
     for (i = 0; i < 3; i++) {
         for (c = 0; c < PUSHING; c++) {
-            K[i][c] = drags ? k->by_v[i][0] * Z[0][c] + k->by_v[i][1] * Z[1][c] + k->by_v[i][2] * Z[2][c] : R(0.0);
+            K[i][c] = drags ? k->by_v[i][0] * E[0][c] + k->by_v[i][1] * E[1][c] + k->by_v[i][2] * E[2][c] : R(0.0);
         }
         if (targets) {
             K[i][3] += k->axis[i] * thrust * drive->left[0];
@@ -205,13 +205,13 @@ INLINED void pushing_slopes(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
 }
 
 /* Body rates at an instant, where targets make them known. */
-INLINED void set_rates(const quadsim_nmpc_problem *p, const struct drive *drive, real *y, real Y[10][TURNING])
+INLINED void set_rates(const quadsim_nmpc_problem *p, const struct drive *drive, real *y, real D[10][TURNING])
 {
     int i;
     for (i = 0; i < 3; i++) {
         y[7 + i] = drive->rates[i];
-        Y[7 + i][4 + i] = drive->left[i + 1];
-        Y[7 + i][7 + i] = p->effect[5 * (i + 1)] * (R(1.0) - drive->left[i + 1]);
+        D[7 + i][4 + i] = drive->left[i + 1];
+        D[7 + i][7 + i] = p->effect[5 * (i + 1)] * (R(1.0) - drive->left[i + 1]);
     }
 }
 
@@ -235,7 +235,7 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
     static const real UNITS[4][4] = {{R(1.0)}, {R(0.0), R(1.0)}, {R(0.0), R(0.0), R(1.0)}, {R(0.0), R(0.0), R(0.0), R(1.0)}};
     const real h = p->step / (real)p->substeps, part[4] = {R(0.0), R(0.5) * h, R(0.5) * h, h};
     const int width = columns_of(n), turning = targets ? 10 : 11 + actuators, befores = n - BODY - actuators;
-    real Y[10][TURNING] = {{R(0.0)}}, Z[3][PUSHING] = {{R(0.0)}}, moved[3][TURNING] = {{R(0.0)}};
+    real D[10][TURNING] = {{R(0.0)}}, E[3][PUSHING] = {{R(0.0)}}, moved[3][TURNING] = {{R(0.0)}};
     real pushed[3][PUSHING] = {{R(0.0)}}, K[10][TURNING], L[3][PUSHING], y[10], travelled[3], by_share[4][NU];
     struct drive drive;
     struct slope k;
@@ -246,31 +246,31 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
         real column[4];
         from_frame(frame, UNITS[i], column);
         for (c = 0; c < 4; c++) {
-            Y[c][i] = column[c];
+            D[c][i] = column[c];
         }
     }
     for (i = 0; i < 3; i++) {
-        Y[7 + i][4 + i] = Z[i][i] = R(1.0);
+        D[7 + i][4 + i] = E[i][i] = R(1.0);
         travelled[i] = R(0.0);
     }
     for (s = 0; s < p->substeps; s++) {
-        real Ys[10][TURNING], Zs[3][PUSHING], ys[10], sum[10][TURNING], push[3][PUSHING], value[10];
+        real Ds[10][TURNING], Es[3][PUSHING], ys[10], sum[10][TURNING], push[3][PUSHING], value[10] = {R(0.0)};
         for (stage = 0; stage < 4; stage++) {
             const real twice = stage == 1 || stage == 2 ? R(2.0) : R(1.0);
             if (stage == 0) {
-                memcpy(Ys, Y, sizeof Y);
-                memcpy(Zs, Z, sizeof Z);
+                memcpy(Ds, D, sizeof D);
+                memcpy(Es, E, sizeof E);
                 memcpy(ys, y, sizeof y);
             } else {
                 const real by = part[stage];
                 for (i = 0; i < 10; i++) {
                     for (c = 0; c < m; c++) {
-                        Ys[i][c] = Y[i][c] + by * K[i][c];
+                        Ds[i][c] = D[i][c] + by * K[i][c];
                     }
                 }
                 for (i = 0; i < 3; i++) {
                     for (c = 0; c < PUSHING; c++) {
-                        Zs[i][c] = Z[i][c] + by * L[i][c];
+                        Es[i][c] = E[i][c] + by * L[i][c];
                     }
                     ys[i] = y[i] + by * k.q[i];
                     ys[4 + i] = y[4 + i] + by * k.v[i];
@@ -280,18 +280,18 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
             }
             drive = drive_at(p, world, x, u, 2 * s + (stage + 1) / 2, by_share);
             if (targets) {
-                set_rates(p, &drive, ys, Ys);
+                set_rates(p, &drive, ys, Ds);
             }
             slope_at(p, world, &drive, drags, 1, ys, ys + 4, ys + 7, &k);
-            turning_slopes(p, &k, ys, ys + 7, drags, by_share, m, targets, actuators, &drive, Ys, K);
-            pushing_slopes(p, world, &k, &drive, drags, targets, Zs, L);
+            turning_slopes(p, &k, ys, ys + 7, drags, by_share, m, targets, actuators, &drive, Ds, K);
+            pushing_slopes(p, world, &k, &drive, drags, targets, Es, L);
             if (stage == 3) { /* of the position, whose slope is the velocity */
                 for (i = 0; i < 3; i++) {
                     for (c = 0; c < m; c++) {
-                        moved[i][c] += h * Y[4 + i][c];
+                        moved[i][c] += h * D[4 + i][c];
                     }
                     for (c = 0; c < PUSHING; c++) {
-                        pushed[i][c] += h * Z[i][c];
+                        pushed[i][c] += h * E[i][c];
                     }
                     travelled[i] += h * y[4 + i];
                 }
@@ -320,19 +320,19 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
         }
         for (i = 0; i < 10; i++) {
             for (c = 0; c < m; c++) {
-                Y[i][c] += h / R(6.0) * sum[i][c];
+                D[i][c] += h / R(6.0) * sum[i][c];
             }
             y[i] += h / R(6.0) * value[i];
         }
         for (i = 0; i < 3; i++) {
             for (c = 0; c < PUSHING; c++) {
-                Z[i][c] += h / R(6.0) * push[i][c];
+                E[i][c] += h / R(6.0) * push[i][c];
             }
         }
     }
     if (targets) {
         drive = drive_at(p, world, x, u, 2 * p->substeps, by_share);
-        set_rates(p, &drive, y, Y);
+        set_rates(p, &drive, y, D);
     }
     /* The map's columns: quaternion, velocity, body rates, actuators, inputs. */
     memset(map, 0, sizeof(real) * (size_t)(BODY * width));
@@ -341,13 +341,13 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
         const int at = (c < 4 ? c : targets && of_input ? c + 5 : c + 3) + (of_input ? befores : 0);
         real q[4], turned[4];
         for (i = 0; i < 4; i++) {
-            q[i] = Y[i][c];
+            q[i] = D[i][c];
         }
         into_frame(next, q, turned);
         for (i = 0; i < 3; i++) {
             map[i * width + at] = moved[i][c];
-            map[(V + i) * width + at] = Y[4 + i][c];
-            map[(W + i) * width + at] = Y[7 + i][c];
+            map[(V + i) * width + at] = D[4 + i][c];
+            map[(W + i) * width + at] = D[7 + i][c];
         }
         for (i = 0; i < 4; i++) {
             map[(Q + i) * width + at] = turned[i];
@@ -357,7 +357,7 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
         const int at = c < 3 ? 4 + c : 7 + c + (c == 4 ? befores : 0);
         for (i = 0; i < 3; i++) {
             map[i * width + at] = pushed[i][c];
-            map[(V + i) * width + at] = Z[i][c];
+            map[(V + i) * width + at] = E[i][c];
         }
     }
     for (i = 0; i < 3; i++) {

@@ -35,6 +35,8 @@ static const real CURVATURE = R(1e-5); /* of a linear price, in its proportion *
 enum { WARM_ROUNDS = 8, MOST_ROUNDS = 4, MOST_INNER = 30, MOST_AGAIN = 20 };
 enum { OF_TILT, OF_RATES, OF_FACES, OF_STATED }; /* slacks of a node */
 
+static const int FREE_INPUTS[NU] = {0, 0, 0, 0};
+
 static const real SIDE[SIDES][2] = {
     {R(1.0), R(0.0)},  {R(0.86602540378443864676), R(0.5)},  {R(0.5), R(0.86602540378443864676)},
     {R(0.0), R(1.0)},  {R(-0.5), R(0.86602540378443864676)}, {R(-0.86602540378443864676), R(0.5)},
@@ -67,7 +69,7 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
     real *gain = work->gain + i * NU * n, *inverse = work->inverse + i * NU * NU;
     real both[MOST][WIDE + 1], H[WIDE + 1][WIDE + 1], pivot[NU], low[NU][NU], K[NU][MOST];
     int r, k, j, a, b;
-    const int any = held != NULL && (held[0] || held[1] || held[2] || held[3]);
+    const int any = held[0] || held[1] || held[2] || held[3];
     for (r = 0; r < n; r++) { /* P [A B], but for A's first three columns, which are P's */
         real row[WIDE + 1] = {R(0.0)};
         for (k = 0; k < W; k++) {
@@ -1088,7 +1090,7 @@ INLINED void barrier_sized(quadsim_nmpc_work *work, const real *effort, const re
             g[j] += known[i * n + j];
         }
         if (factorise) {
-            riccati_node(work, i, actuators, moves, effort + i * NU, NULL, cost, NULL);
+            riccati_node(work, i, actuators, moves, effort + i * NU, FREE_INPUTS, cost, g);
         }
         backward_node(work, i, actuators, moves, push + i * NU, g, work->more + i * NU);
         for (j = 0; j < n; j++) {

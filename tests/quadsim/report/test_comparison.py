@@ -96,7 +96,7 @@ def test_constraints_carry_their_tolerances_and_what_is_required(short_run: Run,
     free = having(short_run, "free", constraints=[])
     rows = comparison_rows([short_run, worse_run, free])
     assert texts(rows, "verdict", "Constraint roll") == [
-        "holds (margin 5 deg, tolerance 0.05)", "exceeded, not required (margin -2.5 deg, tolerance 0.05)", "-",
+        "holds (margin 5 deg, tolerance 0.05)", "violated, not required (margin -2.5 deg, tolerance 0.05)", "-",
     ]  # fmt: skip
     assert marks(rows, "verdict", "Constraint roll")[:2] == [Mark.GOOD, Mark.WARN]
     assert texts(rows, "verdict", "Constraint speed")[1] == "violated (margin -2.5 rad/s, tolerance 1e-06)"
@@ -117,15 +117,15 @@ def test_five_rows_come_first_and_no_bound_is_exceeded_without_a_word(short_run:
     worse_run.summary.update(expected="incomplete", as_expected=True)
     (_, outcome), (_, worst) = (cells(comparison_rows([short_run, worse_run]), row.label) for row in rows[:2])
     assert outcome.text.startswith("incomplete, as expected; not reached: arrival_x")
-    assert outcome.text.endswith("; exceeded, not required: roll, speed")
-    assert worst == Cell(text="roll exceeded, not required (margin -2.5 deg, tolerance 0.05)", mark=Mark.WARN)
+    assert outcome.text.endswith("; violated, not required: roll, speed")
+    assert worst == Cell(text="roll violated, not required (margin -2.5 deg, tolerance 0.05)", mark=Mark.WARN)
     for entry in worse_run.summary["constraints"]:
         if entry["required"]:
             entry.update(with_margin(entry, 0.01))
     worse_run.summary.update(expected="satisfied")
     worse_run.summary["verdict"] = "satisfied"
     (_, outcome) = cells(comparison_rows([short_run, worse_run]), "outcome")
-    assert outcome == Cell(text="satisfied, as expected; exceeded, not required: roll, speed", mark=Mark.WARN)
+    assert outcome == Cell(text="satisfied, as expected; violated, not required: roll, speed", mark=Mark.WARN)
     speeds = short_run.log.plant.state[:, VELOCITY]
     assert texts(rows, "highest speed")[0] == format_number(float(np.linalg.norm(speeds, axis=1).max()))
     errors = [short_run.summary["tracking"]["rmse"][axis] for axis in "xyz"]
@@ -137,7 +137,7 @@ def test_a_bound_exceeded_in_the_commands_alone_is_marked(short_run: Run) -> Non
     (entry,) = (each for each in run.summary["constraints"] if each["name"] == "speed")
     entry.update(worst_margin_sampled=-120.0, worst_margin=0.0, time_violated=0.0, satisfied=False, required=False)
     shown = texts(comparison_rows([run]), "verdict", "Constraint speed")
-    assert shown == ["exceeded, not required (margin -120 rad/s at the samples, tolerance 1e-06)"]
+    assert shown == ["violated, not required (margin -120 rad/s at the samples, tolerance 1e-06)"]
 
 
 def test_runs_have_distinct_names_and_a_course_is_drawn_once(short_run: Run, aborted_run: Run, empty_run: Run) -> None:

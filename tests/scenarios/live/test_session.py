@@ -314,10 +314,10 @@ def test_an_input_that_is_refused_in_flight_is_named_with_its_time_and_status_1(
     refused = f"quadsim: refused: {script}: inputs.1 at t = 0.150 s: effects.air.rotor_drag must be positive"
     assert printed.err.splitlines()[0].startswith(refused)
     line, *opened = printed.out.splitlines()
-    assert line.startswith("hover  completed, a required constraint does not hold: hold_x by ")
+    assert line.startswith("hover  completed, a required constraint is violated: hold_x by ")
     assert line.endswith(" s  1.00 s flown")
     assert opened[0] == f"written to {out}"
-    assert opened[-1] == f"quadsim view {out}"
+    assert opened[-2:] == [f"quadsim view {out}", f"quadsim plot {out} --out run.pdf"]
 
 
 @pytest.mark.slow("live")

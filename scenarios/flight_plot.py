@@ -1,0 +1,80 @@
+"""Signals of any number of flights over one another, as matplotlib axes or as a file for a paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from quadsim.errors import InputError, ParameterError
+from quadsim.flight.rundir import Run
+from quadsim.outputs import require_file, writing_file
+from quadsim.report.comparison import check_names
+from quadsim.report.flight_figures import signals as draw_signals
+from quadsim.report.to_matplotlib import SUFFIXES, draw, show_window, write_figure
+from scenarios.results import Result, Shown
+
+PAGE_WIDTH: Final = 7.16  # of a figure across both columns of a journal's page [in]; 3.5 is one column
+_WIDTHS: Final = (2.0, 20.0)  # smallest and largest [in]
+_USUAL: Final = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+class Overlay(list[Any], Result):
+    """The matplotlib axes of a plot, top to bottom; `axes[0].figure` is the figure."""
+
+    path: Path | None = None  # the file, if one was written
+
+    def show(self) -> None:
+        """Print where the file is, or open the figure in a window.
+
+        Raises:
+            InputError: there is neither a file nor a display.
+        """
+        if self.path is not None:
+            super().show()
+        elif not show_window(self[0].figure):
+            raise InputError("no display to show the plot on; write it to a file: --out plot.pdf")
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+
+        if self.path is not None:
+            yield console.written_to(self.path)
+            yield console.to_open(self.path)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the path of the file and the axes' labels."""
+        path = None if self.path is None else str(self.path)
+        return {"file": path, "panels": [axes.get_ylabel().replace("\n", " ") for axes in self]}
+
+
+def plot_runs(
+    runs: Sequence[Run],
+    signals: Sequence[str],
+    *,
+    labels: Sequence[str] = (),
+    width: float = PAGE_WIDTH,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+) -> Overlay:
+    """Overlay runs; arguments and errors as `scenarios.commands.app.plot`."""
+    if not runs:
+        raise InputError("plot needs one or more flights")
+    check_names(labels, len(runs), "labels")
+    if not _WIDTHS[0] <= width <= _WIDTHS[1]:
+        raise ParameterError("", "width", width, "{:g} to {:g} in".format(*_WIDTHS))
+    if labels:
+        runs = [replace(run, label=label) for run, label in zip(runs, labels, strict=True)]
+    if out is not None:
+        if Path(out).suffix not in SUFFIXES:
+            raise ParameterError("", "out", str(out), f"a file ending in {', '.join(SUFFIXES)}")
+        out = require_file(out, overwrite=overwrite)
+    figure = draw_signals(runs, signals or _USUAL)
+    if out is None:
+        return Overlay(draw(figure, interactive=True, width=width).axes)
+    with writing_file(out, overwrite=overwrite) as path:
+        plot = Overlay(write_figure(figure, path, width=width))
+    plot.path = out
+    return plot
