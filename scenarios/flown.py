@@ -164,7 +164,7 @@ class Flight(Result):
 
         spec = self.scenario.controller_at(self.infeasible_period.time)
         scenario = self.scenario.altered(controller=spec, events=())
-        return diagnose(self.infeasible_period, scenario, self.vehicle)
+        return diagnose(self.infeasible_period, scenario, self.vehicle, self.log.control.status)
 
     @property
     def audit(self) -> tuple[Finding, ...]:

@@ -23,6 +23,7 @@ from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, s
 from mpc.obstacles import SOFT_SPACE
 from mpc.ocp import InfeasiblePeriod
 from mpc.robust.settings import Robust
+from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import InputError
 from quadsim.state import N_STATES, REFERENCE_STATES
 from quadsim.vehicle import Vehicle
@@ -40,14 +41,17 @@ ITERATIONS: Final = (2, 3, 5, 10, 20, 50, 100)
 """Numbers of iterations to try if sequential quadratic programming did not converge."""
 
 
-def diagnose(infeasible_period: InfeasiblePeriod, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:
-    """Return `diagnosis` of a flight's summary.
+def diagnose(
+    infeasible_period: InfeasiblePeriod, scenario: Scenario, vehicle: Vehicle, statuses: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return `diagnosis` of a flight's summary; `statuses` are those of its periods.
 
     The bounds of a user's own controller are not in a scenario file: the problem names them, and the advice states by
     how much a single one would have to be wider.
     """
     if infeasible_period.converges is not None:
-        return _unconverged(infeasible_period, infeasible_period.converges, scenario.controller.iterations)
+        before = scenario.controller.iterations
+        return _unconverged(infeasible_period, infeasible_period.converges, before, statuses)
     spec = scenario.controller
     case = (_Case if isinstance(spec, Bounded) else _OwnCase)(infeasible_period, scenario, spec, vehicle)
     conflict = find_conflict(infeasible_period)
@@ -80,8 +84,11 @@ def changed_scenario(scenario: Scenario, settings: Settings) -> Scenario | None:
     return changed.altered(reference=scenario.reference) if changed.reference == scenario.reference else changed
 
 
-def _unconverged(infeasible_period: InfeasiblePeriod, converges: Callable[[int], bool], before: int) -> dict[str, Any]:
+def _unconverged(
+    infeasible_period: InfeasiblePeriod, converges: Callable[[int], bool], before: int, statuses: Sequence[str]
+) -> dict[str, Any]:
     """Return the diagnosis of a period whose QPs were solved but whose SQP did not converge."""
+    count = f" in {sum(status == NOT_CONVERGED for status in statuses)} of {len(statuses)} periods" if statuses else ""
     enough = next((count for count in ITERATIONS if count > before and converges(count)), None)
     suggestions = [] if enough is None else [{"settings": {"controller.iterations": enough}, "after": None}]
     never = f"it does not within {ITERATIONS[-1]} iterations either"
@@ -92,8 +99,8 @@ def _unconverged(infeasible_period: InfeasiblePeriod, converges: Callable[[int],
         "feasible": True,
         "conflict": [],
         "suggestions": suggestions,
-        "sentence": f"the QP was solved at t = {infeasible_period.time:.2f} s, but the SQP did not converge: "
-        "the plan does not follow the nonlinear dynamics",
+        "sentence": f"the SQP did not converge{count}, first at t = {infeasible_period.time:.2f} s: "
+        "every QP was solved, but the plans do not follow the nonlinear dynamics",
         "advice": advice,
     }
 
