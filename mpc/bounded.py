@@ -205,8 +205,9 @@ def require_lags(inner_lag: tuple[float, ...] | None) -> tuple[float, ...]:
 class InputBounds(RotorBounds):
     """Hard bounds on the rotor speeds and their steps, for every rotor."""
 
-    speed: Annotated[Pair, doc("[rad/s] u_min, u_max of every rotor.  Eq. (20)")]
-    slew: Annotated[Pair, doc("[rad/s per period] delta_min, delta_max of every rotor.  Eq. (15)")]
+    # `field()` makes them required: without it, they would inherit the defaults of `RotorBounds`.
+    speed: Annotated[Pair, doc("[rad/s] u_min, u_max of every rotor.  Eq. (20)")] = field()
+    slew: Annotated[Pair, doc("[rad/s per period] delta_min, delta_max of every rotor.  Eq. (15)")] = field()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,6 +25,17 @@ from scenarios.rollout import Rollout
 GOLDEN: Final = Path(__file__).resolve().parent / "golden"
 PAPER: Final = ("paper-unconstrained", "paper-unconstrained-clipped", "paper-constrained")
 """Flights of the README's table."""
+NO_STEPS: Final = {"speed": [0.0, 250.0], "slew": [-400.0, 400.0]}
+NO_SPEEDS: Final = {"speed": [0.0, 400.0], "slew": [-10.0, 5.0]}
+NOTHING: Final = {"speed": [0.0, 400.0], "slew": [-400.0, 400.0]}
+ABLATION: Final[dict[str, dict[str, Any]]] = {
+    "none": {"controller.output_bounds": {}, "controller.input_bounds": NOTHING},
+    "tilt": {"controller.input_bounds": NOTHING},
+    "speeds": {"controller.output_bounds": {}, "controller.input_bounds": NO_STEPS},
+    "steps": {"controller.output_bounds": {}, "controller.input_bounds": NO_SPEEDS},
+    "all": {},
+}
+"""Constraints of the paper's constrained controller, with its weights and horizon; 400 rad/s is no bound."""
 
 
 def read(name: str) -> dict[str, Any]:
@@ -82,8 +93,23 @@ def paper_entry(flight: Flight) -> dict[str, Any]:
     }
 
 
+def ablation_entry(constraints: str) -> dict[str, Any]:
+    """Outcome and errors [m, deg] of the paper's constrained controller with some of its constraints."""
+    flight = Rollout(load_scenario("paper-constrained").replace(ABLATION[constraints])).fly()
+    rmse = summarise(flight)["tracking"]["rmse"]
+    lost = flight.outcome == "lost"
+    errors = [] if lost else [round(rmse[axis], 5) for axis in "xyz"] + [round(math.degrees(rmse["yaw"]), 4)]
+    return {"lost": lost, "rmse": errors}
+
+
 def main(names: list[str]) -> None:
-    """Fly these scenarios and write their entries; drop those of scenarios that are no more."""
+    """Fly these scenarios and write their entries; drop those of scenarios that are no more.
+
+    The name `ablation` stands for the flights of `ABLATION`.
+    """
+    if "ablation" in names:
+        write("ablation", {constraints: ablation_entry(constraints) for constraints in ABLATION})
+        names = [name for name in names if name != "ablation"]
     flights = {name: Rollout(load_scenario(name)).fly() for name in names}
     library = read("library") | {name: library_entry(flight) for name, flight in flights.items()}
     write("library", {name: entry for name, entry in library.items() if name in scenario_names()})

@@ -16,7 +16,7 @@ import gallery
 import matplotlib as mpl
 import pytest
 import remake
-from golden_numbers import PAPER, paper_entry, read
+from golden_numbers import ABLATION, PAPER, ablation_entry, paper_entry, read
 from test_spine import spine
 
 from scenarios.catalogue import scenario_names, variants
@@ -55,7 +55,15 @@ def test_the_papers_flights_give_their_golden_numbers(name: str, fly_once: Calla
     assert (result["optima"], result["periods"]) == (golden["optima"], golden["periods"])
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/gallery.md"])
+@pytest.mark.slow("pages")
+@pytest.mark.parametrize("constraints", ABLATION)
+def test_constraints_one_by_one_give_their_golden_numbers(constraints: str) -> None:
+    result, golden = ablation_entry(constraints), read("ablation")[constraints]
+    assert result["lost"] == golden["lost"]
+    assert result["rmse"] == pytest.approx(golden["rmse"], abs=1e-3)
+
+
+@pytest.mark.parametrize("document", ["README.md", "docs/gallery.md", "docs/paper.md"])
 def test_tables_of_golden_numbers_are_filled(document: str) -> None:
     text = (ROOT / document).read_text(encoding="utf-8")
     assert "from tests/golden/" in text

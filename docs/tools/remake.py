@@ -192,6 +192,23 @@ def results(flights: dict[str, Any]) -> str:
     return markdown(("", *names), rows)
 
 
+def ablation(flights: dict[str, Any]) -> str:
+    """The constrained controller's weights and horizon with none, one and all of its constraints."""
+    titles = {
+        "none": "none",
+        "tilt": "tilt within 5 deg",
+        "speeds": "speeds within 0 .. 250 rad/s",
+        "steps": "steps within -10 .. 5 rad/s",
+        "all": "all",
+    }
+    head = ("constraints", *(f"RMS error {axis}" for axis in ("x [m]", "y [m]", "z [m]", "yaw [deg]")))
+    rows: list[Row] = []
+    for name, title in titles.items():
+        errors = [f"{error:.3f}" for error in flights[name]["rmse"]] or ["lost", "", "", ""]
+        rows.append((title, *errors))
+    return markdown(head, rows)
+
+
 def _bound(found: dict[str, Any], unit: str) -> str:
     margin, seconds = found["margin"], found["time_violated"]
     if found["satisfied"]:
@@ -417,6 +434,7 @@ def write_csv(name: str) -> None:
 
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "results": results,
+    "ablation": ablation,
     "scenarios": scenarios,
     "papers": papers,
     "peers": peers,
