@@ -55,6 +55,13 @@ def test_the_papers_flights_give_their_golden_numbers(name: str, fly_once: Calla
     assert (result["optima"], result["periods"]) == (golden["optima"], golden["periods"])
 
 
+def test_the_readme_shows_what_a_first_flight_prints(fly_once: Callable[..., Flight]) -> None:
+    block = re.search(r"```text\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert block is not None
+    printed = [line.rstrip() for line in fly_once("paper-constrained").text().splitlines()]
+    assert not [line for line in block[1].splitlines() if line not in printed]
+
+
 @pytest.mark.slow("pages")
 @pytest.mark.parametrize("constraints", ABLATION)
 def test_constraints_one_by_one_give_their_golden_numbers(constraints: str) -> None:

@@ -170,6 +170,13 @@ def markdown(head: Sequence[str], rows: Iterable[Row]) -> str:
 
 
 def results(flights: dict[str, Any]) -> str:
+    """The rows of `paper` by which the flights differ most, for the README."""
+    head, rule, *rows = paper(flights).splitlines(keepends=True)
+    chosen = ("RMS error x", "RMS error z", "pitch within", "speeds within", "steps within")
+    return "".join([head, rule, *(row for row in rows if row.removeprefix("| ").startswith(chosen))])
+
+
+def paper(flights: dict[str, Any]) -> str:
     """The paper's flights side by side."""
     names = ("paper-unconstrained", "paper-unconstrained-clipped", "paper-constrained")
     every = [flights[name] for name in names]
@@ -434,6 +441,7 @@ def write_csv(name: str) -> None:
 
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "results": results,
+    "paper": paper,
     "ablation": ablation,
     "scenarios": scenarios,
     "papers": papers,
