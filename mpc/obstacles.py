@@ -58,7 +58,7 @@ class AvoidanceSettings:
         int,
         Ge(1),
         Le(50),
-        doc("[-] half-spaces per predicted instant in the QP, the tightest ones first; more are added if needed"),
+        doc("[-] of a linear MPC: half-spaces per predicted instant in the QP, the tightest first; more if needed"),
     ] = 6
     iterations: Annotated[
         int,
