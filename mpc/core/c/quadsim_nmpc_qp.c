@@ -185,14 +185,12 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
     }
 }
 
-/* The feed of a node from the gradient g of the next state and push of the inputs; then that of this state. */
-INLINED void backward_node(const quadsim_nmpc_work *work, int i, const int actuators, const int moves, const real *push, real *g,
-                           real *feed)
+/* Add [A B]' g to a sum: the gradient of a node's state, but for the position's, and of its inputs. */
+INLINED void carry_back(const quadsim_nmpc_work *work, int i, const int actuators, const int moves, const real *g,
+                        real *sum)
 {
-    const quadsim_nmpc_problem *p = work->p;
     const int followers = actuators + (moves ? NU : 0), n = BODY + followers, width = (n + 2) & ~1;
-    const real *map = work->map + i * BODY * width, *gain = work->gain + i * NU * n, *inverse = work->inverse + i * NU * NU;
-    real sum[MOST + 2] = {R(0.0)}, v[NU];
+    const real *map = work->map + i * BODY * width;
     int k, j, a;
     for (k = 0; k < BODY; k++) {
         const real by = g[k];
@@ -201,10 +199,21 @@ INLINED void backward_node(const quadsim_nmpc_work *work, int i, const int actua
         }
     }
     for (a = 0; a < followers; a++) {
-        const real left = left_of(p, actuators, a);
+        const real left = left_of(work->p, actuators, a);
         sum[10 + a] += left * g[BODY + a];
         sum[n - 3 + followed(actuators, a)] += (R(1.0) - left) * g[BODY + a];
     }
+}
+
+/* The feed of a node from the gradient g of the next state and push of the inputs; then that of this state. */
+INLINED void backward_node(const quadsim_nmpc_work *work, int i, const int actuators, const int moves, const real *push, real *g,
+                           real *feed)
+{
+    const int n = BODY + actuators + (moves ? NU : 0);
+    const real *gain = work->gain + i * NU * n, *inverse = work->inverse + i * NU * NU;
+    real sum[MOST + 2] = {R(0.0)}, v[NU];
+    int j, a;
+    carry_back(work, i, actuators, moves, g, sum);
     for (a = 0; a < NU; a++) {
         v[a] = sum[n - 3 + a] + (push != NULL ? push[a] : R(0.0));
     }
@@ -514,7 +523,7 @@ INLINED void response_sized(quadsim_nmpc_work *work, int row, real *response, co
 INLINED void gradient_sized(quadsim_nmpc_work *work, real *gradient, const int actuators, const int moves)
 {
     const quadsim_nmpc_problem *p = work->p;
-    const int followers = actuators + (moves ? NU : 0), n = BODY + followers, N = p->horizon, width = (n + 2) & ~1;
+    const int n = BODY + actuators + (moves ? NU : 0), N = p->horizon;
     real g[MOST];
     int i, j, k;
     for (j = 0; j < n; j++) {
@@ -524,20 +533,10 @@ INLINED void gradient_sized(quadsim_nmpc_work *work, real *gradient, const int a
         }
     }
     for (i = N - 1; i >= 0; i--) {
-        const real *map = work->map + i * BODY * width, *s = work->s + i * n, *v = work->v + i * NU;
+        const real *s = work->s + i * n, *v = work->v + i * NU;
         real sum[MOST + 2] = {R(0.0)}, push[NU] = {R(0.0)};
         pull_active(work, i, push, g);
-        for (k = 0; k < BODY; k++) {
-            const real by = g[k];
-            for (j = 0; j < width; j++) {
-                sum[j] += by * map[k * width + j];
-            }
-        }
-        for (j = 0; j < followers; j++) {
-            const real left = left_of(p, actuators, j);
-            sum[10 + j] += left * g[BODY + j];
-            sum[n - 3 + followed(actuators, j)] += (R(1.0) - left) * g[BODY + j];
-        }
+        carry_back(work, i, actuators, moves, g, sum);
         for (j = 0; j < NU; j++) {
             const real step = moves ? p->move * (v[j] - s[n - NU + j]) : R(0.0);
             gradient[i * NU + j] = sum[n - 3 + j] + push[j] + p->effort[j] * (v[j] - work->aim[i * NU + j]) + step;
