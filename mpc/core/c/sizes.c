@@ -14,6 +14,7 @@ SIZE(quadsim_problem);
 SIZE(quadsim_work);
 SIZE(quadsim_robust);
 SIZE(quadsim_controller);
+SIZE(quadsim_trim);
 SIZE(quadsim_guard);
 SIZE(quadsim_mpc);
 SIZE(quadsim_nmpc_term);
