@@ -52,9 +52,9 @@ SOLVERS: Final = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", 
 """The solvers that `make setup` installs."""
 CAMPAIGNS: Final = ("paper-robustness", "paper-robustness-robust", "paper-nominal")
 BATTERIES: Final = {
-    "battery-none": ("none", ["battery", "--set", "controller.disturbance.largest_force=1e-6"]),
-    "battery": ("a force of three axes", ["battery"]),
-    "battery-thrust-scale": ("the thrust's scale", ["battery-thrust-scale"]),
+    "battery-none": ("without an estimate", ["battery", "--set", "controller.disturbance.largest_force=1e-6"]),
+    "battery": ("with a force along three axes", ["battery"]),
+    "battery-thrust-scale": ("with the thrust's scale", ["battery-thrust-scale"]),
 }
 """Of each campaign on a battery, what the observer estimates, and the arguments of `quadsim campaign`."""
 FIGURES: Final = {
@@ -221,12 +221,11 @@ def _bound(found: dict[str, Any], unit: str) -> str:
 
 
 def scenarios(golden: dict[str, Any]) -> str:
-    """The library: films, and one table."""
+    """The library: one table, and films."""
     specs = {name: load_scenario(name) for name in golden}
     rows = [
         (
-            f"![{name}](assets/gallery/{name}.svg){{loading=lazy}}",
-            f"{_title(name)} {specs[name].description}",
+            f"![{name}](assets/gallery/{name}.svg){{loading=lazy}} {_title(name)} {specs[name].description}",
             TOPICS[group],
             golden[name]["verdict"],
         )
@@ -235,8 +234,8 @@ def scenarios(golden: dict[str, Any]) -> str:
         if specs[name].group == group
     ]
     films = "".join(_film(name) for name in golden if name in FILMS)
-    table = markdown(("", "scenario", "topic", "verdict"), rows)
-    return f'<div class="films">\n{films}</div>\n\n<div class="library" markdown>\n\n{table}\n</div>\n'
+    table = markdown(("scenario", "topic", "verdict"), rows)
+    return f'<div class="library" markdown>\n\n{table}\n</div>\n\n<div class="films">\n{films}</div>\n'
 
 
 def _title(name: str) -> str:
@@ -331,17 +330,13 @@ def campaigns(summaries: dict[str, Any]) -> str:
 
 
 def batteries(summaries: dict[str, Any]) -> str:
-    """How many flights on a battery failed, and by which constraint, with their largest errors of height."""
-    rows = []
+    """How many flights on a battery failed by each estimate, with their largest error of height."""
+    failed = []
     for name, (estimate, _) in BATTERIES.items():
-        found = summaries[name]
-        height = found["metrics"]["max_error.z"]
-        held = (found["constraints"][f"hold_{axis}"]["not_satisfied"]["count"] for axis in "xyz")
-        thrust = found["constraints"]["thrust"]["not_satisfied"]["count"]
-        errors = (f"{100.0 * height[size]:.1f} cm" for size in ("p50", "max"))
-        rows.append((estimate, f"{found['events']['failure']['count']} of {found['flights']}", *held, thrust, *errors))
-    beyond = ("x beyond 5 cm", "y beyond 5 cm", "height beyond 5 cm", "thrust beyond its bounds")
-    return markdown(("estimate", "failed", *beyond, "largest error of height: median", "and most"), rows)
+        events, height = summaries[name]["events"], summaries[name]["metrics"]["max_error.z"]
+        share = f"{events['failure']['count']} of {summaries[name]['flights']}"
+        failed.append(f"{share} {estimate} (height off by up to {100.0 * height['max']:.0f} cm)")
+    return f"Flights that fail: {', '.join(failed)}.\n"
 
 
 def solvers(data: Any) -> str:
@@ -371,14 +366,18 @@ def identification(data: Any) -> str:
     rows = []
     for row in _records(data):
         errors = ("lost" if row[key] is None else f"{row[key]:.1f}" for key in ("median_%", "p90_%"))
-        shares = (
-            f"{100.0 * row[event] / row['flights']:.0f} %, {interval(row[f'{event}_from'], row[f'{event}_to'])}"
-            for event in ("violated", "lost")
-        )
-        passed = f"{row['passed']} of {row['sought']}" if "passed" in row else "-"
-        rows.append((row["file"], passed, *errors, *shares, f"{row['vehicles_lost']} of {row['vehicles']}"))
-    head = ("file", "numbers that passed the gates", "error: median [%]", "90 % of vehicles below [%]")
-    return markdown((*head, "violated, 95 % interval", "lost, 95 % interval", "vehicles lost at least once"), rows)
+        violated = f"{100.0 * row['violated'] / row['flights']:.0f} %"
+        span = interval(row["violated_from"], row["violated_to"])
+        rows.append((row["file"], *errors, f"{violated}, {span}", f"{row['vehicles_lost']} of {row['vehicles']}"))
+    head = ("file", "error: median [%]", "90 % of vehicles below [%]", "violated, 95 % interval", "vehicles lost")
+    return markdown(head, rows)
+
+
+def autopilots(data: Any) -> str:
+    """Betaflight against the built-in autopilot, flight by flight."""
+    keys = ("flight", "Betaflight_cm", "built-in_cm", "nearest_margin")
+    rows = [[_cell(row[key]) for key in keys] for row in _records(data)]
+    return markdown([key.replace("_", " ") for key in keys], rows)
 
 
 def records(data: Any) -> str:
@@ -422,7 +421,7 @@ def write_csv(name: str, rows_of: Callable[[Any], list[dict[str, Any]]]) -> None
 
 
 CSV: Final[dict[str, Callable[[Any], list[dict[str, Any]]]]] = {
-    **dict.fromkeys((*KEPT, "intervals", "nonlinear"), _records),
+    **dict.fromkeys((*KEPT, "autopilots", "intervals", "nonlinear"), _records),
     "papers": paper_rows,
     "peers": peer_rows,
 }
@@ -442,7 +441,8 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "identification": identification,
     "nonlinear": nonlinear,
     "film": film,
-    **dict.fromkeys(("flight", "campaign", "autopilots"), records),
+    "autopilots": autopilots,
+    **dict.fromkeys(("flight", "campaign"), records),
 }
 
 
