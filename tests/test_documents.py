@@ -17,7 +17,6 @@ import matplotlib as mpl
 import pytest
 import remake
 from golden_numbers import ABLATION, PAPER, ablation_entry, paper_entry, read
-from test_spine import spine
 
 from scenarios.catalogue import scenario_names, variants
 from scenarios.flown import Flight
@@ -193,8 +192,3 @@ def test_documents_name_what_exists() -> None:
 def test_drawings_are_those_of_the_code(name: str) -> None:
     drawn = (ROOT / "docs/assets" / name).read_text(encoding="utf-8")
     assert drawn == drawings.DRAWINGS[name](), "python docs/tools/drawings.py"
-
-
-def test_the_architecture_lists_the_spine_in_its_order() -> None:
-    page = (ROOT / "docs/design.md").read_text(encoding="utf-8")
-    assert [ROOT / name for name in re.findall(r"^\d+\. `([^`]+)`", page, re.MULTILINE)] == spine()

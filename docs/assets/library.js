@@ -1,4 +1,10 @@
-// A field above the library's table; rows that lack one of its words are hidden.
+// The library: films get their controls, and its table a field; rows that lack one of its words are hidden.
+document.querySelectorAll(".films video").forEach((film) => {
+  Object.assign(film, { controls: true, muted: true, loop: true, playsInline: true });
+  film.addEventListener("error", () => {
+    document.querySelector(".no-films").hidden = false;
+  });
+});
 document.querySelectorAll(".library").forEach((library) => {
   const field = document.createElement("input");
   field.type = "search";
