@@ -34,17 +34,8 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 MADE: Final = ROOT / "runs" / "numbers"
 BLOCK: Final = re.compile(r"<!-- (\S+): filled by docs/tools/remake.py from (\S+) -->\n(.*?)<!-- \1 end -->", re.DOTALL)
 BENCHMARKS: Final = (
-    "solvers",
-    "flight",
-    "nonlinear",
-    "film",
-    "campaign",
-    "mismatch",
-    "speed",
-    "autopilots",
-    "interfaces",
-    "identification",
-    "intervals",
+    *("solvers", "flight", "nonlinear", "film", "campaign", "mismatch", "speed", "autopilots", "interfaces"),
+    *("identification", "intervals"),
 )
 KEPT: Final = ("solvers", "mismatch", "speed", "interfaces", "identification")
 """Benchmarks whose figure is kept in docs/."""
@@ -374,16 +365,10 @@ def autopilots(data: Any) -> str:
 
 
 def records(data: Any) -> str:
-    """A benchmark's records, one a row, under their keys: a table for each kind, by their first key."""
-    kinds: dict[str, list[dict[str, Any]]] = {}
-    for row in _records(data):
-        kinds.setdefault(next(iter(row)), []).append(row)
-    tables = []
-    for rows in kinds.values():
-        keys = [*dict.fromkeys(key for row in rows for key in row)]
-        cells = [[_cell(row.get(key)) for key in keys] for row in rows]
-        tables.append(markdown([key.replace("_", " ") for key in keys], cells))
-    return "\n".join(tables)
+    """A benchmark's records, one a row, under their keys."""
+    rows = _records(data)
+    keys = [*dict.fromkeys(key for row in rows for key in row)]
+    return markdown([key.replace("_", " ") for key in keys], [[_cell(row.get(key)) for key in keys] for row in rows])
 
 
 def _records(data: Any) -> list[dict[str, Any]]:
