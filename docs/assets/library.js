@@ -8,7 +8,7 @@ document.querySelectorAll(".films video").forEach((film) => {
 document.querySelectorAll(".library").forEach((library) => {
   const field = document.createElement("input");
   field.type = "search";
-  field.placeholder = "Filter by name, topic, verdict, word: robust wind violated";
+  field.placeholder = "Filter by name, topic, verdict, word: wind violated";
   field.setAttribute("aria-label", field.placeholder);
   field.addEventListener("input", () => {
     const words = field.value.toLowerCase().split(/\s+/);
