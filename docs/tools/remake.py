@@ -347,14 +347,14 @@ def film(data: Any) -> str:
 
 def identification(data: Any) -> str:
     """How the same vehicles fly by controllers that are made from each file."""
-    rows = []
+    by = []
     for row in _records(data):
-        errors = ("lost" if row[key] is None else f"{row[key]:.1f}" for key in ("median_%", "p90_%"))
-        violated = f"{100.0 * row['violated'] / row['flights']:.0f} %"
+        share = 100.0 * row["violated"] / row["flights"]
         span = interval(row["violated_from"], row["violated_to"])
-        rows.append((row["file"], *errors, f"{violated}, {span}", f"{row['vehicles_lost']} of {row['vehicles']}"))
-    head = ("file", "error: median [%]", "90 % of vehicles below [%]", "violated, 95 % interval", "vehicles lost")
-    return markdown(head, rows)
+        by.append(
+            f"{share:.0f} % ({span}) of the flights by the {row['file']} file, median error {row['median_%']:.1f} %"
+        )
+    return f"A constraint is violated in {'; in '.join(by)}.\n"
 
 
 def autopilots(data: Any) -> str:
