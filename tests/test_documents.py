@@ -35,6 +35,8 @@ SOURCES = [
 ]
 RUN_ON = re.compile(r"^ *(?:Args|Attributes|Examples|Raises|Returns|Yields):[ ]*\S", re.MULTILINE)
 """A section of a docstring that starts on the line of its title, which no tool then takes for a section."""
+MOST_WORDS = 26_000
+"""Of the pages, code and tables included; it may only fall."""
 SLOW, WITNESS = pytest.mark.slow("pages"), pytest.mark.witness("pages")
 ENTRY_POINTS = {"quadsim.controllers"}
 """Groups of entry points, which are written like modules."""
@@ -157,6 +159,14 @@ def test_code_on_the_pages_is_not_cut_in_a_window_of_1280_pixels() -> None:
         ):
             too_wide = [line for line in block.splitlines() if len(line) > 88]
             assert language == "text" or not too_wide, f"{page.name}: {too_wide}"
+
+
+def test_pages_open_with_what_their_reader_can_do_and_stay_few_words() -> None:
+    pages = {page.name: page.read_text(encoding="utf-8") for page in PAGES if page.parent.name == "docs"}
+    for name, text in pages.items():
+        opening = " ".join(text[text.index("# ") :].split()[:60])
+        assert re.search(r"\bAfter (this page|these five steps) you (can|have|know) ", opening), name
+    assert sum(len(text.split()) for text in pages.values()) <= MOST_WORDS
 
 
 def test_guides_have_figures_and_every_picture_says_what_it_shows() -> None:
