@@ -19,7 +19,7 @@ def svg(width: int, height: int, parts: list[str], *, arrows: bool = True) -> st
     marker = "".join(
         f'<marker id="{name}" viewBox="0 0 8 8" refX="6" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
         f'<path d="M0 0 8 4 0 8z" fill="{colour}"/></marker>'
-        for name, colour in (("forward", FORWARD), ("turn", TURN), ("soft", SOFT), ("ink", INK))
+        for name, colour in (("forward", FORWARD), ("turn", TURN))
     )
     lines = "\n".join(parts)
     return (
@@ -35,7 +35,7 @@ def text(x: float, y: float, words: str, anchor: str = "middle", colour: str = S
 
 def arrow(x1: float, y1: float, x2: float, y2: float, kind: str = "forward") -> str:
     """A straight arrow."""
-    colour = {"forward": FORWARD, "turn": TURN, "soft": SOFT, "ink": INK}[kind]
+    colour = {"forward": FORWARD, "turn": TURN}[kind]
     ends = f'x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"'
     return f'<line {ends} stroke="{colour}" stroke-width="2" marker-end="url(#{kind})"/>'
 

@@ -24,7 +24,6 @@ from scenarios.identify.identification_figures import trace_figure
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 FREE: Final[dict[str, Any]] = {"constraints": []}
-UNTIL: Final = 16.0  # what is shown of the paper's step in x, which is at 10 s
 NEAR: Final = 1.2  # of a pillar, where half-spaces are drawn [m]
 
 
