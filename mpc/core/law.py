@@ -11,6 +11,7 @@ from typing import Final, NoReturn
 
 import numpy as np
 
+from mpc.answer import INFEASIBLE_ANSWER
 from mpc.condensing import Condensed
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
 from mpc.core.solver import PROBLEMS, Key, Optimum, Work, core_library, core_problem
@@ -44,7 +45,8 @@ from quadsim.vehicle import N_ROTORS
 
 STATUSES: Final = (
     *(UNCONSTRAINED, SOLVED, SOLVED, "primal_infeasible", "max_iterations", "no_room", INVALID_DATA, "not_finite"),
-    *("out_of_bounds", "state_unknown", "invalid_reference", str(Phase.LANDED), MISSED, NOT_CONVERGED, COMMANDED),
+    *("out_of_bounds", "state_unknown", "invalid_reference", str(Phase.LANDED), MISSED),
+    *(INFEASIBLE_ANSWER, NOT_CONVERGED, COMMANDED),
 )
 """Recorded statuses by `enum quadsim_status`."""
 INVALID: Final = STATUSES.index(INVALID_DATA)

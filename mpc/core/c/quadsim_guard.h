@@ -31,6 +31,7 @@ enum quadsim_status {
     QUADSIM_INVALID_REFERENCE,
     QUADSIM_LANDED,            /* rotors are stopped */
     QUADSIM_MISSED,            /* no question came in time: of serial.c */
+    QUADSIM_INFEASIBLE_ANSWER, /* the plan violates a row by more than rounding */
     QUADSIM_NOT_CONVERGED,     /* the optimum, whose plan misses the nonlinear dynamics by more than it should */
     QUADSIM_COMMANDED          /* the command of a law that solves no problem */
 };

@@ -292,4 +292,26 @@ static inline void lean_of(const real lift[3], real sine, real cosine, real *rol
     *pitch = angle_of(forward, lift[2]);
 }
 
+/* ---- references: rows x y z yaw ----------------------------------------------------------------------------------- */
+
+/* Turns to be taken off the reference's heading in the next period, so that it starts near a yaw: as it went on
+ * before, and from the yaw anew only where that is more than 190 deg away. */
+static inline real first_turns(int *headed, real *heading, const real *reference, real yaw)
+{
+    real turns = *headed ? whole_turns(reference[3] - *heading) : R(0.0);
+    *heading = reference[3] - TURN * turns;
+    if (!*headed || magnitude(yaw - *heading) > R(3.3161255787892263)) {
+        turns -= whole_turns(yaw - *heading);
+        *heading = reference[3] - TURN * turns;
+    }
+    *headed = 1;
+    return turns;
+}
+
+/* The same of row i, of which row i - 1 had these turns. */
+static inline real next_turns(const real *reference, int i, real turns)
+{
+    return i == 0 ? turns : turns + whole_turns(reference[i * 4 + 3] - reference[i * 4 - 1]);
+}
+
 #endif

@@ -31,26 +31,6 @@ static void want(const quadsim_controller *c, const real row[4], real *wanted)
     }
 }
 
-/* Turns to be taken off the reference's heading in the next period, so that it starts near a yaw: as it went on
- * before, and from the yaw anew only where that is more than 190 deg away. */
-static real first_turns(quadsim_mpc *mpc, const real *reference, real yaw)
-{
-    real turns = mpc->headed ? whole_turns(reference[3] - mpc->heading) : R(0.0);
-    mpc->heading = reference[3] - TURN * turns;
-    if (!mpc->headed || magnitude(yaw - mpc->heading) > R(3.3161255787892263)) {
-        turns -= whole_turns(yaw - mpc->heading);
-        mpc->heading = reference[3] - TURN * turns;
-    }
-    mpc->headed = 1;
-    return turns;
-}
-
-/* The same of row i, of which row i - 1 had these turns. */
-static real next_turns(const real *reference, int i, real turns)
-{
-    return i == 0 ? turns : turns + whole_turns(reference[i * 4 + 3] - reference[i * 4 - 1]);
-}
-
 /* Level rest at a state's place and yaw. */
 static void rest_at(const real *state, real *rest)
 {
@@ -386,7 +366,7 @@ static enum quadsim_status solve_robust(quadsim_mpc *mpc, const real *state, con
     if (!mpc->known) {
         return QUADSIM_INVALID_DATA;
     }
-    return solve_ahead(mpc, ahead, reference, first_turns(mpc, reference, state[YAW]), acting);
+    return solve_ahead(mpc, ahead, reference, first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]), acting);
 }
 
 /* ---- the controllers --------------------------------------------------------------------------------------------- */
@@ -426,7 +406,7 @@ static int is_usable(const quadsim_controller *c, const real *state, const real 
 static enum quadsim_status solve_paper(quadsim_mpc *mpc, const real *state, const real *reference, const real *acting)
 {
     const quadsim_controller *c = mpc->controller;
-    real row[4], turns = first_turns(mpc, reference, state[YAW]);
+    real row[4], turns = first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]);
     int i;
     memcpy(mpc->state, state, 12 * sizeof(real));
     memcpy(mpc->resting, c->hover, sizeof(mpc->resting));
