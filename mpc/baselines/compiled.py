@@ -6,6 +6,7 @@ import ctypes
 from functools import cache
 
 from mpc.disturbance import RampNumbers, RampState
+from mpc.fallback.structs import GuardStruct
 from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, struct_members
 
 
@@ -13,13 +14,14 @@ class NumbersStruct(ctypes.Structure):
     """A `quadsim_geometric_numbers`."""
 
     _fields_ = [
-        *struct_members(INT, "commands feedforward moment horizon orders"),
+        *struct_members(INT, "commands feedforward moment exact motion horizon orders"),
         *struct_members(REAL, "period mass gravity k_x k_v k_R:3 k_Omega:3 k_attitude:3 k_i k_I c_1 c_2 sigma sigma_R"),
         *struct_members(
             REAL, "least_lift slope ahead lead:3 drag:3 inertia:9 across:2 damping:3 turning least:4 most:4"
         ),
         *struct_members(AT, "preview course"),
         ("ramp", ctypes.POINTER(RampNumbers)),
+        *struct_members(AT, "fallback"),
     ]
 
 
@@ -59,6 +61,9 @@ class LawStruct(ctypes.Structure):
         ("ramp", ctypes.POINTER(RampState)),
         *struct_members(REAL, "translation:3 rotation:3 command:8 thrust_scale"),
         ("desired", AttitudeStruct),
+        *struct_members(AT, "plan"),
+        *struct_members(INT, "learns"),
+        ("guard", GuardStruct),
     ]
 
 
@@ -75,11 +80,11 @@ def geometric_library() -> ctypes.CDLL:
         quadsim_geometric=LawStruct,
     )
     for name, arguments in {
-        "start": [AT, AT, AT],
+        "start": [AT, AT, AT, AT],
         "reset": [AT, AT],
         "measure": [AT, AT, AT, AT],
         "preview": [AT, AT, AT],
-        "course": [AT, INT, AT, AT, AT],
+        "course": [AT, INT, INT, AT, AT],
         "limit": [AT, REAL, REAL, AT],
         "wrench": [AT] * 5,
         "targets": [AT] * 5,

@@ -178,7 +178,7 @@ class GeometricController(FeedbackLaw):
         self._law, self._motion, self._target = LawStruct(), MotionStruct(), TargetStruct()
         self._at = ctypes.addressof(self._law)
         self._here = ctypes.addressof(self._motion), ctypes.addressof(self._target)
-        self._library.quadsim_geometric_start(self._at, ctypes.addressof(self.numbers), ramp)
+        self._library.quadsim_geometric_start(self._at, ctypes.addressof(self.numbers), ramp, None)
         super().__init__(vehicle, period, settings, target_model(vehicle, period, lags) if self._targets else None)
 
     def reset(self, speeds: Array) -> None:
@@ -200,8 +200,8 @@ class GeometricController(FeedbackLaw):
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """Return the law's wrench as rotor speeds, or its targets; the integrals hold while bounds limit it."""
-        exact, flying = self._feedforward or self.observer is not None, now.phase is Phase.FLYING
-        self._measure(state, *((now.attitude, now.body_rates) if exact else (None, None)))
+        flying = now.phase is Phase.FLYING
+        self._measure(state, *((now.attitude, now.body_rates) if self.numbers.exact else (None, None)))
         self._aim(reference, now.motion)
         follows = flying and self.observer is not None and self.observer.follows(now.time)
         acting = np.ascontiguousarray(before, np.float64)
@@ -229,10 +229,9 @@ class GeometricController(FeedbackLaw):
         """Take the target of a preview (N, 4), with feed-forward that of a motion if the course has one."""
         numbers = ctypes.addressof(self.numbers)
         if self._feedforward and motion is not None:
-            samples = slice(min(len(motion), MOTION_SAMPLES))
-            path, attitudes = (np.ascontiguousarray(part[samples]) for part in (motion.position, motion.attitude))
-            addresses = path.ctypes.data, attitudes.ctypes.data
-            self._library.quadsim_geometric_course(numbers, len(path), *addresses, self._here[1])
+            samples = slice(MOTION_SAMPLES)
+            rows = np.hstack([motion.position[samples], motion.attitude[samples]])
+            self._library.quadsim_geometric_course(numbers, *rows.shape, rows.ctypes.data, self._here[1])
         else:
             preview = np.ascontiguousarray(reference, np.float64)
             self._library.quadsim_geometric_preview(numbers, preview.ctypes.data, self._here[1])
@@ -351,6 +350,7 @@ def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gain
     lags, half, weight = settings.inner_lag or NO_LAG, 0.5 * period, vehicle.mass * vehicle.gravity
     numbers.commands = list(TARGET_SIZES).index(settings.commands)
     numbers.feedforward, numbers.moment, numbers.horizon = settings.feedforward, settings.moment, settings.horizon
+    numbers.exact = settings.feedforward or settings.disturbance is not None
     numbers.orders = (PREVIEW_DEGREE if settings.feedforward else 2) + 1
     numbers.period, numbers.mass, numbers.gravity = period, vehicle.mass, vehicle.gravity
     for name in ("k_x", "k_v", "k_i", "k_I", "c_1", "c_2", "sigma", "sigma_R"):

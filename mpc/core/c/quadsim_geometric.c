@@ -55,29 +55,29 @@ void quadsim_geometric_measure(const quadsim_real state[12], const quadsim_real 
 
 void quadsim_geometric_preview(const numbers_of_law *n, const quadsim_real *reference, quadsim_geometric_target *target)
 {
-    real yaw = reference[3];
+    real turns = R(0.0);
     int order, i, k;
     memset(target, 0, sizeof(*target));
     for (k = 0; k < n->horizon; k++) {
         const real *row = reference + 4 * k;
-        yaw = row[3] - TURN * whole_turns(row[3] - yaw); /* without jumps */
+        turns = next_turns(reference, k, turns);
         for (order = 0; order < n->orders; order++) {
             const real share = n->preview[order * n->horizon + k];
             for (i = 0; i < 3; i++) {
                 target->path[order][i] += share * row[i];
             }
             if (order < 3) {
-                target->yaw[order] += share * yaw;
+                target->yaw[order] += share * (row[3] - TURN * turns);
             }
         }
     }
 }
 
-void quadsim_geometric_course(const numbers_of_law *n, int samples, const quadsim_real *positions,
-                              const quadsim_real *attitudes, quadsim_geometric_target *target)
+void quadsim_geometric_course(const numbers_of_law *n, int samples, int width, const quadsim_real *rows,
+                              quadsim_geometric_target *target)
 {
     const int count = samples < QUADSIM_GEOMETRIC_SAMPLES ? samples : QUADSIM_GEOMETRIC_SAMPLES;
-    const int rows = count <= QUADSIM_GEOMETRIC_DEGREE ? count : QUADSIM_GEOMETRIC_DEGREE + 1;
+    const int orders = count <= QUADSIM_GEOMETRIC_DEGREE ? count : QUADSIM_GEOMETRIC_DEGREE + 1;
     const real *from_samples = n->course;
     real attitude[9];
     int order, i, k;
@@ -87,11 +87,12 @@ void quadsim_geometric_course(const numbers_of_law *n, int samples, const quadsi
     memset(target, 0, sizeof(*target));
     target->headed = 1;
     for (k = 0; k < count; k++) {
-        attitude_of(attitudes + 4 * k, attitude);
-        for (order = 0; order < rows && order < QUADSIM_GEOMETRIC_ORDERS; order++) {
+        const real *row = rows + k * width;
+        attitude_of(row + 3, attitude);
+        for (order = 0; order < orders && order < QUADSIM_GEOMETRIC_ORDERS; order++) {
             const real share = from_samples[order * count + k];
             for (i = 0; i < 3; i++) {
-                target->path[order][i] += share * positions[3 * k + i];
+                target->path[order][i] += share * row[i];
                 if (order < 3) {
                     target->heading[3 * order + i] += share * attitude[3 * i];
                 }
@@ -469,22 +470,43 @@ static void observe(quadsim_geometric *law, int flying, int follows, const motio
     law->thrust_scale = quadsim_ramp_scale(law->ramp, n->ramp);
 }
 
-void quadsim_geometric_start(quadsim_geometric *law, const quadsim_geometric_numbers *numbers, quadsim_ramp *ramp)
+/* Drop the integrals and all that is estimated. */
+static void forget(quadsim_geometric *law, const real *acting)
 {
-    const real hover[4] = {numbers->mass * numbers->gravity, R(0.0), R(0.0), R(0.0)};
+    memset(law->translation, 0, sizeof(law->translation));
+    memset(law->rotation, 0, sizeof(law->rotation));
+    law->learns = 0;
+    if (law->ramp != NULL) {
+        quadsim_ramp_reset(law->ramp, law->numbers->ramp, acting);
+    }
+}
+
+long quadsim_geometric_reals(const numbers_of_law *n)
+{
+    return 2 * n->horizon * NU;
+}
+
+void quadsim_geometric_start(quadsim_geometric *law, const numbers_of_law *n, quadsim_ramp *ramp, quadsim_real *memory)
+{
+    const real hover[NU] = {n->mass * n->gravity, R(0.0), R(0.0), R(0.0)};
     memset(law, 0, sizeof(*law));
-    law->numbers = numbers;
-    law->ramp = numbers->ramp == NULL ? NULL : ramp;
+    law->numbers = n;
+    law->ramp = ramp;
+    law->plan = memory;
+    if (n->fallback != NULL) {
+        quadsim_guard_start(&law->guard, n->fallback, n->horizon, memory + n->horizon * NU);
+    }
     quadsim_geometric_reset(law, hover);
 }
 
 void quadsim_geometric_reset(quadsim_geometric *law, const quadsim_real acting[4])
 {
-    memset(law->translation, 0, sizeof(law->translation));
-    memset(law->rotation, 0, sizeof(law->rotation));
-    if (law->ramp != NULL) {
-        quadsim_ramp_reset(law->ramp, law->numbers->ramp, acting);
+    const real *usable = acting;
+    if (law->numbers->fallback != NULL) {
+        quadsim_guard_reset(&law->guard, acting);
+        usable = law->guard.before;
     }
+    forget(law, usable);
 }
 
 void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, const motion_now *motion,
@@ -512,4 +534,57 @@ void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, co
     if (attained && flying) {
         quadsim_geometric_integrate(law, motion, target);
     }
+}
+
+/* ---- with the fallback contract ------------------------------------------------------------------------------------ */
+
+/* The law's answer to the guard's state, as law->plan. */
+static void answer(quadsim_geometric *law, int flying, const real *measured, const real *reference)
+{
+    const numbers_of_law *n = law->numbers;
+    const quadsim_guard *guard = &law->guard;
+    const int *unseen = guard->unseen, learns = guard->learns;
+    const int turned = unseen[ROLL] == 0 && unseen[PITCH] == 0 && unseen[YAW] == 0;
+    const int turning = unseen[ROLL + 1] == 0 && unseen[PITCH + 1] == 0 && unseen[YAW + 1] == 0;
+    const real *attitude = n->exact && turned && is_finite(measured + 12, 4) ? measured + 12 : NULL;
+    const real *rates = n->exact && turning && is_finite(measured + 16, 3) ? measured + 16 : NULL;
+    motion_now motion;
+    target_now target;
+    int i;
+    quadsim_geometric_measure(guard->state, attitude, rates, &motion);
+    if (n->motion) {
+        quadsim_geometric_course(n, QUADSIM_GEOMETRIC_SAMPLES, QUADSIM_GEOMETRIC_ROW, reference, &target);
+    } else {
+        quadsim_geometric_preview(n, reference, &target);
+    }
+    quadsim_geometric_solve(law, flying, law->learns && learns && guard->asked == 1, &motion, &target, guard->in_force);
+    law->learns = learns;
+    memcpy(law->plan, law->command, NU * sizeof(real));
+    for (i = 1; i < n->horizon; i++) {
+        memcpy(law->plan + i * NU, n->fallback->hover, NU * sizeof(real));
+    }
+}
+
+enum quadsim_status quadsim_geometric_step(quadsim_geometric *law, enum quadsim_phase phase,
+                                           const quadsim_real state[QUADSIM_GEOMETRIC_STATE],
+                                           const quadsim_real *reference, const quadsim_real acting[4],
+                                           quadsim_real command[4])
+{
+    const numbers_of_law *n = law->numbers;
+    const int count = n->motion ? QUADSIM_GEOMETRIC_SAMPLES * QUADSIM_GEOMETRIC_ROW : n->horizon * 4;
+    quadsim_guard *guard = &law->guard;
+    quadsim_trim trim = {{R(0.0)}, {R(0.0), R(0.0), R(1.0)}, {R(0.0)}};
+    enum quadsim_status status;
+    memcpy(trim.commands, n->fallback->hover, sizeof(trim.commands));
+    status = quadsim_guard_begin(guard, phase, &trim, state, reference, count, acting);
+    if (status == QUADSIM_FREE && phase == QUADSIM_PHASE_LANDED) {
+        forget(law, guard->in_force);
+    } else if (status == QUADSIM_FREE) {
+        answer(law, phase == QUADSIM_PHASE_FLYING, state, reference);
+        status = quadsim_guard_check(guard, QUADSIM_COMMANDED, law->plan);
+    }
+    if (quadsim_guard_foresees(guard, phase, status)) {
+        quadsim_guard_foresee(guard, 1, &trim, n->fallback->hover);
+    }
+    return quadsim_guard_end(guard, phase, &trim, status, law->plan, command);
 }

@@ -2,19 +2,22 @@
  *
  * Once every period, call quadsim_geometric_step with what is measured now; hold the command until the next call.
  *
- * state [12]        x vx y vy z vz roll roll_rate pitch pitch_rate yaw yaw_rate
- *                   [m, m/s, rad, rad/s]: world axes with z up; Z-Y-X Euler angles, body to world, and their rates
- * reference [N][4]  x y z yaw [m, rad], where to be one period from now, two, ... N periods from now; whole turns of
- *                   yaw make no difference
+ * state [19]        position, velocity, Euler angles and their rates in the order of quadsim_guard.h [12]; the attitude as
+ *                   a quaternion w x y z, body to world [4], and body rates [3] [rad/s], each derived from the angles and
+ *                   their rates where it is not finite, or where `exact` is not set
+ * reference         previews [N][4]: x y z yaw [m, rad], where to be one period from now, two, ... N periods from now;
+ *                   whole turns of yaw make no difference.  Or where `motion` is set samples of a course [7][17], now, one
+ *                   period on, ...: position, quaternion, and ten numbers that this law does not need
  * acting [4]        the command before, in force up to now
  * command [4]       targets of an autopilot, to hold for the period: thrust [N] and body rates [rad/s]
  *
- * A law's numbers are read only, and may be shared.  All that a law remembers is in a quadsim_geometric, and where it
- * observes disturbances in a quadsim_ramp, both of the caller's.  Nothing is allocated, nothing is shared. */
+ * A law's numbers are read only, and may be shared.  All that a law remembers is in a quadsim_geometric and its memory of
+ * quadsim_geometric_reals(numbers) numbers, and where it observes disturbances in a quadsim_ramp, all of the caller's.
+ * Nothing is allocated, nothing is shared. */
 #ifndef QUADSIM_GEOMETRIC_H
 #define QUADSIM_GEOMETRIC_H
 
-#include "quadsim_core.h"
+#include "quadsim_guard.h"
 #include "quadsim_ramp.h"
 
 #ifdef __cplusplus
@@ -31,13 +34,17 @@ enum { QUADSIM_GEOMETRIC_ROTORS, QUADSIM_GEOMETRIC_RATES, QUADSIM_GEOMETRIC_ATTI
 enum {
     QUADSIM_GEOMETRIC_ORDERS = 5,  /* derivatives of a position from 0 to snap */
     QUADSIM_GEOMETRIC_SAMPLES = 7, /* of a course, at most */
-    QUADSIM_GEOMETRIC_DEGREE = 5   /* of the polynomial through them */
+    QUADSIM_GEOMETRIC_DEGREE = 5,  /* of the polynomial through them */
+    QUADSIM_GEOMETRIC_STATE = 19,  /* numbers of a state, and */
+    QUADSIM_GEOMETRIC_ROW = 17     /* of a sample, for quadsim_geometric_step */
 };
 
 /* Matrices are row by row.  Axes of vectors: world of forces, body of rates and torques. */
 typedef struct quadsim_geometric_numbers {
     int commands;                   /* see above */
     int feedforward, moment;        /* whether jerk, snap and drag are fed forward, and the air's moment */
+    int exact;                      /* whether attitude and body rates count as they are measured */
+    int motion;                     /* whether references are samples of a course, in quadsim_geometric_step */
     int horizon, orders;            /* N samples of a preview; values and derivatives that are taken from it */
     quadsim_real period;            /* [s] */
     quadsim_real mass, gravity;     /* [kg], [m/s^2] */
@@ -54,6 +61,7 @@ typedef struct quadsim_geometric_numbers {
     const quadsim_real *preview;    /* [orders][N] from samples one period on, two, ... to value and derivatives now */
     const quadsim_real *course;     /* [min(K, 6)][K] from samples now, one period on, ..., for K = 1, then 2, ... 7 */
     const quadsim_ramp_numbers *ramp; /* NULL where no disturbance is observed */
+    const quadsim_fallback *fallback; /* NULL where quadsim guards the law: quadsim_geometric_step is not for it */
 } quadsim_geometric_numbers;
 
 /* What is measured. */
@@ -81,17 +89,23 @@ typedef struct quadsim_geometric_attitude {
     quadsim_real attitude[9], rates[3], acceleration[3];
 } quadsim_geometric_attitude;
 
-/* Read command, and thrust_scale; the rest is its own. */
+/* Read command, thrust_scale and guard.level; the rest is its own. */
 typedef struct quadsim_geometric {
     const quadsim_geometric_numbers *numbers;
     quadsim_ramp *ramp;                          /* NULL where numbers->ramp is */
     quadsim_real translation[3], rotation[3];    /* the integrals [m/s^2], [rad/s^2] */
     quadsim_real command[8], thrust_scale;
     quadsim_geometric_attitude desired;
+    quadsim_real *plan; /* [N][4] the command, then hover */
+    int learns;         /* whether the state of the last period was measured */
+    quadsim_guard guard;
 } quadsim_geometric;
 
-/* A law that observes disturbances with `ramp`, the caller's, or without one, in hover; NULL where numbers->ramp is. */
-void quadsim_geometric_start(quadsim_geometric *law, const quadsim_geometric_numbers *numbers, quadsim_ramp *ramp);
+long quadsim_geometric_reals(const quadsim_geometric_numbers *numbers);
+
+/* A law in memory of the caller's, after the command of hover; `ramp` is NULL where numbers->ramp is. */
+void quadsim_geometric_start(quadsim_geometric *law, const quadsim_geometric_numbers *numbers, quadsim_ramp *ramp,
+                             quadsim_real *memory);
 
 /* Restart after a command: targets, or rotor speeds [rad/s]. */
 void quadsim_geometric_reset(quadsim_geometric *law, const quadsim_real acting[4]);
@@ -104,9 +118,10 @@ void quadsim_geometric_measure(const quadsim_real state[12], const quadsim_real 
 void quadsim_geometric_preview(const quadsim_geometric_numbers *numbers, const quadsim_real *reference,
                                quadsim_geometric_target *target);
 
-/* The target of the next samples of a course, from now on: positions [samples][3] and quaternions [samples][4]. */
-void quadsim_geometric_course(const quadsim_geometric_numbers *numbers, int samples, const quadsim_real *positions,
-                              const quadsim_real *attitudes, quadsim_geometric_target *target);
+/* The target of the next samples of a course, from now on: rows of `width` numbers that begin with position and
+ * quaternion. */
+void quadsim_geometric_course(const quadsim_geometric_numbers *numbers, int samples, int width, const quadsim_real *rows,
+                              quadsim_geometric_target *target);
 
 /* The force [3] [N] limited to at least `least` upwards, and sideways to `slope` times that. */
 void quadsim_geometric_limit(const quadsim_real force[3], quadsim_real least, quadsim_real slope, quadsim_real limited[3]);
@@ -130,6 +145,14 @@ void quadsim_geometric_integrate(quadsim_geometric *law, const quadsim_geometric
  * quadsim_geometric_integrate.  `follows`: whether the last call was one period ago. */
 void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, const quadsim_geometric_motion *motion,
                              const quadsim_geometric_target *target, const quadsim_real acting[4]);
+
+/* The command of the period that starts now, always finite and within its bounds: the law's, or what the fallback
+ * contract flies instead (quadsim_guard.h).  Not for a law of rotors.  Channels of the state that are not measured are not
+ * finite. */
+enum quadsim_status quadsim_geometric_step(quadsim_geometric *law, enum quadsim_phase phase,
+                                           const quadsim_real state[QUADSIM_GEOMETRIC_STATE],
+                                           const quadsim_real *reference, const quadsim_real acting[4],
+                                           quadsim_real command[4]);
 
 #ifdef __cplusplus
 }
