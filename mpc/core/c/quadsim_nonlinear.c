@@ -21,6 +21,12 @@ static int rows_of(const quadsim_nonlinear_numbers *numbers)
     return numbers->problem->horizon * numbers->stride;
 }
 
+/* Numbers of a reference. */
+static int count_of(const quadsim_nonlinear_numbers *numbers, int motion)
+{
+    return motion ? (rows_of(numbers) + 1) * QUADSIM_MOTION : rows_of(numbers) * QUADSIM_PREVIEW;
+}
+
 static int actuators_of(const quadsim_nonlinear_numbers *numbers)
 {
     return numbers->problem->actuators;
@@ -261,6 +267,33 @@ static void balance(quadsim_nonlinear *law)
     }
 }
 
+/* Split the observed force into drag, as far as it follows the velocity, and a constant remainder. */
+static void follow_force(quadsim_nonlinear *law, int follows, const real *acting)
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    quadsim_nmpc_world *world = &law->world;
+    const real *velocity = law->measured + V, length = square_root(dot(law->measured + Q, law->measured + Q, 4));
+    real q[4], turn[9], change[3], drag[3], along[3];
+    int i;
+    for (i = 0; i < 4; i++) {
+        q[i] = law->measured[Q + i] / length;
+    }
+    put_rotation(q, turn);
+    quadsim_ramp_update(&law->ramp, numbers->ramp, follows, velocity, turn, law->measured + W, acting);
+    quadsim_ramp_foreseen(&law->ramp, numbers->ramp, R(0.5) * numbers->control_period, world->acceleration, change,
+                          world->angular);
+    quadsim_ramp_drag(&law->ramp, numbers->ramp, drag);
+    for (i = 0; i < 3; i++) {
+        along[i] = drag[i] * (turn[i] * velocity[0] + turn[3 + i] * velocity[1] + turn[6 + i] * velocity[2]);
+        world->drag[i] = numbers->drag[i] + drag[i];
+    }
+    for (i = 0; i < 3; i++) {
+        world->acceleration[i] += dot(turn + 3 * i, along, 3);
+    }
+    world->thrust_scale = quadsim_ramp_scale(&law->ramp, numbers->ramp);
+    find_trim(law);
+}
+
 /* ---- periods ------------------------------------------------------------------------------------------------------ */
 
 /* Let actuators follow the command in force, since the call before. */
@@ -282,13 +315,17 @@ static void spin(quadsim_nonlinear *law, int periods)
 }
 
 /* Drop the plan, and assume no disturbance. */
-static void forget(quadsim_nonlinear *law)
+static void forget(quadsim_nonlinear *law, const real *acting)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     quadsim_nmpc_reset(&law->work);
     law->called = law->turned = law->headed = law->learns = 0;
     law->side = R(1.0);
     law->world.thrust_scale = R(1.0);
+    if (numbers->ramp != NULL) {
+        quadsim_ramp_reset(&law->ramp, numbers->ramp, acting);
+        law->world.thrust_scale = quadsim_ramp_scale(&law->ramp, numbers->ramp);
+    }
     memcpy(law->world.drag, numbers->drag, sizeof(law->world.drag));
     memcpy(law->world.square_drag, numbers->square_drag, sizeof(law->world.square_drag));
     memset(law->estimate, 0, sizeof(law->estimate));
@@ -392,7 +429,7 @@ void quadsim_nonlinear_reset(quadsim_nonlinear *law, const quadsim_real command[
     put_shares(law->numbers, usable, law->rotors);
     memcpy(law->rotors_before, law->rotors, sizeof(law->rotors));
     memcpy(law->before, law->rotors, sizeof(law->before));
-    forget(law);
+    forget(law, usable);
 }
 
 void quadsim_nonlinear_learn(quadsim_nonlinear *law, const quadsim_real estimate[6])
@@ -412,20 +449,20 @@ void quadsim_nonlinear_stand(quadsim_nonlinear *law, int periods, const quadsim_
 {
     put_shares(law->numbers, acting, law->before);
     spin(law, periods);
-    forget(law);
+    forget(law, acting);
 }
 
-int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, const quadsim_real state[12],
+int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int motion, const quadsim_real state[12],
                             const quadsim_real *attitude, const quadsim_real *rates, const quadsim_real *reference,
                             const quadsim_real acting[4])
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     const int actuators = actuators_of(numbers), learns = law->learns && periods == 1;
-    const int count = numbers->motion ? (rows_of(numbers) + 1) * QUADSIM_MOTION : rows_of(numbers) * QUADSIM_PREVIEW;
     law->learns = 0;
     put_shares(numbers, acting, law->before);
     spin(law, periods);
-    if (!is_within(state, PLAUSIBLE, 12) || !is_within(reference, PLAUSIBLE, count) || !is_finite(law->before, NU)) {
+    if (!is_within(state, PLAUSIBLE, 12) || !is_within(reference, PLAUSIBLE, count_of(numbers, motion)) ||
+        !is_finite(law->before, NU)) {
         return 0;
     }
     put_body(state, attitude, rates, law->measured);
@@ -433,7 +470,7 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, con
     if (!is_within(law->measured, PLAUSIBLE, BODY + actuators)) {
         return 0;
     }
-    if (numbers->motion) {
+    if (motion) {
         take_motion(law, reference);
     } else {
         take_preview(law, reference, state[YAW]);
@@ -442,6 +479,9 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, con
     if (flying) {
         if (numbers->observes && learns) {
             observe(law);
+        }
+        if (numbers->ramp != NULL) {
+            follow_force(law, learns, acting);
         }
         law->learns = 1;
         memcpy(law->last, law->measured, sizeof(law->last));
@@ -547,7 +587,7 @@ enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_
                                            quadsim_real command[4])
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
-    const int count = numbers->motion ? (rows_of(numbers) + 1) * QUADSIM_MOTION : rows_of(numbers) * QUADSIM_PREVIEW;
+    const int count = count_of(numbers, numbers->motion);
     quadsim_guard *guard = &law->guard;
     enum quadsim_status status = quadsim_guard_begin(guard, phase, &law->trim, state, reference, count, acting);
     law->work.changes = 0;
@@ -560,8 +600,8 @@ enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_
         const int steep = magnitude(guard->state[PITCH]) >= UPRIGHT; /* where Euler rates are implausible, not a gyro's */
         const real *attitude = turned ? state + 12 : NULL, *rates = turning || steep ? state + 16 : NULL;
         status = QUADSIM_INVALID_DATA;
-        if (quadsim_nonlinear_begin(law, guard->asked, phase == QUADSIM_PHASE_FLYING, guard->state, attitude, rates,
-                                    reference, guard->in_force)) {
+        if (quadsim_nonlinear_begin(law, guard->asked, phase == QUADSIM_PHASE_FLYING, numbers->motion, guard->state,
+                                    attitude, rates, reference, guard->in_force)) {
             status = quadsim_nonlinear_end(law, quadsim_nmpc_step(&law->work, &law->world, law->measured, law->before,
                                                                   law->states, law->thrusts));
         }

@@ -3,7 +3,7 @@
 
 #include "quadsim_geometric.h"
 #include "quadsim_mpc.h"
-#include "quadsim_nmpc.h"
+#include "quadsim_nonlinear.h"
 #include "quadsim_ramp.h"
 
 #define SIZE(type) extern const size_t type##_size; const size_t type##_size = sizeof(type)
@@ -22,6 +22,8 @@ SIZE(quadsim_nmpc_term);
 SIZE(quadsim_nmpc_problem);
 SIZE(quadsim_nmpc_world);
 SIZE(quadsim_nmpc_work);
+SIZE(quadsim_nonlinear_numbers);
+SIZE(quadsim_nonlinear);
 SIZE(quadsim_ramp_numbers);
 SIZE(quadsim_ramp);
 SIZE(quadsim_geometric_numbers);
