@@ -5,12 +5,12 @@ from __future__ import annotations
 import ctypes
 from functools import cache
 
-from mpc.disturbance import RampNumbers, RampState
+from mpc.disturbance import RampState
 from mpc.fallback.structs import GuardStruct
 from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, struct_members
 
 
-class NumbersStruct(ctypes.Structure):
+class GeometricNumbersStruct(ctypes.Structure):
     """A `quadsim_geometric_numbers`."""
 
     _fields_ = [
@@ -19,9 +19,7 @@ class NumbersStruct(ctypes.Structure):
         *struct_members(
             REAL, "least_lift slope ahead lead:3 drag:3 inertia:9 across:2 damping:3 turning least:4 most:4"
         ),
-        *struct_members(AT, "preview course"),
-        ("ramp", ctypes.POINTER(RampNumbers)),
-        *struct_members(AT, "fallback"),
+        *struct_members(AT, "preview course ramp fallback"),
     ]
 
 
@@ -53,14 +51,14 @@ class AttitudeStruct(ctypes.Structure):
     _fields_ = struct_members(REAL, "attitude:9 rates:3 acceleration:3")
 
 
-class LawStruct(ctypes.Structure):
+class GeometricStruct(ctypes.Structure):
     """A `quadsim_geometric`."""
 
     _fields_ = [
-        ("numbers", ctypes.POINTER(NumbersStruct)),
-        ("ramp", ctypes.POINTER(RampState)),
+        *struct_members(AT, "numbers"),
         *struct_members(REAL, "translation:3 rotation:3 command:8 thrust_scale"),
         ("desired", AttitudeStruct),
+        ("ramp", RampState),
         *struct_members(AT, "plan"),
         *struct_members(INT, "learns"),
         ("guard", GuardStruct),
@@ -72,15 +70,15 @@ def geometric_library() -> ctypes.CDLL:
     """Return the library with the law's functions declared."""
     library = load_library()
     check_sizes(
-        quadsim_geometric_numbers=NumbersStruct,
+        quadsim_geometric_numbers=GeometricNumbersStruct,
         quadsim_geometric_motion=MotionStruct,
         quadsim_geometric_target=TargetStruct,
         quadsim_geometric_disturbance=DisturbanceStruct,
         quadsim_geometric_attitude=AttitudeStruct,
-        quadsim_geometric=LawStruct,
+        quadsim_geometric=GeometricStruct,
     )
     for name, arguments in {
-        "start": [AT, AT, AT, AT],
+        "start": [AT, AT, AT],
         "reset": [AT, AT],
         "measure": [AT, AT, AT, AT],
         "preview": [AT, AT, AT],

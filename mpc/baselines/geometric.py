@@ -22,9 +22,9 @@ from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, re
 from mpc.baselines.compiled import (
     AttitudeStruct,
     DisturbanceStruct,
-    LawStruct,
+    GeometricNumbersStruct,
+    GeometricStruct,
     MotionStruct,
-    NumbersStruct,
     TargetStruct,
     geometric_library,
 )
@@ -172,13 +172,13 @@ class GeometricController(FeedbackLaw):
         self.numbers = geometric_numbers(vehicle, period, settings, gains)
         set_arrays(self.numbers, k_R=self.k_R, k_Omega=self.k_Omega)
         self.numbers.preview, self.numbers.course = self._preview.ctypes.data, self._course.ctypes.data
-        ramp = None
-        if self.observer is not None:
-            self.numbers.ramp, ramp = ctypes.pointer(self.observer.numbers), ctypes.addressof(self.observer.state)
-        self._law, self._motion, self._target = LawStruct(), MotionStruct(), TargetStruct()
+        self._law, self._motion, self._target = GeometricStruct(), MotionStruct(), TargetStruct()
         self._at = ctypes.addressof(self._law)
         self._here = ctypes.addressof(self._motion), ctypes.addressof(self._target)
-        self._library.quadsim_geometric_start(self._at, ctypes.addressof(self.numbers), ramp, None)
+        if self.observer is not None:
+            self.observer.bind(self._law.ramp)
+            self.numbers.ramp = ctypes.addressof(self.observer.numbers)
+        self._library.quadsim_geometric_start(self._at, ctypes.addressof(self.numbers), None)
         super().__init__(vehicle, period, settings, target_model(vehicle, period, lags) if self._targets else None)
 
     def reset(self, speeds: Array) -> None:
@@ -312,14 +312,14 @@ class GeometricController(FeedbackLaw):
         attitude, rates, acceleration = (np.array(getattr(law.desired, name)) for name, _ in AttitudeStruct._fields_)
         return result, DesiredAttitude(attitude=attitude.reshape(3, 3), rates=rates, acceleration=acceleration)
 
-    def _copy(self, integrals: Integrals) -> LawStruct:
+    def _copy(self, integrals: Integrals) -> GeometricStruct:
         """Return the law with other integrals."""
-        law = LawStruct.from_buffer_copy(self._law)
+        law = GeometricStruct.from_buffer_copy(self._law)
         set_arrays(law, **vars(integrals))
         return law
 
 
-def _integrals_of(law: LawStruct) -> Integrals:
+def _integrals_of(law: GeometricStruct) -> Integrals:
     return Integrals(translation=np.array(law.translation), rotation=np.array(law.rotation))
 
 
@@ -344,9 +344,11 @@ def previews(settings: Geometric, period: float) -> tuple[Array, Array]:
     return np.ascontiguousarray(differentiator(settings.horizon, period, degree=degree)), np.concatenate(course)
 
 
-def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gains: GeometricGains) -> NumbersStruct:
+def geometric_numbers(
+    vehicle: Vehicle, period: float, settings: Geometric, gains: GeometricGains
+) -> GeometricNumbersStruct:
     """Return the law's numbers for C but for `k_R`, `k_Omega`, and what they point to."""
-    numbers, targets, bounds = NumbersStruct(), settings.commands != ROTORS, settings.actuators(vehicle)
+    numbers, targets, bounds = GeometricNumbersStruct(), settings.commands != ROTORS, settings.actuators(vehicle)
     lags, half, weight = settings.inner_lag or NO_LAG, 0.5 * period, vehicle.mass * vehicle.gravity
     numbers.commands = list(TARGET_SIZES).index(settings.commands)
     numbers.feedforward, numbers.moment, numbers.horizon = settings.feedforward, settings.moment, settings.horizon

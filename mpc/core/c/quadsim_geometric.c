@@ -458,16 +458,16 @@ static void observe(quadsim_geometric *law, int flying, int follows, const motio
     const numbers_of_law *n = law->numbers;
     memset(d, 0, sizeof(*d));
     law->thrust_scale = R(1.0);
-    if (law->ramp == NULL) {
+    if (n->ramp == NULL) {
         return;
     }
     if (!flying) {
-        quadsim_ramp_reset(law->ramp, n->ramp, acting);
+        quadsim_ramp_reset(&law->ramp, n->ramp, acting);
         return;
     }
-    quadsim_ramp_update(law->ramp, n->ramp, follows, motion->velocity, motion->attitude, motion->rates, acting);
-    quadsim_ramp_foreseen(law->ramp, n->ramp, R(0.5) * n->period, d->force, d->change, d->torque);
-    law->thrust_scale = quadsim_ramp_scale(law->ramp, n->ramp);
+    quadsim_ramp_update(&law->ramp, n->ramp, follows, motion->velocity, motion->attitude, motion->rates, acting);
+    quadsim_ramp_foreseen(&law->ramp, n->ramp, R(0.5) * n->period, d->force, d->change, d->torque);
+    law->thrust_scale = quadsim_ramp_scale(&law->ramp, n->ramp);
 }
 
 /* Drop the integrals and all that is estimated. */
@@ -476,8 +476,8 @@ static void forget(quadsim_geometric *law, const real *acting)
     memset(law->translation, 0, sizeof(law->translation));
     memset(law->rotation, 0, sizeof(law->rotation));
     law->learns = 0;
-    if (law->ramp != NULL) {
-        quadsim_ramp_reset(law->ramp, law->numbers->ramp, acting);
+    if (law->numbers->ramp != NULL) {
+        quadsim_ramp_reset(&law->ramp, law->numbers->ramp, acting);
     }
 }
 
@@ -486,13 +486,15 @@ long quadsim_geometric_reals(const numbers_of_law *n)
     return 2 * n->horizon * NU;
 }
 
-void quadsim_geometric_start(quadsim_geometric *law, const numbers_of_law *n, quadsim_ramp *ramp, quadsim_real *memory)
+void quadsim_geometric_start(quadsim_geometric *law, const numbers_of_law *n, quadsim_real *memory)
 {
-    const real hover[NU] = {n->mass * n->gravity, R(0.0), R(0.0), R(0.0)};
+    real hover[NU] = {R(0.0)};
     memset(law, 0, sizeof(*law));
     law->numbers = n;
-    law->ramp = ramp;
     law->plan = memory;
+    if (n->commands != QUADSIM_GEOMETRIC_ROTORS) {
+        hover[0] = n->mass * n->gravity;
+    }
     if (n->fallback != NULL) {
         quadsim_guard_start(&law->guard, n->fallback, n->horizon, memory + n->horizon * NU);
     }

@@ -12,8 +12,7 @@
  * command [4]       targets of an autopilot, to hold for the period: thrust [N] and body rates [rad/s]
  *
  * A law's numbers are read only, and may be shared.  All that a law remembers is in a quadsim_geometric and its memory of
- * quadsim_geometric_reals(numbers) numbers, and where it observes disturbances in a quadsim_ramp, all of the caller's.
- * Nothing is allocated, nothing is shared. */
+ * quadsim_geometric_reals(numbers) reals, all of the caller's.  Nothing is allocated, nothing is shared. */
 #ifndef QUADSIM_GEOMETRIC_H
 #define QUADSIM_GEOMETRIC_H
 
@@ -92,10 +91,10 @@ typedef struct quadsim_geometric_attitude {
 /* Read command, thrust_scale and guard.level; the rest is its own. */
 typedef struct quadsim_geometric {
     const quadsim_geometric_numbers *numbers;
-    quadsim_ramp *ramp;                          /* NULL where numbers->ramp is */
     quadsim_real translation[3], rotation[3];    /* the integrals [m/s^2], [rad/s^2] */
     quadsim_real command[8], thrust_scale;
     quadsim_geometric_attitude desired;
+    quadsim_ramp ramp;  /* of disturbances */
     quadsim_real *plan; /* [N][4] the command, then hover */
     int learns;         /* whether the state of the last period was measured */
     quadsim_guard guard;
@@ -103,9 +102,8 @@ typedef struct quadsim_geometric {
 
 long quadsim_geometric_reals(const quadsim_geometric_numbers *numbers);
 
-/* A law in memory of the caller's, after the command of hover; `ramp` is NULL where numbers->ramp is. */
-void quadsim_geometric_start(quadsim_geometric *law, const quadsim_geometric_numbers *numbers, quadsim_ramp *ramp,
-                             quadsim_real *memory);
+/* A law in memory of the caller's, after the thrust of the weight or, of rotors, with rotors at rest. */
+void quadsim_geometric_start(quadsim_geometric *law, const quadsim_geometric_numbers *numbers, quadsim_real *memory);
 
 /* Restart after a command: targets, or rotor speeds [rad/s]. */
 void quadsim_geometric_reset(quadsim_geometric *law, const quadsim_real acting[4]);
