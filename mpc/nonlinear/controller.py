@@ -336,7 +336,7 @@ class NonlinearMPC:
             alike, rotors = self._inputs is law._inputs, None
             if self._targets is law._targets:
                 its = (np.array(law._law.struct.rotors), np.array(law._law.struct.rotors_before))
-                rotors = its if alike else tuple(self._shares(law._speeds(shares)) for shares in its)
+                rotors = its if alike else (self._shares(law._speeds(its[0])), self._shares(law._speeds(its[1])))
             self._called_at = law._called_at
             self._law.adopt(law._law, rotors)
             alike = alike and self._model.n == law._model.n and self._model.step == law._model.step
