@@ -545,13 +545,14 @@ static void answer(quadsim_geometric *law, int flying, const real *measured, con
 {
     const numbers_of_law *n = law->numbers;
     const quadsim_guard *guard = &law->guard;
-    const int *unseen = guard->unseen, learns = guard->learns;
+    const int *unseen = guard->unseen;
     const int turned = unseen[ROLL] == 0 && unseen[PITCH] == 0 && unseen[YAW] == 0;
     const int turning = unseen[ROLL + 1] == 0 && unseen[PITCH + 1] == 0 && unseen[YAW + 1] == 0;
     const real *attitude = n->exact && turned && is_finite(measured + 12, 4) ? measured + 12 : NULL;
     const real *rates = n->exact && turning && is_finite(measured + 16, 3) ? measured + 16 : NULL;
     motion_now motion;
     target_now target;
+    const int moved = unseen[VX] == 0 && unseen[VY] == 0 && unseen[VZ] == 0;
     int i;
     quadsim_geometric_measure(guard->state, attitude, rates, &motion);
     if (n->motion) {
@@ -559,8 +560,9 @@ static void answer(quadsim_geometric *law, int flying, const real *measured, con
     } else {
         quadsim_geometric_preview(n, reference, &target);
     }
-    quadsim_geometric_solve(law, flying, law->learns && learns && guard->asked == 1, &motion, &target, guard->in_force);
-    law->learns = learns;
+    quadsim_geometric_solve(law, flying, law->learns && guard->learns && guard->asked == 1, &motion, &target,
+                            guard->in_force);
+    law->learns = flying && turned && turning && moved;
     memcpy(law->plan, law->command, NU * sizeof(real));
     for (i = 1; i < n->horizon; i++) {
         memcpy(law->plan + i * NU, n->fallback->hover, NU * sizeof(real));
