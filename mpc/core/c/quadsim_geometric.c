@@ -22,10 +22,25 @@ static real length_of(const real *vector)
 
 /* ---- what is measured, and what is wanted ------------------------------------------------------------------------ */
 
+/* The attitude of Euler angles, body to world. */
+static void put_attitude(const real *state, real attitude[9])
+{
+    real s[3], c[3];
+    sines_of(state, s, c);
+    attitude[0] = c[2] * c[1];
+    attitude[1] = c[2] * s[1] * s[0] - s[2] * c[0];
+    attitude[2] = c[2] * s[1] * c[0] + s[2] * s[0];
+    attitude[3] = s[2] * c[1];
+    attitude[4] = s[2] * s[1] * s[0] + c[2] * c[0];
+    attitude[5] = s[2] * s[1] * c[0] - c[2] * s[0];
+    attitude[6] = -s[1];
+    attitude[7] = c[1] * s[0];
+    attitude[8] = c[1] * c[0];
+}
+
 void quadsim_geometric_measure(const quadsim_real state[12], const quadsim_real *quaternion, const quadsim_real *rates,
                                quadsim_geometric_motion *motion)
 {
-    real s[3], c[3], *attitude = motion->attitude;
     int i;
     for (i = 0; i < 3; i++) {
         motion->position[i] = state[X + 2 * i];
@@ -33,18 +48,9 @@ void quadsim_geometric_measure(const quadsim_real state[12], const quadsim_real 
     }
     motion->yaw = state[YAW];
     if (quaternion != NULL) {
-        attitude_of(quaternion, attitude);
+        attitude_of(quaternion, motion->attitude);
     } else {
-        sines_of(state, s, c);
-        attitude[0] = c[2] * c[1];
-        attitude[1] = c[2] * s[1] * s[0] - s[2] * c[0];
-        attitude[2] = c[2] * s[1] * c[0] + s[2] * s[0];
-        attitude[3] = s[2] * c[1];
-        attitude[4] = s[2] * s[1] * s[0] + c[2] * c[0];
-        attitude[5] = s[2] * s[1] * c[0] - c[2] * s[0];
-        attitude[6] = -s[1];
-        attitude[7] = c[1] * s[0];
-        attitude[8] = c[1] * c[0];
+        put_attitude(state, motion->attitude);
     }
     if (rates != NULL) {
         memcpy(motion->rates, rates, sizeof(motion->rates));
@@ -76,8 +82,9 @@ void quadsim_geometric_preview(const numbers_of_law *n, const quadsim_real *refe
 void quadsim_geometric_course(const numbers_of_law *n, int samples, int width, const quadsim_real *rows,
                               quadsim_geometric_target *target)
 {
+    const int enough = samples > QUADSIM_GEOMETRIC_DEGREE;
     const int count = samples < QUADSIM_GEOMETRIC_SAMPLES ? samples : QUADSIM_GEOMETRIC_SAMPLES;
-    const int orders = count <= QUADSIM_GEOMETRIC_DEGREE ? count : QUADSIM_GEOMETRIC_DEGREE + 1;
+    const int orders = enough ? QUADSIM_GEOMETRIC_DEGREE + 1 : samples;
     const real *from_samples = n->course;
     real attitude[9];
     int order, i, k;
@@ -394,7 +401,7 @@ static void quaternion_of(const real *a, real q[4])
 }
 
 /* The desired attitude as a quaternion, with feed-forward that of half a period later. */
-static void put_attitude(const quadsim_geometric *law, real q[4])
+static void put_quaternion(const quadsim_geometric *law, real q[4])
 {
     const numbers_of_law *n = law->numbers;
     const real quarter = n->feedforward ? R(0.25) * n->period : R(0.0), *Omega = law->desired.rates;
@@ -430,7 +437,7 @@ void quadsim_geometric_targets(quadsim_geometric *law, const motion_now *motion,
         }
     }
     if (n->commands == QUADSIM_GEOMETRIC_ATTITUDE) { /* the autopilot has a gain of its own */
-        put_attitude(law, targets + 4);
+        put_quaternion(law, targets + 4);
     }
 }
 
@@ -483,7 +490,7 @@ static void forget(quadsim_geometric *law, const real *acting)
 
 long quadsim_geometric_reals(const numbers_of_law *n)
 {
-    return 2 * n->horizon * NU;
+    return 2L * n->horizon * NU;
 }
 
 void quadsim_geometric_start(quadsim_geometric *law, const numbers_of_law *n, quadsim_real *memory)

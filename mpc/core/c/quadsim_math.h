@@ -212,10 +212,9 @@ static inline void cross_product(const real *left, const real *right, real *resu
 /* Matrix times vector: of an attitude, from body to world. */
 static inline void turn_by(const real *matrix, const real *vector, real *result)
 {
-    int i;
-    for (i = 0; i < 3; i++) {
-        result[i] = dot(matrix + 3 * i, vector, 3);
-    }
+    result[0] = dot(matrix, vector, 3);
+    result[1] = dot(matrix + 3, vector, 3);
+    result[2] = dot(matrix + 6, vector, 3);
 }
 
 /* The transposed matrix times vector: of an attitude, from world to body. */

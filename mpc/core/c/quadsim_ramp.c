@@ -17,7 +17,7 @@ void quadsim_ramp_reset(quadsim_ramp *ramp, const ramp_numbers *n, const quadsim
 static void mean_wrench(quadsim_ramp *ramp, const ramp_numbers *n, const real *command, real *thrust, real torque[3])
 {
     const real scale = quadsim_ramp_scale(ramp, n), lost = R(1.0) - n->left;
-    real squares[NU], spun = R(0.0);
+    real squares[NU] = {R(0.0)}, spun = R(0.0);
     int i;
     memset(torque, 0, 3 * sizeof(real));
     if (n->targets) {
