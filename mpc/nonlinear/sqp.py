@@ -99,9 +99,9 @@ class SQP:
         tolerance: change of a state or an input at which further steps end.
         faces: half-spaces of positions per node.
         price: l1 and l2 of leaving the largest of a node's half-spaces; None if they are hard.
-        room: active rows that there is room for; None for all that can be needed.
 
     Attributes:
+        most_rows: active rows at most.
         struct: the program's numbers in the core's layout.
         pointed: the arrays that the struct's members point to, by their names; besides these, `terms`.
     """
@@ -119,7 +119,6 @@ class SQP:
         tolerance: float,
         faces: int = 0,
         price: tuple[float, float] | None = None,
-        room: int | None = None,
     ) -> None:
         self._library, self._n, self.horizon = _library(), model.n, problem.horizon
         self.pointed: dict[str, Array] = {}
@@ -130,7 +129,9 @@ class SQP:
         places = N_ROTORS + 2 * (tilt is not None) + 3 * (rates is not None)
         rows = _stated(problem, places, prices)
         self._rows, self._numbers = rows, _numbers(problem)
-        at_most = self.horizon * (N_ROTORS + 3 * (tilt is not None) + 3 * (rates is not None) + len(rows) // 2 + faces)
+        self.most_rows = self.horizon * (
+            N_ROTORS + 3 * (tilt is not None) + 3 * (rates is not None) + len(rows) // 2 + faces
+        )
         p = ProblemStruct(
             horizon=self.horizon,
             difference=difference,
@@ -142,7 +143,7 @@ class SQP:
             rows=len(rows),
             faces=faces,
             slacks=len(prices),
-            room=min(at_most, 6 * self.horizon if room is None else room) + 1,
+            room=min(self.most_rows, 6 * self.horizon) + 1,
             changes=_MOST_CHANGES,
             iterations=iterations,
             corrections=corrections,
@@ -173,6 +174,11 @@ class SQP:
         p.slack = self._array("slack", [row.slack for row in rows], np.intc)
         p.linear, p.quadratic = self._array("linear", linear), self._array("quadratic", quadratic)
         self.struct, self._world = p, World.of(model)
+        self._make_work()
+
+    def resize(self, room: int, changes: int) -> None:
+        """Make room for so many active rows, and allow so many changes of the active set, in memory of its own."""
+        self.struct.room, self.struct.changes = room, changes
         self._make_work()
 
     def _make_work(self) -> None:

@@ -11,7 +11,7 @@ import pytest
 from mpc.codegen.targets import TARGETS
 from quadsim.errors import FlightError, MissingProgramError
 from scenarios.commands.cli import main
-from scenarios.export.in_the_loop import Program, SerialMPC, fly_exported, require_programs
+from scenarios.export.in_the_loop import Frames, Program, SerialMPC, fly_exported, require_programs
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 
@@ -89,7 +89,7 @@ def test_the_command_flies_and_writes_a_run(
 
 def test_a_program_that_ends_ends_the_flight(tmp_path: Path) -> None:
     with Program(TARGETS["posix"], Path("/bin/true")) as line:
-        law = SerialMPC(line, "double", 2)
+        law = SerialMPC(line, Frames("double"))
         with pytest.raises(FlightError, match=r"at t = 0\.500 s: the controller at the serial line gave no answer"):
             law.step(0.5, np.zeros(12), np.zeros((2, 4)), np.zeros(4))
 

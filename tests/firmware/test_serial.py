@@ -165,7 +165,7 @@ def test_a_whole_flight_needs_one_row_a_period(terminal: Terminal, recorded: Rec
     sent: list[bytes] = []
     send = terminal.send
     terminal.send = lambda data: (sent.append(data), send(data))[1]  # type: ignore[method-assign]
-    law = SerialMPC(terminal, "double", N)
+    law = SerialMPC(terminal, Frames("double"))
     law.reset(recorded.speeds)
     for k in range(len(recorded.state)):
         reply = law.step(0.05 * k, recorded.state[k], recorded.path[k : k + N], recorded.acting[k])
