@@ -145,6 +145,7 @@ class GeometricController(FeedbackLaw):
         commands: what it commands.
         gains: of its errors.
         numbers: all that does not change, for C.
+        pointed: the arrays that it points to, by name.
         observer: of disturbances; None for none.
         k_R: (3,) gains of the attitude error about body x, y, z [1/s^2].
         k_Omega: (3,) gains of the rate error [1/s].
@@ -168,10 +169,10 @@ class GeometricController(FeedbackLaw):
         self.k_Omega = gains.k_Omega * np.array([1.0, 1.0, YAW_SHARE])
         self._allocation = make_allocation(vehicle)
         self._library = geometric_library()
-        self._preview, self._course = previews(settings, period)
+        self.pointed = previews(settings, period)
         self.numbers = geometric_numbers(vehicle, period, settings, gains)
         set_arrays(self.numbers, k_R=self.k_R, k_Omega=self.k_Omega)
-        self.numbers.preview, self.numbers.course = self._preview.ctypes.data, self._course.ctypes.data
+        self.numbers.preview, self.numbers.course = (array.ctypes.data for array in self.pointed.values())
         self._law, self._motion, self._target = GeometricStruct(), MotionStruct(), TargetStruct()
         self._at = ctypes.addressof(self._law)
         self._here = ctypes.addressof(self._motion), ctypes.addressof(self._target)
@@ -336,12 +337,13 @@ def _structs(motion: Measured, target: Target) -> tuple[MotionStruct, TargetStru
     return measured, wanted
 
 
-def previews(settings: Geometric, period: float) -> tuple[Array, Array]:
-    """Return the differentiator of a preview, and those of 1, 2, ... `MOTION_SAMPLES` samples of a motion in a row."""
+def previews(settings: Geometric, period: float) -> dict[str, Array]:
+    """Return the differentiators of a `preview`, and of 1, 2, ... `MOTION_SAMPLES` samples of a `course` in a row."""
     degree = PREVIEW_DEGREE if settings.feedforward else 2
     counts = range(1, MOTION_SAMPLES + 1)
     course = [differentiator(count, period, degree=min(MOTION_DEGREE, count - 1), first=0).ravel() for count in counts]
-    return np.ascontiguousarray(differentiator(settings.horizon, period, degree=degree)), np.concatenate(course)
+    preview = differentiator(settings.horizon, period, degree=degree)
+    return {"preview": np.ascontiguousarray(preview), "course": np.concatenate(course)}
 
 
 def geometric_numbers(

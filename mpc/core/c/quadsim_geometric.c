@@ -69,22 +69,42 @@ void quadsim_geometric_preview(const numbers_of_law *n, const quadsim_real *refe
         turns = next_turns(reference, k, turns);
         for (order = 0; order < n->orders; order++) {
             const real share = n->preview[order * n->horizon + k];
-            for (i = 0; i < 3; i++) {
-                target->path[order][i] += share * row[i];
+            for (i = 0; i < 3; i++) { /* from the first sample on, near which floats are fine */
+                target->path[order][i] += share * (row[i] - reference[i]);
             }
             if (order < 3) {
-                target->yaw[order] += share * (row[3] - TURN * turns);
+                target->yaw[order] += share * (row[3] - TURN * turns - reference[3]);
             }
         }
     }
+    for (i = 0; i < 3; i++) {
+        target->path[POSITION][i] += reference[i];
+    }
+    target->yaw[0] += reference[3];
+}
+
+/* Samples of a course that count: what repeats the last one may lie past its end. */
+static int samples_of(int samples, int width, const real *rows)
+{
+    int count = samples < QUADSIM_GEOMETRIC_SAMPLES ? samples : QUADSIM_GEOMETRIC_SAMPLES;
+    for (; count > 1; count--) {
+        const real *last = rows + (count - 1) * width;
+        int i, same = 1;
+        for (i = 0; i < 7; i++) {
+            same &= is_equal(last[i], last[i - width]);
+        }
+        if (!same) {
+            break;
+        }
+    }
+    return count;
 }
 
 void quadsim_geometric_course(const numbers_of_law *n, int samples, int width, const quadsim_real *rows,
                               quadsim_geometric_target *target)
 {
-    const int enough = samples > QUADSIM_GEOMETRIC_DEGREE;
-    const int count = samples < QUADSIM_GEOMETRIC_SAMPLES ? samples : QUADSIM_GEOMETRIC_SAMPLES;
-    const int orders = enough ? QUADSIM_GEOMETRIC_DEGREE + 1 : samples;
+    const int count = samples_of(samples, width, rows);
+    const int orders = count > QUADSIM_GEOMETRIC_DEGREE ? QUADSIM_GEOMETRIC_DEGREE + 1 : count;
     const real *from_samples = n->course;
     real attitude[9];
     int order, i, k;
@@ -99,12 +119,15 @@ void quadsim_geometric_course(const numbers_of_law *n, int samples, int width, c
         for (order = 0; order < orders && order < QUADSIM_GEOMETRIC_ORDERS; order++) {
             const real share = from_samples[order * count + k];
             for (i = 0; i < 3; i++) {
-                target->path[order][i] += share * row[i];
+                target->path[order][i] += share * (row[i] - rows[i]);
                 if (order < 3) {
                     target->heading[3 * order + i] += share * attitude[3 * i];
                 }
             }
         }
+    }
+    for (i = 0; i < 3; i++) {
+        target->path[POSITION][i] += rows[i];
     }
 }
 

@@ -7,7 +7,8 @@
  *                   their rates where it is not finite, or where `exact` is not set
  * reference         previews [N][4]: x y z yaw [m, rad], where to be one period from now, two, ... N periods from now;
  *                   whole turns of yaw make no difference.  Or where `motion` is set samples of a course [7][17], now, one
- *                   period on, ...: position, quaternion, and ten numbers that this law does not need
+ *                   period on, ...: position, quaternion, and ten numbers that this law does not need; past
+ *                   the end of the course its last one
  * acting [4]        the command before, in force up to now
  * command [4]       targets of an autopilot, to hold for the period: thrust [N] and body rates [rad/s]
  *
@@ -117,7 +118,7 @@ void quadsim_geometric_preview(const quadsim_geometric_numbers *numbers, const q
                                quadsim_geometric_target *target);
 
 /* The target of the next samples of a course, from now on: rows of `width` numbers that begin with position and
- * quaternion. */
+ * quaternion; those that repeat the last one do not count. */
 void quadsim_geometric_course(const quadsim_geometric_numbers *numbers, int samples, int width, const quadsim_real *rows,
                               quadsim_geometric_target *target);
 
