@@ -56,6 +56,7 @@ class _Law(ctypes.Structure):
         *struct_members(REAL, f"last:{STATES_ROOM} estimate:6"),
         ("ramp", RampState),
         *struct_members(REAL, f"ahead:{N_BODY + 1}"),
+        ("then", WorldStruct),
     ]
 
 

@@ -20,6 +20,8 @@ CASES = {
     "float": ("cortex-m4f", "float", "paper-constrained", 0.1),
     "robust": ("posix", "double", "robust", 1e-6),
     "unconstrained": ("posix", "double", "paper-unconstrained", 1e-4),
+    "nonlinear": ("posix", "double", "nonlinear", 1e-9),
+    "rates": ("cortex-m7", "float", "autopilot", 0.05),
 }
 """Target, precision, scenario, and how far commands of the two flights may be apart [rad/s]."""
 
@@ -32,7 +34,8 @@ def test_a_flight_by_the_target_is_the_flight_by_python(name: str) -> None:
     if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is not installed: make firmware")
     short = load_scenario(scenario, ["duration=6.0"])
-    exact = short if scenario == "paper-unconstrained" else short.replace({"controller.solver": "core"})
+    linear = scenario in ("paper-constrained", "robust")
+    exact = short.replace({"controller.solver": "core"}) if linear else short
     result, desired = fly_exported(short, target=target, precision=precision, progress=False), Rollout(exact).fly()
     assert result.log.control.status == desired.log.control.status
     assert np.abs(result.command - desired.command).max() <= apart
