@@ -13,7 +13,7 @@ from mpc.baselines.geometric import (
     NO_LAG,
     UNDISTURBED,
     DesiredAttitude,
-    Disturbance,
+    ForeseenDisturbance,
     Geometric,
     Integrals,
     geometric_gains,
@@ -163,7 +163,7 @@ class NumpyGeometric:
         self.k_Omega = gains.k_Omega * np.array([1.0, 1.0, YAW_SHARE])
 
     def wrench(
-        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
+        self, motion: Measured, target: Target, integrals: Integrals, disturbance: ForeseenDisturbance = UNDISTURBED
     ) -> tuple[Array, DesiredAttitude]:
         J, R, Omega = self._vehicle.momentum, motion.attitude, motion.rates
         thrust, desired = self._force(motion, target, integrals, disturbance)
@@ -177,7 +177,7 @@ class NumpyGeometric:
         return np.concatenate([[thrust], moment]), desired
 
     def targets(
-        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
+        self, motion: Measured, target: Target, integrals: Integrals, disturbance: ForeseenDisturbance = UNDISTURBED
     ) -> tuple[Array, DesiredAttitude]:
         R, Omega = motion.attitude, motion.rates
         thrust, desired = self._force(motion, target, integrals, disturbance)
@@ -194,7 +194,7 @@ class NumpyGeometric:
         return np.concatenate([[thrust], rates, q]), desired
 
     def _force(
-        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance
+        self, motion: Measured, target: Target, integrals: Integrals, disturbance: ForeseenDisturbance
     ) -> tuple[float, DesiredAttitude]:
         gains, m, gravity = self.gains, self._vehicle.mass, self._vehicle.gravity
         R, Omega = motion.attitude, motion.rates
@@ -232,7 +232,7 @@ class NumpyGeometric:
         )
 
     def _force_derivatives(
-        self, motion: Measured, target: Target, A: Array, e_v: Array, disturbance: Disturbance
+        self, motion: Measured, target: Target, A: Array, e_v: Array, disturbance: ForeseenDisturbance
     ) -> tuple[Array, Array]:
         m, R, Omega, k_x, k_v = self._vehicle.mass, motion.attitude, motion.rates, self.gains.k_x, self.gains.k_v
         disturbing, change, _ = disturbance

@@ -120,9 +120,9 @@ class Integrals:
     rotation: Array
 
 
-Disturbance: TypeAlias = tuple[Array, Array, Array]
+ForeseenDisturbance: TypeAlias = tuple[Array, Array, Array]
 """The disturbance: acceleration and its rate of change, world, and angular acceleration, body; (3,) each."""
-UNDISTURBED: Final[Disturbance] = (zero(), zero(), zero())
+UNDISTURBED: Final[ForeseenDisturbance] = (zero(), zero(), zero())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,6 +195,11 @@ class GeometricController(FeedbackLaw):
                 self.observer.adopt(previous.observer)
 
     @property
+    def motion_rows(self) -> int:
+        """Samples that it takes of a course's motion; 0 for none."""
+        return MOTION_SAMPLES if self._feedforward else 0
+
+    @property
     def integrals(self) -> Integrals:
         """The integrals now."""
         return _integrals_of(self._law)
@@ -230,7 +235,7 @@ class GeometricController(FeedbackLaw):
         """Take the target of a preview (N, 4), with feed-forward that of a motion if the course has one."""
         numbers = ctypes.addressof(self.numbers)
         if self._feedforward and motion is not None:
-            samples = slice(MOTION_SAMPLES)
+            samples = slice(self.motion_rows)
             rows = np.hstack([motion.position[samples], motion.attitude[samples]])
             self._library.quadsim_geometric_course(numbers, *rows.shape, rows.ctypes.data, self._here[1])
         else:
@@ -258,7 +263,7 @@ class GeometricController(FeedbackLaw):
         )
 
     def wrench(
-        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
+        self, motion: Measured, target: Target, integrals: Integrals, disturbance: ForeseenDisturbance = UNDISTURBED
     ) -> tuple[Array, DesiredAttitude]:
         """Return [f, M_x, M_y, M_z] (4,) [N, N m], and the attitude that the moment turns to.
 
@@ -277,7 +282,7 @@ class GeometricController(FeedbackLaw):
         return self._evaluate(self._library.quadsim_geometric_wrench, 4, motion, target, integrals, disturbance)
 
     def targets(
-        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
+        self, motion: Measured, target: Target, integrals: Integrals, disturbance: ForeseenDisturbance = UNDISTURBED
     ) -> tuple[Array, DesiredAttitude]:
         """Return thrust and body rates (4,) [N, rad/s], for "attitude" (8,) with a quaternion wxyz, and R_c.
 
@@ -304,7 +309,13 @@ class GeometricController(FeedbackLaw):
         return _integrals_of(law)
 
     def _evaluate(
-        self, law_in_c: Any, size: int, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance
+        self,
+        law_in_c: Any,
+        size: int,
+        motion: Measured,
+        target: Target,
+        integrals: Integrals,
+        disturbance: ForeseenDisturbance,
     ) -> tuple[Array, DesiredAttitude]:
         law, structs, result = self._copy(integrals), _structs(motion, target), np.empty(size)
         d = DisturbanceStruct()

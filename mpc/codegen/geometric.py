@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
 
 from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import Geometric, GeometricController
-from mpc.baselines.preview import MOTION_SAMPLES
 from mpc.codegen.ctext import CText
 from mpc.codegen.source import SHARED_FILES, CSource
 from mpc.core.numbers import fallback_numbers
@@ -17,9 +15,6 @@ from mpc.nonlinear.law import WIDTH_OF_MOTION
 from quadsim.errors import ExportError
 from quadsim.state import N_STATES
 from quadsim.vehicle import N_ROTORS, Vehicle
-
-FILES: Final = (*SHARED_FILES, "quadsim_ramp.h", "quadsim_ramp.c", "quadsim_geometric.h", "quadsim_geometric.c")
-"""Files of `mpc/core/c` to export verbatim."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +31,7 @@ class CGeometric(CSource):
     motion: bool = False  # whether the course has a motion, which feed-forward takes
 
     law_name = "quadsim_geometric"
-    law_files = FILES
+    law_files = (*SHARED_FILES, "quadsim_ramp.h", "quadsim_ramp.c", "quadsim_geometric.h", "quadsim_geometric.c")
     state = N_STATES + 7
     tolerances = ("1e-9", "5e-2")  # in floats, positions show a snap of several m/s^4 that is none
     plan = "law->plan"
@@ -73,10 +68,15 @@ class CGeometric(CSource):
         return self.table.commands
 
     @property
+    def motion_rows(self) -> int:
+        """See `CSource`."""
+        return self.law.motion_rows if self.motion else 0
+
+    @property
     def reference(self) -> tuple[int, int, str]:
         """See `CSource`."""
-        if self.motion and self.table.feedforward:
-            return MOTION_SAMPLES, WIDTH_OF_MOTION, "position, quaternion, and ten that do not count"
+        if self.motion_rows:
+            return self.motion_rows, WIDTH_OF_MOTION, "position, quaternion, and ten that do not count"
         return super().reference
 
     @property
@@ -96,5 +96,5 @@ class CGeometric(CSource):
         if law.observer is not None:
             blocks.append(text.struct("quadsim_ramp_numbers", f"{prefix}ramp", **text.mirrored(law.observer.numbers)))
             addresses["ramp"] = f"&{prefix}ramp"
-        members = text.mirrored(law.numbers, addresses, motion=int(self.reference[1] == WIDTH_OF_MOTION))
+        members = text.mirrored(law.numbers, addresses, motion=int(self.motion_rows > 0))
         return [*blocks, text.struct("quadsim_geometric_numbers", "QUADSIM_CONTROLLER", **members)]

@@ -27,7 +27,7 @@ from mpc.codegen.ctext import Precision
 from mpc.codegen.source import CSource
 from mpc.codegen.targets import EMULATOR, TARGETS, Machine
 from mpc.fallback.structs import STATUSES
-from mpc.nonlinear.law import WIDTH_OF_MOTION, measured_state, reference_rows
+from mpc.nonlinear.law import measured_state, reference_rows
 from mpc.pilot import Pilot
 from quadsim.controller import (
     COMMANDED,
@@ -243,8 +243,7 @@ class MPCInTheLoop:
         self.commands, self.ways = source.commands, [0] * len(STATUSES)
         self._serial = SerialMPC(line, Frames(source.precision, source.state, source.reference[1]))
         self._before, self._bounds, self._whole = np.zeros(N_ROTORS), source.bounds, source.state > N_STATES
-        rows, width, _ = source.reference
-        self._rows = rows if width == WIDTH_OF_MOTION else 0
+        self._rows = source.motion_rows
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.baselines.geometric import GeometricController
-from mpc.baselines.preview import MOTION_SAMPLES
 from mpc.bounded import Bounded, Weighted
 from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
@@ -28,7 +27,7 @@ from scenarios.assembly import Assembly
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
-Law = LinearMPC | UnconstrainedMPC | NonlinearMPC | GeometricController
+RecordedLaw = LinearMPC | UnconstrainedMPC | NonlinearMPC | GeometricController
 QUATERNIONS: Final = (NonlinearMPC, GeometricController)
 """Laws that take quaternion and body rates, as exported too."""
 REFUSED: Final = len(Method)  # least status of a period without an optimum
@@ -58,7 +57,7 @@ class _Asked(NamedTuple):
 class Recorder:
     """A law whose questions are noted: from where the flight begins to where it ends, or where a measurement lacks."""
 
-    def __init__(self, inner: Law) -> None:
+    def __init__(self, inner: RecordedLaw) -> None:
         self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
         self.commands = inner.commands if isinstance(inner, QUATERNIONS) else ROTORS
         self.asked: list[_Asked] = []
@@ -94,7 +93,7 @@ def record(scenario: Scenario) -> Recording:
         scenario = scenario.replace({"controller.solver": CORE})
     pilot = Assembly(scenario).controller()
     law = pilot.law
-    assert isinstance(law, Law)
+    assert isinstance(law, RecordedLaw)
     pilot.law = recorder = Recorder(law)
     Rollout(scenario, pilot).fly()
     asked = recorder.asked
@@ -102,7 +101,7 @@ def record(scenario: Scenario) -> Recording:
         raise ExportError("its flight has no period in the air, with everything measured, to record")
     status, commands = _answers(law, scenario.control_period, asked)
     known = len(status)
-    rows = _motion_rows(law)
+    rows = law.motion_rows if isinstance(law, QUATERNIONS) else 0
     windows = [reference_rows(query.now, query.reference, rows) for query in asked[:known]]
     return Recording(
         before=asked[0].acting,
@@ -114,19 +113,12 @@ def record(scenario: Scenario) -> Recording:
     )
 
 
-def _measured(law: Law, query: _Asked) -> Array:
+def _measured(law: RecordedLaw, query: _Asked) -> Array:
     """Return a state as an exported controller takes it."""
     return measured_state(query.now, query.state) if isinstance(law, QUATERNIONS) else query.state
 
 
-def _motion_rows(law: Law) -> int:
-    """Return the samples of a motion that an exported controller takes, if the course has one; 0 for none."""
-    if isinstance(law, GeometricController):
-        return MOTION_SAMPLES if law.numbers.feedforward else 0
-    return law.horizon + 1 if isinstance(law, NonlinearMPC) else 0
-
-
-def _answers(law: Law, period: float, asked: list[_Asked]) -> tuple[NDArray[np.int64], Array]:
+def _answers(law: RecordedLaw, period: float, asked: list[_Asked]) -> tuple[NDArray[np.int64], Array]:
     """Status (K,) and command (K, 4) of a controller for these queries after its reset.
 
     They end before the first period whose optimum is known as a solver's approximation alone.

@@ -10,14 +10,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from exported_c import Host
 from firmware.conftest import Run
+from firmware.test_fuzz import HANGS, HERE, SANITIZERS
 from firmware.test_static import ALLOWED, CPPCHECK, DEFINES, EXPORTS, TIDY, WARNINGS, undefined
 
 import quadsim
 from mpc.codegen.ctext import Precision
-from mpc.codegen.geometric import FILES
+from mpc.codegen.geometric import CGeometric
 from mpc.codegen.targets import TARGETS
+from mpc.fallback.structs import STATUSES
 from quadsim.errors import ExportError, ParameterError
+from quadsim.state import make_state
+from scenarios.assembly import Assembly
 from scenarios.export.exporter import c_controller, export
 from scenarios.export.in_the_loop import fly_exported
 from scenarios.schema.scenario import Scenario
@@ -25,7 +30,7 @@ from scenarios.schema.scenario import Scenario
 FED_FORWARD = {"feedforward": True, "disturbance": {}, "drag": [0.3, 0.2, 0.1], "integral": True}
 """With the autopilot scenario's motion as its reference."""
 LAWS: dict[str, dict[str, Any]] = {"plain": {}, "observing": {"disturbance": {}}, "fed forward": FED_FORWARD}
-SOURCES = tuple(name for name in FILES if name.endswith(".c"))
+SOURCES = tuple(name for name in CGeometric.law_files if name.endswith(".c"))
 OWN = ("quadsim_ramp.c", "quadsim_geometric.c")
 PRECISIONS = pytest.mark.parametrize("precision", ["double", "float"])
 
@@ -115,6 +120,40 @@ def test_sanitizers_find_nothing_in_recorded_periods(exported: Exported, run: Ru
     shutil.copytree(exported("fed forward"), directory)
     flags = "-O1 -g -std=c99 -fsanitize=address,undefined -fno-sanitize-recover=all"
     assert check(directory, run, f"CFLAGS={flags}", "MACHINE_LINK=-fsanitize=address,undefined", "CC=gcc")
+
+
+@PRECISIONS
+def test_arbitrary_bytes_lead_to_commands_within_bounds(
+    precision: Precision, exported: Exported, run: Run, tmp_path: Path
+) -> None:
+    directory, program = exported("fed forward", precision), tmp_path / "fuzz"
+    flags = ["-g", "-O1", "-std=c99", *SANITIZERS, *DEFINES[precision], "-DMOST_CHANGES=0", "-I", directory]
+    built = run("clang", *flags, "-o", program, HERE / "fuzz.c", *(directory / name for name in SOURCES), check=False)
+    if "cannot find" in built.stderr:
+        pytest.skip("clang has no sanitizers: make firmware")
+    assert built.returncode == 0, built.stderr
+    run(program, "-runs=20000", f"-timeout={HANGS}", "-max_len=600", "-len_control=0", "-seed=1", cwd=tmp_path)
+
+
+def test_without_an_answer_the_contract_flies(run: Run) -> None:
+    """A reference that is none, then no measurement: the plan that was kept, hover, the descent, all within bounds."""
+    run("cc", "--version")
+    scenario = scenario_of("plain")
+    host, source = Host(scenario), c_controller(scenario)
+    weight, state = Assembly(scenario).vehicle.mass * 9.81, make_state(position=(0.3, 0.0, 2.0))
+    command, place, levels = np.array([weight, 0.0, 0.0, 0.0]), np.tile([0.0, 0.0, 2.0, 0.0], (source.horizon, 1)), []
+    host.reset(command)
+    for k in range(1400):
+        reference = place if k < 20 else np.full_like(place, np.nan)
+        reply = host.step(state if k < 200 else np.full(12, np.nan), reference, command)
+        command = reply.command
+        levels.append((STATUSES[reply.status], reply.fallback))
+        assert source.bounds is not None
+        assert (command >= source.bounds.u_min).all()
+        assert (command <= source.bounds.u_max).all()
+    ways = list(dict.fromkeys(levels))
+    assert ways[:3] == [("commanded", 0), ("invalid_reference", 1), ("invalid_reference", 2)]
+    assert ways[-1] == ("state_unknown", 3)
 
 
 def test_other_commands_and_room_for_rows_are_refused() -> None:
