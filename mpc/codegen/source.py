@@ -81,6 +81,11 @@ class CSource(abc.ABC):
         return ROTORS
 
     @property
+    def motion_rows(self) -> int:
+        """Samples of a motion that are its reference; 0 of a preview."""
+        return 0
+
+    @property
     def reference(self) -> tuple[int, int, str]:
         """Rows of a reference, numbers of a row, and what they are."""
         return self.horizon, len(REFERENCE_STATES), "x y z yaw"

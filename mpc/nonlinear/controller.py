@@ -189,6 +189,11 @@ class NonlinearMPC:
         self._without_lag.world = self._law.world
         self.reset(self._level)
 
+    @property
+    def motion_rows(self) -> int:
+        """Samples that it takes of a course's motion."""
+        return self.horizon + 1
+
     def _shares(self, speeds: Array) -> Array:
         """Return the inputs for commands (..., 4): rotor speeds [rad/s] or targets [N], [rad/s]."""
         if self._targets:

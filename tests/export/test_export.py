@@ -12,6 +12,7 @@ import scipy.linalg
 
 import quadsim
 from mpc.codegen.ctext import CText
+from mpc.codegen.geometric import CGeometric
 from mpc.codegen.nonlinear import FILES as NONLINEAR_FILES
 from mpc.codegen.source import CORE_FILES, DATA
 from mpc.condensing import Condensed
@@ -71,7 +72,8 @@ def test_any_horizon_is_exported(horizon: int) -> None:
 def test_the_core_is_exported_byte_for_byte(tmp_path: Path) -> None:
     directory = quadsim.export(quadsim.load("hover", SHORT), tmp_path / "c")
     folder = Path(__file__).parents[2] / "mpc" / "core" / "c"
-    assert {path.name for path in folder.iterdir()} - {"sizes.c"} == {*CORE_FILES, *NONLINEAR_FILES}
+    laws = {*CORE_FILES, *NONLINEAR_FILES, *CGeometric.law_files}
+    assert {path.name for path in folder.iterdir()} - {"sizes.c"} == laws
     for name in CORE_FILES:
         assert (directory / name).read_bytes() == (folder / name).read_bytes()
 

@@ -66,8 +66,8 @@ def test_its_observer_does_not_estimate_again_what_it_knows() -> None:
             seen: list[np.ndarray] = []
             law = rollout.loop.controller.law  # type: ignore[attr-defined]
             assert isinstance(law, GeometricController)
-            foreseen = law._observed
-            law._observed = lambda *given, seen=seen, of=foreseen: seen.append((d := of(*given))[2]) or d  # type: ignore[method-assign,misc]
+            assert law.observer is not None
+            law.observer.log = lambda now, seen=seen, of=law.observer.foreseen: seen.append(of(0.01)[2])  # type: ignore[method-assign,misc]
             rollout.fly()
         left.append(float(np.sqrt(np.mean(np.square(seen)))))
     assert left[1] < 0.2 * left[0]

@@ -212,10 +212,9 @@ static inline void cross_product(const real *left, const real *right, real *resu
 /* Matrix times vector: of an attitude, from body to world. */
 static inline void turn_by(const real *matrix, const real *vector, real *result)
 {
-    int i;
-    for (i = 0; i < 3; i++) {
-        result[i] = dot(matrix + 3 * i, vector, 3);
-    }
+    result[0] = dot(matrix, vector, 3);
+    result[1] = dot(matrix + 3, vector, 3);
+    result[2] = dot(matrix + 6, vector, 3);
 }
 
 /* The transposed matrix times vector: of an attitude, from world to body. */
@@ -235,6 +234,31 @@ static inline void thrust_axis_of(const real *attitude, const real *rates, real 
         axis[i] = attitude[3 * i + 2];
         change[i] = attitude[3 * i] * rates[1] - attitude[3 * i + 1] * rates[0];
     }
+}
+
+/* Body to world of a unit quaternion wxyz. */
+static inline void attitude_of(const real *q, real attitude[9])
+{
+    const real w = q[0], x = R(2.0) * q[1], y = R(2.0) * q[2], z = R(2.0) * q[3];
+    attitude[0] = R(1.0) - (y * q[2] + z * q[3]);
+    attitude[1] = x * q[2] - w * z;
+    attitude[2] = x * q[3] + w * y;
+    attitude[3] = x * q[2] + w * z;
+    attitude[4] = R(1.0) - (x * q[1] + z * q[3]);
+    attitude[5] = y * q[3] - w * x;
+    attitude[6] = x * q[3] - w * y;
+    attitude[7] = y * q[3] + w * x;
+    attitude[8] = R(1.0) - (x * q[1] + y * q[2]);
+}
+
+/* The torque of the air on rotors whose speeds add up to `turning`: (m_x W v_y, -m_y W v_x, 0) - D omega; velocity
+ * through the air, and rates, along the body's axes. */
+static inline void air_moment(const real *across, const real *damping, real turning, const real *velocity,
+                              const real *rates, real torque[3])
+{
+    torque[0] = turning * across[0] * velocity[1] - damping[0] * rates[0];
+    torque[1] = -turning * across[1] * velocity[0] - damping[1] * rates[1];
+    torque[2] = -damping[2] * rates[2];
 }
 
 /* ---- states: world axes, Z-Y-X Euler angles and their rates ---------------------------------------------------- */

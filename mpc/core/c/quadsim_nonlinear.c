@@ -128,33 +128,19 @@ static void take_preview(quadsim_nonlinear *law, const real *reference, real yaw
 
 /* ---- what disturbs ------------------------------------------------------------------------------------------------ */
 
-/* R of a unit quaternion, row by row. */
-static void put_rotation(const real *q, real turn[9])
-{
-    const real w = q[0], x = q[1], y = q[2], z = q[3];
-    turn[0] = R(1.0) - R(2.0) * (y * y + z * z);
-    turn[1] = R(2.0) * (x * y - w * z);
-    turn[2] = R(2.0) * (x * z + w * y);
-    turn[3] = R(2.0) * (x * y + w * z);
-    turn[4] = R(1.0) - R(2.0) * (x * x + z * z);
-    turn[5] = R(2.0) * (y * z - w * x);
-    turn[6] = R(2.0) * (x * z - w * y);
-    turn[7] = R(2.0) * (y * z + w * x);
-    turn[8] = R(1.0) - R(2.0) * (x * x + y * y);
-}
-
 /* Add to an acceleration what drag causes at a velocity, world axes. */
 static void add_drag(const quadsim_nmpc_world *world, const real *q, const real *velocity, real sign, real *acceleration)
 {
-    real turn[9], pull[3];
+    real turn[9], air[3], pull[3], drag[3];
     int i;
-    put_rotation(q, turn);
+    attitude_of(q, turn);
+    turn_back_by(turn, velocity, air);
     for (i = 0; i < 3; i++) {
-        const real air = turn[i] * velocity[0] + turn[3 + i] * velocity[1] + turn[6 + i] * velocity[2];
-        pull[i] = -(world->drag[i] * air + world->square_drag[i] * magnitude(air) * air);
+        pull[i] = -(world->drag[i] * air[i] + world->square_drag[i] * magnitude(air[i]) * air[i]);
     }
+    turn_by(turn, pull, drag);
     for (i = 0; i < 3; i++) {
-        acceleration[i] += sign * dot(turn + 3 * i, pull, 3);
+        acceleration[i] += sign * drag[i];
     }
 }
 
@@ -278,7 +264,7 @@ static void follow_force(quadsim_nonlinear *law, int follows, const real *acting
     for (i = 0; i < 4; i++) {
         q[i] = law->measured[Q + i] / length;
     }
-    put_rotation(q, turn);
+    attitude_of(q, turn);
     quadsim_ramp_update(&law->ramp, numbers->ramp, follows, velocity, turn, law->measured + W, acting);
     quadsim_ramp_foreseen(&law->ramp, numbers->ramp, R(0.5) * numbers->control_period, world->acceleration, change,
                           world->angular);
