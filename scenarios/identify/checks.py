@@ -14,7 +14,7 @@ from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.identify.axes import check_axes
 from scenarios.identify.clocks import check_clocks
-from scenarios.identify.columns import RPM
+from scenarios.identify.quantities import RPM
 from scenarios.identify.record import INPUTS, Record, driver
 from scenarios.identify.rotor_order import check_rotor_order
 from scenarios.identify.scales import check_scales
@@ -58,7 +58,10 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     if np.count_nonzero(logged) > 1:
         _check_rows(record, logged)
     shortest = round(SHORTEST_SPAN / record.period)
-    aloft = _runs(logged, shortest) and _runs(logged & ~_grounded(record, logged, vehicle.gravity), shortest)
+    flying = np.ones_like(logged) if record.flying is None else record.flying
+    if not (logged & flying).any() and logged.any():
+        raise InputError(f"{record.name}: never flies: by its autopilot it is disarmed or landed all the time")
+    aloft = _runs(logged, shortest) and _runs(logged & flying & ~_grounded(record, logged, vehicle.gravity), shortest)
     longest = max((part.stop - part.start for part in aloft), default=0) * record.period
     if longest >= LEAST * (1.0 - 1e-6):
         return aloft
@@ -102,8 +105,12 @@ def _check_rows(record: Record, logged: NDArray[np.bool_]) -> None:
         raise InputError(
             f"{name}: the rotors' outputs change {rate:.3g} times per second, and rates are logged "
             f"{1.0 / record.period:.3g} times: log the outputs as often as they are sent, "
-            f"{SLOWEST_COMMANDS:g} times or more"
+            f"{SLOWEST_COMMANDS:g} times or more{_advised(record)}"
         )
+
+
+def _advised(record: Record) -> str:
+    return f" ({record.advice})" if record.advice else ""
 
 
 def check_log(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str, ...]:
@@ -199,7 +206,8 @@ def _poor(record: Record, parts: Sequence[slice]) -> Iterator[str]:
         share, first = 100.0 * (1.0 - logged.mean()), record.t[np.argmin(logged)]
         yield f"{record.name}: {share:.2g} % of its samples, left out, are in gaps, the first at t = {first:.4g} s"
     if record.period > (1.0 + 1e-6) / GOOD_RATE:
-        yield f"{record.name}: {1.0 / record.period:.3g} Hz; below {GOOD_RATE:g} Hz, lag and inertias will be poor"
+        poor = f"{1.0 / record.period:.3g} Hz; below {GOOD_RATE:g} Hz, lag and inertias will be poor"
+        yield f"{record.name}: {poor}{_advised(record)}"
     for field in INPUTS[:2]:
         if (rows := getattr(record, field)) is not None:
             flown = np.concatenate([rows[part] for part in parts])

@@ -2,29 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array
-from scenarios.identify.columns import TABLE_SUFFIXES, read_columns
-from scenarios.identify.series import SampledSeries
-from scenarios.identify.ulog import ULOGS, read_ulog
+from scenarios.identify import ulog
+from scenarios.identify.quantities import LoggedColumns, NamedQuantity, to_series
+from scenarios.identify.series import Column, SampledSeries, held
+from scenarios.identify.tables import read_table
 from scenarios.identify.windows import to_world
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
+SLOWEST_VELOCITY: Final = 0.04  # period [s] of a velocity above which an accelerometer knows it better
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
 _GRAVITY: Final = 9.81  # [m/s^2] of what an accelerometer shows at rest
 _UP: Final = 0.07  # by which the mean force may differ from the weight
 _FORCES: Final = ((1.0 / _GRAVITY, "in g"), (-1.0, "z points down"), (-1.0 / _GRAVITY, "in g, z points down"))
 """Mean force over the weight, and its usual causes."""
 INPUTS: Final = ("commands", "throttle", "speeds")
+
+
+class LogFormat(NamedTuple):
+    """A kind of file that is a log."""
+
+    suffixes: tuple[str, ...]
+    first_bytes: tuple[bytes, ...]  # which also tell it
+    read: Callable[[Path, Sequence[NamedQuantity]], LoggedColumns]
+
+
+FORMATS: Final = (
+    LogFormat((".csv", ".parquet"), (), read_table),
+    LogFormat((".ulg", ".ulog"), (b"ULog",), ulog.read_ulog),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +62,11 @@ class Record:
     throttle: Array | None = None  # (N, 4) the same as a share of full throttle [-]; one of these three is there
     speeds: Array | None = None  # (N, 4) measured rotor speeds [rad/s]
     voltage: Array | None = None  # (N,) of the battery [V]
+    flying: NDArray[np.bool_] | None = None  # (N,) whether its autopilot was armed and not landed
     inertial: bool = False
     """Whether an accelerometer stands in for the velocity, which then has its changes, but neither mean nor drift."""
     notes: tuple[str, ...] = ()  # what was derived or assumed in reading it
+    advice: str = ""  # how its autopilot logs more
 
     @property
     def period(self) -> float:
@@ -60,42 +80,55 @@ def driver(record: Record) -> Array:
     return np.asarray(rows)
 
 
-def read_record(path: Path | str, *, poles: int | None = None) -> Record:
-    """Read a log: a CSV or Parquet table, a run directory of quadsim or its `flight.parquet`, or PX4's ULog.
+def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence[NamedQuantity] = ()) -> Record:
+    """Read a log: a table, a run directory of quadsim or its `flight.parquet`, or an autopilot's log.
 
     Args:
         path: file or run directory.
-        poles: magnets of each motor, for a table of electrical speeds: eRPM / (poles / 2) = rpm.
+        poles: magnets of each motor, for electrical speeds: eRPM / (poles / 2) = rpm.
+        columns: a map of its columns (`scenarios.identify.quantities.read_map`).
 
     Raises:
         FileError: it is missing or damaged, or lacks a column; the message names what is allowed.
-        MissingPackageError: a ULog is to be read without pyulog.
+        MissingPackageError: its format needs a library that is not installed.
         InputError: its clock stands still or goes back, or it has fewer than 10 samples per second.
     """
     given = Path(path)
     file = given / FLIGHT_FILE if given.is_dir() else given
     if not file.is_file():
         raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
-    kind = file.suffix.lower()
-    if kind not in (*TABLE_SUFFIXES, *ULOGS):
-        raise FileError(given, f"is not a log that can be read (these can: {', '.join((*TABLE_SUFFIXES, *ULOGS))})")
-    if kind in ULOGS and poles is not None:
-        raise InputError(f"{given.name}: a ULog has no eRPM that poles could turn into speeds; leave poles out")
-    series = read_ulog(file) if kind in ULOGS else read_columns(file, poles=poles)
-    return to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series)
+    log = _format_of(file).read(file, columns)
+    series = to_series(file, log, columns, poles)
+    return to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series, advice=log.advice)
 
 
-def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
+def stated_rotors(path: Path) -> str:
+    """Return the rotors' layout as a log has it, lines of a vehicle file; empty where it has none."""
+    return ulog.stated_rotors(path) if path.is_file() and _format_of(path).read is ulog.read_ulog else ""
+
+
+def _format_of(file: Path) -> LogFormat:
+    with file.open("rb") as opened:
+        first = opened.read(64)
+    by_bytes = (of for of in FORMATS if first.startswith(of.first_bytes))
+    by_suffix = (of for of in FORMATS if file.suffix.lower() in of.suffixes)
+    if (found := next(by_bytes, None) or next(by_suffix, None)) is None:
+        suffixes = ", ".join(suffix for of in FORMATS for suffix in of.suffixes)
+        raise FileError(file, f"is not a log that can be read (these can: {suffixes})")
+    return found
+
+
+def to_record(name: str, series: Mapping[str, SampledSeries], *, advice: str = "") -> Record:
     """Sample the series of a log, by field of `Record`, on one uniform clock.
 
     Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
-    has no gaps: it changes slowly.
+    has no gaps: it changes slowly; nor has `flying`, which changes rarely.
     """
-    voltage = series.get("voltage")
-    series = {field: samples for field, samples in series.items() if field != "voltage"}
+    voltage, flying = series.get("voltage"), series.get("flying")
+    series = {field: samples for field, samples in series.items() if field not in ("voltage", "flying")}
     for field, samples in series.items():
         _check_clock(name, field, samples.t)
-    force = series.pop("force", None)
+    force = series.pop("specific_force", None)
     optional = ("position", *INPUTS)
     series = {f: s for f, s in series.items() if f not in optional or np.isfinite(s.values).all(axis=1).any()}
     notes: tuple[str, ...] = ()
@@ -114,11 +147,21 @@ def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
     grid = _clock(name, series)
     values = {field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()}
     values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
+    period = float(grid[1] - grid[0])
     if inertial:
-        values["velocity"] = _integrated(name, values["velocity"], values["attitude"], float(grid[1] - grid[0]))
+        values["velocity"] = _integrated(name, values["velocity"], values["attitude"], period)
+    elif force is not None and (slow := _usual_period(series["velocity"].t)) > SLOWEST_VELOCITY:
+        inertial_velocity = _integrated(name, _sampled(force, grid, held=False), values["attitude"], period)
+        off, width = values["velocity"] - inertial_velocity, round(2.0 * slow / period)
+        there = np.asarray(np.isfinite(off).all(axis=1))[:, None]
+        drift = uniform_filter1d(np.where(there, off, 0.0), width, axis=0)
+        drift /= np.maximum(uniform_filter1d(there.astype(float), width, axis=0), 1e-9)
+        values["velocity"] = np.where(there, inertial_velocity + drift, np.nan)
+        notes = (*notes, f"{name}: the velocity is logged at {1.0 / slow:.3g} Hz; the accelerometer fills it in")
     if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
         values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
-    return Record(name=name, t=grid, notes=notes, inertial=inertial, **values)
+    aloft = None if flying is None else held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
+    return Record(name=name, t=grid, flying=aloft, notes=notes, inertial=inertial, advice=advice, **values)
 
 
 def _integrated(name: str, force: Array, attitude: Array, period: float) -> Array:

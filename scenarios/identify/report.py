@@ -33,6 +33,7 @@ from scenarios.identify.prediction import (
     hold_out,
     predict,
 )
+from scenarios.identify.quantities import NamedQuantity
 from scenarios.identify.record import read_record
 from scenarios.identify.vehicle_file import interval_text, rounded, vehicle_text, verdict
 from scenarios.results import Result, Shown, after
@@ -186,6 +187,7 @@ def identify_logs(
     *,
     test: Sequence[Path] = (),
     poles: int | None = None,
+    columns: Sequence[NamedQuantity] = (),
     out: Path | None = None,
     page: Path | None = None,
     overwrite: bool = False,
@@ -196,7 +198,7 @@ def identify_logs(
     places = {name: None if path is None else require_file(path, overwrite=overwrite)
               for name, path in (("file", out), ("page", page))}  # fmt: skip
     vehicle = load_vehicle(start)
-    records, tested = ([read_record(path, poles=poles) for path in paths] for paths in (logs, test))
+    records, tested = ([read_record(path, poles=poles, columns=columns) for path in paths] for paths in (logs, test))
     for one, other in itertools.combinations([*records, *tested], 2):
         if np.array_equal(one.rates, other.rates):
             raise InputError(f"{one.name} and {other.name} are the same flight: name it once")
