@@ -38,10 +38,10 @@ OF_ONE_PLACE = {
     "plotly": "quadsim.report.to_plotly",
     "distributed": "scenarios.many",
     "gymnasium": "scenarios.gym",
-    "pyulog": "scenarios.identify",
+    **dict.fromkeys(("pymavlink", "pyulog"), "scenarios.identify"),
 }
 """What only some outputs need, and where alone it is imported."""
-OF_ROOMS = {"gymnasium": "gym", "pyulog": "identify", "trimesh": "live", "viser": "live"}
+OF_ROOMS = {"gymnasium": "gym", **dict.fromkeys(("pymavlink", "pyulog"), "identify"), "trimesh": "live", "viser": "live"}
 ABSENT = {library for library, room in OF_ROOMS.items() if room not in ROOMS}
 """Libraries that a room alone uses, and those of rooms that have been taken away."""
 IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}

@@ -15,6 +15,7 @@ from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array
 from scenarios.identify import ulog
+from scenarios.identify.dataflash import read_dataflash
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, to_series
 from scenarios.identify.series import Column, SampledSeries, held
 from scenarios.identify.tables import read_table
@@ -42,6 +43,7 @@ class LogFormat(NamedTuple):
 FORMATS: Final = (
     LogFormat((".csv", ".parquet"), (), read_table),
     LogFormat((".ulg", ".ulog"), (b"ULog",), ulog.read_ulog),
+    LogFormat((".bin",), (b"\xa3\x95",), read_dataflash),
 )
 
 

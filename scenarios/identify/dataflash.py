@@ -1,0 +1,92 @@
+"""ArduPilot's dataflash logs (`.bin`), read by pymavlink's DFReader."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.errors import FileError, MissingPackageError
+from quadsim.vehicle import N_ROTORS
+from scenarios.identify.quantities import LoggedColumns, NamedQuantity, named
+from scenarios.identify.series import Column
+
+_NAMES: Final = (
+    named("rates", "IMU.GyrX IMU.GyrY IMU.GyrZ", down=True),
+    named("attitude", "XKQ.Q1 XKQ.Q2 XKQ.Q3 XKQ.Q4", down=True),
+    named("euler", "ATT.Roll ATT.Pitch ATT.Yaw", unit="deg", down=True),
+    named("position", "XKF1.PN XKF1.PE XKF1.PD", down=True),
+    named("velocity", "XKF1.VN XKF1.VE XKF1.VD", down=True),
+    named("specific_force", "IMU.AccX IMU.AccY IMU.AccZ", down=True),
+    named("throttle", "RCOU.C1 RCOU.C2 RCOU.C3 RCOU.C4", unit="us"),
+    named("speeds", "ESC.RPM ESC[1].RPM ESC[2].RPM ESC[3].RPM", unit="rpm"),
+    named("voltage", "BAT.Volt"),
+    NamedQuantity(quantity="flying", columns=("ARM.ArmState",)),
+)
+_ADVICE: Final = "set the bits 0 and 18 of LOG_BITMASK, fast attitude and fast IMU"
+_FIRST_BYTES: Final = b"\xa3\x95"
+_FIRST_MOTOR: Final = 33  # of SERVOn_FUNCTION
+_OUTPUTS: Final = 16
+
+
+def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+    """Read the messages that are used: columns `MESSAGE.Field`, of the second instance on `MESSAGE[1].Field`.
+
+    Raises:
+        MissingPackageError: pymavlink is not installed.
+        FileError: it is not a dataflash log.
+    """
+    used = {column.partition(".")[0].partition("[")[0] for one in (*given, *_NAMES) for column in one.columns}
+    columns: dict[str, Column] = {}
+    with _opened(path) as log:
+        rows: dict[str, list[tuple[float, ...]]] = {}
+        fields: dict[str, list[str]] = {}
+        while (message := log.recv_match(type=[*used, "PARM"])) is not None:
+            if (kind := message.get_type()) in used and "TimeUS" in message.get_fieldnames():
+                of, row = message.fmt.instance_field, message.to_dict()
+                name = f"{kind}[{row[of]}]" if of and row[of] else kind
+                fields.setdefault(name, [key for key, value in row.items() if isinstance(value, int | float)])
+                rows.setdefault(name, []).append(tuple(row[key] for key in fields[name]))
+        parameters = {**log.params}
+    for name, of in fields.items():
+        table = dict(zip(of, np.array(rows[name], float).T, strict=True))
+        t, first = np.unique(table["TimeUS"] * 1e-6, return_index=True)
+        columns |= {f"{name}.{field}": Column(t, values[first]) for field, values in table.items()}
+    turns = [columns[name].t.size if name in columns else 0 for name in ("XKQ.Q1", "ATT.Roll")]
+    if turns[0] < turns[1]:
+        columns = {name: column for name, column in columns.items() if not name.startswith("XKQ")}
+    motors = {parameters.get(f"SERVO{i}_FUNCTION"): i for i in range(1, 1 + _OUTPUTS)}
+    outputs = tuple(f"RCOU.C{motors.get(_FIRST_MOTOR + i, 1 + i)}" for i in range(N_ROTORS))
+    low, high = (float(parameters.get(f"MOT_PWM_{end}") or usual) for end, usual in (("MIN", 1000), ("MAX", 2000)))
+    pulses: dict[str, Any] = {"columns": outputs, "zero": low, "scale": 1.0 / max(high - low, 1.0)}
+    names = [replace(one, **pulses) if one.quantity == "throttle" else one for one in _NAMES]
+    return LoggedColumns(columns=columns, quantities=names, advice=_ADVICE)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """DFReader on a log, which prints what it skips."""
+    with path.open("rb") as file:
+        if file.read(2) != _FIRST_BYTES:
+            raise FileError(path, "is not a dataflash log: it does not begin with a message")
+    try:
+        from pymavlink.DFReader import DFReader_binary
+    except ModuleNotFoundError as error:
+        raise MissingPackageError("a dataflash log", "pymavlink", extra="logs") from error
+
+    class Reader(DFReader_binary):  # type: ignore[misc]  # its own fast index prints past Python
+        init_arrays_fast = DFReader_binary.init_arrays
+
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        try:
+            with Reader(str(path), zero_time_base=True) as log:
+                yield log
+        except FileError:
+            raise
+        except Exception as error:  # it raises whatever its parsing meets
+            raise FileError(path, f"is not a readable dataflash log ({str(error)[:80]})") from error
