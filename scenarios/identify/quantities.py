@@ -167,6 +167,7 @@ def to_series(
     for what, needed in NEEDED.items():
         if not {*needed} & {*known}:
             ways = {one.quantity: ",".join(one.columns) for one in reversed(log.quantities) if one.quantity in needed}
+            ways = ways or {quantity: f"[{quantity}] of the map" for quantity in needed}
             columns = " or ".join(ways[quantity] for quantity in needed if quantity in ways)
             raise FileError(path, f"lacks {what}: columns {columns}; it has {listed(log.columns)}")
     series = {quantity: _series(log.columns, one) for quantity, one in known.items() if quantity != "t"}

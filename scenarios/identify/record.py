@@ -15,6 +15,7 @@ from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array
 from scenarios.identify import ulog
+from scenarios.identify.bags import read_bag
 from scenarios.identify.dataflash import read_dataflash
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, to_series
 from scenarios.identify.series import Column, SampledSeries, held
@@ -43,6 +44,7 @@ class LogFormat(NamedTuple):
 FORMATS: Final = (
     LogFormat((".csv", ".parquet"), (), read_table),
     LogFormat((".ulg", ".ulog"), (b"ULog",), ulog.read_ulog),
+    LogFormat((".bag", ".mcap", ".db3"), (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3"), read_bag),
     LogFormat((".bin",), (b"\xa3\x95",), read_dataflash),
 )
 
@@ -96,10 +98,14 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
         InputError: its clock stands still or goes back, or it has fewer than 10 samples per second.
     """
     given = Path(path)
-    file = given / FLIGHT_FILE if given.is_dir() else given
-    if not file.is_file():
+    bag = (given / "metadata.yaml").is_file()  # of ROS 2, a directory
+    file = given / FLIGHT_FILE if given.is_dir() and not bag else given
+    if not (file.is_file() or bag):
         raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
-    log = _format_of(file).read(file, columns)
+    read = _format_of(file).read
+    if read is not read_table and any(one.quantity == "t" for one in columns):
+        raise InputError(f"{given.name}: has a clock of its own; leave [t] out of the map")
+    log = read(file, columns)
     series = to_series(file, log, columns, poles)
     return to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series, advice=log.advice)
 
@@ -110,6 +116,8 @@ def stated_rotors(path: Path) -> str:
 
 
 def _format_of(file: Path) -> LogFormat:
+    if file.is_dir():
+        return next(of for of in FORMATS if of.read is read_bag)
     with file.open("rb") as opened:
         first = opened.read(64)
     by_bytes = (of for of in FORMATS if first.startswith(of.first_bytes))

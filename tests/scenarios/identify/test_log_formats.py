@@ -11,10 +11,13 @@ import pytest
 from flown_logs import fly_eight, write_log
 
 import quadsim
-from quadsim.errors import FileError
+from quadsim.errors import FileError, InputError
 from quadsim.rotation import quaternion_to_euler
 from quadsim.state import Array
+from quadsim.vehicle import load_vehicle
+from scenarios.commands.cli import main
 from scenarios.identify.checks import check_log, spans
+from scenarios.identify.quantities import NamedQuantity, read_map
 from scenarios.identify.record import Record, read_record
 
 pytestmark = pytest.mark.slow("identification")
@@ -146,3 +149,182 @@ def test_dataflash_of_another_kind_or_torn(tmp_path: Path, eight: Record, capfd:
         FileError, match=r"lacks attitude: columns XKQ\.Q1,.* or ATT\.Roll,.*; it has IMU, IMU.1., XKF1, RCOU"
     ):
         read_record(dataflash(tmp_path / "no.bin", messages, SERVOS))
+
+
+# Columns by a map
+
+
+MAP = """
+[t]
+columns = ["time (us)"]
+unit = "us"
+
+[rates]
+columns = ["gyroADC[0]", "gyroADC[1]", "gyroADC[2]"]
+unit = "deg/s"
+frame = "FRD"
+
+[velocity]
+columns = ["north", "west", "vz"]
+unit = "km/h"
+sign = [1, 1, -1]
+
+[attitude]
+columns = ["q0", "q1", "q2", "q3"]
+frame = "NED/FRD"
+
+[throttle]
+columns = ["motor[0]", "motor[1]", "motor[2]", "motor[3]"]
+unit = "us"
+"""
+
+
+def foreign(path: Path, record: Record) -> Path:
+    """A table with names, units and frames of its own."""
+    table = {"time (us)": 1e6 * record.t}
+    table |= {f"gyroADC[{i}]": column for i, column in enumerate((np.degrees(record.rates) * DOWN).T)}
+    table |= dict(zip(("north", "west", "vz"), (3.6 * record.velocity * [1.0, 1.0, -1.0]).T, strict=True))
+    table |= {f"q{i}": column for i, column in enumerate((record.attitude * np.append(1.0, DOWN)).T)}
+    table |= {f"motor[{i}]": column for i, column in enumerate((1000.0 + 1000.0 * throttle(record)).T)}
+    np.savetxt(path, np.stack([*table.values()], axis=1), delimiter=", ", header=", ".join(table), comments="")
+    return path
+
+
+def mapped(path: Path, text: str) -> tuple[NamedQuantity, ...]:
+    (path / "map.toml").write_text(text, encoding="utf-8")
+    return read_map(path / "map.toml")
+
+
+def test_any_table_by_a_map(tmp_path: Path, eight: Record) -> None:
+    read = read_record(foreign(tmp_path / "foreign.csv", eight), columns=mapped(tmp_path, MAP))
+    check_flight(read, eight, exact=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[rates]", "[gyro]", r"map.toml: has no table 'gyro'; there are t, position, velocity"),
+        ('unit = "deg/s"', 'unit = "dps"', r"rates\.unit must be one of 'rad/s', 'deg/s'; got 'dps'"),
+        ('frame = "FRD"', 'frame = "NED"', r"rates\.frame must be one of 'FLU', 'FRD'; got 'NED'"),
+        ("[1, 1, -1]", "[1, 1]", r"velocity\.sign must be a list of 3 of 1 and -1; got \[1, 1\]"),
+        ('["q0", ', "[", r"attitude\.columns must be a list of 4 names; got \['q1'"),
+        ('unit = "km/h"', 'units = "km/h"', r"velocity has no 'units'; its fields are columns, unit, sign, frame"),
+        ("[t]", "t = 3\n[t.x]", "not valid TOML|must be a table"),
+        ("gyroADC[2]", "gyroADC[3]", r"foreign.csv: lacks what the map's rates\.columns names 'gyroADC\[3\]'; it has"),
+        ('unit = "us"\n\n', "\n", r"[0-9.e-]+ samples per second, period"),
+    ],
+)
+def test_maps_that_cannot_be_used(tmp_path: Path, eight: Record, old: str, new: str, message: str) -> None:
+    assert old in MAP
+    with pytest.raises(InputError, match=message):
+        read_record(foreign(tmp_path / "foreign.csv", eight), columns=mapped(tmp_path, MAP.replace(old, new, 1)))
+
+
+def test_the_command_takes_a_map(tmp_path: Path, eight: Record, capsys: pytest.CaptureFixture[str]) -> None:
+    path = foreign(tmp_path / "foreign.csv", eight)
+    mapped(tmp_path, MAP)
+    words = ["--vehicle", "hummingbird", "--columns", str(tmp_path / "map.toml")]
+    assert main(["identify", str(path), *words, "--out", str(tmp_path / "mine.toml"), "--anyway"]) == 0
+    assert load_vehicle(tmp_path / "mine.toml").inertia[0] == pytest.approx(0.007, rel=0.1)
+    assert main(["identify", str(path), *words[:2], "--columns", str(tmp_path / "none.toml")]) == 2
+    assert "none.toml: cannot be read" in capsys.readouterr().err
+
+
+# Bags
+
+
+BAG_MAP = """
+[rates]
+columns = ["/imu.angular_velocity.x", "/imu.angular_velocity.y", "/imu.angular_velocity.z"]
+
+[velocity]
+columns = ["/odom.twist.twist.linear.x", "/odom.twist.twist.linear.y", "/odom.twist.twist.linear.z"]
+
+[attitude]
+columns = ["/odom.pose.pose.orientation.w", "/odom.pose.pose.orientation.x", "/odom.pose.pose.orientation.y",
+           "/odom.pose.pose.orientation.z"]
+
+[throttle]
+columns = ["/motors.data[0]", "/motors.data[1]", "/motors.data[2]", "/motors.data[3]"]
+"""
+
+
+def write_bag(path: Path, record: Record) -> Path:
+    """A bag of ROS 1, a directory of ROS 2, or its one file: the motors' messages have no header."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    one = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
+    kind = store.types
+    plugin = StoragePlugin.SQLITE3 if path.suffix == ".db3" else StoragePlugin.MCAP
+    whole = path if one else path.with_suffix("")
+    with Writer1(whole) if one else Writer2(whole, version=9, storage_plugin=plugin) as writer:
+        names = ("sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry", "std_msgs/msg/Float32MultiArray")
+        imu, odometry, motors = (
+            writer.add_connection(topic, name, typestore=store)
+            for topic, name in zip(("/imu", "/odom", "/motors"), names, strict=True)
+        )
+        time, vector = kind["builtin_interfaces/msg/Time"], kind["geometry_msgs/msg/Vector3"]
+        point, turn = kind["geometry_msgs/msg/Point"], kind["geometry_msgs/msg/Quaternion"]
+        none = vector(0.0, 0.0, 0.0)
+        for t, rates, velocity, q, u in zip(
+            record.t, record.rates, record.velocity, record.attitude, throttle(record), strict=True
+        ):
+            stamp, arrived = round(1e9 * (t + 50.0)), round(1e9 * (t + 50.0))
+            extra = {"seq": 0} if one else {}
+            header = kind["std_msgs/msg/Header"](stamp=time(stamp // 10**9, stamp % 10**9), frame_id="", **extra)
+            attitude = turn(*q[[1, 2, 3, 0]].tolist())
+            pose = kind["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), attitude)
+            twist = kind["geometry_msgs/msg/Twist"](vector(*velocity.tolist()), none)
+            pose = kind["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36))
+            twist = kind["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36))
+            unknown = np.zeros(9)
+            messages = (
+                (imu, kind[names[0]](header, attitude, unknown, vector(*rates.tolist()), unknown, none, unknown)),
+                (odometry, kind[names[1]](header, "", pose, twist)),
+                (motors, kind[names[2]](kind["std_msgs/msg/MultiArrayLayout"]([], 0), u.astype(np.float32))),
+            )
+            for connection, message in messages:
+                late = arrived + 3_000_000 * (connection is not motors)  # they arrive after they were stamped
+                serialize = store.serialize_ros1 if one else store.serialize_cdr
+                writer.write(connection, late, serialize(message, connection.msgtype))
+    return whole
+
+
+@pytest.mark.parametrize("name", ["ros1.bag", "ros2.mcap", "ros2.db3"])
+def test_bags(tmp_path: Path, eight: Record, name: str) -> None:
+    """By the stamps of the headers, where there are any."""
+    pytest.importorskip("rosbags", reason="the extra logs is not installed")
+    path = write_bag(tmp_path / name, eight)
+    columns = mapped(tmp_path, BAG_MAP)
+    check_flight(read_record(path, columns=columns), eight, exact=1e-6, shift=50.0)
+    if path.is_dir():
+        (alone,) = (file for file in path.iterdir() if file.suffix == Path(name).suffix)
+        assert len(read_record(alone, columns=columns).t) == len(eight.t)
+
+
+def test_bags_that_cannot_be_read(tmp_path: Path, eight: Record) -> None:
+    pytest.importorskip("rosbags", reason="the extra logs is not installed")
+    path = write_bag(tmp_path / "ros1.bag", eight)
+    with pytest.raises(InputError, match=r"ros1\.bag: a bag names no quantities: give --columns"):
+        read_record(path)
+    for old, new, message in (
+        ("velocity.x", "velocities.x", r"'/imu\.angular_velocities\.x': no angular_velocities in header, orientation"),
+        ("data[0]", "data[7]", r"'/motors\.data\[7\]': no 7 in 4 numbers"),
+        ("/imu.angular_velocity.x", "/imu.angular_velocity", r"is not a number but .*Vector3.*: name a field of it"),
+        ("/imu", "/gyro", r"the map's rates\.columns names '/gyro.*; it has /imu, /odom, /motors"),
+        ("[attitude]", "[position]", r"position\.columns must be a list of 3 names"),
+    ):
+        with pytest.raises(FileError, match=message):
+            read_record(path, columns=mapped(tmp_path, BAG_MAP.replace(old, new)))
+    with pytest.raises(InputError, match=r"ros1\.bag: has a clock of its own; leave \[t\] out of the map"):
+        read_record(path, columns=mapped(tmp_path, BAG_MAP + '[t]\ncolumns = ["/imu.header.stamp.sec"]'))
+    cut = BAG_MAP.partition("[throttle]")[0]
+    with pytest.raises(FileError, match=r"lacks rotor commands or speeds: columns \[commands\] of the map or"):
+        read_record(path, columns=mapped(tmp_path, cut))
+    (tmp_path / "torn.mcap").write_bytes(b"\x89MCAP0\r\n nothing")
+    with pytest.raises(FileError, match="is not a readable bag"):
+        read_record(tmp_path / "torn.mcap", columns=mapped(tmp_path, BAG_MAP))
