@@ -29,7 +29,7 @@ RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it may import at its top what is heavy."""
 RECORDING = re.compile(r"quadsim\.report\.recording\.(plots|world)")
 """Imported when a recording is made, and so may import rerun at their top."""
-LOGS = ("pymavlink", "pyulog", "rosbags")
+LOGS = ("orangebox", "pymavlink", "pyulog", "rosbags")
 """Libraries that read logs."""
 OF_ONE_PLACE = {
     "rerun": "quadsim.report.recording",

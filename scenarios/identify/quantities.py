@@ -94,6 +94,7 @@ class LoggedColumns:
     columns: Mapping[str, Column]
     quantities: Sequence[NamedQuantity]  # of a quantity that it names twice, the best first
     advice: str = ""  # how its autopilot logs more
+    notes: tuple[str, ...] = ()  # what was found in reading it
 
 
 def named(quantity: str, columns: str, *, unit: str = "", down: bool = False) -> NamedQuantity:
@@ -169,7 +170,8 @@ def to_series(
             ways = {one.quantity: ",".join(one.columns) for one in reversed(log.quantities) if one.quantity in needed}
             ways = ways or {quantity: f"[{quantity}] of the map" for quantity in needed}
             columns = " or ".join(ways[quantity] for quantity in needed if quantity in ways)
-            raise FileError(path, f"lacks {what}: columns {columns}; it has {listed(log.columns)}")
+            advice = f"; {log.advice}" if log.advice else ""
+            raise FileError(path, f"lacks {what}: columns {columns}; it has {listed(log.columns)}{advice}")
     series = {quantity: _series(log.columns, one) for quantity, one in known.items() if quantity != "t"}
     name = path.name
     if (erpm := series.pop("erpm", None)) is not None:

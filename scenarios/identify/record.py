@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,9 @@ from scipy.ndimage import uniform_filter1d
 from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array
-from scenarios.identify import ulog
+from scenarios.identify import crazyflie, ulog
 from scenarios.identify.bags import read_bag
+from scenarios.identify.blackbox import read_blackbox
 from scenarios.identify.dataflash import read_dataflash
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, to_series
 from scenarios.identify.series import Column, SampledSeries, held
@@ -44,6 +45,8 @@ class LogFormat(NamedTuple):
 FORMATS: Final = (
     LogFormat((".csv", ".parquet"), (), read_table),
     LogFormat((".ulg", ".ulog"), (b"ULog",), ulog.read_ulog),
+    LogFormat((".bbl", ".bfl"), (b"H Product:Blackbox",), read_blackbox),
+    LogFormat((), crazyflie.FIRST_BYTES, crazyflie.read_crazyflie),
     LogFormat((".bag", ".mcap", ".db3"), (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3"), read_bag),
     LogFormat((".bin",), (b"\xa3\x95",), read_dataflash),
 )
@@ -107,7 +110,8 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
         raise InputError(f"{given.name}: has a clock of its own; leave [t] out of the map")
     log = read(file, columns)
     series = to_series(file, log, columns, poles)
-    return to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series, advice=log.advice)
+    record = to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series)
+    return replace(record, advice=log.advice, notes=(*log.notes, *record.notes))
 
 
 def stated_rotors(path: Path) -> str:
@@ -124,11 +128,11 @@ def _format_of(file: Path) -> LogFormat:
     by_suffix = (of for of in FORMATS if file.suffix.lower() in of.suffixes)
     if (found := next(by_bytes, None) or next(by_suffix, None)) is None:
         suffixes = ", ".join(suffix for of in FORMATS for suffix in of.suffixes)
-        raise FileError(file, f"is not a log that can be read (these can: {suffixes})")
+        raise FileError(file, f"is not a log that can be read (these can: {suffixes}, and those of a Crazyflie)")
     return found
 
 
-def to_record(name: str, series: Mapping[str, SampledSeries], *, advice: str = "") -> Record:
+def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
     """Sample the series of a log, by field of `Record`, on one uniform clock.
 
     Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
@@ -155,7 +159,9 @@ def to_record(name: str, series: Mapping[str, SampledSeries], *, advice: str = "
     turn = series["attitude"]
     series = {**series, "attitude": replace(turn, values=_continuous(name, turn.values))}
     grid = _clock(name, series)
-    values = {field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()}
+    values: dict[str, Any] = {
+        field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()
+    }
     values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
     period = float(grid[1] - grid[0])
     if inertial:
@@ -171,7 +177,7 @@ def to_record(name: str, series: Mapping[str, SampledSeries], *, advice: str = "
     if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
         values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
     aloft = None if flying is None else held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
-    return Record(name=name, t=grid, flying=aloft, notes=notes, inertial=inertial, advice=advice, **values)
+    return Record(name=name, t=grid, flying=aloft, notes=notes, inertial=inertial, **values)
 
 
 def _integrated(name: str, force: Array, attitude: Array, period: float) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,13 +13,14 @@ from flown_logs import fly_eight, write_log
 
 import quadsim
 from quadsim.errors import FileError, InputError
-from quadsim.rotation import quaternion_to_euler
+from quadsim.rotation import conjugate, quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import load_vehicle
 from scenarios.commands.cli import main
 from scenarios.identify.checks import check_log, spans
 from scenarios.identify.quantities import NamedQuantity, read_map
 from scenarios.identify.record import Record, read_record
+from scenarios.identify.windows import to_world
 
 pytestmark = pytest.mark.slow("identification")
 
@@ -328,3 +330,155 @@ def test_bags_that_cannot_be_read(tmp_path: Path, eight: Record) -> None:
     (tmp_path / "torn.mcap").write_bytes(b"\x89MCAP0\r\n nothing")
     with pytest.raises(FileError, match="is not a readable bag"):
         read_record(tmp_path / "torn.mcap", columns=mapped(tmp_path, BAG_MAP))
+
+
+# Betaflight
+
+
+def variable(value: int, *, signed: bool) -> bytes:
+    """A number in 7 bits per byte, the lowest first; a signed one in zigzag."""
+    value = (value << 1 ^ value >> 31) & 0xFFFFFFFF if signed else value
+    parts = []
+    while value > 127:
+        parts.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*parts, value])
+
+
+def blackbox(path: Path, columns: dict[str, Array], **headers: object) -> Path:
+    """Write a `.bbl`: every 8th frame whole, the others as changes from the one before, and the end of the log."""
+    n = len(columns)
+    stated: dict[str, object] = {"Data version": 2, "I interval": 8, "P interval": 1}
+    stated["Field I name"] = ",".join(columns)
+    for field, number in (
+        ("I signed", 1),
+        ("I predictor", 0),
+        ("I encoding", 0),
+        ("P predictor", 1),
+        ("P encoding", 0),
+    ):
+        stated[f"Field {field}"] = ",".join([str(number)] * n)
+    product = "H Product:Blackbox flight data recorder by Nicholas Sherlock\n"
+    head = "".join(f"H {name}:{value}\n" for name, value in {**stated, **headers}.items())
+    table = np.rint(np.stack([*columns.values()], axis=1)).astype(int)
+    parts = [f"{product}{head}".encode()]
+    for k, row in enumerate(table):
+        parts.append(b"P" if k % 8 else b"I")
+        parts += [variable(int(v), signed=True) for v in (row - table[k - 1] if k % 8 else row)]
+    path.write_bytes(b"".join([*parts, b"E\xffEnd of log\x00"]))
+    return path
+
+
+def betaflight(record: Record) -> dict[str, Array]:
+    """Gyro in 0.1 deg/s, accelerometer of 2048 per g, the quaternion's vector, DShot, speeds in 100 eRPM."""
+    falling = np.gradient(record.velocity, record.t, axis=0) + np.array([0.0, 0.0, 9.81])
+    force = to_world(conjugate(record.attitude), falling)
+    turn = record.attitude * np.sign(record.attitude[:, :1])
+    speeds = throttle(record) * FULL * 60.0 / (2.0 * np.pi) * 6.0 / 100.0
+    groups = {"gyroADC": 10.0 * np.degrees(record.rates), "accSmooth": force * 2048.0 / 9.80665}
+    groups |= {
+        "imuQuaternion": 32767.0 * turn[:, 1:],
+        "motor": 158.0 + (2047.0 - 158.0) * throttle(record),
+        "eRPM": speeds,
+    }
+    table = {"loopIteration": np.arange(len(record.t)) * 1.0, "time": 1e6 * (record.t + 3.0)}
+    table |= {f"{name}[{i}]": column for name, of in groups.items() for i, column in enumerate(of.T)}
+    return {**table, "vbatLatest": np.full(len(record.t), 1587.0)}
+
+
+HEADERS = {
+    "Firmware revision": "Betaflight 4.6.0",
+    "gyro_scale": "0x3f800000",
+    "acc_1G": 2048,
+    "motorOutput": "158,2047",
+}
+HEADERS |= {"motor_poles": 12, "blackbox_high_resolution": 1}
+
+
+def test_blackbox(tmp_path: Path, eight: Record) -> None:
+    """Units by its header; the longest of the flights in a file; a log that is cut off ends there."""
+    pytest.importorskip("orangebox", reason="the extra logs is not installed")
+    path = blackbox(tmp_path / "LOG00001.BFL", betaflight(eight), **HEADERS)
+    whole = path.read_bytes()
+    short = blackbox(tmp_path / "short.bbl", {name: of[:50] for name, of in betaflight(eight).items()}, **HEADERS)
+    path.write_bytes(short.read_bytes() + whole)
+    read = read_record(path)
+    assert read.inertial
+    assert read.notes[0] == "LOG00001.BFL: the longest of its 2 flights is read"
+    check_flight(read, eight, exact=2e-3, shift=3.0)
+    assert read.voltage == pytest.approx(15.87)
+    assert read.speeds is not None
+    np.testing.assert_allclose(read.speeds, FULL * np.asarray(read.throttle), atol=2.0)
+    path.write_bytes(whole[: len(whole) * 3 // 4])
+    assert 0.6 * len(eight.t) < len(read_record(path).t) < 0.9 * len(eight.t)
+
+
+def test_blackbox_that_cannot_be_used(tmp_path: Path, eight: Record) -> None:
+    pytest.importorskip("orangebox", reason="the extra logs is not installed")
+    (tmp_path / "log.bbl").write_bytes(b"H Product:Blackbox flight data recorder\nnothing")
+    with pytest.raises(FileError, match=r"is not a readable Blackbox log|has no frame"):
+        read_record(tmp_path / "log.bbl")
+    table = {name: of for name, of in betaflight(eight).items() if not name.startswith("imuQ")}
+    with pytest.raises(FileError, match=r"lacks attitude: .*it has loopIteration.*set blackbox_disable_attitude, _acc"):
+        read_record(blackbox(tmp_path / "default.bbl", table, **HEADERS))
+
+
+# Crazyflie
+
+
+def micro_sd(path: Path, events: dict[str, dict[str, Array]], version: int) -> Path:
+    """Write a log of the micro SD card deck: events by name, each with `t` [s] and variables by `name(letter)`."""
+    parts = [b"\xbc" + struct.pack("<HH", version, len(events))]
+    rows = []
+    for number, (event, variables) in enumerate(events.items()):
+        names = [name for name in variables if name != "t"]
+        texts = b"".join(f"{name}\0".encode() for name in names)
+        parts.append(struct.pack("<H", number) + f"{event}\0".encode() + struct.pack("<H", len(names)) + texts)
+        letters = [name[-2] for name in names]
+        for t, *values in zip(*(variables[name] for name in ("t", *names)), strict=True):
+            whole = [v if letter == "f" else round(v) for v, letter in zip(values, letters, strict=True)]
+            stamp = round(1e3 * t) if version == 1 else round(1e6 * t)
+            rows.append((t, struct.pack(f"<H{'I' if version == 1 else 'Q'}{''.join(letters)}", number, stamp, *whole)))
+    data = b"".join(parts + [row for _, row in sorted(rows, key=lambda row: row[0])])
+    path.write_bytes(data + struct.pack("<I", zlib.crc32(data)))
+    return path
+
+
+def crazyflie(record: Record, *, angles: bool) -> dict[str, dict[str, Array]]:
+    """What its estimator has, gyro in deg/s, outputs of 16 bit; the battery in an event of its own."""
+    names = {"stateEstimate.v{}(f)": ("xyz", record.velocity), "gyro.{}(f)": ("xyz", np.degrees(record.rates))}
+    if angles:
+        table = np.degrees(quaternion_to_euler(record.attitude)) * [1.0, -1.0, 1.0]
+        fixed = dict(zip(("roll", "pitch", "yaw"), table.T, strict=True))
+        fixed = {f"stateEstimate.{name}(f)": column for name, column in fixed.items()}
+    else:
+        names |= {"stateEstimate.q{}(f)": ("wxyz", record.attitude)}
+        fixed = {}
+    names |= {"pwm.m{}_pwm(H)" if angles else "motor.m{}(I)": ("1234", 65535.0 * throttle(record))}
+    for pattern, (letters, rows) in names.items():
+        fixed |= {pattern.format(letter): column for letter, column in zip(letters, rows.T, strict=True)}
+    slow = record.t[::20]
+    battery = {"t": slow, "pm.vbatMV(H)": np.full(len(slow), 3912.0)}
+    return {"fixedFrequency": {"t": record.t, **fixed}, "battery": battery}
+
+
+@pytest.mark.parametrize(("version", "angles"), [(1, False), (2, True)])
+def test_crazyflie(tmp_path: Path, eight: Record, version: int, angles: bool) -> None:
+    read = read_record(micro_sd(tmp_path / "log00", crazyflie(eight, angles=angles), version))
+    check_flight(read, eight, exact=2e-5)
+    assert read.voltage == pytest.approx(3.912)
+
+
+def test_crazyflie_that_cannot_be_used(tmp_path: Path, eight: Record) -> None:
+    path = micro_sd(tmp_path / "log00", crazyflie(eight, angles=False), 2)
+    whole = path.read_bytes()
+    for spoilt in (whole[:5] + b"\xff" + whole[6:], whole[:200], whole[:20]):
+        path.write_bytes(spoilt)
+        with pytest.raises(FileError, match="is not a readable log of a Crazyflie"):
+            read_record(path)
+    path.write_bytes(whole[: len(whole) // 2])
+    assert read_record(path).notes == ("log00: its check sum is wrong: it is cut off or damaged",)
+    events = crazyflie(eight, angles=False)
+    del events["fixedFrequency"]["gyro.y(f)"]
+    with pytest.raises(FileError, match=r"lacks body rates: columns gyro\.x,gyro\.y,gyro\.z; .*in config\.txt of the"):
+        read_record(micro_sd(tmp_path / "log01", events, 2))

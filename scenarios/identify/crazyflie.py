@@ -1,0 +1,99 @@
+"""Logs of the Crazyflie's micro SD card deck, a file without a suffix.
+
+The format is documented with the firmware (`usddeck.c`): 0xBC; version and number of event types, 16 bit; of each type
+its number, name, and the count and names of its variables, which end in `(f)`, a letter of `struct`; then events, a
+type, a time (1: 32 bit, in ms; 2: 64 bit, in us) and values; at last a CRC-32 of what is before it.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.errors import FileError
+from quadsim.vehicle import N_ROTORS
+from scenarios.identify.quantities import LoggedColumns, NamedQuantity, named
+from scenarios.identify.series import Column
+
+FIRST_BYTES: Final = (b"\xbc\x01\x00", b"\xbc\x02\x00")
+_STAMPS: Final = {1: (struct.Struct("<HI"), 1e-3), 2: (struct.Struct("<HQ"), 1e-6)}
+_STATE: Final = "stateEstimate."
+
+
+def _each(pattern: str, names: str) -> str:
+    return " ".join(pattern.format(name) for name in names.split())
+
+
+_ROTORS: Final = " ".join(str(1 + i) for i in range(N_ROTORS))
+_NAMES: Final = (
+    named("position", _each(f"{_STATE}{{}}", "x y z")),
+    named("velocity", _each(f"{_STATE}{{}}", "vx vy vz")),
+    named("specific_force", _each("acc.{}", "x y z"), unit="g"),
+    named("attitude", _each(f"{_STATE}{{}}", "qw qx qy qz")),
+    NamedQuantity(  # its pitch is positive where the nose is up
+        quantity="euler", columns=tuple(_each(f"{_STATE}{{}}", "roll pitch yaw").split()), scale=np.pi / 180.0,
+        sign=(1.0, -1.0, 1.0),
+    ),
+    named("rates", _each("gyro.{}", "x y z"), unit="deg/s"),
+    *(named("throttle", _each(f"{way}", _ROTORS), unit="16 bit") for way in ("pwm.m{}_pwm", "motor.m{}")),
+    named("speeds", _each("rpm.m{}", _ROTORS), unit="rpm"),
+    named("voltage", "pm.vbatMV", unit="mV"),
+    named("voltage", "pm.vbat"),
+)  # fmt: skip
+_ADVICE: Final = "in config.txt of the card, log stateEstimate.qw .. qz, vx .. vz, gyro, pwm and rpm at 100 Hz or more"
+
+
+def read_crazyflie(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+    """Read every variable of the log, by its name, each on the clock of its event type.
+
+    Raises:
+        FileError: it is not such a log.
+    """
+    data = path.read_bytes()
+    try:
+        columns = _columns(data[:-4])
+    except (KeyError, ValueError, struct.error) as error:
+        raise FileError(path, f"is not a readable log of a Crazyflie ({type(error).__name__}: {error})") from error
+    whole = zlib.crc32(data[:-4]) == int.from_bytes(data[-4:], "little")
+    notes = () if whole else (f"{path.name}: its check sum is wrong: it is cut off or damaged",)
+    return LoggedColumns(columns=columns, quantities=_NAMES, advice=_ADVICE, notes=notes)
+
+
+def _columns(data: bytes) -> dict[str, Column]:
+    version, count = struct.unpack_from("<HH", data, 1)
+    head, unit = _STAMPS[version]
+    at = 5
+
+    def name() -> str:
+        nonlocal at
+        end = data.index(0, at)
+        text, at = data[at:end].decode("ascii"), end + 1
+        return text
+
+    events: dict[int, tuple[list[str], struct.Struct, list[Any]]] = {}
+    for _ in range(count):
+        (number,), at = struct.unpack_from("<H", data, at), at + 2
+        name()  # of the event
+        (size,), at = struct.unpack_from("<H", data, at), at + 2
+        variables = [name() for _ in range(size)]
+        values = struct.Struct("<" + "".join(variable[-2] for variable in variables))
+        events[number] = ([variable[:-3] for variable in variables], values, [])
+    while at + head.size <= len(data):
+        number, stamp = head.unpack_from(data, at)
+        _, values, rows = events[number]
+        if at + head.size + values.size > len(data):  # it is cut off
+            break
+        rows.append((stamp * unit, *values.unpack_from(data, at + head.size)))
+        at += head.size + values.size
+    columns: dict[str, Column] = {}
+    for variables, _, rows in events.values():
+        if rows:
+            table = np.array(rows, float)
+            t, first = np.unique(table[:, 0], return_index=True)
+            columns |= {name: Column(t, of[first]) for name, of in zip(variables, table.T[1:], strict=True)}
+    return columns
