@@ -57,8 +57,8 @@ def identify(
     """
     from quadsim.assets import vehicle_path
     from scenarios.identify.quantities import read_map
-    from scenarios.identify.record import stated_rotors
     from scenarios.identify.report import NEEDED_PARAMETERS, identify_logs
+    from scenarios.identify.ulog import stated_rotors
 
     if not logs:
         raise InputError("identify needs a flight log: CSV, Parquet, an autopilot's, or a run directory")

@@ -17,7 +17,7 @@ import numpy as np
 
 from quadsim.errors import FileError
 from quadsim.vehicle import N_ROTORS
-from scenarios.identify.quantities import LoggedColumns, NamedQuantity, named
+from scenarios.identify.quantities import LoggedColumns, NamedQuantity, logged_as
 from scenarios.identify.series import Column
 
 FIRST_BYTES: Final = (b"\xbc\x01\x00", b"\xbc\x02\x00")
@@ -31,19 +31,19 @@ def _each(pattern: str, names: str) -> str:
 
 _ROTORS: Final = " ".join(str(1 + i) for i in range(N_ROTORS))
 _NAMES: Final = (
-    named("position", _each(f"{_STATE}{{}}", "x y z")),
-    named("velocity", _each(f"{_STATE}{{}}", "vx vy vz")),
-    named("specific_force", _each("acc.{}", "x y z"), unit="g"),
-    named("attitude", _each(f"{_STATE}{{}}", "qw qx qy qz")),
+    logged_as("position", _each(f"{_STATE}{{}}", "x y z")),
+    logged_as("velocity", _each(f"{_STATE}{{}}", "vx vy vz")),
+    logged_as("specific_force", _each("acc.{}", "x y z"), unit="g"),
+    logged_as("attitude", _each(f"{_STATE}{{}}", "qw qx qy qz")),
     NamedQuantity(  # its pitch is positive where the nose is up
         quantity="euler", columns=tuple(_each(f"{_STATE}{{}}", "roll pitch yaw").split()), scale=np.pi / 180.0,
         sign=(1.0, -1.0, 1.0),
     ),
-    named("rates", _each("gyro.{}", "x y z"), unit="deg/s"),
-    *(named("throttle", _each(f"{way}", _ROTORS), unit="16 bit") for way in ("pwm.m{}_pwm", "motor.m{}")),
-    named("speeds", _each("rpm.m{}", _ROTORS), unit="rpm"),
-    named("voltage", "pm.vbatMV", unit="mV"),
-    named("voltage", "pm.vbat"),
+    logged_as("rates", _each("gyro.{}", "x y z"), unit="deg/s"),
+    *(logged_as("throttle", _each(f"{way}", _ROTORS), unit="16 bit") for way in ("pwm.m{}_pwm", "motor.m{}")),
+    logged_as("speeds", _each("rpm.m{}", _ROTORS), unit="rpm"),
+    logged_as("voltage", "pm.vbatMV", unit="mV"),
+    logged_as("voltage", "pm.vbat"),
 )  # fmt: skip
 _ADVICE: Final = "in config.txt of the card, log stateEstimate.qw .. qz, vx .. vz, gyro, pwm and rpm at 100 Hz or more"
 

@@ -13,19 +13,19 @@ import numpy as np
 
 from quadsim.errors import FileError, MissingPackageError
 from quadsim.vehicle import N_ROTORS
-from scenarios.identify.quantities import LoggedColumns, NamedQuantity, named
+from scenarios.identify.quantities import LoggedColumns, NamedQuantity, logged_as
 from scenarios.identify.series import Column
 
 _NAMES: Final = (
-    named("rates", "IMU.GyrX IMU.GyrY IMU.GyrZ", down=True),
-    named("attitude", "XKQ.Q1 XKQ.Q2 XKQ.Q3 XKQ.Q4", down=True),
-    named("euler", "ATT.Roll ATT.Pitch ATT.Yaw", unit="deg", down=True),
-    named("position", "XKF1.PN XKF1.PE XKF1.PD", down=True),
-    named("velocity", "XKF1.VN XKF1.VE XKF1.VD", down=True),
-    named("specific_force", "IMU.AccX IMU.AccY IMU.AccZ", down=True),
-    named("throttle", "RCOU.C1 RCOU.C2 RCOU.C3 RCOU.C4", unit="us"),
-    named("speeds", "ESC.RPM ESC[1].RPM ESC[2].RPM ESC[3].RPM", unit="rpm"),
-    named("voltage", "BAT.Volt"),
+    logged_as("rates", "IMU.GyrX IMU.GyrY IMU.GyrZ", down=True),
+    logged_as("attitude", "XKQ.Q1 XKQ.Q2 XKQ.Q3 XKQ.Q4", down=True),
+    logged_as("euler", "ATT.Roll ATT.Pitch ATT.Yaw", unit="deg", down=True),
+    logged_as("position", "XKF1.PN XKF1.PE XKF1.PD", down=True),
+    logged_as("velocity", "XKF1.VN XKF1.VE XKF1.VD", down=True),
+    logged_as("specific_force", "IMU.AccX IMU.AccY IMU.AccZ", down=True),
+    logged_as("throttle", "RCOU.C1 RCOU.C2 RCOU.C3 RCOU.C4", unit="us"),
+    logged_as("speeds", "ESC.RPM ESC[1].RPM ESC[2].RPM ESC[3].RPM", unit="rpm"),
+    logged_as("voltage", "BAT.Volt"),
     NamedQuantity(quantity="flying", columns=("ARM.ArmState",)),
 )
 _ADVICE: Final = "set the bits 0 and 18 of LOG_BITMASK, fast attitude and fast IMU"

@@ -42,7 +42,7 @@ class Quantity(NamedTuple):
     frames: tuple[str, str] | None = None  # with z up, which is ours, and with z down
 
 
-QUANTITIES: Final = {
+LOGGED: Final = {
     "t": Quantity(1, {"s": (0.0, 1.0), "ms": (0.0, 1e-3), "us": (0.0, 1e-6), "ns": (0.0, 1e-9)}),
     "position": Quantity(3, _LENGTHS, _WORLDS),
     "velocity": Quantity(3, {f"{unit}/s": of for unit, of in _LENGTHS.items()} | {"km/h": (0.0, 1 / 3.6)}, _WORLDS),
@@ -59,7 +59,7 @@ QUANTITIES: Final = {
     "voltage": Quantity(1, {"V": (0.0, 1.0), "mV": (0.0, 1e-3), "cV": (0.0, 0.01)}),
 }  # fmt: skip
 """Every quantity, its usual unit first."""
-NEEDED: Final = {
+_NEEDED: Final = {
     "velocity": ("velocity", "position", "specific_force"),
     "attitude": ("attitude", "euler"),
     "body rates": ("rates",),
@@ -97,9 +97,9 @@ class LoggedColumns:
     notes: tuple[str, ...] = ()  # what was found in reading it
 
 
-def named(quantity: str, columns: str, *, unit: str = "", down: bool = False) -> NamedQuantity:
+def logged_as(quantity: str, columns: str, *, unit: str = "", down: bool = False) -> NamedQuantity:
     """A quantity by the names of its columns, in one of its units."""
-    units = QUANTITIES[quantity].units
+    units = LOGGED[quantity].units
     zero, scale = units[unit or next(iter(units))]
     return NamedQuantity(quantity=quantity, columns=tuple(columns.split()), zero=zero, scale=scale, down=down)
 
@@ -114,9 +114,9 @@ def read_map(path: Path) -> tuple[NamedQuantity, ...]:
 
 
 def _named_in(path: Path, quantity: str, table: Any) -> NamedQuantity:
-    if quantity not in QUANTITIES:
-        raise FileError(path, f"has no table {quantity!r}; there are {', '.join(QUANTITIES)}")
-    size, units, frames = QUANTITIES[quantity]
+    if quantity not in LOGGED:
+        raise FileError(path, f"has no table {quantity!r}; there are {', '.join(LOGGED)}")
+    size, units, frames = LOGGED[quantity]
     usual: dict[str, Any] = {"columns": [], "unit": next(iter(units)), "sign": [1] * size}
     usual |= {"frame": frames[0]} if frames else {}
     if not isinstance(table, dict) or (odd := {*table} - {*usual}):
@@ -165,7 +165,7 @@ def to_series(
     for one in (*given, *log.quantities):
         if {*one.columns} <= {*log.columns}:
             known.setdefault(one.quantity, one)
-    for what, needed in NEEDED.items():
+    for what, needed in _NEEDED.items():
         if not {*needed} & {*known}:
             ways = {one.quantity: ",".join(one.columns) for one in reversed(log.quantities) if one.quantity in needed}
             ways = ways or {quantity: f"[{quantity}] of the map" for quantity in needed}

@@ -20,7 +20,7 @@ from scenarios.identify.blackbox import read_blackbox
 from scenarios.identify.dataflash import read_dataflash
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, to_series
 from scenarios.identify.series import Column, SampledSeries, held
-from scenarios.identify.tables import read_table
+from scenarios.identify.tables import read_columns
 from scenarios.identify.windows import to_world
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
@@ -43,8 +43,8 @@ class LogFormat(NamedTuple):
 
 
 FORMATS: Final = (
-    LogFormat((".csv", ".parquet"), (), read_table),
-    LogFormat((".ulg", ".ulog"), (b"ULog",), ulog.read_ulog),
+    LogFormat((".csv", ".parquet"), (), read_columns),
+    LogFormat(ulog.ULOGS, (b"ULog",), ulog.read_ulog),
     LogFormat((".bbl", ".bfl"), (b"H Product:Blackbox",), read_blackbox),
     LogFormat((), crazyflie.FIRST_BYTES, crazyflie.read_crazyflie),
     LogFormat((".bag", ".mcap", ".db3"), (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3"), read_bag),
@@ -106,17 +106,12 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
     if not (file.is_file() or bag):
         raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
     read = _format_of(file).read
-    if read is not read_table and any(one.quantity == "t" for one in columns):
+    if read is not read_columns and any(one.quantity == "t" for one in columns):
         raise InputError(f"{given.name}: has a clock of its own; leave [t] out of the map")
     log = read(file, columns)
     series = to_series(file, log, columns, poles)
     record = to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series)
     return replace(record, advice=log.advice, notes=(*log.notes, *record.notes))
-
-
-def stated_rotors(path: Path) -> str:
-    """Return the rotors' layout as a log has it, lines of a vehicle file; empty where it has none."""
-    return ulog.stated_rotors(path) if path.is_file() and _format_of(path).read is ulog.read_ulog else ""
 
 
 def _format_of(file: Path) -> LogFormat:

@@ -14,35 +14,35 @@ from quadsim.errors import FileError
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, read_parquet
 from quadsim.rotation import euler_to_body_rates
 from quadsim.state import Array
-from scenarios.identify.quantities import LoggedColumns, NamedQuantity, listed, named
+from scenarios.identify.quantities import LoggedColumns, NamedQuantity, listed, logged_as
 from scenarios.identify.series import Column
 
 _NAMES: Final = (
-    *(named("position", way) for way in ("x y z", "px py pz", "pos_x pos_y pos_z")),
-    *(named("velocity", way) for way in ("vx vy vz", "vel_x vel_y vel_z")),
-    *(named("specific_force", way) for way in ("ax ay az", "acc_x acc_y acc_z", "accel_x accel_y accel_z")),
-    *(named("attitude", way) for way in ("qw qx qy qz", "q_w q_x q_y q_z")),
-    named("euler", "roll pitch yaw"),
-    *(named("rates", f"{way}") for way in ("wx wy wz", "p q r", "gyro_x gyro_y gyro_z")),
-    named("rates", "body_rate_x body_rate_y body_rate_z"),
-    named("commands", "u1 u2 u3 u4"),
-    named("throttle", "throttle1 throttle2 throttle3 throttle4"),
-    named("speeds", "w1 w2 w3 w4"),
-    *(named("speeds", way, unit="rpm") for way in ("rpm1 rpm2 rpm3 rpm4", "m1_rpm m2_rpm m3_rpm m4_rpm")),
-    *(named("erpm", way) for way in ("erpm1 erpm2 erpm3 erpm4", "m1_erpm m2_erpm m3_erpm m4_erpm")),
-    *(named("voltage", way) for way in ("voltage", "vbat")),
+    *(logged_as("position", way) for way in ("x y z", "px py pz", "pos_x pos_y pos_z")),
+    *(logged_as("velocity", way) for way in ("vx vy vz", "vel_x vel_y vel_z")),
+    *(logged_as("specific_force", way) for way in ("ax ay az", "acc_x acc_y acc_z", "accel_x accel_y accel_z")),
+    *(logged_as("attitude", way) for way in ("qw qx qy qz", "q_w q_x q_y q_z")),
+    logged_as("euler", "roll pitch yaw"),
+    *(logged_as("rates", f"{way}") for way in ("wx wy wz", "p q r", "gyro_x gyro_y gyro_z")),
+    logged_as("rates", "body_rate_x body_rate_y body_rate_z"),
+    logged_as("commands", "u1 u2 u3 u4"),
+    logged_as("throttle", "throttle1 throttle2 throttle3 throttle4"),
+    logged_as("speeds", "w1 w2 w3 w4"),
+    *(logged_as("speeds", way, unit="rpm") for way in ("rpm1 rpm2 rpm3 rpm4", "m1_rpm m2_rpm m3_rpm m4_rpm")),
+    *(logged_as("erpm", way) for way in ("erpm1 erpm2 erpm3 erpm4", "m1_erpm m2_erpm m3_erpm m4_erpm")),
+    *(logged_as("voltage", way) for way in ("voltage", "vbat")),
 )
 _TIMES: Final = (
-    *(named("t", name) for name in ("t", "t_s", "time_s")),
-    *(named("t", name, unit="ms") for name in ("t_ms", "time_ms", "timestamp_ms")),
-    *(named("t", name, unit="us") for name in ("t_us", "time_us", "timestamp_us")),
+    *(logged_as("t", name) for name in ("t", "t_s", "time_s")),
+    *(logged_as("t", name, unit="ms") for name in ("t_ms", "time_ms", "timestamp_ms")),
+    *(logged_as("t", name, unit="us") for name in ("t_us", "time_us", "timestamp_us")),
 )
 _TIMES_OF_ANY_UNIT: Final = ("time", "timestamp")
 """Columns of time in s, ms or us: their step tells which, as a log has 10 to 1000 samples per second."""
 _KNOWN: Final = {*_TIMES_OF_ANY_UNIT, *(column for one in (*_NAMES, *_TIMES) for column in one.columns)}
 
 
-def read_table(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+def read_columns(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read a table's columns: those that a map names, and those with a name that is in use.
 
     A name is what stands before its unit in brackets, in any case; a map may also name a column in full.

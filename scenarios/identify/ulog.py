@@ -12,9 +12,10 @@ import numpy as np
 from quadsim.errors import FileError, MissingPackageError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, named
+from scenarios.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, logged_as
 from scenarios.identify.series import Column, held
 
+ULOGS: Final = (".ulg", ".ulog")
 _ROTORS: Final = range(N_ROTORS)
 
 
@@ -23,17 +24,17 @@ def _fields(pattern: str, count: int) -> str:
 
 
 _NAMES: Final = (
-    named("rates", _fields("vehicle_angular_velocity.xyz[{}]", 3), down=True),
-    named("rates", _fields("sensor_combined.gyro_rad[{}]", 3), down=True),
-    named("attitude", _fields("vehicle_attitude.q[{}]", 4), down=True),
-    named("position", "vehicle_local_position.x vehicle_local_position.y vehicle_local_position.z", down=True),
-    named("velocity", "vehicle_local_position.vx vehicle_local_position.vy vehicle_local_position.vz", down=True),
-    named("specific_force", _fields("sensor_combined.accelerometer_m_s2[{}]", 3), down=True),
-    named("specific_force", _fields("vehicle_acceleration.xyz[{}]", 3), down=True),
-    named("throttle", _fields("actuator_motors.control[{}]", N_ROTORS)),
-    named("throttle", _fields("actuator_outputs.output[{}]", N_ROTORS), unit="us"),
-    named("speeds", _fields("esc_status.esc[{}].esc_rpm", N_ROTORS), unit="rpm"),
-    named("voltage", "battery_status.voltage_v"),
+    logged_as("rates", _fields("vehicle_angular_velocity.xyz[{}]", 3), down=True),
+    logged_as("rates", _fields("sensor_combined.gyro_rad[{}]", 3), down=True),
+    logged_as("attitude", _fields("vehicle_attitude.q[{}]", 4), down=True),
+    logged_as("position", "vehicle_local_position.x vehicle_local_position.y vehicle_local_position.z", down=True),
+    logged_as("velocity", "vehicle_local_position.vx vehicle_local_position.vy vehicle_local_position.vz", down=True),
+    logged_as("specific_force", _fields("sensor_combined.accelerometer_m_s2[{}]", 3), down=True),
+    logged_as("specific_force", _fields("vehicle_acceleration.xyz[{}]", 3), down=True),
+    logged_as("throttle", _fields("actuator_motors.control[{}]", N_ROTORS)),
+    logged_as("throttle", _fields("actuator_outputs.output[{}]", N_ROTORS), unit="us"),
+    logged_as("speeds", _fields("esc_status.esc[{}].esc_rpm", N_ROTORS), unit="rpm"),
+    logged_as("voltage", "battery_status.voltage_v"),
 )
 _STATES: Final = ("actuator_armed", "vehicle_land_detected")
 _ADVICE: Final = "set SDLOG_PROFILE to 17, the default set and the high rate"
@@ -66,7 +67,7 @@ _FLYING: Final = NamedQuantity(quantity="flying", columns=("flying",))
 
 
 def stated_rotors(path: Path) -> str:
-    """Return the rotors as a ULog's CA_ROTOR parameters have them, lines of a vehicle file; empty without them.
+    """Return the rotors by a ULog's CA_ROTOR parameters, lines of a vehicle file; empty without, and of other logs.
 
     PX4 has them front, right, down, and a positive moment for a rotor that turns counter-clockwise from above.
 
@@ -74,6 +75,8 @@ def stated_rotors(path: Path) -> str:
         MissingPackageError: pyulog is not installed.
         FileError: it is not a ULog.
     """
+    if path.suffix.lower() not in ULOGS or not path.is_file():
+        return ""
     stated = _parsed(path, _STATES).initial_parameters
     if int(stated.get("CA_ROTOR_COUNT", 0)) != N_ROTORS:
         return ""

@@ -291,7 +291,7 @@ def test_the_last_fifth_of_the_airborne_samples_is_held_out(place: Path) -> None
 
 
 REFUSED: list[tuple[str, str]] = [
-    ("", "identify needs a flight log: CSV, Parquet, ULog, or a run directory"),
+    ("", "identify needs a flight log: CSV, Parquet, an autopilot's, or a run directory"),
     ("eight.csv", "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template"),
     ("eight.csv --vehicle none.toml", "none.toml: no such vehicle file"),
     ("none.csv --vehicle start.toml", "none.csv: is missing"),

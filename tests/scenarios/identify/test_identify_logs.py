@@ -223,7 +223,7 @@ def test_columns_of_one_name_are_refused(tmp_path: Path, eight: Record) -> None:
 
 def test_files_that_are_no_logs(tmp_path: Path, eight: Record) -> None:
     (tmp_path / "empty").mkdir()
-    (tmp_path / "log.bin").write_bytes(b"")
+    (tmp_path / "log.txt").write_bytes(b"")
     (tmp_path / "log.csv").write_bytes(b"\x00\xff")
     (tmp_path / "log.ulg").write_bytes(b"no log at all")
     text = write_csv(tmp_path / "text.csv", columns(eight))
@@ -231,7 +231,7 @@ def test_files_that_are_no_logs(tmp_path: Path, eight: Record) -> None:
     for name, problem in {
         "none.csv": "is missing",
         "empty": "has no flight.parquet",
-        "log.bin": r"can be read \(these can: .csv, .parquet, .ulg",
+        "log.txt": r"can be read \(these can: .csv, .parquet, .ulg",
         "log.csv": "lacks a column of time|is not a readable CSV",
         "log.ulg": "is not a readable ULog",
         "text.csv": "column t must be numbers",
