@@ -22,7 +22,12 @@ from quadsim.vehicle import Vehicle, load_vehicle
 from scenarios.identify.checks import check_log, spans
 from scenarios.identify.estimate import Identification, ParameterEstimate
 from scenarios.identify.fit import identify_records
-from scenarios.identify.identification_figures import horizon_figure, interval_figure, trace_figure
+from scenarios.identify.identification_figures import (
+    horizon_figure,
+    interval_figure,
+    residual_figure,
+    trace_figure,
+)
 from scenarios.identify.prediction import (
     HORIZONS,
     JUDGED,
@@ -246,7 +251,7 @@ def _render(result: IdentifiedVehicle) -> str:
     """Return the page as HTML."""
     parameters, errors = result.tables()
     trace = result.prediction.trace
-    figures = (trace_figure(trace), horizon_figure(result.prediction))
+    figures = (trace_figure(trace), residual_figure(result.prediction), horizon_figure(result.prediction))
     return render_page(
         "identification",
         f"Identified: {result.vehicle.name}",
