@@ -15,7 +15,7 @@ from quadsim.vehicle import Vehicle
 from scenarios.identify.axes import check_axes
 from scenarios.identify.clocks import check_clocks
 from scenarios.identify.quantities import RPM
-from scenarios.identify.record import INPUTS, Record, driver
+from scenarios.identify.record import INPUTS, SLOWEST_COMMANDS, Record, driver
 from scenarios.identify.rotor_order import check_rotor_order
 from scenarios.identify.scales import check_scales
 from scenarios.identify.windows import body_z, rate_over_window
@@ -28,7 +28,6 @@ SLOW, CALM = 0.3, 0.5
 CONSTANT: Final = 3e-3  # share of the outputs below which their change in a second is none
 STILL: Final = 1e-3  # share of the largest output below which a rotor's outputs do not change
 MOST_REPEATED: Final = 0.05  # share of rows that may repeat the one before
-SLOWEST_COMMANDS: Final = 20.0  # [Hz] at which the rotors' outputs must be logged
 GOOD_RATE: Final = 50.0  # [Hz] below which lag and inertias are poor
 FACTOR: Final = 1.8  # by which hover speed in the log and by the start may differ
 NOTED_FACTOR: Final = 1.4

@@ -25,6 +25,7 @@ from scenarios.identify.windows import to_world
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
+SLOWEST_COMMANDS: Final = 20.0  # [Hz] at which the rotors' outputs must be logged
 SLOWEST_VELOCITY: Final = 0.04  # period [s] of a velocity above which an accelerometer knows it better
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
 _GRAVITY: Final = 9.81  # [m/s^2] of what an accelerometer shows at rest
@@ -240,11 +241,17 @@ def _usual_period(t: Array) -> float:
 
 
 def _clock(name: str, series: Mapping[str, SampledSeries]) -> Array:
-    """The common clock: of the rates or of the commands, whichever is slower; where all fields have samples."""
+    """The common clock: of the rates or of the commands, whichever is slower; where all fields have samples.
+
+    Commands that are logged too rarely do not count: the checks name them.
+    """
     driver = next((field for field in INPUTS if field in series), None)
     if driver is None:
         raise InputError(f"{name}: its commands, throttle and speeds have no row with a number for each rotor")
-    slower = max((series["rates"].t, series[driver].t), key=_usual_period)
+    clocks = [series["rates"].t, series[driver].t]
+    if driver != "speeds" and _usual_period(clocks[1]) > 1.0 / (0.9 * SLOWEST_COMMANDS):
+        del clocks[1]
+    slower = max(clocks, key=_usual_period)
     period = _usual_period(slower)
     if 1.0 / period < 0.95 * SLOWEST_RATE:
         raise InputError(
