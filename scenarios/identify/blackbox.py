@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,8 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError, MissingPackageError
-from quadsim.vehicle import N_ROTORS
-from scenarios.identify.quantities import RPM, LoggedColumns, NamedQuantity
+from scenarios.identify.quantities import RPM, LoggedColumns, NamedQuantity, logged_as
 from scenarios.identify.series import Column
 
 _ADVICE: Final = (
@@ -35,6 +35,7 @@ def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
         from orangebox import Parser
     except ModuleNotFoundError as error:
         raise MissingPackageError("a Blackbox log", "orangebox", extra="logs") from error
+    logging.getLogger("orangebox").addHandler(logging.NullHandler())  # else it warns of what it guesses
     rows: list[tuple[Any, ...]] = []
     try:
         log = Parser.load(str(path), allow_invalid_header=True)
@@ -64,25 +65,16 @@ def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
 
 def _quantities(headers: Mapping[str, Any]) -> tuple[NamedQuantity, ...]:
     """What the columns are, in the units that the log's header states."""
-
-    def quantity(what: str, pattern: str, count: int, scale: float, zero: float = 0.0) -> NamedQuantity:
-        columns = tuple(pattern.format(i) for i in range(count))
-        return NamedQuantity(quantity=what, columns=columns, scale=scale, zero=zero)
-
     (degrees,) = struct.unpack("<f", struct.pack("<I", int(headers.get("gyro_scale", 0x3F800000))))
     degrees *= 0.1 if headers.get("blackbox_high_resolution") == 1 else 1.0
     low, high = headers.get("motorOutput", (1000, 2000))
     rpm = 100.0 / (0.5 * float(headers.get("motor_poles", _POLES)))
-    turn = NamedQuantity(
-        quantity="attitude",
-        columns=("imuQuaternion.w", *(f"imuQuaternion[{i}]" for i in range(3))),
-        scale=1.0 / _WHOLE,
-    )
+    gravity = _G / float(headers.get("acc_1G", 2048))
     return (
-        quantity("rates", "gyroADC[{}]", 3, np.radians(degrees)),
-        turn,
-        quantity("specific_force", "accSmooth[{}]", 3, _G / float(headers.get("acc_1G", 2048))),
-        quantity("throttle", "motor[{}]", N_ROTORS, 1.0 / (high - low), low),
-        quantity("speeds", "eRPM[{}]", N_ROTORS, rpm * RPM),
-        quantity("voltage", "vbatLatest", 1, 0.01),
+        logged_as("rates", "gyroADC[{}]", scale=np.radians(degrees)),
+        logged_as("attitude", "imuQuaternion{}", each=".w [0] [1] [2]", scale=1.0 / _WHOLE),
+        logged_as("specific_force", "accSmooth[{}]", scale=gravity),
+        logged_as("throttle", "motor[{}]", scale=1.0 / (high - low), zero=low),
+        logged_as("speeds", "eRPM[{}]", scale=rpm * RPM),
+        logged_as("voltage", "vbatLatest", unit="cV"),
     )

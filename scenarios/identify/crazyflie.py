@@ -16,35 +16,24 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError
-from quadsim.vehicle import N_ROTORS
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, logged_as
 from scenarios.identify.series import Column
 
 FIRST_BYTES: Final = (b"\xbc\x01\x00", b"\xbc\x02\x00")
 _STAMPS: Final = {1: (struct.Struct("<HI"), 1e-3), 2: (struct.Struct("<HQ"), 1e-6)}
-_STATE: Final = "stateEstimate."
-
-
-def _each(pattern: str, names: str) -> str:
-    return " ".join(pattern.format(name) for name in names.split())
-
-
-_ROTORS: Final = " ".join(str(1 + i) for i in range(N_ROTORS))
+_ROTORS: Final = "1 2 3 4"
 _NAMES: Final = (
-    logged_as("position", _each(f"{_STATE}{{}}", "x y z")),
-    logged_as("velocity", _each(f"{_STATE}{{}}", "vx vy vz")),
-    logged_as("specific_force", _each("acc.{}", "x y z"), unit="g"),
-    logged_as("attitude", _each(f"{_STATE}{{}}", "qw qx qy qz")),
-    NamedQuantity(  # its pitch is positive where the nose is up
-        quantity="euler", columns=tuple(_each(f"{_STATE}{{}}", "roll pitch yaw").split()), scale=np.pi / 180.0,
-        sign=(1.0, -1.0, 1.0),
-    ),
-    logged_as("rates", _each("gyro.{}", "x y z"), unit="deg/s"),
-    *(logged_as("throttle", _each(f"{way}", _ROTORS), unit="16 bit") for way in ("pwm.m{}_pwm", "motor.m{}")),
-    logged_as("speeds", _each("rpm.m{}", _ROTORS), unit="rpm"),
+    logged_as("position", "stateEstimate.{}", each="x y z"),
+    logged_as("velocity", "stateEstimate.v{}", each="x y z"),
+    logged_as("specific_force", "acc.{}", each="x y z", unit="g"),
+    logged_as("attitude", "stateEstimate.q{}", each="w x y z"),
+    logged_as("euler", "stateEstimate.{}", each="roll pitch yaw", unit="deg", sign=(1.0, -1.0, 1.0)),  # nose up
+    logged_as("rates", "gyro.{}", each="x y z", unit="deg/s"),
+    *(logged_as("throttle", way, each=_ROTORS, unit="16 bit") for way in ("pwm.m{}_pwm", "motor.m{}")),
+    logged_as("speeds", "rpm.m{}", each=_ROTORS, unit="rpm"),
     logged_as("voltage", "pm.vbatMV", unit="mV"),
     logged_as("voltage", "pm.vbat"),
-)  # fmt: skip
+)
 _ADVICE: Final = "in config.txt of the card, log stateEstimate.qw .. qz, vx .. vz, gyro, pwm and rpm at 100 Hz or more"
 
 

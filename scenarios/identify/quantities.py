@@ -61,7 +61,7 @@ LOGGED: Final = {
 """Every quantity, its usual unit first."""
 _NEEDED: Final = {
     "velocity": ("velocity", "position", "specific_force"),
-    "attitude": ("attitude", "euler"),
+    "attitude": ("attitude", "euler", "specific_force"),
     "body rates": ("rates",),
     "rotor commands or speeds": ("commands", "throttle", "speeds", "erpm"),
 }
@@ -97,11 +97,15 @@ class LoggedColumns:
     notes: tuple[str, ...] = ()  # what was found in reading it
 
 
-def logged_as(quantity: str, columns: str, *, unit: str = "", down: bool = False) -> NamedQuantity:
-    """A quantity by the names of its columns, in one of its units."""
-    units = LOGGED[quantity].units
+def logged_as(
+    quantity: str, columns: str, *, each: str = "", unit: str = "", down: bool = False, **numbers: Any
+) -> NamedQuantity:
+    """A quantity by its columns: by their names, or one name with {} for each of some words, else for 0, 1, ..."""
+    size, units, _ = LOGGED[quantity]
+    names = [columns.format(i) for i in each.split() or range(size)] if "{}" in columns else columns.split()
     zero, scale = units[unit or next(iter(units))]
-    return NamedQuantity(quantity=quantity, columns=tuple(columns.split()), zero=zero, scale=scale, down=down)
+    known = {"zero": zero, "scale": scale, **numbers}
+    return NamedQuantity(quantity=quantity, columns=tuple(names), down=down, **known)
 
 
 def read_map(path: Path) -> tuple[NamedQuantity, ...]:

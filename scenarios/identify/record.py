@@ -9,7 +9,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FLIGHT_FILE
@@ -18,20 +17,16 @@ from scenarios.identify import crazyflie, ulog
 from scenarios.identify.bags import read_bag
 from scenarios.identify.blackbox import read_blackbox
 from scenarios.identify.dataflash import read_dataflash
+from scenarios.identify.inertial import filled_in, integrated_velocity, levelled_attitude
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, to_series
 from scenarios.identify.series import Column, SampledSeries, held
 from scenarios.identify.tables import read_columns
-from scenarios.identify.windows import to_world
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
 SLOWEST_COMMANDS: Final = 20.0  # [Hz] at which the rotors' outputs must be logged
 SLOWEST_VELOCITY: Final = 0.04  # period [s] of a velocity above which an accelerometer knows it better
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
-_GRAVITY: Final = 9.81  # [m/s^2] of what an accelerometer shows at rest
-_UP: Final = 0.07  # by which the mean force may differ from the weight
-_FORCES: Final = ((1.0 / _GRAVITY, "in g"), (-1.0, "z points down"), (-1.0 / _GRAVITY, "in g, z points down"))
-"""Mean force over the weight, and its usual causes."""
 INPUTS: Final = ("commands", "throttle", "speeds")
 
 
@@ -152,6 +147,12 @@ def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
         slope = np.gradient(place.values, place.t, axis=0)
         series = {**series, "velocity": SampledSeries(t=place.t, values=slope)}
         notes = (f"{name}: no velocity is logged; it is the central difference of the position",)
+    if "attitude" not in series:
+        assert force is not None
+        gyro = series["rates"]
+        known = np.stack([np.interp(gyro.t, force.t, column) for column in force.values.T], axis=1)
+        series["attitude"] = SampledSeries(t=gyro.t, values=levelled_attitude(gyro.t, gyro.values, known))
+        notes = (*notes, f"{name}: no attitude is logged; it is the gyro's, levelled by the accelerometer")
     turn = series["attitude"]
     series = {**series, "attitude": replace(turn, values=_continuous(name, turn.values))}
     grid = _clock(name, series)
@@ -161,43 +162,15 @@ def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
     values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
     period = float(grid[1] - grid[0])
     if inertial:
-        values["velocity"] = _integrated(name, values["velocity"], values["attitude"], period)
+        values["velocity"] = integrated_velocity(name, values["velocity"], values["attitude"], period)
     elif force is not None and (slow := _usual_period(series["velocity"].t)) > SLOWEST_VELOCITY:
-        inertial_velocity = _integrated(name, _sampled(force, grid, held=False), values["attitude"], period)
-        off, width = values["velocity"] - inertial_velocity, round(2.0 * slow / period)
-        there = np.asarray(np.isfinite(off).all(axis=1))[:, None]
-        drift = uniform_filter1d(np.where(there, off, 0.0), width, axis=0)
-        drift /= np.maximum(uniform_filter1d(there.astype(float), width, axis=0), 1e-9)
-        values["velocity"] = np.where(there, inertial_velocity + drift, np.nan)
+        shown = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
+        values["velocity"] = filled_in(values["velocity"], shown, round(2.0 * slow / period))
         notes = (*notes, f"{name}: the velocity is logged at {1.0 / slow:.3g} Hz; the accelerometer fills it in")
     if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
         values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
     aloft = None if flying is None else held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
     return Record(name=name, t=grid, flying=aloft, notes=notes, inertial=inertial, **values)
-
-
-def _integrated(name: str, force: Array, attitude: Array, period: float) -> Array:
-    """Velocity (N, 3), but for its drift, by specific force (N, 3), body, and attitude (N, 4); NaN in gaps.
-
-    Raises:
-        InputError: the mean force does not carry the weight.
-    """
-    world = to_world(attitude, force)
-    there = np.asarray(np.isfinite(world).all(axis=1))
-    if not there.any():
-        return world
-    up = float(np.mean(world[there, 2])) / _GRAVITY
-    if not 1.0 / (1.0 + _UP) < up < 1.0 + _UP:
-        likely = next((what for of, what in _FORCES if abs(up / of - 1.0) < _UP), "not the specific force in body axes")
-        raise InputError(
-            f"{name}: ax, ay, az carry {up:.3g} times the weight in the mean, 1 within {_UP:.0%} is allowed: likely "
-            f"{likely}; give the specific force in m/s^2, x forward, y left, z up"
-        )
-    rest = np.where(there[:, None], world - [0.0, 0.0, _GRAVITY], 0.0)
-    rest -= rest[there].mean(axis=0)
-    steps = np.zeros_like(rest)
-    steps[1:] = 0.5 * period * (rest[1:] + rest[:-1])
-    return np.where(there[:, None], np.cumsum(steps, axis=0), np.nan)
 
 
 def _check_clock(name: str, field: str, t: Array) -> None:

@@ -17,24 +17,19 @@ from scenarios.identify.series import Column, held
 
 ULOGS: Final = (".ulg", ".ulog")
 _ROTORS: Final = range(N_ROTORS)
-
-
-def _fields(pattern: str, count: int) -> str:
-    return " ".join(pattern.format(i) for i in range(count))
-
-
 _NAMES: Final = (
-    logged_as("rates", _fields("vehicle_angular_velocity.xyz[{}]", 3), down=True),
-    logged_as("rates", _fields("sensor_combined.gyro_rad[{}]", 3), down=True),
-    logged_as("attitude", _fields("vehicle_attitude.q[{}]", 4), down=True),
-    logged_as("position", "vehicle_local_position.x vehicle_local_position.y vehicle_local_position.z", down=True),
-    logged_as("velocity", "vehicle_local_position.vx vehicle_local_position.vy vehicle_local_position.vz", down=True),
-    logged_as("specific_force", _fields("sensor_combined.accelerometer_m_s2[{}]", 3), down=True),
-    logged_as("specific_force", _fields("vehicle_acceleration.xyz[{}]", 3), down=True),
-    logged_as("throttle", _fields("actuator_motors.control[{}]", N_ROTORS)),
-    logged_as("throttle", _fields("actuator_outputs.output[{}]", N_ROTORS), unit="us"),
-    logged_as("speeds", _fields("esc_status.esc[{}].esc_rpm", N_ROTORS), unit="rpm"),
+    logged_as("rates", "vehicle_angular_velocity.xyz[{}]", down=True),
+    logged_as("rates", "sensor_combined.gyro_rad[{}]", down=True),
+    logged_as("attitude", "vehicle_attitude.q[{}]", down=True),
+    logged_as("position", "vehicle_local_position.{}", each="x y z", down=True),
+    logged_as("velocity", "vehicle_local_position.v{}", each="x y z", down=True),
+    logged_as("specific_force", "sensor_combined.accelerometer_m_s2[{}]", down=True),
+    logged_as("specific_force", "vehicle_acceleration.xyz[{}]", down=True),
+    logged_as("throttle", "actuator_motors.control[{}]"),
+    logged_as("throttle", "actuator_outputs.output[{}]", unit="us"),
+    logged_as("speeds", "esc_status.esc[{}].esc_rpm", unit="rpm"),
     logged_as("voltage", "battery_status.voltage_v"),
+    NamedQuantity(quantity="flying", columns=("flying",)),
 )
 _STATES: Final = ("actuator_armed", "vehicle_land_detected")
 _ADVICE: Final = "set SDLOG_PROFILE to 17, the default set and the high rate"
@@ -60,10 +55,7 @@ def read_ulog(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
         columns["flying"] = flying
     pulses = _by_pulses(log.initial_parameters)
     names = [replace(one, **pulses) if one.columns[0] == "actuator_outputs.output[0]" else one for one in _NAMES]
-    return LoggedColumns(columns=columns, quantities=(*names, _FLYING), advice=_ADVICE)
-
-
-_FLYING: Final = NamedQuantity(quantity="flying", columns=("flying",))
+    return LoggedColumns(columns=columns, quantities=names, advice=_ADVICE)
 
 
 def stated_rotors(path: Path) -> str:

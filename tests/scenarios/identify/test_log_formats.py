@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,18 @@ import pytest
 from flown_logs import fly_eight, write_log
 
 import quadsim
+from quadsim.assets import vehicle_path
 from quadsim.errors import FileError, InputError
 from quadsim.rotation import conjugate, quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import load_vehicle
 from scenarios.commands.cli import main
 from scenarios.identify.checks import check_log, spans
+from scenarios.identify.model import stretch
 from scenarios.identify.quantities import NamedQuantity, read_map
 from scenarios.identify.record import Record, read_record
+from scenarios.identify.rotor_response import rotor_response
+from scenarios.identify.rotors import lagging
 from scenarios.identify.windows import to_world
 
 pytestmark = pytest.mark.slow("identification")
@@ -418,9 +422,25 @@ def test_blackbox_that_cannot_be_used(tmp_path: Path, eight: Record) -> None:
     (tmp_path / "log.bbl").write_bytes(b"H Product:Blackbox flight data recorder\nnothing")
     with pytest.raises(FileError, match=r"is not a readable Blackbox log|has no frame"):
         read_record(tmp_path / "log.bbl")
-    table = {name: of for name, of in betaflight(eight).items() if not name.startswith("imuQ")}
-    with pytest.raises(FileError, match=r"lacks attitude: .*it has loopIteration.*set blackbox_disable_attitude, _acc"):
+    table = {name: of for name, of in betaflight(eight).items() if not name.startswith(("imuQ", "acc"))}
+    with pytest.raises(FileError, match=r"lacks velocity: .*it has loopIteration.*set blackbox_disable_attitude, _acc"):
         read_record(blackbox(tmp_path / "default.bbl", table, **HEADERS))
+
+
+def test_a_log_without_attitude_is_levelled_by_its_accelerometer(tmp_path: Path, eight: Record) -> None:
+    """As Betaflight up to 4.5 logs it: its tilt comes within 2 deg, its heading begins at 0."""
+    pytest.importorskip("orangebox", reason="the extra logs is not installed")
+    table = {name: of for name, of in betaflight(eight).items() if not name.startswith("imuQ")}
+    read = read_record(blackbox(tmp_path / "default.bbl", table, **HEADERS))
+    assert read.notes[-1] == "default.bbl: no attitude is logged; it is the gyro's, levelled by the accelerometer"
+    vertical = np.tile([0.0, 0.0, 1.0], (len(eight.t), 1))
+    up, known = (to_world(conjugate(record.attitude), vertical) for record in (read, eight))  # which no heading changes
+    assert np.abs(known[:, :2]).max() > 0.2
+    np.testing.assert_allclose(up, known, atol=np.radians(2.0))
+    commanded = {name: of for name, of in table.items() if not name.startswith("eRPM")}
+    blackbox(tmp_path / "default.bbl", commanded, **HEADERS)
+    identified = quadsim.identify(tmp_path / "default.bbl", vehicle="hummingbird").vehicle
+    np.testing.assert_allclose(identified.inertia, load_vehicle(vehicle_path("hummingbird")).inertia, rtol=0.03)
 
 
 # Crazyflie
@@ -482,3 +502,15 @@ def test_crazyflie_that_cannot_be_used(tmp_path: Path, eight: Record) -> None:
     del events["fixedFrequency"]["gyro.y(f)"]
     with pytest.raises(FileError, match=r"lacks body rates: columns gyro\.x,gyro\.y,gyro\.z; .*in config\.txt of the"):
         read_record(micro_sd(tmp_path / "log01", events, 2))
+
+
+def test_a_voltage_that_stands_still_shows_nothing(eight: Record) -> None:
+    vehicle = quadsim.load_vehicle("hummingbird")
+    turning = lagging(np.asarray(eight.commands), eight.period, rise=0.02, fall=0.03, delay=0.0)
+    flown = replace(eight, speeds=turning.speeds, throttle=throttle(eight), commands=None)
+    names = {}
+    for what, voltage in {"still": np.full(len(eight.t), 11.1), "sags": np.linspace(12.0, 11.0, len(eight.t))}.items():
+        response = rotor_response([stretch(replace(flown, voltage=voltage), 0)], vehicle, 11.1)
+        names[what] = {*response}
+        assert response["rotor_rise"].value == pytest.approx(0.02, abs=3e-3)
+    assert names["sags"] - names["still"] == {"voltage_exponent"}
