@@ -47,10 +47,8 @@ def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     except Exception as error:  # orangebox raises whatever its parsing meets, and where a log is cut off
         if not rows:
             raise FileError(path, f"is not a readable Blackbox log ({str(error)[:80]})") from error
-    table = np.array([[np.nan if value == "" else value for value in row] for row in rows], float).reshape(
-        -1, len(names)
-    )
-    if "time" not in names or not len(table):
+    table = np.array([[np.nan if value == "" else value for value in row] for row in rows], float)
+    if "time" not in names or not table.size:
         raise FileError(path, "has no frame with a time")
     t, first = np.unique(table[:, names.index("time")] * 1e-6, return_index=True)
     columns = {name: Column(t, of[first]) for name, of in zip(names, table.T, strict=True)}

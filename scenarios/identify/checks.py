@@ -87,10 +87,12 @@ def _check_rows(record: Record, logged: NDArray[np.bool_]) -> None:
     if still.any():
         rotors = " and ".join(str(i + 1) for i in np.flatnonzero(still))
         raise InputError(f"{name}: the outputs of rotor {rotors} never change while the others do: log all four")
-    for field, columns in (("rates", "wx wy wz"), ("velocity", "vx vy vz")):
+    for field, columns in (("rates", "wx wy wz"), ("velocity", "vx vy vz"), ("attitude", "qw qx qy qz")):
         rows = getattr(record, field)[logged]
         frozen = [c for c, moved in zip(columns.split(), np.ptp(rows, axis=0) > 0.0, strict=True) if not moved]
-        if 0 < len(frozen) < 3 and (rows[0, [columns.split().index(c) for c in frozen]] != 0.0).any():
+        if len(frozen) == rows.shape[1]:
+            raise InputError(f"{name}: {', '.join(frozen)} stand still while the motors run: log what was measured")
+        if frozen and field != "attitude" and (rows[0, [columns.split().index(c) for c in frozen]] != 0.0).any():
             raise InputError(f"{name}: {', '.join(frozen)} stands still while the others change: log all three axes")
     moving = np.concatenate([record.rates, record.attitude], axis=1)[logged]
     repeated = float((np.diff(moving, axis=0) == 0.0).all(axis=1).mean())

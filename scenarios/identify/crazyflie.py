@@ -46,7 +46,7 @@ def read_crazyflie(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     data = path.read_bytes()
     try:
         columns = _columns(data[:-4])
-    except (KeyError, ValueError, struct.error) as error:
+    except (IndexError, KeyError, ValueError, struct.error) as error:
         raise FileError(path, f"is not a readable log of a Crazyflie ({type(error).__name__}: {error})") from error
     whole = zlib.crc32(data[:-4]) == int.from_bytes(data[-4:], "little")
     notes = () if whole else (f"{path.name}: its check sum is wrong: it is cut off or damaged",)

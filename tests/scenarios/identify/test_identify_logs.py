@@ -331,6 +331,8 @@ SPOILT: dict[str, Spoil] = {
     "wx stands still while the others change": lambda record: replace(
         record, rates=np.column_stack([np.full(len(record.t), 0.1), record.rates[:, 1:]])
     ),
+    "wx, wy, wz stand still while the motors run": scaled(rates=0.0),
+    "qw, qx, qy, qz stand still": lambda record: replace(record, attitude=np.tile(record.attitude[0], (800, 1))),
     "outputs of rotor 2 never change": lambda record: replace(
         record,
         commands=record.commands * [1.0, 0.0, 1.0, 1.0],  # type: ignore[operator]
