@@ -19,7 +19,6 @@ import numpy as np
 import tomlkit
 
 from quadsim.errors import FileError
-from quadsim.input_limits import LARGEST_CSV
 from quadsim.state import Array
 
 _GRAM: Final = 9.80665e-3  # [N]
@@ -31,6 +30,7 @@ _UNITS: Final[dict[str, dict[str, float]]] = {
 }
 """Columns of the table, and their units; `rpm` is a speed in rpm."""
 _NAME: Final = re.compile(r"\s*(\w+)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*")
+_LARGEST: Final = 1_000_000  # [bytes]
 _FEWEST: Final = 3  # rows
 _WORST: Final = 0.1  # RMS of what is left, over the largest value, at most
 _FULL: Final = 0.95  # throttle above which the fastest row is at full throttle
@@ -136,8 +136,8 @@ def stand_vehicle_text(stand: Path, start: str) -> tuple[str, dict[str, Any]]:
 def _read(path: Path) -> dict[str, Array]:
     """The columns of a table in SI units."""
     try:
-        if (size := path.stat().st_size) > LARGEST_CSV:
-            raise FileError(path, f"must be of {LARGEST_CSV} or fewer bytes; got {size}")
+        if (size := path.stat().st_size) > _LARGEST:
+            raise FileError(path, f"must be of {_LARGEST} or fewer bytes; got {size}")
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(path, f"cannot be read ({error})") from error

@@ -10,9 +10,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.errors import FileError, InputError, MissingPackageError
+from quadsim.errors import FileError, InputError
+from scenarios.identify.libraries import reading
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity
-from scenarios.identify.series import Column
+from scenarios.identify.series import Column, on_one_clock
 
 _STEP: Final = re.compile(r"\.?([A-Za-z_]\w*)|\[(\d+)\]")
 
@@ -27,18 +28,15 @@ def read_bag(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
         FileError: it is no bag, or has no message with such a field.
         InputError: there is no map.
     """
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ModuleNotFoundError as error:
-        raise MissingPackageError("a bag", "rosbags", extra="logs") from error
     if not given:
         raise InputError(f"{path.name}: a bag names no quantities: give --columns, a map of its topics")
     wanted: dict[str, list[str]] = {}
     for name in dict.fromkeys(column for one in given for column in one.columns):
         wanted.setdefault(name.partition(".")[0], []).append(name)
-    columns: dict[str, Column] = {}
-    try:
+    with reading(path, "bag", "rosbags"):
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
             columns = {connection.topic: Column(np.zeros(0), np.zeros(0)) for connection in bag.connections}
             for topic, names in wanted.items():
@@ -48,23 +46,14 @@ def read_bag(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
                     message: Any = bag.deserialize(raw, connection.msgtype)
                     stamp = getattr(getattr(message, "header", None), "stamp", None)
                     t = 1e-9 * arrived if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
-                    rows.append([t, *map(partial(_at, message), names)])
+                    rows.append([t, *map(partial(_at, path, message), names)])
                 if rows:
-                    table = np.array(rows, float)
-                    t, first = np.unique(table[:, 0], return_index=True)
-                    columns |= {name: Column(t, of[first]) for name, of in zip(names, table.T[1:], strict=True)}
-    except _NoFieldError as error:
-        raise FileError(path, str(error)) from error
-    except Exception as error:  # rosbags raises whatever its parsing meets
-        raise FileError(path, f"is not a readable bag ({str(error)[:80]})") from error
+                    times, *values = np.array(rows, float).T
+                    columns |= on_one_clock(times, dict(zip(names, values, strict=True)))
     return LoggedColumns(columns=columns, quantities=given)
 
 
-class _NoFieldError(Exception):
-    """A message has no such number."""
-
-
-def _at(message: Any, name: str) -> float:
+def _at(path: Path, message: Any, name: str) -> float:
     """The number at the end of a path of fields and indices, of the topic's name the rest."""
     value = message
     for field, index in _STEP.findall(name.partition(".")[2]):
@@ -73,8 +62,8 @@ def _at(message: Any, name: str) -> float:
         except (AttributeError, IndexError, TypeError) as error:
             fields = [key for key in getattr(value, "__dataclass_fields__", ()) if key != "__msgtype__"]
             there = ", ".join(fields) or f"{np.size(value)} number{'s' * (np.size(value) > 1)}"
-            raise _NoFieldError(f"{name!r}: no {field or index} in {there}") from error
+            raise FileError(path, f"{name!r}: no {field or index} in {there}") from error
     try:
         return float(value)
     except (TypeError, ValueError) as error:
-        raise _NoFieldError(f"{name!r} is not a number but {type(value).__name__}: name a field of it") from error
+        raise FileError(path, f"{name!r} is not a number but {type(value).__name__}: name a field of it") from error

@@ -10,9 +10,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.errors import FileError, MissingPackageError
+from quadsim.errors import FileError
+from scenarios.identify.libraries import reading
 from scenarios.identify.quantities import RPM, LoggedColumns, NamedQuantity, logged_as
-from scenarios.identify.series import Column
+from scenarios.identify.series import Column, on_one_clock
 
 _ADVICE: Final = (
     "in Betaflight, set blackbox_disable_attitude, _acc, _rpm and _gyro to OFF, blackbox_sample_rate to 1/8"
@@ -31,31 +32,31 @@ def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
         MissingPackageError: orangebox is not installed.
         FileError: it is not a Blackbox log.
     """
-    try:
-        from orangebox import Parser
-    except ModuleNotFoundError as error:
-        raise MissingPackageError("a Blackbox log", "orangebox", extra="logs") from error
     logging.getLogger("orangebox").addHandler(logging.NullHandler())  # else it warns of what it guesses
     rows: list[tuple[Any, ...]] = []
-    try:
+    with reading(path, "Blackbox log", "orangebox"):
+        from orangebox import Parser
+
         log = Parser.load(str(path), allow_invalid_header=True)
         begins = [*log.reader.log_pointers, path.stat().st_size]
         log = Parser.load(str(path), 1 + int(np.argmax(np.diff(begins))), allow_invalid_header=True)
         names, headers = log.field_names, log.headers
-        for frame in log.frames():
-            rows.append(frame.data[: len(names)])
-    except Exception as error:  # orangebox raises whatever its parsing meets, and where a log is cut off
-        if not rows:
-            raise FileError(path, f"is not a readable Blackbox log ({str(error)[:80]})") from error
+        try:
+            for frame in log.frames():
+                rows.append(frame.data[: len(names)])
+        except (IndexError, RuntimeError, TypeError, ValueError):  # a log that is cut off ends there
+            if not rows:
+                raise
     table = np.array([[np.nan if value == "" else value for value in row] for row in rows], float)
     if "time" not in names or not table.size:
         raise FileError(path, "has no frame with a time")
-    t, first = np.unique(table[:, names.index("time")] * 1e-6, return_index=True)
-    columns = {name: Column(t, of[first]) for name, of in zip(names, table.T, strict=True)}
+    columns = on_one_clock(table[:, names.index("time")] * 1e-6, dict(zip(names, table.T, strict=True)))
     turn = [columns.get(f"imuQuaternion[{i}]") for i in range(3)]
     if all(turn):
         x, y, z = (of.values / _WHOLE for of in turn if of is not None)
-        columns["imuQuaternion.w"] = Column(t, _WHOLE * np.sqrt(np.maximum(1.0 - x * x - y * y - z * z, 0.0)))
+        columns["imuQuaternion.w"] = Column(
+            columns["time"].t, _WHOLE * np.sqrt(np.maximum(1.0 - x * x - y * y - z * z, 0.0))
+        )
     flights = len(begins) - 1
     notes = (f"{path.name}: the longest of its {flights} flights is read",) if flights > 1 else ()
     return LoggedColumns(columns=columns, quantities=_quantities(headers), advice=_ADVICE, notes=notes)

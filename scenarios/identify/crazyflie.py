@@ -17,7 +17,7 @@ import numpy as np
 
 from quadsim.errors import FileError
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, logged_as
-from scenarios.identify.series import Column
+from scenarios.identify.series import Column, on_one_clock
 
 FIRST_BYTES: Final = (b"\xbc\x01\x00", b"\xbc\x02\x00")
 _STAMPS: Final = {1: (struct.Struct("<HI"), 1e-3), 2: (struct.Struct("<HQ"), 1e-6)}
@@ -82,7 +82,6 @@ def _columns(data: bytes) -> dict[str, Column]:
     columns: dict[str, Column] = {}
     for variables, _, rows in events.values():
         if rows:
-            table = np.array(rows, float)
-            t, first = np.unique(table[:, 0], return_index=True)
-            columns |= {name: Column(t, of[first]) for name, of in zip(variables, table.T[1:], strict=True)}
+            times, *numbers = np.array(rows, float).T
+            columns |= on_one_clock(times, dict(zip(variables, numbers, strict=True)))
     return columns

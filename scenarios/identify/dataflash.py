@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from quadsim.errors import FileError, MissingPackageError
+from quadsim.errors import FileError
 from quadsim.vehicle import N_ROTORS
+from scenarios.identify.libraries import reading
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, logged_as
-from scenarios.identify.series import Column
+from scenarios.identify.series import Column, on_one_clock
 
 _NAMES: Final = (
     logged_as("rates", "IMU.GyrX IMU.GyrY IMU.GyrZ", down=True),
@@ -43,20 +44,28 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     """
     used = {column.partition(".")[0].partition("[")[0] for one in (*given, *_NAMES) for column in one.columns}
     columns: dict[str, Column] = {}
-    with _opened(path) as log:
-        rows: dict[str, list[tuple[float, ...]]] = {}
-        fields: dict[str, list[str]] = {}
-        while (message := log.recv_match(type=[*used, "PARM"])) is not None:
-            if (kind := message.get_type()) in used and "TimeUS" in message.get_fieldnames():
-                of, row = message.fmt.instance_field, message.to_dict()
-                name = f"{kind}[{row[of]}]" if of and row[of] else kind
-                fields.setdefault(name, [key for key, value in row.items() if isinstance(value, int | float)])
-                rows.setdefault(name, []).append(tuple(row[key] for key in fields[name]))
-        parameters = {**log.params}
+    rows: dict[str, list[tuple[float, ...]]] = {}
+    fields: dict[str, list[str]] = {}
+    with reading(path, "dataflash log", "pymavlink"), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        from pymavlink.DFReader import DFReader_binary
+
+        class Reader(DFReader_binary):  # type: ignore[misc]  # whose own fast index prints past Python
+            init_arrays_fast = DFReader_binary.init_arrays
+
+        with path.open("rb") as file:
+            if file.read(2) != _FIRST_BYTES:
+                raise FileError(path, "is not a readable dataflash log: it does not begin with a message")
+        with Reader(str(path), zero_time_base=True) as log:
+            while (message := log.recv_match(type=[*used, "PARM"])) is not None:
+                if (kind := message.get_type()) in used and "TimeUS" in message.get_fieldnames():
+                    of, row = message.fmt.instance_field, message.to_dict()
+                    name = f"{kind}[{row[of]}]" if of and row[of] else kind
+                    fields.setdefault(name, [key for key, value in row.items() if isinstance(value, int | float)])
+                    rows.setdefault(name, []).append(tuple(row[key] for key in fields[name]))
+            parameters = {**log.params}
     for name, of in fields.items():
-        table = dict(zip(of, np.array(rows[name], float).T, strict=True))
-        t, first = np.unique(table["TimeUS"] * 1e-6, return_index=True)
-        columns |= {f"{name}.{field}": Column(t, values[first]) for field, values in table.items()}
+        table = {f"{name}.{field}": values for field, values in zip(of, np.array(rows[name], float).T, strict=True)}
+        columns |= on_one_clock(table[f"{name}.TimeUS"] * 1e-6, table)
     turns = [columns[name].t.size if name in columns else 0 for name in ("XKQ.Q1", "ATT.Roll")]
     if turns[0] < turns[1]:
         columns = {name: column for name, column in columns.items() if not name.startswith("XKQ")}
@@ -66,27 +75,3 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     pulses: dict[str, Any] = {"columns": outputs, "zero": low, "scale": 1.0 / max(high - low, 1.0)}
     names = [replace(one, **pulses) if one.quantity == "throttle" else one for one in _NAMES]
     return LoggedColumns(columns=columns, quantities=names, advice=_ADVICE)
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """DFReader on a log, which prints what it skips."""
-    with path.open("rb") as file:
-        if file.read(2) != _FIRST_BYTES:
-            raise FileError(path, "is not a dataflash log: it does not begin with a message")
-    try:
-        from pymavlink.DFReader import DFReader_binary
-    except ModuleNotFoundError as error:
-        raise MissingPackageError("a dataflash log", "pymavlink", extra="logs") from error
-
-    class Reader(DFReader_binary):  # type: ignore[misc]  # its own fast index prints past Python
-        init_arrays_fast = DFReader_binary.init_arrays
-
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        try:
-            with Reader(str(path), zero_time_base=True) as log:
-                yield log
-        except FileError:
-            raise
-        except Exception as error:  # it raises whatever its parsing meets
-            raise FileError(path, f"is not a readable dataflash log ({str(error)[:80]})") from error

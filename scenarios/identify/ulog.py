@@ -9,11 +9,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.errors import FileError, MissingPackageError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
+from scenarios.identify.libraries import reading
 from scenarios.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, logged_as
-from scenarios.identify.series import Column, held
+from scenarios.identify.series import Column, held, on_one_clock
 
 ULOGS: Final = (".ulg", ".ulog")
 _ROTORS: Final = range(N_ROTORS)
@@ -48,8 +48,7 @@ def read_ulog(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     for data in sorted(log.data_list, key=lambda data: data.multi_id, reverse=True):  # the first instance of each
         stamps = data.data.get("timestamp_sample", data.data["timestamp"])
         stamps = np.asarray(stamps if np.any(stamps) else data.data["timestamp"], float)
-        t, rows = np.unique(stamps * 1e-6, return_index=True)  # an estimator may publish one sample twice
-        columns |= {f"{data.name}.{name}": Column(t, np.asarray(of, float)[rows]) for name, of in data.data.items()}
+        columns |= on_one_clock(stamps * 1e-6, {f"{data.name}.{name}": of for name, of in data.data.items()})
     columns |= {name: Column(of.t, np.abs(of.values)) for name, of in columns.items() if name.endswith("esc_rpm")}
     if flying := _flying(columns):
         columns["flying"] = flying
@@ -86,15 +85,10 @@ def stated_rotors(path: Path) -> str:
 
 
 def _parsed(path: Path, topics: Sequence[str]) -> Any:
-    try:
+    with reading(path, "ULog", "pyulog"), path.open("rb") as file:  # which pyulog leaves open where it fails
         from pyulog import ULog
-    except ModuleNotFoundError as error:
-        raise MissingPackageError("a ULog", "pyulog", extra="logs") from error
-    try:
-        with path.open("rb") as file:  # which pyulog leaves open where it fails
-            return ULog(file, [*topics])
-    except Exception as error:  # pyulog raises whatever its parsing meets
-        raise FileError(path, f"is not a readable ULog ({str(error)[:80]})") from error
+
+        return ULog(file, [*topics])
 
 
 def _flying(columns: Mapping[str, Column]) -> Column | None:

@@ -143,7 +143,7 @@ def test_dataflash(tmp_path: Path, eight: Record) -> None:
 def test_dataflash_of_another_kind_or_torn(tmp_path: Path, eight: Record, capfd: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("pymavlink", reason="the extra logs is not installed")
     (tmp_path / "log.bin").write_bytes(b"no log")
-    with pytest.raises(FileError, match="is not a dataflash log"):
+    with pytest.raises(FileError, match="is not a readable dataflash log"):
         read_record(tmp_path / "log.bin")
     path = dataflash(tmp_path / "torn.bin", ardupilot(eight), SERVOS)
     whole = path.read_bytes()
