@@ -25,6 +25,7 @@ from scenarios.identify.tables import read_columns
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
 SLOWEST_COMMANDS: Final = 20.0  # [Hz] at which the rotors' outputs must be logged
+FASTEST_RATE: Final = 250.0  # [Hz] above which samples are averaged: none of the parameters is as fast
 SLOWEST_VELOCITY: Final = 0.04  # period [s] of a velocity above which an accelerometer knows it better
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
 INPUTS: Final = ("commands", "throttle", "speeds")
@@ -169,8 +170,23 @@ def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
         notes = (*notes, f"{name}: the velocity is logged at {1.0 / slow:.3g} Hz; the accelerometer fills it in")
     if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
         values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
+    if len(grid) > 10 * (size := int(1.0 / (FASTEST_RATE * period))) > 20:
+        grid, values = _thinned(grid, values, size - 1 + size % 2)
+        values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
+        rates = f"{1.0 / period:.0f} Hz, of which means at {1.0 / (grid[1] - grid[0]):.0f} Hz are used"
+        notes = (*notes, f"{name}: {rates}")
     aloft = None if flying is None else held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
     return Record(name=name, t=grid, flying=aloft, notes=notes, inertial=inertial, **values)
+
+
+def _thinned(grid: Array, values: Mapping[str, Array], size: int) -> tuple[Array, dict[str, Any]]:
+    """The mean of every `size` samples, odd, about their middle; of what is held, from there to the next middle."""
+    count, half, means = len(grid) // size - 1, size // 2, {}
+    for field, rows in values.items():
+        begin = half if field in INPUTS[:2] else 0
+        blocks = rows[begin : begin + count * size]
+        means[field] = blocks.reshape(count, size, *rows.shape[1:]).mean(axis=1)
+    return grid[half : half + count * size : size], means
 
 
 def _check_clock(name: str, field: str, t: Array) -> None:

@@ -21,9 +21,10 @@ from scenarios.commands.cli import main
 from scenarios.identify.checks import check_log, spans
 from scenarios.identify.model import stretch
 from scenarios.identify.quantities import NamedQuantity, read_map
-from scenarios.identify.record import Record, read_record
+from scenarios.identify.record import Record, read_record, to_record
 from scenarios.identify.rotor_response import rotor_response
 from scenarios.identify.rotors import lagging
+from scenarios.identify.series import SampledSeries
 from scenarios.identify.windows import to_world
 
 pytestmark = pytest.mark.slow("identification")
@@ -514,3 +515,16 @@ def test_a_voltage_that_stands_still_shows_nothing(eight: Record) -> None:
         names[what] = {*response}
         assert response["rotor_rise"].value == pytest.approx(0.02, abs=3e-3)
     assert names["sags"] - names["still"] == {"voltage_exponent"}
+
+
+def test_a_fast_log_is_averaged_without_a_shift() -> None:
+    """At 1 kHz, three samples each: what is measured about their middle, commands over the time they are held."""
+    t = np.arange(4000) * 1e-3
+    motion = np.sin(t[:, None] * [20.0, 21.0, 22.0])
+    rows = {"rates": motion, "velocity": motion, "attitude": np.tile([1.0, 0.0, 0.0, 0.0], (4000, 1))}
+    rows["commands"] = 100.0 + np.arange(4000.0)[:, None] * [1.0, 1.0, 1.0, 1.0]
+    read = to_record("fast", {name: SampledSeries(t=t, values=of) for name, of in rows.items()})
+    assert read.notes == ("fast: 1000 Hz, of which means at 333 Hz are used",)
+    np.testing.assert_allclose(read.rates, np.sin(read.t[:, None] * [20.0, 21.0, 22.0]), atol=2e-4)
+    assert read.commands is not None
+    np.testing.assert_allclose(read.commands[:, 0], 100.0 + 1e3 * read.t + 1.0)  # k, k + 1 and k + 2 from t_k on
