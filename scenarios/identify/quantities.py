@@ -28,6 +28,7 @@ from scenarios.identify.series import Column, SampledSeries
 RPM: Final = math.tau / 60.0  # [rad/s]
 NO_ERPM: Final = 65535  # of 16 bits: no value, but a gap
 HALF_TURN: Final = np.array([1.0, -1.0, -1.0])  # about x: NED to north, west, up; FRD to x forward, y left, z up
+_LISTED: Final = 40  # names in a message
 _DEGREE: Final = math.pi / 180.0
 _LENGTHS: Final = {"m": (0.0, 1.0), "cm": (0.0, 0.01), "mm": (0.0, 1e-3)}
 _SPEEDS: Final = {"rad/s": (0.0, 1.0), "rpm": (0.0, RPM)}
@@ -205,8 +206,11 @@ def to_series(
 
 
 def listed(columns: Iterable[str]) -> str:
-    """Names of columns, of those with a dot the topics alone."""
-    return ", ".join([*dict.fromkeys(column.partition(".")[0] for column in columns)][:40]) or "none"
+    """Names of columns; where there are many, of those with a dot the topics alone."""
+    names = [*columns]
+    if len(names) > _LISTED:
+        names = [*dict.fromkeys(name.partition(".")[0] for name in names)][:_LISTED]
+    return ", ".join(names) or "none"
 
 
 def _series(columns: Mapping[str, Column], one: NamedQuantity) -> SampledSeries:

@@ -596,7 +596,8 @@ def test_ulog_needs_its_topics_and_pyulog(tmp_path: Path, eight: Record, monkeyp
     del topics["vehicle_attitude"]
     path = ulog(tmp_path / "short.ulg", topics)
     with pytest.raises(
-        FileError, match=r"lacks attitude: columns vehicle_attitude\.q\[0\].*; it has actuator_motors, battery_"
+        FileError,
+        match=r"lacks attitude: columns vehicle_attitude\.q\[0\].*; it has (actuator_motors|vehicle_|battery_)",
     ):
         read_record(path)
     with pytest.raises(InputError, match="leave poles out"):
