@@ -114,8 +114,11 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
 def _format_of(file: Path) -> LogFormat:
     if file.is_dir():
         return next(of for of in FORMATS if of.read is read_bag)
-    with file.open("rb") as opened:
-        first = opened.read(64)
+    try:
+        with file.open("rb") as opened:
+            first = opened.read(64)
+    except OSError as error:
+        raise FileError(file, f"cannot be read ({error})") from error
     by_bytes = (of for of in FORMATS if first.startswith(of.first_bytes))
     by_suffix = (of for of in FORMATS if file.suffix.lower() in of.suffixes)
     if (found := next(by_bytes, None) or next(by_suffix, None)) is None:
