@@ -29,6 +29,8 @@ RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it may import at its top what is heavy."""
 RECORDING = re.compile(r"quadsim\.report\.recording\.(plots|world)")
 """Imported when a recording is made, and so may import rerun at their top."""
+LOGS = ("orangebox", "pymavlink", "pyulog", "rosbags")
+"""Libraries that read logs."""
 OF_ONE_PLACE = {
     "rerun": "quadsim.report.recording",
     "imageio": "quadsim.report.film",
@@ -38,10 +40,10 @@ OF_ONE_PLACE = {
     "plotly": "quadsim.report.to_plotly",
     "distributed": "scenarios.many",
     "gymnasium": "scenarios.gym",
-    "pyulog": "scenarios.identify",
+    **dict.fromkeys(LOGS, "scenarios.identify"),
 }
 """What only some outputs need, and where alone it is imported."""
-OF_ROOMS = {"gymnasium": "gym", "pyulog": "identify", "trimesh": "live", "viser": "live"}
+OF_ROOMS = {"gymnasium": "gym", **dict.fromkeys(LOGS, "identify"), "trimesh": "live", "viser": "live"}
 ABSENT = {library for library, room in OF_ROOMS.items() if room not in ROOMS}
 """Libraries that a room alone uses, and those of rooms that have been taken away."""
 IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
