@@ -278,7 +278,13 @@ def export(boards: list[dict[str, Any]]) -> str:
     """What an exported controller takes on a board, of `make firmware`."""
     rows = [
         (
-            *(f"`{board['law']}`", board["target"], board["precision"], f"{board['flash'] / 1e3:.0f}", f"{board['ram'] / 1e3:.0f}"),
+            *(
+                f"`{board['law']}`",
+                board["target"],
+                board["precision"],
+                f"{board['flash'] / 1e3:.0f}",
+                f"{board['ram'] / 1e3:.0f}",
+            ),
             *(f"{board[name] / 1e6:.2f}" for name in ("p50", "p99", "warm", "first")),
         )
         for board in boards
