@@ -42,6 +42,7 @@ from mpc.nonlinear.rigidbody import (
     rigid_body,
     rotation,
     thrust_axis,
+    turned_by_air,
 )
 from mpc.nonlinear.settings import Nonlinear
 from mpc.nonlinear.sqp import SQP, SQPStatus, slack_groups
@@ -155,7 +156,10 @@ class NonlinearMPC:
             lag=lags,
             drag=self._drag,
             quadratic_drag=np.array(settings.quadratic_drag),
+            moment=settings.moment,
         )
+        if settings.moment:
+            vehicle.require_moment("controller")
         self._inverse = np.linalg.inv(self._model.effectiveness)
         lifts = vehicle.mass * vehicle.gravity * vehicle.thrust_shares
         self._hover = lifts * (vehicle.mean_coefficient / vehicle.coefficients)  # of rotors with the mean coefficient
@@ -201,6 +205,7 @@ class NonlinearMPC:
                 period,
                 drag=self._model.drag / vehicle.mass,
                 quadratic_drag=self._model.quadratic_drag / vehicle.mass,
+                moment=settings.moment,
                 thrust_lag=self._lag if self._targets else None,
             )
         self.reset(self._level)
@@ -506,9 +511,9 @@ class NonlinearMPC:
         )
 
     def _balanced(self, nodes: Nodes) -> Nodes:
-        """Add to the reference what balances drag and disturbance: thrust turned by the least rotation, and torque."""
+        """Add to the reference what balances air and disturbance: thrust turned by the least rotation, and torque."""
         model = self._model
-        if not (model.drags or model.acceleration.any() or model.angular_acceleration.any()):
+        if not (model.drags or model.moments or model.acceleration.any() or model.angular_acceleration.any()):
             return nodes
         states, thrusts = nodes.states.copy(), nodes.thrusts
         q, mass = states[:, Q], self._vehicle.mass
@@ -529,6 +534,8 @@ class NonlinearMPC:
         states[:, Q] = multiply(turn, q)
         effort = np.empty((len(total), 4))
         effort[:, 0], effort[:, 1:] = size[:-1] - total, -model.angular_acceleration
+        if model.moments:
+            effort[:, 1:] -= turned_by_air(model, R[:-1], states[:-1, V], states[:-1, W], thrusts)
         return Nodes(states, thrusts + effort @ self._inverse.T)
 
     def _iterate(self, time: float, measured: Array, nodes: Nodes) -> Answer:

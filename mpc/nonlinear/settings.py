@@ -147,6 +147,9 @@ class Nonlinear(ControllerTable):
         0.0,
         0.0,
     )
+    moment: Annotated[
+        bool, doc("whether the prediction has the vehicle's rotor_moment, in still air, and its rate_damping")
+    ] = False
     output_bounds: Annotated[
         dict[str, Pair], doc("[m, m/s] lower and upper bound, of positions and velocities by their states' names")
     ] = field(default_factory=dict)
@@ -190,7 +193,13 @@ class Nonlinear(ControllerTable):
                 rule = f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
                 raise ValueError(rule)
             require_ordered(f"output_bounds.{name}", pair)
-        of_rotors = {"inputs": "thrust", "rotor_lag": 0.0, "indi": None, "input_bounds": VEHICLES_SPEEDS}
+        of_rotors = {
+            "inputs": "thrust",
+            "rotor_lag": 0.0,
+            "moment": False,
+            "indi": None,
+            "input_bounds": VEHICLES_SPEEDS,
+        }
         require_space(self, of_rotors)
         speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
         if speeds and self.commands != ROTORS:

@@ -78,7 +78,13 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
                 row[j] += by * map[k * width + j];
             }
         }
-        for (k = W; k < BODY; k++) { /* body rates do not depend on the quaternion or the velocity */
+        for (k = W; p->moments && k < BODY; k++) { /* only by the air do body rates depend on the quaternion and velocity */
+            const real by = cost[r * n + k];
+            for (j = 0; j < 6; j++) {
+                row[j] += by * map[k * width + j];
+            }
+        }
+        for (k = W; k < BODY; k++) {
             const real by = cost[r * n + k];
             for (j = 6; j < width; j++) {
                 row[j] += by * map[k * width + j];
@@ -97,6 +103,12 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
         real row[WIDE + 1] = {R(0.0)};
         const int past = (j + 2) & ~1;
         for (k = 0; k < (j < 7 ? W : BODY); k++) {
+            const real by = map[k * width + j];
+            for (r = 0; r < past; r++) {
+                row[r] += by * both[k][r];
+            }
+        }
+        for (k = W; p->moments && j < 7 && k < BODY; k++) {
             const real by = map[k * width + j];
             for (r = 0; r < past; r++) {
                 row[r] += by * both[k][r];

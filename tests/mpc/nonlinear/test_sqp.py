@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,10 @@ from quadsim.space import Sphere
 from quadsim.state import N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import load_vehicle
 
-VEHICLE, PERIOD = load_vehicle(vehicle_path("hummingbird")), 0.02
+VEHICLE = replace(
+    load_vehicle(vehicle_path("hummingbird")), rotor_moment=(2e-5, -3e-5), rate_damping=(0.01, 0.02, 0.03)
+)
+PERIOD = 0.02
 HOVER = np.full(4, VEHICLE.hover_speed)
 RATES: dict[str, Any] = {"commands": "rates", "inner_lag": (0.03, 0.02, 0.02, 0.05), "tilt": 15.0, "body_rate": 40.0}
 FENCE = Polytope(name="fence", of=("x", "vy", "z"), rows=((1.0, 0.5, 0.0), (0.0, 0.0, 1.0)), upper=(0.3, 0.2))
@@ -47,6 +51,8 @@ MANY: dict[str, dict[str, Any]] = {
     "polytopes": {"inputs": "speed", "polytopes": (FENCE, LIFT)},
     "targets": RATES | {"soft": Soft(linear=20.0, quadratic=5.0)},
     "targets and moves": RATES | {"soft": Soft(linear=20.0, quadratic=5.0), "weights": Weights(move=0.5)},
+    "moment": {"moment": True},
+    "moment and moves with lag": {"moment": True, "inputs": "speed", "rotor_lag": 0.02, "weights": Weights(move=0.5)},
     "drag": {"drag": (0.3, 0.3, 0.1), "quadratic_drag": (0.05, 0.05, 0.02), "terminal": "lqr", "tilt": 12.0},
 }
 
