@@ -41,8 +41,10 @@ with T, at its start, the thrust that acted and T_c the one commanded.  The auto
 
 from __future__ import annotations
 
+import ctypes
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated, Final
 
 import numpy as np
@@ -50,10 +52,10 @@ from annotated_types import doc
 from numpy.typing import ArrayLike
 
 from quadsim.controller import StepInputs
+from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, set_arrays, struct_members
 from quadsim.fields import NonNegative, Positive
-from quadsim.rotation import cross
 from quadsim.state import Array
-from quadsim.vehicle import Vehicle
+from quadsim.vehicle import N_ROTORS, Vehicle
 
 FORCE_SHARE: Final = 0.5
 """Default bandwidth of the force estimate times the control period."""
@@ -96,12 +98,53 @@ class RampSettings:
     largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 100.0
 
 
+class RampNumbers(ctypes.Structure):
+    """A `quadsim_ramp_numbers`."""
+
+    _fields_ = [
+        *struct_members(INT, "scaled targets moment"),
+        *struct_members(REAL, "period mass gravity least_lift gain:6 gain_of_change:6 largest:6 inertia:9 inverse:9"),
+        *struct_members(REAL, "allocation:16 momentum:4 lag left drag:3 square_drag:3 across:2 damping:3"),
+        *struct_members(REAL, "decay ballast"),
+    ]
+
+
+class RampState(ctypes.Structure):
+    """A `quadsim_ramp`."""
+
+    _fields_ = [
+        *struct_members(INT, "measured"),
+        *struct_members(REAL, "value:6 change:6 products:3 squares:3 acting:4"),
+        *struct_members(REAL, "velocity:3 rates:3 axis:3 turning:3 pull:3 resisting:3"),
+    ]
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    library = load_library()
+    check_sizes(quadsim_ramp_numbers=RampNumbers, quadsim_ramp=RampState)
+    library.quadsim_ramp_reset.restype, library.quadsim_ramp_reset.argtypes = None, [AT] * 3
+    library.quadsim_ramp_update.restype = None
+    library.quadsim_ramp_update.argtypes = [AT, AT, INT, AT, AT, AT, AT]
+    library.quadsim_ramp_foreseen.restype = None
+    library.quadsim_ramp_foreseen.argtypes = [AT, AT, REAL, AT, AT, AT]
+    library.quadsim_ramp_scale.restype, library.quadsim_ramp_scale.argtypes = REAL, [AT] * 2
+    library.quadsim_ramp_drag.restype, library.quadsim_ramp_drag.argtypes = None, [AT] * 3
+    return library
+
+
 class RampObserver:
     """The six filters, an evolving state: three for the force (world axes) and three for the torque (body axes).
 
     Commands are rotor speeds, or with `thrust_lag` [s] collective thrusts [N] that act with this lag; no torque is
     estimated then. The model knows `drag` (3,) [1/s] and `quadratic_drag` (3,) [1/m], of the square of each component,
     in body axes, and with `moment` the vehicle's `air_moment`.
+
+    The core computes it, `quadsim_ramp.c`; a law in C calls it there, with the addresses of both attributes.
+
+    Attributes:
+        numbers: what does not change.
+        state: the estimates.
     """
 
     def __init__(
@@ -115,48 +158,38 @@ class RampObserver:
         moment: bool = False,
         thrust_lag: float | None = None,
     ) -> None:
-        force = FORCE_SHARE / period if settings.force is None else settings.force
-        torque = TORQUE_SHARE / period if settings.torque is None else settings.torque
-        pole = np.exp(-period * np.repeat([force, torque], 3))
-        self._gain, self._gain_of_change = 1.0 - pole**2, (1.0 - pole) ** 2 / period
-        self._largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
-        self._thrust_lag, scaled = thrust_lag, settings.thrust_scale
-        self._scaled = thrust_lag is not None if scaled is None else scaled
-        if self._scaled:
-            self._largest[2] = LARGEST_CHANGE * vehicle.gravity
-        if thrust_lag is not None:
-            self._gain[3:] = self._gain_of_change[3:] = 0.0
-        self._vehicle, self._period, self._lag = vehicle, period, settings.rotor_lag or 0.0
-        inertia = (vehicle.rotor_inertia or 0.0) if self._lag else 0.0
-        self._momentum = -inertia * np.array(vehicle.rotor_spins, float)
-        self._drag, self._quadratic, self._moment = np.array(drag, float), np.array(quadratic_drag, float), moment
-        self._decay = math.exp(-period / settings.drag_memory)
-        self._ballast = FITTED_FROM**2 / (1.0 - self._decay)
-        self._up = np.array([0.0, 0.0, vehicle.gravity])
-        self._rotors, self._thrust = vehicle.hover_speeds, vehicle.mass * vehicle.gravity
-        self.reset(self._rotors if thrust_lag is None else self._thrust)
+        self._library, self._period = _library(), period
+        self.numbers, self.state = RampNumbers(), RampState()
+        _fill(self.numbers, settings, vehicle, period, thrust_lag)
+        self.numbers.moment = moment
+        set_arrays(self.numbers, drag=np.array(drag, float), square_drag=np.array(quadratic_drag, float))
+        self._at = ctypes.addressof(self.state), ctypes.addressof(self.numbers)
+        arrays = (self.state.value, self.state.change, self.state.acting)
+        self._value, self._change, self._acting = map(np.ctypeslib.as_array, arrays)
+        # What C reads in an update, and what it writes.
+        self._measured = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(N_ROTORS)
+        self._foreseen = np.zeros((3, 3))
+        self._addresses = [array.ctypes.data for array in (*self._measured, *self._foreseen)]
+        self.reset(vehicle.mass * vehicle.gravity if self.numbers.targets else vehicle.hover_speeds)
 
     def reset(self, acting: Array | float) -> None:
         """Clear the estimates; the rotors turn at `acting` (4,) [rad/s], or give this thrust [N] with `thrust_lag`."""
-        self._value, self._change = np.zeros(6), np.zeros(6)
-        self._products, self._squares = np.zeros(3), np.zeros(3)
-        if self._thrust_lag is None:
-            self._rotors = np.array(acting, float)
-        else:
-            self._thrust = float(acting)
-        self._last: tuple[Array, Array, Array, Array] | None = None
+        command = self._measured[-1]
+        command[:] = acting
+        self._library.quadsim_ramp_reset(*self._at, command.ctypes.data)
         self._time = 0.0
 
     def adopt(self, other: RampObserver) -> None:
         """Take over the state of another observer, as far as it estimates the same."""
-        same_commands = (self._thrust_lag is None) == (other._thrust_lag is None)
-        shared = np.array([True, True, self._scaled == other._scaled, *[same_commands] * 3])
-        self._value = np.where(shared, np.clip(other._value, -self._largest, self._largest), 0.0)
-        self._change = np.where(shared, other._change, 0.0)
-        if same_commands:
-            self._rotors, self._thrust = other._rotors, other._thrust
-        self._products, self._squares = other._products, other._squares
-        self._last, self._time = other._last, other._time
+        same_commands = self.numbers.targets == other.numbers.targets
+        shared = np.array([True, True, self.numbers.scaled == other.numbers.scaled, *[same_commands] * 3])
+        largest, acting = np.array(self.numbers.largest), self._acting.copy()
+        ctypes.memmove(self._at[0], other._at[0], ctypes.sizeof(RampState))
+        self._value[:] = np.where(shared, np.clip(self._value, -largest, largest), 0.0)
+        self._change[:] = np.where(shared, self._change, 0.0)
+        if not same_commands:
+            self._acting[:] = acting
+        self._time = other._time
 
     def update(self, time: float, velocity: Array, attitude: Array, rates: Array, command: Array | float) -> None:
         """Update the estimates at the end of a period; after a gap, only record the start of the next one.
@@ -164,73 +197,29 @@ class RampObserver:
         Measured values: velocity (3,), world; attitude (3, 3), body to world; body rates (3,). The command was held
         over the period that ends: rotor speeds (4,) [rad/s], or the thrust [N] with `thrust_lag`.
         """
-        period, vehicle = self._period, self._vehicle
-        thrust, torque = self._mean_wrench(command)
-        axis, turning = attitude[:, 2], attitude @ np.array([rates[1], -rates[0], 0.0])
-        v_b = attitude.T @ velocity
-        drag = -attitude @ ((self._drag + self._quadratic * np.abs(v_b)) * v_b)
-        momentum = vehicle.momentum(rates)
-        momentum[2] += self._momentum @ self._rotors
-        resisting = cross(rates, momentum)
-        if self._moment:
-            resisting -= vehicle.air_moment(float(self._rotors.sum()), v_b, rates)
-        now = velocity, rates, np.concatenate([axis, turning]), np.concatenate([drag, resisting])
-        last, self._last = self._last, now
-        before, self._time = self._time, time
-        if last is None or abs(time - before - period) > _SAME_TIME:
-            return
-        # Mean over the period from its two ends; for the thrust axis also from its derivative (Euler-Maclaurin).
-        b = 0.5 * (last[2][:3] + axis) + period / 12.0 * (last[2][3:] - turning)
-        mean = 0.5 * (last[3] + now[3])
-        drag, resisting = mean[:3], mean[3:]
-        lift = thrust / vehicle.mass * b
-        missed = np.concatenate(
-            [
-                (velocity - last[0]) / period + self._up - lift - drag,
-                (rates - last[1]) / period - vehicle.angular_acceleration(torque - resisting),
-            ]
-        )
-        holds = False
-        if self._scaled:
-            g = self._vehicle.gravity
-            if holds := bool(lift[2] < OBSERVABLE_THRUST * g):
-                self._change[2] = 0.0
-            s = self._value[2] / g if holds else missed[2] / lift[2]
-            missed[:2], missed[2] = missed[:2] - s * lift[:2], g * s
-        predicted = self._value + period * self._change
-        surprise = missed - predicted
-        value = predicted + self._gain * surprise
-        self._value = np.minimum(np.maximum(value, -self._largest), self._largest)
-        self._change = np.where(value == self._value, self._change + self._gain_of_change * surprise, 0.0)
-        if holds:
-            return
-        d_b = attitude.T @ self.foreseen(0.0)[0]
-        if self._scaled:
-            d_b[2] = 0.0
-        self._products, self._squares = self._decay * self._products + d_b * v_b, self._decay * self._squares + v_b**2
+        for array, value in zip(self._measured, (velocity, attitude, rates, command), strict=True):
+            array[:] = value
+        follows = abs(time - self._time - self._period) <= _SAME_TIME
+        self._time = time
+        self._library.quadsim_ramp_update(*self._at, follows, *self._addresses[:4])
 
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
         """Predict the disturbance `ahead` [s] after the last measurement: three arrays (3,).
 
         Acceleration [m/s^2] and its rate of change [m/s^3], world axes; angular acceleration [rad/s^2], body axes.
         """
-        value = self._value + (0.5 * self._period + ahead) * self._change  # the estimate is for mid-period
-        change = self._change[:3].copy()
-        if self._scaled:
-            value[2] = change[2] = 0.0
-        return value[:3], change, value[3:]
+        self._library.quadsim_ramp_foreseen(*self._at, ahead, *self._addresses[4:])
+        force, change, torque = self._foreseen.copy()
+        return force, change, torque
 
     @property
     def thrust_scale(self) -> float:
         """The thrust that rotors give over the modelled one, kappa, in the period that follows the last measurement."""
-        if not self._scaled:
-            return 1.0
-        change = (self._value[2] + self._period * self._change[2]) / self._vehicle.gravity
-        return 1.0 + min(max(float(change), -LARGEST_CHANGE), LARGEST_CHANGE)
+        return float(self._library.quadsim_ramp_scale(*self._at))
 
     def log(self, now: StepInputs) -> None:
         """Log the thrust scale, where it is estimated, as `thrust_scale`."""
-        if self._scaled:
+        if self.numbers.scaled:
             now.log("thrust_scale", self.thrust_scale)
 
     @property
@@ -239,28 +228,41 @@ class RampObserver:
 
         A least-squares fit of d_b + diag(drag) v_b that weights older samples less; zero while the vehicle is slow.
         """
-        return np.maximum(-self._products / (self._squares + self._ballast), 0.0)
+        drag = np.empty(3)
+        self._library.quadsim_ramp_drag(*self._at, drag.ctypes.data)
+        return drag
 
-    def _mean_wrench(self, command: Array | float) -> tuple[float, Array]:
-        """The mean thrust [N], before its scale, and torque (3,) [N m] of a period with this command."""
-        if self._thrust_lag is None:
-            spun, squares = self._rotors, self._mean_squares(np.asarray(command))
-            wrench = self._vehicle.allocation @ squares
-            torque = self.thrust_scale * wrench[1:]
-            torque[2] -= self._momentum @ (self._rotors - spun) / self._period
-            return float(wrench[0]), torque
-        thrust, share = float(command), self._thrust_lag / self._period
-        left, away = math.exp(-1.0 / share) if share else 0.0, self._thrust - thrust
-        self._thrust = thrust + left * away
-        return thrust + share * (1.0 - left) * away, np.zeros(3)
 
-    def _mean_squares(self, speeds: Array) -> Array:
-        """(4,) mean squares of the rotor speeds over the period, which tend to `speeds` exponentially [rad^2/s^2]."""
-        if self._lag == 0.0:
-            return np.square(speeds)
-        away, share = self._rotors - speeds, self._lag / self._period
-        left = math.exp(-1.0 / share)
-        self._rotors = speeds + left * away
-        return np.asarray(
-            speeds**2 + 2.0 * share * (1.0 - left) * speeds * away + 0.5 * share * (1.0 - left**2) * away**2
-        )
+def _fill(
+    numbers: RampNumbers, settings: RampSettings, vehicle: Vehicle, period: float, thrust_lag: float | None
+) -> None:
+    """Fill in all numbers but what the model knows of the air."""
+    bandwidths = settings.force or FORCE_SHARE / period, settings.torque or TORQUE_SHARE / period
+    pole = np.exp(-period * np.repeat(bandwidths, 3))
+    gain, gain_of_change = 1.0 - pole**2, (1.0 - pole) ** 2 / period
+    largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
+    numbers.targets = thrust_lag is not None
+    numbers.scaled = numbers.targets if settings.thrust_scale is None else settings.thrust_scale
+    if numbers.scaled:
+        largest[2] = LARGEST_CHANGE * vehicle.gravity
+    if numbers.targets:
+        gain[3:] = gain_of_change[3:] = 0.0
+    numbers.period, numbers.mass, numbers.gravity = period, vehicle.mass, vehicle.gravity
+    numbers.least_lift = OBSERVABLE_THRUST * vehicle.gravity
+    lag = (settings.rotor_lag or 0.0) if thrust_lag is None else thrust_lag
+    numbers.lag, numbers.left = lag / period, math.exp(-period / lag) if lag else 0.0
+    rotor_inertia = (vehicle.rotor_inertia or 0.0) if lag else 0.0
+    set_arrays(
+        numbers,
+        gain=gain,
+        gain_of_change=gain_of_change,
+        largest=largest,
+        inertia=vehicle.inertia_matrix,
+        inverse=vehicle.angular_acceleration(np.eye(3)),
+        allocation=vehicle.allocation,
+        momentum=-rotor_inertia * np.array(vehicle.rotor_spins, float),
+        across=vehicle.rotor_moment or (0.0, 0.0),
+        damping=vehicle.rate_damping or (0.0, 0.0, 0.0),
+    )
+    numbers.decay = math.exp(-period / settings.drag_memory)
+    numbers.ballast = FITTED_FROM**2 / (1.0 - numbers.decay)

@@ -8,16 +8,18 @@ from functools import cached_property
 from importlib import resources
 from typing import Final
 
+from mpc.answer import ActuatorBounds
 from mpc.codegen.ctext import CText, Precision
 from mpc.core.numbers import Exportable, controller_numbers, fallback_numbers, robust_numbers
 from mpc.core.solver import core_problem
 from mpc.core.tables import Tables, members
+from mpc.model import hover_model
 from mpc.robust.settings import split_delay
 from quadsim.vehicle import N_ROTORS
 
 CORE_FILES: Final = (
     *("quadsim_core.h", "quadsim_core.c", "quadsim_math.h"),
-    *("quadsim_mpc.h", "quadsim_mpc.c", "quadsim_guard.c"),
+    *("quadsim_mpc.h", "quadsim_mpc.c", "quadsim_guard.h", "quadsim_guard.c"),
 )
 """Files of `mpc/core/c` to export verbatim."""
 DATA: Final = "quadsim_data.h"
@@ -100,7 +102,11 @@ def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
 def _controller(text: CText, law: Exportable, tables: Tables) -> list[str]:
     """Return the numbers apart from those of the optimisation, with the `quadsim_controller` last."""
     numbers, robust = controller_numbers(law), "NULL"
-    fallback = {name: text.value(value) for name, value in fallback_numbers(law).items()}
+    problem = law.problem
+    bounds = ActuatorBounds.of_problem(problem) if problem.every_constraint else None
+    model = hover_model(law.vehicle, problem.model.period)
+    members = fallback_numbers(model, bounds, law.fallback, problem.horizon)
+    fallback = {name: text.value(value) for name, value in members.items()}
     blocks = [
         text.array("C_r", numbers.pop("C_r")),
         text.struct("quadsim_fallback", f"{text.prefix}fallback", **fallback),

@@ -11,6 +11,7 @@ from typing import Final, NoReturn
 
 import numpy as np
 
+from mpc.answer import INFEASIBLE_ANSWER
 from mpc.condensing import Condensed
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
 from mpc.core.solver import PROBLEMS, Key, Optimum, Work, core_library, core_problem
@@ -25,9 +26,11 @@ from mpc.paper import rollout
 from mpc.robust.settings import LONGEST_SPAN
 from mpc.solvers import INVALID_DATA, Answer
 from quadsim.controller import (
+    COMMANDED,
     GAIN,
     GROUNDED,
     MISSED,
+    NOT_CONVERGED,
     SOLVED,
     UNCONSTRAINED,
     Command,
@@ -43,6 +46,7 @@ from quadsim.vehicle import N_ROTORS
 STATUSES: Final = (
     *(UNCONSTRAINED, SOLVED, SOLVED, "primal_infeasible", "max_iterations", "no_room", INVALID_DATA, "not_finite"),
     *("out_of_bounds", "state_unknown", "invalid_reference", str(Phase.LANDED), MISSED),
+    *(INFEASIBLE_ANSWER, NOT_CONVERGED, COMMANDED),
 )
 """Recorded statuses by `enum quadsim_status`."""
 INVALID: Final = STATUSES.index(INVALID_DATA)
@@ -69,19 +73,24 @@ class _Robust(ctypes.Structure):
 class _Controller(ctypes.Structure):
     _fields_ = [
         *((name, _AT) for name in ("problem", "robust", "fallback", "C_r")),
-        *_arrays(hover=4, speed_min=4, speed_max=4, step_min=4, step_max=4),
+        *_arrays(hover=4),
     ]
+
+
+class _Trim(ctypes.Structure):
+    _fields_ = _arrays(commands=4, lift=3, twist=3)
 
 
 class _Guard(ctypes.Structure):
     """The fallback contract's, which only an export has: in flight it is `mpc.fallback.contract.Guard`."""
 
     _fields_ = [
-        *((name, _INT) for name in ("planned", "foreseeing", "age", "hovered", "targeted", "since")),
+        *((name, _AT) for name in ("numbers", "kept")),
+        *((name, _INT) for name in ("horizon", "level", "learns", "asked", "waiting", "planned", "foreseeing")),
+        *((name, _INT) for name in ("age", "hovered", "targeted", "since")),
         ("unseen", _INT * 12),
-        *_arrays(
-            state=12, covariance=144, last=12, last_rates=3, foreseen=12, heading=2, level=2, resting=4, target=12
-        ),
+        *_arrays(in_force=4, before=4, state=12, covariance=144, last=12, last_rates=3, foreseen=12),
+        *_arrays(heading=2, level_there=2, resting=4, target=12),
     ]
 
 
@@ -89,9 +98,10 @@ class _MPC(ctypes.Structure):
     _fields_ = [
         *(("controller", _AT), ("work", Work), ("wanted", _AT), ("kept", _AT), ("sent", _AT)),
         *_arrays(state=16, rest=16, resting=4, before=4),
-        *(("fallback", _INT), ("headed", _INT), ("heading", _REAL), ("known", _INT)),
+        *(("headed", _INT), ("heading", _REAL), ("known", _INT)),
         *_arrays(rotors=4, ahead=12, turning=4, estimate=6),
-        *_arrays(trim=4, lift=3, twist=3, effectiveness=16),
+        ("trim", _Trim),
+        *_arrays(effectiveness=16),
         ("guard", _Guard),
     ]
 
@@ -99,7 +109,13 @@ class _MPC(ctypes.Structure):
 @cache
 def _library() -> ctypes.CDLL:
     library = core_library()
-    check_sizes(quadsim_robust=_Robust, quadsim_controller=_Controller, quadsim_guard=_Guard, quadsim_mpc=_MPC)
+    check_sizes(
+        quadsim_robust=_Robust,
+        quadsim_controller=_Controller,
+        quadsim_trim=_Trim,
+        quadsim_guard=_Guard,
+        quadsim_mpc=_MPC,
+    )
     library.quadsim_mpc_reals.restype, library.quadsim_mpc_reals.argtypes = ctypes.c_long, [_AT]
     library.quadsim_mpc_start.restype, library.quadsim_mpc_start.argtypes = None, [_AT] * 3
     library.quadsim_mpc_reset.restype, library.quadsim_mpc_reset.argtypes = None, [_AT] * 2
@@ -165,9 +181,10 @@ class CompiledPreparation:
         self._at = ctypes.addressof(mpc)
         self._library.quadsim_mpc_start(self._at, controller, self._memory.ctypes.data)
         self.optimum = Optimum(self.problem, shared.problem, mpc.work)
-        parts = (mpc.resting, mpc.turning, mpc.rotors, mpc.ahead, mpc.estimate, mpc.trim, mpc.lift, mpc.twist)
-        self._u_s, self._turning, self._rotors, self._ahead, self._estimate, *trim = map(np.ctypeslib.as_array, parts)
-        self._trim, self._lift, self._twist = trim
+        trim = mpc.trim
+        parts = (mpc.resting, mpc.turning, mpc.rotors, mpc.ahead, mpc.estimate, trim.commands, trim.lift, trim.twist)
+        views = [np.ctypeslib.as_array(part) for part in parts]
+        self._u_s, self._turning, self._rotors, self._ahead, self._estimate, self._trim, self._lift, self._twist = views
         self._x, self._x_s = (np.ctypeslib.as_array(part)[:n] for part in (mpc.state, mpc.rest))
         self._wanted = _view(mpc.wanted, N * len(self.problem.objective.C_r)).reshape(N, -1)
         whole = 0 if self._robust is None else self._robust.under_way

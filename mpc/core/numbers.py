@@ -24,7 +24,7 @@ from mpc.fallback.completion import (
 from mpc.fallback.hover import LARGEST_CLIMB, LARGEST_TURN, HoverLaw
 from mpc.fallback.settings import USUAL_FALLBACK, FallbackSettings
 from mpc.heading import slope
-from mpc.model import hover_model
+from mpc.model import LinearModel, hover_model
 from mpc.nonlinear.model import SUBSTEPS, nonlinear_model
 from mpc.observer import UPRIGHT, DisturbanceObserver
 from mpc.obstacles import Shape
@@ -71,13 +71,7 @@ def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequenc
 
 def controller_numbers(law: Exportable) -> dict[str, Array]:
     """Return the members of a `quadsim_controller`."""
-    problem, free = law.problem, np.full(N_ROTORS, NO_BOUND)
-    limits = {"speed_min": -free, "speed_max": free, "step_min": -free, "step_max": free}
-    if problem.every_constraint:
-        bounds = ActuatorBounds.of_problem(problem)
-        sides = bounds.u_min, bounds.u_max, bounds.delta_min, bounds.delta_max
-        limits = {name: np.clip(side, -NO_BOUND, NO_BOUND) for name, side in zip(limits, sides, strict=True)}
-    return {"C_r": problem.objective.C_r, "hover": problem.model.u_bar, **limits}
+    return {"C_r": law.problem.objective.C_r, "hover": law.problem.model.u_bar}
 
 
 def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
@@ -124,13 +118,25 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
     }
 
 
-def fallback_numbers(law: Exportable) -> dict[str, int | float | Array]:
-    """Return the members of a `quadsim_fallback`; see `mpc.fallback.contract.Guard`, which compares times [s]."""
-    settings, period, N = law.fallback, law.problem.model.period, law.problem.horizon
-    model = hover_model(law.vehicle, period)
+def fallback_numbers(
+    model: LinearModel, bounds: ActuatorBounds | None, settings: FallbackSettings, horizon: int
+) -> dict[str, int | float | Array]:
+    """Return the members of a `quadsim_fallback`; see `mpc.fallback.contract.Guard`, which compares times [s].
+
+    Args:
+        model: of level hover.
+        bounds: on commands; None for none.
+        settings: the table, with the tilt that its law's bounds leave.
+        horizon: N of the law's plans.
+    """
+    period, free = model.period, np.full(N_ROTORS, NO_BOUND)
     assert settings.tilt is not None
     hover, Q = HoverLaw(model, tilt=math.radians(settings.tilt)), acceleration_noise(period)
     pairs = [Q[first : first + 2, first : first + 2][np.triu_indices(2)] for first in (POSITION[0], EULER[0])]
+    sides = (-free, free, -free, free)
+    if bounds is not None:
+        sides = bounds.u_min, bounds.u_max, bounds.delta_min, bounds.delta_max
+    least, most, step_least, step_most = (np.clip(side, -NO_BOUND, NO_BOUND) for side in sides)
 
     def periods(time: float) -> int:
         """Return the most periods that last no longer than a time [s]."""
@@ -138,8 +144,9 @@ def fallback_numbers(law: Exportable) -> dict[str, int | float | Array]:
         return min(next(n for n in (count + 1, count, count - 1) if n * period <= time), MOST_PERIODS)
 
     return {
-        "plan_age": min(periods(settings.plan_age + 1e-9), N - 1),
-        "hover": min(math.ceil((settings.hover - 1e-9) / period), MOST_PERIODS),
+        "targets": int(model.targets),
+        "plan_age": min(periods(settings.plan_age + 1e-9), horizon - 1),
+        "hover_periods": min(math.ceil((settings.hover - 1e-9) / period), MOST_PERIODS),
         "unseen": periods(settings.unseen),
         "compared": periods(LONGEST_SPAN + 1e-6),
         "sink": settings.sink,
@@ -148,7 +155,7 @@ def fallback_numbers(law: Exportable) -> dict[str, int | float | Array]:
         "tilt": hover.tilt,
         "climb": LARGEST_CLIMB,
         "turn": LARGEST_TURN,
-        "largest_speed": LARGEST_SPEED,
+        "largest_command": LARGEST_SPEED,
         "largest_reference": PLAUSIBLE_REFERENCE,
         "distance": settings.distance,
         "plausible": PLAUSIBLE,
@@ -156,6 +163,11 @@ def fallback_numbers(law: Exportable) -> dict[str, int | float | Array]:
         "noise": NOISE**2,
         "unknown": UNKNOWN**2,
         "process": np.concatenate(pairs),
+        "hover": model.u_bar,
+        "least": least,
+        "most": most,
+        "step_least": step_least,
+        "step_most": step_most,
         "A": model.A,
         "B": model.B,
         "gain": hover.gain,

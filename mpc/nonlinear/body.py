@@ -4,27 +4,17 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
 from functools import cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from mpc.nonlinear.rigidbody import N_BODY, Inputs, RigidBody
-from quadsim.core.library import check_sizes, load_library
+from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, set_arrays, struct_members
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 
 STATES_ROOM: Final = 21
-INT: Final = ctypes.c_int
-REAL: Final = ctypes.c_double
-AT: Final = ctypes.c_void_p
-
-
-def struct_members(kind: type[Any], names: str) -> list[tuple[str, Any]]:
-    """Return members of a struct, as `x n:3`."""
-    parts = (name.partition(":") for name in names.split())
-    return [(name, kind * int(size) if size else kind) for name, _, size in parts]
 
 
 class ProblemStruct(ctypes.Structure):
@@ -58,12 +48,6 @@ def _library() -> ctypes.CDLL:
     library.quadsim_nmpc_slopes.argtypes = [AT] * 7
     library.quadsim_nmpc_advance.argtypes = [AT, AT, INT, AT, AT, AT]
     return library
-
-
-def set_arrays(struct: ctypes.Structure, **arrays: Array | Sequence[float]) -> None:
-    """Set array members of a struct."""
-    for name, values in arrays.items():
-        getattr(struct, name)[:] = np.asarray(values, float).ravel().tolist()
 
 
 class World:

@@ -12,22 +12,10 @@ from typing import Any, Final, NamedTuple, NoReturn
 import numpy as np
 
 from mpc.constraints import Constraint
-from mpc.nonlinear.body import (
-    AT,
-    INT,
-    REAL,
-    STATES_ROOM,
-    ProblemStruct,
-    World,
-    body_numbers,
-    set_arrays,
-    struct_members,
-    unpacked,
-    width_of,
-)
+from mpc.nonlinear.body import STATES_ROOM, ProblemStruct, World, body_numbers, unpacked, width_of
 from mpc.nonlinear.rigidbody import N_BODY, P, RigidBody, V
 from mpc.ocp import Problem
-from quadsim.core.library import check_sizes, load_library
+from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, set_arrays, struct_members
 from quadsim.state import Array, Indices
 from quadsim.vehicle import N_ROTORS
 

@@ -5,9 +5,17 @@ from __future__ import annotations
 import ctypes
 from functools import cache
 from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from quadsim.core.build import LIBRARY, ROOT, CompilationError, compile_library, is_current
 from quadsim.errors import FileError
+
+INT: Final = ctypes.c_int
+REAL: Final = ctypes.c_double
+AT: Final = ctypes.c_void_p
 
 
 @cache
@@ -43,6 +51,18 @@ def check_sizes(**mirrors: type[ctypes.Structure]) -> None:
     for name, mirror in mirrors.items():
         size = ctypes.c_size_t.in_dll(load_library(), f"{name}_size").value
         assert ctypes.sizeof(mirror) == size, f"{name} has {size} bytes, not {ctypes.sizeof(mirror)}"
+
+
+def struct_members(kind: type[Any], names: str) -> list[tuple[str, Any]]:
+    """Return members of a struct, as `x n:3`."""
+    parts = (name.partition(":") for name in names.split())
+    return [(name, kind * int(size) if size else kind) for name, _, size in parts]
+
+
+def set_arrays(struct: ctypes.Structure, **arrays: ArrayLike) -> None:
+    """Set array members of a struct."""
+    for name, values in arrays.items():
+        getattr(struct, name)[:] = np.asarray(values, float).ravel().tolist()
 
 
 def _loaded(root: Path) -> ctypes.CDLL | str:

@@ -91,22 +91,22 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
             quadsim_mpc_reset(mpc, acting);
             memcpy(command, own->hover, sizeof command); /* in force where acting is none */
         }
-        memcpy(before, is_within(acting, own->fallback->largest_speed, 4) ? acting : command, sizeof before);
+        memcpy(before, is_within(acting, own->fallback->largest_command, 4) ? acting : command, sizeof before);
         status = quadsim_mpc_step(mpc, phase, state, reference, acting, command);
         steps++;
         require(status >= QUADSIM_FREE && status < QUADSIM_MISSED, "a status");
         require((status == QUADSIM_LANDED) == (phase == QUADSIM_PHASE_LANDED), "rotors that stop on the ground alone");
-        require((status <= QUADSIM_WHOLE || status == QUADSIM_LANDED) == (mpc->fallback == 0), "a level without optimum");
-        require(mpc->fallback >= 0 && mpc->fallback <= 3, "a level");
+        require((status <= QUADSIM_WHOLE || status == QUADSIM_LANDED) == (mpc->guard.level == 0), "a level without optimum");
+        require(mpc->guard.level >= 0 && mpc->guard.level <= 3, "a level");
         require(is_finite(mpc->guard.state, 12), "a state");
         require(is_finite(command, 4), "a finite command");
         require(mpc->work.changes >= 0, "a number of changes");
         require(mpc->work.changes <= 4 * own->problem->changes, "a limited number of changes");
         for (j = 0; j < 4; j++) {
-            require(command[j] >= own->speed_min[j] && command[j] <= own->speed_max[j], "bounds on speeds");
-            if (before[j] >= own->speed_min[j] && before[j] <= own->speed_max[j]) {
+            require(command[j] >= own->fallback->least[j] && command[j] <= own->fallback->most[j], "bounds on speeds");
+            if (before[j] >= own->fallback->least[j] && before[j] <= own->fallback->most[j]) {
                 const real step = command[j] - before[j];
-                require(step >= own->step_min[j] - R(1e-4) && step <= own->step_max[j] + R(1e-4),
+                require(step >= own->fallback->step_least[j] - R(1e-4) && step <= own->fallback->step_most[j] + R(1e-4),
                         "bounds on steps of speeds");
             }
         }

@@ -41,7 +41,7 @@ void host_step(host *at, const double *inputs, double *answers)
     convert(acting, inputs + 12, 4);
     convert(reference, inputs + 17, QUADSIM_HORIZON * 4);
     answers[0] = (double)quadsim_mpc_step(&at->mpc, (enum quadsim_phase)inputs[16], state, reference, acting, command);
-    answers[1] = (double)at->mpc.fallback;
+    answers[1] = (double)at->mpc.guard.level;
     answers[2] = (double)at->mpc.work.changes;
     for (i = 0; i < 4; i++) {
         answers[3 + i] = (double)command[i];

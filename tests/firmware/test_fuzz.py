@@ -53,9 +53,9 @@ def test_a_command_out_of_bounds_is_detected(exported: Export, run: Run, tmp_pat
     """The target can fail: with a controller that does not clip, it does at once."""
     directory = exported("posix", "double", "controller.horizon=10", "duration=5")
     text = (directory / "quadsim_guard.c").read_text()
-    clip = "command[j] = clipped(speeds[j], lower, upper);"
+    clip = "command[j] = clipped(wanted[j], lower, upper);"
     assert clip in text
-    (tmp_path / "quadsim_guard.c").write_text(text.replace(clip, "(void)upper, command[j] = lower + speeds[j];"))
+    (tmp_path / "quadsim_guard.c").write_text(text.replace(clip, "(void)upper, command[j] = lower + wanted[j];"))
     compile = ["clang", "-O1", "-std=c99", *SANITIZERS, "-I", tmp_path, "-I", directory]
     sources = [HERE / "fuzz.c", tmp_path / "quadsim_guard.c", *(directory / name for name in CONTROLLER[1:])]
     built = run(*compile, "-o", tmp_path / "fuzz", *sources, check=False)

@@ -29,7 +29,7 @@ from scenarios.schema.scenario import Scenario
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
-HEADER = Path(__file__).parents[2] / "mpc" / "core" / "c" / "quadsim_mpc.h"
+HEADER = Path(__file__).parents[2] / "mpc" / "core" / "c" / "quadsim_guard.h"
 TOLD = ("max_iterations", "no_room")
 """Failures of the C alone: in Python PIQP answers instead."""
 SHORT = {"controller.fallback": {"unseen": 0.4, "hover": 0.5, "plan_age": 0.5}}

@@ -112,7 +112,7 @@ def test_planted_faults_are_detected(fault: str, exported: Export, run: Run, tmp
     source.write_text(PLANTED.format(body=body.format()))
     include = f"-I{header}"
     if tool == "nm":
-        for name in ("quadsim_core.h", "quadsim_mpc.h"):
+        for name in ("quadsim_core.h", "quadsim_guard.h", "quadsim_mpc.h"):
             shutil.copy(header / name, tmp_path)
         assert any(name.startswith(finding) for name in undefined([source], "float", run, tmp_path / "planted.o"))
         return

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy_ramp import NumpyRamp
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -153,7 +154,7 @@ def straight(
     """70 periods at a constant tilt [deg] and commanded thrust over weight, whose scale has this integral over time."""
     g, R, rest = vehicle.gravity, tilted(tilt), np.zeros(3)
     rotors = np.full(4, vehicle.hover_speed * np.sqrt(thrust))
-    command = rotors if observer._thrust_lag is None else thrust * vehicle.mass * g
+    command = thrust * vehicle.mass * g if observer.numbers.targets else rotors
     observer.reset(command)
     for k in range(70):
         t = k * PERIOD
@@ -295,3 +296,45 @@ def test_an_observer_takes_over_only_what_it_estimates_itself(vehicle: Vehicle) 
     same.adopt(turning)
     assert same.thrust_scale == 1.0
     np.testing.assert_array_equal(same.foreseen(0.0)[2], 0.0)
+
+
+@pytest.mark.parametrize("scaled", [True, False])
+@pytest.mark.parametrize(
+    ("rotor_lag", "thrust_lag", "moment"),
+    [(0.0, None, False), (0.03, None, True), (0.0, None, True), (None, 0.03, False), (None, 0.0, False)],
+)
+def test_the_core_has_the_numbers_of_the_equations(
+    vehicle: Vehicle, scaled: bool, rotor_lag: float | None, thrust_lag: float | None, moment: bool
+) -> None:
+    """Whatever the motion: at every tenth update there was a gap, and some are upside down or beyond the limits."""
+    Ixx, products = vehicle.inertia[0], 0.05 * vehicle.inertia[0] * np.array([1.0, -2.0, 3.0])
+    vehicle = replace(
+        vehicle,
+        **{"inertia": (Ixx, 1.1 * Ixx, 1.5 * Ixx), "products_of_inertia": tuple(products.tolist())},
+        rotor_inertia=0.01 * Ixx,
+        **{"rotor_moment": (2e-5, -3e-5), "rate_damping": (0.1, 0.2, 0.3)},
+    )
+    settings = RampSettings(thrust_scale=scaled, rotor_lag=rotor_lag, largest_force=5.0)
+    rng, weight = np.random.default_rng(5), vehicle.mass * vehicle.gravity
+    hover = vehicle.hover_speeds if thrust_lag is None else np.array([weight])
+    drags = {"drag": np.array([0.3, 0.2, 0.1]), "quadratic_drag": np.array([0.02, 0.0, 0.05])}
+    others = {"moment": moment, "thrust_lag": thrust_lag}
+    observer = RampObserver(settings, vehicle, PERIOD, **drags, **others)  # type: ignore[arg-type]
+    check = NumpyRamp(settings, vehicle, PERIOD, **drags, **others, acting=hover)  # type: ignore[arg-type]
+    time, limited, fitted = 0.0, 0, 0
+    for k in range(100):
+        follows = k % 10 != 9
+        time += PERIOD if follows else 3.0 * PERIOD
+        v, Omega = rng.normal(size=3) * 0.1 + [1.0, 2.0, -0.5], rng.normal(size=3) * 0.5
+        R = (Rotation.from_euler("X", 180.0 * (k % 20 == 7), degrees=True) * Rotation.from_rotvec(Omega)).as_matrix()
+        command = hover * rng.uniform(0.8, 1.2, size=hover.shape)
+        observer.update(time, v, R, Omega, command)
+        check.update(follows, v, R, Omega, command)
+        limited += bool(np.any(np.abs(check.value) == check.largest))
+        fitted += bool(check.fitted.any())
+        for value, expected in zip(observer.foreseen(0.1), check.foreseen(0.1), strict=True):
+            np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(observer.drag, check.fitted, rtol=1e-9, atol=1e-12)
+        assert observer.thrust_scale == pytest.approx(check.scale, abs=1e-12)
+    assert 0 < limited < 100
+    assert fitted

@@ -113,7 +113,7 @@ static int solve(const struct question *question)
     flying = 1;
     answer.status = (uint16_t)quadsim_mpc_step(&mpc, question->kind == STAND ? QUADSIM_PHASE_ARMED : QUADSIM_PHASE_FLYING,
                                                question->state, window, question->acting, answer.command);
-    answer.fallback = (uint16_t)mpc.fallback;
+    answer.fallback = (uint16_t)mpc.guard.level;
     return 1;
 }
 

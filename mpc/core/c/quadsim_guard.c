@@ -2,7 +2,7 @@
  *
  * Each period flies the first of these that there is: the law's optimum; the last one's plan, shifted, with a correction
  * towards the states that it foresaw; level hover; descent.  Statement, sources and twin: mpc/fallback of quadsim. */
-#include "quadsim_mpc.h"
+#include "quadsim_guard.h"
 
 #include <string.h>
 
@@ -27,12 +27,6 @@ static void count_up(int *periods)
 static void find_heading(real yaw, real heading[2])
 {
     sin_cos(yaw, &heading[0], &heading[1]);
-}
-
-/* Roll and pitch at rest. */
-static void find_level(const quadsim_mpc *mpc, const real heading[2], real level[2])
-{
-    lean_of(mpc->lift, heading[0], heading[1], &level[0], &level[1]);
 }
 
 /* Turn positions and velocities about world z by the angle of a sine and a cosine. */
@@ -71,19 +65,18 @@ static void respond_about(const quadsim_fallback *f, const real heading[2], cons
 }
 
 /* A state a period later under a command, by the model about where the vehicle rests. */
-static void predict(const quadsim_mpc *mpc, const real heading[2], const real *command, real *state)
+static void predict(const quadsim_fallback *f, const quadsim_trim *trim, const real heading[2], const real *command,
+                    real *state)
 {
-    const quadsim_controller *c = mpc->controller;
-    const quadsim_fallback *f = c->fallback;
     real effect[NU], level[2], lift = R(0.0);
     int j;
-    find_level(mpc, heading, level);
-    for (j = 0; j < NU; j++) { /* thrust has another slope there, and turns the vehicle */
-        effect[j] = mpc->trim[j] / c->hover[j] * (command[j] - mpc->trim[j]);
+    lean_of(trim->lift, heading[0], heading[1], &level[0], &level[1]);
+    for (j = 0; j < NU; j++) { /* thrust of rotors has another slope there, and turns the vehicle */
+        effect[j] = (f->targets ? R(1.0) : trim->commands[j] / f->hover[j]) * (command[j] - trim->commands[j]);
         lift += f->slope[j] * effect[j];
     }
-    for (j = 0; j < NU; j++) {
-        effect[j] += lift * dot(f->inverse + j * NU + 1, mpc->twist, 3);
+    for (j = 0; j < NU && !f->targets; j++) {
+        effect[j] += lift * dot(f->inverse + j * NU + 1, trim->twist, 3);
     }
     respond_about(f, heading, level, effect, state);
 }
@@ -196,10 +189,9 @@ static void put_diagonal(real *covariance, const real *variances)
 }
 
 /* The whole state now, of what is measured of it, the others predicted under the command in force. */
-static void complete(quadsim_mpc *mpc, const real *measured, const real *acting, int flying)
+static void complete(quadsim_guard *g, const quadsim_trim *trim, const real *measured, int flying)
 {
-    const quadsim_fallback *f = mpc->controller->fallback;
-    quadsim_guard *g = &mpc->guard;
+    const quadsim_fallback *f = g->numbers;
     real predicted[12], heading[2];
     int seen[12], repeated[12], i, all = 1, any;
     for (i = 0; i < 12; i++) {
@@ -210,7 +202,7 @@ static void complete(quadsim_mpc *mpc, const real *measured, const real *acting,
     if (!all || (flying && any)) {
         memcpy(predicted, g->state, sizeof(predicted));
         find_heading(g->state[YAW], heading);
-        predict(mpc, heading, acting, predicted);
+        predict(f, trim, heading, g->in_force, predicted);
         if (flying) {
             drop_frozen(f, predicted, measured, repeated, seen);
         }
@@ -270,15 +262,14 @@ static void demand(const quadsim_fallback *f, const real *error, const real leve
 
 /* ---- what is flown ----------------------------------------------------------------------------------------------- */
 
-/* Speeds within what the bounds on them and on their steps leave after a command [rad/s]; where these leave nothing,
- * within those on the speeds. */
-static void clip(const quadsim_controller *c, const real *speeds, const real *before, real *command)
+void quadsim_guard_clip(const quadsim_fallback *f, const quadsim_real *wanted, const quadsim_real *before,
+                        quadsim_real *command)
 {
     int j;
     for (j = 0; j < NU; j++) {
-        const real lower = clipped(before[j] + c->step_min[j], c->speed_min[j], c->speed_max[j]);
-        const real upper = clipped(before[j] + c->step_max[j], c->speed_min[j], c->speed_max[j]);
-        command[j] = clipped(speeds[j], lower, upper);
+        const real lower = clipped(before[j] + f->step_least[j], f->least[j], f->most[j]);
+        const real upper = clipped(before[j] + f->step_most[j], f->least[j], f->most[j]);
+        command[j] = clipped(wanted[j], lower, upper);
     }
 }
 
@@ -289,51 +280,39 @@ static void forget(quadsim_guard *g)
 }
 
 /* The command of the last plan, corrected; 0 from when it is no longer usable. */
-static int follow_plan(quadsim_mpc *mpc, int lost, const real *acting, real *command)
+static int follow_plan(quadsim_guard *g, int lost, real *command)
 {
-    const quadsim_controller *c = mpc->controller;
     static const real level[2] = {R(0.0), R(0.0)};
-    quadsim_guard *g = &mpc->guard;
-    real changes[NU], error[12], heading[2];
+    const quadsim_fallback *f = g->numbers;
+    real error[12], heading[2];
     int i, near = 1;
     if (!g->planned) {
         return 0;
     }
-    if (!g->foreseeing) { /* the paper's model is not turned */
-        g->foreseeing = 1;
-        find_heading(c->robust == NULL ? R(0.0) : g->foreseen[YAW], g->heading);
-        find_level(mpc, g->heading, g->level);
-        memcpy(g->resting, mpc->resting, sizeof(g->resting));
-    }
-    for (i = 0; i < NU; i++) {
-        changes[i] = mpc->kept[(g->age - 1) * NU + i] - g->resting[i];
-    }
-    respond_about(c->fallback, g->heading, g->level, changes, g->foreseen);
     for (i = 0; i < 12; i++) {
         error[i] = g->state[i] - g->foreseen[i];
-        near &= is_within(error + i, c->fallback->distance[i], 1);
+        near &= is_within(error + i, f->distance[i], 1);
     }
-    g->planned = near && !lost && g->age <= c->fallback->plan_age;
+    g->planned = near && !lost && g->age <= f->plan_age;
     if (!g->planned) {
         return 0;
     }
     find_heading(g->state[YAW], heading);
     turn(error, -heading[0], heading[1]);
-    demand(c->fallback, error, level, command);
+    demand(f, error, level, command);
     for (i = 0; i < NU; i++) {
-        command[i] += mpc->kept[g->age * NU + i];
+        command[i] += g->kept[g->age * NU + i];
     }
-    clip(c, command, acting, command);
+    quadsim_guard_clip(f, command, g->in_force, command);
     return 1;
 }
 
 /* The command of level hover, or of the descent after it; returns its level. */
-static int hover(quadsim_mpc *mpc, const real *acting, real *command)
+static int hover(quadsim_guard *g, const quadsim_trim *trim, real *command)
 {
-    const quadsim_fallback *f = mpc->controller->fallback;
-    quadsim_guard *g = &mpc->guard;
+    const quadsim_fallback *f = g->numbers;
     const real *state = g->state;
-    const int sinking = g->hovered >= f->hover;
+    const int sinking = g->hovered >= f->hover_periods;
     real error[12], level[2], heading[2];
     int i;
     if (!g->targeted) {
@@ -358,45 +337,89 @@ static int hover(quadsim_mpc *mpc, const real *acting, real *command)
     }
     find_heading(state[YAW], heading);
     turn(error, -heading[0], heading[1]);
-    find_level(mpc, heading, level);
+    lean_of(trim->lift, heading[0], heading[1], &level[0], &level[1]);
     demand(f, error, level, command);
     for (i = 0; i < NU; i++) {
-        command[i] += mpc->trim[i];
+        command[i] += trim->commands[i];
     }
-    clip(mpc->controller, command, acting, command);
+    quadsim_guard_clip(f, command, g->in_force, command);
     return sinking ? 3 : 2;
 }
 
-/* The law's status, that of an optimum if its plan may be flown. */
-static enum quadsim_status call_law(quadsim_mpc *mpc, enum quadsim_phase phase, const real *reference,
-                                    const real *acting)
+/* ---- periods ----------------------------------------------------------------------------------------------------- */
+
+int quadsim_is_flown(enum quadsim_status status)
 {
-    quadsim_guard *g = &mpc->guard;
-    const real *plan = mpc->work.plan;
-    enum quadsim_status status;
+    return status <= QUADSIM_WHOLE || status >= QUADSIM_NOT_CONVERGED;
+}
+
+void quadsim_guard_start(quadsim_guard *guard, const quadsim_fallback *numbers, int horizon, quadsim_real *kept)
+{
+    memset(guard, 0, sizeof(*guard));
+    guard->numbers = numbers;
+    guard->horizon = horizon;
+    guard->kept = kept;
+}
+
+void quadsim_guard_reset(quadsim_guard *guard, const quadsim_real command[4])
+{
+    const quadsim_fallback *f = guard->numbers;
+    int i;
+    memcpy(guard->before, is_within(command, f->largest_command, NU) ? command : f->hover, sizeof(guard->before));
+    forget(guard);
+    guard->level = guard->learns = 0;
+    memset(guard->state, 0, sizeof(guard->state));
+    put_diagonal(guard->covariance, f->unknown);
+    for (i = 0; i < 12; i++) {
+        guard->unseen[i] = NEVER;
+        guard->last[i] = guard->last_rates[i % 3] = R(-1e30); /* what no channel repeats */
+    }
+    guard->since = guard->asked = guard->waiting = NEVER;
+}
+
+enum quadsim_status quadsim_guard_begin(quadsim_guard *guard, enum quadsim_phase phase, const quadsim_trim *trim,
+                                        const quadsim_real state[12], const quadsim_real *reference, int count,
+                                        const quadsim_real acting[4])
+{
+    const quadsim_fallback *f = guard->numbers;
+    int i, oldest = 0, moving = 1;
+    memcpy(guard->in_force, is_within(acting, f->largest_command, NU) ? acting : guard->before, sizeof(guard->in_force));
+    complete(guard, trim, state, phase == QUADSIM_PHASE_FLYING);
+    count_up(&guard->waiting);
+    for (i = 0; i < 12; i++) {
+        oldest = guard->unseen[i] > oldest ? guard->unseen[i] : oldest;
+        moving &= guard->unseen[i] == 0 || i == X || i == Y || i == Z; /* how it turns, and how fast it flies */
+    }
+    guard->learns = 0;
+    if (oldest > f->unseen) {
+        guard->since = NEVER;
+        return QUADSIM_STATE_UNKNOWN;
+    }
+    if (!is_within(reference, f->largest_reference, count)) {
+        guard->since = NEVER;
+        return QUADSIM_INVALID_REFERENCE;
+    }
+    guard->asked = guard->waiting;
+    guard->waiting = 0;
+    count_up(&guard->since);
+    if (phase != QUADSIM_PHASE_LANDED) {
+        guard->learns = moving && guard->since <= f->compared && phase == QUADSIM_PHASE_FLYING;
+        guard->since = moving ? 0 : guard->since;
+    }
+    return QUADSIM_FREE;
+}
+
+enum quadsim_status quadsim_guard_check(const quadsim_guard *guard, enum quadsim_status status, const quadsim_real *plan)
+{
     real flown[NU];
-    int i, moving = 1;
-    for (i = 0; i < 12; i++) { /* where and how fast the vehicle turns, and how fast it flies */
-        moving &= g->unseen[i] == 0 || i == X || i == Y || i == Z;
-    }
-    count_up(&g->since);
-    if (!moving || g->since > mpc->controller->fallback->compared || phase != QUADSIM_PHASE_FLYING) {
-        mpc->known = 0; /* nothing to learn from */
-    }
-    if (moving) {
-        g->since = 0;
-    }
-    status = quadsim_mpc_solve(mpc, g->state, reference, acting);
-    if (phase != QUADSIM_PHASE_FLYING) { /* the ground holds the vehicle */
-        mpc->known = 0;
-    }
-    if (status > QUADSIM_WHOLE) {
+    int i;
+    if (!quadsim_is_flown(status)) {
         return status;
     }
-    if (!is_finite(plan, mpc->work.p->horizon * NU)) {
+    if (!is_finite(plan, guard->horizon * NU)) {
         return QUADSIM_NOT_FINITE;
     }
-    clip(mpc->controller, plan, acting, flown);
+    quadsim_guard_clip(guard->numbers, plan, guard->in_force, flown);
     for (i = 0; i < NU; i++) {
         if (magnitude(plan[i] - flown[i]) > BOUND_TOLERANCE) {
             return QUADSIM_OUT_OF_BOUNDS;
@@ -405,67 +428,58 @@ static enum quadsim_status call_law(quadsim_mpc *mpc, enum quadsim_phase phase, 
     return status;
 }
 
-void quadsim_guard_reset(quadsim_mpc *mpc)
+int quadsim_guard_foresees(const quadsim_guard *guard, enum quadsim_phase phase, enum quadsim_status status)
 {
-    quadsim_guard *g = &mpc->guard;
-    int i;
-    memset(g, 0, sizeof(*g));
-    put_diagonal(g->covariance, mpc->controller->fallback->unknown);
-    for (i = 0; i < 12; i++) {
-        g->unseen[i] = NEVER;
-        g->last[i] = g->last_rates[i % 3] = R(-1e30); /* what no channel repeats */
-    }
-    g->since = NEVER;
-    mpc->fallback = 0;
+    return guard->planned && phase != QUADSIM_PHASE_LANDED && !quadsim_is_flown(status);
 }
 
-enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, enum quadsim_phase phase, const quadsim_real state[12],
-                                     const quadsim_real *reference, const quadsim_real acting[4],
-                                     quadsim_real command[4])
+const quadsim_real *quadsim_guard_row(const quadsim_guard *guard)
 {
-    const quadsim_controller *c = mpc->controller;
-    const quadsim_fallback *f = c->fallback;
-    quadsim_guard *g = &mpc->guard;
-    enum quadsim_status status = QUADSIM_STATE_UNKNOWN;
-    real in_force[NU];
-    int i, oldest = 0;
-    memcpy(in_force, is_within(acting, f->largest_speed, NU) ? acting : mpc->before, sizeof(in_force));
-    complete(mpc, state, in_force, phase == QUADSIM_PHASE_FLYING);
-    for (i = 0; i < 12; i++) {
-        oldest = g->unseen[i] > oldest ? g->unseen[i] : oldest;
+    return guard->kept + (guard->age < guard->horizon ? guard->age : guard->horizon - 1) * NU;
+}
+
+void quadsim_guard_foresee(quadsim_guard *guard, int heading, const quadsim_trim *trim, const quadsim_real resting[4])
+{
+    const real *row = quadsim_guard_row(guard);
+    real changes[NU];
+    int i;
+    if (!guard->foreseeing) {
+        guard->foreseeing = 1;
+        find_heading(heading ? guard->foreseen[YAW] : R(0.0), guard->heading);
+        lean_of(trim->lift, guard->heading[0], guard->heading[1], &guard->level_there[0], &guard->level_there[1]);
+        memcpy(guard->resting, resting, sizeof(guard->resting));
     }
-    if (oldest > f->unseen) {
-        g->since = NEVER;
-    } else if (!is_within(reference, f->largest_reference, c->problem->horizon * 4)) {
-        g->since = NEVER;
-        status = QUADSIM_INVALID_REFERENCE;
-    } else if (phase == QUADSIM_PHASE_LANDED) {
-        count_up(&g->since);
-        quadsim_mpc_stand(mpc, in_force);
-    } else {
-        status = call_law(mpc, phase, reference, in_force);
+    for (i = 0; i < NU; i++) {
+        changes[i] = row[i] - guard->resting[i];
     }
+    respond_about(guard->numbers, guard->heading, guard->level_there, changes, guard->foreseen);
+}
+
+enum quadsim_status quadsim_guard_end(quadsim_guard *guard, enum quadsim_phase phase, const quadsim_trim *trim,
+                                      enum quadsim_status status, const quadsim_real *plan, quadsim_real command[4])
+{
+    const quadsim_fallback *f = guard->numbers;
     if (phase == QUADSIM_PHASE_LANDED) {
         static const real slowest[NU] = {R(0.0)};
-        forget(g);
-        mpc->fallback = 0;
+        forget(guard);
+        guard->level = 0;
         status = QUADSIM_LANDED;
-        clip(c, slowest, in_force, command);
-    } else if (status <= QUADSIM_WHOLE) {
-        forget(g);
-        mpc->fallback = 0;
-        clip(c, mpc->work.plan, in_force, command);
-        memcpy(mpc->kept, mpc->work.plan, (size_t)(c->problem->horizon * NU) * sizeof(real));
-        memcpy(mpc->kept, command, NU * sizeof(real));
-        memcpy(g->foreseen, g->state, sizeof(g->foreseen));
-        g->planned = 1;
+        quadsim_guard_clip(f, slowest, guard->in_force, command);
+    } else if (quadsim_is_flown(status)) {
+        forget(guard);
+        guard->level = 0;
+        quadsim_guard_clip(f, plan, guard->in_force, command);
+        memcpy(guard->kept, plan, (size_t)(guard->horizon * NU) * sizeof(real));
+        memcpy(guard->kept, command, NU * sizeof(real));
+        memcpy(guard->foreseen, guard->state, sizeof(guard->foreseen));
+        guard->planned = 1;
     } else {
-        count_up(&g->age);
-        mpc->fallback = 1;
-        if (!follow_plan(mpc, status == QUADSIM_STATE_UNKNOWN, in_force, command)) {
-            mpc->fallback = hover(mpc, in_force, command);
+        count_up(&guard->age);
+        guard->level = 1;
+        if (!follow_plan(guard, status == QUADSIM_STATE_UNKNOWN, command)) {
+            guard->level = hover(guard, trim, command);
         }
     }
-    memcpy(mpc->before, command, sizeof(mpc->before));
+    memcpy(guard->before, command, sizeof(guard->before));
     return status;
 }

@@ -200,6 +200,43 @@ static inline real square_root(real number)
     return factor * root;
 }
 
+/* ---- vectors (3,) and matrices [3][3], row by row; results lie apart from what they are of ------------------------ */
+
+static inline void cross_product(const real *left, const real *right, real *result)
+{
+    result[0] = left[1] * right[2] - left[2] * right[1];
+    result[1] = left[2] * right[0] - left[0] * right[2];
+    result[2] = left[0] * right[1] - left[1] * right[0];
+}
+
+/* Matrix times vector: of an attitude, from body to world. */
+static inline void turn_by(const real *matrix, const real *vector, real *result)
+{
+    int i;
+    for (i = 0; i < 3; i++) {
+        result[i] = dot(matrix + 3 * i, vector, 3);
+    }
+}
+
+/* The transposed matrix times vector: of an attitude, from world to body. */
+static inline void turn_back_by(const real *matrix, const real *vector, real *result)
+{
+    int i;
+    for (i = 0; i < 3; i++) {
+        result[i] = matrix[i] * vector[0] + matrix[3 + i] * vector[1] + matrix[6 + i] * vector[2];
+    }
+}
+
+/* Body z in world axes, and its rate of change, R hat(Omega) e_3, of an attitude and body rates. */
+static inline void thrust_axis_of(const real *attitude, const real *rates, real axis[3], real change[3])
+{
+    int i;
+    for (i = 0; i < 3; i++) {
+        axis[i] = attitude[3 * i + 2];
+        change[i] = attitude[3 * i] * rates[1] - attitude[3 * i + 1] * rates[0];
+    }
+}
+
 /* ---- states: world axes, Z-Y-X Euler angles and their rates ---------------------------------------------------- */
 
 enum { X = 0, VX = 1, Y = 2, VY = 3, Z = 4, VZ = 5, ROLL = 6, PITCH = 8, YAW = 10 };
@@ -228,6 +265,28 @@ static inline void lean_of(const real lift[3], real sine, real cosine, real *rol
     const real forward = cosine * lift[0] + sine * lift[1], left = cosine * lift[1] - sine * lift[0];
     *roll = -angle_of(left, square_root(forward * forward + lift[2] * lift[2]));
     *pitch = angle_of(forward, lift[2]);
+}
+
+/* ---- references: rows x y z yaw ----------------------------------------------------------------------------------- */
+
+/* Turns to be taken off the reference's heading in the next period, so that it starts near a yaw: as it went on
+ * before, and from the yaw anew only where that is more than 190 deg away. */
+static inline real first_turns(int *headed, real *heading, const real *reference, real yaw)
+{
+    real turns = *headed ? whole_turns(reference[3] - *heading) : R(0.0);
+    *heading = reference[3] - TURN * turns;
+    if (!*headed || magnitude(yaw - *heading) > R(3.3161255787892263)) {
+        turns -= whole_turns(yaw - *heading);
+        *heading = reference[3] - TURN * turns;
+    }
+    *headed = 1;
+    return turns;
+}
+
+/* The same of row i, of which row i - 1 had these turns. */
+static inline real next_turns(const real *reference, int i, real turns)
+{
+    return i == 0 ? turns : turns + whole_turns(reference[i * 4 + 3] - reference[i * 4 - 1]);
 }
 
 #endif

@@ -31,26 +31,6 @@ static void want(const quadsim_controller *c, const real row[4], real *wanted)
     }
 }
 
-/* Turns to be taken off the reference's heading in the next period, so that it starts near a yaw: as it went on
- * before, and from the yaw anew only where that is more than 190 deg away. */
-static real first_turns(quadsim_mpc *mpc, const real *reference, real yaw)
-{
-    real turns = mpc->headed ? whole_turns(reference[3] - mpc->heading) : R(0.0);
-    mpc->heading = reference[3] - TURN * turns;
-    if (!mpc->headed || magnitude(yaw - mpc->heading) > R(3.3161255787892263)) {
-        turns -= whole_turns(yaw - mpc->heading);
-        mpc->heading = reference[3] - TURN * turns;
-    }
-    mpc->headed = 1;
-    return turns;
-}
-
-/* The same of row i, of which row i - 1 had these turns. */
-static real next_turns(const real *reference, int i, real turns)
-{
-    return i == 0 ? turns : turns + whole_turns(reference[i * 4 + 3] - reference[i * 4 - 1]);
-}
-
 /* Level rest at a state's place and yaw. */
 static void rest_at(const real *state, real *rest)
 {
@@ -189,20 +169,20 @@ static void believe(quadsim_mpc *mpc)
         up = r->least_lift * r->gravity;
     }
     thrust = square_root(acceleration[0] * acceleration[0] + acceleration[1] * acceleration[1] + up * up);
-    mpc->lift[0] = -acceleration[0];
-    mpc->lift[1] = -acceleration[1];
-    mpc->lift[2] = up;
+    mpc->trim.lift[0] = -acceleration[0];
+    mpc->trim.lift[1] = -acceleration[1];
+    mpc->trim.lift[2] = up;
     memcpy(mpc->effectiveness, r->effectiveness, sizeof(mpc->effectiveness));
     drive[0] = thrust;
     for (i = 0; i < 3; i++) {
-        mpc->twist[i] = mpc->estimate[3 + i] / r->gravity;
-        drive[1 + i] = -thrust * mpc->twist[i];
+        mpc->trim.twist[i] = mpc->estimate[3 + i] / r->gravity;
+        drive[1 + i] = -thrust * mpc->trim.twist[i];
         for (j = 0; j < NU; j++) {
-            mpc->effectiveness[(1 + i) * NU + j] += mpc->twist[i] * r->effectiveness[j];
+            mpc->effectiveness[(1 + i) * NU + j] += mpc->trim.twist[i] * r->effectiveness[j];
         }
     }
     for (j = 0; j < NU; j++) {
-        mpc->trim[j] = square_root(dot(r->allocation + j * NU, drive, NU));
+        mpc->trim.commands[j] = square_root(dot(r->allocation + j * NU, drive, NU));
     }
 }
 
@@ -299,13 +279,13 @@ static void find_rest(quadsim_mpc *mpc, real sine, real cosine)
     real excess_thrust = R(0.0);
     int j;
     rest_at(mpc->state, rest);
-    lean_of(mpc->lift, sine, cosine, &rest[ROLL], &rest[PITCH]);
+    lean_of(mpc->trim.lift, sine, cosine, &rest[ROLL], &rest[PITCH]);
     for (j = 0; j < NU; j++) {
-        const real turning = mpc->turning[j], resting = mpc->trim[j];
+        const real turning = mpc->turning[j], resting = mpc->trim.commands[j];
         excess_thrust += r->effectiveness[j] * (turning * turning - resting * resting);
     }
     for (j = 0; j < NU; j++) {
-        speeds[j] = mpc->trim[j] - excess_thrust * dot(r->slope_inverse + j * NU + 1, mpc->twist, 3);
+        speeds[j] = mpc->trim.commands[j] - excess_thrust * dot(r->slope_inverse + j * NU + 1, mpc->trim.twist, 3);
     }
     put_modes(mpc->controller, speeds, rest);
 }
@@ -386,7 +366,7 @@ static enum quadsim_status solve_robust(quadsim_mpc *mpc, const real *state, con
     if (!mpc->known) {
         return QUADSIM_INVALID_DATA;
     }
-    return solve_ahead(mpc, ahead, reference, first_turns(mpc, reference, state[YAW]), acting);
+    return solve_ahead(mpc, ahead, reference, first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]), acting);
 }
 
 /* ---- the controllers --------------------------------------------------------------------------------------------- */
@@ -426,7 +406,7 @@ static int is_usable(const quadsim_controller *c, const real *state, const real 
 static enum quadsim_status solve_paper(quadsim_mpc *mpc, const real *state, const real *reference, const real *acting)
 {
     const quadsim_controller *c = mpc->controller;
-    real row[4], turns = first_turns(mpc, reference, state[YAW]);
+    real row[4], turns = first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]);
     int i;
     memcpy(mpc->state, state, 12 * sizeof(real));
     memcpy(mpc->resting, c->hover, sizeof(mpc->resting));
@@ -462,15 +442,19 @@ void quadsim_mpc_start(quadsim_mpc *mpc, const quadsim_controller *controller, r
     mpc->kept = memory + p->horizon * p->regulated;
     mpc->sent = mpc->kept + p->horizon * NU;
     quadsim_work_start(&mpc->work, p, mpc->sent + sent_reals(controller));
+    quadsim_guard_start(&mpc->guard, controller->fallback, p->horizon, mpc->kept);
     quadsim_mpc_reset(mpc, controller->hover);
 }
 
 void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
 {
     const quadsim_fallback *fallback = mpc->controller->fallback;
-    const int right = fallback == NULL ? is_finite(speeds, NU) : is_within(speeds, fallback->largest_speed, NU);
-    const real *usable = right ? speeds : mpc->controller->hover;
+    const real *usable = is_finite(speeds, NU) ? speeds : mpc->controller->hover;
     int i;
+    if (fallback != NULL) {
+        quadsim_guard_reset(&mpc->guard, speeds);
+        usable = mpc->guard.before;
+    }
     memcpy(mpc->before, usable, sizeof(mpc->before));
     memcpy(mpc->rotors, usable, sizeof(mpc->rotors));
     memcpy(mpc->turning, usable, sizeof(mpc->turning));
@@ -481,13 +465,10 @@ void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
     quadsim_work_reset(&mpc->work);
     mpc->known = mpc->headed = 0;
     memcpy(mpc->resting, mpc->controller->hover, sizeof(mpc->resting));
-    memcpy(mpc->trim, mpc->controller->hover, sizeof(mpc->trim));
-    mpc->lift[2] = R(1.0);
+    memcpy(mpc->trim.commands, mpc->controller->hover, sizeof(mpc->trim.commands));
+    mpc->trim.lift[2] = R(1.0);
     if (mpc->controller->robust != NULL) {
         believe(mpc);
-    }
-    if (fallback != NULL) {
-        quadsim_guard_reset(mpc);
     }
 }
 
@@ -533,4 +514,31 @@ enum quadsim_status quadsim_mpc_solve(quadsim_mpc *mpc, const quadsim_real state
         return solve_robust(mpc, state, reference, in_force, usable);
     }
     return usable ? solve_paper(mpc, state, reference, in_force) : QUADSIM_INVALID_DATA;
+}
+
+enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, enum quadsim_phase phase, const quadsim_real state[12],
+                                     const quadsim_real *reference, const quadsim_real acting[4],
+                                     quadsim_real command[4])
+{
+    const quadsim_controller *c = mpc->controller;
+    quadsim_guard *guard = &mpc->guard;
+    const real *plan = mpc->work.plan;
+    enum quadsim_status status =
+        quadsim_guard_begin(guard, phase, &mpc->trim, state, reference, c->problem->horizon * 4, acting);
+    if (status == QUADSIM_FREE && phase == QUADSIM_PHASE_LANDED) {
+        quadsim_mpc_stand(mpc, guard->in_force);
+    } else if (status == QUADSIM_FREE) {
+        mpc->known = mpc->known && guard->learns;
+        status = quadsim_mpc_solve(mpc, guard->state, reference, guard->in_force);
+        if (phase != QUADSIM_PHASE_FLYING) { /* the ground holds the vehicle */
+            mpc->known = 0;
+        }
+        status = quadsim_guard_check(guard, status, plan);
+    }
+    if (quadsim_guard_foresees(guard, phase, status)) { /* the paper's model is not turned */
+        quadsim_guard_foresee(guard, c->robust != NULL, &mpc->trim, mpc->resting);
+    }
+    status = quadsim_guard_end(guard, phase, &mpc->trim, status, plan, command);
+    memcpy(mpc->before, command, sizeof(mpc->before));
+    return status;
 }

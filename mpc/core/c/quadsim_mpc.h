@@ -1,4 +1,4 @@
-/* Model predictive controllers of quadrotors.
+/* Linear model predictive controllers of quadrotors.
  *
  * Once every period, call quadsim_mpc_step with what is measured now; hold the command until the next call.
  *
@@ -15,7 +15,7 @@
 #ifndef QUADSIM_MPC_H
 #define QUADSIM_MPC_H
 
-#include "quadsim_core.h"
+#include "quadsim_guard.h"
 
 #ifdef __cplusplus
 extern "C" {
@@ -46,25 +46,6 @@ typedef struct quadsim_robust {
     quadsim_real plausible_state[12], plausible_reference[4];          /* most that is taken for a measurement */
 } quadsim_robust;
 
-/* The numbers of the fallback contract.  Ages are in periods; the model is that of level hover. */
-typedef struct quadsim_fallback {
-    int plan_age, hover;           /* how long a plan is flown, and level hover after it, at most */
-    int unseen, compared;          /* how old a channel may be that is predicted; the last state that is learnt from */
-    quadsim_real sink, sunk;       /* of the descent [m/s], and in a period [m] */
-    quadsim_real settled;          /* horizontal speed above which no place is held [m/s] */
-    quadsim_real tilt, climb, turn; /* most that hover demands [rad], [m/s^2], [rad/s^2] */
-    quadsim_real largest_speed;    /* most that is taken for a command [rad/s] */
-    quadsim_real largest_reference; /* and for a reference [m], [rad] */
-    quadsim_real distance[12];     /* from a plan's states at most */
-    quadsim_real plausible[12], unmoved[12]; /* most that is taken for a measurement; least motion of what moves */
-    quadsim_real noise[12], unknown[12]; /* variances of what is measured, and before the first measurement */
-    quadsim_real process[6];       /* of the prediction: position, with velocity, velocity; the same of angles */
-    quadsim_real A[144], B[48];
-    quadsim_real gain[48], lean[8]; /* of hover: from errors to accelerations, from horizontal ones to tilts */
-    quadsim_real slope[4];         /* from changes of speeds to acceleration along z */
-    quadsim_real inverse[16];      /* from accelerations along z and about x, y, z to changes of speeds */
-} quadsim_fallback;
-
 /* A controller's numbers. */
 typedef struct quadsim_controller {
     const quadsim_problem *problem;
@@ -72,56 +53,19 @@ typedef struct quadsim_controller {
     const quadsim_fallback *fallback; /* NULL where quadsim guards the law: quadsim_mpc_step is not for it */
     const quadsim_real *C_r;                                 /* [n_r][n] regulated outputs, C_r x */
     quadsim_real hover[4];                                   /* [rad/s] */
-    quadsim_real speed_min[4], speed_max[4];                 /* [rad/s]; no bound: +-1e30 */
-    quadsim_real step_min[4], step_max[4];                   /* of speeds from one period to the next [rad/s] */
 } quadsim_controller;
 
-/* How a period was answered.  The first three are the optimum, flown as it is; the others are why there is none. */
-enum quadsim_status {
-    QUADSIM_FREE = QUADSIM_FOUND_FREE,   /* the optimum without constraints keeps them all */
-    QUADSIM_AXES = QUADSIM_FOUND_AXES,   /* the optimum with rows of states alone, axis by axis, keeps all others */
-    QUADSIM_WHOLE = QUADSIM_FOUND_WHOLE, /* the optimum of the whole problem */
-    QUADSIM_PRIMAL_INFEASIBLE = QUADSIM_FOUND_INFEASIBLE,
-    QUADSIM_MAX_ITERATIONS = QUADSIM_FOUND_GAVE_UP, /* the search took as many changes as it may */
-    QUADSIM_NO_ROOM = QUADSIM_FOUND_NO_ROOM,        /* for as many active rows */
-    QUADSIM_INVALID_DATA = QUADSIM_FOUND_INVALID,   /* numbers that are not finite, or implausible */
-    QUADSIM_NOT_FINITE,        /* the plan */
-    QUADSIM_OUT_OF_BOUNDS,     /* the plan's first command */
-    QUADSIM_STATE_UNKNOWN,     /* a channel has not been measured for too long */
-    QUADSIM_INVALID_REFERENCE,
-    QUADSIM_LANDED,            /* rotors are stopped */
-    QUADSIM_MISSED             /* no question came in time: of serial.c */
-};
-
-/* Where a period passes: in the air, on the ground with rotors that turn, or at rest there. */
-enum quadsim_phase { QUADSIM_PHASE_FLYING, QUADSIM_PHASE_ARMED, QUADSIM_PHASE_LANDED };
-
-/* What the fallback contract remembers. */
-typedef struct quadsim_guard {
-    int planned, foreseeing;   /* whether a plan is kept; whether `foreseen` moves along it */
-    int age, hovered, targeted; /* periods in fallback, and in hover or descent; whether these have a target */
-    int since;                 /* periods since the law was given a state that is measured */
-    int unseen[12];            /* periods since each channel was */
-    quadsim_real state[12];    /* complete */
-    quadsim_real covariance[144];
-    quadsim_real last[12], last_rates[3]; /* as measured the period before; body rates */
-    quadsim_real foreseen[12]; /* the state of the last optimum, then where its plan leads */
-    quadsim_real heading[2], level[2], resting[4]; /* sine and cosine of its yaw, roll and pitch at rest, speeds there */
-    quadsim_real target[12];
-} quadsim_guard;
-
-/* A controller.  Read fallback, work.changes and work.plan, the last optimum [N][4] in rad/s; the rest is its own. */
+/* A controller.  Read guard.level, work.changes and work.plan, the last optimum [N][4] in rad/s; the rest is its own. */
 typedef struct quadsim_mpc {
     const quadsim_controller *controller;
     quadsim_work work;
     quadsim_real *wanted;           /* [N][n_r] y_d - C_r x_s */
-    quadsim_real *kept;             /* [N][4] the last optimum that was flown [rad/s] */
+    quadsim_real *kept;             /* [N][4] of the guard */
     quadsim_real *sent;             /* robust: [under_way][4] the commands before the last, oldest first [rad/s] */
     quadsim_real state[QUADSIM_LAW_STATES]; /* the query: x(k), seen from axes that may be turned by the yaw */
     quadsim_real rest[QUADSIM_LAW_STATES];  /* where the model rests, x_s */
     quadsim_real resting[4];                 /* and at which speeds, u_s [rad/s] */
     quadsim_real before[4];         /* the last command [rad/s] */
-    int fallback;                   /* of the last step: 0 its optimum, 1 the plan kept, 2 hover, 3 descent */
     int headed;                     /* whether a heading has been followed */
     quadsim_real heading;           /* the reference's one period from now, on the turn that is followed [rad] */
     int known;                      /* robust: whether the state ahead is known */
@@ -129,9 +73,7 @@ typedef struct quadsim_mpc {
     quadsim_real ahead[12];         /* the state there */
     quadsim_real turning[4];        /* speeds at the instant from which the command acts [rad/s] */
     quadsim_real estimate[6];       /* disturbance: world x, y, along thrust [m/s^2], body [rad/s^2] */
-    quadsim_real trim[4];           /* rotor speeds at rest against it [rad/s]; the paper's: of level hover */
-    quadsim_real lift[3];           /* along which thrust points there, world axes */
-    quadsim_real twist[3];          /* angular acceleration over that by thrust [1/m] */
+    quadsim_trim trim;              /* at rest against it; the paper's: level hover */
     quadsim_real effectiveness[16]; /* from squared speeds to U/m and I^-1 tau, so twisted */
     quadsim_guard guard;
 } quadsim_mpc;
@@ -161,9 +103,6 @@ enum quadsim_status quadsim_mpc_solve(quadsim_mpc *mpc, const quadsim_real state
 enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, enum quadsim_phase phase, const quadsim_real state[12],
                                      const quadsim_real *reference, const quadsim_real acting[4],
                                      quadsim_real command[4]);
-
-/* Forget measurements, plan and level: of quadsim_mpc_reset. */
-void quadsim_guard_reset(quadsim_mpc *mpc);
 
 #ifdef __cplusplus
 }

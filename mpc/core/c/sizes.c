@@ -3,6 +3,7 @@
 
 #include "quadsim_mpc.h"
 #include "quadsim_nmpc.h"
+#include "quadsim_ramp.h"
 
 #define SIZE(type) extern const size_t type##_size; const size_t type##_size = sizeof(type)
 
@@ -13,9 +14,12 @@ SIZE(quadsim_problem);
 SIZE(quadsim_work);
 SIZE(quadsim_robust);
 SIZE(quadsim_controller);
+SIZE(quadsim_trim);
 SIZE(quadsim_guard);
 SIZE(quadsim_mpc);
 SIZE(quadsim_nmpc_term);
 SIZE(quadsim_nmpc_problem);
 SIZE(quadsim_nmpc_world);
 SIZE(quadsim_nmpc_work);
+SIZE(quadsim_ramp_numbers);
+SIZE(quadsim_ramp);

@@ -1,0 +1,574 @@
+#include "quadsim_nonlinear.h"
+
+#include <string.h>
+
+#include "quadsim_nmpc_math.h"
+
+static const real PLAUSIBLE = R(1e5);         /* of any number that is taken for a measurement */
+static const real KEPT_SIDE = R(-0.08715574274765817); /* cosine of 95 deg, half of what a heading may be off */
+static const real INFEASIBLE = R(1e-3);       /* violation of a row that a plan may have */
+static const real UPRIGHT = R(1.4);           /* pitch up to which Euler rates are as plausible as body rates [rad] */
+#ifdef QUADSIM_FLOAT
+static const real OUTSIDE = 1e-3F; /* tolerance of bounds on inputs, as a share of the largest */
+#else
+static const real OUTSIDE = 1e-6;
+#endif
+enum { LONG_AGO = 64 }; /* periods after which actuators have reached their command */
+
+/* Periods of the reference and of the plan. */
+static int rows_of(const quadsim_nonlinear_numbers *numbers)
+{
+    return numbers->problem->horizon * numbers->stride;
+}
+
+static int actuators_of(const quadsim_nonlinear_numbers *numbers)
+{
+    return numbers->problem->actuators;
+}
+
+/* ---- inputs and commands ----------------------------------------------------------------------------------------- */
+
+/* Shares of the largest inputs for commands (4,). */
+static void put_shares(const quadsim_nonlinear_numbers *numbers, const real *commands, real *shares)
+{
+    const quadsim_nmpc_problem *p = numbers->problem;
+    int j;
+    for (j = 0; j < NU; j++) {
+        const real thrust = numbers->coefficient * commands[j] * commands[j] / p->largest;
+        const real rotor = p->speeds ? square_root(thrust) : thrust;
+        shares[j] = p->targets ? commands[j] / numbers->scale[j] : rotor;
+    }
+}
+
+/* Commands (4,) for shares, moved onto their bounds. */
+static void put_commands(const quadsim_nonlinear_numbers *numbers, const real *shares, real *commands)
+{
+    const quadsim_nmpc_problem *p = numbers->problem;
+    int j;
+    for (j = 0; j < NU; j++) {
+        const real share = clipped(shares[j], p->lower[j], p->upper[j]);
+        const real rotor = p->speeds ? share * share : share;
+        commands[j] = p->targets ? share * numbers->scale[j] : square_root(rotor * p->largest / numbers->coefficient);
+    }
+}
+
+/* ---- the reference ----------------------------------------------------------------------------------------------- */
+
+/* Nodes of a motion. */
+static void take_motion(quadsim_nonlinear *law, const real *reference)
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    const int N = numbers->problem->horizon;
+    int i;
+    for (i = 0; i <= N; i++) {
+        const real *row = reference + i * numbers->stride * QUADSIM_MOTION;
+        memcpy(law->states + i * BODY, row, BODY * sizeof(real));
+        if (i < N) {
+            memcpy(law->thrusts + i * NU, row + BODY, NU * sizeof(real));
+        }
+    }
+}
+
+/* A level node at x y z yaw (4,), of which these are the rates. */
+static void put_node(quadsim_nonlinear *law, int node, const real *place, const real *rates)
+{
+    real *state = law->states + node * BODY;
+    memset(state, 0, BODY * sizeof(real));
+    memcpy(state + P, place, 3 * sizeof(real));
+    sin_cos(R(0.5) * place[3], &state[Q + 3], &state[Q]);
+    memcpy(state + V, rates, 3 * sizeof(real));
+    state[W + 2] = rates[3];
+    if (node < law->numbers->problem->horizon) {
+        memcpy(law->thrusts + node * NU, law->numbers->lifts, NU * sizeof(real));
+    }
+}
+
+/* Nodes of a preview: velocities by differences, level, thrusts of hover.  The first node, which has no cost, is
+ * extrapolated from the first two rows. */
+static void take_preview(quadsim_nonlinear *law, const real *reference, real yaw)
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    const int rows = rows_of(numbers);
+    real turns = first_turns(&law->headed, &law->heading, reference, yaw);
+    real place[4], next[4], step[4] = {R(0.0)}, rates[4];
+    int k, j;
+    memcpy(place, reference, sizeof(place));
+    place[3] -= TURN * turns;
+    for (k = 1; k <= rows; k++) { /* the k-th row, k periods from now */
+        memcpy(next, place, sizeof(next));
+        if (k < rows) {
+            turns = next_turns(reference, k, turns);
+            memcpy(next, reference + k * 4, sizeof(next));
+            next[3] -= TURN * turns;
+        }
+        for (j = 0; j < 4; j++) {
+            const real ahead = k < rows ? next[j] - place[j] : step[j];
+            rates[j] = R(0.5) * ((k == 1 ? ahead : step[j]) + ahead) / numbers->control_period;
+            step[j] = ahead;
+        }
+        if (k == 1) {
+            real first[4];
+            for (j = 0; j < 4; j++) {
+                first[j] = place[j] - step[j];
+            }
+            put_node(law, 0, first, rates);
+        }
+        if (k % numbers->stride == 0) {
+            put_node(law, k / numbers->stride, place, rates);
+        }
+        memcpy(place, next, sizeof(place));
+    }
+}
+
+/* ---- what disturbs ------------------------------------------------------------------------------------------------ */
+
+/* R of a unit quaternion, row by row. */
+static void put_rotation(const real *q, real turn[9])
+{
+    const real w = q[0], x = q[1], y = q[2], z = q[3];
+    turn[0] = R(1.0) - R(2.0) * (y * y + z * z);
+    turn[1] = R(2.0) * (x * y - w * z);
+    turn[2] = R(2.0) * (x * z + w * y);
+    turn[3] = R(2.0) * (x * y + w * z);
+    turn[4] = R(1.0) - R(2.0) * (x * x + z * z);
+    turn[5] = R(2.0) * (y * z - w * x);
+    turn[6] = R(2.0) * (x * z - w * y);
+    turn[7] = R(2.0) * (y * z + w * x);
+    turn[8] = R(1.0) - R(2.0) * (x * x + y * y);
+}
+
+/* Add to an acceleration what drag causes at a velocity, world axes. */
+static void add_drag(const quadsim_nmpc_world *world, const real *q, const real *velocity, real sign, real *acceleration)
+{
+    real turn[9], pull[3];
+    int i;
+    put_rotation(q, turn);
+    for (i = 0; i < 3; i++) {
+        const real air = turn[i] * velocity[0] + turn[3 + i] * velocity[1] + turn[6 + i] * velocity[2];
+        pull[i] = -(world->drag[i] * air + world->square_drag[i] * magnitude(air) * air);
+    }
+    for (i = 0; i < 3; i++) {
+        acceleration[i] += sign * dot(turn + 3 * i, pull, 3);
+    }
+}
+
+static int is_any(const real *numbers, int count)
+{
+    int i;
+    for (i = 0; i < count; i++) {
+        if (magnitude(numbers[i]) > R(0.0)) {
+            return 1;
+        }
+    }
+    return 0;
+}
+
+/* Where the vehicle rests under the world's disturbance; of rotors level hover. */
+static void find_trim(quadsim_nonlinear *law)
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    const quadsim_nmpc_problem *p = numbers->problem;
+    quadsim_trim *trim = &law->trim;
+    memset(trim, 0, sizeof(*trim));
+    memcpy(trim->commands, numbers->level, sizeof(trim->commands));
+    trim->lift[2] = R(1.0);
+    if (p->targets) {
+        const real least = numbers->least_lift * p->gravity, up = p->gravity - law->world.acceleration[2];
+        trim->lift[0] = -law->world.acceleration[0];
+        trim->lift[1] = -law->world.acceleration[1];
+        trim->lift[2] = up > least ? up : least;
+        trim->commands[0] = numbers->mass * square_root(dot(trim->lift, trim->lift, 3)) / law->world.thrust_scale;
+    }
+}
+
+/* Predict with the observer's estimate from now on. */
+static void believe(quadsim_nonlinear *law)
+{
+    memcpy(law->world.acceleration, law->estimate, sizeof(law->world.acceleration));
+    memset(law->world.angular, 0, sizeof(law->world.angular));
+    if (!law->numbers->problem->targets) { /* an inner loop balances torques */
+        memcpy(law->world.angular, law->estimate + 3, sizeof(law->world.angular));
+    }
+    find_trim(law);
+}
+
+/* Take note of how the measured state differs from the one that the last and the command in force lead to. */
+static void observe(quadsim_nonlinear *law)
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    real expected[QUADSIM_NMPC_MOST];
+    int i;
+    memcpy(law->last + BODY, law->rotors_before, (size_t)actuators_of(numbers) * sizeof(real));
+    quadsim_nmpc_advance(numbers->period, &law->world, 1, law->last, law->before, expected);
+    for (i = 0; i < 6; i++) {
+        const int at = i < 3 ? V + i : W + i - 3;
+        const real surprise = i >= 3 && numbers->problem->targets ? R(0.0) : law->measured[at] - expected[at];
+        law->estimate[i] = clipped(law->estimate[i] + numbers->gain[i] * surprise, -numbers->largest[i], numbers->largest[i]);
+    }
+    believe(law);
+}
+
+/* Turn a quaternion by the least rotation that takes a unit vector to the direction of another, (1 + a . b, a x b) up to
+ * its length; not at all where they are opposite. */
+static void turn_least(const real *unit, const real *to, real size, real *q)
+{
+    real turn[4], turned[4], length;
+    int i;
+    turn[0] = R(1.0) + dot(unit, to, 3) / size;
+    turn[1] = (unit[1] * to[2] - unit[2] * to[1]) / size;
+    turn[2] = (unit[2] * to[0] - unit[0] * to[2]) / size;
+    turn[3] = (unit[0] * to[1] - unit[1] * to[0]) / size;
+    length = square_root(dot(turn, turn, 4));
+    if (length < R(1e-6)) {
+        return;
+    }
+    from_frame(turn, q, turned);
+    for (i = 0; i < 4; i++) {
+        q[i] = turned[i] / length;
+    }
+}
+
+/* Add to the reference what balances drag and disturbance: thrust turned by the least rotation, and torque. */
+static void balance(quadsim_nonlinear *law)
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    const quadsim_nmpc_world *world = &law->world;
+    const int N = numbers->problem->horizon;
+    int i, j;
+    if (!is_any(world->acceleration, 3) && !is_any(world->angular, 3) && !is_any(world->drag, 3) &&
+        !is_any(world->square_drag, 3)) {
+        return;
+    }
+    for (i = N; i >= 0; i--) { /* the last node has the thrusts of the one before, as they were */
+        real *state = law->states + i * BODY, *thrusts = law->thrusts + (i < N ? i : N - 1) * NU;
+        const real total = ((thrusts[0] + thrusts[1]) + (thrusts[2] + thrusts[3])) / numbers->mass;
+        real axis[3], wanted[3], effort[NU], size;
+        thrust_axis(state + Q, axis);
+        for (j = 0; j < 3; j++) {
+            wanted[j] = total * axis[j] - world->acceleration[j];
+        }
+        add_drag(world, state + Q, state + V, R(-1.0), wanted);
+        size = square_root(dot(wanted, wanted, 3));
+        size = size > R(1e-9) ? size : R(1e-9);
+        turn_least(axis, wanted, size, state + Q);
+        effort[0] = size - total;
+        for (j = 0; j < 3; j++) {
+            effort[1 + j] = -world->angular[j];
+        }
+        for (j = 0; j < NU && i < N; j++) {
+            thrusts[j] += dot(numbers->inverse + j * NU, effort, NU);
+        }
+    }
+}
+
+/* ---- periods ------------------------------------------------------------------------------------------------------ */
+
+/* Let actuators follow the command in force, since the call before. */
+static void spin(quadsim_nonlinear *law, int periods)
+{
+    const real left = law->numbers->left;
+    int i, j;
+    memcpy(law->rotors_before, law->rotors, sizeof(law->rotors));
+    if (law->called && left > R(0.0)) {
+        for (j = 0; j < NU; j++) {
+            real away = law->rotors[j] - law->before[j];
+            for (i = 0; i < periods && i < LONG_AGO; i++) {
+                away *= left;
+            }
+            law->rotors[j] = law->before[j] + away;
+        }
+    }
+    law->called = 1;
+}
+
+/* Drop the plan, and assume no disturbance. */
+static void forget(quadsim_nonlinear *law)
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    quadsim_nmpc_reset(&law->work);
+    law->called = law->turned = law->headed = law->learns = 0;
+    law->side = R(1.0);
+    law->world.thrust_scale = R(1.0);
+    memcpy(law->world.drag, numbers->drag, sizeof(law->world.drag));
+    memcpy(law->world.square_drag, numbers->square_drag, sizeof(law->world.square_drag));
+    memset(law->estimate, 0, sizeof(law->estimate));
+    believe(law);
+}
+
+/* The attitude that Euler angles stand for. */
+static void put_attitude(const real *state, real q[4])
+{
+    real s[3], c[3];
+    int i;
+    for (i = 0; i < 3; i++) {
+        sin_cos(R(0.5) * state[ROLL + 2 * i], &s[i], &c[i]);
+    }
+    q[0] = c[0] * c[1] * c[2] + s[0] * s[1] * s[2];
+    q[1] = s[0] * c[1] * c[2] - c[0] * s[1] * s[2];
+    q[2] = c[0] * s[1] * c[2] + s[0] * c[1] * s[2];
+    q[3] = c[0] * c[1] * s[2] - s[0] * s[1] * c[2];
+}
+
+/* A body (13,) of a state, and of attitude and body rates where these are known. */
+static void put_body(const real *state, const real *attitude, const real *rates, real *body)
+{
+    int i;
+    for (i = 0; i < 3; i++) {
+        body[P + i] = state[2 * i];
+        body[V + i] = state[2 * i + 1];
+    }
+    if (attitude != NULL && is_finite(attitude, 4)) {
+        memcpy(body + Q, attitude, 4 * sizeof(real));
+    } else {
+        put_attitude(state, body + Q);
+    }
+    if (rates != NULL && is_finite(rates, 3)) {
+        memcpy(body + W, rates, 3 * sizeof(real));
+    } else {
+        body_rates(state, body + W);
+    }
+}
+
+/* q and -q are one attitude: the one near the last measured, and of the reference's, whose turns count, the nearer one
+ * until it is more than 190 deg away. */
+static void choose_sides(quadsim_nonlinear *law)
+{
+    real *q = law->measured + Q;
+    const int N = law->numbers->problem->horizon;
+    int i, j;
+    if (!law->turned) {
+        memcpy(law->quaternion, law->states + Q, sizeof(law->quaternion));
+    }
+    law->turned = 1;
+    if (dot(q, law->quaternion, 4) < R(0.0)) {
+        for (j = 0; j < 4; j++) {
+            q[j] = -q[j];
+        }
+    }
+    memcpy(law->quaternion, q, sizeof(law->quaternion));
+    if (law->side * dot(q, law->states + Q, 4) < KEPT_SIDE) {
+        law->side = -law->side;
+    }
+    for (i = 0; i <= N && law->side < R(0.0); i++) {
+        for (j = 0; j < 4; j++) {
+            law->states[i * BODY + Q + j] *= R(-1.0);
+        }
+    }
+}
+
+long quadsim_nonlinear_reals(const quadsim_nonlinear_numbers *numbers)
+{
+    const int N = numbers->problem->horizon;
+    return quadsim_nmpc_reals(numbers->problem) + (N + 1) * BODY + N * NU + 2 * rows_of(numbers) * NU;
+}
+
+long quadsim_nonlinear_ints(const quadsim_nonlinear_numbers *numbers)
+{
+    return quadsim_nmpc_ints(numbers->problem);
+}
+
+void quadsim_nonlinear_start(quadsim_nonlinear *law, const quadsim_nonlinear_numbers *numbers, quadsim_real *reals,
+                             int *ints)
+{
+    const int N = numbers->problem->horizon, rows = rows_of(numbers);
+    memset(law, 0, sizeof(*law));
+    law->numbers = numbers;
+    law->states = reals;
+    law->thrusts = law->states + (N + 1) * BODY;
+    law->plan = law->thrusts + N * NU;
+    law->kept = law->plan + rows * NU;
+    quadsim_nmpc_start(&law->work, numbers->problem, law->kept + rows * NU, ints);
+    quadsim_guard_start(&law->guard, numbers->fallback, rows, law->kept);
+    quadsim_nonlinear_reset(law, numbers->level);
+}
+
+void quadsim_nonlinear_reset(quadsim_nonlinear *law, const quadsim_real command[4])
+{
+    const real *usable = is_finite(command, NU) ? command : law->numbers->level;
+    if (law->numbers->fallback != NULL) {
+        quadsim_guard_reset(&law->guard, command);
+        usable = law->guard.before;
+    }
+    put_shares(law->numbers, usable, law->rotors);
+    memcpy(law->rotors_before, law->rotors, sizeof(law->rotors));
+    memcpy(law->before, law->rotors, sizeof(law->before));
+    forget(law);
+}
+
+void quadsim_nonlinear_learn(quadsim_nonlinear *law, const quadsim_real estimate[6])
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    int i;
+    if (!numbers->observes || !is_finite(estimate, 6)) {
+        return;
+    }
+    for (i = 0; i < 6; i++) {
+        law->estimate[i] = clipped(estimate[i], -numbers->largest[i], numbers->largest[i]);
+    }
+    believe(law);
+}
+
+void quadsim_nonlinear_stand(quadsim_nonlinear *law, int periods, const quadsim_real acting[4])
+{
+    put_shares(law->numbers, acting, law->before);
+    spin(law, periods);
+    forget(law);
+}
+
+int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, const quadsim_real state[12],
+                            const quadsim_real *attitude, const quadsim_real *rates, const quadsim_real *reference,
+                            const quadsim_real acting[4])
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    const int actuators = actuators_of(numbers), learns = law->learns && periods == 1;
+    const int count = numbers->motion ? (rows_of(numbers) + 1) * QUADSIM_MOTION : rows_of(numbers) * QUADSIM_PREVIEW;
+    law->learns = 0;
+    put_shares(numbers, acting, law->before);
+    spin(law, periods);
+    if (!is_within(state, PLAUSIBLE, 12) || !is_within(reference, PLAUSIBLE, count) || !is_finite(law->before, NU)) {
+        return 0;
+    }
+    put_body(state, attitude, rates, law->measured);
+    memcpy(law->measured + BODY, law->rotors, (size_t)actuators * sizeof(real));
+    if (!is_within(law->measured, PLAUSIBLE, BODY + actuators)) {
+        return 0;
+    }
+    if (numbers->motion) {
+        take_motion(law, reference);
+    } else {
+        take_preview(law, reference, state[YAW]);
+    }
+    choose_sides(law);
+    if (flying) {
+        if (numbers->observes && learns) {
+            observe(law);
+        }
+        law->learns = 1;
+        memcpy(law->last, law->measured, sizeof(law->last));
+    }
+    balance(law);
+    return 1;
+}
+
+enum quadsim_status quadsim_nonlinear_end(quadsim_nonlinear *law, enum quadsim_nmpc_status answer)
+{
+    static const enum quadsim_status STATUS[] = {QUADSIM_FREE, QUADSIM_WHOLE, QUADSIM_WHOLE, QUADSIM_PRIMAL_INFEASIBLE,
+                                                 QUADSIM_MAX_ITERATIONS, QUADSIM_NO_ROOM, QUADSIM_INVALID_DATA};
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    const quadsim_nmpc_problem *p = numbers->problem;
+    const quadsim_nmpc_work *work = &law->work;
+    enum quadsim_status status = STATUS[answer];
+    const real *inputs = answer == QUADSIM_NMPC_UNCONVERGED ? work->u : work->v;
+    int i, j;
+    for (i = 0; status <= QUADSIM_WHOLE && i < p->horizon * NU; i++) {
+        if (!is_finite(inputs + i, 1)) {
+            status = QUADSIM_NOT_FINITE;
+        } else if (!(inputs[i] <= p->upper[i % NU] + OUTSIDE && inputs[i] >= p->lower[i % NU] - OUTSIDE)) {
+            status = QUADSIM_OUT_OF_BOUNDS;
+        }
+    }
+    if (status <= QUADSIM_WHOLE && !(work->violation <= INFEASIBLE)) {
+        status = QUADSIM_INFEASIBLE_ANSWER;
+    }
+    if (status > QUADSIM_WHOLE) {
+        quadsim_nmpc_reset(&law->work);
+        return status;
+    }
+    for (i = 0; i < p->horizon; i++) {
+        for (j = 0; j < numbers->stride; j++) {
+            put_commands(numbers, inputs + i * NU, law->plan + (i * numbers->stride + j) * NU);
+        }
+    }
+    return work->defect > numbers->converged ? QUADSIM_NOT_CONVERGED : status;
+}
+
+/* ---- with the fallback contract ------------------------------------------------------------------------------------ */
+
+/* The angle whose tangent is y / x, of any quadrant [rad]. */
+static real direction_of(real y, real x)
+{
+    if (x > R(0.0)) {
+        return angle_of(y, x);
+    }
+    if (x < R(0.0)) {
+        return angle_of(y, -x) * R(-1.0) + (y < R(0.0) ? -R(2.0) * HALF_PI : R(2.0) * HALF_PI);
+    }
+    return y < R(0.0) ? -HALF_PI : (y > R(0.0) ? HALF_PI : R(0.0));
+}
+
+/* The state (12,) of a body, its yaw on the turn nearest to that of the state before. */
+static void put_state(const real *body, real *state)
+{
+    const real w = body[Q], x = body[Q + 1], y = body[Q + 2], z = body[Q + 3];
+    const real sine = clipped(R(2.0) * (w * y - z * x), R(-1.0), R(1.0)), before = state[YAW];
+    real s[3], c[3], along;
+    int i;
+    for (i = 0; i < 3; i++) {
+        state[2 * i] = body[P + i];
+        state[2 * i + 1] = body[V + i];
+    }
+    state[ROLL] = direction_of(R(2.0) * (w * x + y * z), R(1.0) - R(2.0) * (x * x + y * y));
+    state[PITCH] = direction_of(sine, square_root(R(1.0) - sine * sine));
+    state[YAW] = direction_of(R(2.0) * (w * z + x * y), R(1.0) - R(2.0) * (y * y + z * z));
+    state[YAW] -= TURN * whole_turns(state[YAW] - before);
+    sines_of(state, s, c);
+    along = body[W + 1] * s[0] + body[W + 2] * c[0];
+    c[1] = magnitude(c[1]) > R(1e-9) ? c[1] : R(1e-9); /* Euler rates grow without bound there */
+    state[ROLL + 1] = body[W] + along * s[1] / c[1];
+    state[PITCH + 1] = body[W + 1] * c[0] - body[W + 2] * s[0];
+    state[YAW + 1] = along / c[1];
+}
+
+/* Move the state that the guard foresees on by a period, under its plan. */
+static void foresee(quadsim_nonlinear *law)
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    quadsim_guard *guard = &law->guard;
+    real shares[NU], next[BODY + 1], length;
+    int i;
+    if (!guard->foreseeing) {
+        guard->foreseeing = 1;
+        put_body(guard->foreseen, NULL, NULL, law->ahead);
+    }
+    put_shares(numbers, quadsim_guard_row(guard), shares);
+    law->ahead[BODY] = R(0.0);
+    quadsim_nmpc_advance(numbers->unlagged, &law->world, 1, law->ahead, shares, next);
+    length = square_root(dot(next + Q, next + Q, 4));
+    for (i = 0; i < 4; i++) {
+        next[Q + i] /= length;
+    }
+    memcpy(law->ahead, next, sizeof(law->ahead));
+    put_state(law->ahead, guard->foreseen);
+}
+
+enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_phase phase,
+                                           const quadsim_real state[QUADSIM_NONLINEAR_STATE],
+                                           const quadsim_real *reference, const quadsim_real acting[4],
+                                           quadsim_real command[4])
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    const int count = numbers->motion ? (rows_of(numbers) + 1) * QUADSIM_MOTION : rows_of(numbers) * QUADSIM_PREVIEW;
+    quadsim_guard *guard = &law->guard;
+    enum quadsim_status status = quadsim_guard_begin(guard, phase, &law->trim, state, reference, count, acting);
+    law->work.changes = 0;
+    if (status == QUADSIM_FREE && phase == QUADSIM_PHASE_LANDED) {
+        quadsim_nonlinear_stand(law, guard->asked, guard->in_force);
+    } else if (status == QUADSIM_FREE) {
+        const int *unseen = guard->unseen;
+        const int turned = unseen[ROLL] == 0 && unseen[PITCH] == 0 && unseen[YAW] == 0;
+        const int turning = unseen[ROLL + 1] == 0 && unseen[PITCH + 1] == 0 && unseen[YAW + 1] == 0;
+        const int steep = magnitude(guard->state[PITCH]) >= UPRIGHT; /* where Euler rates are implausible, not a gyro's */
+        const real *attitude = turned ? state + 12 : NULL, *rates = turning || steep ? state + 16 : NULL;
+        status = QUADSIM_INVALID_DATA;
+        if (quadsim_nonlinear_begin(law, guard->asked, phase == QUADSIM_PHASE_FLYING, guard->state, attitude, rates,
+                                    reference, guard->in_force)) {
+            status = quadsim_nonlinear_end(law, quadsim_nmpc_step(&law->work, &law->world, law->measured, law->before,
+                                                                  law->states, law->thrusts));
+        }
+        status = quadsim_guard_check(guard, status, law->plan);
+    }
+    if (quadsim_guard_foresees(guard, phase, status)) {
+        foresee(law);
+    }
+    return quadsim_guard_end(guard, phase, &law->trim, status, law->plan, command);
+}
