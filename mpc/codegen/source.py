@@ -22,6 +22,8 @@ CORE_FILES: Final = (
     *("quadsim_mpc.h", "quadsim_mpc.c", "quadsim_guard.h", "quadsim_guard.c"),
 )
 """Files of `mpc/core/c` to export verbatim."""
+BODY_FILES: Final = ("quadsim_rigid.h",)
+"""Files of `quadsim/core` to export verbatim."""
 DATA: Final = "quadsim_data.h"
 """The generated file."""
 CHANGES: Final = 500
@@ -77,7 +79,8 @@ class CController:
     @cached_property
     def files(self) -> dict[str, str]:
         """Its C files, by name."""
-        return {name: part(name, "mpc.core") for name in CORE_FILES} | {DATA: self._data()}
+        body = {name: (resources.files("quadsim.core") / name).read_text(encoding="utf-8") for name in BODY_FILES}
+        return {name: part(name, "mpc.core") for name in CORE_FILES} | body | {DATA: self._data()}
 
     def _data(self) -> str:
         text = CText(self.precision, "quadsim_data_")

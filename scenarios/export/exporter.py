@@ -246,7 +246,7 @@ state, and of the C library `memcpy` and `memset`.
 | file | is |
 |---|---|
 | `quadsim_mpc.h` | the interface: state order, units, frames |
-| `quadsim_mpc.c`, `quadsim_core.{{h,c}}`, `quadsim_math.h` | the law and its solver, the same for every controller |
+| `quadsim_mpc.c`, `quadsim_core.{{h,c}}`, `quadsim_{{math,rigid}}.h` | the law and its solver, the same for all |
 | `quadsim_guard.c` | what is flown where the law has no answer, and the state that lacks measurements, completed |
 | `{DATA}` | this controller's numbers, and the memory that it needs |
 | `{FACTS}` | what it takes, and how far its room for active rows suffices |

@@ -230,7 +230,7 @@ static void steer(quadsim_nmpc_work *work, const quadsim_nmpc_world *world)
         }
         pull[2] += p->gravity;
         thrust_axis(q, axis);
-        along = pull[0] * axis[0] + pull[1] * axis[1] + pull[2] * axis[2];
+        along = dot(pull, axis, 3);
         size = square_root(pull[0] * pull[0] + pull[1] * pull[1] + pull[2] * pull[2]) + R(1e-6);
         wanted[0] = R(0.0); /* R(q)' pull is the vector part of q* (0, pull) q */
         memcpy(wanted + 1, pull, sizeof pull);

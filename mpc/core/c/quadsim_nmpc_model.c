@@ -93,23 +93,18 @@ static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wor
                     const real *q, const real *v, const real *w_b, int derive, struct slope *k)
 {
     const real w = q[0], x = q[1], y = q[2], z = q[3];
-    const real turn[3][3] = {{R(1.0) - R(2.0) * (y * y + z * z), R(2.0) * (x * y - w * z), R(2.0) * (x * z + w * y)},
-                             {R(2.0) * (x * y + w * z), R(1.0) - R(2.0) * (x * x + z * z), R(2.0) * (y * z - w * x)},
-                             {R(2.0) * (x * z - w * y), R(2.0) * (y * z + w * x), R(1.0) - R(2.0) * (x * x + y * y)}};
     const real slopes[4][3][3] = {{{R(0.0), -z, y}, {z, R(0.0), -x}, {-y, x, R(0.0)}},
                                   {{R(0.0), y, z}, {y, R(-2.0) * x, -w}, {z, w, R(-2.0) * x}},
                                   {{R(-2.0) * y, x, w}, {x, R(0.0), z}, {-w, z, R(-2.0) * y}},
                                   {{R(-2.0) * z, -w, x}, {w, R(-2.0) * z, y}, {x, y, R(0.0)}}}; /* halves */
     const real *const m = p->moment, *const c = p->damping;
-    real pull[3], damped[3][3], along[3];
+    real turn[3][3], pull[3], damped[3][3], along[3];
     int i, j, a;
+    rotation_of(q, R(2.0), turn);
+    add_air_drag(world->drag, world->square_drag, turn, v, along, pull, k->v);
     for (a = 0; a < 3; a++) {
-        const real body = turn[0][a] * v[0] + turn[1][a] * v[1] + turn[2][a] * v[2], size = magnitude(body);
-        const real rate = -(world->drag[a] + R(2.0) * world->square_drag[a] * size);
-        along[a] = body;
-        pull[a] = -(world->drag[a] + world->square_drag[a] * size) * body;
+        const real rate = -(world->drag[a] + R(2.0) * world->square_drag[a] * magnitude(along[a]));
         for (i = 0; i < 3; i++) {
-            k->v[i] += turn[i][a] * pull[a];
             damped[i][a] = turn[i][a] * rate;
         }
     }
@@ -147,18 +142,14 @@ static void slope_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wo
 {
     const real T = drive->thrust, twice = R(2.0) * T;
     int i;
-    k->q[0] = R(0.5) * (-q[1] * w[0] - q[2] * w[1] - q[3] * w[2]);
-    k->q[1] = R(0.5) * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1]);
-    k->q[2] = R(0.5) * (q[0] * w[1] - q[1] * w[2] + q[3] * w[0]);
-    k->q[3] = R(0.5) * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0]);
+    quaternion_rate(q, w, k->q);
     thrust_axis(q, k->axis);
     for (i = 0; i < 3; i++) {
         k->v[i] = T * k->axis[i] + world->acceleration[i];
     }
     k->v[2] -= p->gravity;
-    k->w[0] = p->gyration[0] * w[1] * w[2] + drive->angular[0];
-    k->w[1] = p->gyration[1] * w[2] * w[0] + drive->angular[1];
-    k->w[2] = p->gyration[2] * w[0] * w[1] + drive->angular[2];
+    memcpy(k->w, drive->angular, sizeof k->w);
+    add_gyroscopic(p->gyration, w, k->w);
     if (derive) {
         const real by_q[3][4] = {{twice * q[2], twice * q[3], twice * q[0], twice * q[1]},
                                  {-twice * q[1], -twice * q[0], twice * q[3], twice * q[2]},
