@@ -60,7 +60,7 @@ OPTIMAL: Final = {SQPStatus.FREE, SQPStatus.BOUNDED, SQPStatus.UNCONVERGED}
 
 
 class Replay:
-    """Solves each period of an `SQP` several times from the same memory.
+    """Solves each period of a law's `SQP` several times from the same memory.
 
     Attributes:
         ms: the least processor time of each period.
@@ -68,19 +68,19 @@ class Replay:
         iterations: changes of the active set and recursions of each period's last program.
     """
 
-    def __init__(self, sqp: SQP, repeats: int) -> None:
-        self._sqp, self._step, self._repeats = sqp, sqp.step, repeats
+    def __init__(self, law: NonlinearMPC, repeats: int) -> None:
+        self._sqp, self._step, self._memory, self._repeats = law._sqp, law._sqp.step, law._law._memory, repeats
         self.ms: list[float] = []
         self.active: list[int] = []
         self.iterations: list[int] = []
 
-    def step(self, measured: Array, before: Array, states: Array, thrusts: Array) -> SQPStatus:
+    def step(self) -> SQPStatus:
         """See `SQP.step`."""
         sqp, spent = self._sqp, []
-        memory, work = [part.copy() for part in sqp._memory], bytes(sqp._work)
-        status = self._step(measured, before, states, thrusts)
+        memory, work = [part.copy() for part in self._memory], bytes(sqp._work)
+        status = self._step()
         for _ in range(self._repeats):
-            for part, before in zip(sqp._memory, memory, strict=True):
+            for part, before in zip(self._memory, memory, strict=True):
                 part[:] = before
             ctypes.memmove(sqp._at, work, len(work))
             started = clock.thread_time()
@@ -106,8 +106,8 @@ def replayed(scenario: Scenario, repeats: int) -> Record:
     worst = 0.0
     with Rollout(scenario.replace({"controller.kkt_every": 1})) as flight:
         law = law_of(flight)
-        replay = Replay(law._sqp, repeats)
-        law._sqp.step = replay.step  # type: ignore[method-assign]
+        replay = Replay(law, repeats)
+        law._sqp.step = replay.step  # type: ignore[assignment, method-assign]
         try:
             while not flight.done:
                 stats = flight.loop.step().command.stats
@@ -168,7 +168,7 @@ class CoreRTI:
     def step(self, measured: Array) -> tuple[float, Array]:
         """Plan from a measured state (13,); return the processor time of the call [s], and the first input (4,)."""
         sqp = self._sqp
-        sqp._measured[:], sqp._before[:], (sqp._states[:], sqp._thrusts[:]) = measured, self._hover, self._reference
+        sqp._ask((measured, self._hover, *self._reference))
         started = clock.thread_time()
         status = sqp._library.quadsim_nmpc_step(*sqp._arguments)
         spent = clock.thread_time() - started

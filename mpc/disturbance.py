@@ -159,18 +159,21 @@ class RampObserver:
         thrust_lag: float | None = None,
     ) -> None:
         self._library, self._period = _library(), period
-        self.numbers, self.state = RampNumbers(), RampState()
+        self.numbers = RampNumbers()
         _fill(self.numbers, settings, vehicle, period, thrust_lag)
         self.numbers.moment = moment
         set_arrays(self.numbers, drag=np.array(drag, float), square_drag=np.array(quadratic_drag, float))
-        self._at = ctypes.addressof(self.state), ctypes.addressof(self.numbers)
-        arrays = (self.state.value, self.state.change, self.state.acting)
-        self._value, self._change, self._acting = map(np.ctypeslib.as_array, arrays)
+        self.bind(RampState())
         # What C reads in an update, and what it writes.
         self._measured = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(N_ROTORS)
         self._foreseen = np.zeros((3, 3))
         self._addresses = [array.ctypes.data for array in (*self._measured, *self._foreseen)]
         self.reset(vehicle.mass * vehicle.gravity if self.numbers.targets else vehicle.hover_speeds)
+
+    def bind(self, state: RampState) -> None:
+        """Keep the estimates in this memory from now on, as they are there."""
+        self.state, self._at = state, (ctypes.addressof(state), ctypes.addressof(self.numbers))
+        self._value, self._change, self._acting = map(np.ctypeslib.as_array, (state.value, state.change, state.acting))
 
     def reset(self, acting: Array | float) -> None:
         """Clear the estimates; the rotors turn at `acting` (4,) [rad/s], or give this thrust [N] with `thrust_lag`."""

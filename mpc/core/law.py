@@ -11,12 +11,12 @@ from typing import Final, NoReturn
 
 import numpy as np
 
-from mpc.answer import INFEASIBLE_ANSWER
 from mpc.condensing import Condensed
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
 from mpc.core.solver import PROBLEMS, Key, Optimum, Work, core_library, core_problem
 from mpc.core.tables import with_constraints
 from mpc.equilibrium import Trim
+from mpc.fallback.structs import STATUSES, GuardStruct, TrimStruct
 from mpc.heading import predict_in_heading_frame
 from mpc.linear import Remembered
 from mpc.model import hover_model
@@ -26,12 +26,8 @@ from mpc.paper import rollout
 from mpc.robust.settings import LONGEST_SPAN
 from mpc.solvers import INVALID_DATA, Answer
 from quadsim.controller import (
-    COMMANDED,
     GAIN,
     GROUNDED,
-    MISSED,
-    NOT_CONVERGED,
-    SOLVED,
     UNCONSTRAINED,
     Command,
     Phase,
@@ -43,12 +39,6 @@ from quadsim.core.library import check_sizes
 from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS
 
-STATUSES: Final = (
-    *(UNCONSTRAINED, SOLVED, SOLVED, "primal_infeasible", "max_iterations", "no_room", INVALID_DATA, "not_finite"),
-    *("out_of_bounds", "state_unknown", "invalid_reference", str(Phase.LANDED), MISSED),
-    *(INFEASIBLE_ANSWER, NOT_CONVERGED, COMMANDED),
-)
-"""Recorded statuses by `enum quadsim_status`."""
 INVALID: Final = STATUSES.index(INVALID_DATA)
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _SAME_TIME: Final = 1e-6  # [s]
@@ -77,32 +67,15 @@ class _Controller(ctypes.Structure):
     ]
 
 
-class _Trim(ctypes.Structure):
-    _fields_ = _arrays(commands=4, lift=3, twist=3)
-
-
-class _Guard(ctypes.Structure):
-    """The fallback contract's, which only an export has: in flight it is `mpc.fallback.contract.Guard`."""
-
-    _fields_ = [
-        *((name, _AT) for name in ("numbers", "kept")),
-        *((name, _INT) for name in ("horizon", "level", "learns", "asked", "waiting", "planned", "foreseeing")),
-        *((name, _INT) for name in ("age", "hovered", "targeted", "since")),
-        ("unseen", _INT * 12),
-        *_arrays(in_force=4, before=4, state=12, covariance=144, last=12, last_rates=3, foreseen=12),
-        *_arrays(heading=2, level_there=2, resting=4, target=12),
-    ]
-
-
 class _MPC(ctypes.Structure):
     _fields_ = [
         *(("controller", _AT), ("work", Work), ("wanted", _AT), ("kept", _AT), ("sent", _AT)),
         *_arrays(state=16, rest=16, resting=4, before=4),
         *(("headed", _INT), ("heading", _REAL), ("known", _INT)),
         *_arrays(rotors=4, ahead=12, turning=4, estimate=6),
-        ("trim", _Trim),
+        ("trim", TrimStruct),
         *_arrays(effectiveness=16),
-        ("guard", _Guard),
+        ("guard", GuardStruct),
     ]
 
 
@@ -112,8 +85,8 @@ def _library() -> ctypes.CDLL:
     check_sizes(
         quadsim_robust=_Robust,
         quadsim_controller=_Controller,
-        quadsim_trim=_Trim,
-        quadsim_guard=_Guard,
+        quadsim_trim=TrimStruct,
+        quadsim_guard=GuardStruct,
         quadsim_mpc=_MPC,
     )
     library.quadsim_mpc_reals.restype, library.quadsim_mpc_reals.argtypes = ctypes.c_long, [_AT]

@@ -51,19 +51,27 @@ def _library() -> ctypes.CDLL:
 
 
 class World:
-    """What a model knows of its surroundings, in the core's layout: disturbance, drag and thrust scale."""
+    """What a model knows of its surroundings, in the core's layout.
 
-    def __init__(self, model: RigidBody) -> None:
-        self._struct = WorldStruct()
-        self.address, self._numbers = (
-            ctypes.addressof(self._struct),
-            np.ctypeslib.as_array((REAL * 13).from_buffer(self._struct)),
-        )
-        self.set(model)
+    Attributes:
+        address: of the struct.
+        numbers: (13,) its view: acceleration, angular acceleration, drag, quadratic drag over the mass, thrust scale.
+    """
+
+    def __init__(self, struct: WorldStruct) -> None:
+        self._struct, self.address = struct, ctypes.addressof(struct)
+        self.numbers = np.ctypeslib.as_array((REAL * 13).from_buffer(struct))
+
+    @classmethod
+    def of(cls, model: RigidBody) -> World:
+        """Return that of a model."""
+        world = cls(WorldStruct())
+        world.set(model)
+        return world
 
     def set(self, model: RigidBody) -> None:
         """Take another disturbance, drag and thrust scale."""
-        numbers, mass = self._numbers, model.mass
+        numbers, mass = self.numbers, model.mass
         numbers[0:3], numbers[3:6] = model.acceleration, model.angular_acceleration
         numbers[6:9], numbers[9:12], numbers[12] = model.drag / mass, model.quadratic_drag / mass, model.thrust_scale
 
@@ -90,23 +98,28 @@ class Body:
 
     Args:
         model: the rigid body; `set_world` changes its disturbance, drag and thrust scale.
+
+    Attributes:
+        world: what it knows of its surroundings; another one may be shared with others.
+        struct: its numbers in the core's layout.
+        left: what `struct.left` points to.
     """
 
     def __init__(self, model: RigidBody) -> None:
-        self._p, self._n, self._library = ProblemStruct(), model.n, _library()
-        self._left = body_numbers(model, self._p)
-        self._world = World(model)
+        self.struct, self._n, self._library = ProblemStruct(), model.n, _library()
+        self.left = body_numbers(model, self.struct)
+        self.world = World.of(model)
 
     def set_world(self, model: RigidBody) -> None:
         """Take the disturbance, drag and thrust scale of another model."""
-        self._world.set(model)
+        self.world.set(model)
 
     def advance(self, x: Array, u: Array) -> Array:
         """Return the states (..., n) one step after states x (..., n) under inputs u (..., 4)."""
         x, u, end = np.ascontiguousarray(x), np.ascontiguousarray(u), np.empty(x.shape)
         assert x.shape == (*u.shape[:-1], self._n)
         assert u.shape[-1] == N_ROTORS
-        at = ctypes.addressof(self._p), self._world.address, math.prod(x.shape[:-1])
+        at = ctypes.addressof(self.struct), self.world.address, math.prod(x.shape[:-1])
         self._library.quadsim_nmpc_advance(*at, x.ctypes.data, u.ctypes.data, end.ctypes.data)
         return end
 
@@ -126,9 +139,9 @@ class Body:
         slopes, end, frames = np.empty((M, N_BODY, width_of(n))), np.empty((M, n)), np.ascontiguousarray(frames)
         for i in range(M):
             arrays = (x[i], u[i], frames[i : i + 2], slopes[i], end[i])
-            at = ctypes.addressof(self._p), self._world.address
+            at = ctypes.addressof(self.struct), self.world.address
             self._library.quadsim_nmpc_slopes(*at, *(array.ctypes.data for array in arrays))
-        return *unpacked(slopes, n, 0, self._left[-1]), end
+        return *unpacked(slopes, n, 0, self.left[-1]), end
 
 
 def width_of(n: int) -> int:

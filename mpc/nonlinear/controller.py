@@ -27,22 +27,19 @@ from mpc.bounded import resolved_lag
 from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver
 from mpc.equilibrium import LEAST_LIFT, Trim
+from mpc.fallback.structs import STATUSES
 from mpc.model import LinearModel
 from mpc.nonlinear.body import Body
-from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
+from mpc.nonlinear.law import NonlinearLaw, NumbersStruct
 from mpc.nonlinear.rigidbody import (
     N_BODY,
     Inputs,
     P,
     Q,
-    RigidBody,
     V,
     W,
-    drag_acceleration,
     rigid_body,
-    rotation,
     thrust_axis,
-    turned_by_air,
 )
 from mpc.nonlinear.settings import Nonlinear
 from mpc.nonlinear.sqp import SQP, SQPStatus, slack_groups
@@ -58,6 +55,7 @@ from quadsim.controller import (
     GAIN,
     GROUNDED,
     NOT_CONVERGED,
+    OPTIMAL,
     ROTORS,
     SOLVED,
     UNCONSTRAINED,
@@ -67,13 +65,12 @@ from quadsim.controller import (
     StepInputs,
     stopped,
 )
+from quadsim.core.library import set_arrays
 from quadsim.errors import ParameterError
 from quadsim.rotation import (
     body_to_euler_rates,
-    cross,
     euler_to_body_rates,
     euler_to_quaternion,
-    multiply,
     quaternion_to_euler,
 )
 from quadsim.state import (
@@ -81,19 +78,13 @@ from quadsim.state import (
     ANGLES,
     EULER,
     EULER_RATE,
-    INDEX,
-    KEPT,
     N_STATES,
     POSITIONS,
     VELOCITIES,
     Array,
-    ReferenceTurns,
-    all_true,
 )
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-OUTSIDE: Final = 1e-6
-"""Tolerance of an input's bounds, as a share of the largest input; an answer outside is moved onto them."""
 CONVERGED: Final = 0.1
 """Largest dynamics defect of a converged plan (`quadsim.controller.Statistics`). Library flights exceed it in at most 9
 periods, after steps of the course and upside down; a tumbling vehicle exceeds it in all."""
@@ -106,14 +97,6 @@ TILT_SIDES: Final = 12
 """Sides of the polygon that a tilt bound imposes on the thrust axis's horizontal part, inside the circle; it costs up
 to 3.4 % of the bound's sine."""
 _OPTIMA: Final = {SQPStatus.FREE, SQPStatus.BOUNDED, SQPStatus.UNCONVERGED}
-SQP_FAILURES: Final = {
-    SQPStatus.INFEASIBLE: "primal_infeasible",
-    SQPStatus.GIVEN_UP: "max_iterations",
-    SQPStatus.NO_ROOM: "no_room",
-    SQPStatus.NOT_FINITE: INVALID_DATA,
-}
-_PLAUSIBLE: Final = 1e5
-_SAME_TIME: Final = 1e-6  # [s]
 
 
 class NonlinearMPC:
@@ -160,9 +143,6 @@ class NonlinearMPC:
         )
         if settings.moment:
             vehicle.require_moment("controller")
-        self._inverse = np.linalg.inv(self._model.effectiveness)
-        lifts = vehicle.mass * vehicle.gravity * vehicle.thrust_shares
-        self._hover = lifts * (vehicle.mean_coefficient / vehicle.coefficients)  # of rotors with the mean coefficient
         self._level = vehicle.hover_speeds
         if self._targets:
             self._level = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
@@ -189,11 +169,6 @@ class NonlinearMPC:
             faces=0 if space is None else space.count,
             price=None if space is None else space.penalty,
         )
-        # The same body over a control period: from measurement to measurement, and for other plans, without rotor lag.
-        period_model = replace(self._model, step=period)
-        self._of_period = Body(period_model)
-        lags = (0.0, *lags[1:])
-        self._without_lag = Body(replace(period_model, rotor_lag=None, lag=lags, substeps=1))
         observing, ramp = settings.offset_free, settings.disturbance
         self._observer = None if observing is None else DisturbanceObserver(observing, period)
         self._ramp: RampObserver | None = None
@@ -208,6 +183,14 @@ class NonlinearMPC:
                 moment=settings.moment,
                 thrust_lag=self._lag if self._targets else None,
             )
+        # The same body over a control period: from measurement to measurement, and for other plans, without rotor lag.
+        period_model = replace(self._model, step=period)
+        self._of_period = Body(period_model)
+        without_lag = replace(period_model, rotor_lag=None, lag=(0.0, *lags[1:]), substeps=1)
+        self._without_lag = Body(without_lag)
+        bodies = self._of_period.struct, self._without_lag.struct
+        self._law = NonlinearLaw(self._law_numbers(), self._sqp, *bodies, self._ramp)
+        self._without_lag.world = self._law.world
         self.reset(self._level)
 
     def _shares(self, speeds: Array) -> Array:
@@ -216,13 +199,31 @@ class NonlinearMPC:
             return speeds / self._model.scale
         return self._model.shares(self._vehicle.mean_coefficient * np.square(speeds))
 
-    @property
-    def _in_force(self) -> Array | float:
-        """The command in force, for the observer of forces: rotor speeds (4,) [rad/s], or collective thrust [N]."""
-        return float(self._acting[0]) if self._targets else self._acting
-
-    def _clip(self, shares: Array) -> Array:
-        return np.minimum(np.maximum(shares, self._lower), self._upper)
+    def _law_numbers(self) -> NumbersStruct:
+        vehicle, model, observer = self._vehicle, self._model, self._observer
+        numbers = NumbersStruct(
+            stride=self._stride,
+            observes=observer is not None,
+            control_period=self._period,
+            mass=vehicle.mass,
+            coefficient=vehicle.mean_coefficient,
+            left=math.exp(-self._period / self._lag) if self._lag else 0.0,
+            least_lift=LEAST_LIFT,
+            converged=CONVERGED,
+        )
+        lifts = vehicle.mass * vehicle.gravity * vehicle.thrust_shares
+        set_arrays(
+            numbers,
+            scale=model.scale,
+            level=self._level,
+            lifts=lifts * (vehicle.mean_coefficient / vehicle.coefficients),  # of rotors with the mean coefficient
+            inverse=np.linalg.inv(model.effectiveness),
+            drag=model.drag / vehicle.mass,
+            square_drag=model.quadratic_drag / vehicle.mass,
+        )
+        if observer is not None:
+            set_arrays(numbers, gain=observer.gain, largest=observer.largest)
+        return numbers
 
     def _speeds(self, shares: Array) -> Array:
         """Return the commands of inputs: rotor speeds [rad/s] or targets [N], [rad/s]."""
@@ -327,117 +328,66 @@ class NonlinearMPC:
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed; or after a target that acts."""
-        self._acting = np.array(speeds, float)
-        self._rotors = self._rotors_before = self._shares(self._acting)
-        self._forget()
+        self._acting, self._called_at = np.array(speeds, float), math.nan
+        self._law.reset(self._acting)
         self._check.reset()
         self.infeasible_period: InfeasiblePeriod | None = None
-
-    def _forget(self) -> None:
-        """Drop the plan, and assume no disturbance."""
-        self._sqp.reset()
-        self._quaternion: Array | None = None
-        self._side = 1.0
-        self._turns = ReferenceTurns()
-        self._last: tuple[float, Array] | None = None  # time and state of the last period
-        self._called_at = math.nan
-        if self._observer is not None:
-            self._observer.reset()
-        if self._ramp is not None:
-            self._ramp.reset(self._in_force)
-            self._model = replace(self._model, drag=self._drag, thrust_scale=self._ramp.thrust_scale)
-        self._update_disturbance(np.zeros(6))
 
     def adopt(self, previous: object) -> None:
         """Take over disturbance, rotor speeds and plan of the previous law, these only from one with like commands."""
         law = previous if isinstance(previous, NonlinearMPC) else None
         if law is not None:
-            alike = self._inputs is law._inputs
-            same_space = self._targets is law._targets
-            if same_space:
-                shares = law._rotors, law._rotors_before
-                self._rotors, self._rotors_before = (
-                    share if alike else self._shares(law._speeds(share)) for share in shares
-                )
-            self._quaternion, self._side, self._called_at = law._quaternion, law._side, law._called_at
-            if law._last is not None and same_space:
-                time, x = law._last
-                self._last = time, np.concatenate([x[:N_BODY], self._rotors])[: self._model.n]
+            alike, rotors = self._inputs is law._inputs, None
+            if self._targets is law._targets:
+                its = (np.array(law._law.struct.rotors), np.array(law._law.struct.rotors_before))
+                rotors = its if alike else (self._shares(law._speeds(its[0])), self._shares(law._speeds(its[1])))
+            self._called_at = law._called_at
+            self._law.adopt(law._law, rotors)
             alike = alike and self._model.n == law._model.n and self._model.step == law._model.step
             plan = law._sqp.plan
             if plan is not None and alike:
                 self._sqp.plan = resized(plan[0], self._nodes + 1), resized(plan[1], self._nodes)
             if self._ramp is not None and law._ramp is not None:
                 self._ramp.adopt(law._ramp)
-        observer = None if law is None else law._observer
-        estimate = disturbance_of(previous) if observer is None else observer.estimate
-        if self._observer is not None and estimate is not None:
-            self._observer.adopt(estimate)
-            self._update_disturbance(self._observer.estimate)
+        estimate = disturbance_of(previous)
+        if law is not None and law._observer is not None:
+            estimate = np.array(law._law.struct.estimate)
+        if estimate is not None:
+            self._law.learn(estimate)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; numbers out of range give the status `invalid_data`."""
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
-        last, self._last = self._last, None
-        before, self._called_at, self._rotors_before = self._called_at, now.time, self._rotors
-        if self._lag and math.isfinite(before):  # the rotors have followed the command
-            left = math.exp(-(now.time - before) / self._lag)
-            commanded = self._shares(self._acting)
-            self._rotors = commanded + left * (self._rotors - commanded)
+        since, self._called_at = now.time - self._called_at, now.time
+        periods = round(since / self._period) if math.isfinite(since) else 0
         if now.phase in GROUNDED:
+            self._law.stand(periods, self._acting)
             self._acting = self._bounds.lowest(self._acting)
-            self._forget()
             return stopped(self._acting.copy(), self.horizon, now.phase)
-        measured = self._measured(now, state)
-        if not (np.abs(measured) <= _PLAUSIBLE).all() or not (np.abs(reference) <= _PLAUSIBLE).all():
+        if not self._law.begin(periods, now.phase is Phase.FLYING, now, state, reference, self._acting):
             return refused(self._acting, self.horizon, INVALID_DATA)
-        stride = self._stride
-        if now.motion is not None:
-            nodes = nodes_of_motion(now.motion, self._nodes, stride)
-        else:
-            reference = self._turns.follow(reference, float(state[INDEX["yaw"]]))
-            nodes = nodes_of_preview(reference, self._nodes, stride, self._period, self._hover)
-        if self._quaternion is None:
-            self._quaternion = nodes.states[0, Q]
-        if measured[Q] @ self._quaternion < 0.0:
-            measured[Q] *= -1.0
-        self._quaternion = measured[Q].copy()
-        # q and -q are one attitude, a whole turn apart: of the nodes, the nearer one counts, as by `ReferenceTurns`.
-        if self._side * (measured[Q] @ nodes.states[0, Q]) < math.cos(0.5 * KEPT):
-            self._side = -self._side
-        nodes.states[:, Q] *= self._side
-        if now.phase is Phase.FLYING:
-            if self._observer is not None and last is not None:
-                self._learn(last, now.time, measured)
-            if self._ramp is not None:
-                self._follow(self._ramp, now.time, measured)
-                self._ramp.log(now)
-            self._last = now.time, measured
-        nodes = self._balanced(nodes)
+        if self._ramp is not None and now.phase is Phase.FLYING:
+            self._ramp.log(now)
         last_plan = self._sqp.plan
-        answer = self._iterate(now.time, measured, nodes)
-        answer, status = self._check(self.problem, None, answer, self._rejection(answer))
+        answer, found = self._iterate(now.time)
+        status = STATUSES[found]
+        answer, reason = self._check(self.problem, None, answer, None if status in ACCEPTED else status)
         first = self.infeasible_period
-        if status is not None:
-            if status != INVALID_DATA and (first is None or first.converges is not None):
-                self.infeasible_period = self._kept_period(now.time, status)
-            self._sqp.reset()
-            return refused(self._acting, self.horizon, status, answer)
-        status = answer.status
-        if answer.stats.sqp_defect > CONVERGED:
-            status = NOT_CONVERGED
-            if first is None:
-                start = _Start(last_plan, self._acting, self._model, now.time, measured, nodes)
-                converges = partial(_converges, self._again, self.settings, start)
-                self.infeasible_period = replace(self._kept_period(now.time, status), converges=converges)
-        speeds = self._speeds(self._clip(answer.plan))
+        if reason is not None:
+            if reason != INVALID_DATA and (first is None or first.converges is not None):
+                self.infeasible_period = self._kept_period(now.time, reason)
+            return refused(self._acting, self.horizon, reason, answer)
+        if status == NOT_CONVERGED and first is None:
+            start = _Start(last_plan, self._law.world.numbers.copy(), now.time, self._law.query)
+            converges = partial(_converges, self._again, self.settings, start)
+            self.infeasible_period = replace(self._kept_period(now.time, status), converges=converges)
+        speeds = self._law.plan.copy()
         self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
-        return command_of(speeds[0], np.repeat(speeds, stride, axis=0), status, answer)
+        return command_of(speeds[0], speeds, status, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the latest disturbance estimate, without rotor lag."""
-        self._without_lag.set_world(self._model)
         n = N_BODY + self._targets
         x, predicted = np.zeros((len(states), n)), np.empty((*plans.shape[:2], N_STATES))
         x[:, :N_BODY] = _body(states)
@@ -453,102 +403,24 @@ class NonlinearMPC:
     @property
     def disturbance(self) -> Array:
         """(6,) estimated acceleration now, world [m/s^2], and angular acceleration, body [rad/s^2]."""
-        return np.concatenate([self._model.acceleration, self._model.angular_acceleration])
+        return self._law.world.numbers[:6].copy()
 
     @property
     def trim(self) -> Trim | None:
         """The target at rest under the estimated force and thrust scale, for the fallback; None for rotor speeds."""
-        if not self._targets:
-            return None
-        model = self._model
-        lift = np.array([0.0, 0.0, model.gravity]) - model.acceleration
-        lift[2] = max(lift[2], LEAST_LIFT * model.gravity)
-        thrust = model.mass * float(np.linalg.norm(lift)) / model.thrust_scale
-        return Trim(speeds=np.array([thrust, 0.0, 0.0, 0.0]), lift=lift)
+        trim = self._law.struct.trim
+        return Trim(speeds=np.array(trim.commands), lift=np.array(trim.lift)) if self._targets else None
 
-    def _measured(self, now: StepInputs, state: Array) -> Array:
-        """(n,) the model's state."""
-        x = np.empty(self._model.n)
-        x[P], x[V], x[N_BODY:] = state[POSITIONS], state[VELOCITIES], self._rotors[: self._model.n - N_BODY]
-        q, w = now.attitude, now.body_rates
-        x[Q] = q if q is not None and all_true(np.isfinite(q)) else euler_to_quaternion(state[ANGLES])
-        x[W] = (
-            w if w is not None and all_true(np.isfinite(w)) else euler_to_body_rates(state[ANGLES], state[ANGLE_RATES])
-        )
-        return x
-
-    def _learn(self, last: tuple[float, Array], time: float, measured: Array) -> None:
-        """Compare the measured state with its prediction from the last one, disturbance included."""
-        before, x = last
-        if not abs(time - before - self._period) <= _SAME_TIME:
-            return
-        assert self._observer is not None
-        if x.size > N_BODY:
-            x = np.concatenate([x[:N_BODY], self._rotors_before])[: self._model.n]
-        self._of_period.set_world(self._model)
-        expected = self._of_period.advance(x, self._shares(self._acting))
-        turned = np.zeros(3) if self._targets else measured[W] - expected[W]  # an inner loop balances torques
-        self._observer.learn(np.concatenate([measured[V] - expected[V], turned]))
-        self._update_disturbance(self._observer.estimate)
-
-    def _update_disturbance(self, estimate: Array) -> None:
-        """Use this disturbance (6,) in predictions from now on."""
-        torque = np.zeros(3) if self._targets else estimate[3:]
-        self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=torque)
-
-    def _follow(self, ramp: RampObserver, time: float, measured: Array) -> None:
-        """Split the observed force into drag, as far as it follows the velocity, and a constant remainder."""
-        R, velocity = rotation(measured[Q] / np.linalg.norm(measured[Q])), measured[V]
-        ramp.update(time, velocity, R, measured[W], self._in_force)
-        acceleration, _, angular = ramp.foreseen(0.5 * self._period)
-        drag = ramp.drag
-        self._model = replace(
-            self._model,
-            drag=self._drag + self._vehicle.mass * drag,
-            acceleration=acceleration + R @ (drag * (R.T @ velocity)),
-            angular_acceleration=angular,
-            thrust_scale=ramp.thrust_scale,
-        )
-
-    def _balanced(self, nodes: Nodes) -> Nodes:
-        """Add to the reference what balances air and disturbance: thrust turned by the least rotation, and torque."""
-        model = self._model
-        if not (model.drags or model.moments or model.acceleration.any() or model.angular_acceleration.any()):
-            return nodes
-        states, thrusts = nodes.states.copy(), nodes.thrusts
-        q, mass = states[:, Q], self._vehicle.mass
-        R = rotation(q)
-        axis = R[:, :, 2].copy()
-        total = thrusts.sum(axis=1) / mass
-        force = np.append(total, total[-1])[:, None] * axis
-        thrust_acceleration = force - model.acceleration - drag_acceleration(model, R, states[:, V])
-        size = np.maximum(np.linalg.norm(thrust_acceleration, axis=1), 1e-9)
-        # The least rotation from axis a to axis b is (1 + a . b, a x b), up to its length.
-        turn = np.empty_like(q)
-        turn[:, 0] = 1.0 + (axis * thrust_acceleration).sum(axis=1) / size
-        turn[:, 1:] = cross(axis, thrust_acceleration) / size[:, None]
-        length = np.linalg.norm(turn, axis=1)
-        if (around := length < 1e-6).any():
-            turn[around], length[around] = (1.0, 0.0, 0.0, 0.0), 1.0
-        turn /= length[:, None]
-        states[:, Q] = multiply(turn, q)
-        effort = np.empty((len(total), 4))
-        effort[:, 0], effort[:, 1:] = size[:-1] - total, -model.angular_acceleration
-        if model.moments:
-            effort[:, 1:] -= turned_by_air(model, R[:-1], states[:-1, V], states[:-1, W], thrusts)
-        return Nodes(states, thrusts + effort @ self._inverse.T)
-
-    def _iterate(self, time: float, measured: Array, nodes: Nodes) -> Answer:
-        """Take SQP steps from the stored plan."""
+    def _iterate(self, time: float) -> tuple[Answer, int]:
+        """Take SQP steps from the stored plan; return the answer and its status in the core."""
         sqp, started = self._sqp, clock.perf_counter()
-        sqp.set_world(self._model)
-        asked = measured, self._shares(self._acting), nodes.states, nodes.thrusts
-        status = sqp.step(*asked) if self._space is None else self._among(self._space, time, asked)
+        status = sqp.step() if self._space is None else self._among(self._space, time)
+        found = self._law.end(status)
         spent_s = clock.perf_counter() - started
         if status not in _OPTIMA:
             nowhere = np.full((self._nodes, N_ROTORS), math.nan)
             stats = Statistics(iterations=sqp.iterations, solve_s=spent_s)
-            return Answer(nowhere, np.zeros((self._nodes, 0)), SQP_FAILURES[status], CORE, stats=stats)
+            return Answer(nowhere, np.zeros((self._nodes, 0)), STATUSES[found], CORE, stats=stats), found
         free, active = status is SQPStatus.FREE, sqp.active
         stats = Statistics(
             iterations=sqp.iterations,
@@ -558,7 +430,7 @@ class NonlinearMPC:
             sqp_step=sqp.moved,
             solve_s=spent_s,
         )
-        return Answer(
+        answer = Answer(
             sqp.planned_inputs if status is SQPStatus.UNCONVERGED else sqp.inputs,
             sqp.slacks(self._groups),
             UNCONSTRAINED if free else SOLVED,
@@ -567,11 +439,12 @@ class NonlinearMPC:
             stats=stats,
             certificate=self._certificate,
         )
+        return answer, found
 
-    def _among(self, space: Space, time: float, asked: tuple[Array, Array, Array, Array]) -> SQPStatus:
+    def _among(self, space: Space, time: float) -> SQPStatus:
         """Take SQP steps among half-spaces: those of a program follow its optimum, a few times at most."""
         sqp, t = self._sqp, time + space.period * np.arange(1.0, self._nodes + 1.0)
-        if not sqp.begin(*asked):
+        if not sqp.begin():
             return SQPStatus.NOT_FINITE
         on = True
         while on:
@@ -627,15 +500,6 @@ class NonlinearMPC:
         named = self._space.constraints(*self._sqp.half_spaces, self.problem.model.n)
         return replace(self.problem, constraints=(*self.problem.constraints, *named))
 
-    def _rejection(self, answer: Answer) -> str | None:
-        status, plan = answer.status, answer.plan
-        if status not in ACCEPTED:
-            return status
-        beyond = np.abs(plan - self._clip(plan)).max()
-        if beyond <= OUTSIDE:
-            return None
-        return "out_of_bounds" if np.isfinite(plan).all() else "not_finite"
-
 
 def _body(states: Array) -> Array:
     """(..., 13) states of the rigid body from states (..., 12)."""
@@ -650,16 +514,15 @@ class _Start(NamedTuple):
     """What a period's plan starts from: data alone, so that a flight can be pickled."""
 
     plan: tuple[Array, Array] | None
-    acting: Array
-    model: RigidBody
+    world: Array  # see `mpc.nonlinear.body.World`
     time: float
-    measured: Array
-    nodes: Nodes
+    query: tuple[Array, ...]  # see `mpc.nonlinear.sqp.SQP.begin`
 
 
 def _converges(make: Callable[..., NonlinearMPC], settings: Nonlinear, start: _Start, iterations: int) -> bool:
     """Return whether a period's plan converges within `iterations`."""
     law = make(settings=replace(settings, iterations=iterations))
-    law._sqp.plan, law._acting, law._model = start.plan, start.acting, start.model
-    answer = law._iterate(start.time, start.measured, start.nodes)
-    return law._rejection(answer) is None and answer.stats.sqp_defect <= CONVERGED
+    law._law.ask(start.world, start.query)
+    law._sqp.plan = start.plan
+    _, status = law._iterate(start.time)
+    return STATUSES[status] in OPTIMAL

@@ -187,10 +187,3 @@ def drag_acceleration(model: RigidBody, R: Array, v: Array) -> Array:
     air = (np.swapaxes(R, -1, -2) @ v[..., None])[..., 0]
     pull = -(model.drag * air + model.quadratic_drag * np.abs(air) * air) / model.mass
     return np.asarray((R @ pull[..., None])[..., 0])
-
-
-def turned_by_air(model: RigidBody, R: Array, v: Array, omega: Array, thrusts: Array) -> Array:
-    """(..., 3) angular acceleration by the air's torque, body [rad/s^2], with rotor thrusts (..., 4) [N]."""
-    speed = np.sqrt(np.maximum(thrusts / model.largest_thrust, 0.0)).sum(axis=-1)
-    air = (np.swapaxes(R, -1, -2) @ v[..., None])[..., :2, 0]
-    return np.asarray(speed[..., None] * (air @ model.moment.T) - omega @ model.damping.T)

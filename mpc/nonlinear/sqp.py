@@ -45,7 +45,9 @@ class _Term(ctypes.Structure):
     _fields_ = [*struct_members(REAL, "coefficient"), *struct_members(INT, "entry lag")]
 
 
-class _Work(ctypes.Structure):
+class WorkStruct(ctypes.Structure):
+    """A `quadsim_nmpc_work`."""
+
     _fields_ = [
         *struct_members(AT, "p"),
         *struct_members(INT, "planned shifted doubtful iterations count changes rounds inner patience"),
@@ -59,7 +61,7 @@ class _Work(ctypes.Structure):
 @cache
 def _library() -> ctypes.CDLL:
     library = load_library()
-    check_sizes(quadsim_nmpc_term=_Term, quadsim_nmpc_problem=ProblemStruct, quadsim_nmpc_work=_Work)
+    check_sizes(quadsim_nmpc_term=_Term, quadsim_nmpc_problem=ProblemStruct, quadsim_nmpc_work=WorkStruct)
     for name in ("reals", "ints"):
         function = getattr(library, f"quadsim_nmpc_{name}")
         function.restype, function.argtypes = ctypes.c_long, [AT]
@@ -97,6 +99,11 @@ class SQP:
         tolerance: change of a state or an input at which further steps end.
         faces: half-spaces of positions per node.
         price: l1 and l2 of leaving the largest of a node's half-spaces; None if they are hard.
+        room: active rows that there is room for; None for all that can be needed.
+
+    Attributes:
+        struct: the program's numbers in the core's layout.
+        pointed: the arrays that the struct's members point to, by their names; besides these, `terms`.
     """
 
     def __init__(
@@ -112,9 +119,10 @@ class SQP:
         tolerance: float,
         faces: int = 0,
         price: tuple[float, float] | None = None,
+        room: int | None = None,
     ) -> None:
         self._library, self._n, self.horizon = _library(), model.n, problem.horizon
-        self._kept: list[object] = []
+        self.pointed: dict[str, Array] = {}
         moves = problem.objective.Q_d is not None
         parts = {part.name: part for part in problem.every_constraint}
         tilt, rates = parts.get("tilt"), parts.get("body_rates")
@@ -134,7 +142,7 @@ class SQP:
             rows=len(rows),
             faces=faces,
             slacks=len(prices),
-            room=min(at_most, 6 * self.horizon) + 1,
+            room=min(at_most, 6 * self.horizon if room is None else room) + 1,
             changes=_MOST_CHANGES,
             iterations=iterations,
             corrections=corrections,
@@ -158,20 +166,28 @@ class SQP:
         bounds = [[row.first for row in rows], [row.bound for row in rows]]
         linear, quadratic = np.array(prices).T
         self._prices = linear, np.where(quadratic > 0.0, quadratic, _CURVATURE * linear)
-        self._left, p.terminal = body_numbers(model, p), self._array(terminal)
-        p.terms = self._keep((_Term * max(len(terms), 1))(*(_Term(*term) for term in terms)))
-        p.first, p.slack = self._array(first, np.intc), self._array([row.slack for row in rows], np.intc)
-        p.bounds, p.linear, p.quadratic = self._array(bounds), self._array(linear), self._array(quadratic)
-        self._p, self._world = p, World(model)
+        self.pointed["left"], p.terminal = body_numbers(model, p), self._array("terminal", terminal)
+        self.terms = (_Term * max(len(terms), 1))(*(_Term(*term) for term in terms))
+        p.terms, p.bounds = ctypes.addressof(self.terms), self._array("bounds", bounds)
+        p.first = self._array("first", first, np.intc)
+        p.slack = self._array("slack", [row.slack for row in rows], np.intc)
+        p.linear, p.quadratic = self._array("linear", linear), self._array("quadratic", quadratic)
+        self.struct, self._world = p, World.of(model)
         self._make_work()
 
     def _make_work(self) -> None:
-        p, library, N = self._p, self._library, self.horizon
+        p, library, N, work = self.struct, self._library, self.horizon, WorkStruct()
         at = ctypes.addressof(p)
         self._memory = np.zeros(library.quadsim_nmpc_reals(at)), np.zeros(library.quadsim_nmpc_ints(at), np.intc)
-        self._work, self._status = _Work(), ctypes.c_int()
-        self._at = ctypes.addressof(self._work)
-        library.quadsim_nmpc_start(self._at, at, *(part.ctypes.data for part in self._memory))
+        library.quadsim_nmpc_start(ctypes.addressof(work), at, *(part.ctypes.data for part in self._memory))
+        arrays = (np.zeros(self._n), np.zeros(N_ROTORS), np.zeros((N + 1, N_BODY)), np.zeros((N, N_ROTORS)))
+        self.bind(work, self._world, arrays)
+
+    def bind(self, work: WorkStruct, world: World, arrays: tuple[Array, Array, Array, Array]) -> None:
+        """Use another work of the same problem, another world and other arrays for the arguments of `step`."""
+        p, N = self.struct, self.horizon
+        self._work, self._world, self._asked, self._status = work, world, arrays, ctypes.c_int()
+        self._at = ctypes.addressof(work)
         self._size = self._n + N_ROTORS * bool(p.moves)
         self._x, self._u = self._view("x", N + 1, self._size), self._view("u", N, N_ROTORS)
         self._s, self._v = self._view("s", N + 1, self._size), self._view("v", N, N_ROTORS)
@@ -182,22 +198,15 @@ class SQP:
         self._multiplier = self._view("multiplier", p.room)
         self._row = self._view("row", p.room, kind=INT)
         self._free, self._held = self._view("free", N, p.slacks, kind=INT), self._view("held", N, N_ROTORS, kind=INT)
-        self._measured, self._before = np.zeros(self._n), np.zeros(N_ROTORS)
-        self._states, self._thrusts = np.zeros((N + 1, N_BODY)), np.zeros((N, N_ROTORS))
-        inputs = (self._measured, self._before, self._states, self._thrusts)
-        self._arguments = self._at, self._world.address, *(array.ctypes.data for array in inputs)
+        self._measured, self._before = arrays[:2]
+        self._arguments = self._at, self._world.address, *(array.ctypes.data for array in arrays)
 
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
         raise TypeError("an SQP cannot be copied or pickled: make another from its problem")
 
-    def _keep(self, memory: ctypes.Array[_Term]) -> int:
-        self._kept.append(memory)
-        return ctypes.addressof(memory)
-
-    def _array(self, values: Array | Sequence[object], kind: type = np.double) -> int:
-        array: Array = np.ascontiguousarray(values, kind)
-        self._kept.append(array)
+    def _array(self, name: str, values: Array | Sequence[object], kind: type = np.double) -> int:
+        array = self.pointed[name] = np.ascontiguousarray(values, kind)
         return array.ctypes.data
 
     def _view(self, name: str, *shape: int, kind: Any = REAL) -> Array:
@@ -231,22 +240,25 @@ class SQP:
         if self._size > self._n:
             self._x[0, self._n :], self._x[1:, self._n :] = self._before, self._u
 
-    def step(self, measured: Array, before: Array, states: Array, thrusts: Array) -> SQPStatus:
+    def step(self, *asked: Array) -> SQPStatus:
         """Plan from a measured state (n,) after the inputs `before` (4,), along a reference; see `begin`."""
-        self._measured[:], self._before[:], self._states[:], self._thrusts[:] = measured, before, states, thrusts
+        self._ask(asked)
         return SQPStatus(self._library.quadsim_nmpc_step(*self._arguments))
 
-    def begin(self, measured: Array, before: Array, states: Array, thrusts: Array) -> bool:
+    def begin(self, *asked: Array) -> bool:
         """Take a measured state (n,), the inputs `before` (4,) and a reference; False if numbers are not finite.
 
         Args:
-            measured: position, quaternion, velocity, body rates and actuators.
-            before: inputs in force.
-            states: (N + 1, 13) reference states.
-            thrusts: (N, 4) thrusts of the rotors that hold them [N].
+            asked: position, quaternion, velocity, body rates and actuators (n,) as measured; inputs in force (4,);
+                reference states (N + 1, 13), and thrusts of the rotors that hold them (N, 4) [N]; none: what the
+                arrays that it is bound to contain.
         """
-        self._measured[:], self._before[:], self._states[:], self._thrusts[:] = measured, before, states, thrusts
+        self._ask(asked)
         return bool(self._library.quadsim_nmpc_begin(*self._arguments))
+
+    def _ask(self, asked: tuple[Array, ...]) -> None:
+        for array, value in zip(self._asked, asked, strict=False):
+            array[:] = value
 
     def linearise(self) -> None:
         """Make the program of the stored plan."""
@@ -347,7 +359,7 @@ class SQP:
 
         Those of half-spaces begin at column `faces_from`.
         """
-        p, found = self._p, np.zeros((self.horizon, rows))
+        p, found = self.struct, np.zeros((self.horizon, rows))
         stated = 2 * N_ROTORS + _TILT_SIDES + 6
         kinds = stated + p.rows + p.faces + p.slacks
         starts = self._numbers
@@ -371,9 +383,9 @@ class SQP:
 
     def steps(self) -> tuple[Array, Array, Array]:
         """A (N, n, n), B (N, n, 4), c (N, n) of the program; under `tilt`, the thrust axis is two further states."""
-        p, N, n = self._p, self.horizon, self._n
+        p, N, n = self.struct, self.horizon, self._n
         maps, offset = self._view("map", N, N_BODY, width_of(self._size)), self._view("offset", N, self._size)
-        A, B = unpacked(maps, n, self._size - n, self._left[-1])
+        A, B = unpacked(maps, n, self._size - n, self.pointed["left"][-1])
         c = np.array(offset[:, :n])
         if p.tilts:
             axis, known = self._view("axis", N, 2, 4), self._view("known", N, 2)

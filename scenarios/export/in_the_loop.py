@@ -26,7 +26,7 @@ import numpy as np
 from mpc.answer import ActuatorBounds
 from mpc.codegen.ctext import Precision
 from mpc.codegen.targets import EMULATOR, TARGETS, Machine
-from mpc.core.law import STATUSES
+from mpc.fallback.structs import STATUSES
 from mpc.ocp import Problem
 from quadsim.controller import (
     CORE,

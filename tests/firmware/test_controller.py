@@ -12,7 +12,7 @@ import pytest
 from exported_c import HOST, Host, Reply, replay
 
 from mpc.codegen.ctext import Precision
-from mpc.core.law import STATUSES
+from mpc.fallback.structs import STATUSES
 from quadsim.state import Array
 from scenarios.export.exporter import c_controller
 from scenarios.export.record import REFUSED, Recording, record

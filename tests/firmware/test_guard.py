@@ -16,8 +16,8 @@ from exported_c import PHASES, Host
 from mpc.answer import ActuatorBounds
 from mpc.builders import guard_of
 from mpc.codegen import source
-from mpc.core.law import STATUSES
 from mpc.equilibrium import Trim
+from mpc.fallback.structs import STATUSES
 from mpc.heading import advance
 from mpc.linear import LinearMPC
 from mpc.model import hover_model

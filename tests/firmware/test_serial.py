@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from firmware.conftest import Answers, Export, Run
 
-from mpc.core.law import STATUSES
+from mpc.fallback.structs import STATUSES
 from quadsim.state import Array
 from scenarios.export.in_the_loop import Frames, QueryKind, Reply, SerialMPC, make_program
 from scenarios.export.record import Recording, record

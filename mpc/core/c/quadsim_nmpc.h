@@ -165,6 +165,10 @@ void quadsim_nmpc_slopes(const quadsim_nmpc_problem *problem, const quadsim_nmpc
 void quadsim_nmpc_advance(const quadsim_nmpc_problem *problem, const quadsim_nmpc_world *world, int count,
                           const quadsim_real *states, const quadsim_real *inputs, quadsim_real *ends);
 
+/* The angular acceleration [3] by the air's torque in a state [13] with thrusts of the rotors [4] in newton. */
+void quadsim_nmpc_turned(const quadsim_nmpc_problem *problem, const quadsim_real *state, const quadsim_real *thrusts,
+                         quadsim_real *turned);
+
 #ifdef __cplusplus
 }
 #endif

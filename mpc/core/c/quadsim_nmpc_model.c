@@ -88,6 +88,30 @@ static int meets_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wo
     return any;
 }
 
+/* What the air's torque does with so much speed of the rotors, at a velocity along body axes and body rates. */
+static void turn_by_air(const quadsim_nmpc_problem *p, real speed, const real *along, const real *w, real *turned)
+{
+    int i;
+    for (i = 0; i < 3; i++) {
+        const real *m = p->moment + 2 * i, *c = p->damping + 3 * i;
+        turned[i] = speed * (m[0] * along[0] + m[1] * along[1]) - (c[0] * w[0] + c[1] * w[1] + c[2] * w[2]);
+    }
+}
+
+void quadsim_nmpc_turned(const quadsim_nmpc_problem *p, const real *state, const real *thrusts, real *turned)
+{
+    real turn[3][3], along[3], slope, speed = R(0.0);
+    int i;
+    rotation_of(state + Q, R(2.0), turn);
+    for (i = 0; i < 3; i++) {
+        along[i] = along_axis(turn, i, state + V);
+    }
+    for (i = 0; p->moments && i < NU; i++) {
+        speed += speed_of(thrusts[i] / p->largest, &slope);
+    }
+    turn_by_air(p, speed, along, state + W, turned);
+}
+
 /* Add to a slope what the air does, drag and torque, and, where wanted, its derivatives. */
 static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive,
                     const real *q, const real *v, const real *w_b, int derive, struct slope *k)
@@ -97,8 +121,8 @@ static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wor
                                   {{R(0.0), y, z}, {y, R(-2.0) * x, -w}, {z, w, R(-2.0) * x}},
                                   {{R(-2.0) * y, x, w}, {x, R(0.0), z}, {-w, z, R(-2.0) * y}},
                                   {{R(-2.0) * z, -w, x}, {w, R(-2.0) * z, y}, {x, y, R(0.0)}}}; /* halves */
-    const real *const m = p->moment, *const c = p->damping;
-    real turn[3][3], pull[3], damped[3][3], along[3];
+    const real *const m = p->moment;
+    real turn[3][3], pull[3], damped[3][3], along[3], turned[3];
     int i, j, a;
     rotation_of(q, R(2.0), turn);
     add_air_drag(world->drag, world->square_drag, turn, v, along, pull, k->v);
@@ -108,10 +132,12 @@ static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wor
             damped[i][a] = turn[i][a] * rate;
         }
     }
+    if (p->moments) {
+        turn_by_air(p, drive->speed, along, w_b, turned);
+    }
     for (i = 0; p->moments && i < 3; i++) {
         k->w_by_speed[i] = m[2 * i] * along[0] + m[2 * i + 1] * along[1];
-        k->w[i] += drive->speed * k->w_by_speed[i] -
-                   (c[3 * i] * w_b[0] + c[3 * i + 1] * w_b[1] + c[3 * i + 2] * w_b[2]);
+        k->w[i] += turned[i];
         for (j = 0; j < 3; j++) {
             k->w_by_v[i][j] = drive->speed * (m[2 * i] * turn[j][0] + m[2 * i + 1] * turn[j][1]);
         }

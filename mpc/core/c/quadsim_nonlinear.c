@@ -21,6 +21,12 @@ static int rows_of(const quadsim_nonlinear_numbers *numbers)
     return numbers->problem->horizon * numbers->stride;
 }
 
+/* Numbers of a reference. */
+static int count_of(const quadsim_nonlinear_numbers *numbers, int motion)
+{
+    return motion ? (rows_of(numbers) + 1) * QUADSIM_MOTION : rows_of(numbers) * QUADSIM_PREVIEW;
+}
+
 static int actuators_of(const quadsim_nonlinear_numbers *numbers)
 {
     return numbers->problem->actuators;
@@ -122,36 +128,6 @@ static void take_preview(quadsim_nonlinear *law, const real *reference, real yaw
 
 /* ---- what disturbs ------------------------------------------------------------------------------------------------ */
 
-/* R of a unit quaternion, row by row. */
-static void put_rotation(const real *q, real turn[9])
-{
-    const real w = q[0], x = q[1], y = q[2], z = q[3];
-    turn[0] = R(1.0) - R(2.0) * (y * y + z * z);
-    turn[1] = R(2.0) * (x * y - w * z);
-    turn[2] = R(2.0) * (x * z + w * y);
-    turn[3] = R(2.0) * (x * y + w * z);
-    turn[4] = R(1.0) - R(2.0) * (x * x + z * z);
-    turn[5] = R(2.0) * (y * z - w * x);
-    turn[6] = R(2.0) * (x * z - w * y);
-    turn[7] = R(2.0) * (y * z + w * x);
-    turn[8] = R(1.0) - R(2.0) * (x * x + y * y);
-}
-
-/* Add to an acceleration what drag causes at a velocity, world axes. */
-static void add_drag(const quadsim_nmpc_world *world, const real *q, const real *velocity, real sign, real *acceleration)
-{
-    real turn[9], pull[3];
-    int i;
-    put_rotation(q, turn);
-    for (i = 0; i < 3; i++) {
-        const real air = turn[i] * velocity[0] + turn[3 + i] * velocity[1] + turn[6 + i] * velocity[2];
-        pull[i] = -(world->drag[i] * air + world->square_drag[i] * magnitude(air) * air);
-    }
-    for (i = 0; i < 3; i++) {
-        acceleration[i] += sign * dot(turn + 3 * i, pull, 3);
-    }
-}
-
 static int is_any(const real *numbers, int count)
 {
     int i;
@@ -228,37 +204,66 @@ static void turn_least(const real *unit, const real *to, real size, real *q)
     }
 }
 
-/* Add to the reference what balances drag and disturbance: thrust turned by the least rotation, and torque. */
+/* Add to the reference what balances air and disturbance: thrust turned by the least rotation, and torque. */
 static void balance(quadsim_nonlinear *law)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     const quadsim_nmpc_world *world = &law->world;
     const int N = numbers->problem->horizon;
     int i, j;
-    if (!is_any(world->acceleration, 3) && !is_any(world->angular, 3) && !is_any(world->drag, 3) &&
+    if (!numbers->problem->moments && !is_any(world->acceleration, 3) && !is_any(world->angular, 3) && !is_any(world->drag, 3) &&
         !is_any(world->square_drag, 3)) {
         return;
     }
     for (i = N; i >= 0; i--) { /* the last node has the thrusts of the one before, as they were */
         real *state = law->states + i * BODY, *thrusts = law->thrusts + (i < N ? i : N - 1) * NU;
         const real total = ((thrusts[0] + thrusts[1]) + (thrusts[2] + thrusts[3])) / numbers->mass;
-        real axis[3], wanted[3], effort[NU], size;
+        real turn[3][3], along[3], pull[3], drag[3] = {R(0.0)}, turned[3], axis[3], wanted[3], effort[NU], size;
         thrust_axis(state + Q, axis);
+        rotation_of(state + Q, R(2.0), turn);
+        add_air_drag(world->drag, world->square_drag, turn, state + V, along, pull, drag);
+        quadsim_nmpc_turned(numbers->problem, state, thrusts, turned);
         for (j = 0; j < 3; j++) {
-            wanted[j] = total * axis[j] - world->acceleration[j];
+            wanted[j] = total * axis[j] - world->acceleration[j] - drag[j];
         }
-        add_drag(world, state + Q, state + V, R(-1.0), wanted);
         size = square_root(dot(wanted, wanted, 3));
         size = size > R(1e-9) ? size : R(1e-9);
         turn_least(axis, wanted, size, state + Q);
         effort[0] = size - total;
         for (j = 0; j < 3; j++) {
-            effort[1 + j] = -world->angular[j];
+            effort[1 + j] = -world->angular[j] - turned[j];
         }
         for (j = 0; j < NU && i < N; j++) {
             thrusts[j] += dot(numbers->inverse + j * NU, effort, NU);
         }
     }
+}
+
+/* Split the observed force into drag, as far as it follows the velocity, and a constant remainder. */
+static void follow_force(quadsim_nonlinear *law, int follows, const real *acting)
+{
+    const quadsim_nonlinear_numbers *numbers = law->numbers;
+    quadsim_nmpc_world *world = &law->world;
+    const real *velocity = law->measured + V, length = square_root(dot(law->measured + Q, law->measured + Q, 4));
+    real q[4], turn[3][3], change[3], drag[3], along[3];
+    int i;
+    for (i = 0; i < 4; i++) {
+        q[i] = law->measured[Q + i] / length;
+    }
+    rotation_of(q, R(2.0), turn);
+    quadsim_ramp_update(&law->ramp, numbers->ramp, follows, velocity, turn[0], law->measured + W, acting);
+    quadsim_ramp_foreseen(&law->ramp, numbers->ramp, R(0.5) * numbers->control_period, world->acceleration, change,
+                          world->angular);
+    quadsim_ramp_drag(&law->ramp, numbers->ramp, drag);
+    for (i = 0; i < 3; i++) {
+        along[i] = drag[i] * along_axis(turn, i, velocity);
+        world->drag[i] = numbers->drag[i] + drag[i];
+    }
+    for (i = 0; i < 3; i++) {
+        world->acceleration[i] += dot(turn[i], along, 3);
+    }
+    world->thrust_scale = quadsim_ramp_scale(&law->ramp, numbers->ramp);
+    find_trim(law);
 }
 
 /* ---- periods ------------------------------------------------------------------------------------------------------ */
@@ -282,13 +287,17 @@ static void spin(quadsim_nonlinear *law, int periods)
 }
 
 /* Drop the plan, and assume no disturbance. */
-static void forget(quadsim_nonlinear *law)
+static void forget(quadsim_nonlinear *law, const real *acting)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     quadsim_nmpc_reset(&law->work);
     law->called = law->turned = law->headed = law->learns = 0;
     law->side = R(1.0);
     law->world.thrust_scale = R(1.0);
+    if (numbers->ramp != NULL) {
+        quadsim_ramp_reset(&law->ramp, numbers->ramp, acting);
+        law->world.thrust_scale = quadsim_ramp_scale(&law->ramp, numbers->ramp);
+    }
     memcpy(law->world.drag, numbers->drag, sizeof(law->world.drag));
     memcpy(law->world.square_drag, numbers->square_drag, sizeof(law->world.square_drag));
     memset(law->estimate, 0, sizeof(law->estimate));
@@ -392,7 +401,7 @@ void quadsim_nonlinear_reset(quadsim_nonlinear *law, const quadsim_real command[
     put_shares(law->numbers, usable, law->rotors);
     memcpy(law->rotors_before, law->rotors, sizeof(law->rotors));
     memcpy(law->before, law->rotors, sizeof(law->before));
-    forget(law);
+    forget(law, usable);
 }
 
 void quadsim_nonlinear_learn(quadsim_nonlinear *law, const quadsim_real estimate[6])
@@ -412,20 +421,20 @@ void quadsim_nonlinear_stand(quadsim_nonlinear *law, int periods, const quadsim_
 {
     put_shares(law->numbers, acting, law->before);
     spin(law, periods);
-    forget(law);
+    forget(law, acting);
 }
 
-int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, const quadsim_real state[12],
+int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int motion, const quadsim_real state[12],
                             const quadsim_real *attitude, const quadsim_real *rates, const quadsim_real *reference,
                             const quadsim_real acting[4])
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     const int actuators = actuators_of(numbers), learns = law->learns && periods == 1;
-    const int count = numbers->motion ? (rows_of(numbers) + 1) * QUADSIM_MOTION : rows_of(numbers) * QUADSIM_PREVIEW;
     law->learns = 0;
     put_shares(numbers, acting, law->before);
     spin(law, periods);
-    if (!is_within(state, PLAUSIBLE, 12) || !is_within(reference, PLAUSIBLE, count) || !is_finite(law->before, NU)) {
+    if (!is_within(state, PLAUSIBLE, 12) || !is_within(reference, PLAUSIBLE, count_of(numbers, motion)) ||
+        !is_finite(law->before, NU)) {
         return 0;
     }
     put_body(state, attitude, rates, law->measured);
@@ -433,7 +442,7 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, con
     if (!is_within(law->measured, PLAUSIBLE, BODY + actuators)) {
         return 0;
     }
-    if (numbers->motion) {
+    if (motion) {
         take_motion(law, reference);
     } else {
         take_preview(law, reference, state[YAW]);
@@ -442,6 +451,9 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, con
     if (flying) {
         if (numbers->observes && learns) {
             observe(law);
+        }
+        if (numbers->ramp != NULL) {
+            follow_force(law, learns, acting);
         }
         law->learns = 1;
         memcpy(law->last, law->measured, sizeof(law->last));
@@ -547,7 +559,7 @@ enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_
                                            quadsim_real command[4])
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
-    const int count = numbers->motion ? (rows_of(numbers) + 1) * QUADSIM_MOTION : rows_of(numbers) * QUADSIM_PREVIEW;
+    const int count = count_of(numbers, numbers->motion);
     quadsim_guard *guard = &law->guard;
     enum quadsim_status status = quadsim_guard_begin(guard, phase, &law->trim, state, reference, count, acting);
     law->work.changes = 0;
@@ -560,8 +572,8 @@ enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_
         const int steep = magnitude(guard->state[PITCH]) >= UPRIGHT; /* where Euler rates are implausible, not a gyro's */
         const real *attitude = turned ? state + 12 : NULL, *rates = turning || steep ? state + 16 : NULL;
         status = QUADSIM_INVALID_DATA;
-        if (quadsim_nonlinear_begin(law, guard->asked, phase == QUADSIM_PHASE_FLYING, guard->state, attitude, rates,
-                                    reference, guard->in_force)) {
+        if (quadsim_nonlinear_begin(law, guard->asked, phase == QUADSIM_PHASE_FLYING, numbers->motion, guard->state,
+                                    attitude, rates, reference, guard->in_force)) {
             status = quadsim_nonlinear_end(law, quadsim_nmpc_step(&law->work, &law->world, law->measured, law->before,
                                                                   law->states, law->thrusts));
         }

@@ -19,6 +19,7 @@
 
 #include "quadsim_guard.h"
 #include "quadsim_nmpc.h"
+#include "quadsim_ramp.h"
 
 #ifdef __cplusplus
 extern "C" {
@@ -31,6 +32,7 @@ typedef struct quadsim_nonlinear_numbers {
     const quadsim_nmpc_problem *period;   /* its body over a control period: sizes, step, substeps and lags count */
     const quadsim_nmpc_problem *unlagged; /* the same without lag of thrusts, for plans */
     const quadsim_fallback *fallback;     /* NULL where quadsim guards the law: quadsim_nonlinear_step is not for it */
+    const quadsim_ramp_numbers *ramp;     /* NULL where no changing force is followed */
     int stride;                           /* control periods from node to node */
     int motion;                           /* whether references are motions */
     int observes;                         /* whether disturbances are estimated as constant */
@@ -67,6 +69,7 @@ typedef struct quadsim_nonlinear {
     int learns;                       /* whether `last` is known, the state of the last period */
     quadsim_real last[QUADSIM_NMPC_MOST];
     quadsim_real estimate[6];         /* disturbance: world [m/s^2], body [rad/s^2] */
+    quadsim_ramp ramp;                /* one that changes */
     quadsim_real ahead[QUADSIM_NMPC_BODY + 1]; /* where the guard's plan leads */
 } quadsim_nonlinear;
 
@@ -90,8 +93,8 @@ void quadsim_nonlinear_stand(quadsim_nonlinear *law, int periods, const quadsim_
  * are the query then, which quadsim_nmpc_step answers.  0 where numbers are not plausible.
  *
  * Attitude and body rates may be NULL; `flying`: the ground does not hold the vehicle, so that its motion shows a
- * disturbance. */
-int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, const quadsim_real state[12],
+ * disturbance; `motion`: the reference is one, no preview. */
+int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int motion, const quadsim_real state[12],
                             const quadsim_real *attitude, const quadsim_real *rates, const quadsim_real *reference,
                             const quadsim_real acting[4]);
 

@@ -2,7 +2,7 @@
 #include <stddef.h>
 
 #include "quadsim_mpc.h"
-#include "quadsim_nmpc.h"
+#include "quadsim_nonlinear.h"
 #include "quadsim_ramp.h"
 
 #define SIZE(type) extern const size_t type##_size; const size_t type##_size = sizeof(type)
@@ -21,5 +21,7 @@ SIZE(quadsim_nmpc_term);
 SIZE(quadsim_nmpc_problem);
 SIZE(quadsim_nmpc_world);
 SIZE(quadsim_nmpc_work);
+SIZE(quadsim_nonlinear_numbers);
+SIZE(quadsim_nonlinear);
 SIZE(quadsim_ramp_numbers);
 SIZE(quadsim_ramp);

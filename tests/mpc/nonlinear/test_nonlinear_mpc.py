@@ -15,7 +15,7 @@ from mpc.answer import ActuatorBounds
 from mpc.constraints import Constraint
 from mpc.diagnosis import find_conflict
 from mpc.nonlinear.controller import CONVERGED, STEP_TOLERANCE, NonlinearMPC
-from mpc.nonlinear.reference import nodes_of_motion, nodes_of_preview
+from mpc.nonlinear.law import WIDTH_OF_MOTION, put_motion
 from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, rigid_body, thrust_axis
 from mpc.nonlinear.settings import Nonlinear, Weights
 from mpc.observer import ObserverSettings
@@ -237,34 +237,35 @@ def test_a_flip_is_flown_through() -> None:
 # --- references ----------------------------------------------------------------------------------------------------
 
 
-def test_nodes_near_the_end_repeat_the_last_that_is_there_and_inputs_the_one_before() -> None:
+def test_rows_past_the_end_of_a_motion_repeat_the_last_and_thrusts_the_one_before() -> None:
     samples = np.arange(21.0)
     spread = np.tile(samples[:, None], (1, 4))
     motion = Motion(
         position=spread[:, :3], velocity=spread[:, :3], acceleration=spread[:, :3], attitude=spread,
         body_rates=spread[:, :3], thrusts=spread,
     )  # fmt: skip
-    for k, states, inputs in (
-        (0, [0, 5, 10, 15], [0, 5, 10]),
-        (5, [5, 10, 15, 20], [5, 10, 15]),
-        (6, [6, 11, 16, 16], [6, 11, 11]),
-        (15, [15, 20, 20, 20], [15, 15, 15]),
-        (16, [16, 16, 16, 16], [16, 16, 16]),
-        (20, [20, 20, 20, 20], [20, 20, 20]),
+    rows = np.zeros((6, WIDTH_OF_MOTION))
+    for k, states, thrusts in (
+        (0, [0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5]),
+        (15, [15, 16, 17, 18, 19, 20], [15, 16, 17, 18, 19, 20]),
+        (17, [17, 18, 19, 20, 20, 20], [17, 18, 19, 19, 19, 19]),
+        (20, [20] * 6, [20] * 6),
     ):
-        nodes = nodes_of_motion(motion.after(k), 3, 5)
-        np.testing.assert_array_equal(nodes.states[:, 0], states)
-        np.testing.assert_array_equal(nodes.thrusts[:, 0], inputs)
+        put_motion(motion.after(k), rows)
+        np.testing.assert_array_equal(rows[:, :13], np.tile(np.array(states)[:, None], (1, 13)))
+        np.testing.assert_array_equal(rows[:, 13], thrusts)
 
 
 def test_nodes_of_a_preview_have_its_velocity_and_its_yaw() -> None:
-    rows = np.arange(1, 21)[:, None] * [0.1, 0.0, -0.05, 0.2]
-    nodes = nodes_of_preview(rows, 4, 5, 0.1, 1.75)
-    np.testing.assert_allclose(nodes.states[:, 0], [0.0, 0.5, 1.0, 1.5, 2.0], atol=1e-12)
-    np.testing.assert_allclose(nodes.states[:, V], np.tile([1.0, 0.0, -0.5], (5, 1)), atol=1e-9)
-    np.testing.assert_allclose(nodes.states[:, 12], 2.0)
-    np.testing.assert_allclose(nodes.states[2, Q], [math.cos(1.0), 0.0, 0.0, math.sin(1.0)])
-    assert (nodes.thrusts == 1.75).all()
+    controller = law(horizon=4)
+    rows = np.arange(1, 9)[:, None] * [0.1, 0.0, -0.05, 0.2]
+    call(controller, at_rest(), reference=rows)
+    _, _, states, thrusts = controller._law.query
+    np.testing.assert_allclose(states[:, 0], [0.0, 0.2, 0.4, 0.6, 0.8], atol=1e-12)
+    np.testing.assert_allclose(states[:, V], np.tile([5.0, 0.0, -2.5], (5, 1)), atol=1e-9)
+    np.testing.assert_allclose(states[:, 12], 10.0)
+    np.testing.assert_allclose(states[2, Q], [math.cos(0.4), 0.0, 0.0, math.sin(0.4)])
+    np.testing.assert_allclose(thrusts, VEHICLE.mass * VEHICLE.gravity / 4.0)
 
 
 # --- disturbances --------------------------------------------------------------------------------------------------

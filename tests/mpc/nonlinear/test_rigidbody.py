@@ -23,7 +23,6 @@ from mpc.nonlinear.rigidbody import (
     rigid_body,
     rotation,
     thrust_axis,
-    turned_by_air,
 )
 from quadsim.assets import vehicle_path
 from quadsim.rotation import (
@@ -115,15 +114,6 @@ def test_it_moves_by_the_equations_of_a_rigid_body_in_air(inputs: Inputs) -> Non
         for i in range(2)
     ]
     np.testing.assert_allclose(advance_nodes(model, x, u)[:2], ends, atol=1e-8)
-
-
-def test_the_torque_of_the_air_is_that_of_the_vehicle() -> None:
-    model, rng = rigid_body(VEHICLE, 0.1, moment=True), np.random.default_rng(6)
-    v, omega, thrusts = rng.normal(size=3), rng.normal(size=3), rng.uniform(0.5, 2.0, 4)
-    R = rotation(np.array([0.5, -0.5, 0.5, 0.5]))
-    turning = float(np.sqrt(thrusts / VEHICLE.mean_coefficient).sum())
-    expected = VEHICLE.angular_acceleration(VEHICLE.air_moment(turning, R.T @ v, omega))
-    np.testing.assert_allclose(turned_by_air(model, R, v, omega, thrusts), expected, atol=1e-13)
 
 
 @pytest.mark.parametrize("others", [{}, DRAG])
