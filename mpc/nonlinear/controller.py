@@ -168,6 +168,7 @@ class NonlinearMPC:
             tolerance=tolerance,
             faces=0 if space is None else space.count,
             price=None if space is None else space.penalty,
+            time_limit=settings.time_limit,
         )
         observing, ramp = settings.offset_free, settings.disturbance
         self._observer = None if observing is None else DisturbanceObserver(observing, period)
@@ -521,7 +522,7 @@ class _Start(NamedTuple):
 
 def _converges(make: Callable[..., NonlinearMPC], settings: Nonlinear, start: _Start, iterations: int) -> bool:
     """Return whether a period's plan converges within `iterations`."""
-    law = make(settings=replace(settings, iterations=iterations))
+    law = make(settings=replace(settings, iterations=iterations, time_limit=None))
     law._law.ask(start.world, start.query)
     law._sqp.plan = start.plan
     _, status = law._iterate(start.time)

@@ -106,6 +106,13 @@ class Nonlinear(ControllerTable):
         Le(100),
         doc("most steps of sequential quadratic programming in a period; 1: the real-time iteration"),
     ] = 1
+    time_limit: Annotated[
+        Positive | None,
+        doc(
+            "[s] wall-clock time after which a period takes no further step; one is always taken; absent: no limit; "
+            "with one, a flight depends on the machine and is not reproducible"
+        ),
+    ] = None
     shift: Annotated[
         bool | None, doc("whether the last plan is shifted by a node; absent: if a node lasts one period")
     ] = None

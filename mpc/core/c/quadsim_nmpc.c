@@ -288,7 +288,7 @@ int quadsim_nmpc_begin(quadsim_nmpc_work *work, const quadsim_nmpc_world *world,
     work->share = work->largest = R(1.0);
     work->least = R(1e30);
     work->patience = PATIENCE;
-    work->iterations = 0;
+    work->iterations = work->ends = 0;
     work->defect = work->moved = R(0.0);
     return 1;
 }
@@ -370,7 +370,7 @@ int quadsim_nmpc_keep(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, 
     }
     work->planned = 1;
     work->defect = quadsim_nmpc_defect(work, world);
-    on = work->iterations < p->iterations + p->corrections && !(p->iterations > 1 && work->moved <= p->tolerance) &&
+    on = !work->ends && work->iterations < p->iterations + p->corrections && !(p->iterations > 1 && work->moved <= p->tolerance) &&
          !(p->corrections > 0 && work->iterations >= p->iterations && work->defect <= CONVERGED);
     if (on && p->iterations > 1) {
         relax(work);

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -184,6 +185,25 @@ def test_the_start_makes_no_difference() -> None:
 
 
 @pytest.mark.slow("nonlinear")
+@pytest.mark.parametrize("settings", [{}, RATES | {"soft": Soft(linear=20.0, quadratic=5.0)}])
+def test_steps_end_with_the_time_and_keep_the_plan(settings: dict[str, Any]) -> None:
+    """By a clock that is a second later whenever it is asked: the plan is that of as many steps without a limit."""
+    x = thrown(np.random.default_rng(4), 1.0)
+    whole, three, limited = (
+        law(**settings, iterations=iterations, time_limit=limit)
+        for iterations, limit in ((8, None), (3, None), (8, 2.5))
+    )
+    limited._sqp.clock = partial(next, itertools.count(1.0))
+    plans = [call(controller, x).plan for controller in (whole, three, limited)]
+    assert [controller._sqp._work.iterations for controller in (whole, three, limited)] == [8, 3, 3]
+    np.testing.assert_array_equal(plans[1], plans[2])
+    assert np.abs(plans[0] - plans[2]).max() > 0.0
+    again, same = limited._sqp.plan, three._sqp.plan
+    assert again is not None
+    assert same is not None
+    np.testing.assert_array_equal(again[0], same[0])
+
+
 def test_ten_thousand_thrown_states_have_typed_answers() -> None:
     """From near to absurd: no hang, no number that is none, no status without a name."""
     rng = np.random.default_rng(1)
