@@ -370,7 +370,8 @@ int quadsim_nmpc_keep(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, 
     }
     work->planned = 1;
     work->defect = quadsim_nmpc_defect(work, world);
-    on = !work->ends && work->iterations < p->iterations + p->corrections && !(p->iterations > 1 && work->moved <= p->tolerance) &&
+    on = !work->ends && work->iterations < p->iterations + p->corrections &&
+         !(p->iterations > 1 && work->moved <= p->tolerance) &&
          !(p->corrections > 0 && work->iterations >= p->iterations && work->defect <= CONVERGED);
     if (on && p->iterations > 1) {
         relax(work);

@@ -8,7 +8,7 @@
 
 enum { PUSHING = 6, TURNING = 18 };
 
-static const real SLOW = R(0.01); /* share of thrust below which a parabola stands for the root, whose slope is infinite at 0 */
+static const real SLOW = R(0.01); /* share of thrust below which a parabola stands for the root, which is steep at 0 */
 
 /* What acts at an instant. */
 struct drive {
@@ -158,13 +158,15 @@ static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wor
                 sum += slopes[j][i][a] * pull[a] + damped[i][a] * air[a];
             }
             k->by_q[i][j] += R(2.0) * sum;
-            k->w_by_q[i][j] = !p->moments ? R(0.0) : R(2.0) * drive->speed * (m[2 * i] * air[0] + m[2 * i + 1] * air[1]);
+            if (p->moments) {
+                k->w_by_q[i][j] = R(2.0) * drive->speed * (m[2 * i] * air[0] + m[2 * i + 1] * air[1]);
+            }
         }
     }
 }
 
-static void slope_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive, int air, int derive,
-                     const real *q, const real *v, const real *w, struct slope *k)
+static void slope_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive, int air,
+                     int derive, const real *q, const real *v, const real *w, struct slope *k)
 {
     const real T = drive->thrust, twice = R(2.0) * T;
     int i;
@@ -405,7 +407,8 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
     /* The map's columns: quaternion, velocity, body rates, actuators, inputs. */
     memset(map, 0, sizeof(real) * (size_t)(BODY * width));
     for (c = 0; c < turning + (moments ? 3 : 0); c++) {
-        const int of_input = c >= 7 + (targets ? 0 : actuators), of_turning = c < 4 ? c : targets && of_input ? c + 5 : c + 3;
+        const int of_input = c >= 7 + (targets ? 0 : actuators);
+        const int of_turning = c < 4 ? c : targets && of_input ? c + 5 : c + 3;
         const int at = c < turning ? of_turning + (of_input ? befores : 0) : 4 + c - turning;
         real q[4], turned[4];
         for (i = 0; i < 4; i++) {

@@ -211,8 +211,8 @@ static void balance(quadsim_nonlinear *law)
     const quadsim_nmpc_world *world = &law->world;
     const int N = numbers->problem->horizon;
     int i, j;
-    if (!numbers->problem->moments && !is_any(world->acceleration, 3) && !is_any(world->angular, 3) && !is_any(world->drag, 3) &&
-        !is_any(world->square_drag, 3)) {
+    if (!numbers->problem->moments && !is_any(world->acceleration, 3) && !is_any(world->angular, 3) &&
+        !is_any(world->drag, 3) && !is_any(world->square_drag, 3)) {
         return;
     }
     for (i = N; i >= 0; i--) { /* the last node has the thrusts of the one before, as they were */
@@ -245,13 +245,14 @@ static void follow_force(quadsim_nonlinear *law, int follows, const real *acting
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     quadsim_nmpc_world *world = &law->world;
     const real *velocity = law->measured + V, length = square_root(dot(law->measured + Q, law->measured + Q, 4));
-    real q[4], turn[3][3], change[3], drag[3], along[3];
+    real q[4], turn[3][3], attitude[9], change[3], drag[3], along[3];
     int i;
     for (i = 0; i < 4; i++) {
         q[i] = law->measured[Q + i] / length;
     }
     rotation_of(q, R(2.0), turn);
-    quadsim_ramp_update(&law->ramp, numbers->ramp, follows, velocity, turn[0], law->measured + W, acting);
+    memcpy(attitude, turn, sizeof(attitude));
+    quadsim_ramp_update(&law->ramp, numbers->ramp, follows, velocity, attitude, law->measured + W, acting);
     quadsim_ramp_foreseen(&law->ramp, numbers->ramp, R(0.5) * numbers->control_period, world->acceleration, change,
                           world->angular);
     quadsim_ramp_drag(&law->ramp, numbers->ramp, drag);
