@@ -96,7 +96,7 @@ docs: setup $(VENV)/.docs  ## build the documentation into site/, with films; a 
 numbers: setup  ## fill the tables of README.md and docs/ from JSON (OPTIONS="speed mismatch" measures these first)
 	@$(PY) docs/tools/remake.py $(OPTIONS)
 
-reproduce: setup  ## fly the numbers of every paper that ships into docs/papers.md: some five minutes
+reproduce: setup  ## fly the numbers of every paper that ships into docs/evidence.md: some five minutes
 	@$(PY) docs/tools/remake.py papers
 
 pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constraints.txt

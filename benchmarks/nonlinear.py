@@ -69,7 +69,8 @@ class Replay:
     """
 
     def __init__(self, law: NonlinearMPC, repeats: int) -> None:
-        self._sqp, self._step, self._memory, self._repeats = law._sqp, law._sqp.step, law._law._memory, repeats
+        self._sqp, self._step, self._repeats = law._sqp, law._sqp.step, repeats
+        self._memory: tuple[Any, ...] = law._law._memory
         self.ms: list[float] = []
         self.active: list[int] = []
         self.iterations: list[int] = []
@@ -77,11 +78,12 @@ class Replay:
     def step(self) -> SQPStatus:
         """See `SQP.step`."""
         sqp, spent = self._sqp, []
-        memory, work = [part.copy() for part in self._memory], bytes(sqp._work)
+        memory: list[Any] = [part.copy() for part in self._memory]
+        work = bytes(sqp._work)
         status = self._step()
         for _ in range(self._repeats):
             for part, before in zip(self._memory, memory, strict=True):
-                part[:] = before
+                np.copyto(part, before)
             ctypes.memmove(sqp._at, work, len(work))
             started = clock.thread_time()
             again = sqp._library.quadsim_nmpc_step(*sqp._arguments)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import quadsim
 from quadsim.state import Array
-from scenarios.export.in_the_loop import SerialMPC
+from scenarios.export.in_the_loop import Frames, SerialMPC
 
 
 class Terminal:
@@ -55,7 +55,7 @@ def main() -> None:
         directory = quadsim.export(scenario, Path(scratch) / "c")
         subprocess.run(["make", "--quiet", "-C", directory, "serial.elf"], check=True)
         terminal = Terminal(directory / "serial.elf")
-        computer = SerialMPC(terminal, "double", scenario.controller.horizon)
+        computer = SerialMPC(terminal, Frames("double"))
 
         def law(now: quadsim.StepInputs, state: Array, reference: Array) -> Array:
             assert now.acting is not None

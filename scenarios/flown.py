@@ -146,7 +146,7 @@ class Flight(Result):
         If all had one and a constraint does not hold, it explains the first SQP that did not converge, if any.  What is
         advised has been flown, in `scenarios.remedies.MOST_FLOWN` flights at most; this takes seconds, once.
 
-        `sentence` and `advice` are for users; `docs/controllers.md` explains the other entries.
+        `sentence` and `advice` are for users; `docs/audit.md` explains the other entries.
         """
         explanation = self._explanation
         if explanation is None or self.try_remedies is None:

@@ -51,20 +51,25 @@ class Host:
     """One controller of a compiled library."""
 
     def __init__(self, scenario: Scenario, precision: Precision = "double", rows: int | None = None) -> None:
-        files, right = c_controller(scenario, precision, rows).files, ctypes.c_int()
-        self.library = library(tuple(files.items()), precision)
+        source, right = c_controller(scenario, precision, rows), ctypes.c_int()
+        self.library = library(tuple(source.files.items()), precision)
         self.library.host_size.restype = ctypes.c_size_t
         self.memory = np.zeros(self.library.host_size(ctypes.byref(right)) // 8 + 1)
         assert right.value, "the memory that the export states is not what the controller needs"
-        self.horizon = scenario.controller.horizon
-        self.inputs, self.answers = np.zeros(17 + 4 * self.horizon), np.zeros(7 + 4 * self.horizon)
+        self.rows, width, _ = source.reference
+        self.horizon, self.state = source.horizon, source.state
+        self.inputs = np.zeros(self.state + 5 + self.rows * width)
+        self.answers = np.zeros(7 + 4 * self.horizon)
 
-    def reset(self, speeds: Array) -> None:
-        self._call(self.library.host_reset, np.array(speeds, float))
+    def reset(self, before: Array) -> None:
+        self._call(self.library.host_reset, np.array(before, float))
 
     def step(self, state: Array, reference: Array, acting: Array, phase: Phase = Phase.FLYING) -> Reply:
-        self.inputs[:12], self.inputs[12:16], self.inputs[17:] = state, acting, reference.ravel()
-        self.inputs[16] = PHASES.index(phase)
+        """Of a state (12,) that is to be longer, the rest is not measured."""
+        at = self.state
+        self.inputs[:at] = np.nan
+        self.inputs[: len(state)], self.inputs[at : at + 4], self.inputs[at + 5 :] = state, acting, reference.ravel()
+        self.inputs[at + 4] = PHASES.index(phase)
         self._call(self.library.host_step, self.inputs, self.answers)
         result = self.answers.copy()
         return Reply(*(int(number) for number in result[:3]), result[3:7], result[7:].reshape(-1, 4))
@@ -75,9 +80,8 @@ class Host:
 
 def replay(host: Host, recording: Recording) -> list[Reply]:
     """The answers to all recorded periods, from reset on."""
-    host.reset(recording.speeds)
-    N = host.horizon
+    host.reset(recording.before)
     return [
-        host.step(state, recording.path[k : k + N], acting)
+        host.step(state, recording.path[k : k + host.rows], acting)
         for k, (state, acting) in enumerate(zip(recording.state, recording.acting, strict=True))
     ]

@@ -29,13 +29,13 @@ from scenarios.commands.rooms import ROOMS
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 PARTS: Final = {
-    "campaign": ("scenarios/library/campaigns", "docs/campaigns.md", "docs/own-campaign.md", "docs/survive.md"),
+    "campaign": ("scenarios/library/campaigns", "docs/campaigns.md"),
     "design": (),
-    "export": ("mpc/codegen", "tests/export", "tests/firmware", "tests/exported_c.py", "docs/export.md", "docs/fly.md"),
+    "export": ("mpc/codegen", "tests/export", "tests/firmware", "tests/exported_c.py", "docs/export.md"),
     "gym": ("quadsim/gym.py", "docs/gym.md"),
     "identify": ("docs/identify.md",),
     "live": ("docs/live.md",),
-    "papers": ("scenarios/library/papers", "docs/papers.md"),
+    "papers": ("scenarios/library/papers",),
 }
 """Folders, tests and pages of each room, beside `scenarios/NAME` and `tests/scenarios/NAME`."""
 

@@ -17,7 +17,6 @@ import matplotlib as mpl
 import pytest
 import remake
 from golden_numbers import ABLATION, PAPER, ablation_entry, paper_entry, read
-from test_spine import spine
 
 from scenarios.catalogue import scenario_names, variants
 from scenarios.flown import Flight
@@ -36,6 +35,8 @@ SOURCES = [
 ]
 RUN_ON = re.compile(r"^ *(?:Args|Attributes|Examples|Raises|Returns|Yields):[ ]*\S", re.MULTILINE)
 """A section of a docstring that starts on the line of its title, which no tool then takes for a section."""
+MOST_WORDS = 26_000
+"""Of the pages, code and tables included; it may only fall."""
 SLOW, WITNESS = pytest.mark.slow("pages"), pytest.mark.witness("pages")
 ENTRY_POINTS = {"quadsim.controllers"}
 """Groups of entry points, which are written like modules."""
@@ -160,15 +161,25 @@ def test_code_on_the_pages_is_not_cut_in_a_window_of_1280_pixels() -> None:
             assert language == "text" or not too_wide, f"{page.name}: {too_wide}"
 
 
-def test_every_guide_has_a_figure_and_every_picture_says_what_it_shows() -> None:
+def test_pages_open_with_what_their_reader_can_do_and_stay_few_words() -> None:
+    pages = {page.name: page.read_text(encoding="utf-8") for page in PAGES if page.parent.name == "docs"}
+    for name, text in pages.items():
+        opening = " ".join(text[text.index("# ") :].split()[:60])
+        assert re.search(r"\bAfter (this page|these five steps) you (can|have|know) ", opening), name
+    assert sum(len(text.split()) for text in pages.values()) <= MOST_WORDS
+
+
+def test_guides_have_figures_and_every_picture_says_what_it_shows() -> None:
     site = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    guides = re.findall(r"[a-z-]+\.md", site[site.index("- Guides:") : site.index("- The paper:")])
+    guides = re.findall(r"[a-z-]+\.md", site[site.index("- Do:") : site.index("- Look up:")])
     drawn = set()
     for page in PAGES:
-        pictures = re.findall(r"!\[(.*?)\]\((.*?)\)", page.read_text(encoding="utf-8"))
+        text = page.read_text(encoding="utf-8")
+        pictures = re.findall(r"!\[(.*?)\]\((.*?)\)", text)
         assert all(shows for shows, _ in pictures), page.name
-        drawn |= {page.name for _, file in pictures if "figures/" in file}
-    assert {*guides} - drawn == {"commands.md", "live.md"}
+        if "quadsim.plot(" in text or any("figures/" in file for _, file in pictures):
+            drawn.add(page.name)
+    assert {*guides} - drawn == {"audit.md", "campaigns.md", "export.md", "live.md", "own-vehicle.md"}
 
 
 def test_sections_of_docstrings_have_their_titles_on_lines_of_their_own() -> None:
@@ -193,8 +204,3 @@ def test_documents_name_what_exists() -> None:
 def test_drawings_are_those_of_the_code(name: str) -> None:
     drawn = (ROOT / "docs/assets" / name).read_text(encoding="utf-8")
     assert drawn == drawings.DRAWINGS[name](), "python docs/tools/drawings.py"
-
-
-def test_the_architecture_lists_the_spine_in_its_order() -> None:
-    page = (ROOT / "docs/design.md").read_text(encoding="utf-8")
-    assert [ROOT / name for name in re.findall(r"^\d+\. `([^`]+)`", page, re.MULTILINE)] == spine()

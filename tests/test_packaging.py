@@ -93,7 +93,7 @@ def test_source_archive_can_be_built_and_tested_from(dist: Path) -> None:
     with tarfile.open(file) as sdist:
         held = {name.partition("/")[2] for name in sdist.getnames()}
     assert {"Makefile", "constraints.txt", "README.md", "LICENSE", "CITATION.cff", "tests/conftest.py"} <= held
-    assert {".ci/run", "tests/peers/conftest.py", "docs/tools/remake.py", "docs/verification.md"} <= held
+    assert {".ci/run", "tests/peers/conftest.py", "docs/tools/remake.py", "docs/evidence.md"} <= held
     assert not [name for name in held if "__pycache__" in name or name.startswith(("runs/", ".venv/"))]
 
 

@@ -1,4 +1,4 @@
-"""Build the page on which the paper's MPC flies into site/fly, and link it from site/fly.html: `make docs`.
+"""Build the page on which the paper's MPC flies into site/fly, and link it from site/index.html: `make docs`.
 
 It takes clang and wasm-ld for the controllers, npm for MuJoCo, three.js and esbuild, and a network the first time.
 Without them the page is left out.
@@ -144,9 +144,9 @@ def main() -> None:
     if reason := build(SITE / "fly"):
         print(f"The page on which the MPC flies is left out of the site: {reason}.")
         return
-    page = SITE / "fly.html"
+    page = SITE / "index.html"
     text = page.read_text(encoding="utf-8")
-    assert LEFT_OUT in text, "docs/fly.md has no place for the link"
+    assert LEFT_OUT in text, "docs/index.md has no place for the link"
     page.write_text(text.replace(LEFT_OUT, LINK), encoding="utf-8")
     shutil.copy(FONT / "files/stix-two-math-latin-400-normal.woff2", SITE / "assets/math.woff2")
     shutil.copy(FONT / "LICENSE", SITE / "assets/LICENSE-math.txt")

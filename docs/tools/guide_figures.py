@@ -17,14 +17,13 @@ import quadsim
 import quadsim.gym
 from quadsim.flight.audit import SIGNALS
 from quadsim.palette import COLOUR, CYCLE
-from quadsim.report.figure import Area, Band, Bound, Figure, Panel, Series, outlines
+from quadsim.report.figure import Area, Bound, Figure, Panel, Series, outlines
 from quadsim.sim.effects.battery import LIPO
 from quadsim.state import POSITION
 from scenarios.identify.identification_figures import trace_figure
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 FREE: Final[dict[str, Any]] = {"constraints": []}
-UNTIL: Final = 16.0  # what is shown of the paper's step in x, which is at 10 s
 NEAR: Final = 1.2  # of a pillar, where half-spaces are drawn [m]
 
 
@@ -57,16 +56,6 @@ def curves(
 def fly(name: str, changes: Mapping[str, Any]) -> quadsim.Flight:
     """A scenario of the library with changes."""
     return quadsim.fly(quadsim.load(name, changes), progress=False)
-
-
-def controllers() -> Figure:
-    """The same step of 10 m under four control laws: x, and pitch against the bound of 5 deg."""
-    flights = {}
-    for label in ("constrained", "robust", "lqr", "geometric"):
-        law = {"controller": {"type": label, "tilt": 5.0}} if label in ("lqr", "geometric") else {}
-        flights[label] = fly("robust" if label == "robust" else "paper-constrained", {"duration": 24.0, **FREE, **law})
-    panels = (curves("x", flights, start=7.0), curves("pitch", flights, start=7.0, bounds=(-5.0, 5.0)))
-    return Figure(key="controllers", title="", panels=panels, columns=1)
 
 
 def linear() -> Figure:
@@ -102,35 +91,6 @@ def linear() -> Figure:
         Panel(title="planned speed of rotor 1 [rad/s]", y_label="speed", series=tuple(speed)),
     )
     return Figure(key="linear", title="", panels=panels)
-
-
-def robust() -> Figure:
-    """A wrong mass and an unmodelled lag, under the paper's controller and under the robust one."""
-    pairs = []
-    for changes in ({"actual.mass": 4.8}, {"effects.rotors": {"rise": 0.02, "fall": 0.02}}):
-        names = {"constrained": "paper-constrained", "robust": "robust"}
-        pairs.append({label: fly(name, {"duration": UNTIL, **FREE, **changes}) for label, name in names.items()})
-    heavy, lagging = pairs
-    course = Series(
-        x=np.array([3.0, UNTIL]), y=np.full(2, 10.0), colour=COLOUR.reference, label="reference", dashed=True
-    )
-    height = curves("z", heavy, "20 % more mass than modelled", start=3.0)
-    pitch = curves("pitch", lagging, "20 ms of unmodelled lag", bounds=(-5.0, 5.0), start=3.0)
-    panels = (
-        replace(height, series=(course, *height.series), y_range=(8.5, 10.5)),
-        replace(pitch, y_range=(-15.0, 15.0)),
-    )
-    return Figure(key="robust", title="", panels=panels)
-
-
-def nonlinear() -> Figure:
-    """Released upside down: the rigid body's model, and the gain of the hover model."""
-    weights = {"output_weights": {"x": 10.0, "y": 10.0, "z": 100.0, "yaw": 100.0}, "input_weights": {"speed": 9e-4}}
-    hover_model = {"controller": {"type": "unconstrained", "horizon": 40, **weights}}
-    flights = {label: fly("inverted-start", {"duration": 3.0, **FREE, **law})
-               for label, law in (("nonlinear", {}), ("unconstrained, hover model", hover_model))}  # fmt: skip
-    panels = (curves("tilt", flights), replace(curves("z", flights), y_range=(5.0, 10.2)))
-    return Figure(key="nonlinear", title="", panels=panels, end=3.0)
 
 
 def effects() -> Figure:
@@ -245,46 +205,6 @@ def space() -> Figure:
     return Figure(key="space", title="", panels=(panel,), columns=1)
 
 
-def campaigns() -> Figure:
-    """Errors of random flights, and the interval of their share of failures as it narrows."""
-    from scipy.stats import binomtest
-
-    mass = {"name": "mass", "fields": ["actual.mass"], "distribution": "uniform", "low": 3.8, "high": 4.2}
-    hover = quadsim.load("hover").replace({"duration": 2.0, **FREE})
-    with tempfile.TemporaryDirectory() as folder:
-        answer = quadsim.campaign(
-            hover, vary=[mass], flights=100, fields={"failure": ["rmse.z > 0.05"]}, out=f"{folder}/masses"
-        )
-        table = answer.to_pandas()
-    failed = (table["rmse.z"] > 0.05).to_numpy()
-    points = tuple(
-        Series(x=table["draw.mass"][which].to_numpy(), y=table["rmse.z"][which].to_numpy(), colour=colour, label=label,
-               style="points", width=3.0)
-        for which, colour, label in ((~failed, COLOUR.satisfied, "flight"), (failed, COLOUR.violated, "failed"))
-    )  # fmt: skip
-    counts = np.arange(4, len(failed) + 1)
-    shares = np.cumsum(failed)[counts - 1] / counts
-    ends = [binomtest(int(np.cumsum(failed)[n - 1]), int(n)).proportion_ci() for n in counts]
-    band = Band(x=1.0 * counts, low=np.array([end.low for end in ends]), high=np.array([end.high for end in ends]),
-                colour=COLOUR.flown, label="95 % interval")  # fmt: skip
-    panels = (
-        Panel(title="each flight", y_label="RMS error of z [m]", x_label="mass [kg]", series=points,
-              bounds=(Bound(value=0.05),)),
-        Panel(title="share that failed", y_label="share", x_label="flights", bands=(band,), y_range=(0.0, 1.0),
-              series=(Series(x=1.0 * counts, y=shares, colour=COLOUR.flown, label="share"),)),
-    )  # fmt: skip
-    return Figure(key="campaigns", title="", panels=panels)
-
-
-def export() -> Figure:
-    """How the work of the core varies over the paper's flight."""
-    flight = fly("paper-constrained", {"controller.solver": "core", **FREE})
-    t, iterations = flight.log.control.t, flight.log.control.iterations.astype(float)
-    work = Series(x=t, y=iterations, colour=CYCLE[1], style="steps")
-    panels = (curves("x", {"": flight}), Panel(title="iterations of the core", whole=True, series=(work,)))
-    return Figure(key="export", title="", panels=panels, columns=1, end=60.0)
-
-
 def learning() -> Figure:
     """A random agent in turbulence, alone and behind the safety filter."""
     example = run_path(str(ROOT / "examples" / "safety_filter.py"))
@@ -303,14 +223,6 @@ def learning() -> Figure:
         flights[label] = env.unwrapped.flight()
     panel = replace(curves("tilt", flights, bounds=(example["LARGEST"],)), y_range=(0.0, 20.0))
     return Figure(key="learning", title="", panels=(panel,), columns=1, end=5.0)
-
-
-def scenarios() -> Figure:
-    """The pitch of three flights of one course, satisfied, violated and lost."""
-    names = {"satisfied": "paper-constrained", "violated": "paper-unconstrained", "lost": "paper-constrained-lag20"}
-    flights = {verdict: fly(name, {"duration": UNTIL, **FREE}) for verdict, name in names.items()}
-    panel = replace(curves("pitch", flights, bounds=(-5.0, 5.0), start=7.0), y_range=(-15.0, 15.0))
-    return Figure(key="scenarios", title="", panels=(panel,), columns=1)
 
 
 def identification() -> Figure:
@@ -347,18 +259,12 @@ def betaflight() -> Figure:
 FIGURES: Final[dict[str, Callable[[], Figure]]] = {
     made.__name__: made
     for made in (
-        controllers,
         linear,
-        robust,
-        nonlinear,
         effects,
         autopilot,
         battery,
         space,
-        campaigns,
-        export,
         learning,
-        scenarios,
         identification,
     )
 }

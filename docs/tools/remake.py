@@ -3,7 +3,7 @@
 A table stands between `<!-- NAME: filled by docs/tools/remake.py from FILE -->` and `<!-- NAME end -->`.  Golden
 numbers are in the repository, under tests/golden; all other files are made by a command, under runs/.  A table whose
 file is not there stays as it is.  What a command of this script made states its commit, its date and its solver below
-the table.  The records of five benchmarks are kept as CSV, docs/data.
+the table.  What nobody reads row by row is kept as CSV in docs/data.
 
     python docs/tools/remake.py                    # fill all tables from the files that are there
     python docs/tools/remake.py speed mismatch     # run the commands that make these files first
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import math
 import re
 import subprocess
 import sys
@@ -35,29 +34,18 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 MADE: Final = ROOT / "runs" / "numbers"
 BLOCK: Final = re.compile(r"<!-- (\S+): filled by docs/tools/remake.py from (\S+) -->\n(.*?)<!-- \1 end -->", re.DOTALL)
 BENCHMARKS: Final = (
-    "solvers",
-    "flight",
-    "nonlinear",
-    "film",
-    "campaign",
-    "mismatch",
-    "speed",
-    "autopilots",
-    "interfaces",
-    "identification",
-    "intervals",
+    *("solvers", "flight", "nonlinear", "film", "campaign", "mismatch", "speed", "autopilots", "interfaces"),
+    *("identification", "intervals"),
 )
 KEPT: Final = ("solvers", "mismatch", "speed", "interfaces", "identification")
-"""Benchmarks whose figure and records are kept in docs/."""
+"""Benchmarks whose figure is kept in docs/."""
 SOLVERS: Final = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "core", "clarabel")
 """The solvers that `make setup` installs."""
-PRECISE: Final = ("thrust_coefficient", "inertia_x", "inertia_y")
-"""Parameters whose median error [%] the table of intervals shows."""
 CAMPAIGNS: Final = ("paper-robustness", "paper-robustness-robust", "paper-nominal")
 BATTERIES: Final = {
-    "battery-none": ("none", ["battery", "--set", "controller.disturbance.largest_force=1e-6"]),
-    "battery": ("a force of three axes", ["battery"]),
-    "battery-thrust-scale": ("the thrust's scale", ["battery-thrust-scale"]),
+    "battery-none": ("without an estimate", ["battery", "--set", "controller.disturbance.largest_force=1e-6"]),
+    "battery": ("with a force along three axes", ["battery"]),
+    "battery-thrust-scale": ("with the thrust's scale", ["battery-thrust-scale"]),
 }
 """Of each campaign on a battery, what the observer estimates, and the arguments of `quadsim campaign`."""
 FIGURES: Final = {
@@ -66,27 +54,22 @@ FIGURES: Final = {
 }
 """Pictures of docs/, and the files that they are copies of."""
 COLOURS: Final = 128
-TOPICS: Final[dict[Group, tuple[str, str]]] = {
-    "paper": ("The paper's flights, and where its controller ends", "[the paper, equation by equation](paper.md)"),
-    "papers": ("Other papers, reproduced", "[Papers, reproduced](papers.md)"),
-    "courses": ("Courses and vehicles", "[Courses](effects.md#courses)"),
-    "air": ("Wind, drag and rotors that lag", "[Effects](effects.md#effects)"),
-    "faults": ("Faults, loads and slow computers", "[Events](effects.md#events)"),
-    "ground": ("Take-off, landing and the ground", "[Effects](effects.md#effects)"),
-    "space": ("Obstacles, windows and corridors", "[Constraints in space](space.md)"),
-    "sensors": ("Sensors and estimation", "[What the controller receives](effects.md#what-the-controller-receives)"),
+TOPICS: Final[dict[Group, str]] = {
+    "paper": "the paper",
+    "papers": "other papers",
+    "courses": "courses",
+    "air": "wind, drag, lag",
+    "faults": "faults",
+    "ground": "ground",
+    "space": "obstacles",
+    "sensors": "sensors",
 }
-"""Of each group of scenarios, its title and its guide."""
-FILMS: Final = {
-    "paper-constrained-lag20": "Rotors lag by 20 ms: the paper's hard QP turns infeasible, and the vehicle is lost.",
-    "robust-lag50": "50 ms of lag, known to the robust MPC: tilt stays within 5 deg.",
-    "power-loop": "Upside down at its top: nonlinear MPC on a Kalman filter's estimate.",
-    "window": "Through a window 8 cm wider than the vehicle.",
-    "thrown-ball": "A ball crosses the course where the vehicle would be.",
-    "take-off-and-landing": "From cold rotors on the ground, up 2 m, and down again.",
-}
-"""The scenarios that the gallery films, and what to see there."""
-WITHOUT_SOLVER: Final = ("film", "intervals", "nonlinear")
+"""Of each group of scenarios, its name in the table."""
+FILMS: Final = (
+    *("paper-constrained-lag20", "robust-lag50", "power-loop", "window", "thrown-ball", "take-off-and-landing"),
+)
+"""The scenarios that the library films."""
+WITHOUT_SOLVER: Final = ("film", "nonlinear")
 """Tables whose numbers come from no QP."""
 Row = Sequence[object]
 
@@ -224,26 +207,21 @@ def _bound(found: dict[str, Any], unit: str) -> str:
 
 
 def scenarios(golden: dict[str, Any]) -> str:
-    """The library's scenarios: the guide, the films and the table of each group."""
-    head = ("", "scenario", "verdict", "nearest", "RMS error [m]")
+    """The library: one table, and films."""
     specs = {name: load_scenario(name) for name in golden}
-    parts = []
-    for group in get_args(Group):
-        if not (members := [name for name in golden if specs[name].group == group]):
-            continue
-        title, guide = TOPICS[group]
-        rows = [
-            (
-                f"![{name}](assets/gallery/{name}.svg){{loading=lazy}}",
-                f"{_title(name)} {specs[name].description}",
-                *scenario_cells(golden[name]),
-            )
-            for name in members
-        ]
-        films = "".join(_film(name) for name in members if name in FILMS)
-        shown = f'<div class="films">\n{films}</div>\n\n' if films else ""
-        parts.append(f"## {title}\n\nGuide: {guide}.\n\n{shown}{markdown(head, rows)}")
-    return "\n".join(parts)
+    rows = [
+        (
+            f"![{name}](assets/gallery/{name}.svg){{loading=lazy}} {_title(name)} {specs[name].description}",
+            TOPICS[group],
+            golden[name]["verdict"],
+        )
+        for group in get_args(Group)
+        for name in golden
+        if specs[name].group == group
+    ]
+    films = "".join(_film(name) for name in golden if name in FILMS)
+    table = markdown(("scenario", "topic", "verdict"), rows)
+    return f'<div class="library" markdown>\n\n{table}\n</div>\n\n<div class="films">\n{films}</div>\n'
 
 
 def _title(name: str) -> str:
@@ -252,59 +230,67 @@ def _title(name: str) -> str:
 
 
 def _film(name: str) -> str:
-    """A film that loads once it is played, under a poster."""
-    sources = f'src="films/{name}.mp4" poster="assets/gallery/{name}.jpg" preload="none"'
-    failed = "document.querySelector('.no-films').hidden = false"
-    video = f'<video {sources} controls muted loop playsinline onerror="{failed}"></video>'
-    return f"<figure>{video}<figcaption>{_title(name)} {FILMS[name]}</figcaption></figure>\n"
-
-
-def scenario_cells(entry: dict[str, Any]) -> tuple[str, str, str]:
-    """A scenario's verdict, nearest bound and error of the position; "-" where the vehicle was lost."""
-    if "rmse" not in entry:
-        return entry["verdict"], "-", "-"
-    nearest = f"{entry['nearest']} {entry['margin'] + 0.0:.2f} {entry['unit']}"
-    return entry["verdict"], nearest, f"{math.hypot(*entry['rmse'][:3]):.3f}"
+    """A film under a poster; assets/library.js gives it its controls."""
+    video = f'<video src="films/{name}.mp4" poster="assets/gallery/{name}.jpg" preload="none"></video>'
+    return f"<figure>{video}<figcaption>{_title(name)}</figcaption></figure>\n"
 
 
 def papers(reproduction: dict[str, Any]) -> str:
-    """Published numbers and ours, a table for each paper."""
-    parts = []
+    """How many of each paper's numbers are reproduced."""
+    rows = []
     for paper in reproduction["papers"]:
-        rows = [(number["name"], number["unit"], *_number(number)) for number in paper["numbers"]]
-        table = markdown(("number", "unit", "published", "ours", "tolerance", "reproduced"), rows)
-        about = ", ".join(filter(None, [paper["authors"], paper["publication"]]))
-        parts.append(f"### {paper['title']}\n\n{about}{about and '.' + chr(10) * 2}{table}")
-    return "\n".join(parts)
+        within = sum(number["within"] for number in paper["numbers"])
+        about = ", ".join(filter(None, [paper["title"], paper["authors"], paper["publication"]]))
+        rows.append((about, f"{within} of {len(paper['numbers'])}"))
+    return markdown(("paper", "numbers reproduced"), rows)
 
 
-def _number(number: dict[str, Any]) -> tuple[str, ...]:
-    span = number["published"] if isinstance(number["published"], list) else [number["published"]]
-    published = " to ".join(f"{value:g}" for value in sorted({*span}))
-    relation = "" if number["relation"] == "equal" else f"{number['relation']} "
-    ours = "-" if number["ours"] is None else f"{number['ours'] + 0.0:.4g}"
-    return f"{relation}{published}", ours, f"{number['tolerance']:.2g}", "yes" if number["within"] else "no"
+def paper_rows(reproduction: dict[str, Any]) -> list[dict[str, Any]]:
+    """Published numbers and ours."""
+    rows = []
+    for paper in reproduction["papers"]:
+        for number in paper["numbers"]:
+            span = number["published"] if isinstance(number["published"], list) else [number["published"]]
+            published = " to ".join(f"{value:g}" for value in sorted({*span}))
+            row = {"paper": paper["title"], **{key: number[key] for key in ("name", "unit", "relation")}}
+            rows.append(row | {"published": published} | {key: number[key] for key in ("ours", "tolerance", "within")})
+    return rows
+
+
+def peer_rows(checks: list[list[str]]) -> list[dict[str, Any]]:
+    """Every check of `make peers`; those of QP solvers last."""
+    shown = (check for check in checks if not check[0].endswith(": failures"))
+    head = ("check", "peer", "measured", "allowed")
+    return [dict(zip(head, check, strict=True)) for check in sorted(shown, key=lambda check: check[0][0] == "`")]
 
 
 def peers(checks: list[list[str]]) -> str:
-    """Every check of `make peers`; those of QP solvers last."""
-    shown = sorted(
-        (check for check in checks if not check[0].endswith(": failures")), key=lambda check: check[0][0] == "`"
-    )
-    return markdown(("check", "peer", "measured", "allowed"), shown)
+    """Of each peer, its checks, and the largest difference as a share of the allowed one."""
+    rows: dict[str, list[float]] = {}
+    for check in peer_rows(checks):
+        measured, allowed = (float(check[key].split()[0]) for key in ("measured", "allowed"))
+        rows.setdefault(check["peer"], []).append(measured / allowed)
+    head = ("peer", "checks", "largest difference over the allowed one")
+    return markdown(head, [(peer, len(shares), f"{max(shares):.1g}") for peer, shares in sorted(rows.items())])
 
 
 def export(boards: list[dict[str, Any]]) -> str:
     """What an exported controller takes on a board, of `make firmware`."""
     rows = [
         (
-            *(board["target"], board["precision"], f"{board['flash'] / 1e3:.0f}", f"{board['ram'] / 1e3:.0f}"),
+            *(
+                f"`{board['law']}`",
+                board["target"],
+                board["precision"],
+                f"{board['flash'] / 1e3:.0f}",
+                f"{board['ram'] / 1e3:.0f}",
+            ),
             *(f"{board[name] / 1e6:.2f}" for name in ("p50", "p99", "warm", "first")),
         )
         for board in boards
     ]
     instructions = ("instructions: median [M]", "p99", "most after the first", "the first")
-    return markdown(("target", "precision", "flash [kB]", "RAM [kB]", *instructions), rows)
+    return markdown(("scenario", "target", "precision", "flash [kB]", "RAM [kB]", *instructions), rows)
 
 
 def first_flights(flights: list[dict[str, Any]]) -> str:
@@ -334,82 +320,61 @@ def campaigns(summaries: dict[str, Any]) -> str:
 
 
 def batteries(summaries: dict[str, Any]) -> str:
-    """How many flights on a battery failed, and by which constraint, with their largest errors of height."""
-    rows = []
+    """How many flights on a battery failed by each estimate, with their largest error of height."""
+    failed = []
     for name, (estimate, _) in BATTERIES.items():
-        found = summaries[name]
-        height = found["metrics"]["max_error.z"]
-        held = (found["constraints"][f"hold_{axis}"]["not_satisfied"]["count"] for axis in "xyz")
-        thrust = found["constraints"]["thrust"]["not_satisfied"]["count"]
-        errors = (f"{100.0 * height[size]:.1f} cm" for size in ("p50", "max"))
-        rows.append((estimate, f"{found['events']['failure']['count']} of {found['flights']}", *held, thrust, *errors))
-    beyond = ("x beyond 5 cm", "y beyond 5 cm", "height beyond 5 cm", "thrust beyond its bounds")
-    return markdown(("estimate", "failed", *beyond, "largest error of height: median", "and most"), rows)
+        events, height = summaries[name]["events"], summaries[name]["metrics"]["max_error.z"]
+        share = f"{events['failure']['count']} of {summaries[name]['flights']}"
+        failed.append(f"{share} {estimate} (height off by up to {100.0 * height['max']:.0f} cm)")
+    return f"Flights that fail: {', '.join(failed)}.\n"
 
 
 def solvers(data: Any) -> str:
-    """Step times of every solver, and how they compare with the first of the scenario."""
+    """Step times of every solver, and how the 99th percentile compares with that of the scenario's first."""
     rows, first = [], {row["scenario"]: row for row in reversed(_records(data))}
     for row in _records(data):
         times = (f"{row[key]:.3g}" for key in ("p50_ms", "p99_ms"))
-        ratios = (f"{row[key] / first[row['scenario']][key]:.2f}" for key in ("p50_ms", "p99_ms"))
-        rows.append((row["scenario"], row["solver"], *times, *ratios))
-    return markdown(("scenario", "solver", "p50 [ms]", "p99 [ms]", "p50, ratio", "p99, ratio"), rows)
+        rows.append((row["scenario"], row["solver"], *times, f"{row['p99_ms'] / first[row['scenario']]['p99_ms']:.2f}"))
+    return markdown(("scenario", "solver", "p50 [ms]", "p99 [ms]", "p99, ratio"), rows)
+
+
+def nonlinear(data: Any) -> str:
+    """The law in C beside acados."""
+    keys = ("case", "C_p50_ms", "C_p99_ms", "p50_ratio", "p99_ratio")
+    rows = [[_cell(row[key]) for key in keys] for row in _records(data) if "case" in row]
+    return markdown([key.replace("_", " ") for key in keys], rows)
+
+
+def film(data: Any) -> str:
+    """How long a film takes."""
+    (row,) = _records(data)
+    return f"A frame takes {row['frame_ms']:.0f} ms, a minute of film {row['s_per_minute_of_film']:.0f} s.\n"
 
 
 def identification(data: Any) -> str:
     """How the same vehicles fly by controllers that are made from each file."""
-    rows = []
+    by = []
     for row in _records(data):
-        errors = ("lost" if row[key] is None else f"{row[key]:.1f}" for key in ("median_%", "p90_%"))
-        shares = (
-            f"{100.0 * row[event] / row['flights']:.0f} %, {interval(row[f'{event}_from'], row[f'{event}_to'])}"
-            for event in ("violated", "lost")
+        share = 100.0 * row["violated"] / row["flights"]
+        span = interval(row["violated_from"], row["violated_to"])
+        by.append(
+            f"{share:.0f} % ({span}) of the flights by the {row['file']} file, median error {row['median_%']:.1f} %"
         )
-        passed = f"{row['passed']} of {row['sought']}" if "passed" in row else "-"
-        rows.append((row["file"], passed, *errors, *shares, f"{row['vehicles_lost']} of {row['vehicles']}"))
-    head = ("file", "numbers that passed the gates", "error: median [%]", "90 % of vehicles below [%]")
-    return markdown((*head, "violated, 95 % interval", "lost, 95 % interval", "vehicles lost at least once"), rows)
+    return f"A constraint is violated in {'; in '.join(by)}.\n"
 
 
-def intervals(data: Any) -> str:
-    """Of each condition, how often the interval of a parameter that passes its gates holds the truth."""
-    shown = {
-        "thrust_coefficient": "b",
-        **{f"inertia_{axis}": f"J{axis}" for axis in "xyz"},
-        "drag_to_thrust": "d / b",
-        "rotor_rise": "rise",
-        "rotor_fall": "fall",
-        "rotor_inertia": "Jr",
-        "rotor_drag": "rotor drag",
-        "delay": "delay",
-    }
-    rows: dict[str, dict[str, str]] = {}
-    for row in _records(data):
-        error = f" ({100.0 * row['median_error']:.2g})" if row["parameter"] in PRECISE and row["passed"] else ""
-        rows.setdefault(row["condition"], {})[row["parameter"]] = f"{row['inside']}/{row['passed']}{error}"
-    cells = [(name, *(of[parameter] for parameter in shown)) for name, of in rows.items()]
-    return markdown(("log", *shown.values()), cells)
-
-
-def _with_half(mean: float | None, half: float | None) -> str:
-    """A mean error in centimetres, with half its interval."""
-    if mean is None:
-        return "-"
-    return f"{100.0 * mean:.1f}" if half is None else f"{100.0 * mean:.1f} ± {100.0 * half:.1f}"
+def autopilots(data: Any) -> str:
+    """How far Betaflight's flights are from those of the built-in autopilot."""
+    rows = _records(data)
+    most, held = max(abs(row["difference_cm"]) for row in rows), sum(row["verdict"] == "satisfied" for row in rows)
+    return f"Of {len(rows)} flights {held} are satisfied; RMS errors differ by at most {most:.2g} cm.\n"
 
 
 def records(data: Any) -> str:
-    """A benchmark's records, one a row, under their keys: a table for each kind, by their first key."""
-    kinds: dict[str, list[dict[str, Any]]] = {}
-    for row in _records(data):
-        kinds.setdefault(next(iter(row)), []).append(row)
-    tables = []
-    for rows in kinds.values():
-        keys = [*dict.fromkeys(key for row in rows for key in row)]
-        cells = [[_cell(row.get(key)) for key in keys] for row in rows]
-        tables.append(markdown([key.replace("_", " ") for key in keys], cells))
-    return "\n".join(tables)
+    """A benchmark's records, one a row, under their keys."""
+    rows = _records(data)
+    keys = [*dict.fromkeys(key for row in rows for key in row)]
+    return markdown([key.replace("_", " ") for key in keys], [[_cell(row.get(key)) for key in keys] for row in rows])
 
 
 def _records(data: Any) -> list[dict[str, Any]]:
@@ -424,14 +389,14 @@ def _cell(value: object) -> str:
     return "-" if value is None else str(value)
 
 
-def write_csv(name: str) -> None:
-    """A benchmark's records as docs/data/NAME.csv, numbers to four digits."""
+def write_csv(name: str, rows_of: Callable[[Any], list[dict[str, Any]]]) -> None:
+    """What a name's file holds as docs/data/NAME.csv, numbers to four digits."""
     source = MADE / f"{name}.json"
     if not source.is_file():
         return
     rows = [
         {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()}
-        for row in _records(json.loads(source.read_text(encoding="utf-8")))
+        for row in rows_of(json.loads(source.read_text(encoding="utf-8")))
     ]
     with (ROOT / "docs" / "data" / f"{name}.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, [*dict.fromkeys(key for row in rows for key in row)], lineterminator="\n")
@@ -439,6 +404,12 @@ def write_csv(name: str) -> None:
         writer.writerows(rows)
 
 
+CSV: Final[dict[str, Callable[[Any], list[dict[str, Any]]]]] = {
+    **dict.fromkeys((*KEPT, "autopilots", "intervals", "nonlinear"), _records),
+    "papers": paper_rows,
+    "peers": peer_rows,
+}
+"""What docs/data keeps, and how its rows are read."""
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "results": results,
     "paper": paper,
@@ -452,8 +423,10 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "battery": batteries,
     "solvers": solvers,
     "identification": identification,
-    "intervals": intervals,
-    **dict.fromkeys(("flight", "nonlinear", "film", "campaign", "autopilots"), records),
+    "nonlinear": nonlinear,
+    "film": film,
+    "autopilots": autopilots,
+    **dict.fromkeys(("flight", "campaign"), records),
 }
 
 
@@ -498,8 +471,8 @@ def main() -> None:
         page.write_text(text, encoding="utf-8")
         for source in missing:
             print(f"{page.relative_to(ROOT)}: stays as it is without {source}")
-    for name in KEPT:
-        write_csv(name)
+    for name, rows_of in CSV.items():
+        write_csv(name, rows_of)
     for name, drawn in FIGURES.items():
         if (ROOT / drawn).is_file():
             figure = Image.open(ROOT / drawn).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)

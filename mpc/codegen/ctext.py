@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -9,9 +10,11 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from mpc.core.tables import NO_BOUND
 from quadsim.state import Array
 
 Precision = Literal["double", "float"]
+_KINDS: Final = {np.dtype(np.uint8): "unsigned char", np.dtype(np.intc): "int"}
 LEAST_FLOAT: Final = 1.2e-38
 """Magnitude below which a number becomes 0: some compilers reject constants that single precision would truncate."""
 ELEMENT_TYPES: Final = {"axes": "quadsim_axis", "rows": "quadsim_row", "terms": "quadsim_term"}
@@ -40,7 +43,7 @@ class CText:
 
     def array(self, name: str, values: Array) -> str:
         """Return a constant array of bytes or numbers, row by row; an empty one gets a single zero."""
-        kind, text = ("unsigned char", str) if values.dtype == np.uint8 else ("quadsim_real", self.number)
+        kind, text = _KINDS.get(values.dtype, "quadsim_real"), str if values.dtype in _KINDS else self.number
         entries = ", ".join(map(text, values.ravel().tolist() or [0]))
         return self._array(kind, name, values.size, textwrap.wrap(entries, 116, break_on_hyphens=False))
 
@@ -49,6 +52,33 @@ class CText:
         wrap = textwrap.TextWrapper(120, initial_indent="    ", subsequent_indent="        ")
         lines = [wrap.fill(f".{member} = {value},") for member, value in members.items()]
         return "\n".join([f"static const {kind} {name} = {{", *lines, "};\n"])
+
+    def mirrored(
+        self, struct: ctypes.Structure, pointers: Mapping[str, str] | None = None, **others: int
+    ) -> dict[str, str]:
+        """Return the initialisers of a struct that Python mirrors.
+
+        Args:
+            struct: it; an infinite number becomes +-1e30.
+            pointers: initialisers of its pointers; NULL of those left out.
+            others: values of members that replace those of the struct.
+        """
+        initialisers = {}
+        for name, kind, *_ in struct._fields_:
+            if kind is ctypes.c_void_p:
+                initialisers[name] = (pointers or {}).get(name, "NULL")
+            else:
+                value = others.get(name, getattr(struct, name))
+                if isinstance(value, ctypes.Array | float):
+                    value = np.clip(np.array(value, float), -NO_BOUND, NO_BOUND)
+                    value = value if value.ndim else value.item()
+                initialisers[name] = self.value(value)
+        return initialisers
+
+    def structs(self, kind: str, name: str, structs: Iterable[ctypes.Structure]) -> str:
+        """Return a constant array of structs without pointers, that Python mirrors."""
+        lines = ["{" + ", ".join(self.mirrored(struct).values()) + "}," for struct in structs]
+        return self._array(kind, name, len(lines), lines)
 
     def members(self, values: Mapping[str, Any], suffix: str = "") -> tuple[list[str], dict[str, str]]:
         """Return the arrays that a struct's members point to, with names ending in `suffix`, and its initialisers."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import abc
 import math
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
-from typing import Final
+from typing import ClassVar, Final
 
 from mpc.answer import ActuatorBounds
 from mpc.codegen.ctext import CText, Precision
@@ -15,15 +16,16 @@ from mpc.core.solver import core_problem
 from mpc.core.tables import Tables, members
 from mpc.model import hover_model
 from mpc.robust.settings import split_delay
+from quadsim.controller import ROTORS
+from quadsim.state import N_STATES, REFERENCE_STATES
 from quadsim.vehicle import N_ROTORS
 
-CORE_FILES: Final = (
-    *("quadsim_core.h", "quadsim_core.c", "quadsim_math.h"),
-    *("quadsim_mpc.h", "quadsim_mpc.c", "quadsim_guard.h", "quadsim_guard.c"),
-)
-"""Files of `mpc/core/c` to export verbatim."""
+SHARED_FILES: Final = ("quadsim_core.h", "quadsim_math.h", "quadsim_guard.h", "quadsim_guard.c")
+"""Files of `mpc/core/c` that every law takes."""
+CORE_FILES: Final = (*SHARED_FILES, "quadsim_core.c", "quadsim_mpc.h", "quadsim_mpc.c")
+"""Those of the linear laws."""
 BODY_FILES: Final = ("quadsim_rigid.h",)
-"""Files of `quadsim/core` to export verbatim."""
+"""Files of `quadsim/core` to export verbatim, for every law."""
 DATA: Final = "quadsim_data.h"
 """The generated file."""
 CHANGES: Final = 500
@@ -39,13 +41,149 @@ def part(name: str, package: str = "mpc.codegen") -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CController:
-    """A controller as C source."""
+class CSource(abc.ABC):
+    """A controller as C source: the files of its law, verbatim, and one of its numbers."""
 
-    law: Exportable  # the law to export
     precision: Precision = "double"  # of all numbers
     title: str = ""  # a line that identifies it, in ASCII
-    asked: int | None = None  # active rows with room; None for 2.56 per step of the horizon, and at least 64
+    asked: int | None = None  # active rows with room; None for a number that usually suffices
+
+    law_name: ClassVar[str]
+    """Header of its law, and first word of its functions."""
+    law_files: ClassVar[tuple[str, ...]]
+    """Files of `mpc/core/c` to export verbatim."""
+    state: ClassVar[int] = N_STATES
+    """Numbers of a measured state."""
+    plan: ClassVar[str] = "law->work.plan"
+    changes: ClassVar[str] = "law->work.changes"
+
+    @property
+    @abc.abstractmethod
+    def period(self) -> float:
+        """The control period [s]."""
+
+    @property
+    @abc.abstractmethod
+    def horizon(self) -> int:
+        """Periods of the plan."""
+
+    @property
+    @abc.abstractmethod
+    def bounds(self) -> ActuatorBounds | None:
+        """Bounds on its commands; None for none."""
+
+    @property
+    def tolerances(self) -> tuple[str, str]:
+        """Of recorded commands, in doubles and in floats."""
+        return "1e-8", "6e-2"
+
+    @property
+    def commands(self) -> str:
+        """What it commands: rotor speeds, or the targets of an autopilot by name."""
+        return ROTORS
+
+    @property
+    def reference(self) -> tuple[int, int, str]:
+        """Rows of a reference, numbers of a row, and what they are."""
+        return self.horizon, len(REFERENCE_STATES), "x y z yaw"
+
+    @property
+    @abc.abstractmethod
+    def rows(self) -> int:
+        """Capacity for active rows."""
+
+    @property
+    @abc.abstractmethod
+    def reals(self) -> int:
+        """Numbers of memory needed."""
+
+    @property
+    def ints(self) -> int:
+        """Integers of memory needed."""
+        return 0
+
+    @property
+    def real_bytes(self) -> int:
+        """Size of a number in bytes."""
+        return 8 if self.precision == "double" else 4
+
+    @property
+    def memory_bytes(self) -> int:
+        """Memory needed, in bytes."""
+        return self.reals * self.real_bytes + 4 * self.ints
+
+    @abc.abstractmethod
+    def numbers(self, text: CText) -> list[str]:
+        """Return the generated numbers, with `QUADSIM_CONTROLLER` last."""
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """Its C files, by name."""
+        body = {name: (resources.files("quadsim.core") / name).read_text(encoding="utf-8") for name in BODY_FILES}
+        return {name: part(name, "mpc.core") for name in self.law_files} | body | {DATA: self.filled(part(DATA))}
+
+    @property
+    def objects(self) -> str:
+        """Its object files, as the Makefile lists them."""
+        return " ".join(sorted(name.replace(".c", ".o") for name in self.law_files if name.endswith(".c")))
+
+    def filled(self, template: str) -> str:
+        """Fill in the names between @ of a C file."""
+        count, width, what = self.reference
+        name, ints = self.law_name, self.ints
+        fits = f"{name}_reals(&QUADSIM_CONTROLLER) == QUADSIM_MEMORY"
+        values = {
+            "LAW": name,
+            "TITLE": self.title,
+            "PERIOD": f"{self.period:g}",
+            "IFN": "ifdef" if self.precision == "double" else "ifndef",
+            "PRECISION": self.precision,
+            "HORIZON": self.horizon,
+            "STATE": self.state,
+            "ROWS": count,
+            "ROW": width,
+            "REFERENCE": what,
+            "MEMORY": self.reals,
+            "INTS": f"    int ints[{ints}];\n" if ints else "",
+            "MORE": ", memory->ints" if ints else "",
+            "FITS": f"{fits} && {name}_ints(&QUADSIM_CONTROLLER) == {ints}" if ints else fits,
+            "PLAN": self.plan,
+            "CHANGES": self.changes,
+            "DOUBLE_TOLERANCE": self.tolerances[0],
+            "FLOAT_TOLERANCE": self.tolerances[1],
+        }
+        if "@NUMBERS@" in template:
+            numbers = self.numbers(CText(self.precision, "quadsim_data_"))
+            template = template.replace("@NUMBERS@\n", "\n".join(numbers))
+        for key, value in values.items():
+            template = template.replace(f"@{key}@", str(value))
+        return template
+
+
+@dataclass(frozen=True, kw_only=True)
+class CController(CSource):
+    """A linear controller as C source, with room for 2.56 active rows per step of the horizon, and at least 64."""
+
+    law: Exportable  # the law to export
+
+    law_name = "quadsim_mpc"
+    law_files = CORE_FILES
+
+    @property
+    def period(self) -> float:
+        """See `CSource`."""
+        return self.law.problem.model.period
+
+    @property
+    def horizon(self) -> int:
+        """See `CSource`."""
+        return self.law.problem.horizon
+
+    @property
+    def bounds(self) -> ActuatorBounds | None:
+        """See `CSource`."""
+        problem = self.law.problem
+        return ActuatorBounds.of_problem(problem) if problem.every_constraint else None
 
     @cached_property
     def tables(self) -> Tables:
@@ -54,15 +192,14 @@ class CController:
 
     @property
     def rows(self) -> int:
-        """Capacity for active rows."""
-        N = self.law.problem.horizon
-        usual = max(LEAST_ROWS, math.ceil(ROWS_PER_STEP * N))
-        return min(N * len(self.tables.rows), usual if self.asked is None else self.asked)
+        """See `CSource`."""
+        usual = max(LEAST_ROWS, math.ceil(ROWS_PER_STEP * self.horizon))
+        return min(self.horizon * len(self.tables.rows), usual if self.asked is None else self.asked)
 
     @property
     def reals(self) -> int:
-        """Numbers of memory needed, as counted by `quadsim_mpc_reals`."""
-        N, problem, room = self.law.problem.horizon, self.tables.problem, self.rows + 1
+        """See `CSource`: as counted by `quadsim_mpc_reals`."""
+        N, problem, room = self.horizon, self.tables.problem, self.rows + 1
         rows = N * len(self.tables.rows)
         packed = 4 * room + 3 * rows  # bytes of integers
         widest = max(len(axis.B) for axis in self.tables.axes)
@@ -71,29 +208,10 @@ class CController:
         sent = 0 if settings is None else N_ROTORS * split_delay(settings.delay, period)[0]
         return work + packed // self.real_bytes + 1 + N * (len(problem.objective.C_r) + N_ROTORS) + sent
 
-    @property
-    def real_bytes(self) -> int:
-        """Size of a number in bytes."""
-        return 8 if self.precision == "double" else 4
-
-    @cached_property
-    def files(self) -> dict[str, str]:
-        """Its C files, by name."""
-        body = {name: (resources.files("quadsim.core") / name).read_text(encoding="utf-8") for name in BODY_FILES}
-        return {name: part(name, "mpc.core") for name in CORE_FILES} | body | {DATA: self._data()}
-
-    def _data(self) -> str:
-        text = CText(self.precision, "quadsim_data_")
-        head = part(DATA).replace("@TITLE@", self.title).replace("@PERIOD@", f"{self.law.problem.model.period:g}")
-        for name, value in {
-            "@IFN@": "ifdef" if self.precision == "double" else "ifndef",
-            "@PRECISION@": self.precision,
-            "@HORIZON@": self.law.problem.horizon,
-            "@MEMORY@": self.reals,
-        }.items():
-            head = head.replace(name, str(value))
-        numbers = problem_data(text, self.tables, self.rows + 1)
-        return head.replace("@NUMBERS@\n", "\n".join([*numbers, *_controller(text, self.law, self.tables)]))
+    def numbers(self, text: CText) -> list[str]:
+        """See `CSource`."""
+        optimisation = problem_data(text, self.tables, self.rows + 1)
+        return [*optimisation, *_controller(text, self.law, self.bounds, self.tables)]
 
 
 def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
@@ -102,11 +220,10 @@ def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
     return [*blocks, text.struct("quadsim_problem", f"{text.prefix}problem", **entries)]
 
 
-def _controller(text: CText, law: Exportable, tables: Tables) -> list[str]:
+def _controller(text: CText, law: Exportable, bounds: ActuatorBounds | None, tables: Tables) -> list[str]:
     """Return the numbers apart from those of the optimisation, with the `quadsim_controller` last."""
     numbers, robust = controller_numbers(law), "NULL"
     problem = law.problem
-    bounds = ActuatorBounds.of_problem(problem) if problem.every_constraint else None
     model = hover_model(law.vehicle, problem.model.period)
     members = fallback_numbers(model, bounds, law.fallback, problem.horizon)
     fallback = {name: text.value(value) for name, value in members.items()}

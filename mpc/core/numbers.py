@@ -35,6 +35,8 @@ from quadsim.errors import ExportError
 from quadsim.state import EULER, POSITION, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
+AVOIDS: Final = "its half-spaces around obstacles are others in each period: leave out controller.avoidance"
+"""Why a controller that avoids obstacles is not exported."""
 MOST_PERIODS: Final = 2**30 - 1
 """Most periods that a time of the fallback contract has in C."""
 
@@ -58,8 +60,7 @@ def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequenc
         InputError: no controller can be built from these numbers.
     """
     if isinstance(table, Bounded) and table.avoidance is not None and shapes:
-        rule = "its half-spaces around obstacles are others in each period: leave out controller.avoidance"
-        raise ExportError(rule)
+        raise ExportError(AVOIDS)
     return Exportable(
         name=table.type,
         problem=table.problem(vehicle, period),

@@ -56,6 +56,7 @@ class _Law(ctypes.Structure):
         *struct_members(REAL, f"last:{STATES_ROOM} estimate:6"),
         ("ramp", RampState),
         *struct_members(REAL, f"ahead:{N_BODY + 1}"),
+        ("then", WorldStruct),
     ]
 
 
@@ -102,11 +103,8 @@ class NonlinearLaw:
         self._problems = sqp.struct, period, unlagged  # whose addresses the numbers have
         numbers.problem, numbers.period, numbers.unlagged = map(ctypes.addressof, self._problems)
         numbers.ramp = None if ramp is None else ctypes.addressof(ramp.numbers)
-        at = ctypes.addressof(numbers)
-        self._memory = (
-            np.zeros(self._library.quadsim_nonlinear_reals(at)),
-            np.zeros(self._library.quadsim_nonlinear_ints(at), np.intc),
-        )
+        at, (reals, ints) = ctypes.addressof(numbers), memory_of(numbers, sqp.struct)
+        self._memory = np.zeros(reals), np.zeros(ints, np.intc)
         self.struct = law = _Law()
         self._at = ctypes.addressof(law)
         self._library.quadsim_nonlinear_start(self._at, at, *(part.ctypes.data for part in self._memory))
@@ -189,8 +187,36 @@ class NonlinearLaw:
             mine.learns, mine.last[:N_BODY] = its.learns, its.last[:N_BODY]
 
 
+def measured_state(now: StepInputs, state: Array) -> Array:
+    """(19,) a state, quaternion and body rates as an exported controller takes them; NaN for what is not measured."""
+    measured = np.full(N_STATES + 7, math.nan)
+    measured[:N_STATES] = state
+    if now.attitude is not None:
+        measured[N_STATES : N_STATES + 4] = now.attitude
+    if now.body_rates is not None:
+        measured[N_STATES + 4 :] = now.body_rates
+    return measured
+
+
+def reference_rows(now: StepInputs, reference: Array) -> Array:
+    """(N + 1, 17) the motion of a period, or without one its reference (N, 4), as an exported controller takes them."""
+    if now.motion is None:
+        return reference
+    rows = np.zeros((len(reference) + 1, WIDTH_OF_MOTION))
+    put_motion(now.motion, rows)
+    return rows
+
+
+def memory_of(numbers: NumbersStruct, problem: ProblemStruct) -> tuple[int, int]:
+    """Return the reals and integers of memory that a law with another program needs."""
+    library, other = _library(), NumbersStruct.from_buffer_copy(numbers)
+    other.problem = ctypes.addressof(problem)
+    at = ctypes.addressof(other)
+    return library.quadsim_nonlinear_reals(at), library.quadsim_nonlinear_ints(at)
+
+
 def put_motion(motion: Motion, rows: Array) -> None:
-    """Write the samples of a motion from now on into rows (M, 17); past the end the last (of thrusts: but one)."""
+    """Write the samples of a motion from now on into rows (M, 17); past the end the last."""
     count = min(len(motion), len(rows))
     parts = (motion.position, motion.attitude, motion.velocity, motion.body_rates)
     first = 0
@@ -198,9 +224,7 @@ def put_motion(motion: Motion, rows: Array) -> None:
         rows[:count, first : first + part.shape[1]] = part[:count]
         first += part.shape[1]
     rows[:count, first:] = motion.thrusts[:count]
-    if count < len(rows):
-        rows[count:] = rows[count - 1]
-        rows[count - 1 :, first:] = motion.thrusts[max(count - 2, 0)]
+    rows[count:] = rows[count - 1]
 
 
 def _view(address: int, *shape: int) -> Array:

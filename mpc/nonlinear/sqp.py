@@ -101,9 +101,9 @@ class SQP:
         time_limit: time since `begin` after which no further step is taken [s]; None for none.
         faces: half-spaces of positions per node.
         price: l1 and l2 of leaving the largest of a node's half-spaces; None if they are hard.
-        room: active rows that there is room for; None for all that can be needed.
 
     Attributes:
+        most_rows: active rows at most.
         struct: the program's numbers in the core's layout.
         pointed: the arrays that the struct's members point to, by their names; besides these, `terms`.
         clock: returns the time [s].
@@ -123,7 +123,6 @@ class SQP:
         time_limit: float | None = None,
         faces: int = 0,
         price: tuple[float, float] | None = None,
-        room: int | None = None,
     ) -> None:
         self._library, self._n, self.horizon = _library(), model.n, problem.horizon
         self.clock: Callable[[], float] = time.perf_counter
@@ -136,7 +135,9 @@ class SQP:
         places = N_ROTORS + 2 * (tilt is not None) + 3 * (rates is not None)
         rows = _stated(problem, places, prices)
         self._rows, self._numbers = rows, _numbers(problem)
-        at_most = self.horizon * (N_ROTORS + 3 * (tilt is not None) + 3 * (rates is not None) + len(rows) // 2 + faces)
+        self.most_rows = self.horizon * (
+            N_ROTORS + 3 * (tilt is not None) + 3 * (rates is not None) + len(rows) // 2 + faces
+        )
         p = ProblemStruct(
             horizon=self.horizon,
             difference=difference,
@@ -148,7 +149,7 @@ class SQP:
             rows=len(rows),
             faces=faces,
             slacks=len(prices),
-            room=min(at_most, 6 * self.horizon if room is None else room) + 1,
+            room=min(self.most_rows, 6 * self.horizon) + 1,
             changes=_MOST_CHANGES,
             iterations=iterations,
             corrections=corrections,
@@ -179,6 +180,11 @@ class SQP:
         p.slack = self._array("slack", [row.slack for row in rows], np.intc)
         p.linear, p.quadratic = self._array("linear", linear), self._array("quadratic", quadratic)
         self.struct, self._world = p, World.of(model)
+        self._make_work()
+
+    def resize(self, room: int, changes: int) -> None:
+        """Make room for so many active rows, and allow so many changes of the active set, in memory of its own."""
+        self.struct.room, self.struct.changes = room, changes
         self._make_work()
 
     def _make_work(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -13,11 +13,14 @@ import numpy as np
 
 from mpc.bounded import Weighted
 from mpc.codegen.ctext import CText, Precision
-from mpc.codegen.source import CHANGES, DATA, CController, part
+from mpc.codegen.nonlinear import CNonlinear
+from mpc.codegen.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
 from mpc.codegen.targets import TARGETS, Machine
-from mpc.core.numbers import Exportable, exportable
+from mpc.core.numbers import AVOIDS, Exportable, exportable
 from mpc.core.solver import CoreProblem, Work, core_library
-from mpc.ocp import Problem
+from mpc.nonlinear.rigidbody import N_BODY, P, V
+from mpc.nonlinear.settings import Nonlinear
+from mpc.nonlinear.sqp import SQPStatus
 from mpc.solvers import Method
 from quadsim.controller import ROTORS
 from quadsim.errors import ExportError, ParameterError
@@ -53,56 +56,80 @@ class Reach:
     lost: int = 0
 
     def __str__(self) -> str:
+        draws = DRAWS if self.drawn == 0 else self.drawn // (1 + DISTANCES.index(self.distance))
         sufficed = f"up to {self.distance:g} m and m/s per axis it sufficed for all {self.feasible} feasible states"
         if self.beyond is None:
             return f"{sufficed} of {self.drawn} drawn"
-        return f"{sufficed} of {self.drawn} drawn, at {self.beyond:g} it lacked for {self.lost} of {DRAWS}"
+        return f"{sufficed} of {self.drawn} drawn, at {self.beyond:g} it lacked for {self.lost} of {draws}"
 
 
-class _Search:
-    """Cold searches for the optimum with a room, and a number of changes, of its own."""
+Solves = Callable[[Array], bool]
+"""Whether a search from a state (6,) off a reference at rest finds an optimum: position [m], velocity [m/s]."""
 
-    def __init__(self, shared: CoreProblem, room: int, changes: int) -> None:
-        self._library, self._shared = core_library(), shared
-        self._problem = type(shared.struct).from_buffer_copy(shared.struct)
-        self._problem.room, self._problem.changes = room, changes
-        at = ctypes.addressof(self._problem)
+
+class LinearSearch:
+    """Cold searches of a linear controller with a room, and a number of changes, of its own; 0 for all that it needs.
+
+    Attitude and yaw are level, rotors hover.
+    """
+
+    def __init__(self, controller: CController, room: int, changes: int) -> None:
+        problem = controller.law.problem
+        self._library, self._shared = core_library(), CoreProblem(problem)
+        struct = self._struct = type(self._shared.struct).from_buffer_copy(self._shared.struct)
+        struct.room, struct.changes = room or struct.room, changes or struct.changes
+        at, self._work = ctypes.addressof(struct), np.zeros(ctypes.sizeof(Work), np.uint8)
         self._memory = np.zeros(self._library.quadsim_work_reals(at))
-        self._work = np.zeros(ctypes.sizeof(Work), np.uint8)
-        self._at = self._work.ctypes.data
-        self._library.quadsim_work_start(self._at, at, self._memory.ctypes.data)
+        self._library.quadsim_work_start(self._work.ctypes.data, at, self._memory.ctypes.data)
+        rest, speeds = np.zeros(problem.model.n), np.array(problem.model.u_bar)
+        rest[N_STATES:] = (self._shared.tables.modes @ speeds)[: rest.size - N_STATES]
+        self._query = np.zeros((problem.horizon, len(problem.objective.C_r))), rest, speeds, speeds
 
-    def solves(self, *arguments: Array) -> bool:
-        self._library.quadsim_work_reset(self._at)
-        return self._library.quadsim_optimise(self._at, *(part.ctypes.data for part in arguments)) < len(Method)
+    def __call__(self, offset: Array) -> bool:
+        """See `Solves`."""
+        state = self._query[1].copy()
+        state[[*POSITION, *VELOCITY]] += offset
+        self._library.quadsim_work_reset(self._work.ctypes.data)
+        arguments = (self._work, state, *self._query)
+        found: int = self._library.quadsim_optimise(*(part.ctypes.data for part in arguments))
+        return found < len(Method)
 
 
-def reach(problem: Problem, room: int, changes: int) -> Reach:
+def nonlinear_search(controller: CNonlinear, room: int, changes: int) -> Solves:
+    """Return the same of a nonlinear controller's first programs, along a reference at rest."""
+    law = replace(controller).law
+    sqp, hover, N = law._sqp, law.problem.model.u_bar, law._sqp.horizon
+    sqp.resize(room or sqp.struct.room, changes or sqp.struct.changes)
+    states, thrusts = np.zeros((N + 1, N_BODY)), np.tile(np.array(law._law.numbers.lifts), (N, 1))
+    states[:, 3] = 1.0
+
+    def solves(offset: Array) -> bool:
+        measured = np.concatenate([states[0], hover[: sqp.struct.actuators]])
+        measured[P], measured[V] = offset[:3], offset[3:]
+        sqp.reset()
+        return sqp.step(measured, hover, states, thrusts) <= SQPStatus.UNCONVERGED
+
+    return solves
+
+
+def reach(whole: Solves, limited: Solves, draws: int = DRAWS) -> Reach:
     """Draw states around a reference at rest, and search with this room and with all that can be needed.
 
-    Position and velocity are uniform within a distance per axis, attitude and yaw are level, rotors hover; each search
-    begins without an active set.
+    Position and velocity are uniform within a distance per axis; each search begins without an active set.
 
     Raises:
         FileError: the library cannot be compiled or loaded.
     """
-    shared, rng = CoreProblem(problem), np.random.default_rng(0)
-    whole, limited = _Search(shared, shared.struct.room, shared.struct.changes), _Search(shared, room, changes)
-    rest, speeds = np.zeros(problem.model.n), np.array(problem.model.u_bar)
-    rest[N_STATES:] = (shared.tables.modes @ speeds)[: rest.size - N_STATES]
-    target, moving = np.zeros((problem.horizon, len(problem.objective.C_r))), [*POSITION, *VELOCITY]
-    reached = Reach(distance=0.0, drawn=0, feasible=0)
+    rng, reached = np.random.default_rng(0), Reach(distance=0.0, drawn=0, feasible=0)
     for distance in DISTANCES:
         feasible = lost = 0
-        for offset in rng.uniform(-distance, distance, (DRAWS, len(moving))):
-            state = rest.copy()
-            state[moving] += offset
-            if whole.solves(state, target, rest, speeds, speeds):
+        for offset in rng.uniform(-distance, distance, (draws, 6)):
+            if whole(offset):
                 feasible += 1
-                lost += not limited.solves(state, target, rest, speeds, speeds)
+                lost += not limited(offset)
         if lost:
             return replace(reached, beyond=distance, lost=lost)
-        reached = Reach(distance=distance, drawn=reached.drawn + DRAWS, feasible=reached.feasible + feasible)
+        reached = Reach(distance=distance, drawn=reached.drawn + draws, feasible=reached.feasible + feasible)
     return reached
 
 
@@ -155,8 +182,8 @@ def export(
     with reserving(out, overwrite=overwrite) as directory:
         controller = c_controller(scenario, precision, rows)
         facts = _facts(controller)
-        files = controller.files | programs(TARGETS[target], precision) | vector_files(record(scenario), precision)
-        files["README.md"] = _readme(scenario, precision, room_sentence(facts))
+        files = controller.files | programs(controller, TARGETS[target]) | vector_files(record(scenario), controller)
+        files["README.md"] = _readme(scenario, controller, room_sentence(facts))
         files[FACTS] = json.dumps(facts, indent=2) + "\n"
         with writing(directory, overwrite=overwrite) as partial:
             for name, text in files.items():
@@ -164,17 +191,32 @@ def export(
     return absolute(out)
 
 
-def c_controller(scenario: Scenario, precision: Precision = "double", rows: int | None = None) -> CController:
+def c_controller(scenario: Scenario, precision: Precision = "double", rows: int | None = None) -> CSource:
     """The controller's own files, with room for active `rows`; see `export`.
 
     Raises:
         ExportError: this controller cannot be exported.
     """
-    return CController(law=exported_law(scenario), precision=precision, title=_title(scenario), asked=rows)
+    table, assembly, title = scenario.controller, Assembly(scenario), _title(scenario)
+    if not isinstance(table, Nonlinear):
+        return CController(law=exported_law(scenario), precision=precision, title=title, asked=rows)
+    if table.avoidance is not None and (scenario.obstacles or assembly.regions):
+        raise ExportError(AVOIDS)
+    if table.commands != ROTORS and table.inner_lag is None:
+        table = replace(table, inner_lag=assembly.inner_lag)
+    return CNonlinear(
+        table=table,
+        vehicle=assembly.vehicle,
+        control_period=scenario.control_period,
+        motion=assembly.motion is not None,
+        precision=precision,
+        title=title,
+        asked=rows,
+    )
 
 
 def exported_law(scenario: Scenario) -> Exportable:
-    """Return the exported controller: that of the scenario without its guards.
+    """Return the exported linear controller: that of the scenario without its guards.
 
     Raises:
         ExportError: it cannot be exported.
@@ -182,17 +224,24 @@ def exported_law(scenario: Scenario) -> Exportable:
     controller, shapes = scenario.controller, (*scenario.obstacles, *scenario.regions)
     if not isinstance(controller, Weighted):
         how = "" if controller.commands == ROTORS else f' with commands = "{controller.commands}"'
-        exported = "exported are unconstrained, constrained and robust, whose matrices are fixed"
-        raise ExportError(f"it is {controller.type!r}{how}; {exported}")
+        raise ExportError(
+            f"it is {controller.type!r}{how}; exported are unconstrained, constrained, robust and nonlinear"
+        )
     return exportable(controller, Assembly(scenario).vehicle, scenario.control_period, shapes)
 
 
-def _facts(controller: CController) -> dict[str, Any]:
+def _facts(controller: CSource) -> dict[str, Any]:
+    room = controller.rows + 1
+    if isinstance(controller, CNonlinear):
+        found = reach(nonlinear_search(controller, 0, 0), nonlinear_search(controller, room, CHANGES), DRAWS // 4)
+    else:
+        assert isinstance(controller, CController)
+        found = reach(LinearSearch(controller, 0, 0), LinearSearch(controller, room, CHANGES))
     return {
         "precision": controller.precision,
         "rows": controller.rows,
-        "memory_bytes": controller.reals * controller.real_bytes,
-        "reach": asdict(reach(controller.law.problem, controller.rows + 1, CHANGES)),
+        "memory_bytes": controller.memory_bytes,
+        "reach": asdict(found),
     }
 
 
@@ -201,10 +250,11 @@ def room_sentence(facts: Mapping[str, Any]) -> str:
     return f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory; {Reach(**facts['reach'])}"
 
 
-def programs(target: Machine, precision: Precision) -> dict[str, str]:
+def programs(controller: CSource, target: Machine) -> dict[str, str]:
     """Return the files that run the controller on a target, by name."""
     names = ("main.c", "serial.c", "target.h", *target.sources, "LICENSE")
-    return {name: part(name) for name in names} | {"Makefile": target.makefile(precision) + part("Makefile")}
+    makefile = f"{target.makefile(controller.precision)}CONTROLLER = {controller.objects}\n{part('Makefile')}"
+    return {name: part(name) for name in names} | {"Makefile": makefile}
 
 
 def _title(scenario: Scenario) -> str:
@@ -214,40 +264,43 @@ def _title(scenario: Scenario) -> str:
     return title.encode("ascii", "replace").decode().replace("\n", " ")
 
 
-def vector_files(recording: Recording, precision: Precision) -> dict[str, str]:
+def vector_files(recording: Recording, controller: CSource) -> dict[str, str]:
     """The recorded periods as C, by file name."""
-    row = CText(precision).value
+    row = CText(controller.precision).value
     queries = zip(recording.state, recording.acting, recording.command, recording.status.tolist(), strict=True)
     rows = [f"    {{{', '.join(map(row, arrays))}, {status}}}" for *arrays, status in queries]
     path = [f"    {row(reference)}" for reference in recording.path]
     source = [
         '#include "vectors.h"\n',
         "const int quadsim_vectors_count = QUADSIM_VECTORS;\n",
-        f"const quadsim_real quadsim_vectors_speeds[4] = {row(recording.speeds)};\n",
-        "const quadsim_real quadsim_vectors_path[QUADSIM_VECTORS_ROWS][4] = {",
+        f"const quadsim_real quadsim_vectors_before[4] = {row(recording.before)};\n",
+        f"const quadsim_real quadsim_vectors_path[QUADSIM_VECTORS_ROWS][{recording.path.shape[1]}] = {{",
         ",\n".join(path) + "\n};\n",
         "const struct quadsim_vector quadsim_vectors[QUADSIM_VECTORS] = {",
         ",\n".join(rows) + "\n};\n",
     ]
-    sizes = {"@COUNT@": len(rows), "@ROWS@": len(path)}
-    header = part("vectors.h")
+    sizes = {"@COUNT@": len(rows), "@PATH@": len(path)}
+    header = controller.filled(part("vectors.h"))
     for name, size in sizes.items():
         header = header.replace(name, str(size))
     return {"vectors.h": header, "vectors.c": "\n".join(source)}
 
 
-def _readme(scenario: Scenario, precision: Precision, room: str) -> str:
+def _readme(scenario: Scenario, controller: CSource, room: str) -> str:
+    precision, law = controller.precision, controller.law_name
+    files = *controller.law_files, *BODY_FILES
+    sources = ", ".join(f"`{name}`" for name in files if not name.startswith(("quadsim_guard", law)))
     return f"""# {_title(scenario)}
 
 A model predictive controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
 called every {scenario.control_period:g} s.  It needs nothing but a compiler: no allocation, no recursion, no global
-state, and of the C library `memcpy` and `memset`.
+state, and of the C library `memcpy`, `memmove` and `memset`.
 
 | file | is |
 |---|---|
-| `quadsim_mpc.h` | the interface: state order, units, frames |
-| `quadsim_mpc.c`, `quadsim_core.{{h,c}}`, `quadsim_{{math,rigid}}.h` | the law and its solver, the same for all |
-| `quadsim_guard.c` | what is flown where the law has no answer, and the state that lacks measurements, completed |
+| `{law}.h` | the interface: state order, units, frames |
+| `{law}.c`, {sources} | the law and its solver, the same for every controller of its kind |
+| `quadsim_guard.{{h,c}}` | what is flown without an answer of the law, and the completion of lacking measurements |
 | `{DATA}` | this controller's numbers, and the memory that it needs |
 | `{FACTS}` | what it takes, and how far its room for active rows suffices |
 | `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
@@ -256,17 +309,17 @@ state, and of the C library `memcpy` and `memset`.
 | `target.h` and what implements it | the clock, the console and the serial line that these two need of a machine |
 
 ```c
-static quadsim_mpc mpc;
-static quadsim_real memory[QUADSIM_MEMORY];
-quadsim_mpc_start(&mpc, &QUADSIM_CONTROLLER, memory);
-quadsim_mpc_reset(&mpc, speeds);          /* the command in force */
+static quadsim_law law;
+static quadsim_memory memory;
+quadsim_law_start(&law, &memory);
+quadsim_law_reset(&law, before);          /* the command in force */
 /* every {scenario.control_period:g} s: */
-status = quadsim_mpc_step(&mpc, QUADSIM_PHASE_FLYING, state, reference, acting, command);
+status = quadsim_law_step(&law, QUADSIM_PHASE_FLYING, state, reference, acting, command);
 ```
 
 {room[0].upper()}{room[1:]}.
 
 Solve once before take-off: the first step starts without an active set and takes the most changes of it.
-`mpc.work.changes` is the number in each step.  Compile with `-ffp-contract=off`, and every processor gives the same
-bits{", and with `-DQUADSIM_FLOAT`, as the Makefile does" if precision == "float" else ""}.
+`quadsim_law_changes(&law)` is the number in each step.  Compile with `-ffp-contract=off`, and every processor gives
+the same bits{", and with `-DQUADSIM_FLOAT`, as the Makefile does" if precision == "float" else ""}.
 """

@@ -23,16 +23,22 @@ from typing import Final, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds
 from mpc.codegen.ctext import Precision
+from mpc.codegen.source import CSource
 from mpc.codegen.targets import EMULATOR, TARGETS, Machine
 from mpc.fallback.structs import STATUSES
-from mpc.ocp import Problem
+from mpc.nonlinear.law import measured_state, reference_rows
+from mpc.pilot import Pilot
 from quadsim.controller import (
+    COMMANDED,
     CORE,
     FALLBACK,
     GAIN,
     GROUNDED,
+    LAW,
+    NOT_CONVERGED,
+    SOLVED,
+    UNCONSTRAINED,
     Command,
     Phase,
     StepInputs,
@@ -41,18 +47,18 @@ from quadsim.controller import (
 from quadsim.errors import FlightError, MissingProgramError, QuadsimError
 from quadsim.flight.audit import COMMAND_SIGNALS, Limit
 from quadsim.outputs import reserving
-from quadsim.state import N_STATES, Array
+from quadsim.state import N_STATES, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly
-from scenarios.export.exporter import c_controller, exported_law, programs
+from scenarios.export.exporter import c_controller, programs
 from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, reporting
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
-ANSWERERS: Final = (GAIN, CORE, CORE)
-"""`answered_by` of an optimum, by `enum quadsim_status`."""
+ANSWERERS: Final = {UNCONSTRAINED: GAIN, SOLVED: CORE, NOT_CONVERGED: CORE, COMMANDED: LAW}
+"""`answered_by` of a command that is flown as it is, by its status."""
 CROSS_PACKAGES: Final = "make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
 HOST_PACKAGES: Final = "make gcc libc6-dev"
 LONGEST_ANSWER: Final = 120.0
@@ -155,11 +161,11 @@ class Line(Protocol):
 
 
 class Frames:
-    """Questions and answers as bytes, in a precision."""
+    """Questions and answers as bytes, in a precision, of so many numbers of a state and of a row of the reference."""
 
-    def __init__(self, precision: str) -> None:
+    def __init__(self, precision: str, state: int = N_STATES, row: int = len(REFERENCE_STATES)) -> None:
         letter = _LETTER[precision]
-        self._question = struct.Struct(f"<2I{N_STATES + 2 * N_ROTORS}{letter}2I")
+        self._question = struct.Struct(f"<2I{state + row + N_ROTORS}{letter}2I")
         self._answer = struct.Struct(f"<2I{N_ROTORS}{letter}2HI")
 
     @property
@@ -183,18 +189,18 @@ class Frames:
 
 
 class SerialMPC:
-    """An exported controller of `double` or `float` numbers at the other end of a serial line."""
+    """An exported controller at the other end of a serial line, by its numbers' bytes."""
 
-    def __init__(self, line: Line, precision: str, horizon: int) -> None:
-        self._line, self._frames, self._horizon = line, Frames(precision), horizon
-        self._number, self._window, self._speeds = 0, np.zeros((0, 4)), np.zeros(N_ROTORS)
+    def __init__(self, line: Line, frames: Frames) -> None:
+        self._line, self._frames = line, frames
+        self._number, self._window, self._speeds = 0, np.zeros((0, 0)), np.zeros(N_ROTORS)
 
     def reset(self, speeds: Array) -> None:
         """Restart after u(-1) (4,) [rad/s]."""
-        self._speeds, self._window = np.array(speeds, float), np.zeros((0, 4))
+        self._speeds, self._window = np.array(speeds, float), np.zeros((0, 0))
 
     def step(self, time: float, state: Array, reference: Array, acting: Array, kind: Solving = QueryKind.STEP) -> Reply:
-        """The answer at t_k [s] to x(k) (12,), the reference (N, 4) and u(k-1) (4,) [rad/s].
+        """The answer at t_k [s] to x(k), the reference and u(k-1) (4,), as the exported controller takes them.
 
         Where the reference is the last one moved on, its last row alone is sent.
 
@@ -227,16 +233,16 @@ class MPCInTheLoop:
     While landed the rotors are taken to their lowest speed as fast as their bounds allow, here and not there.
 
     Attributes:
-        ways: how many periods had which status of `quadsim_mpc.h`.
+        ways: how many periods had which status of `quadsim_guard.h`.
     """
 
     predict: Callable[[Array, Array], Array]  # there is none: plans stay where they are made
 
-    def __init__(self, serial: SerialMPC, problem: Problem, name: str, target: Machine) -> None:
-        self.name, self.solver, self.horizon = name, f"C99 on {target.title}", problem.horizon
-        self.ways = [0] * len(STATUSES)
-        self._serial, self._before = serial, problem.model.u_bar[:N_ROTORS]
-        self._bounds = ActuatorBounds.of_problem(problem) if problem.every_constraint else None
+    def __init__(self, line: Line, source: CSource, name: str, target: Machine) -> None:
+        self.name, self.solver, self.horizon = name, f"C99 on {target.title}", source.horizon
+        self.commands, self.ways = source.commands, [0] * len(STATUSES)
+        self._serial = SerialMPC(line, Frames(source.precision, source.state, source.reference[1]))
+        self._before, self._bounds, self._whole = np.zeros(N_ROTORS), source.bounds, source.state > N_STATES
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
@@ -251,18 +257,20 @@ class MPCInTheLoop:
         """
         acting = self._before if now.acting is None else now.acting
         if now.phase in GROUNDED:
-            self._before = np.zeros(N_ROTORS) if self._bounds is None else self._bounds.reach(acting)[0]
+            self._before = np.zeros(N_ROTORS) if self._bounds is None else self._bounds.lowest(acting)
             self._serial.reset(self._before)
             return stopped(self._before.copy(), self.horizon, now.phase)
         kind: Solving = QueryKind.STEP if now.phase is Phase.FLYING else QueryKind.STAND
+        if self._whole:
+            state, reference = measured_state(now, state), reference_rows(now, reference)
         reply = self._serial.step(now.time, state, reference, acting, kind)
-        self._before = reply.command
+        self._before, status = reply.command, STATUSES[reply.status]
         self.ways[reply.status] += 1
         return Command(
             speeds=reply.command.copy(),
             plan=np.tile(reply.command, (self.horizon, 1)),
-            status=STATUSES[reply.status],
-            answered_by=ANSWERERS[reply.status] if reply.status < len(ANSWERERS) else FALLBACK,
+            status=status,
+            answered_by=ANSWERERS.get(status, FALLBACK),
             fallback=reply.fallback,
         )
 
@@ -298,11 +306,11 @@ def fly_exported(
     """
     scenario = load_scenario(scenario)
     machine = TARGETS[target]
-    files = c_controller(scenario, precision).files | programs(machine, precision)
+    source, assembly = c_controller(scenario, precision), Assembly(scenario)
+    files = source.files | programs(source, machine)
     require_programs(machine, "to fly an exported controller")
-    problem = exported_law(scenario).problem
-    if precision == "float" and problem.every_constraint:
-        scenario = _allowing(scenario, float(np.spacing(np.float32(ActuatorBounds.of_problem(problem).u_max.max()))))
+    if precision == "float" and source.bounds is not None:
+        scenario = _allowing(scenario, float(np.spacing(np.float32(source.bounds.u_max.max()))))
     with tempfile.TemporaryDirectory(prefix="quadsim-") as scratch, reporting(progress) as report:
         directory = Path(scratch)
         for name, text in files.items():
@@ -310,12 +318,12 @@ def fly_exported(
         # The emulated clock is not the flight's.
         image = make_program(directory, "serial.elf", "CPPFLAGS=-DWATCHDOG_MS=0")
         with Program(machine, image) as line:
-            serial = SerialMPC(line, precision, problem.horizon)
-            law = MPCInTheLoop(serial, problem, scenario.controller.type, machine)
+            law = MPCInTheLoop(line, source, scenario.controller.type, machine)
+            pilot = assembly.with_autopilot(Pilot(law, assembly.vehicle))
             if out is None:
-                return Rollout(scenario, law).fly(report)
+                return Rollout(scenario, pilot).fly(report)
             with reserving(out) as place:
-                flight = Rollout(scenario, law).fly(report)
+                flight = Rollout(scenario, pilot).fly(report)
                 flight.save(place, video=False, progress=report)
                 return replace(flight, directory=place)
 

@@ -3,40 +3,52 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpc.bounded import Bounded
+from mpc.bounded import Bounded, Weighted
 from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
+from mpc.fallback.structs import STATUSES
 from mpc.linear import LinearMPC
+from mpc.nonlinear.controller import NonlinearMPC
+from mpc.nonlinear.law import measured_state, reference_rows
 from mpc.ocp import Query
 from mpc.solvers import Method
 from mpc.unconstrained import UnconstrainedMPC
-from quadsim.controller import ACCEPTED, CORE, GAIN, Command, Phase, StepInputs
+from quadsim.controller import ACCEPTED, CORE, GAIN, ROTORS, SOLVED, Command, Phase, StepInputs
 from quadsim.errors import ExportError, PlanExhaustedError
 from quadsim.state import Array
 from scenarios.assembly import Assembly
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
-MPC = LinearMPC | UnconstrainedMPC
+MPC = LinearMPC | UnconstrainedMPC | NonlinearMPC
 REFUSED: Final = len(Method)  # least status of a period without an optimum
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """K consecutive periods of one flight."""
+    """K consecutive periods of one flight; M rows of W numbers are a reference."""
 
-    speeds: Array  # (4,) the command before the first [rad/s]
-    state: Array  # (K, 12) as the controller was given it
-    acting: Array  # (K, 4) command in force before each [rad/s]
-    path: Array  # (K + N - 1, 4) references; period k is given N rows from row k on
+    before: Array  # (4,) the command before the first
+    state: Array  # (K, 12) as the controller was given it; a nonlinear one's (K, 19), with quaternion and body rates
+    acting: Array  # (K, 4) command in force before each
+    path: Array  # (K + M - 1, W) references; period k is given M rows from row k on
     status: NDArray[np.int64]  # (K,) as of `enum quadsim_status`: `REFUSED` for all that are no optimum
-    command: Array  # (K, 4) the optimum's first command; the one before where there is none [rad/s]
+    command: Array  # (K, 4) the optimum's first command; the one before where there is none
+
+
+class _Asked(NamedTuple):
+    """A period's inputs: state, command in force, reference and motion."""
+
+    state: Array
+    acting: Array
+    reference: Array
+    now: StepInputs
 
 
 class Recorder:
@@ -44,22 +56,23 @@ class Recorder:
 
     def __init__(self, inner: MPC) -> None:
         self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
-        self.queries: list[tuple[Array, Array, Array]] = []
-        """State (12,), command in force (4,) and reference (N, 4) of each period."""
+        self.commands = inner.commands if isinstance(inner, NonlinearMPC) else ROTORS
+        self.asked: list[_Asked] = []
         self._before, self._ended = np.zeros(4), False
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
-        self.queries, self._before, self._ended = [], np.array(speeds, float), False
+        self.asked, self._before, self._ended = [], np.array(speeds, float), False
         self.inner.reset(speeds)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`."""
         flying = now.phase is Phase.FLYING and (now.unseen is None or not now.unseen.any())
-        self._ended |= bool(self.queries) and not flying
+        self._ended |= bool(self.asked) and not flying
         if flying and not self._ended:
             acting = self._before if now.acting is None else now.acting
-            self.queries.append((state.copy(), np.array(acting, float), np.array(reference, float)))
+            parts = (state.copy(), np.array(acting, float), np.array(reference, float))
+            self.asked.append(_Asked(*parts, replace(now, signals=None)))
         command = self.inner.step(now, state, reference)
         self._before = command.speeds.copy()
         return command
@@ -71,7 +84,8 @@ class Recorder:
 
 def record(scenario: Scenario) -> Recording:
     """Fly a scenario, record each period, and compute the answers of a controller that starts with the first."""
-    scenario = scenario.replace({"controller.compiled": False})
+    if isinstance(scenario.controller, Weighted):
+        scenario = scenario.replace({"controller.compiled": False})
     if isinstance(scenario.controller, Bounded):
         scenario = scenario.replace({"controller.solver": CORE})
     pilot = Assembly(scenario).controller()
@@ -79,48 +93,60 @@ def record(scenario: Scenario) -> Recording:
     assert isinstance(law, MPC)
     pilot.law = recorder = Recorder(law)
     Rollout(scenario, pilot).fly()
-    queries = recorder.queries
-    if not queries:
+    asked = recorder.asked
+    if not asked:
         raise ExportError("its flight has no period in the air, with everything measured, to record")
-    states, acting, windows = (np.array(column) for column in zip(*queries, strict=True))
-    status, commands = _answers(law, scenario.control_period, acting[0], queries)
+    status, commands = _answers(law, scenario.control_period, asked)
     known = len(status)
+    windows = [reference_rows(query.now, query.reference) for query in asked[:known]]
     return Recording(
-        speeds=acting[0],
-        state=states[:known],
-        acting=acting[:known],
-        path=np.concatenate([windows[: known - 1, 0], windows[known - 1]]),
+        before=asked[0].acting,
+        state=np.array([_measured(law, query) for query in asked[:known]]),
+        acting=np.array([query.acting for query in asked[:known]]),
+        path=np.concatenate([[rows[0] for rows in windows[:-1]], windows[-1]]) if known > 1 else windows[0],
         status=status,
         command=commands,
     )
 
 
-def _answers(
-    law: MPC, period: float, speeds: Array, queries: list[tuple[Array, Array, Array]]
-) -> tuple[NDArray[np.int64], Array]:
+def _measured(law: MPC, query: _Asked) -> Array:
+    """Return a state as an exported controller takes it."""
+    return measured_state(query.now, query.state) if isinstance(law, NonlinearMPC) else query.state
+
+
+def _answers(law: MPC, period: float, asked: list[_Asked]) -> tuple[NDArray[np.int64], Array]:
     """Status (K,) and command (K, 4) of a controller for these queries after its reset.
 
     They end before the first period whose optimum is known as a solver's approximation alone.
     """
     if isinstance(law, UnconstrainedMPC):
-        return np.zeros(len(queries), np.int64), _free_commands(law, queries)
-    law.reset(speeds)
+        return np.zeros(len(asked), np.int64), _free_commands(law, asked)
+    law.reset(asked[0].acting)
     answers: list[tuple[int, Array]] = []
-    for k, (state, acting, reference) in enumerate(queries):
-        answer = REFUSED, acting
+    for k, query in enumerate(asked):
+        answer = REFUSED, query.acting
         with contextlib.suppress(PlanExhaustedError):
-            command = law.step(StepInputs(time=k * period, acting=acting), state, reference)
+            now = replace(query.now, time=k * period, acting=query.acting)
+            command = law.step(now, query.state, query.reference)
             if command.status in ACCEPTED:
-                assert law.answer is not None
-                answer = law.answer.method, command.speeds
-                if command.answered_by not in (GAIN, CORE):
+                if isinstance(law, LinearMPC) and command.answered_by not in (GAIN, CORE):
                     break
+                answer = _found(law, command), command.speeds
         answers.append(answer)
     status, commands = zip(*answers, strict=True)
     return np.array(status), np.array(commands)
 
 
-def _free_commands(law: UnconstrainedMPC, queries: list[tuple[Array, Array, Array]]) -> Array:
+def _found(law: LinearMPC | NonlinearMPC, command: Command) -> int:
+    """Return the status of an optimum, as of `enum quadsim_status`."""
+    if isinstance(law, NonlinearMPC):
+        return STATUSES.index(command.status) if command.status != SOLVED else Method.WHOLE
+    assert law.answer is not None
+    return law.answer.method
+
+
+def _free_commands(law: UnconstrainedMPC, asked: list[_Asked]) -> Array:
     """(K, 4) from the core: the one gain of Eq. (24) has lost half its digits at N = 100."""
     core, desired = Core(with_constraints(law.problem)), law.problem.objective.desired
-    return np.array([core.solve(Query(state, desired(path), before)).plan[0] for state, before, path in queries])
+    queries = (Query(state, desired(path), acting) for state, acting, path, _ in asked)
+    return np.array([core.solve(query).plan[0] for query in queries])

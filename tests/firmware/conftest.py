@@ -27,6 +27,11 @@ MEASURED = Path(__file__).resolve().parents[2] / "runs" / "numbers" / "export.js
 """What docs/tools/remake.py fills the table of docs/export.md from."""
 
 
+def sources_of(directory: Path) -> list[Path]:
+    """The controller's own C files in an export."""
+    return sorted(directory.glob("quadsim_*.c"))
+
+
 @pytest.fixture(scope="session")
 def run() -> Run:
     """Runs a command; skips where its program is not installed; fails with its output unless `check` is false."""
@@ -77,8 +82,8 @@ def answers(exported: Export, run: Run, tmp_path_factory: pytest.TempPathFactory
 def measured(record_property: Callable[[str, object], None]) -> Measured:
     """Reports what a controller takes on a board."""
 
-    def report(board: str, precision: str, **numbers: float) -> None:
-        key = {"target": TARGETS[board].title, "precision": precision}
+    def report(law: str, board: str, precision: str, **numbers: float) -> None:
+        key = {"law": law, "target": TARGETS[board].title, "precision": precision}
         record_property("measured", key | {name: int(number) for name, number in numbers.items()})
 
     return report
@@ -88,9 +93,9 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Save what was measured, once every board was."""
     reports = terminalreporter.getreports("passed")
     result = [value for report in reports for name, value in report.user_properties if name == "measured"]
-    boards: dict[tuple[str, str], dict[str, Any]] = {}
+    boards: dict[tuple[str, str, str], dict[str, Any]] = {}
     for numbers in result:
-        boards.setdefault((numbers["target"], numbers["precision"]), {}).update(numbers)
+        boards.setdefault((numbers["law"], numbers["target"], numbers["precision"]), {}).update(numbers)
     if boards and all({"flash", "p50"} <= numbers.keys() for numbers in boards.values()):
         MEASURED.parent.mkdir(parents=True, exist_ok=True)
         MEASURED.write_text(json.dumps([boards[key] for key in sorted(boards)], indent=1), encoding="utf-8")

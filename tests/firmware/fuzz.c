@@ -52,67 +52,69 @@ static real take(const uint8_t **data, size_t *left, int manner, real centre, re
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
-    static const real scale[12] = {R(1.0), R(2.0), R(1.0), R(2.0), R(1.0), R(2.0),
-                                   R(0.1), R(1.0), R(0.1), R(1.0), R(0.5), R(1.0)};
-    const quadsim_controller *own = &QUADSIM_CONTROLLER;
-    quadsim_mpc *mpc = malloc(sizeof *mpc); /* on the heap, where the sanitizer sees both of its ends */
-    real *memory = malloc(sizeof(real) * QUADSIM_MEMORY);
-    real *reference = malloc(sizeof(real) * QUADSIM_HORIZON * 4);
+    static const real scale[19] = {R(1.0), R(2.0), R(1.0), R(2.0), R(1.0), R(2.0), R(0.1), R(1.0), R(0.1), R(1.0),
+                                   R(0.5), R(1.0), R(1.0), R(0.5), R(0.5), R(0.5), R(1.0), R(1.0), R(1.0)};
+    const quadsim_fallback *fallback = QUADSIM_CONTROLLER.fallback;
+    quadsim_law *law = malloc(sizeof *law); /* on the heap, where the sanitizer sees both of its ends */
+    quadsim_memory *memory = malloc(sizeof *memory);
+    real *reference = malloc(sizeof(real) * QUADSIM_ROWS * QUADSIM_ROW);
     real command[4];
     int i, j;
     if (!registered) {
         registered = !atexit(report);
     }
-    memcpy(command, own->hover, sizeof command);
-    quadsim_mpc_start(mpc, own, memory);
-    for (i = 0; i < QUADSIM_HORIZON * 4; i++) {
+    memcpy(command, fallback->hover, sizeof command);
+    quadsim_law_start(law, memory);
+    for (i = 0; i < QUADSIM_ROWS * QUADSIM_ROW; i++) {
         reference[i] = R(0.0);
     }
     for (i = 0; i < STEPS && size > 0; i++) {
         const int manners = *data++;
-        real state[12], acting[4], before[4];
+        real state[QUADSIM_STATE], acting[4], before[4];
         const int place = (manners >> 3) & 7; /* on the ground in a quarter of all steps */
         const enum quadsim_phase phase =
             place == 7 ? QUADSIM_PHASE_LANDED : (place == 6 ? QUADSIM_PHASE_ARMED : QUADSIM_PHASE_FLYING);
         enum quadsim_status status = QUADSIM_MISSED;
         size--;
-        for (j = 0; j < 12; j++) {
+        for (j = 0; j < QUADSIM_STATE; j++) {
             state[j] = take(&data, &size, manners & 3, R(0.0), scale[j]);
         }
-        memmove(reference, reference + 4, sizeof(real) * (QUADSIM_HORIZON - 1) * 4);
+        memmove(reference, reference + QUADSIM_ROW, sizeof(real) * (QUADSIM_ROWS - 1) * QUADSIM_ROW);
+        for (j = 0; j < QUADSIM_ROW; j++) {
+            reference[(QUADSIM_ROWS - 1) * QUADSIM_ROW + j] = take(&data, &size, (manners >> 2) & 3, R(0.0), R(3.0));
+        }
         for (j = 0; j < 4; j++) {
-            reference[(QUADSIM_HORIZON - 1) * 4 + j] = take(&data, &size, (manners >> 2) & 3, R(0.0), R(3.0));
             acting[j] = command[j];
             if ((manners & 64) == 0) {
-                acting[j] = take(&data, &size, (manners >> 4) & 3, own->hover[j], R(80.0));
+                acting[j] = take(&data, &size, (manners >> 4) & 3, fallback->hover[j], fallback->targets ? R(5.0) : R(80.0));
             }
         }
         if ((manners & 128) != 0) {
-            quadsim_mpc_reset(mpc, acting);
-            memcpy(command, own->hover, sizeof command); /* in force where acting is none */
+            quadsim_law_reset(law, acting);
+            memcpy(command, fallback->hover, sizeof command); /* in force where acting is none */
         }
-        memcpy(before, is_within(acting, own->fallback->largest_command, 4) ? acting : command, sizeof before);
-        status = quadsim_mpc_step(mpc, phase, state, reference, acting, command);
+        memcpy(before, is_within(acting, fallback->largest_command, 4) ? acting : command, sizeof before);
+        status = quadsim_law_step(law, phase, state, reference, acting, command);
         steps++;
-        require(status >= QUADSIM_FREE && status < QUADSIM_MISSED, "a status");
+        require(status >= QUADSIM_FREE && status <= QUADSIM_COMMANDED && status != QUADSIM_MISSED, "a status");
         require((status == QUADSIM_LANDED) == (phase == QUADSIM_PHASE_LANDED), "rotors that stop on the ground alone");
-        require((status <= QUADSIM_WHOLE || status == QUADSIM_LANDED) == (mpc->guard.level == 0), "a level without optimum");
-        require(mpc->guard.level >= 0 && mpc->guard.level <= 3, "a level");
-        require(is_finite(mpc->guard.state, 12), "a state");
+        require((quadsim_is_flown(status) || status == QUADSIM_LANDED) == (law->guard.level == 0), "a level without optimum");
+        require(law->guard.level >= 0 && law->guard.level <= 3, "a level");
+        require(is_finite(law->guard.state, 12), "a state");
         require(is_finite(command, 4), "a finite command");
-        require(mpc->work.changes >= 0, "a number of changes");
-        require(mpc->work.changes <= 4 * own->problem->changes, "a limited number of changes");
+        require(quadsim_law_changes(law) >= 0, "a number of changes");
+        require(quadsim_law_changes(law) <= 4 * QUADSIM_CONTROLLER.problem->changes, "a limited number of changes");
         for (j = 0; j < 4; j++) {
-            require(command[j] >= own->fallback->least[j] && command[j] <= own->fallback->most[j], "bounds on speeds");
-            if (before[j] >= own->fallback->least[j] && before[j] <= own->fallback->most[j]) {
+            require(command[j] >= fallback->least[j] && command[j] <= fallback->most[j], "bounds on speeds");
+            if (before[j] >= fallback->least[j] && before[j] <= fallback->most[j]) {
                 const real step = command[j] - before[j];
-                require(step >= own->fallback->step_least[j] - R(1e-4) && step <= own->fallback->step_most[j] + R(1e-4),
+                require(step >= fallback->step_least[j] - R(1e-4) && step <= fallback->step_most[j] + R(1e-4),
                         "bounds on steps of speeds");
             }
         }
     }
     free(reference);
     free(memory);
-    free(mpc);
+    free(law);
     return 0;
 }

@@ -4,8 +4,8 @@
 #include <stddef.h>
 
 typedef struct host {
-    quadsim_mpc mpc;
-    quadsim_real memory[QUADSIM_MEMORY];
+    quadsim_law law;
+    quadsim_memory memory;
 } host;
 
 static void convert(quadsim_real *to, const double *from, int count)
@@ -19,34 +19,34 @@ static void convert(quadsim_real *to, const double *from, int count)
 /* Bytes of a controller, and whether its memory is as much as it needs. */
 size_t host_size(int *right)
 {
-    *right = quadsim_mpc_reals(&QUADSIM_CONTROLLER) == QUADSIM_MEMORY;
+    *right = quadsim_law_fits();
     return sizeof(host);
 }
 
-void host_reset(host *at, const double *speeds)
+void host_reset(host *at, const double *before)
 {
     quadsim_real start[4];
-    convert(start, speeds, 4);
-    quadsim_mpc_start(&at->mpc, &QUADSIM_CONTROLLER, at->memory);
-    quadsim_mpc_reset(&at->mpc, start);
+    convert(start, before, 4);
+    quadsim_law_start(&at->law, &at->memory);
+    quadsim_law_reset(&at->law, start);
 }
 
-/* Inputs: state [12], acting [4], phase, reference [N][4].  Answered: status, fallback, changes, command [4],
- * plan [N][4]. */
+/* Inputs: state, acting [4], phase, reference.  Answered: status, fallback, changes, command [4], plan [N][4]. */
 void host_step(host *at, const double *inputs, double *answers)
 {
-    quadsim_real state[12], acting[4], reference[QUADSIM_HORIZON * 4], command[4];
+    quadsim_real state[QUADSIM_STATE], acting[4], reference[QUADSIM_ROWS * QUADSIM_ROW], command[4];
+    const double *rest = inputs + QUADSIM_STATE;
     int i;
-    convert(state, inputs, 12);
-    convert(acting, inputs + 12, 4);
-    convert(reference, inputs + 17, QUADSIM_HORIZON * 4);
-    answers[0] = (double)quadsim_mpc_step(&at->mpc, (enum quadsim_phase)inputs[16], state, reference, acting, command);
-    answers[1] = (double)at->mpc.guard.level;
-    answers[2] = (double)at->mpc.work.changes;
+    convert(state, inputs, QUADSIM_STATE);
+    convert(acting, rest, 4);
+    convert(reference, rest + 5, QUADSIM_ROWS * QUADSIM_ROW);
+    answers[0] = (double)quadsim_law_step(&at->law, (enum quadsim_phase)rest[4], state, reference, acting, command);
+    answers[1] = (double)at->law.guard.level;
+    answers[2] = (double)quadsim_law_changes(&at->law);
     for (i = 0; i < 4; i++) {
         answers[3 + i] = (double)command[i];
     }
     for (i = 0; i < QUADSIM_HORIZON * 4; i++) {
-        answers[7 + i] = (double)at->mpc.work.plan[i];
+        answers[7 + i] = (double)quadsim_law_plan(&at->law)[i];
     }
 }

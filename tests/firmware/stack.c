@@ -6,8 +6,8 @@
 #define PAINTED 65536
 #define PAINT 0xA5U
 
-static quadsim_mpc mpc;
-static quadsim_real memory[QUADSIM_MEMORY];
+static quadsim_law law;
+static quadsim_memory memory;
 
 int main(void)
 {
@@ -19,12 +19,12 @@ int main(void)
     for (byte = bottom; byte < top - 256; byte++) { /* not main's own frame */
         *byte = PAINT;
     }
-    quadsim_mpc_start(&mpc, &QUADSIM_CONTROLLER, memory);
-    quadsim_mpc_reset(&mpc, quadsim_vectors_speeds);
+    quadsim_law_start(&law, &memory);
+    quadsim_law_reset(&law, quadsim_vectors_before);
     for (k = 0; k < quadsim_vectors_count; k++) {
         quadsim_real command[4];
         const struct quadsim_vector *recorded = &quadsim_vectors[k];
-        (void)quadsim_mpc_step(&mpc, QUADSIM_PHASE_FLYING, recorded->state, quadsim_vectors_path[k],
+        (void)quadsim_law_step(&law, QUADSIM_PHASE_FLYING, recorded->state, quadsim_vectors_path[k],
                                recorded->acting, command);
     }
     while (bottom[untouched] == PAINT) {

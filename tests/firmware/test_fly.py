@@ -80,7 +80,7 @@ def test_commands_in_the_page_have_the_bits_of_the_native_ones(tab: Any, name: s
         scenario = scenario.replace(bounds)
     host, recording = Host(scenario), record(scenario)
     native = [[reply.status, reply.changes, *reply.command] for reply in replay(host, recording)]
-    recorded = (recording.speeds, recording.state, recording.acting, recording.path)
+    recorded = (recording.before, recording.state, recording.acting, recording.path)
     answers = tab.evaluate(COMMANDS, [name, degrees, *(array.tolist() for array in recorded)])
     assert len(answers) == scenario.periods
     if degrees == 5.0:

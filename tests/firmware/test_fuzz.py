@@ -7,10 +7,9 @@ import re
 from pathlib import Path
 
 import pytest
-from firmware.conftest import Export, Run
+from firmware.conftest import Export, Run, sources_of
 
 HERE = Path(__file__).parent
-CONTROLLER = ("quadsim_guard.c", "quadsim_mpc.c", "quadsim_core.c")
 SANITIZERS = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
 SECONDS = 8
 """Of each controller; the variable FUZZ_RUNS has a number of inputs instead, of four steps or so each."""
@@ -25,6 +24,9 @@ CONTROLLERS = {
     "whole": ("paper-constrained", "double"),
     "robust": ("robust", "double", *SHORT),
     "robust, float": ("robust", "float", *SHORT),
+    "nonlinear": ("nonlinear", "double", "duration=5"),
+    "rates": ("autopilot", "double", "duration=3"),
+    "rates, float": ("autopilot", "float", "duration=3"),
 }
 
 
@@ -35,7 +37,7 @@ def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Exp
     directory, program = exported("posix", *settings, scenario=scenario), tmp_path / "fuzz"
     define = ["-DQUADSIM_FLOAT"] if "float" in settings else []
     compile = ["clang", "-g", "-O3", "-std=c99", "-ffp-contract=off", *SANITIZERS, *define, "-I", directory]
-    built = run(*compile, "-o", program, HERE / "fuzz.c", *(directory / name for name in CONTROLLER), check=False)
+    built = run(*compile, "-o", program, HERE / "fuzz.c", *sources_of(directory), check=False)
     if "cannot find" in built.stderr:
         pytest.skip("clang has no sanitizers: make firmware")
     assert built.returncode == 0, built.stderr
@@ -57,7 +59,11 @@ def test_a_command_out_of_bounds_is_detected(exported: Export, run: Run, tmp_pat
     assert clip in text
     (tmp_path / "quadsim_guard.c").write_text(text.replace(clip, "(void)upper, command[j] = lower + wanted[j];"))
     compile = ["clang", "-O1", "-std=c99", *SANITIZERS, "-I", tmp_path, "-I", directory]
-    sources = [HERE / "fuzz.c", tmp_path / "quadsim_guard.c", *(directory / name for name in CONTROLLER[1:])]
+    sources = [
+        HERE / "fuzz.c",
+        tmp_path / "quadsim_guard.c",
+        *(path for path in sources_of(directory) if path.name != "quadsim_guard.c"),
+    ]
     built = run(*compile, "-o", tmp_path / "fuzz", *sources, check=False)
     if "cannot find" in built.stderr:
         pytest.skip("clang has no sanitizers: make firmware")

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,9 @@ from mpc.equilibrium import Trim
 from mpc.fallback.structs import STATUSES
 from mpc.heading import advance
 from mpc.linear import LinearMPC
-from mpc.model import hover_model
+from mpc.model import LinearModel
+from mpc.nonlinear.controller import NonlinearMPC
+from mpc.nonlinear.settings import Nonlinear
 from quadsim.controller import Command, StepInputs
 from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array
 from scenarios.assembly import Assembly
@@ -35,6 +38,13 @@ TOLD = ("max_iterations", "no_room")
 SHORT = {"controller.fallback": {"unseen": 0.4, "hover": 0.5, "plan_age": 0.5}}
 CEILING = {"name": "ceiling", "of": ["vz"], "rows": [[1.0]], "upper": [0.4]}
 HARD = SHORT | {"controller.soft.linear": 1e8, "controller.polytopes": [CEILING]}
+HARD_NONLINEAR = {"controller.polytopes": [CEILING], "controller.offset_free": {}}
+NONLINEAR: dict[str, Any] = {
+    "controller": {"type": "nonlinear", "horizon": 20, "fallback": {"unseen": 0.4, "hover": 0.5, "plan_age": 0.5}}
+}
+RATES = {
+    "controller": NONLINEAR["controller"] | {"commands": "rates", "inner_lag": [0.02, 0.03, 0.03, 0.06]},
+}
 PERIODS = 240
 
 
@@ -42,7 +52,7 @@ PERIODS = 240
 class Told:
     """A law that fails as it is told to."""
 
-    law: LinearMPC
+    law: LinearMPC | NonlinearMPC
     failure: str | None = None
 
     def __post_init__(self) -> None:
@@ -66,12 +76,12 @@ class Told:
 class Vehicle:
     """A vehicle that moves as the hover model does under a constant force, measured with noise and with faults."""
 
-    def __init__(self, scenario: Scenario, seed: int) -> None:
+    def __init__(self, model: LinearModel, seed: int) -> None:
         self.rng, self.state, self.measured = np.random.default_rng(seed), np.zeros(12), np.zeros(12)
-        self.model = hover_model(Assembly(scenario).vehicle, scenario.control_period)
-        self.speeds = self.model.u_bar
+        self.model, self.speeds = model, model.u_bar
         self.state[INDEX["yaw"]] = 0.4
-        self.trim = Trim(speeds=self.speeds + np.array([3.0, 4.0, 3.0, 2.0]), lift=np.array([-0.2, 0.1, 9.81]))
+        more = np.array([0.3, 0.0, 0.0, 0.0] if model.targets else [3.0, 4.0, 3.0, 2.0])
+        self.trim = Trim(speeds=self.speeds + more, lift=np.array([-0.2, 0.1, 9.81]))
 
     def move(self) -> None:
         self.state = advance(self.model, self.state, self.speeds, self.trim)
@@ -91,11 +101,13 @@ def over(channels: tuple[int, ...], *spans: range) -> dict[int, tuple[int, ...]]
 
 def flown(scenario: Scenario, host: Host, seed: int = 0) -> tuple[list[Command], list[tuple[str, int, Array]]]:
     """Commands of Python and of C to the same measurements, while the vehicle flies Python's."""
-    table, period, vehicle = scenario.controller, scenario.control_period, Vehicle(scenario, seed)
-    pilot = Assembly(scenario.replace({"controller.compiled": True})).controller()
+    table, period = scenario.controller, scenario.control_period
+    linear = not isinstance(table, Nonlinear)
+    pilot = Assembly(scenario.replace({"controller.compiled": True} if linear else {})).controller()
     guard = guard_of(table, Assembly(scenario).vehicle, period)
     assert guard is not None
-    assert isinstance(pilot.law, LinearMPC)
+    assert isinstance(pilot.law, LinearMPC | NonlinearMPC)
+    vehicle = Vehicle(guard.hover.model, seed)
     law, everything = Told(pilot.law), tuple(range(12))
     law.reset(guard.reset(vehicle.speeds))
     host.reset(vehicle.speeds)
@@ -130,6 +142,8 @@ CASES = {
     "no room": ("robust", SHORT, {"rows": 12}, {"no_room"}),
     "delayed": ("robust-lag50", SHORT, {"rows": 12}, {"no_room"}),
     "without heading": ("paper-constrained", SHORT, {"rows": 12}, {"no_room"}),
+    "nonlinear": ("hover", NONLINEAR | HARD_NONLINEAR, {}, {"primal_infeasible"}),
+    "rates": ("hover", RATES | HARD_NONLINEAR, {}, {"primal_infeasible"}),
 }
 """Scenario, its changes, limits of the C, and failures that occur beside those of every case."""
 ALWAYS = {"solved", "unconstrained", "state_unknown", "invalid_reference", "landed"}
@@ -146,7 +160,7 @@ def test_c_flies_what_python_flies(case: str, monkeypatch: pytest.MonkeyPatch) -
     assert {status for status, _, _ in c} >= ALWAYS | failures
     assert {level for _, level, _ in c} == {0, 1, 2, 3}
     apart = np.abs(np.array([command.speeds for command in python]) - [speeds for _, _, speeds in c])
-    assert apart.max() <= 1e-12
+    assert apart.max() <= (1e-4 if "controller" in changes else 1e-12)  # far off, a nonlinear law amplifies it
 
 
 def test_statuses_have_the_same_names() -> None:

@@ -11,7 +11,7 @@ import pytest
 from mpc.codegen.targets import TARGETS
 from quadsim.errors import FlightError, MissingProgramError
 from scenarios.commands.cli import main
-from scenarios.export.in_the_loop import Program, SerialMPC, fly_exported, require_programs
+from scenarios.export.in_the_loop import Frames, Program, SerialMPC, fly_exported, require_programs
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 
@@ -20,6 +20,8 @@ CASES = {
     "float": ("cortex-m4f", "float", "paper-constrained", 0.1),
     "robust": ("posix", "double", "robust", 1e-6),
     "unconstrained": ("posix", "double", "paper-unconstrained", 1e-4),
+    "nonlinear": ("posix", "double", "nonlinear", 1e-9),
+    "rates": ("cortex-m7", "float", "autopilot", 0.05),
 }
 """Target, precision, scenario, and how far commands of the two flights may be apart [rad/s]."""
 
@@ -32,7 +34,8 @@ def test_a_flight_by_the_target_is_the_flight_by_python(name: str) -> None:
     if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is not installed: make firmware")
     short = load_scenario(scenario, ["duration=6.0"])
-    exact = short if scenario == "paper-unconstrained" else short.replace({"controller.solver": "core"})
+    linear = scenario in ("paper-constrained", "robust")
+    exact = short.replace({"controller.solver": "core"}) if linear else short
     result, desired = fly_exported(short, target=target, precision=precision, progress=False), Rollout(exact).fly()
     assert result.log.control.status == desired.log.control.status
     assert np.abs(result.command - desired.command).max() <= apart
@@ -89,7 +92,7 @@ def test_the_command_flies_and_writes_a_run(
 
 def test_a_program_that_ends_ends_the_flight(tmp_path: Path) -> None:
     with Program(TARGETS["posix"], Path("/bin/true")) as line:
-        law = SerialMPC(line, "double", 2)
+        law = SerialMPC(line, Frames("double"))
         with pytest.raises(FlightError, match=r"at t = 0\.500 s: the controller at the serial line gave no answer"):
             law.step(0.5, np.zeros(12), np.zeros((2, 4)), np.zeros(4))
 

@@ -50,7 +50,7 @@ class Autopilot:
 
     def question(self, kind: QueryKind, row: Array, k: int = 0) -> bytes:
         self.number += 1
-        acting = self.recorded.speeds if kind is QueryKind.START else self.recorded.acting[k]
+        acting = self.recorded.before if kind is QueryKind.START else self.recorded.acting[k]
         return self.frames.question(kind, self.number, self.recorded.state[k], row, acting)
 
     def start(self) -> None:
@@ -165,8 +165,8 @@ def test_a_whole_flight_needs_one_row_a_period(terminal: Terminal, recorded: Rec
     sent: list[bytes] = []
     send = terminal.send
     terminal.send = lambda data: (sent.append(data), send(data))[1]  # type: ignore[method-assign]
-    law = SerialMPC(terminal, "double", N)
-    law.reset(recorded.speeds)
+    law = SerialMPC(terminal, Frames("double"))
+    law.reset(recorded.before)
     for k in range(len(recorded.state)):
         reply = law.step(0.05 * k, recorded.state[k], recorded.path[k : k + N], recorded.acting[k])
         assert np.abs(reply.command - recorded.command[k]).max() <= 1e-8

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from firmware.conftest import Export, Run
+from firmware.conftest import Export, Run, sources_of
 
 from mpc.codegen.targets import TARGETS
 
@@ -24,21 +24,27 @@ TIDY = ",".join(
 )
 CPPCHECK = ["--quiet", "--std=c99", "--enable=warning,style,performance,portability", "--error-exitcode=1"]
 CPPCHECK += ["--suppress=variableScope", "--suppress=unusedStructMember"]  # of members that other controllers use
-ALLOWED = {"memcpy", "memset"}
+ALLOWED = {"memcpy", "memmove", "memset"}
 DEFINES = {"double": [], "float": ["-DQUADSIM_FLOAT"]}
 EXPORTS = {"double": ("cortex-m7", "double"), "float": ("cortex-m4f", "float")}
-CONTROLLER = ("quadsim_guard.c", "quadsim_mpc.c", "quadsim_core.c")
-PROGRAMS = (*CONTROLLER, "main.c", "serial.c", "vectors.c")
+PROGRAMS = ("main.c", "serial.c", "vectors.c")
+LAWS = {"linear": ("paper-constrained",), "nonlinear": ("autopilot", "duration=2.0")}
+"""A scenario of each kind of law, and its settings."""
 
 
+@pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("compiler", ["gcc", "clang", "arm-none-eabi-gcc"])
 @pytest.mark.parametrize("precision", EXPORTS)
-def test_compilers_give_no_warning(precision: str, compiler: str, exported: Export, run: Run, tmp_path: Path) -> None:
-    bare = compiler.startswith("arm")
-    directory = exported(*EXPORTS[precision]) if bare else exported("posix", precision)
+def test_compilers_give_no_warning(
+    precision: str, compiler: str, law: str, exported: Export, run: Run, tmp_path: Path
+) -> None:
+    bare, (scenario, *settings) = compiler.startswith("arm"), LAWS[law]
+    target = EXPORTS[precision] if bare else ("posix", precision)
+    directory = exported(*target, *settings, scenario=scenario)
     machine = TARGETS[EXPORTS[precision][0]].machine.split() if bare else []
-    for name in (*PROGRAMS, "startup.c" if bare else "posix.c"):
-        run(compiler, *machine, *DEFINES[precision], *WARNINGS, "-c", directory / name, "-o", tmp_path / "object.o")
+    programs = [directory / name for name in (*PROGRAMS, "startup.c" if bare else "posix.c")]
+    for source in (*sources_of(directory), *programs):
+        run(compiler, *machine, *DEFINES[precision], *WARNINGS, "-c", source, "-o", tmp_path / "object.o")
 
 
 def test_files_of_two_precisions_do_not_make_a_program(exported: Export, run: Run, tmp_path: Path) -> None:
@@ -47,14 +53,17 @@ def test_files_of_two_precisions_do_not_make_a_program(exported: Export, run: Ru
     done = run("gcc", "-DQUADSIM_FLOAT", "-c", directory / "main.c", "-o", tmp_path / "main.o", check=False)
     assert "this export is of doubles" in done.stderr
     run("gcc", "-DQUADSIM_FLOAT", "-c", directory / "quadsim_core.c", "-o", core)
-    sources = [directory / name for name in ("main.c", "vectors.c", "posix.c", *CONTROLLER[:2])]
+    others = [path for path in sources_of(directory) if path.name != "quadsim_core.c"]
+    sources = [*others, *(directory / name for name in ("main.c", "vectors.c", "posix.c"))]
     done = run("gcc", *sources, core, "-o", tmp_path / "program", check=False)
     assert "undefined reference to `quadsim_work_start'" in done.stderr
 
 
-def test_analysers_find_nothing(exported: Export, run: Run, tmp_path: Path) -> None:
-    directory = exported("posix", "double")
-    sources = [directory / name for name in (*CONTROLLER, "main.c", "serial.c", "posix.c")]
+@pytest.mark.parametrize("law", LAWS)
+def test_analysers_find_nothing(law: str, exported: Export, run: Run, tmp_path: Path) -> None:
+    scenario, *settings = LAWS[law]
+    directory = exported("posix", "double", *settings, scenario=scenario)
+    sources = [*sources_of(directory), *(directory / name for name in ("main.c", "serial.c", "posix.c"))]
     for source in sources:
         run("gcc", *WARNINGS, "-O1", "-fanalyzer", "-c", source, "-o", tmp_path / "object.o")
     # In one precision: else cppcheck takes lengths in floats for those in doubles.
@@ -70,13 +79,15 @@ def undefined(sources: list[Path], precision: str, run: Run, made: Path) -> set[
     return {line.split()[-1] for line in run("arm-none-eabi-nm", "-u", made).stdout.splitlines()}
 
 
+@pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("precision", EXPORTS)
 def test_a_controller_needs_the_library_for_copies_only(
-    precision: str, exported: Export, run: Run, tmp_path: Path
+    precision: str, law: str, exported: Export, run: Run, tmp_path: Path
 ) -> None:
     """No malloc, no mathematics, and in float no emulated doubles, which a Cortex-M4F would need."""
-    directory = exported(*EXPORTS[precision])
-    assert undefined([directory / name for name in CONTROLLER], precision, run, tmp_path / "needed.o") <= ALLOWED
+    scenario, *settings = LAWS[law]
+    directory = exported(*EXPORTS[precision], *settings, scenario=scenario)
+    assert undefined(sources_of(directory), precision, run, tmp_path / "needed.o") <= ALLOWED
 
 
 PLANTED = """

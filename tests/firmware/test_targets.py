@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from firmware.conftest import Answer, Answers, Export, Measured, Run
+from firmware.conftest import Answer, Answers, Export, Measured, Run, sources_of
 
 from mpc.codegen.targets import INSTRUCTIONS_PER_TICK, TARGETS
 from scenarios.export.in_the_loop import make_program
 
 HERE = Path(__file__).parent
-CONTROLLER = ("quadsim_guard", "quadsim_mpc", "quadsim_core")
 BOARDS = [name for name, target in TARGETS.items() if target.board]
 AARCH64 = ("CC=aarch64-linux-gnu-gcc", "MACHINE_LINK=-static", "RUN=qemu-aarch64")
 OTHERS = {
@@ -25,10 +25,41 @@ OTHERS = {
 }
 DEFINES = {"double": [], "float": ["-DQUADSIM_FLOAT"]}
 CONTRACTED = "ALWAYS=-ffp-contract=fast"
-MEDIAN, RARE, WARM, COLD = 0.1e6, 3e6, 7e6, 9e6
-"""Instructions of a step at most, of the Cortex-M7 in double and of both in float: p50, p99, warm, the first."""
-FLASH, MEMORY = {"double": 200_000, "float": 125_000}, {"double": 103_000, "float": 53_000}
-"""Bytes at most: of code and constants; of the controller's struct and memory."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a scenario's controller may take on a board: of instructions, of the Cortex-M7 in double and both in float.
+
+    Attributes:
+        steps: median, 99th percentile, most after the first, and the first [10^6 instructions].
+        flash: code and constants, in doubles and in floats [kB].
+        memory: the controller's struct and memory, in doubles and in floats [kB].
+        periods: that are recorded.
+        statuses: that occur.
+    """
+
+    steps: tuple[float, float, float, float]
+    flash: dict[str, float]
+    memory: dict[str, float]
+    periods: int
+    statuses: set[int]
+
+
+LAWS = {
+    "paper-constrained": Limits(
+        (0.1, 3.0, 7.0, 9.0), {"double": 200, "float": 125}, {"double": 103, "float": 53}, 1200, {0, 1, 2}
+    ),
+    "nonlinear": Limits(
+        (2.0, 9.0, 12.0, 12.0), {"double": 200, "float": 200}, {"double": 115, "float": 60}, 600, {0, 2}
+    ),
+    "autopilot": Limits((2.0, 5.0, 5.0, 5.0), {"double": 200, "float": 200}, {"double": 75, "float": 40}, 302, {0}),
+}
+BOARDED = [
+    (law, board, precision)
+    for law in LAWS
+    for board, precision in (("cortex-m7", "double"), ("cortex-m7", "float"), ("cortex-m4f", "float"))
+]
 FRAME, STACK = 1400, 4000
 """Bytes at most: of a function; in all."""
 
@@ -52,13 +83,14 @@ def test_a_board_starts_counts_and_stops(board: str, exported: Export, run: Run,
         assert run(*emulate, input=fault, check=False).returncode == 3
 
 
+@pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("precision", ["double", "float"])
 @pytest.mark.parametrize("other", OTHERS)
-def test_every_target_answers_the_same_bits(other: str, precision: str, answers: Answers) -> None:
+def test_every_target_answers_the_same_bits(other: str, precision: str, law: str, answers: Answers) -> None:
     target, *make = OTHERS[other]
-    host, result = answers("posix", precision), answers(target, precision, *make)
-    assert len(host) == 1200
-    assert {int(answer[1], 16) for answer in host} == {0, 1, 2}  # every way to an optimum
+    host, result = (answers(at, precision, *how, scenario=law) for at, how in (("posix", ()), (target, make)))
+    assert len(host) == LAWS[law].periods
+    assert {int(answer[1], 16) for answer in host} == LAWS[law].statuses  # every way to an optimum
     assert bits(result) == bits(host)
 
 
@@ -78,53 +110,52 @@ def test_contraction_would_change_bits(answers: Answers) -> None:
     assert bits(answers("posix", "double", *AARCH64, CONTRACTED)) != bits(answers("posix", "double"))
 
 
-@pytest.mark.parametrize(
-    ("board", "precision"), [("cortex-m7", "double"), ("cortex-m7", "float"), ("cortex-m4f", "float")]
-)
-def test_a_step_takes_few_instructions(board: str, precision: str, answers: Answers, measured: Measured) -> None:
-    """Instructions, not cycles: the emulator has neither caches nor wait states."""
-    steps = np.array([int(answer[7], 16) * INSTRUCTIONS_PER_TICK for answer in answers(board, precision)])
-    result = {"p50": np.median(steps), "p99": np.percentile(steps, 99), "warm": steps[1:].max(), "first": steps[0]}
-    measured(board, precision, **result)
-    assert result["p50"] <= MEDIAN
-    assert result["p99"] <= RARE
-    assert result["warm"] <= WARM
-    assert result["first"] <= COLD
-
-
-@pytest.mark.parametrize(
-    ("board", "precision"), [("cortex-m7", "double"), ("cortex-m7", "float"), ("cortex-m4f", "float")]
-)
-def test_a_controller_fits(
-    board: str, precision: str, exported: Export, run: Run, measured: Measured, tmp_path: Path
+@pytest.mark.parametrize(("law", "board", "precision"), BOARDED)
+def test_a_step_takes_few_instructions(
+    law: str, board: str, precision: str, answers: Answers, measured: Measured
 ) -> None:
-    directory, tools = exported(board, precision), "arm-none-eabi-size"
+    """Instructions, not cycles: the emulator has neither caches nor wait states."""
+    found = answers(board, precision, scenario=law)
+    steps = np.array([int(answer[7], 16) * INSTRUCTIONS_PER_TICK for answer in found])
+    result = {"p50": np.median(steps), "p99": np.percentile(steps, 99), "warm": steps[1:].max(), "first": steps[0]}
+    measured(law, board, precision, **result)
+    for number, most in zip(result.values(), LAWS[law].steps, strict=True):
+        assert number <= 1e6 * most
+
+
+@pytest.mark.parametrize(("law", "board", "precision"), BOARDED)
+def test_a_controller_fits(
+    law: str, board: str, precision: str, exported: Export, run: Run, measured: Measured, tmp_path: Path
+) -> None:
+    directory, tools = exported(board, precision, scenario=law), "arm-none-eabi-size"
     run(TARGETS[board].compiler, "--version")
     make_program(directory, "vectors.elf")
     numbers = tmp_path / "numbers.c"
-    numbers.write_text('#include "quadsim_data.h"\nconst quadsim_controller *const used = &QUADSIM_CONTROLLER;\n')
+    numbers.write_text('#include "quadsim_data.h"\nconst void *const used = &QUADSIM_CONTROLLER;\n')
     flags = [*TARGETS[board].machine.split(), *DEFINES[precision], "-std=c99", "-I", directory]
     run(TARGETS[board].compiler, *flags, "-c", numbers, "-o", tmp_path / "numbers.o")
-    objects = [*(directory / f"{name}.o" for name in CONTROLLER), tmp_path / "numbers.o"]
+    sources = sources_of(directory)
+    objects = [*(path.with_suffix(".o") for path in sources), tmp_path / "numbers.o"]
     sizes = [line.split()[:3] for line in run(tools, *objects).stdout.splitlines()[1:]]
     flash, data, zeroed = (sum(map(int, column)) for column in zip(*sizes, strict=True))
-    assert flash <= FLASH[precision]
-    assert (data, zeroed) == (0, 0)  # no state but the caller's
     symbols = run("arm-none-eabi-nm", "-S", directory / "main.o").stdout
-    ram = sum(int(size, 16) for size in re.findall(r"^\S+ (\S+) b (?:mpc|memory)$", symbols, re.MULTILINE))
-    measured(board, precision, flash=flash, ram=ram)
-    assert 0 < ram <= MEMORY[precision]
-    frames = [line.split("\t") for name in CONTROLLER for line in (directory / f"{name}.su").read_text().splitlines()]
+    ram = sum(int(size, 16) for size in re.findall(r"^\S+ (\S+) b (?:law|memory)$", symbols, re.MULTILINE))
+    measured(law, board, precision, flash=flash, ram=ram)
+    assert flash <= 1e3 * LAWS[law].flash[precision]
+    assert (data, zeroed) == (0, 0)  # no state but the caller's
+    assert 0 < ram <= 1e3 * LAWS[law].memory[precision]
+    frames = [line.split("\t") for path in sources for line in path.with_suffix(".su").read_text().splitlines()]
     assert {kind for _, _, kind in frames} == {"static"}
     assert max(int(size) for _, size, _ in frames) <= FRAME
 
 
+@pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(("board", "precision"), [("cortex-m7", "double"), ("cortex-m4f", "float")])
-def test_the_stack_is_small(board: str, precision: str, exported: Export, run: Run, tmp_path: Path) -> None:
+def test_the_stack_is_small(board: str, precision: str, law: str, exported: Export, run: Run, tmp_path: Path) -> None:
     """Painted below main, and looked at after all recorded periods."""
-    directory = exported(board, precision)
+    directory = exported(board, precision, scenario=law)
     target, image = TARGETS[board], tmp_path / "stack.elf"
-    sources = [directory / f"{name}.c" for name in (*CONTROLLER, "vectors", "startup")]
+    sources = [*sources_of(directory), *(directory / f"{name}.c" for name in ("vectors", "startup"))]
     flags = f"{target.machine} {' '.join(DEFINES[precision])} -O3 -std=gnu99 -ffp-contract=off -I {directory}".split()
     link = f"-nostartfiles -T {directory / 'mps2.ld'} --specs=nano.specs".split()
     run(target.compiler, *flags, "-o", image, HERE / "stack.c", *sources, *link)

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from mpc.ocp import Problem
 
 MEASURED = Path(__file__).resolve().parents[2] / "runs" / "numbers" / "peers.json"
-"""What docs/tools/remake.py fills the table of docs/verification.md from."""
+"""What docs/tools/remake.py fills the table of docs/evidence.md from."""
 
 
 @pytest.fixture(scope="session", autouse=True)

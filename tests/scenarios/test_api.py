@@ -88,17 +88,17 @@ def test_every_docstring_has_an_example_that_runs(
     assert runner.failures == 0, capsys.readouterr().out
 
 
-def test_the_page_of_the_api_has_every_name() -> None:
-    page = (EXAMPLES.parent / "docs/api.md").read_text(encoding="utf-8")
+def test_the_pages_of_the_api_have_every_name() -> None:
+    page = "".join(path.read_text(encoding="utf-8") for path in (EXAMPLES.parent / "docs").glob("api*.md"))
     named = set(re.findall(r"^::: ((?:quadsim|quadsim\.gym|mpc)\.\w+)$", page, re.MULTILINE))
     subpackages = {name for name in mpc.__all__ if isinstance(getattr(mpc, name), ModuleType)}
     handed_out = {quadsim: {*quadsim.__all__}, quadsim.gym: {*quadsim.gym.__all__}, mpc: {*mpc.__all__} - subpackages}
     assert named == {f"{package.__name__}.{name}" for package, names in handed_out.items() for name in names}
 
 
-def test_the_page_of_the_api_lists_members_that_exist() -> None:
+def test_the_pages_of_the_api_list_members_that_exist() -> None:
     """Of each entry, the attributes, properties and fields that it shows."""
-    page = (EXAMPLES.parent / "docs/api.md").read_text(encoding="utf-8")
+    page = "".join(path.read_text(encoding="utf-8") for path in (EXAMPLES.parent / "docs").glob("api*.md"))
     listed = re.findall(r"^::: ([\w.]+)\n    options:\n      members: \[([\w, ]+)\]$", page, re.MULTILINE)
     assert len(listed) == page.count("members:") > 2
     for name, members in listed:

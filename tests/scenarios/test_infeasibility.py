@@ -314,7 +314,7 @@ def test_a_flight_whose_sqp_does_not_converge_says_so_and_what_helps() -> None:
         [],
     )
     assert "the SQP did not converge" in result["sentence"]
-    text = (Path(__file__).resolve().parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parents[2] / "docs" / "audit.md").read_text(encoding="utf-8")
     assert f"{result['sentence']}\n{result['advice']}\n" in text
     helped = quadsim.fly(tumble.replace(result["suggestions"][0]["settings"]))
     assert helped.summary["controller"]["statuses"].get("not_converged", 0) == 0
@@ -420,7 +420,7 @@ def test_what_is_advised_keeps_the_flight_and_what_is_not_would_not_have() -> No
             lost = f"lost at t = {failed.time.size * 0.05:.4g} s"
             assert (failed.outcome, each["why"]) == ("lost", lost)
     assert result["advice"].startswith(f"to try, each flown until {until:.4g} s: controller.type = ")
-    text = (Path(__file__).resolve().parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parents[2] / "docs" / "audit.md").read_text(encoding="utf-8")
     assert f"{result['sentence']}\n{result['advice']}\n" in text
 
 

@@ -238,7 +238,7 @@ def test_every_scenario_has_golden_numbers() -> None:
 
 
 def test_the_page_states_every_loss_criterion_and_its_default() -> None:
-    text = (ROOT / "docs" / "scenarios.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
     for name, info in fields_of(Lost).items():
         assert f"- `lost.{name} = {info.default:g}`: {info.description}\n" in text
 

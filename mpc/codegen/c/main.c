@@ -5,8 +5,8 @@
 #include "target.h"
 #include "vectors.h"
 
-static quadsim_mpc mpc;
-static quadsim_real memory[QUADSIM_MEMORY];
+static quadsim_law law;
+static quadsim_memory memory;
 
 /* Write a value's bytes, the most significant first, and a blank; returns what follows. */
 static char *put(char *line, const void *value, size_t bytes)
@@ -24,29 +24,31 @@ static char *put(char *line, const void *value, size_t bytes)
 int main(void)
 {
     int k, j, failed = 0;
-    if (quadsim_mpc_reals(&QUADSIM_CONTROLLER) != QUADSIM_MEMORY) {
+    if (!quadsim_law_fits()) {
         target_print("wrong: the controller needs another amount of memory\n");
         return 1;
     }
-    quadsim_mpc_start(&mpc, &QUADSIM_CONTROLLER, memory);
-    quadsim_mpc_reset(&mpc, quadsim_vectors_speeds);
+    quadsim_law_start(&law, &memory);
+    quadsim_law_reset(&law, quadsim_vectors_before);
     for (k = 0; k < quadsim_vectors_count; k++) {
         const struct quadsim_vector *recorded = &quadsim_vectors[k];
         const uint32_t started = target_ticks();
         char line[128], *end = line;
         quadsim_real command[4];
         const int status =
-            (int)quadsim_mpc_step(&mpc, QUADSIM_PHASE_FLYING, recorded->state, quadsim_vectors_path[k],
+            (int)quadsim_law_step(&law, QUADSIM_PHASE_FLYING, recorded->state, quadsim_vectors_path[k],
                                   recorded->acting, command);
+        const int changes = quadsim_law_changes(&law);
         const uint32_t ticks = target_ticks() - started;
-        /* From QUADSIM_PRIMAL_INFEASIBLE on there is no optimum to compare with. */
-        const int optimal = recorded->status < (int)QUADSIM_PRIMAL_INFEASIBLE;
+        /* Else there is no optimum to compare with. */
+        const int optimal = quadsim_is_flown((enum quadsim_status)recorded->status);
+        const int flown = quadsim_is_flown((enum quadsim_status)status);
         /* In float rounding alone may make a bound active: any status of an optimum will do. */
         const int same = QUADSIM_VECTORS_ANY_OPTIMUM || status == recorded->status;
-        int wrong = optimal ? !same || status >= (int)QUADSIM_PRIMAL_INFEASIBLE : status < (int)QUADSIM_PRIMAL_INFEASIBLE;
+        int wrong = optimal ? !same || !flown : flown;
         end = put(end, &k, sizeof k);
         end = put(end, &status, sizeof status);
-        end = put(end, &mpc.work.changes, sizeof mpc.work.changes);
+        end = put(end, &changes, sizeof changes);
         for (j = 0; j < 4; j++) {
             const quadsim_real off = command[j] - recorded->command[j];
             end = put(end, &command[j], sizeof command[j]);

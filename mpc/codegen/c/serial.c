@@ -13,29 +13,28 @@
 #define WATCHDOG_MS 100 /* 0 for none */
 #endif
 #define MARK 0x4D504351U
-#define N QUADSIM_HORIZON
 
 /* anew, after u(-1) = acting; a row of the reference alone; all; the same while the ground holds the vehicle */
 enum kind { START, ROW, STEP, STAND };
 
 struct question {
     uint32_t mark, number;  /* MARK; one more with each question */
-    quadsim_real state[12]; /* x(k), as in quadsim_mpc.h */
-    quadsim_real row[4];    /* reference at t(k + N); those at t(k + 1) .. t(k + N - 1) have come before */
-    quadsim_real acting[4]; /* u(k - 1) [rad/s] */
+    quadsim_real state[QUADSIM_STATE]; /* x(k), as in the controller's header */
+    quadsim_real row[QUADSIM_ROW];     /* the last row of the reference; those before have come before */
+    quadsim_real acting[4];            /* u(k - 1) */
     uint32_t kind, crc;
 };
 
 struct answer {
     uint32_t mark, number; /* the question's */
-    quadsim_real command[4]; /* u(k) [rad/s] */
-    uint16_t status, fallback; /* as of quadsim_mpc_step, and its level */
+    quadsim_real command[4]; /* u(k) */
+    uint16_t status, fallback; /* as of quadsim_law_step, and its level */
     uint32_t crc;
 };
 
-static quadsim_mpc mpc;
-static quadsim_real memory[QUADSIM_MEMORY];
-static quadsim_real window[4 * N];
+static quadsim_law law;
+static quadsim_memory memory;
+static quadsim_real window[QUADSIM_ROW * QUADSIM_ROWS];
 static struct answer answer; /* the last one; its mark is 0 before there is one */
 static int flying;           /* whether a state has come since the start */
 
@@ -93,17 +92,17 @@ static int solve(const struct question *question)
 {
     uint32_t rows = question->number - answer.number; /* new ones, those lost included */
     if (question->kind == START) {
-        quadsim_mpc_reset(&mpc, question->acting);
+        quadsim_law_reset(&law, question->acting);
         memcpy(answer.command, question->acting, sizeof answer.command);
         answer.mark = MARK;
         flying = 0;
-        rows = N;
+        rows = QUADSIM_ROWS;
     } else if (answer.mark != MARK || rows == 0U || rows > UINT32_MAX / 2U) {
         return 0;
     }
-    for (rows = rows < N ? rows : N; rows > 0U; rows--) {
-        memmove(window, window + 4, sizeof window - sizeof question->row);
-        memcpy(window + 4 * (N - 1), question->row, sizeof question->row);
+    for (rows = rows < QUADSIM_ROWS ? rows : QUADSIM_ROWS; rows > 0U; rows--) {
+        memmove(window, window + QUADSIM_ROW, sizeof window - sizeof question->row);
+        memcpy(window + QUADSIM_ROW * (QUADSIM_ROWS - 1), question->row, sizeof question->row);
     }
     answer.number = question->number;
     put_missed();
@@ -111,9 +110,9 @@ static int solve(const struct question *question)
         return 0;
     }
     flying = 1;
-    answer.status = (uint16_t)quadsim_mpc_step(&mpc, question->kind == STAND ? QUADSIM_PHASE_ARMED : QUADSIM_PHASE_FLYING,
+    answer.status = (uint16_t)quadsim_law_step(&law, question->kind == STAND ? QUADSIM_PHASE_ARMED : QUADSIM_PHASE_FLYING,
                                                question->state, window, question->acting, answer.command);
-    answer.fallback = (uint16_t)mpc.guard.level;
+    answer.fallback = (uint16_t)law.guard.level;
     return 1;
 }
 
@@ -121,7 +120,7 @@ int main(void)
 {
     static struct question question;
     uint32_t fresh = target_ticks();
-    quadsim_mpc_start(&mpc, &QUADSIM_CONTROLLER, memory);
+    quadsim_law_start(&law, &memory);
     for (;;) {
         if (receive(&question)) {
             if (solve(&question)) {

@@ -541,11 +541,12 @@ static void foresee(quadsim_nonlinear *law)
     int i;
     if (!guard->foreseeing) {
         guard->foreseeing = 1;
+        law->then = law->world;
         put_body(guard->foreseen, NULL, NULL, law->ahead);
     }
     put_shares(numbers, quadsim_guard_row(guard), shares);
     law->ahead[BODY] = R(0.0);
-    quadsim_nmpc_advance(numbers->unlagged, &law->world, 1, law->ahead, shares, next);
+    quadsim_nmpc_advance(numbers->unlagged, &law->then, 1, law->ahead, shares, next);
     length = square_root(dot(next + Q, next + Q, 4));
     for (i = 0; i < 4; i++) {
         next[Q + i] /= length;

@@ -70,7 +70,8 @@ typedef struct quadsim_nonlinear {
     quadsim_real last[QUADSIM_NMPC_MOST];
     quadsim_real estimate[6];         /* disturbance: world [m/s^2], body [rad/s^2] */
     quadsim_ramp ramp;                /* one that changes */
-    quadsim_real ahead[QUADSIM_NMPC_BODY + 1]; /* where the guard's plan leads */
+    quadsim_real ahead[QUADSIM_NMPC_BODY + 1]; /* where the guard's plan leads, */
+    quadsim_nmpc_world then;          /* in the world as it was known when the plan was first needed */
 } quadsim_nonlinear;
 
 long quadsim_nonlinear_reals(const quadsim_nonlinear_numbers *numbers);
