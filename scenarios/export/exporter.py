@@ -16,7 +16,7 @@ from mpc.bounded import Weighted
 from mpc.codegen.ctext import CText, Precision
 from mpc.codegen.geometric import CGeometric
 from mpc.codegen.nonlinear import CNonlinear
-from mpc.codegen.source import CHANGES, DATA, CController, CSource, part
+from mpc.codegen.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
 from mpc.codegen.targets import TARGETS, Machine
 from mpc.core.numbers import AVOIDS, Exportable, exportable
 from mpc.core.solver import CoreProblem, Work, core_library
@@ -295,7 +295,8 @@ def _readme(scenario: Scenario, controller: CSource, room: str) -> str:
     precision, law = controller.precision, controller.law_name
     solves_none = isinstance(controller, CGeometric)
     what = "geometric" if solves_none else "model predictive"
-    sources = ", ".join(f"`{name}`" for name in controller.law_files if not name.startswith(("quadsim_guard", law)))
+    files = *controller.law_files, *BODY_FILES
+    sources = ", ".join(f"`{name}`" for name in files if not name.startswith(("quadsim_guard", law)))
     return f"""# {_title(scenario)}
 
 A {what} controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
