@@ -32,7 +32,7 @@ FILES: Final = (
 """Files of `mpc/core/c` to export verbatim."""
 ROWS_PER_NODE: Final = 2.0
 """Capacity for active rows, per node."""
-LEAST_ROWS: Final = 32
+FEWEST_ROWS: Final = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +56,8 @@ class CNonlinear(CSource):
     def __post_init__(self) -> None:
         if self.table.indi is not None:
             raise ExportError("its rotor speeds are corrected at each physics step: leave out controller.indi")
+        if self.table.time_limit is not None:
+            raise ExportError("its steps end by a clock, which the C has not: leave out controller.time_limit")
 
     @cached_property
     def law(self) -> NonlinearMPC:
@@ -111,7 +113,7 @@ class CNonlinear(CSource):
     def rows(self) -> int:
         """See `CSource`."""
         sqp = self.law._sqp
-        usual = max(LEAST_ROWS, math.ceil(ROWS_PER_NODE * sqp.horizon))
+        usual = max(FEWEST_ROWS, math.ceil(ROWS_PER_NODE * sqp.horizon))
         return min(sqp.most_rows, usual if self.asked is None else self.asked)
 
     @property

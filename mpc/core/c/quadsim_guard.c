@@ -45,7 +45,9 @@ static void respond(const quadsim_fallback *f, const real heading[2], const real
 {
     real before[12];
     int i;
-    memcpy(before, deviation, sizeof(before));
+    for (i = 0; i < 12; i++) {
+        before[i] = deviation[i];
+    }
     turn(before, -heading[0], heading[1]);
     for (i = 0; i < 12; i++) {
         deviation[i] = dot(f->A + i * 12, before, 12) + dot(f->B + i * NU, changes, NU);
@@ -134,7 +136,7 @@ static void drop_frozen(const quadsim_fallback *f, const real *predicted, const 
 static void spread(const quadsim_fallback *f, const real heading[2], real *covariance)
 {
     static const real still[NU] = {R(0.0)};
-    real line[12];
+    real line[12] = {R(0.0)};
     int i, j;
     for (j = 0; j < 12; j++) {
         for (i = 0; i < 12; i++) {
@@ -284,7 +286,7 @@ static int follow_plan(quadsim_guard *g, int lost, real *command)
 {
     static const real level[2] = {R(0.0), R(0.0)};
     const quadsim_fallback *f = g->numbers;
-    real error[12], heading[2];
+    real error[12] = {R(0.0)}, heading[2];
     int i, near = 1;
     if (!g->planned) {
         return 0;
@@ -313,7 +315,7 @@ static int hover(quadsim_guard *g, const quadsim_trim *trim, real *command)
     const quadsim_fallback *f = g->numbers;
     const real *state = g->state;
     const int sinking = g->hovered >= f->hover_periods;
-    real error[12], level[2], heading[2];
+    real error[12] = {R(0.0)}, level[2], heading[2];
     int i;
     if (!g->targeted) {
         g->targeted = 1;

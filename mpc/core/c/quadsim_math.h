@@ -241,12 +241,12 @@ static inline void thrust_axis_of(const real *attitude, const real *rates, real 
 /* Body to world of a unit quaternion wxyz, row by row. */
 static inline void attitude_of(const real *q, real attitude[9])
 {
-    real turn[3][3];
+    real rows[3][3];
     int i, j;
-    rotation_of(q, R(2.0), turn);
+    rotation_of(q, R(2.0), rows);
     for (i = 0; i < 3; i++) {
         for (j = 0; j < 3; j++) {
-            attitude[3 * i + j] = turn[i][j];
+            attitude[3 * i + j] = rows[i][j];
         }
     }
 }

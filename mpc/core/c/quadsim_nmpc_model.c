@@ -39,12 +39,13 @@ static real speed_of(real share, real *slope)
     }
 }
 
-static struct drive drive_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u, int instant,
-                             real by_share[5][NU])
+static struct drive drive_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x,
+                             const real *u, int instant, real by_share[5][NU])
 {
     struct drive drive;
     int i, j;
     drive.left = p->left + instant * NU;
+    drive.speed = R(0.0);
     if (p->targets) {
         const real thrust = p->effect[0] * world->thrust_scale;
         drive.thrust = thrust * (u[0] + drive.left[0] * (x[BODY] - u[0]));
@@ -55,7 +56,7 @@ static struct drive drive_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_w
         }
         return drive;
     }
-    drive.thrust = drive.speed = R(0.0);
+    drive.thrust = R(0.0);
     for (i = 0; i < 3; i++) {
         drive.angular[i] = world->angular[i];
     }

@@ -66,7 +66,7 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
     const int followers = actuators + (moves ? NU : 0), n = BODY + followers, width = (n + 2) & ~1, first = n - 3;
     const real *map = work->map + i * BODY * width;
     real *gain = work->gain + i * NU * n, *inverse = work->inverse + i * NU * NU;
-    real both[MOST][WIDE + 1], H[WIDE + 1][WIDE + 1], pivot[NU], low[NU][NU], K[NU][MOST];
+    real both[MOST][WIDE + 1], H[WIDE + 1][WIDE + 1], pivot[NU] = {R(0.0)}, low[NU][NU], K[NU][MOST];
     int r, k, j, a, b;
     const int any = held[0] || held[1] || held[2] || held[3];
     for (r = 0; r < n; r++) { /* P [A B], but for A's first three columns, which are P's */
@@ -103,8 +103,8 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
         const int past = (j + 2) & ~1;
         for (k = 0; k < (j < 7 ? W : BODY); k++) {
             const real by = map[k * width + j];
-            for (r = 0; r < past; r++) {
-                row[r] += by * both[k][r];
+            for (r = 0; r < past; r++) { /* rows of `both` are set above, whichever columns are */
+                row[r] += by * both[k][r]; /* NOLINT(clang-analyzer-core.UndefinedBinaryOperatorResult) */
             }
         }
         for (k = W; p->moments && j < 7 && k < BODY; k++) {
