@@ -202,9 +202,12 @@ class RampObserver:
         """
         for array, value in zip(self._measured, (velocity, attitude, rates, command), strict=True):
             array[:] = value
-        follows = abs(time - self._time - self._period) <= _SAME_TIME
-        self._time = time
-        self._library.quadsim_ramp_update(*self._at, follows, *self._addresses[:4])
+        self._library.quadsim_ramp_update(*self._at, self.follows(time), *self._addresses[:4])
+
+    def follows(self, time: float) -> bool:
+        """Return whether an update at a time [s] follows the one before by a period, and remember the time."""
+        before, self._time = self._time, time
+        return abs(time - before - self._period) <= _SAME_TIME
 
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
         """Predict the disturbance `ahead` [s] after the last measurement: three arrays (3,).

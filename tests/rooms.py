@@ -48,6 +48,7 @@ USING: Final = {
     "scenarios/identify/test_identify.py": ("design",),
     "scenarios/identify/test_identify_fit.py": ("design",),
     "scenarios/identify/test_identify_logs.py": ("design",),
+    "scenarios/identify/test_log_formats.py": ("design",),
     "scenarios/test_answer_first.py": ("campaign", "design", "identify"),
     "scenarios/test_api.py": EVERY,
     "scenarios/test_bounded_input.py": ("campaign", "identify"),

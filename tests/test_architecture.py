@@ -17,6 +17,7 @@ from typing import TypeGuard
 
 import pytest
 
+from quadsim.core.build import sources
 from scenarios.commands.rooms import ROOMS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -29,6 +30,8 @@ RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it may import at its top what is heavy."""
 RECORDING = re.compile(r"quadsim\.report\.recording\.(plots|world)")
 """Imported when a recording is made, and so may import rerun at their top."""
+LOGS = ("orangebox", "pymavlink", "pyulog", "rosbags")
+"""Libraries that read logs."""
 OF_ONE_PLACE = {
     "rerun": "quadsim.report.recording",
     "imageio": "quadsim.report.film",
@@ -38,10 +41,10 @@ OF_ONE_PLACE = {
     "plotly": "quadsim.report.to_plotly",
     "distributed": "scenarios.many",
     "gymnasium": "scenarios.gym",
-    "pyulog": "scenarios.identify",
+    **dict.fromkeys(LOGS, "scenarios.identify"),
 }
 """What only some outputs need, and where alone it is imported."""
-OF_ROOMS = {"gymnasium": "gym", "pyulog": "identify", "trimesh": "live", "viser": "live"}
+OF_ROOMS = {"gymnasium": "gym", **dict.fromkeys(LOGS, "identify"), "trimesh": "live", "viser": "live"}
 ABSENT = {library for library, room in OF_ROOMS.items() if room not in ROOMS}
 """Libraries that a room alone uses, and those of rooms that have been taken away."""
 IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
@@ -50,6 +53,8 @@ HANDING_OUT = ("quadsim", "mpc")
 """Packages with a table of public names, each imported on first use; `quadsim` also starts the command."""
 MOST_DEFINED_TWICE = 20
 """Public names that several modules define: they may only get fewer."""
+MOST_FORMULAS_TWICE = 2
+"""Formulas that several C files of the library have: they may only get fewer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,6 +261,39 @@ def test_few_public_names_are_defined_twice() -> None:
             places.setdefault(name, []).append(module)
     twice = {name: sorted(of) for name, of in sorted(places.items()) if len(of) > 1}
     assert len(twice) <= MOST_DEFINED_TWICE, twice
+
+
+def formulas(source: str) -> Iterator[tuple[str, ...]]:
+    """Yield long expressions that C code assigns, of three products or more, with names by order of appearance."""
+    source = re.sub(r"/\*.*?\*/|^\s*#.*?$", "", source, flags=re.DOTALL | re.MULTILINE)
+    source = re.sub(r"\bR\((-?[\d.e+-]+)\)", r"\1", source)
+    for statement in re.split(r"[;{}]", source):
+        _, _, assigned = statement.partition("=")
+        names: dict[str, str] = {}
+        words = re.findall(r"[A-Za-z_]\w*|[\d.]+(?:e[+-]?\d+)?|->|[^\s\w]", assigned)
+        if len(words) > 16 and words.count("*") > 2:
+            yield tuple(names.setdefault(word, f"name{len(names)}") if word[0].isalpha() else word for word in words)
+
+
+def test_a_formula_is_found_whatever_its_names_are() -> None:
+    one, other = "real a = R(2.0) * (q[1] * q[3] + q[0] * q[2]);", "/* = */ x->b += 2.0 * (w[1] * w[3] + w[0] * w[2]);"
+    assert [*formulas(one)] == [*formulas(other)] != []
+    assert [*formulas(one.replace("q[0]", "p[0]"))] != [*formulas(other)]
+
+
+def test_the_rigid_body_is_written_once_in_c() -> None:
+    places: dict[tuple[str, ...], set[str]] = {}
+    for path in sources():
+        for formula in formulas(path.read_text()):
+            places.setdefault(formula, set()).add(path.name)
+    twice = {" ".join(formula): sorted(of) for formula, of in places.items() if len(of) > 1}
+    assert len(twice) <= MOST_FORMULAS_TWICE, twice
+
+
+def test_c_of_the_testbed_includes_its_own_headers_alone() -> None:
+    core = ROOT / "quadsim" / "core"
+    included = {name for path in core.glob("*.[ch]") for name in re.findall(r'#include "(.*)"', path.read_text())}
+    assert included == {path.name for path in core.glob("*.h")}
 
 
 def test_what_is_imported_is_what_is_declared(imports: list[Import]) -> None:

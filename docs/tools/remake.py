@@ -278,13 +278,19 @@ def export(boards: list[dict[str, Any]]) -> str:
     """What an exported controller takes on a board, of `make firmware`."""
     rows = [
         (
-            *(board["target"], board["precision"], f"{board['flash'] / 1e3:.0f}", f"{board['ram'] / 1e3:.0f}"),
+            *(
+                f"`{board['law']}`",
+                board["target"],
+                board["precision"],
+                f"{board['flash'] / 1e3:.0f}",
+                f"{board['ram'] / 1e3:.0f}",
+            ),
             *(f"{board[name] / 1e6:.2f}" for name in ("p50", "p99", "warm", "first")),
         )
         for board in boards
     ]
     instructions = ("instructions: median [M]", "p99", "most after the first", "the first")
-    return markdown(("target", "precision", "flash [kB]", "RAM [kB]", *instructions), rows)
+    return markdown(("scenario", "target", "precision", "flash [kB]", "RAM [kB]", *instructions), rows)
 
 
 def first_flights(flights: list[dict[str, Any]]) -> str:

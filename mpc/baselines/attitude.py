@@ -1,14 +1,14 @@
-"""Attitudes as rotation matrices: the attitude for a force and a heading, its derivatives, and attitude errors."""
+"""Attitudes as rotation matrices: the attitude for a force and a heading, and its error."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from mpc.baselines.compiled import geometric_library
 from mpc.nonlinear.rigidbody import rotation
 from quadsim.rotation import body_to_world, euler_to_body_rates
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array
@@ -46,22 +46,14 @@ def hat(vector: Array) -> Array:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def vee(matrix: Array) -> Array:
-    """(3,) inverse of `hat`, applied to the skew part of a matrix (3, 3)."""
-    skew = 0.5 * (matrix - matrix.T)
-    return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
-
-
 def limit_force(force: Array, *, least: float, tilt: float) -> Array:
     """Limit a force (3,) [N], world, to at least `least` [N] upwards and at most `tilt` [rad] from the vertical.
 
     The limit changes the vertical part only if it is too small; the horizontal part keeps its direction.
     """
-    upward = max(float(force[2]), least)
-    horizontal = math.hypot(force[0], force[1])
-    allowed = upward * math.tan(tilt)
-    share = 1.0 if horizontal <= allowed else allowed / horizontal
-    return np.array([share * force[0], share * force[1], upward])
+    force, limited = np.ascontiguousarray(force, np.float64), np.empty(3)
+    geometric_library().quadsim_geometric_limit(force.ctypes.data, least, math.tan(tilt), limited.ctypes.data)
+    return limited
 
 
 def attitude_for(force: Array, yaw: float) -> Array:
@@ -99,87 +91,3 @@ def prioritised_error(attitude: Array, desired: Array, yaw_weight: float) -> Arr
     half = 0.5 * yaw_weight * turn
     c, s = math.cos(half), math.sin(half)
     return 2.0 * np.array([x * c + y * s, y * c - x * s, w * s / yaw_weight])
-
-
-def quaternion_of(rotation: Array) -> Array:
-    """(4,) unit quaternion q, wxyz, of a matrix (3, 3): the longest column of 4 q q'."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    outer = np.array(
-        [
-            [1.0 + a + e + i, h - f, c - g, d - b],
-            [h - f, 1.0 + a - e - i, b + d, c + g],
-            [c - g, b + d, 1.0 - a + e - i, f + h],
-            [d - b, c + g, f + h, 1.0 - a - e + i],
-        ]
-    )
-    column = outer[np.argmax(np.diag(outer))]
-    return np.asarray(column / np.linalg.norm(column))
-
-
-def attitude_error(attitude: Array, desired: Array) -> Array:
-    """e_R = (R_d' R - R' R_d)^vee / 2 (3,).  Lee, Leok, McClamroch (2010)."""
-    return vee(desired.T @ attitude)
-
-
-def rate_error(attitude: Array, rates: Array, desired: Array, desired_rates: Array) -> Array:
-    """e_Omega = Omega - R' R_d Omega_d (3,) [rad/s].  Lee, Leok, McClamroch (2010)."""
-    return np.asarray(rates - attitude.T @ desired @ desired_rates)
-
-
-def unit_derivatives(v: Array, v1: Array, v2: Array) -> tuple[Array, Array, Array]:
-    """The direction v / |v| of v (3,) != 0 and its first two derivatives (3,), from those of v."""
-    length = np.linalg.norm(v)
-    u = v / length
-    along = u @ v1
-    u1 = (v1 - along * u) / length
-    u2 = (v2 - (u1 @ v1 + u @ v2) * u - 2.0 * along * u1) / length
-    return u, u1, u2
-
-
-@dataclass(frozen=True, kw_only=True)
-class DesiredAttitude:
-    """The commanded attitude R_c (3, 3), Omega_c (3,) [rad/s] and its derivative (3,) [rad/s^2], in its own axes."""
-
-    attitude: Array
-    rates: Array
-    acceleration: Array
-
-
-def desired_attitude(force: Sequence[Array], momentum: Sequence[Array], drag: Array, heading: Array) -> DesiredAttitude:
-    """R_c = [b_1c, b_2c, b_3c], with b_1c as close to the heading as the force allows.
-
-    Rotors and drag together give `force`, f b_3c - R_c diag(d) R_c' p = A. Perpendicular to b_3c, b_1c . (A + d_x p) =
-    0 and b_2c . (A + d_y p) = 0; along it, f = b_3c . (A + d_z p). Faessler et al.  (2018), Eqs.  (12) to (16), with
-    body x rather than body y close to a given direction.  Without drag, b_3c lies along A.
-
-    Args:
-        force: A and its first two derivatives, (3,) each [N].
-        momentum: p, mass times the velocity that causes drag, and its first two derivatives, (3,) each.
-        drag: d (3,), body axes [1/s].
-        heading: (3, 3) rows: the direction h and its first two derivatives.
-    """
-    h, h1, h2 = heading
-    beta = unit_derivatives(*_with_drag(force, momentum, drag[1]))
-    b2, b21, b22 = unit_derivatives(*_cross(beta, (h, h1, h2)))
-    if drag[0] == drag[1]:
-        b3, b31, b32 = beta
-        b1, b11, b12 = _cross((b2, b21, b22), beta)
-    else:
-        alpha = unit_derivatives(*_with_drag(force, momentum, drag[0]))
-        b1, b11, b12 = unit_derivatives(*_cross((b2, b21, b22), alpha))
-        b3, b31, b32 = _cross((b1, b11, b12), (b2, b21, b22))
-    R_c = np.stack([b1, b2, b3], axis=1)
-    Omega_c = vee(R_c.T @ np.stack([b11, b21, b31], axis=1))
-    acceleration_c = vee(R_c.T @ np.stack([b12, b22, b32], axis=1))  # of hat(Omega_c)^2 + hat(Omega_c'), skew
-    return DesiredAttitude(attitude=R_c, rates=Omega_c, acceleration=acceleration_c)
-
-
-def _with_drag(force: Sequence[Array], momentum: Sequence[Array], drag: float) -> Sequence[Array]:
-    return force if drag == 0.0 else [A + drag * p for A, p in zip(force, momentum, strict=True)]
-
-
-def _cross(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, Array, Array]:
-    """The cross product of two vectors and its first two derivatives, from those of the vectors."""
-    (a0, a1, a2), (b0, b1, b2) = a, b
-    first = np.cross(a1, b0) + np.cross(a0, b1)
-    return np.cross(a0, b0), first, np.cross(a2, b0) + 2.0 * np.cross(a1, b1) + np.cross(a0, b2)

@@ -6,41 +6,42 @@ Subject to Rotor Drag for Accurate Tracking of High-Speed Trajectories", 2018.
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 import numpy as np
 from annotated_types import Len, doc
 
 from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
-from mpc.baselines.attitude import (
-    LEAST_THRUST_SHARE,
-    DesiredAttitude,
-    Measured,
-    attitude_error,
-    desired_attitude,
-    limit_force,
-    motion_of,
-    quaternion_of,
-    rate_error,
-)
+from mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
+from mpc.baselines.compiled import (
+    AttitudeStruct,
+    DisturbanceStruct,
+    GeometricNumbersStruct,
+    GeometricStruct,
+    MotionStruct,
+    TargetStruct,
+    geometric_library,
+)
 from mpc.baselines.law import FeedbackLaw, Tuned
-from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion
+from mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIEW_DEGREE, Target, differentiator
 from mpc.bounded import USUAL_TARGETS, Range, Seconds, TargetBounds, law_of, require_lags, require_space
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
 from mpc.model import target_model
 from mpc.nonlinear.model import zero
 from mpc.obstacles import Shape
-from quadsim.controller import ROTORS, Command, Phase, StepInputs
+from quadsim.controller import ROTORS, TARGET_SIZES, Command, Phase, StepInputs
+from quadsim.core.library import set_arrays
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
-from quadsim.rotation import multiply
-from quadsim.state import Array, wrapped
+from quadsim.motion import Motion
+from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
 Commands: TypeAlias = Literal["rotors", "rates", "attitude"]
@@ -119,9 +120,18 @@ class Integrals:
     rotation: Array
 
 
-Disturbance: TypeAlias = tuple[Array, Array, Array]
+ForeseenDisturbance: TypeAlias = tuple[Array, Array, Array]
 """The disturbance: acceleration and its rate of change, world, and angular acceleration, body; (3,) each."""
-UNDISTURBED: Final[Disturbance] = (zero(), zero(), zero())
+UNDISTURBED: Final[ForeseenDisturbance] = (zero(), zero(), zero())
+
+
+@dataclass(frozen=True, kw_only=True)
+class DesiredAttitude:
+    """The commanded attitude R_c (3, 3), Omega_c (3,) [rad/s] and its derivative (3,) [rad/s^2], in its own axes."""
+
+    attitude: Array
+    rates: Array
+    acceleration: Array
 
 
 class GeometricController(FeedbackLaw):
@@ -129,10 +139,14 @@ class GeometricController(FeedbackLaw):
 
     It commands rotor speeds, or to an autopilot targets: thrust and body rates (4,) [N, rad/s], or these and a
     quaternion wxyz (8,), with rates that are fed forward. With targets, `reset` and `StepInputs.acting` are targets.
+    The law is in C, `quadsim_geometric.c`; the core's allocation turns its wrench into rotor speeds.
 
     Attributes:
         commands: what it commands.
         gains: of its errors.
+        numbers: all that does not change, for C.
+        pointed: the arrays that it points to, by name.
+        observer: of disturbances; None for none.
         k_R: (3,) gains of the attitude error about body x, y, z [1/s^2].
         k_Omega: (3,) gains of the rate error [1/s].
     """
@@ -140,85 +154,116 @@ class GeometricController(FeedbackLaw):
     name: Final = "geometric"
 
     def __init__(self, vehicle: Vehicle, period: float, settings: Geometric) -> None:
-        self.commands, self._targets, self._vehicle = settings.commands, settings.commands != ROTORS, vehicle
+        self.commands, self._targets = settings.commands, settings.commands != ROTORS
         self.gains = gains = geometric_gains(vehicle, period, settings)
-        self._feedforward, self._drag, self._moment = settings.feedforward, np.array(settings.drag), settings.moment
+        self._feedforward, lags = settings.feedforward, settings.inner_lag or NO_LAG
         if settings.moment:
             vehicle.require_moment("controller")
-        self._turning = float(vehicle.hover_speeds.sum())  # of all rotors [rad/s]
-        self._largest_tilt, lags = math.radians(settings.tilt), settings.inner_lag or NO_LAG
-        half = 0.5 * period
-        self._ahead = half + (lags[0] if self._targets else 0.0)  # of the thrust that is fed forward
-        self._lead = np.array(lags[1:]) + (half if settings.feedforward else 0.0)
-        self._observer = None
+        self.observer: RampObserver | None = None
         if settings.disturbance is not None:
             lag = lags[0] if self._targets else None
-            self._observer = RampObserver(
+            self.observer = RampObserver(
                 settings.disturbance, vehicle, period, drag=settings.drag, moment=settings.moment, thrust_lag=lag
             )
-        super().__init__(vehicle, period, settings, target_model(vehicle, period, lags) if self._targets else None)
-        if settings.feedforward:
-            self._operator = differentiator(settings.horizon, period, degree=PREVIEW_DEGREE)
         self.k_R = gains.k_R * np.array([1.0, 1.0, YAW_SHARE**2])
         self.k_Omega = gains.k_Omega * np.array([1.0, 1.0, YAW_SHARE])
         self._allocation = make_allocation(vehicle)
+        self._library = geometric_library()
+        self.pointed = previews(settings, period)
+        self.numbers = geometric_numbers(vehicle, period, settings, gains)
+        set_arrays(self.numbers, k_R=self.k_R, k_Omega=self.k_Omega)
+        self.numbers.preview, self.numbers.course = (array.ctypes.data for array in self.pointed.values())
+        self._law, self._motion, self._target = GeometricStruct(), MotionStruct(), TargetStruct()
+        self._at = ctypes.addressof(self._law)
+        self._here = ctypes.addressof(self._motion), ctypes.addressof(self._target)
+        if self.observer is not None:
+            self.observer.bind(self._law.ramp)
+            self.numbers.ramp = ctypes.addressof(self.observer.numbers)
+        self._library.quadsim_geometric_start(self._at, ctypes.addressof(self.numbers), None)
+        super().__init__(vehicle, period, settings, target_model(vehicle, period, lags) if self._targets else None)
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], or target."""
         super().reset(speeds)
-        self._integrals = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
-        if self._observer is not None:
-            self._observer.reset(speeds[0] if self._targets else speeds)
+        self._library.quadsim_geometric_reset(self._at, self._before.ctypes.data)
 
     def adopt(self, previous: object) -> None:
         """Take over the integrals and the observer of the previous law."""
         if isinstance(previous, GeometricController):
-            self._integrals = previous._integrals
-            if self._observer is not None and previous._observer is not None:
-                self._observer.adopt(previous._observer)
+            set_arrays(self._law, **vars(previous.integrals))
+            if self.observer is not None and previous.observer is not None:
+                self.observer.adopt(previous.observer)
+
+    @property
+    def motion_rows(self) -> int:
+        """Samples that it takes of a course's motion; 0 for none."""
+        return MOTION_SAMPLES if self._feedforward else 0
+
+    @property
+    def integrals(self) -> Integrals:
+        """The integrals now."""
+        return _integrals_of(self._law)
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """Return the law's wrench as rotor speeds, or its targets; the integrals hold while bounds limit it."""
-        exact = self._feedforward or self._observer is not None
-        motion = motion_of(state, now.attitude, now.body_rates) if exact else motion_of(state)
-        target = target_of(reference, self._operator)
-        if self._feedforward and now.motion is not None:
-            yaw = np.array([target.yaw, target.yaw_rate, target.yaw_acceleration])
-            target = target_of_motion(now.motion, yaw, self._period)
-        disturbance = self._observed(now, motion, before)
-        kappa = 1.0 if self._observer is None else self._observer.thrust_scale
+        flying = now.phase is Phase.FLYING
+        self._measure(state, *((now.attitude, now.body_rates) if self.numbers.exact else (None, None)))
+        self._aim(reference, now.motion)
+        follows = flying and self.observer is not None and self.observer.follows(now.time)
+        acting = np.ascontiguousarray(before, np.float64)
+        self._library.quadsim_geometric_solve(self._at, flying, follows, *self._here, acting.ctypes.data)
+        if flying and self.observer is not None:
+            self.observer.log(now)
+        command = np.array(self._law.command[: TARGET_SIZES[self.commands]])
         if self._targets:
-            speeds, desired = self.targets(motion, target, self._integrals, disturbance)
-            speeds[0] /= kappa
-            demanded = speeds[:3].copy()  # translation does not depend on yaw
-            speeds[:4] = self.bounds.clip(speeds[:4], before)
-            attained = np.array_equal(speeds[:3], demanded)
-        else:
-            wrench, desired = self.wrench(motion, target, self._integrals, disturbance)
-            wrench /= kappa
-            lower, upper = self.bounds.reach(before)
-            speeds = allocate(self._allocation, wrench, lower, upper)
-            attained = np.allclose(
-                self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max()
-            )
-        if attained and now.phase is Phase.FLYING:
-            self._integrals = self.integrate(self._integrals, motion, target, desired)
+            return self._held_for_a_period(command)
+        speeds = allocate(self._allocation, command, *self.bounds.reach(before))
+        given, smallest = self._allocation.M @ speeds**2, 1e-6 * self._allocation.scale.max()
+        if flying and np.allclose(given, command, rtol=0.0, atol=smallest):
+            self._library.quadsim_geometric_integrate(self._at, *self._here)
         return self._held_for_a_period(speeds)
 
-    def _observed(self, now: StepInputs, motion: Measured, before: Array) -> Disturbance:
-        """Predict the disturbance in the middle of the period that starts now; zero until the vehicle flies."""
-        if self._observer is None:
-            return UNDISTURBED
-        acting = before[0] if self._targets else before
-        if now.phase is not Phase.FLYING:
-            self._observer.reset(acting)
-            return UNDISTURBED
-        self._observer.update(now.time, motion.velocity, motion.attitude, motion.rates, acting)
-        self._observer.log(now)
-        return self._observer.foreseen(0.5 * self._period)
+    def _measure(self, state: Array, attitude: Array | None, rates: Array | None) -> None:
+        """Take the motion of a state, with the attitude and the body rates that are measured, if they are."""
+        arrays = [
+            None if array is None else np.ascontiguousarray(array, np.float64) for array in (state, attitude, rates)
+        ]
+        addresses = (None if array is None else array.ctypes.data for array in arrays)
+        self._library.quadsim_geometric_measure(*addresses, self._here[0])
+
+    def _aim(self, reference: Array, motion: Motion | None) -> None:
+        """Take the target of a preview (N, 4), with feed-forward that of a motion if the course has one."""
+        numbers = ctypes.addressof(self.numbers)
+        if self._feedforward and motion is not None:
+            samples = slice(self.motion_rows)
+            rows = np.hstack([motion.position[samples], motion.attitude[samples]])
+            self._library.quadsim_geometric_course(numbers, *rows.shape, rows.ctypes.data, self._here[1])
+        else:
+            preview = np.ascontiguousarray(reference, np.float64)
+            self._library.quadsim_geometric_preview(numbers, preview.ctypes.data, self._here[1])
+
+    def target(self, reference: Array, motion: Motion | None = None) -> Target:
+        """Return the target of a preview (N, 4) of x, y, z [m], yaw [rad], or with feed-forward that of a given motion.
+
+        All derivatives of a motion come from positions and attitudes, not from the velocities that a course states, so
+        that they agree with the flown path.  Near the end of the course fewer samples give fewer derivatives.
+        """
+        self._aim(reference, motion)
+        path, yaw = np.array(self._target.path).reshape(-1, 3), list(self._target.yaw)
+        return Target(
+            position=path[0],
+            velocity=path[1],
+            acceleration=path[2],
+            jerk=path[3],
+            snap=path[4],
+            yaw=yaw[0],
+            yaw_rate=yaw[1],
+            yaw_acceleration=yaw[2],
+            heading=np.array(self._target.heading).reshape(3, 3) if self._target.headed else None,
+        )
 
     def wrench(
-        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
+        self, motion: Measured, target: Target, integrals: Integrals, disturbance: ForeseenDisturbance = UNDISTURBED
     ) -> tuple[Array, DesiredAttitude]:
         """Return [f, M_x, M_y, M_z] (4,) [N, N m], and the attitude that the moment turns to.
 
@@ -226,25 +271,18 @@ class GeometricController(FeedbackLaw):
         M = -J (k_R e_R + k_Omega e_Omega + d_Omega) + Omega x J Omega
             - J (hat(Omega) R' R_c Omega_c - R' R_c Omega_c'),
 
-        with the observed disturbance d, d_Omega.  Feed-forward adds the drag at the reference's velocity
-        (`desired_attitude`), and f is that of half a period later.  With `moment`, M also balances `Vehicle.air_moment`
-        at the reference's velocity and rates, with rotor speeds as the root of f.
+        with the errors e_R = (R_c' R - R' R_c)^vee / 2 and e_Omega = Omega - R' R_c Omega_c of Lee et al. (2010), and
+        the observed disturbance d, d_Omega.  R_c has b_3c along A, and b_1c as close to the heading as that allows.
+        Feed-forward adds the drag at the reference's velocity to A and R_c (Faessler et al.), and f is that of half a
+        period later.  With `moment`, M also balances `Vehicle.air_moment` at the reference's velocity and rates, with
+        rotor speeds as the root of f.
 
         Where the limits of tilt or lift change A, the desired attitude counts as constant.
         """
-        J, R, Omega = self._vehicle.momentum, motion.attitude, motion.rates
-        thrust, desired = self._force(motion, target, integrals, disturbance)
-        e_R, e_Omega = attitude_error(R, desired.attitude), rate_error(R, Omega, desired.attitude, desired.rates)
-        R_rel = R.T @ desired.attitude
-        ahead = np.cross(Omega, R_rel @ desired.rates) - R_rel @ desired.acceleration + disturbance[2]
-        moment = np.cross(Omega, J(Omega)) - J(self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
-        if self._moment:
-            turning = self._turning * math.sqrt(max(thrust, 0.0) / (self._vehicle.mass * self._vehicle.gravity))
-            moment -= self._vehicle.air_moment(turning, R.T @ target.velocity, R_rel @ desired.rates)
-        return np.concatenate([[thrust], moment]), desired
+        return self._evaluate(self._library.quadsim_geometric_wrench, 4, motion, target, integrals, disturbance)
 
     def targets(
-        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
+        self, motion: Measured, target: Target, integrals: Integrals, disturbance: ForeseenDisturbance = UNDISTURBED
     ) -> tuple[Array, DesiredAttitude]:
         """Return thrust and body rates (4,) [N, rad/s], for "attitude" (8,) with a quaternion wxyz, and R_c.
 
@@ -260,100 +298,93 @@ class GeometricController(FeedbackLaw):
         the lag in the command.  An autopilot that takes R_c, with feed-forward that of half a period later, adds its
         own k e_R.
         """
-        R, Omega = motion.attitude, motion.rates
-        thrust, desired = self._force(motion, target, integrals, disturbance)
-        R_rel = R.T @ desired.attitude
-        Omega_d = R_rel @ desired.rates
-        rates = Omega_d + self._lead * (R_rel @ desired.acceleration - np.cross(Omega, Omega_d))
-        if self.commands == "rates":
-            rates -= np.array(self.gains.k_attitude) * attitude_error(R, desired.attitude)
-            return np.concatenate([[thrust], rates]), desired
-        q = quaternion_of(desired.attitude)
-        if self._feedforward:
-            q = multiply(q, np.append(1.0, 0.25 * self._period * desired.rates))
-            q /= np.linalg.norm(q)
-        return np.concatenate([[thrust], rates, q]), desired
-
-    def _force(
-        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance
-    ) -> tuple[float, DesiredAttitude]:
-        """Return the thrust [N] along body z, and the desired attitude; see `wrench`."""
-        gains, m, gravity = self.gains, self._vehicle.mass, self._vehicle.gravity
-        R, Omega = motion.attitude, motion.rates
-        e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
-        weight = np.array([0.0, 0.0, gravity])
-        demanded = m * (-gains.k_x * e_x - gains.k_v * e_v - integrals.translation + weight + target.acceleration)
-        demanded -= m * disturbance[0]
-        A = limit_force(demanded, least=LEAST_THRUST_SHARE * m * gravity, tilt=self._largest_tilt)
-        A1 = A2 = p1 = p2 = np.zeros(3)
-        if np.array_equal(A, demanded):
-            A1, A2 = self._force_derivatives(motion, target, A, e_v, disturbance)
-            p1, p2 = m * target.acceleration, m * target.jerk
-        desired = desired_attitude(
-            (A, A1, A2),
-            (m * target.velocity, p1, p2),
-            self._drag,
-            _heading(motion.yaw, target) if target.heading is None else target.heading,
-        )
-        if not self._feedforward:
-            return float(A @ R[:, 2]), desired
-        up = R[:, 2] + self._ahead * R @ np.array([Omega[1], -Omega[0], 0.0])
-        along, along1 = A + m * self._drag[2] * target.velocity, A1 + self._drag[2] * p1
-        return float((along + self._ahead * along1) @ up), desired
+        size = TARGET_SIZES[self.commands]
+        return self._evaluate(self._library.quadsim_geometric_targets, size, motion, target, integrals, disturbance)
 
     def integrate(self, integrals: Integrals, motion: Measured, target: Target, desired: DesiredAttitude) -> Integrals:
         """Return the integrals of e_v + c_1 e_x and e_Omega + c_2 e_R one period later, saturated."""
-        gains, period = self.gains, self._period
-        e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
-        e_R = attitude_error(motion.attitude, desired.attitude)
-        e_Omega = rate_error(motion.attitude, motion.rates, desired.attitude, desired.rates)
-        translation = integrals.translation + period * gains.k_i * (e_v + gains.c_1 * e_x)
-        rotation = integrals.rotation + period * gains.k_I * (e_Omega + gains.c_2 * e_R)
-        return Integrals(
-            translation=np.clip(translation, -gains.sigma, gains.sigma),
-            rotation=np.clip(rotation, -gains.sigma_R, gains.sigma_R),
-        )
+        law, (measured, wanted) = self._copy(integrals), _structs(motion, target)
+        set_arrays(law.desired, **vars(desired))
+        self._library.quadsim_geometric_integrate(*map(ctypes.addressof, (law, measured, wanted)))
+        return _integrals_of(law)
 
-    def _force_derivatives(
-        self, motion: Measured, target: Target, A: Array, e_v: Array, disturbance: Disturbance
-    ) -> tuple[Array, Array]:
-        """Return A' and A'' (3,), by the equations of motion under the law's own thrust, drag and disturbance.
+    def _evaluate(
+        self,
+        law_in_c: Any,
+        size: int,
+        motion: Measured,
+        target: Target,
+        integrals: Integrals,
+        disturbance: ForeseenDisturbance,
+    ) -> tuple[Array, DesiredAttitude]:
+        law, structs, result = self._copy(integrals), _structs(motion, target), np.empty(size)
+        d = DisturbanceStruct()
+        set_arrays(d, **dict(zip(("force", "change", "torque"), disturbance, strict=True)))
+        law_in_c(*map(ctypes.addressof, (law, *structs, d)), result.ctypes.data)
+        attitude, rates, acceleration = (np.array(getattr(law.desired, name)) for name, _ in AttitudeStruct._fields_)
+        return result, DesiredAttitude(attitude=attitude.reshape(3, 3), rates=rates, acceleration=acceleration)
 
-        The disturbance is assumed to change at a constant rate; drag turns with the body.
-        """
-        m, R, Omega, k_x, k_v = self._vehicle.mass, motion.attitude, motion.rates, self.gains.k_x, self.gains.k_v
-        disturbing, change, _ = disturbance
-        up, up1 = R[:, 2], R @ np.array([Omega[1], -Omega[0], 0.0])  # R e_3 and its derivative, R hat(Omega) e_3
-        v_b = R.T @ motion.velocity
-        v_d = R.T @ target.velocity
-        f = max(float(A @ up) + m * self._drag[2] * v_d[2], 0.0)
-        e_a = f / m * up - np.array([0.0, 0.0, self._vehicle.gravity]) - target.acceleration
-        e_a += disturbing - R @ (self._drag * v_b)
-        A1 = -m * (k_x * e_v + k_v * e_a) + m * (target.jerk - change)
-        f1 = float(A1 @ up + A @ up1)
-        e_j = f1 / m * up + f / m * up1 - target.jerk + change
-        if self._drag.any():
-            along = self._drag[2] * (target.acceleration @ up + target.velocity @ up1)
-            v_b1 = R.T @ (e_a + target.acceleration) - np.cross(Omega, v_b)
-            e_j += along * up - R @ (np.cross(Omega, self._drag * v_b) + self._drag * v_b1)
-        return A1, -m * (k_x * e_a + k_v * e_j) + m * target.snap
+    def _copy(self, integrals: Integrals) -> GeometricStruct:
+        """Return the law with other integrals."""
+        law = GeometricStruct.from_buffer_copy(self._law)
+        set_arrays(law, **vars(integrals))
+        return law
 
 
-def _heading(yaw: float, target: Target) -> Array:
-    """(3, 3) rows: the desired horizontal direction of body x, and its first two derivatives.
+def _integrals_of(law: GeometricStruct) -> Integrals:
+    return Integrals(translation=np.array(law.translation), rotation=np.array(law.rotation))
 
-    e_R vanishes at half a turn, where it should be largest.  If the heading error exceeds a quarter turn, the desired
-    heading is a quarter turn away, at rest.
-    """
-    turn = -wrapped(yaw - target.yaw)
-    near = abs(turn) <= 0.5 * math.pi
-    heading = yaw + (turn if near else math.copysign(0.5 * math.pi, turn))
-    rate, acceleration = (target.yaw_rate, target.yaw_acceleration) if near else (0.0, 0.0)
-    along, across = (
-        np.array([math.cos(heading), math.sin(heading), 0.0]),
-        np.array([-math.sin(heading), math.cos(heading), 0.0]),
+
+def _structs(motion: Measured, target: Target) -> tuple[MotionStruct, TargetStruct]:
+    """Return both as C takes them."""
+    measured, wanted = MotionStruct(), TargetStruct()
+    measured.yaw = motion.yaw
+    set_arrays(measured, **{name: getattr(motion, name) for name in ("position", "velocity", "attitude", "rates")})
+    path = (target.position, target.velocity, target.acceleration, target.jerk, target.snap)
+    set_arrays(wanted, path=np.stack(path), yaw=(target.yaw, target.yaw_rate, target.yaw_acceleration))
+    if target.heading is not None:
+        wanted.headed = 1
+        set_arrays(wanted, heading=target.heading)
+    return measured, wanted
+
+
+def previews(settings: Geometric, period: float) -> dict[str, Array]:
+    """Return the differentiators of a `preview`, and of 1, 2, ... `MOTION_SAMPLES` samples of a `course` in a row."""
+    degree = PREVIEW_DEGREE if settings.feedforward else 2
+    counts = range(1, MOTION_SAMPLES + 1)
+    course = [differentiator(count, period, degree=min(MOTION_DEGREE, count - 1), first=0).ravel() for count in counts]
+    preview = differentiator(settings.horizon, period, degree=degree)
+    return {"preview": np.ascontiguousarray(preview), "course": np.concatenate(course)}
+
+
+def geometric_numbers(
+    vehicle: Vehicle, period: float, settings: Geometric, gains: GeometricGains
+) -> GeometricNumbersStruct:
+    """Return the law's numbers for C but for `k_R`, `k_Omega`, and what they point to."""
+    numbers, targets, bounds = GeometricNumbersStruct(), settings.commands != ROTORS, settings.actuators(vehicle)
+    lags, half, weight = settings.inner_lag or NO_LAG, 0.5 * period, vehicle.mass * vehicle.gravity
+    numbers.commands = list(TARGET_SIZES).index(settings.commands)
+    numbers.feedforward, numbers.moment, numbers.horizon = settings.feedforward, settings.moment, settings.horizon
+    numbers.exact = settings.feedforward or settings.disturbance is not None
+    numbers.orders = (PREVIEW_DEGREE if settings.feedforward else 2) + 1
+    numbers.period, numbers.mass, numbers.gravity = period, vehicle.mass, vehicle.gravity
+    for name in ("k_x", "k_v", "k_i", "k_I", "c_1", "c_2", "sigma", "sigma_R"):
+        setattr(numbers, name, getattr(gains, name))
+    numbers.least_lift, numbers.slope = LEAST_THRUST_SHARE * weight, math.tan(math.radians(settings.tilt))
+    numbers.ahead = half + (lags[0] if targets else 0.0)
+    numbers.turning = float(vehicle.hover_speeds.sum())
+    set_arrays(
+        numbers,
+        k_attitude=gains.k_attitude,
+        lead=np.array(lags[1:]) + (half if settings.feedforward else 0.0),
+        drag=settings.drag,
+        inertia=vehicle.inertia_matrix,
+        across=vehicle.rotor_moment or (0.0, 0.0),
+        damping=vehicle.rate_damping or (0.0, 0.0, 0.0),
+        least=bounds.u_min,
+        most=bounds.u_max,
     )
-    return np.stack([along, rate * across, acceleration * across - rate**2 * along])
+    return numbers
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,7 @@ from typing import Final
 import numpy as np
 
 from mpc.nonlinear.model import zero
-from mpc.nonlinear.rigidbody import rotation
 from quadsim.errors import ParameterError
-from quadsim.motion import Motion
 from quadsim.state import Array, read_only
 
 SMALLEST_PREVIEW: Final = 3  # a parabola needs three samples
@@ -70,32 +68,4 @@ def target_of(reference: Array, operator: Array) -> Target:
         yaw_rate=float(rate[3]),
         yaw_acceleration=float(acceleration[3]),
         **{name: each[:3] for name, each in zip(("jerk", "snap"), higher, strict=False)},
-    )
-
-
-def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
-    """Return the target from the present and next samples of a motion and yaw (3,), its rate and acceleration.
-
-    All derivatives come from positions and attitudes, not from the velocities that a course states, so that they agree
-    with the flown path.  Near the end of the course fewer samples give fewer derivatives.
-    """
-    samples = min(len(motion), MOTION_SAMPLES)
-    degree = min(MOTION_DEGREE, samples - 1)
-    operator = differentiator(samples, period, degree=degree, first=0)
-    derivatives = np.zeros((MOTION_DEGREE, 3))  # position to snap
-    orders = min(degree + 1, MOTION_DEGREE)
-    derivatives[:orders] = operator[:orders] @ motion.position[:samples]
-    heading = np.zeros((3, 3))
-    heading[: min(degree + 1, 3)] = operator[:3] @ rotation(motion.attitude[:samples])[:, :, 0]
-    position, velocity, acceleration, jerk, snap = derivatives
-    return Target(
-        position=position,
-        velocity=velocity,
-        acceleration=acceleration,
-        jerk=jerk,
-        snap=snap,
-        yaw=float(yaw[0]),
-        yaw_rate=float(yaw[1]),
-        yaw_acceleration=float(yaw[2]),
-        heading=heading,
     )

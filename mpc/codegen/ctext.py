@@ -78,7 +78,7 @@ class CText:
     def structs(self, kind: str, name: str, structs: Iterable[ctypes.Structure]) -> str:
         """Return a constant array of structs without pointers, that Python mirrors."""
         lines = ["{" + ", ".join(self.mirrored(struct).values()) + "}," for struct in structs]
-        return self._array(kind, name, len(lines), lines)
+        return self._array(kind, name, len(lines), lines or ["{0}"])
 
     def members(self, values: Mapping[str, Any], suffix: str = "") -> tuple[list[str], dict[str, str]]:
         """Return the arrays that a struct's members point to, with names ending in `suffix`, and its initialisers."""

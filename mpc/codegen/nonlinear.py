@@ -95,11 +95,16 @@ class CNonlinear(CSource):
         return self.table.commands
 
     @property
+    def motion_rows(self) -> int:
+        """See `CSource`."""
+        return self.law.motion_rows if self.motion else 0
+
+    @property
     def reference(self) -> tuple[int, int, str]:
         """See `CSource`."""
         if self.motion:
             what = "position, quaternion, velocity, body rates, thrusts of the rotors"
-            return self.horizon + 1, WIDTH_OF_MOTION, what
+            return self.motion_rows, WIDTH_OF_MOTION, what
         return super().reference
 
     @property

@@ -24,6 +24,8 @@ SHARED_FILES: Final = ("quadsim_core.h", "quadsim_math.h", "quadsim_guard.h", "q
 """Files of `mpc/core/c` that every law takes."""
 CORE_FILES: Final = (*SHARED_FILES, "quadsim_core.c", "quadsim_mpc.h", "quadsim_mpc.c")
 """Those of the linear laws."""
+BODY_FILES: Final = ("quadsim_rigid.h",)
+"""Files of `quadsim/core` to export verbatim, for every law."""
 DATA: Final = "quadsim_data.h"
 """The generated file."""
 CHANGES: Final = 500
@@ -81,6 +83,11 @@ class CSource(abc.ABC):
         return ROTORS
 
     @property
+    def motion_rows(self) -> int:
+        """Samples of a motion that are its reference; 0 of a preview."""
+        return 0
+
+    @property
     def reference(self) -> tuple[int, int, str]:
         """Rows of a reference, numbers of a row, and what they are."""
         return self.horizon, len(REFERENCE_STATES), "x y z yaw"
@@ -117,7 +124,8 @@ class CSource(abc.ABC):
     @cached_property
     def files(self) -> dict[str, str]:
         """Its C files, by name."""
-        return {name: part(name, "mpc.core") for name in self.law_files} | {DATA: self.filled(part(DATA))}
+        body = {name: (resources.files("quadsim.core") / name).read_text(encoding="utf-8") for name in BODY_FILES}
+        return {name: part(name, "mpc.core") for name in self.law_files} | body | {DATA: self.filled(part(DATA))}
 
     @property
     def objects(self) -> str:

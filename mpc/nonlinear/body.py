@@ -21,9 +21,11 @@ class ProblemStruct(ctypes.Structure):
     """A `quadsim_nmpc_problem`."""
 
     _fields_ = [
-        *struct_members(INT, "horizon actuators targets speeds substeps difference shifts moves tilts turns places"),
+        *struct_members(
+            INT, "horizon actuators targets speeds moments substeps difference shifts moves tilts turns places"
+        ),
         *struct_members(INT, "rows faces slacks room changes iterations corrections"),
-        *struct_members(REAL, "tolerance step gravity largest effect:16 gyration:3 lead:4"),
+        *struct_members(REAL, "tolerance step gravity largest effect:16 gyration:3 moment:6 damping:9 lead:4"),
         *struct_members(AT, "left"),
         *struct_members(REAL, "weight:21 effort:4 move"),
         *struct_members(AT, "terminal"),
@@ -77,12 +79,14 @@ class World:
 def body_numbers(model: RigidBody, p: ProblemStruct) -> Array:
     """Fill in the rigid body's numbers; return (2 substeps + 1, 4) what p.left points to, which the caller keeps."""
     p.actuators, p.targets, p.speeds = model.actuators, model.targets, model.inputs is Inputs.SPEED
-    p.substeps, p.step, p.gravity = model.substeps, model.step, model.gravity
+    p.moments, p.substeps, p.step, p.gravity = model.moments, model.substeps, model.step, model.gravity
     p.largest = model.mass * model.gravity if model.targets else model.largest_thrust
     ixx, iyy, izz = model.inertia.tolist()
     gyration = (0.0, 0.0, 0.0) if model.targets else ((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz)
     lag = np.array(model.lags)
-    set_arrays(p, effect=model.effect, gyration=gyration, lead=lag / model.step)
+    set_arrays(
+        p, effect=model.effect, gyration=gyration, moment=model.moment, damping=model.damping, lead=lag / model.step
+    )
     instants = np.arange(2 * model.substeps + 1)[:, None] * (0.5 * model.step / model.substeps)
     left = np.where(lag > 0.0, np.exp(-instants / np.where(lag > 0.0, lag, 1.0)), 0.0)
     p.left = left.ctypes.data

@@ -139,7 +139,10 @@ class NonlinearMPC:
             lag=lags,
             drag=self._drag,
             quadratic_drag=np.array(settings.quadratic_drag),
+            moment=settings.moment,
         )
+        if settings.moment:
+            vehicle.require_moment("controller")
         self._level = vehicle.hover_speeds
         if self._targets:
             self._level = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
@@ -165,6 +168,7 @@ class NonlinearMPC:
             tolerance=tolerance,
             faces=0 if space is None else space.count,
             price=None if space is None else space.penalty,
+            time_limit=settings.time_limit,
         )
         observing, ramp = settings.offset_free, settings.disturbance
         self._observer = None if observing is None else DisturbanceObserver(observing, period)
@@ -177,6 +181,7 @@ class NonlinearMPC:
                 period,
                 drag=self._model.drag / vehicle.mass,
                 quadratic_drag=self._model.quadratic_drag / vehicle.mass,
+                moment=settings.moment,
                 thrust_lag=self._lag if self._targets else None,
             )
         # The same body over a control period: from measurement to measurement, and for other plans, without rotor lag.
@@ -188,6 +193,11 @@ class NonlinearMPC:
         self._law = NonlinearLaw(self._law_numbers(), self._sqp, *bodies, self._ramp)
         self._without_lag.world = self._law.world
         self.reset(self._level)
+
+    @property
+    def motion_rows(self) -> int:
+        """Samples that it takes of a course's motion."""
+        return self.horizon + 1
 
     def _shares(self, speeds: Array) -> Array:
         """Return the inputs for commands (..., 4): rotor speeds [rad/s] or targets [N], [rad/s]."""
@@ -517,7 +527,7 @@ class _Start(NamedTuple):
 
 def _converges(make: Callable[..., NonlinearMPC], settings: Nonlinear, start: _Start, iterations: int) -> bool:
     """Return whether a period's plan converges within `iterations`."""
-    law = make(settings=replace(settings, iterations=iterations))
+    law = make(settings=replace(settings, iterations=iterations, time_limit=None))
     law._law.ask(start.world, start.query)
     law._sqp.plan = start.plan
     _, status = law._iterate(start.time)

@@ -198,13 +198,13 @@ def measured_state(now: StepInputs, state: Array) -> Array:
     return measured
 
 
-def reference_rows(now: StepInputs, reference: Array) -> Array:
-    """(N + 1, 17) the motion of a period, or without one its reference (N, 4), as an exported controller takes them."""
-    if now.motion is None:
+def reference_rows(now: StepInputs, reference: Array, rows: int) -> Array:
+    """(M, 17) so many samples of a period's motion, of 0 its reference (N, 4), as an exported controller takes them."""
+    if rows == 0 or now.motion is None:
         return reference
-    rows = np.zeros((len(reference) + 1, WIDTH_OF_MOTION))
-    put_motion(now.motion, rows)
-    return rows
+    samples = np.zeros((rows, WIDTH_OF_MOTION))
+    put_motion(now.motion, samples)
+    return samples
 
 
 def memory_of(numbers: NumbersStruct, problem: ProblemStruct) -> tuple[int, int]:

@@ -4,7 +4,10 @@ The states are position p (world), quaternion q = (w, x, y, z) (Hamilton, body t
 rates omega: 13. With rotor lag, the four rotors' thrusts or speeds are four further states that follow the inputs,
 
     p' = v,    q' = 1/2 q (0, omega),    v' = T R(q) e_z - g e_z + R(q) d(R(q)' v) + a,
-    omega' = I^-1 (tau - omega x I omega) + alpha,    d(v_b) = -(D_1 v_b + D_2 |v_b| v_b) / m, component by component.
+    omega' = I^-1 (tau + tau_a - omega x I omega) + alpha,    d(v_b) = -(D_1 v_b + D_2 |v_b| v_b) / m, by components.
+
+With `moment`, tau_a = (m_x W v_y, -m_y W v_x, 0) - D omega (`Vehicle.air_moment`), with v_b and the sum W of the
+rotors' speeds: roots of thrusts, but below a share of 1 % a parabola, as the root has no derivative at 0.
 
 R(q) is polynomial and not divided by |q|^2, so the derivatives are valid for a q of any length.  Inputs u are the
 rotors' thrusts or speeds as shares of the largest, held between nodes; T = thrust / m and I^-1 tau are known exactly at
@@ -26,7 +29,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Final
 
 import numpy as np
@@ -50,6 +53,10 @@ _FIRST, _SECOND = np.array([10, 6, 7, 6, 5, 11, 7, 11, 5]), np.array([15, 3, 2, 
 _SIGN: Final = np.array([1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
 _EYE: Final = np.eye(3).ravel()
 _OUTER: Final = 1.0 - 2.0 * _EYE
+
+
+def _zeros(columns: int) -> Array:
+    return read_only(np.zeros((3, columns)))
 
 
 class Inputs(StrEnum):
@@ -78,6 +85,8 @@ class RigidBody:
     thrust_scale: float = 1.0  # thrust that acts per thrust of the inputs
     drag: Array = field(default_factory=zero)  # (3,) D_1, linear, body axes [N s/m]
     quadratic_drag: Array = field(default_factory=zero)  # (3,) D_2, body axes [N s^2/m^2]
+    moment: Array = field(default_factory=partial(_zeros, 2))  # (3, 2) maps v_x, v_y [m/s] to I^-1 tau_a per share of W
+    damping: Array = field(default_factory=partial(_zeros, 3))  # (3, 3) I^-1 D [1/s]; neither with targets
     acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
     angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha, body frame [rad/s^2]; none with targets
 
@@ -85,6 +94,11 @@ class RigidBody:
     def drags(self) -> bool:
         """Whether there is drag."""
         return bool(np.any(self.drag) or np.any(self.quadratic_drag))
+
+    @cached_property
+    def moments(self) -> bool:
+        """Whether the air turns the body."""
+        return bool(np.any(self.moment) or np.any(self.damping))
 
     @property
     def targets(self) -> bool:
@@ -130,8 +144,14 @@ class RigidBody:
         return shares if self.inputs is Inputs.THRUST else np.sqrt(np.maximum(shares, 0.0))
 
 
-def rigid_body(vehicle: Vehicle, step: float, **others: object) -> RigidBody:
-    """Return the vehicle's model, undisturbed; `others` sets fields of `RigidBody`."""
+def rigid_body(vehicle: Vehicle, step: float, *, moment: bool = False, **others: object) -> RigidBody:
+    """Return the vehicle's model, undisturbed, with `moment` also in the air's torque; `others` sets other fields."""
+    if moment:
+        still, units = np.zeros(3), np.eye(3)
+        rolls = [vehicle.air_moment(vehicle.speed_max, unit, still) for unit in units[:2]]
+        damped = [vehicle.air_moment(0.0, still, unit) for unit in units]
+        others["moment"] = read_only(vehicle.angular_acceleration(np.array(rolls)).T)
+        others["damping"] = read_only(-vehicle.angular_acceleration(np.array(damped)).T)
     return RigidBody(
         effectiveness=read_only(vehicle.accelerations(vehicle.allocation / vehicle.mean_coefficient)),
         largest_thrust=vehicle.mean_coefficient * vehicle.speed_max**2,

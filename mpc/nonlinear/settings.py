@@ -106,6 +106,13 @@ class Nonlinear(ControllerTable):
         Le(100),
         doc("most steps of sequential quadratic programming in a period; 1: the real-time iteration"),
     ] = 1
+    time_limit: Annotated[
+        Positive | None,
+        doc(
+            "[s] wall-clock time after which a period takes no further step; one is always taken; absent: no limit; "
+            "with one, a flight depends on the machine and is not reproducible"
+        ),
+    ] = None
     shift: Annotated[
         bool | None, doc("whether the last plan is shifted by a node; absent: if a node lasts one period")
     ] = None
@@ -147,6 +154,9 @@ class Nonlinear(ControllerTable):
         0.0,
         0.0,
     )
+    moment: Annotated[
+        bool, doc("whether the prediction has the vehicle's rotor_moment, in still air, and its rate_damping")
+    ] = False
     output_bounds: Annotated[
         dict[str, Pair], doc("[m, m/s] lower and upper bound, of positions and velocities by their states' names")
     ] = field(default_factory=dict)
@@ -190,7 +200,13 @@ class Nonlinear(ControllerTable):
                 rule = f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
                 raise ValueError(rule)
             require_ordered(f"output_bounds.{name}", pair)
-        of_rotors = {"inputs": "thrust", "rotor_lag": 0.0, "indi": None, "input_bounds": VEHICLES_SPEEDS}
+        of_rotors = {
+            "inputs": "thrust",
+            "rotor_lag": 0.0,
+            "moment": False,
+            "indi": None,
+            "input_bounds": VEHICLES_SPEEDS,
+        }
         require_space(self, of_rotors)
         speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
         if speeds and self.commands != ROTORS:

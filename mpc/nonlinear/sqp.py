@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import cache
 from typing import Any, Final, NamedTuple, NoReturn
@@ -50,7 +51,7 @@ class WorkStruct(ctypes.Structure):
 
     _fields_ = [
         *struct_members(AT, "p"),
-        *struct_members(INT, "planned shifted doubtful iterations count changes rounds inner patience"),
+        *struct_members(INT, "planned shifted doubtful iterations count changes rounds inner patience ends"),
         *struct_members(REAL, "defect moved violation share largest least measured:21 start:21 before:4"),
         *struct_members(AT, "x u frame goal aim face beyond map offset end axis known gain inverse feed more s v"),
         *struct_members(AT, "value own response factor multiplier r d price rate origin x_before u_before last"),
@@ -97,6 +98,7 @@ class SQP:
         iterations: most steps in a period.
         corrections: further steps, if the plan misses the dynamics by too much.
         tolerance: change of a state or an input at which further steps end.
+        time_limit: time since `begin` after which no further step is taken [s]; None for none.
         faces: half-spaces of positions per node.
         price: l1 and l2 of leaving the largest of a node's half-spaces; None if they are hard.
 
@@ -104,6 +106,7 @@ class SQP:
         most_rows: active rows at most.
         struct: the program's numbers in the core's layout.
         pointed: the arrays that the struct's members point to, by their names; besides these, `terms`.
+        clock: returns the time [s].
     """
 
     def __init__(
@@ -117,10 +120,13 @@ class SQP:
         iterations: int,
         corrections: int,
         tolerance: float,
+        time_limit: float | None = None,
         faces: int = 0,
         price: tuple[float, float] | None = None,
     ) -> None:
         self._library, self._n, self.horizon = _library(), model.n, problem.horizon
+        self.clock: Callable[[], float] = time.perf_counter
+        self._time_limit, self._deadline = time_limit, math.inf
         self.pointed: dict[str, Array] = {}
         moves = problem.objective.Q_d is not None
         parts = {part.name: part for part in problem.every_constraint}
@@ -248,8 +254,14 @@ class SQP:
 
     def step(self, *asked: Array) -> SQPStatus:
         """Plan from a measured state (n,) after the inputs `before` (4,), along a reference; see `begin`."""
-        self._ask(asked)
-        return SQPStatus(self._library.quadsim_nmpc_step(*self._arguments))
+        if self._time_limit is None:
+            self._ask(asked)
+            return SQPStatus(self._library.quadsim_nmpc_step(*self._arguments))
+        on, status = self.begin(*asked), SQPStatus.NOT_FINITE
+        while on:
+            self.linearise()
+            status, on = self.keep(self.solve())
+        return status
 
     def begin(self, *asked: Array) -> bool:
         """Take a measured state (n,), the inputs `before` (4,) and a reference; False if numbers are not finite.
@@ -260,6 +272,8 @@ class SQP:
                 arrays that it is bound to contain.
         """
         self._ask(asked)
+        if self._time_limit is not None:
+            self._deadline = self.clock() + self._time_limit
         return bool(self._library.quadsim_nmpc_begin(*self._arguments))
 
     def _ask(self, asked: tuple[Array, ...]) -> None:
@@ -277,6 +291,7 @@ class SQP:
     def keep(self, status: SQPStatus) -> tuple[SQPStatus, bool]:
         """Keep the optimum as the plan; return the plan's status, and whether another step should follow."""
         self._status.value = status
+        self._work.ends = self._time_limit is not None and self.clock() >= self._deadline
         on = self._library.quadsim_nmpc_keep(self._at, self._world.address, ctypes.addressof(self._status))
         return SQPStatus(self._status.value), bool(on)
 

@@ -48,6 +48,11 @@ def sources(root: Path = ROOT) -> list[Path]:
     return [file for folder in FOLDERS for file in sorted((root / folder).glob("*.[ch]"))]
 
 
+def include(root: Path = ROOT) -> list[str]:
+    """Return the option for headers of ours that C files of `mpc` include."""
+    return ["-I", str(root / FOLDERS[0])]
+
+
 def stamp(root: Path = ROOT) -> str:
     """Return a text that identifies all that determines the library's bits but the compiler: flags and sources."""
     digest = hashlib.sha256(" ".join(FLAGS).encode())
@@ -113,7 +118,7 @@ def compile_library(root: Path = ROOT) -> Path:
     """
     library = root / LIBRARY
     units = [str(file) for file in sources(root) if file.suffix == ".c"]
-    command = [*compiler(), *FLAGS, f'-DQUADSIM_SOURCES="{stamp(root)}"', *units, "-lm", "-o"]
+    command = [*compiler(), *FLAGS, *include(root), f'-DQUADSIM_SOURCES="{stamp(root)}"', *units, "-lm", "-o"]
     try:
         with tempfile.TemporaryDirectory(dir=library.parent, prefix=f"{library.name}.") as scratch:
             partial = Path(scratch) / library.name

@@ -80,15 +80,16 @@ static void turn_by_inverse(const quadsim_filter *f, const double *torque, doubl
 /* Angular acceleration at body rates under a torque, damped. */
 static void turn_at(const quadsim_filter *f, const double *torque, const double *rates, double *result)
 {
-    const double *J = f->inertia, p = rates[0], q = rates[1], r = rates[2];
+    const double *J = f->inertia, coupling[3] = {(J[1] - J[2]) / J[0], (J[2] - J[0]) / J[1], (J[0] - J[1]) / J[2]};
     double momentum[3], gyroscopic[3], net[3];
     for (int i = 0; i < 3; i++) {
         net[i] = torque[i] - f->rate_damping[i] * rates[i];
     }
     if (is_diagonal(f)) {
-        result[0] = net[0] / J[0] - (J[2] - J[1]) / J[0] * q * r;
-        result[1] = net[1] / J[1] - (J[0] - J[2]) / J[1] * p * r;
-        result[2] = net[2] / J[2] - (J[1] - J[0]) / J[2] * p * q;
+        for (int i = 0; i < 3; i++) {
+            result[i] = net[i] / J[i];
+        }
+        add_gyroscopic(coupling, rates, result);
         return;
     }
     times_inertia(J, f->products, rates, momentum);
@@ -138,12 +139,11 @@ static void predict(const quadsim_filter *f, quadsim_track *t, double accelerati
     const double halfway[3] = {p1, q1, r1};
     const double to_middle[3] = {quarter * (p + p1), quarter * (q + q1), quarter * (r + r1)};
     const double to_end[3] = {h * p1, h * q1, h * r1};
-    double middle[4], turned[4], after[MEAN];
+    double middle[4], turned[4], after[MEAN], R[3][3];
     exponential(to_middle, turned);
     multiply(t->mean + QUATERNION, turned, middle);
-    const double w = middle[0], x = middle[1], y = middle[2], z = middle[3];
-    const double push[3] = {2.0 * a * (x * z + w * y), 2.0 * a * (y * z - w * x),
-                            a * (1.0 - 2.0 * (x * x + y * y)) - f->gravity};
+    rotation_of(middle, 2.0, R);
+    const double push[3] = {a * R[0][2], a * R[1][2], a * R[2][2] - f->gravity};
     for (int i = 0; i < 3; i++) {
         after[i] = t->mean[i] + h * (t->mean[V_ + i] + half * push[i]);
         after[V_ + i] = t->mean[V_ + i] + h * push[i];
@@ -158,16 +158,13 @@ static void predict(const quadsim_filter *f, quadsim_track *t, double accelerati
     after[MEAN_RATES + 2] = r + h * turn[2];
     memcpy(t->mean, after, sizeof after);
 
-    const double lift[3][2] = {{-2.0 * a * (x * y - w * z), a * (1.0 - 2.0 * (y * y + z * z))},
-                               {-a * (1.0 - 2.0 * (x * x + z * z)), 2.0 * a * (x * y + w * z)},
-                               {-2.0 * a * (y * z + w * x), 2.0 * a * (x * z - w * y)}};
     const double turning[3][3] = {{0.0, r1, -q1}, {-r1, 0.0, p1}, {q1, -p1, 0.0}};
     double spinning[3][3];
     turn_slope(f, halfway, spinning);
     square A = {{0.0}}, F = {{0.0}};
     for (int i = 0; i < 3; i++) {
         A[P_ + i][V_ + i] = A[THETA + i][OMEGA + i] = h;
-        A[V_ + i][THETA] = h * lift[i][0], A[V_ + i][THETA + 1] = h * lift[i][1];
+        A[V_ + i][THETA] = h * (-a * R[i][1]), A[V_ + i][THETA + 1] = h * (a * R[i][0]);
         for (int j = 0; j < 3; j++) {
             A[THETA + i][THETA + j] = h * turning[i][j];
             A[OMEGA + i][OMEGA + j] = h * spinning[i][j];
@@ -234,8 +231,8 @@ static void add_rotor_moment(const quadsim_filter *f, const quadsim_track *t, do
     double R[3][3];
     const double *v = t->mean + V_;
     to_matrix(t->mean + QUATERNION, R);
-    torque[0] += f->rotor_moment[0] * turning * (R[0][1] * v[0] + R[1][1] * v[1] + R[2][1] * v[2]);
-    torque[1] -= f->rotor_moment[1] * turning * (R[0][0] * v[0] + R[1][0] * v[1] + R[2][0] * v[2]);
+    torque[0] += f->rotor_moment[0] * turning * along_axis(R, 1, v);
+    torque[1] -= f->rotor_moment[1] * turning * along_axis(R, 0, v);
 }
 
 static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *commands, const uint8_t *grounded, int64_t base,

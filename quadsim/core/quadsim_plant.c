@@ -141,17 +141,6 @@ static double thrust_ratio(double height, double radius)
     return 1.0 / (1.0 - image * image);
 }
 
-static void add_along_axes(const quadsim_vehicle *v, double R[3][3], const double *air, double *force)
-{
-    for (int axis = 0; axis < 3; axis++) {
-        const double along = R[0][axis] * air[0] + R[1][axis] * air[1] + R[2][axis] * air[2];
-        const double pull = -(v->linear_drag[axis] + v->quadratic_drag[axis] * fabs(along)) * along;
-        for (int i = 0; i < 3; i++) {
-            force[i] += pull * R[i][axis];
-        }
-    }
-}
-
 static void add_pushes(const quadsim_vehicle *v, double R[3][3], double *wrench)
 {
     for (int64_t k = 0; k < v->pushing; k++) {
@@ -159,7 +148,7 @@ static void add_pushes(const quadsim_vehicle *v, double R[3][3], double *wrench)
         double body[3], torque[3];
         for (int i = 0; i < 3; i++) {
             wrench[i] += f[i];
-            body[i] = R[0][i] * f[0] + R[1][i] * f[1] + R[2][i] * f[2];
+            body[i] = along_axis(R, i, f);
         }
         cross(v->pushes[k].point, body, torque);
         for (int i = 0; i < 3; i++) {
@@ -208,7 +197,7 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
                       const double *wind, double *wrench)
 {
     const double *rate = velocity + 3;
-    double R[3][3], air[3], along[2];
+    double R[3][3], air[3], along[3], pull[3];
     to_matrix(pose + 3, R);
     for (int i = 0; i < 3; i++) {
         air[i] = velocity[i] - wind[i];
@@ -216,7 +205,7 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
         wrench[3 + i] = -v->rate_damping[i] * rate[i];
     }
     for (int i = 0; i < 2; i++) {
-        along[i] = R[0][i] * air[0] + R[1][i] * air[1] + R[2][i] * air[2];
+        along[i] = along_axis(R, i, air);
     }
     wrench[3] -= rate[1] * rotors->momentum;
     wrench[4] += rate[0] * rotors->momentum;
@@ -229,7 +218,7 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
             wrench[i] += R[i][0] * x + R[i][1] * y;
         }
     }
-    add_along_axes(v, R, air, wrench);
+    add_air_drag(v->linear_drag, v->quadratic_drag, R, air, along, pull, wrench);
     wrench[3] += v->rotor_moment[0] * (along[1] * rotors->turning + rate[2] * rotors->turning_x);
     wrench[4] -= v->rotor_moment[1] * (along[0] * rotors->turning - rate[2] * rotors->turning_y);
     add_height(v, R, along, rate, rotors->speed, wrench);
@@ -243,20 +232,15 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
 static void forces_midway(quadsim_vehicle *v, const rotor_state *rotors, const double *wind, double *wrench)
 {
     const double half = 0.5 * v->timestep, *pose = v->motion, *q = pose + 3;
-    double velocity[6], ahead[7];
+    double velocity[6], ahead[7], rate[4];
     for (int i = 0; i < 6; i++) {
         velocity[i] = v->velocity[i] + 0.5 * (v->velocity[i] - v->before[i]);
         v->before[i] = v->velocity[i];
     }
-    const double w = q[0], x = q[1], y = q[2], z = q[3], quarter = 0.5 * half;
-    const double a = velocity[3], b = velocity[4], c = velocity[5];
-    for (int i = 0; i < 3; i++) {
-        ahead[i] = pose[i] + half * velocity[i];
+    quaternion_rate(q, velocity + 3, rate);
+    for (int i = 0; i < 7; i++) {
+        ahead[i] = pose[i] + half * (i < 3 ? velocity[i] : rate[i - 3]);
     }
-    ahead[3] = w - quarter * (x * a + y * b + z * c);
-    ahead[4] = x + quarter * (w * a + y * c - z * b);
-    ahead[5] = y + quarter * (w * b + z * a - x * c);
-    ahead[6] = z + quarter * (w * c + x * b - y * a);
     forces_at(v, ahead, velocity, rotors, wind, wrench);
 }
 
@@ -283,7 +267,7 @@ static void derive(const quadsim_vehicle *v, const double *x, const rotor_state 
                    const double *held, double *wrench, double *rate)
 {
     const double *q = x + 3, *w = x + 10, *T = rotors->thrust, *J = v->inertia, m = v->mass;
-    double torque[3], load[WRENCH], momentum[3], gyroscopic[3];
+    double torque[3], load[WRENCH], momentum[3], gyroscopic[3], axis[3];
     const double lift = T[0] + T[1] + T[2] + T[3];
     forces_at(v, x, x + 7, rotors, wind, wrench);
     for (int i = 0; i < 3; i++) {
@@ -293,13 +277,12 @@ static void derive(const quadsim_vehicle *v, const double *x, const rotor_state 
         load[3 + i] = wrench[3 + i] + held[3 + i];
         rate[i] = x[7 + i];
     }
-    rate[3] = -0.5 * (q[1] * w[0] + q[2] * w[1] + q[3] * w[2]);
-    rate[4] = 0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1]);
-    rate[5] = 0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2]);
-    rate[6] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0]);
-    rate[7] = (2.0 * (q[1] * q[3] + q[0] * q[2]) * lift + load[0]) / m;
-    rate[8] = (2.0 * (q[2] * q[3] - q[0] * q[1]) * lift + load[1]) / m;
-    rate[9] = ((1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2])) * lift + load[2]) / m - v->gravity;
+    quaternion_rate(q, w, rate + 3);
+    thrust_axis(q, axis);
+    for (int i = 0; i < 3; i++) {
+        rate[7 + i] = (axis[i] * lift + load[i]) / m;
+    }
+    rate[9] -= v->gravity;
     if (v->products[0] != 0.0 || v->products[1] != 0.0 || v->products[2] != 0.0) {
         times_inertia(J, v->products, w, momentum);
         cross(w, momentum, gyroscopic);
@@ -311,9 +294,14 @@ static void derive(const quadsim_vehicle *v, const double *x, const rotor_state 
         }
         return;
     }
-    rate[10] = (torque[0] + load[3] - (J[2] - J[1]) * w[1] * w[2]) / J[0];
-    rate[11] = (torque[1] + load[4] - (J[0] - J[2]) * w[2] * w[0]) / J[1];
-    rate[12] = (torque[2] + load[5] - (J[1] - J[0]) * w[0] * w[1]) / J[2];
+    const double coupling[3] = {J[1] - J[2], J[2] - J[0], J[0] - J[1]};
+    for (int i = 0; i < 3; i++) {
+        torque[i] += load[3 + i];
+    }
+    add_gyroscopic(coupling, w, torque);
+    for (int i = 0; i < 3; i++) {
+        rate[10 + i] = torque[i] / J[i];
+    }
 }
 
 static void step_runge_kutta(quadsim_vehicle *v, const rotor_state *rotors, const double *wind, const double *disturbance,

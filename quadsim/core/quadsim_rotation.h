@@ -4,6 +4,12 @@
 
 #include <math.h>
 
+typedef double real;
+
+#define R(number) number
+
+#include "quadsim_rigid.h"
+
 /* Angular momentum of body rates: J x, J of moments (3) and products xy, xz, yz of inertia (3). */
 static inline void times_inertia(const double *moments, const double *products, const double *x, double *result)
 {
@@ -98,16 +104,7 @@ static inline void cross(const double *a, const double *b, double *product)
 /* Body to world, of a quaternion that need not be of unit length. */
 static inline void to_matrix(const double *q, double R[3][3])
 {
-    const double w = q[0], x = q[1], y = q[2], z = q[3], s = 2.0 / (w * w + x * x + y * y + z * z);
-    R[0][0] = 1.0 - s * (y * y + z * z);
-    R[0][1] = s * (x * y - w * z);
-    R[0][2] = s * (x * z + w * y);
-    R[1][0] = s * (x * y + w * z);
-    R[1][1] = 1.0 - s * (x * x + z * z);
-    R[1][2] = s * (y * z - w * x);
-    R[2][0] = s * (x * z - w * y);
-    R[2][1] = s * (y * z + w * x);
-    R[2][2] = 1.0 - s * (x * x + y * y);
+    rotation_of(q, 2.0 / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]), R);
 }
 
 #endif

@@ -95,6 +95,7 @@ def vehicle_report(
     /,
     *,
     template: Flag = False,
+    thrust_stand: File | None = None,
     scenario: ScenarioName | None = None,
     out: File | None = None,
     overwrite: Flag = False,
@@ -104,13 +105,15 @@ def vehicle_report(
     Args:
         name: shipped vehicle's name, or path to a TOML file.
         template: print a commented vehicle file to fill in instead.
+        thrust_stand: CSV table of one rotor on a stand (rpm or throttle, thrust [N], torque [N m]): print the vehicle's
+            file, or the template, with the numbers that it gives, and the fit.
         scenario: scenario whose bounds the vehicle may be unable to meet; they are listed.
         out: PNG file for a picture of the vehicle on a floor of 10 cm squares.
         overwrite: replace an existing file.
 
     Returns:
         The vehicle's parameters with their sources, the `figures` derived from them, and the `shortfalls` if a scenario
-        is given; or the template.
+        is given; or the `content` of a vehicle file.
 
     Raises:
         InputError: the vehicle or scenario does not exist, the vehicle cannot fly, or the file does not end in .png.
@@ -132,8 +135,19 @@ def vehicle_report(
     from scenarios.assembly import stated_autopilot
     from scenarios.design import shortfalls, vehicle_report
 
+    blank = Path(__file__).with_name("vehicle_template.toml")
+    if thrust_stand is not None:
+        for option, value in {"--template": template, "--scenario": scenario, "--out": out}.items():
+            if value:
+                raise ParameterError("", "--thrust-stand", str(thrust_stand), f"given without {option}")
+        start = blank if name is None else vehicle_path(str(name))
+        if name is not None:
+            load_vehicle(start)
+        from scenarios.design.thrust_stand import stand_vehicle_text
+
+        return results.Document(*stand_vehicle_text(Path(thrust_stand), start.read_text(encoding="utf-8-sig")))
     if template:
-        return results.Document((Path(__file__).with_name("vehicle_template.toml")).read_text(encoding="utf-8"))
+        return results.Document(blank.read_text(encoding="utf-8"))
     if name is None:
         names = ", ".join(vehicle_names())
         raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")

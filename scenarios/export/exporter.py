@@ -11,10 +11,12 @@ from typing import Any, Final, get_args
 
 import numpy as np
 
+from mpc.baselines.geometric import Geometric
 from mpc.bounded import Weighted
 from mpc.codegen.ctext import CText, Precision
+from mpc.codegen.geometric import CGeometric
 from mpc.codegen.nonlinear import CNonlinear
-from mpc.codegen.source import CHANGES, DATA, CController, CSource, part
+from mpc.codegen.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
 from mpc.codegen.targets import TARGETS, Machine
 from mpc.core.numbers import AVOIDS, Exportable, exportable
 from mpc.core.solver import CoreProblem, Work, core_library
@@ -133,6 +135,11 @@ def reach(whole: Solves, limited: Solves, draws: int = DRAWS) -> Reach:
     return reached
 
 
+WARM: Final = """Solve once before take-off: the first step starts without an active set and takes the most changes of
+it.  `quadsim_law_changes(&law)` is the number in each step.
+
+"""
+"""What the README says of a solver."""
 FACTS: Final = "export.json"
 """File with an export's memory and the range of its room."""
 
@@ -200,21 +207,21 @@ def c_controller(scenario: Scenario | Assembly, precision: Precision = "double",
     assembly = scenario if isinstance(scenario, Assembly) else Assembly(scenario)
     scenario = assembly.scenario
     table, title = scenario.controller, _title(scenario)
-    if not isinstance(table, Nonlinear):
+    if not isinstance(table, Nonlinear | Geometric):
         return CController(law=exported_law(scenario), precision=precision, title=title, asked=rows)
-    if table.avoidance is not None and (scenario.obstacles or assembly.regions):
+    if isinstance(table, Nonlinear) and table.avoidance is not None and (scenario.obstacles or assembly.regions):
         raise ExportError(AVOIDS)
     if table.commands != ROTORS and table.inner_lag is None:
         table = replace(table, inner_lag=assembly.inner_lag)
-    return CNonlinear(
-        table=table,
-        vehicle=assembly.vehicle,
-        control_period=scenario.control_period,
-        motion=assembly.motion is not None,
-        precision=precision,
-        title=title,
-        asked=rows,
-    )
+    shared: dict[str, Any] = {
+        **{"vehicle": assembly.vehicle, "control_period": scenario.control_period},
+        **{"motion": assembly.motion is not None, "precision": precision, "title": title, "asked": rows},
+    }
+    if isinstance(table, Geometric):
+        if rows is not None:
+            raise ParameterError("", "--rows", rows, "left out: a geometric controller solves no problem")
+        return CGeometric(table=table, **shared)
+    return CNonlinear(table=table, **shared)
 
 
 def exported_law(scenario: Scenario) -> Exportable:
@@ -226,29 +233,27 @@ def exported_law(scenario: Scenario) -> Exportable:
     controller, shapes = scenario.controller, (*scenario.obstacles, *scenario.regions)
     if not isinstance(controller, Weighted):
         how = "" if controller.commands == ROTORS else f' with commands = "{controller.commands}"'
-        raise ExportError(
-            f"it is {controller.type!r}{how}; exported are unconstrained, constrained, robust and nonlinear"
-        )
+        exported = "exported are unconstrained, constrained, robust, nonlinear, and geometric of rates"
+        raise ExportError(f"it is {controller.type!r}{how}; {exported}")
     return exportable(controller, Assembly(scenario).vehicle, scenario.control_period, shapes)
 
 
 def _facts(controller: CSource) -> dict[str, Any]:
-    room = controller.rows + 1
+    room, size = controller.rows + 1, {"precision": controller.precision, "memory_bytes": controller.memory_bytes}
+    if isinstance(controller, CGeometric):
+        return size
     if isinstance(controller, CNonlinear):
         found = reach(nonlinear_search(controller, 0, 0), nonlinear_search(controller, room, CHANGES), DRAWS // 4)
     else:
         assert isinstance(controller, CController)
         found = reach(LinearSearch(controller, 0, 0), LinearSearch(controller, room, CHANGES))
-    return {
-        "precision": controller.precision,
-        "rows": controller.rows,
-        "memory_bytes": controller.memory_bytes,
-        "reach": asdict(found),
-    }
+    return size | {"rows": controller.rows, "reach": asdict(found)}
 
 
 def room_sentence(facts: Mapping[str, Any]) -> str:
     """Return the memory of the room for active rows, and the distance from the reference up to which it suffices."""
+    if "rows" not in facts:
+        return f"{facts['memory_bytes']} bytes of memory"
     return f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory; {Reach(**facts['reach'])}"
 
 
@@ -290,20 +295,23 @@ def vector_files(recording: Recording, controller: CSource) -> dict[str, str]:
 
 def _readme(scenario: Scenario, controller: CSource, room: str) -> str:
     precision, law = controller.precision, controller.law_name
-    sources = ", ".join(f"`{name}`" for name in controller.law_files if not name.startswith(("quadsim_guard", law)))
+    solves_none = isinstance(controller, CGeometric)
+    what = "geometric" if solves_none else "model predictive"
+    files = *controller.law_files, *BODY_FILES
+    sources = ", ".join(f"`{name}`" for name in files if not name.startswith(("quadsim_guard", law)))
     return f"""# {_title(scenario)}
 
-A model predictive controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
+A {what} controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
 called every {scenario.control_period:g} s.  It needs nothing but a compiler: no allocation, no recursion, no global
 state, and of the C library `memcpy`, `memmove` and `memset`.
 
 | file | is |
 |---|---|
 | `{law}.h` | the interface: state order, units, frames |
-| `{law}.c`, {sources} | the law and its solver, the same for every controller of its kind |
+| `{law}.c`, {sources} | the law, the same for every controller of its kind |
 | `quadsim_guard.{{h,c}}` | what is flown without an answer of the law, and the completion of lacking measurements |
 | `{DATA}` | this controller's numbers, and the memory that it needs |
-| `{FACTS}` | what it takes, and how far its room for active rows suffices |
+| `{FACTS}` | what it takes{"" if solves_none else ", and how far its room for active rows suffices"} |
 | `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
 | `main.c`, `Makefile` | `make check` runs these periods and compares |
 | `serial.c` | the controller behind a serial line, with checksums and a watchdog: a start for an integration |
@@ -320,7 +328,6 @@ status = quadsim_law_step(&law, QUADSIM_PHASE_FLYING, state, reference, acting, 
 
 {room[0].upper()}{room[1:]}.
 
-Solve once before take-off: the first step starts without an active set and takes the most changes of it.
-`quadsim_law_changes(&law)` is the number in each step.  Compile with `-ffp-contract=off`, and every processor gives
+{"" if solves_none else WARM}Compile with `-ffp-contract=off`, and every processor gives
 the same bits{", and with `-DQUADSIM_FLOAT`, as the Makefile does" if precision == "float" else ""}.
 """

@@ -244,6 +244,7 @@ class MPCInTheLoop:
         self.commands, self.ways = source.commands, [0] * len(STATUSES)
         self._serial = SerialMPC(line, Frames(source.precision, source.state, source.reference[1]))
         self._before, self._bounds, self._whole = np.zeros(N_ROTORS), source.bounds, source.state > N_STATES
+        self._rows = source.motion_rows
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
@@ -263,7 +264,7 @@ class MPCInTheLoop:
             return stopped(self._before.copy(), self.horizon, now.phase)
         kind: Solving = QueryKind.STEP if now.phase is Phase.FLYING else QueryKind.STAND
         if self._whole:
-            state, reference = measured_state(now, state), reference_rows(now, reference)
+            state, reference = measured_state(now, state), reference_rows(now, reference, self._rows)
         reply = self._serial.step(now.time, state, reference, acting, kind)
         self._before, status = reply.command, STATUSES[reply.status]
         self.ways[reply.status] += 1

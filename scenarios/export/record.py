@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mpc.baselines.geometric import GeometricController
 from mpc.bounded import Bounded, Weighted
 from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
@@ -26,7 +27,9 @@ from scenarios.assembly import Assembly
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
-MPC = LinearMPC | UnconstrainedMPC | NonlinearMPC
+RecordedLaw = LinearMPC | UnconstrainedMPC | NonlinearMPC | GeometricController
+QUATERNIONS: Final = (NonlinearMPC, GeometricController)
+"""Laws that take quaternion and body rates, as exported too."""
 REFUSED: Final = len(Method)  # least status of a period without an optimum
 
 
@@ -52,11 +55,11 @@ class _Asked(NamedTuple):
 
 
 class Recorder:
-    """An MPC whose questions are noted: from where the flight begins to where it ends, or where a measurement lacks."""
+    """A law whose questions are noted: from where the flight begins to where it ends, or where a measurement lacks."""
 
-    def __init__(self, inner: MPC) -> None:
+    def __init__(self, inner: RecordedLaw) -> None:
         self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
-        self.commands = inner.commands if isinstance(inner, NonlinearMPC) else ROTORS
+        self.commands = inner.commands if isinstance(inner, QUATERNIONS) else ROTORS
         self.asked: list[_Asked] = []
         self._before, self._ended = np.zeros(4), False
 
@@ -90,7 +93,7 @@ def record(scenario: Scenario) -> Recording:
         scenario = scenario.replace({"controller.solver": CORE})
     pilot = Assembly(scenario).controller()
     law = pilot.law
-    assert isinstance(law, MPC)
+    assert isinstance(law, RecordedLaw)
     pilot.law = recorder = Recorder(law)
     Rollout(scenario, pilot).fly()
     asked = recorder.asked
@@ -98,7 +101,8 @@ def record(scenario: Scenario) -> Recording:
         raise ExportError("its flight has no period in the air, with everything measured, to record")
     status, commands = _answers(law, scenario.control_period, asked)
     known = len(status)
-    windows = [reference_rows(query.now, query.reference) for query in asked[:known]]
+    rows = law.motion_rows if isinstance(law, QUATERNIONS) else 0
+    windows = [reference_rows(query.now, query.reference, rows) for query in asked[:known]]
     return Recording(
         before=asked[0].acting,
         state=np.array([_measured(law, query) for query in asked[:known]]),
@@ -109,12 +113,12 @@ def record(scenario: Scenario) -> Recording:
     )
 
 
-def _measured(law: MPC, query: _Asked) -> Array:
+def _measured(law: RecordedLaw, query: _Asked) -> Array:
     """Return a state as an exported controller takes it."""
-    return measured_state(query.now, query.state) if isinstance(law, NonlinearMPC) else query.state
+    return measured_state(query.now, query.state) if isinstance(law, QUATERNIONS) else query.state
 
 
-def _answers(law: MPC, period: float, asked: list[_Asked]) -> tuple[NDArray[np.int64], Array]:
+def _answers(law: RecordedLaw, period: float, asked: list[_Asked]) -> tuple[NDArray[np.int64], Array]:
     """Status (K,) and command (K, 4) of a controller for these queries after its reset.
 
     They end before the first period whose optimum is known as a solver's approximation alone.
@@ -137,9 +141,9 @@ def _answers(law: MPC, period: float, asked: list[_Asked]) -> tuple[NDArray[np.i
     return np.array(status), np.array(commands)
 
 
-def _found(law: LinearMPC | NonlinearMPC, command: Command) -> int:
+def _found(law: LinearMPC | NonlinearMPC | GeometricController, command: Command) -> int:
     """Return the status of an optimum, as of `enum quadsim_status`."""
-    if isinstance(law, NonlinearMPC):
+    if isinstance(law, QUATERNIONS):
         return STATUSES.index(command.status) if command.status != SOLVED else Method.WHOLE
     assert law.answer is not None
     return law.answer.method

@@ -14,8 +14,8 @@ from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.identify.axes import check_axes
 from scenarios.identify.clocks import check_clocks
-from scenarios.identify.columns import RPM
-from scenarios.identify.record import INPUTS, Record, driver
+from scenarios.identify.quantities import RPM
+from scenarios.identify.record import INPUTS, SLOWEST_COMMANDS, Record, driver
 from scenarios.identify.rotor_order import check_rotor_order
 from scenarios.identify.scales import check_scales
 from scenarios.identify.windows import body_z, rate_over_window
@@ -28,7 +28,6 @@ SLOW, CALM = 0.3, 0.5
 CONSTANT: Final = 3e-3  # share of the outputs below which their change in a second is none
 STILL: Final = 1e-3  # share of the largest output below which a rotor's outputs do not change
 MOST_REPEATED: Final = 0.05  # share of rows that may repeat the one before
-SLOWEST_COMMANDS: Final = 20.0  # [Hz] at which the rotors' outputs must be logged
 GOOD_RATE: Final = 50.0  # [Hz] below which lag and inertias are poor
 FACTOR: Final = 1.8  # by which hover speed in the log and by the start may differ
 NOTED_FACTOR: Final = 1.4
@@ -58,7 +57,10 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     if np.count_nonzero(logged) > 1:
         _check_rows(record, logged)
     shortest = round(SHORTEST_SPAN / record.period)
-    aloft = _runs(logged, shortest) and _runs(logged & ~_grounded(record, logged, vehicle.gravity), shortest)
+    flying = np.ones_like(logged) if record.flying is None else record.flying
+    if not (logged & flying).any() and logged.any():
+        raise InputError(f"{record.name}: never flies: by its autopilot it is disarmed or landed all the time")
+    aloft = _runs(logged, shortest) and _runs(logged & flying & ~_grounded(record, logged, vehicle.gravity), shortest)
     longest = max((part.stop - part.start for part in aloft), default=0) * record.period
     if longest >= LEAST * (1.0 - 1e-6):
         return aloft
@@ -85,10 +87,12 @@ def _check_rows(record: Record, logged: NDArray[np.bool_]) -> None:
     if still.any():
         rotors = " and ".join(str(i + 1) for i in np.flatnonzero(still))
         raise InputError(f"{name}: the outputs of rotor {rotors} never change while the others do: log all four")
-    for field, columns in (("rates", "wx wy wz"), ("velocity", "vx vy vz")):
+    for field, columns in (("rates", "wx wy wz"), ("velocity", "vx vy vz"), ("attitude", "qw qx qy qz")):
         rows = getattr(record, field)[logged]
         frozen = [c for c, moved in zip(columns.split(), np.ptp(rows, axis=0) > 0.0, strict=True) if not moved]
-        if 0 < len(frozen) < 3 and (rows[0, [columns.split().index(c) for c in frozen]] != 0.0).any():
+        if len(frozen) == rows.shape[1]:
+            raise InputError(f"{name}: {', '.join(frozen)} stand still while the motors run: log what was measured")
+        if frozen and field != "attitude" and (rows[0, [columns.split().index(c) for c in frozen]] != 0.0).any():
             raise InputError(f"{name}: {', '.join(frozen)} stands still while the others change: log all three axes")
     moving = np.concatenate([record.rates, record.attitude], axis=1)[logged]
     repeated = float((np.diff(moving, axis=0) == 0.0).all(axis=1).mean())
@@ -102,8 +106,12 @@ def _check_rows(record: Record, logged: NDArray[np.bool_]) -> None:
         raise InputError(
             f"{name}: the rotors' outputs change {rate:.3g} times per second, and rates are logged "
             f"{1.0 / record.period:.3g} times: log the outputs as often as they are sent, "
-            f"{SLOWEST_COMMANDS:g} times or more"
+            f"{SLOWEST_COMMANDS:g} times or more{_advised(record)}"
         )
+
+
+def _advised(record: Record) -> str:
+    return f" ({record.advice})" if record.advice else ""
 
 
 def check_log(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str, ...]:
@@ -199,7 +207,8 @@ def _poor(record: Record, parts: Sequence[slice]) -> Iterator[str]:
         share, first = 100.0 * (1.0 - logged.mean()), record.t[np.argmin(logged)]
         yield f"{record.name}: {share:.2g} % of its samples, left out, are in gaps, the first at t = {first:.4g} s"
     if record.period > (1.0 + 1e-6) / GOOD_RATE:
-        yield f"{record.name}: {1.0 / record.period:.3g} Hz; below {GOOD_RATE:g} Hz, lag and inertias will be poor"
+        poor = f"{1.0 / record.period:.3g} Hz; below {GOOD_RATE:g} Hz, lag and inertias will be poor"
+        yield f"{record.name}: {poor}{_advised(record)}"
     for field in INPUTS[:2]:
         if (rows := getattr(record, field)) is not None:
             flown = np.concatenate([rows[part] for part in parts])

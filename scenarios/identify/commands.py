@@ -22,19 +22,22 @@ def identify(
     page: File | None = None,
     overwrite: Flag = False,
     poles: Whole | None = None,
+    columns: File | None = None,
     wind: Flag = False,
     anyway: Flag = False,
 ) -> IdentifiedVehicle:
     """Identify a vehicle from flight logs: its file, with an interval for every number.
 
     Args:
-        logs: flights of one vehicle: CSV, Parquet, ULog, or run directories.
+        logs: flights of one vehicle: CSV, Parquet, logs of PX4, ArduPilot, Betaflight or Crazyflie, bags of ROS, or run
+            directories.
         vehicle: start: a vehicle's name, or path to a TOML file with its mass, arm length and rotor layout.
         test: log to predict and not to fit; may be repeated (default: the last fifth of each log, which is not fitted).
         out: TOML file for the identified vehicle (default: none is written).
         page: HTML file for the page: intervals, and measured against predicted.
         overwrite: replace existing files.
         poles: magnets of a motor, where a log has its electrical speed.
+        columns: TOML file that says which columns of the logs are which quantity, in which unit, sign and frame.
         wind: seek the wind too; where no position is logged, that is always done.
         anyway: write the vehicle file even where the start, or the thrust alone, predicts better.
 
@@ -53,14 +56,18 @@ def identify(
         quadsim.errors.FileError: not-logged-yet.csv: is missing, or not a file
     """
     from quadsim.assets import vehicle_path
+    from scenarios.identify.quantities import read_map
     from scenarios.identify.report import NEEDED_PARAMETERS, identify_logs
+    from scenarios.identify.ulog import stated_rotors
 
     if not logs:
-        raise InputError("identify needs a flight log: CSV, Parquet, ULog, or a run directory")
+        raise InputError("identify needs a flight log: CSV, Parquet, an autopilot's, or a run directory")
     if vehicle is None:
+        rotors = next((rotors for log in logs if (rotors := stated_rotors(Path(log)))), "")
         raise InputError(
             "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template > start.toml"
             f" writes one; give your {NEEDED_PARAMETERS}, and estimates of the rest"
+            + (f". The log has the rotors, in place of arm_length and rotor_azimuths: {rotors}" if rotors else "")
         )
     for name, path, ending in (("--out", out, ".toml"), ("--page", page, ".html")):
         if path is not None and Path(path).suffix != ending:
@@ -70,6 +77,7 @@ def identify(
         raise ParameterError("", "--test", str(both[0]), "a log that is not fitted too")
     files = {name: None if path is None else Path(path) for name, path in (("out", out), ("page", page))}
     start = vehicle_path(str(vehicle))
+    meaning = () if columns is None else read_map(Path(columns))
     return identify_logs(
-        fitted, start, test=tested, poles=poles, overwrite=overwrite, wind=wind, anyway=anyway, **files
+        fitted, start, test=tested, poles=poles, columns=meaning, overwrite=overwrite, wind=wind, anyway=anyway, **files
     )

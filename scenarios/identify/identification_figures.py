@@ -11,13 +11,23 @@ from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import Figure, Panel, Series
 from quadsim.state import shown_unit
 from scenarios.identify.estimate import ParameterEstimate
-from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, PredictionErrors, Trace
+from scenarios.identify.prediction import (
+    HORIZONS,
+    IDENTIFIED,
+    QUANTITIES,
+    RESIDUAL_AFTER,
+    START,
+    THRUST_ONLY,
+    PredictionErrors,
+    Trace,
+)
 
 _COLOURS: Final = dict(zip((IDENTIFIED, THRUST_ONLY, START), CYCLE, strict=False))
 _TRACED: Final = (
     *((f"v{axis}, world", "m/s") for axis in "xyz"),
     *((f"{axis} rate", "rad/s") for axis in ("roll", "pitch", "yaw")),
 )
+_COLUMNS: Final = (0, 3, 1, 4, 2, 5)  # velocities in the left one
 
 
 def interval_figure(estimates: Sequence[ParameterEstimate]) -> Figure:
@@ -72,7 +82,7 @@ def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)
     t = trace.t - trace.t[0, 0]
     gap = np.full((len(t), 1), np.nan)
     panels = []
-    for i in (0, 3, 1, 4, 2, 5):  # velocities in the left column
+    for i in _COLUMNS:
         title, (unit, scale) = _TRACED[i][0], shown_unit(_TRACED[i][1])
         predicted = (
             Series(
@@ -101,3 +111,20 @@ def horizon_figure(prediction: PredictionErrors) -> Figure:
         )
         panels += [Panel(title=quantity, unit=unit, x_label="horizon [s]", series=series)] if series else []
     return Figure(key="horizon", title="mean error over the horizon", panels=tuple(panels))
+
+
+def residual_figure(prediction: PredictionErrors) -> Figure:
+    """Return what is left of velocity and body rates, axis by axis, of the identified vehicle and of thrust alone."""
+    panels = []
+    for i in _COLUMNS:
+        title, (unit, scale) = _TRACED[i][0], shown_unit(_TRACED[i][1])
+        series = []
+        for name in (THRUST_ONLY, IDENTIFIED):
+            left = scale * prediction.residuals[name][:, i]
+            series.append(
+                Series(x=prediction.ends, y=left, colour=_COLOURS[name], label=name, style="points", width=3.0)
+            )
+        title += f": RMS {float(np.sqrt(np.square(left).mean())):.2g}"  # of the identified vehicle
+        panels.append(Panel(title=title, unit=unit, x_label="held-out flight [s]", series=tuple(series), height=0.7))
+    title = f"measured less predicted after {RESIDUAL_AFTER:g} s; RMS of the identified vehicle"
+    return Figure(key="residuals", title=title, panels=tuple(panels))

@@ -27,6 +27,7 @@ from scenarios.identify.rotors import Turning
 
 PREDICTION_WINDOW: Final = 0.5  # longest horizon [s]; windows start every half of it
 HORIZONS: Final = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)  # at which errors are taken [s]
+RESIDUAL_AFTER: Final = 0.25  # [s] from a window's start
 JUDGED: Final = (0.1, 0.25, 0.5)  # horizons of the verdict [s]
 TIE: Final = 0.05  # by which the errors of a quantity may exceed a rival's, in their geometric mean over the horizons
 IDENTIFIED, START, THRUST_ONLY = "identified", "start", "thrust only"
@@ -34,6 +35,7 @@ QUANTITIES: Final = {"position": "m", "velocity": "m/s", "attitude": "rad", "bod
 ROTOR_FIELDS: Final = ("commands", "throttle", "speeds", "voltage")  # what a record may say of them
 _HELD_OUT: Final = 0.2  # share of the airborne samples of a log
 _DRIFT: Final = 5.0  # [s] over which a velocity by the accelerometer is left out
+_RESIDUAL: Final = HORIZONS.index(RESIDUAL_AFTER)
 _SHOWN: Final = 10  # windows in a trace
 _VELOCITY_AND_RATES: Final = [3, 4, 5, 10, 11, 12]  # of a state
 
@@ -56,6 +58,9 @@ class PredictionErrors:
     errors: Mapping[str, Array]
     """By model: (len(HORIZONS), 4) mean norm of the error, in the order of `QUANTITIES`; NaN without what they need."""
     trace: Trace
+    ends: Array  # (W,) time at which each window's residual is taken, log after log [s]
+    residuals: Mapping[str, Array]
+    """By model: (W, 6) measured less predicted velocity, world [m/s], and body rates [rad/s] after `RESIDUAL_AFTER`."""
 
     def ratios(self, rival: str) -> dict[str, tuple[float, ...]]:
         """Errors of the identified vehicle over a rival's at `JUDGED`, by quantity that the logs have."""
@@ -120,7 +125,8 @@ def predict(
         InputError: no span is as long as a window.
     """
     errors: dict[str, list[Array]] = {name: [] for name in (IDENTIFIED, START, THRUST_ONLY)}
-    traces = []
+    residuals: dict[str, list[Array]] = {name: [] for name in errors}
+    traces, ends, begun = [], [], 0.0
     for flight, record, span in (
         (i, record, span) for i, (record, own) in enumerate(zip(records, spans, strict=True)) for span in own
     ):
@@ -137,7 +143,11 @@ def predict(
             states = _simulate(model, start, rotors, rows, measured, record.period, turns=name != THRUST_ONLY)
             errors[name].append(_errors(states[:, at], measured[:, at]))
             errors[name][-1][..., 1] *= np.nan if record.inertial else 1.0
+            residuals[name].append((measured - states)[:, at[_RESIDUAL], _VELOCITY_AND_RATES])
             drawn_states[name] = states[drawn]
+        taken = record.t[rows[:, at[_RESIDUAL]]]
+        ends.append(begun + taken - taken[0])
+        begun = float(ends[-1][-1]) + PREDICTION_WINDOW
         traces.append(
             Trace(log=record.name, t=record.t[rows[: 2 * _SHOWN : 2]], measured=measured[drawn], predicted=drawn_states)
         )
@@ -151,6 +161,8 @@ def predict(
         windows=len(whole[IDENTIFIED]),
         errors={name: of.mean(axis=0) for name, of in whole.items()},
         trace=max(traces, key=lambda trace: len(trace.t)),
+        ends=np.concatenate(ends),
+        residuals={name: np.concatenate(parts) for name, parts in residuals.items()},
     )
 
 

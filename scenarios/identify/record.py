@@ -2,29 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array
-from scenarios.identify.columns import TABLE_SUFFIXES, read_columns
-from scenarios.identify.series import SampledSeries
-from scenarios.identify.ulog import ULOGS, read_ulog
-from scenarios.identify.windows import to_world
+from scenarios.identify import crazyflie, ulog
+from scenarios.identify.bags import read_bag
+from scenarios.identify.blackbox import read_blackbox
+from scenarios.identify.dataflash import read_dataflash
+from scenarios.identify.inertial import filled_in, integrated_velocity, levelled_attitude
+from scenarios.identify.quantities import LoggedColumns, NamedQuantity, to_series
+from scenarios.identify.series import Column, SampledSeries, held
+from scenarios.identify.tables import read_columns
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
+SLOWEST_COMMANDS: Final = 20.0  # [Hz] at which the rotors' outputs must be logged
+FASTEST_RATE: Final = 250.0  # [Hz] above which samples are averaged: none of the parameters is as fast
+SLOWEST_VELOCITY: Final = 0.04  # period [s] of a velocity above which an accelerometer knows it better
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
-_GRAVITY: Final = 9.81  # [m/s^2] of what an accelerometer shows at rest
-_UP: Final = 0.07  # by which the mean force may differ from the weight
-_FORCES: Final = ((1.0 / _GRAVITY, "in g"), (-1.0, "z points down"), (-1.0 / _GRAVITY, "in g, z points down"))
-"""Mean force over the weight, and its usual causes."""
 INPUTS: Final = ("commands", "throttle", "speeds")
+
+
+class LogFormat(NamedTuple):
+    """A kind of file that is a log."""
+
+    suffixes: tuple[str, ...]
+    first_bytes: tuple[bytes, ...]  # which also tell it
+    read: Callable[[Path, Sequence[NamedQuantity]], LoggedColumns]
+
+
+FORMATS: Final = (
+    LogFormat((".csv", ".parquet"), (), read_columns),
+    LogFormat(ulog.ULOGS, (b"ULog",), ulog.read_ulog),
+    LogFormat((".bbl", ".bfl"), (b"H Product:Blackbox",), read_blackbox),
+    LogFormat((), crazyflie.FIRST_BYTES, crazyflie.read_crazyflie),
+    LogFormat((".bag", ".mcap", ".db3"), (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3"), read_bag),
+    LogFormat((".bin",), (b"\xa3\x95",), read_dataflash),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +66,11 @@ class Record:
     throttle: Array | None = None  # (N, 4) the same as a share of full throttle [-]; one of these three is there
     speeds: Array | None = None  # (N, 4) measured rotor speeds [rad/s]
     voltage: Array | None = None  # (N,) of the battery [V]
+    flying: NDArray[np.bool_] | None = None  # (N,) whether its autopilot was armed and not landed
     inertial: bool = False
     """Whether an accelerometer stands in for the velocity, which then has its changes, but neither mean nor drift."""
     notes: tuple[str, ...] = ()  # what was derived or assumed in reading it
+    advice: str = ""  # how its autopilot logs more
 
     @property
     def period(self) -> float:
@@ -60,42 +84,60 @@ def driver(record: Record) -> Array:
     return np.asarray(rows)
 
 
-def read_record(path: Path | str, *, poles: int | None = None) -> Record:
-    """Read a log: a CSV or Parquet table, a run directory of quadsim or its `flight.parquet`, or PX4's ULog.
+def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence[NamedQuantity] = ()) -> Record:
+    """Read a log: a table, a run directory of quadsim or its `flight.parquet`, or an autopilot's log.
 
     Args:
         path: file or run directory.
-        poles: magnets of each motor, for a table of electrical speeds: eRPM / (poles / 2) = rpm.
+        poles: magnets of each motor, for electrical speeds: eRPM / (poles / 2) = rpm.
+        columns: a map of its columns (`scenarios.identify.quantities.read_map`).
 
     Raises:
         FileError: it is missing or damaged, or lacks a column; the message names what is allowed.
-        MissingPackageError: a ULog is to be read without pyulog.
+        MissingPackageError: its format needs a library that is not installed.
         InputError: its clock stands still or goes back, or it has fewer than 10 samples per second.
     """
     given = Path(path)
-    file = given / FLIGHT_FILE if given.is_dir() else given
-    if not file.is_file():
+    bag = (given / "metadata.yaml").is_file()  # of ROS 2, a directory
+    file = given / FLIGHT_FILE if given.is_dir() and not bag else given
+    if not (file.is_file() or bag):
         raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
-    kind = file.suffix.lower()
-    if kind not in (*TABLE_SUFFIXES, *ULOGS):
-        raise FileError(given, f"is not a log that can be read (these can: {', '.join((*TABLE_SUFFIXES, *ULOGS))})")
-    if kind in ULOGS and poles is not None:
-        raise InputError(f"{given.name}: a ULog has no eRPM that poles could turn into speeds; leave poles out")
-    series = read_ulog(file) if kind in ULOGS else read_columns(file, poles=poles)
-    return to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series)
+    read = _format_of(file).read
+    if read is not read_columns and any(one.quantity == "t" for one in columns):
+        raise InputError(f"{given.name}: has a clock of its own; leave [t] out of the map")
+    log = read(file, columns)
+    series = to_series(file, log, columns, poles)
+    record = to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series)
+    return replace(record, advice=log.advice, notes=(*log.notes, *record.notes))
+
+
+def _format_of(file: Path) -> LogFormat:
+    if file.is_dir():
+        return next(of for of in FORMATS if of.read is read_bag)
+    try:
+        with file.open("rb") as opened:
+            first = opened.read(64)
+    except OSError as error:
+        raise FileError(file, f"cannot be read ({error})") from error
+    by_bytes = (of for of in FORMATS if first.startswith(of.first_bytes))
+    by_suffix = (of for of in FORMATS if file.suffix.lower() in of.suffixes)
+    if (found := next(by_bytes, None) or next(by_suffix, None)) is None:
+        suffixes = ", ".join(suffix for of in FORMATS for suffix in of.suffixes)
+        raise FileError(file, f"is not a log that can be read (these can: {suffixes}, and those of a Crazyflie)")
+    return found
 
 
 def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
     """Sample the series of a log, by field of `Record`, on one uniform clock.
 
     Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
-    has no gaps: it changes slowly.
+    has no gaps: it changes slowly; nor has `flying`, which changes rarely.
     """
-    voltage = series.get("voltage")
-    series = {field: samples for field, samples in series.items() if field != "voltage"}
+    voltage, flying = series.get("voltage"), series.get("flying")
+    series = {field: samples for field, samples in series.items() if field not in ("voltage", "flying")}
     for field, samples in series.items():
         _check_clock(name, field, samples.t)
-    force = series.pop("force", None)
+    force = series.pop("specific_force", None)
     optional = ("position", *INPUTS)
     series = {f: s for f, s in series.items() if f not in optional or np.isfinite(s.values).all(axis=1).any()}
     notes: tuple[str, ...] = ()
@@ -109,40 +151,45 @@ def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
         slope = np.gradient(place.values, place.t, axis=0)
         series = {**series, "velocity": SampledSeries(t=place.t, values=slope)}
         notes = (f"{name}: no velocity is logged; it is the central difference of the position",)
+    if "attitude" not in series:
+        assert force is not None
+        gyro = series["rates"]
+        known = np.stack([np.interp(gyro.t, force.t, column) for column in force.values.T], axis=1)
+        series["attitude"] = SampledSeries(t=gyro.t, values=levelled_attitude(gyro.t, gyro.values, known))
+        notes = (*notes, f"{name}: no attitude is logged; it is the gyro's, levelled by the accelerometer")
     turn = series["attitude"]
     series = {**series, "attitude": replace(turn, values=_continuous(name, turn.values))}
     grid = _clock(name, series)
-    values = {field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()}
+    values: dict[str, Any] = {
+        field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()
+    }
     values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
+    period = float(grid[1] - grid[0])
     if inertial:
-        values["velocity"] = _integrated(name, values["velocity"], values["attitude"], float(grid[1] - grid[0]))
+        values["velocity"] = integrated_velocity(name, values["velocity"], values["attitude"], period)
+    elif force is not None and (slow := _usual_period(series["velocity"].t)) > SLOWEST_VELOCITY:
+        shown = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
+        values["velocity"] = filled_in(values["velocity"], shown, round(2.0 * slow / period))
+        notes = (*notes, f"{name}: the velocity is logged at {1.0 / slow:.3g} Hz; the accelerometer fills it in")
     if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
         values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
-    return Record(name=name, t=grid, notes=notes, inertial=inertial, **values)
+    if len(grid) > 10 * (size := int(1.0 / (FASTEST_RATE * period))) > 20:
+        grid, values = _thinned(grid, values, size - 1 + size % 2)
+        values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
+        rates = f"{1.0 / period:.0f} Hz, of which means at {1.0 / (grid[1] - grid[0]):.0f} Hz are used"
+        notes = (*notes, f"{name}: {rates}")
+    aloft = None if flying is None else held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
+    return Record(name=name, t=grid, flying=aloft, notes=notes, inertial=inertial, **values)
 
 
-def _integrated(name: str, force: Array, attitude: Array, period: float) -> Array:
-    """Velocity (N, 3), but for its drift, by specific force (N, 3), body, and attitude (N, 4); NaN in gaps.
-
-    Raises:
-        InputError: the mean force does not carry the weight.
-    """
-    world = to_world(attitude, force)
-    there = np.asarray(np.isfinite(world).all(axis=1))
-    if not there.any():
-        return world
-    up = float(np.mean(world[there, 2])) / _GRAVITY
-    if not 1.0 / (1.0 + _UP) < up < 1.0 + _UP:
-        likely = next((what for of, what in _FORCES if abs(up / of - 1.0) < _UP), "not the specific force in body axes")
-        raise InputError(
-            f"{name}: ax, ay, az carry {up:.3g} times the weight in the mean, 1 within {_UP:.0%} is allowed: likely "
-            f"{likely}; give the specific force in m/s^2, x forward, y left, z up"
-        )
-    rest = np.where(there[:, None], world - [0.0, 0.0, _GRAVITY], 0.0)
-    rest -= rest[there].mean(axis=0)
-    steps = np.zeros_like(rest)
-    steps[1:] = 0.5 * period * (rest[1:] + rest[:-1])
-    return np.where(there[:, None], np.cumsum(steps, axis=0), np.nan)
+def _thinned(grid: Array, values: Mapping[str, Array], size: int) -> tuple[Array, dict[str, Any]]:
+    """The mean of every `size` samples, odd, about their middle; of what is held, from there to the next middle."""
+    count, half, means = len(grid) // size - 1, size // 2, {}
+    for field, rows in values.items():
+        begin = half if field in INPUTS[:2] else 0
+        blocks = rows[begin : begin + count * size]
+        means[field] = blocks.reshape(count, size, *rows.shape[1:]).mean(axis=1)
+    return grid[half : half + count * size : size], means
 
 
 def _check_clock(name: str, field: str, t: Array) -> None:
@@ -186,11 +233,17 @@ def _usual_period(t: Array) -> float:
 
 
 def _clock(name: str, series: Mapping[str, SampledSeries]) -> Array:
-    """The common clock: of the rates or of the commands, whichever is slower; where all fields have samples."""
+    """The common clock: of the rates or of the commands, whichever is slower; where all fields have samples.
+
+    Commands that are logged too rarely do not count: the checks name them.
+    """
     driver = next((field for field in INPUTS if field in series), None)
     if driver is None:
         raise InputError(f"{name}: its commands, throttle and speeds have no row with a number for each rotor")
-    slower = max((series["rates"].t, series[driver].t), key=_usual_period)
+    clocks = [series["rates"].t, series[driver].t]
+    if driver != "speeds" and _usual_period(clocks[1]) > 1.0 / (0.9 * SLOWEST_COMMANDS):
+        del clocks[1]
+    slower = max(clocks, key=_usual_period)
     period = _usual_period(slower)
     if 1.0 / period < 0.95 * SLOWEST_RATE:
         raise InputError(

@@ -22,7 +22,12 @@ from quadsim.vehicle import Vehicle, load_vehicle
 from scenarios.identify.checks import check_log, spans
 from scenarios.identify.estimate import Identification, ParameterEstimate
 from scenarios.identify.fit import identify_records
-from scenarios.identify.identification_figures import horizon_figure, interval_figure, trace_figure
+from scenarios.identify.identification_figures import (
+    horizon_figure,
+    interval_figure,
+    residual_figure,
+    trace_figure,
+)
 from scenarios.identify.prediction import (
     HORIZONS,
     JUDGED,
@@ -33,6 +38,7 @@ from scenarios.identify.prediction import (
     hold_out,
     predict,
 )
+from scenarios.identify.quantities import NamedQuantity
 from scenarios.identify.record import read_record
 from scenarios.identify.vehicle_file import interval_text, rounded, vehicle_text, verdict
 from scenarios.results import Result, Shown, after
@@ -186,6 +192,7 @@ def identify_logs(
     *,
     test: Sequence[Path] = (),
     poles: int | None = None,
+    columns: Sequence[NamedQuantity] = (),
     out: Path | None = None,
     page: Path | None = None,
     overwrite: bool = False,
@@ -196,7 +203,7 @@ def identify_logs(
     places = {name: None if path is None else require_file(path, overwrite=overwrite)
               for name, path in (("file", out), ("page", page))}  # fmt: skip
     vehicle = load_vehicle(start)
-    records, tested = ([read_record(path, poles=poles) for path in paths] for paths in (logs, test))
+    records, tested = ([read_record(path, poles=poles, columns=columns) for path in paths] for paths in (logs, test))
     for one, other in itertools.combinations([*records, *tested], 2):
         if np.array_equal(one.rates, other.rates):
             raise InputError(f"{one.name} and {other.name} are the same flight: name it once")
@@ -244,7 +251,7 @@ def _render(result: IdentifiedVehicle) -> str:
     """Return the page as HTML."""
     parameters, errors = result.tables()
     trace = result.prediction.trace
-    figures = (trace_figure(trace), horizon_figure(result.prediction))
+    figures = (trace_figure(trace), residual_figure(result.prediction), horizon_figure(result.prediction))
     return render_page(
         "identification",
         f"Identified: {result.vehicle.name}",

@@ -22,6 +22,7 @@ CORNER: Final = 6.0  # [Hz], a tenth of the log's rate if that is less
 _EDGE: Final = 0.5  # [s] at the ends of a stretch that the filter disturbs
 _BLOCK: Final = 3.0  # [s] that are left out in turn
 _FEWEST: Final = 6  # blocks
+_SAG: Final = 0.005  # share of the voltage that it must change by to show what it does
 
 
 class RotorResponse(NamedTuple):
@@ -41,14 +42,16 @@ def rotor_response(parts: Sequence[Stretch], vehicle: Vehicle, voltage: float) -
         voltage: at which the throttle curve holds [V].
 
     Returns:
-        `rotor_rise`, `rotor_fall` and `delay` [s], and where the log has throttle and voltage `throttle_curve` and
+        `rotor_rise`, `rotor_fall` and `delay` [s], and where the log shows them, `throttle_curve` and
         `voltage_exponent`.
     """
     record = parts[0].record
     lag = vehicle.rotor_rise or vehicle.rotor_fall or 0.03
     start = {"rotor_rise": lag, "rotor_fall": lag, "delay": 0.0}
     start |= {"throttle_curve": 1.0} if record.commands is None else {}
-    start |= {"voltage_exponent": 1.0} if record.voltage is not None else {}
+    voltages = [part.record.voltage for part in parts if part.record.voltage is not None]
+    sags = bool(voltages) and np.ptp(np.concatenate(voltages)) > _SAG * voltage
+    start |= {"voltage_exponent": 1.0} if sags else {}
     period, edge = record.period, round(_EDGE / record.period)
     low_pass = butter(2, min(CORNER, 0.1 / period), fs=1.0 / period, output="sos")
     speeds = [np.asarray(part.record.speeds) for part in parts]

@@ -1,97 +1,116 @@
-"""PX4's ULog as a log: world NED and body FRD become z up, x forward and y left."""
+"""PX4's ULog, read by pyulog."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from quadsim.errors import FileError, MissingPackageError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.identify.columns import RPM
-from scenarios.identify.series import SampledSeries
+from scenarios.identify.libraries import reading
+from scenarios.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, logged_as
+from scenarios.identify.series import Column, held, on_one_clock
 
 ULOGS: Final = (".ulg", ".ulog")
-HALF_TURN: Final = np.array([1.0, -1.0, -1.0])  # about x: NED to north, west, up; FRD to x forward, y left, z up
-_VECTOR: Final = tuple(f"xyz[{i}]" for i in range(3))
-_QUATERNION: Final = tuple(f"q[{i}]" for i in range(4))
 _ROTORS: Final = range(N_ROTORS)
-_TOPICS: Final[dict[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
-    "rates": (
-        ("vehicle_angular_velocity", _VECTOR),
-        ("sensor_combined", tuple(f"gyro_rad[{i}]" for i in range(3))),
-    ),
-    "attitude": (("vehicle_attitude", _QUATERNION),),
-    "position": (("vehicle_local_position", ("x", "y", "z")),),
-    "velocity": (("vehicle_local_position", ("vx", "vy", "vz")),),
-    "throttle": (("actuator_motors", tuple(f"control[{i}]" for i in _ROTORS)),),
-    "pwm": (("actuator_outputs", tuple(f"output[{i}]" for i in _ROTORS)),),
-    "speeds": (("esc_status", tuple(f"esc[{i}].esc_rpm" for i in _ROTORS)),),
-    "voltage": (("battery_status", ("voltage_v",)),),
-}
-"""Topics of each quantity and their fields, the best first."""
-_PULSES: Final = (
-    (1000.0, ("PWM_MAIN_MIN1", "PWM_MAIN_MIN", "PWM_MIN")),
-    (2000.0, ("PWM_MAIN_MAX1", "PWM_MAIN_MAX", "PWM_MAX")),
+_NAMES: Final = (
+    logged_as("rates", "vehicle_angular_velocity.xyz[{}]", down=True),
+    logged_as("rates", "sensor_combined.gyro_rad[{}]", down=True),
+    logged_as("attitude", "vehicle_attitude.q[{}]", down=True),
+    logged_as("position", "vehicle_local_position.{}", each="x y z", down=True),
+    logged_as("velocity", "vehicle_local_position.v{}", each="x y z", down=True),
+    logged_as("specific_force", "sensor_combined.accelerometer_m_s2[{}]", down=True),
+    logged_as("specific_force", "vehicle_acceleration.xyz[{}]", down=True),
+    logged_as("throttle", "actuator_motors.control[{}]"),
+    logged_as("throttle", "actuator_outputs.output[{}]", unit="us"),
+    logged_as("speeds", "esc_status.esc[{}].esc_rpm", unit="rpm"),
+    logged_as("voltage", "battery_status.voltage_v"),
+    NamedQuantity(quantity="flying", columns=("flying",)),
 )
-"""Shortest and longest pulse of a motor [us]: what is usual, and the parameters that say otherwise."""
-_NEEDED: Final = (("rates",), ("attitude",), ("velocity",), ("throttle", "pwm", "speeds"))
+_STATES: Final = ("actuator_armed", "vehicle_land_detected")
+_ADVICE: Final = "set SDLOG_PROFILE to 17, the default set and the high rate"
+_FIRST_MOTOR: Final = 101  # of PWM_MAIN_FUNCn
 
 
-def read_ulog(path: Path) -> dict[str, SampledSeries]:
-    """Read the series of a ULog by field of `scenarios.identify.record.Record`.
+def read_ulog(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+    """Read the topics of a ULog that are used: columns `topic.field`, each on the clock of its measurement.
 
     Raises:
         MissingPackageError: pyulog is not installed.
-        FileError: it is not a ULog, or lacks a topic.
+        FileError: it is not a ULog.
     """
-    try:
+    log = _parsed(path, [*_STATES, *(column.partition(".")[0] for one in (*given, *_NAMES) for column in one.columns)])
+    columns: dict[str, Column] = {}
+    for data in sorted(log.data_list, key=lambda data: data.multi_id, reverse=True):  # the first instance of each
+        stamps = data.data.get("timestamp_sample", data.data["timestamp"])
+        stamps = np.asarray(stamps if np.any(stamps) else data.data["timestamp"], float)
+        columns |= on_one_clock(stamps * 1e-6, {f"{data.name}.{name}": of for name, of in data.data.items()})
+    columns |= {name: Column(of.t, np.abs(of.values)) for name, of in columns.items() if name.endswith("esc_rpm")}
+    if flying := _flying(columns):
+        columns["flying"] = flying
+    pulses = _by_pulses(log.initial_parameters)
+    names = [replace(one, **pulses) if one.columns[0] == "actuator_outputs.output[0]" else one for one in _NAMES]
+    return LoggedColumns(columns=columns, quantities=names, advice=_ADVICE)
+
+
+def stated_rotors(path: Path) -> str:
+    """Return the rotors by a ULog's CA_ROTOR parameters, lines of a vehicle file; empty without, and of other logs.
+
+    PX4 has them front, right, down, and a positive moment for a rotor that turns counter-clockwise from above.
+
+    Raises:
+        MissingPackageError: pyulog is not installed.
+        FileError: it is not a ULog.
+    """
+    if path.suffix.lower() not in ULOGS or not path.is_file():
+        return ""
+    stated = _parsed(path, _STATES).initial_parameters
+    if int(stated.get("CA_ROTOR_COUNT", 0)) != N_ROTORS:
+        return ""
+    hubs = [[float(stated.get(f"CA_ROTOR{i}_P{axis}", 0.0)) for axis in "XYZ"] for i in _ROTORS]
+    moments = np.array([float(stated.get(f"CA_ROTOR{i}_KM", 0.05)) for i in _ROTORS])
+    values = {
+        "rotor_positions": ((np.round(np.array(hubs) * HALF_TURN, 4) + 0.0).tolist(), "m"),
+        "rotor_spins": ([-1 if moment > 0.0 else 1 for moment in moments], "-"),
+        "drag_to_thrust": (round(float(np.abs(moments).mean()), 4), "m"),
+    }
+    return "; ".join(
+        f'{name} = {{value = {value}, unit = "{unit}", source = "CA_ROTOR of {path.name}"}}'
+        for name, (value, unit) in values.items()
+    )
+
+
+def _parsed(path: Path, topics: Sequence[str]) -> Any:
+    with reading(path, "ULog", "pyulog"), path.open("rb") as file:  # which pyulog leaves open where it fails
         from pyulog import ULog
-    except ModuleNotFoundError as error:
-        raise MissingPackageError("a ULog", "pyulog", extra="logs") from error
-    names = sorted({topic for ways in _TOPICS.values() for topic, _ in ways})
-    try:
-        with path.open("rb") as file:  # which pyulog leaves open where it fails
-            log = ULog(file, names)
-    except Exception as error:  # pyulog raises whatever its parsing meets
-        raise FileError(path, f"is not a readable ULog ({str(error)[:80]})") from error
-    instances = sorted(log.data_list, key=lambda data: data.multi_id, reverse=True)
-    topics = {data.name: data.data for data in instances}  # the first instance of each
-    series = {field: found for field, ways in _TOPICS.items() if (found := _series(ways, topics)) is not None}
-    for needed in _NEEDED:
-        if not {*needed} & {*series}:
-            ways = " or ".join(topic for field in needed for topic, _ in _TOPICS[field])
-            raise FileError(path, f"lacks the topic {ways}; of those used it has {', '.join(topics) or 'none'}")
-    pwm = series.pop("pwm", None)
-    if pwm is not None and "throttle" not in series:
-        low, high = (
-            float(next((log.initial_parameters[name] for name in names if name in log.initial_parameters), usual))
-            for usual, names in _PULSES
-        )
-        series["throttle"] = SampledSeries(t=pwm.t, values=(pwm.values - low) / (high - low))
-    for field in ("rates", "velocity", "position"):
-        if field in series:
-            series[field] = SampledSeries(t=series[field].t, values=series[field].values * HALF_TURN)
-    turn = series["attitude"]
-    series["attitude"] = SampledSeries(t=turn.t, values=turn.values * [1.0, *HALF_TURN])
-    if "speeds" in series:
-        rpm = series.pop("speeds")
-        if np.abs(rpm.values).max() > 0.0:  # speed controllers without telemetry report zeros
-            series["speeds"] = SampledSeries(t=rpm.t, values=np.abs(rpm.values) * RPM)
-    return series
+
+        return ULog(file, [*topics])
 
 
-def _series(ways: tuple[tuple[str, tuple[str, ...]], ...], topics: dict[str, Any]) -> SampledSeries | None:
-    """The first of the topics that is there with all its fields, on the clock of its measurement."""
-    for topic, fields in ways:
-        data: dict[str, Array] = topics.get(topic, {})
-        if {*fields} <= {*data}:
-            stamps = data.get("timestamp_sample", data["timestamp"])
-            t = np.asarray(stamps if np.any(stamps) else data["timestamp"], float) * 1e-6
-            _, rows = np.unique(t, return_index=True)  # an estimator may publish one sample twice
-            return SampledSeries(
-                t=t[rows], values=np.stack([np.asarray(data[name], float)[rows] for name in fields], axis=1)
-            )
-    return None
+def _flying(columns: Mapping[str, Column]) -> Column | None:
+    """Whether it is armed and not landed, as far as the log says so."""
+    states = {"actuator_armed.armed": 1.0, "vehicle_land_detected.landed": 0.0}
+    known = [(columns[name], flying) for name, flying in states.items() if name in columns]
+    if not known:
+        return None
+    t = np.unique(np.concatenate([column.t for column, _ in known]))
+    return Column(t, np.prod([held(column, t) == flying for column, flying in known], axis=0).astype(float))
+
+
+def _by_pulses(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Which outputs are the motors, and their shortest and longest pulses [us]; a negative one is the common one."""
+    functions = {int(parameters.get(f"PWM_MAIN_FUNC{i + 1}", 0)) - _FIRST_MOTOR: i for i in range(2 * N_ROTORS)}
+    outputs = [functions.get(motor, motor) for motor in _ROTORS]
+
+    def pulses(end: str, usual: float) -> Array:
+        names = [(f"PWM_MAIN_{end}{i + 1}", f"PWM_MAIN_{end}", f"PWM_{end}") for i in outputs]
+        stated = ([float(parameters[name]) for name in ways if name in parameters] for ways in names)
+        return np.array([next((pulse for pulse in of if pulse >= 0.0), usual) for of in stated])
+
+    low, high = pulses("MIN", 1000.0), pulses("MAX", 2000.0)
+    columns = tuple(f"actuator_outputs.output[{i}]" for i in outputs)
+    return {"columns": columns, "zero": low, "scale": 1.0 / np.maximum(high - low, 1.0)}

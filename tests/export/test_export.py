@@ -12,8 +12,9 @@ import scipy.linalg
 
 import quadsim
 from mpc.codegen.ctext import CText
+from mpc.codegen.geometric import CGeometric
 from mpc.codegen.nonlinear import FILES as NONLINEAR_FILES
-from mpc.codegen.source import CORE_FILES, DATA
+from mpc.codegen.source import BODY_FILES, CORE_FILES, DATA
 from mpc.condensing import Condensed
 from mpc.core.solver import Core
 from mpc.core.tables import AxisTables, tables
@@ -70,10 +71,14 @@ def test_any_horizon_is_exported(horizon: int) -> None:
 
 def test_the_core_is_exported_byte_for_byte(tmp_path: Path) -> None:
     directory = quadsim.export(quadsim.load("hover", SHORT), tmp_path / "c")
-    folder = Path(__file__).parents[2] / "mpc" / "core" / "c"
-    assert {path.name for path in folder.iterdir()} - {"sizes.c"} == {*CORE_FILES, *NONLINEAR_FILES}
+    root = Path(__file__).parents[2]
+    folder = root / "mpc" / "core" / "c"
+    laws = {*CORE_FILES, *NONLINEAR_FILES, *CGeometric.law_files}
+    assert {path.name for path in folder.iterdir()} - {"sizes.c"} == laws
     for name in CORE_FILES:
         assert (directory / name).read_bytes() == (folder / name).read_bytes()
+    for name in BODY_FILES:
+        assert (directory / name).read_bytes() == (root / "quadsim" / "core" / name).read_bytes()
 
 
 def test_the_same_export_twice_is_the_same_bytes(tmp_path: Path) -> None:
@@ -114,7 +119,18 @@ def test_an_export_is_complete_and_replaces_an_earlier_one_on_request(tmp_path: 
         quadsim.export(scenario, directory)
     assert quadsim.export(scenario, directory, overwrite=True) == directory
     names = {path.name for path in directory.iterdir()}
-    assert {*CORE_FILES, DATA, FACTS, "vectors.h", "vectors.c", "main.c", "Makefile", "README.md", "LICENSE"} <= names
+    assert {
+        *CORE_FILES,
+        *BODY_FILES,
+        DATA,
+        FACTS,
+        "vectors.h",
+        "vectors.c",
+        "main.c",
+        "Makefile",
+        "README.md",
+        "LICENSE",
+    } <= names
     assert f"#define QUADSIM_VECTORS {scenario.periods}" in (directory / "vectors.h").read_text()
     (directory / "main.o").write_text("built")
     with pytest.raises(OutputError, match=r"does not list main\.o; move that away first$"):

@@ -10,6 +10,9 @@
 #include "quadsim_math.h"
 
 #define STEPS 8 /* of an input at most, after a reset */
+#ifndef MOST_CHANGES
+#define MOST_CHANGES (4 * QUADSIM_CONTROLLER.problem->changes) /* of a law that solves one */
+#endif
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
@@ -103,7 +106,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         require(is_finite(law->guard.state, 12), "a state");
         require(is_finite(command, 4), "a finite command");
         require(quadsim_law_changes(law) >= 0, "a number of changes");
-        require(quadsim_law_changes(law) <= 4 * QUADSIM_CONTROLLER.problem->changes, "a limited number of changes");
+        require(quadsim_law_changes(law) <= MOST_CHANGES, "a limited number of changes");
         for (j = 0; j < 4; j++) {
             require(command[j] >= fallback->least[j] && command[j] <= fallback->most[j], "bounds on speeds");
             if (before[j] >= fallback->least[j] && before[j] <= fallback->most[j]) {

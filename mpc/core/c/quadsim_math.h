@@ -16,6 +16,8 @@
 
 typedef quadsim_real real;
 
+#include "quadsim_rigid.h"
+
 enum { NU = QUADSIM_INPUTS };
 
 #define TURN R(6.283185307179586)
@@ -212,10 +214,9 @@ static inline void cross_product(const real *left, const real *right, real *resu
 /* Matrix times vector: of an attitude, from body to world. */
 static inline void turn_by(const real *matrix, const real *vector, real *result)
 {
-    int i;
-    for (i = 0; i < 3; i++) {
-        result[i] = dot(matrix + 3 * i, vector, 3);
-    }
+    result[0] = dot(matrix, vector, 3);
+    result[1] = dot(matrix + 3, vector, 3);
+    result[2] = dot(matrix + 6, vector, 3);
 }
 
 /* The transposed matrix times vector: of an attitude, from world to body. */
@@ -237,6 +238,29 @@ static inline void thrust_axis_of(const real *attitude, const real *rates, real 
     }
 }
 
+/* Body to world of a unit quaternion wxyz, row by row. */
+static inline void attitude_of(const real *q, real attitude[9])
+{
+    real turn[3][3];
+    int i, j;
+    rotation_of(q, R(2.0), turn);
+    for (i = 0; i < 3; i++) {
+        for (j = 0; j < 3; j++) {
+            attitude[3 * i + j] = turn[i][j];
+        }
+    }
+}
+
+/* The torque of the air on rotors whose speeds add up to `turning`: (m_x W v_y, -m_y W v_x, 0) - D omega; velocity
+ * through the air, and rates, along the body's axes. */
+static inline void air_moment(const real *across, const real *damping, real turning, const real *velocity,
+                              const real *rates, real torque[3])
+{
+    torque[0] = turning * across[0] * velocity[1] - damping[0] * rates[0];
+    torque[1] = -turning * across[1] * velocity[0] - damping[1] * rates[1];
+    torque[2] = -damping[2] * rates[2];
+}
+
 /* ---- states: world axes, Z-Y-X Euler angles and their rates ---------------------------------------------------- */
 
 enum { X = 0, VX = 1, Y = 2, VY = 3, Z = 4, VZ = 5, ROLL = 6, PITCH = 8, YAW = 10 };
@@ -248,15 +272,29 @@ static inline void sines_of(const real *state, real sine[3], real cosine[3])
     sin_cos(state[YAW], &sine[2], &cosine[2]);
 }
 
-/* Body rates (p, q, r) of Euler angles and their rates. */
-static inline void body_rates(const real *state, real rates[3])
+/* Body rates (p, q, r) of the rates of Euler angles with these sines and cosines. */
+static inline void rates_of(const real *state, const real s[3], const real k[3], real rates[3])
 {
     const real a = state[ROLL + 1], b = state[PITCH + 1], c = state[YAW + 1];
-    real s[3], k[3];
-    sines_of(state, s, k);
     rates[0] = a - c * s[1];
     rates[1] = b * k[0] + c * k[1] * s[0];
     rates[2] = c * k[1] * k[0] - b * s[0];
+}
+
+static inline void body_rates(const real *state, real rates[3])
+{
+    real s[3], k[3];
+    sines_of(state, s, k);
+    rates_of(state, s, k, rates);
+}
+
+/* What a thrust pushes along world axes, at Euler angles with these sines and cosines. */
+static inline void push_of(real thrust, const real s[3], const real k[3], real push[3])
+{
+    const real level = thrust * s[1] * k[0], side = thrust * s[0];
+    push[0] = k[2] * level + s[2] * side;
+    push[1] = s[2] * level - k[2] * side;
+    push[2] = thrust * k[1] * k[0];
 }
 
 /* Roll and pitch of a vehicle whose thrust points along lift (3,), upwards, at a yaw. */

@@ -50,13 +50,11 @@ static enum quadsim_status optimise(quadsim_mpc *mpc, const real *acting)
 /* ---- the vehicle's model ----------------------------------------------------------------------------------------- */
 
 /* The unit vector along which rotors push, world axes. */
-static void thrust_axis(const real *state, real axis[3])
+static void axis_at(const real *state, real axis[3])
 {
     real s[3], c[3];
     sines_of(state, s, c);
-    axis[0] = c[2] * (c[0] * s[1]) + s[2] * s[0];
-    axis[1] = s[2] * (c[0] * s[1]) - c[2] * s[0];
-    axis[2] = c[0] * c[1];
+    push_of(R(1.0), s, c, axis);
 }
 
 /* Rates of change of a state, of U/m and I^-1 tau (4,) and a constant acceleration (3,).  Sec. 2.2. */
@@ -64,27 +62,22 @@ static void slopes(const quadsim_robust *robust, const real *state, const real *
                    real *rates)
 {
     const real a = state[ROLL + 1], b = state[PITCH + 1], c = state[YAW + 1];
-    real s[3], k[3], p, q, r, dp, dq, dr, yaw, turn, level, side;
+    real s[3], k[3], w[3], push[3], turned[3], yaw;
     int i;
     sines_of(state, s, k);
     for (i = 0; i < 12; i += 2) {
         rates[i] = state[i + 1];
     }
-    turn = c * k[1];
-    p = a - c * s[1];
-    q = b * k[0] + turn * s[0];
-    r = turn * k[0] - b * s[0];
-    dp = drive[1] + robust->gyration[0] * q * r;
-    dq = drive[2] + robust->gyration[1] * r * p;
-    dr = drive[3] + robust->gyration[2] * p * q;
-    yaw = (dq * s[0] + dr * k[0] + b * (a + c * s[1])) / k[1];
-    level = drive[0] * s[1] * k[0];
-    side = drive[0] * s[0];
-    rates[VX] = k[2] * level + s[2] * side + disturbance[0];
-    rates[VY] = s[2] * level - k[2] * side + disturbance[1];
-    rates[VZ] = drive[0] * k[1] * k[0] + (disturbance[2] - robust->gravity);
-    rates[ROLL + 1] = dp + b * turn + s[1] * yaw;
-    rates[PITCH + 1] = dq * k[0] - dr * s[0] - a * turn;
+    push_of(drive[0], s, k, push);
+    rates_of(state, s, k, w);
+    memcpy(turned, drive + 1, sizeof(turned));
+    add_gyroscopic(robust->gyration, w, turned);
+    yaw = (turned[1] * s[0] + turned[2] * k[0] + b * (a + c * s[1])) / k[1];
+    rates[VX] = push[0] + disturbance[0];
+    rates[VY] = push[1] + disturbance[1];
+    rates[VZ] = push[2] + (disturbance[2] - robust->gravity);
+    rates[ROLL + 1] = turned[0] + b * (c * k[1]) + s[1] * yaw;
+    rates[PITCH + 1] = turned[1] * k[0] - turned[2] * s[0] - a * (c * k[1]);
     rates[YAW + 1] = yaw;
 }
 
@@ -130,7 +123,7 @@ static void advance(const quadsim_mpc *mpc, real time, const real *decay, const 
     if (!(time > R(1e-9))) {
         return;
     }
-    thrust_axis(state, axis);
+    axis_at(state, axis);
     find_disturbance(mpc, axis, disturbance);
     for (k = 0; k < QUADSIM_SUBSTEPS; k++, decay += 4) {
         find_drive(mpc, rotors, command, decay[0], drive);
@@ -192,7 +185,7 @@ static void observe(quadsim_mpc *mpc, const real *measured, const real *expected
     const quadsim_robust *r = mpc->controller->robust;
     real axis[3], rates[3], expected_rates[3], surprise[6], upright;
     int i;
-    thrust_axis(measured, axis);
+    axis_at(measured, axis);
     body_rates(measured, rates);
     body_rates(expected, expected_rates);
     upright = axis[2] > r->upright ? axis[2] : r->upright;

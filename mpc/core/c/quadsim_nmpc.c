@@ -230,7 +230,7 @@ static void steer(quadsim_nmpc_work *work, const quadsim_nmpc_world *world)
         }
         pull[2] += p->gravity;
         thrust_axis(q, axis);
-        along = pull[0] * axis[0] + pull[1] * axis[1] + pull[2] * axis[2];
+        along = dot(pull, axis, 3);
         size = square_root(pull[0] * pull[0] + pull[1] * pull[1] + pull[2] * pull[2]) + R(1e-6);
         wanted[0] = R(0.0); /* R(q)' pull is the vector part of q* (0, pull) q */
         memcpy(wanted + 1, pull, sizeof pull);
@@ -288,7 +288,7 @@ int quadsim_nmpc_begin(quadsim_nmpc_work *work, const quadsim_nmpc_world *world,
     work->share = work->largest = R(1.0);
     work->least = R(1e30);
     work->patience = PATIENCE;
-    work->iterations = 0;
+    work->iterations = work->ends = 0;
     work->defect = work->moved = R(0.0);
     return 1;
 }
@@ -370,7 +370,8 @@ int quadsim_nmpc_keep(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, 
     }
     work->planned = 1;
     work->defect = quadsim_nmpc_defect(work, world);
-    on = work->iterations < p->iterations + p->corrections && !(p->iterations > 1 && work->moved <= p->tolerance) &&
+    on = !work->ends && work->iterations < p->iterations + p->corrections &&
+         !(p->iterations > 1 && work->moved <= p->tolerance) &&
          !(p->corrections > 0 && work->iterations >= p->iterations && work->defect <= CONVERGED);
     if (on && p->iterations > 1) {
         relax(work);

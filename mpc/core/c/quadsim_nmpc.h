@@ -44,6 +44,7 @@ typedef struct quadsim_nmpc_problem {
     int actuators;              /* states of actuators: none, 1 with targets, 4 with rotor lag */
     int targets;                /* whether inputs are thrust and body rates, not those of rotors */
     int speeds;                 /* whether inputs are rotor speeds, not thrusts */
+    int moments;                /* whether the air turns the body; not with targets */
     int substeps;               /* Runge-Kutta steps from node to node */
     int difference;             /* whether the attitude error is q - q_r, not 2 vec(q_r* q) */
     int shifts;                 /* whether the plan moves on by a node from call to call */
@@ -59,6 +60,8 @@ typedef struct quadsim_nmpc_problem {
     quadsim_real largest;       /* thrust that is a share of 1 [N]: of a rotor, or with targets the weight */
     quadsim_real effect[16];    /* maps shares to T [m/s^2] and I^-1 tau; with targets its diagonal to T and body rates */
     quadsim_real gyration[3];   /* (Iyy - Izz) / Ixx, ... */
+    quadsim_real moment[6], damping[9]; /* I^-1 torque: [3][2] of velocity along body x and y, per sum of the rotors'
+                                         * speeds as shares, and [3][3] of body rates, which it opposes */
     quadsim_real lead[4];       /* targets: time constants over the step, for the reference */
     const quadsim_real *left;   /* [2 substeps + 1][4] of a distance from the input, after each half substep */
     quadsim_real weight[QUADSIM_NMPC_MOST], effort[QUADSIM_INPUTS], move; /* diagonals of Q and R; of steps of inputs */
@@ -100,6 +103,7 @@ typedef struct quadsim_nmpc_work {
     int changes;       /* of the active set in the last program */
     int rounds, inner; /* of holding and releasing inputs in it, and of the interior point method */
     int patience;      /* see relax in quadsim_nmpc.c */
+    int ends;          /* the caller's, between _begin and _keep: whether no SQP step is to follow, as time is up */
     quadsim_real defect, moved, violation; /* of the plan; the largest violation of a row by the optimum, less its slack */
     quadsim_real share, largest, least;
     quadsim_real measured[QUADSIM_NMPC_MOST]; /* state, with the input before */
@@ -161,6 +165,10 @@ void quadsim_nmpc_slopes(const quadsim_nmpc_problem *problem, const quadsim_nmpc
 /* Next states [count][n] of states and inputs [count][4]; a step, its substeps and lags are the problem's. */
 void quadsim_nmpc_advance(const quadsim_nmpc_problem *problem, const quadsim_nmpc_world *world, int count,
                           const quadsim_real *states, const quadsim_real *inputs, quadsim_real *ends);
+
+/* The angular acceleration [3] by the air's torque in a state [13] with thrusts of the rotors [4] in newton. */
+void quadsim_nmpc_turned(const quadsim_nmpc_problem *problem, const quadsim_real *state, const quadsim_real *thrusts,
+                         quadsim_real *turned);
 
 #ifdef __cplusplus
 }

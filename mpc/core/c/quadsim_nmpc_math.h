@@ -54,14 +54,6 @@ static inline void from_frame(const real *frame, const real *q, real *out)
     out[3] = z * a - y * b + x * c + w * d;
 }
 
-/* R(q) e_z of a quaternion of any length. */
-static inline void thrust_axis(const real *q, real axis[3])
-{
-    axis[0] = R(2.0) * (q[1] * q[3] + q[0] * q[2]);
-    axis[1] = R(2.0) * (q[2] * q[3] - q[0] * q[1]);
-    axis[2] = R(1.0) - R(2.0) * (q[1] * q[1] + q[2] * q[2]);
-}
-
 /* quadsim_nmpc_model.c: by how much the plan misses the dynamics. */
 quadsim_real quadsim_nmpc_defect(const quadsim_nmpc_work *work, const quadsim_nmpc_world *world);
 

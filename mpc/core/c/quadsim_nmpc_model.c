@@ -2,14 +2,18 @@
  *
  * Columns of derivatives pass through the stages with the value.  Two kinds of them are apart: those that turn the
  * attitude ("turning": of the quaternion, body rates, and what acts on these), and those of velocity and of targets of
- * thrust, which only push ("pushing").  Actuators follow their inputs exactly. */
+ * thrust, which only push ("pushing").  Where the air turns the body, so does velocity.  Actuators follow their inputs
+ * exactly. */
 #include "quadsim_nmpc_math.h"
 
-enum { PUSHING = 6, TURNING = 16 };
+enum { PUSHING = 6, TURNING = 18 };
+
+static const real SLOW = R(0.01); /* share of thrust below which a parabola stands for the root, which is steep at 0 */
 
 /* What acts at an instant. */
 struct drive {
     real thrust, angular[3];  /* T, I^-1 tau + alpha */
+    real speed;               /* sum of the rotors' speeds, as shares */
     real rates[3];            /* of targets */
     const real *left;
 };
@@ -18,10 +22,25 @@ struct drive {
 struct slope {
     real q[4], v[3], w[3];
     real axis[3], by_q[3][4], by_v[3][3];
+    real w_by_q[3][4], w_by_v[3][3], w_by_speed[3]; /* where the air turns the body */
 };
 
+/* A rotor's speed, as a share, of a share of thrust, and its slope. */
+static real speed_of(real share, real *slope)
+{
+    if (share < SLOW) {
+        const real edge = square_root(SLOW), part = share / SLOW;
+        *slope = (R(1.5) - part) / edge;
+        return edge * (R(1.5) - R(0.5) * part) * part;
+    } else {
+        const real speed = square_root(share);
+        *slope = R(0.5) / speed;
+        return speed;
+    }
+}
+
 static struct drive drive_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u, int instant,
-                             real by_share[4][NU])
+                             real by_share[5][NU])
 {
     struct drive drive;
     int i, j;
@@ -36,7 +55,7 @@ static struct drive drive_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_w
         }
         return drive;
     }
-    drive.thrust = R(0.0);
+    drive.thrust = drive.speed = R(0.0);
     for (i = 0; i < 3; i++) {
         drive.angular[i] = world->angular[i];
     }
@@ -51,39 +70,76 @@ static struct drive drive_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_w
         for (i = 0; i < 4; i++) {
             by_share[i][j] = p->effect[NU * i + j] * by;
         }
+        if (p->moments) {
+            by_share[4][j] = R(1.0);
+            drive.speed += p->speeds ? now : speed_of(now, &by_share[4][j]);
+        }
     }
     return drive;
 }
 
-static int has_drag(const quadsim_nmpc_world *world)
+/* Whether air acts on the body. */
+static int meets_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world)
 {
-    int i, any = 0;
+    int i, any = p->moments;
     for (i = 0; i < 3; i++) {
         any |= world->drag[i] != R(0.0) || world->square_drag[i] != R(0.0);
     }
     return any;
 }
 
-/* Add drag to a slope, and, where wanted, its derivatives. */
-static void add_drag(const quadsim_nmpc_world *world, const real *q, const real *v, int derive, struct slope *k)
+/* What the air's torque does with so much speed of the rotors, at a velocity along body axes and body rates. */
+static void turn_by_air(const quadsim_nmpc_problem *p, real speed, const real *along, const real *w, real *turned)
+{
+    int i;
+    for (i = 0; i < 3; i++) {
+        const real *m = p->moment + 2 * i, *c = p->damping + 3 * i;
+        turned[i] = speed * (m[0] * along[0] + m[1] * along[1]) - (c[0] * w[0] + c[1] * w[1] + c[2] * w[2]);
+    }
+}
+
+void quadsim_nmpc_turned(const quadsim_nmpc_problem *p, const real *state, const real *thrusts, real *turned)
+{
+    real turn[3][3], along[3], slope, speed = R(0.0);
+    int i;
+    rotation_of(state + Q, R(2.0), turn);
+    for (i = 0; i < 3; i++) {
+        along[i] = along_axis(turn, i, state + V);
+    }
+    for (i = 0; p->moments && i < NU; i++) {
+        speed += speed_of(thrusts[i] / p->largest, &slope);
+    }
+    turn_by_air(p, speed, along, state + W, turned);
+}
+
+/* Add to a slope what the air does, drag and torque, and, where wanted, its derivatives. */
+static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive,
+                    const real *q, const real *v, const real *w_b, int derive, struct slope *k)
 {
     const real w = q[0], x = q[1], y = q[2], z = q[3];
-    const real turn[3][3] = {{R(1.0) - R(2.0) * (y * y + z * z), R(2.0) * (x * y - w * z), R(2.0) * (x * z + w * y)},
-                             {R(2.0) * (x * y + w * z), R(1.0) - R(2.0) * (x * x + z * z), R(2.0) * (y * z - w * x)},
-                             {R(2.0) * (x * z - w * y), R(2.0) * (y * z + w * x), R(1.0) - R(2.0) * (x * x + y * y)}};
     const real slopes[4][3][3] = {{{R(0.0), -z, y}, {z, R(0.0), -x}, {-y, x, R(0.0)}},
                                   {{R(0.0), y, z}, {y, R(-2.0) * x, -w}, {z, w, R(-2.0) * x}},
                                   {{R(-2.0) * y, x, w}, {x, R(0.0), z}, {-w, z, R(-2.0) * y}},
                                   {{R(-2.0) * z, -w, x}, {w, R(-2.0) * z, y}, {x, y, R(0.0)}}}; /* halves */
-    real pull[3], damped[3][3];
+    const real *const m = p->moment;
+    real turn[3][3], pull[3], damped[3][3], along[3], turned[3];
     int i, j, a;
+    rotation_of(q, R(2.0), turn);
+    add_air_drag(world->drag, world->square_drag, turn, v, along, pull, k->v);
     for (a = 0; a < 3; a++) {
-        const real body = turn[0][a] * v[0] + turn[1][a] * v[1] + turn[2][a] * v[2], size = magnitude(body);
-        const real rate = -(world->drag[a] + R(2.0) * world->square_drag[a] * size);
-        pull[a] = -(world->drag[a] + world->square_drag[a] * size) * body;
+        const real rate = -(world->drag[a] + R(2.0) * world->square_drag[a] * magnitude(along[a]));
         for (i = 0; i < 3; i++) {
-            k->v[i] += turn[i][a] * pull[a];
             damped[i][a] = turn[i][a] * rate;
+        }
+    }
+    if (p->moments) {
+        turn_by_air(p, drive->speed, along, w_b, turned);
+    }
+    for (i = 0; p->moments && i < 3; i++) {
+        k->w_by_speed[i] = m[2 * i] * along[0] + m[2 * i + 1] * along[1];
+        k->w[i] += turned[i];
+        for (j = 0; j < 3; j++) {
+            k->w_by_v[i][j] = drive->speed * (m[2 * i] * turn[j][0] + m[2 * i + 1] * turn[j][1]);
         }
     }
     for (i = 0; derive && i < 3; i++) {
@@ -102,51 +158,52 @@ static void add_drag(const quadsim_nmpc_world *world, const real *q, const real 
                 sum += slopes[j][i][a] * pull[a] + damped[i][a] * air[a];
             }
             k->by_q[i][j] += R(2.0) * sum;
+            if (p->moments) {
+                k->w_by_q[i][j] = R(2.0) * drive->speed * (m[2 * i] * air[0] + m[2 * i + 1] * air[1]);
+            }
         }
     }
 }
 
-static void slope_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive, int drags, int derive,
-                     const real *q, const real *v, const real *w, struct slope *k)
+static void slope_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive, int air,
+                     int derive, const real *q, const real *v, const real *w, struct slope *k)
 {
     const real T = drive->thrust, twice = R(2.0) * T;
     int i;
-    k->q[0] = R(0.5) * (-q[1] * w[0] - q[2] * w[1] - q[3] * w[2]);
-    k->q[1] = R(0.5) * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1]);
-    k->q[2] = R(0.5) * (q[0] * w[1] - q[1] * w[2] + q[3] * w[0]);
-    k->q[3] = R(0.5) * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0]);
+    quaternion_rate(q, w, k->q);
     thrust_axis(q, k->axis);
     for (i = 0; i < 3; i++) {
         k->v[i] = T * k->axis[i] + world->acceleration[i];
     }
     k->v[2] -= p->gravity;
-    k->w[0] = p->gyration[0] * w[1] * w[2] + drive->angular[0];
-    k->w[1] = p->gyration[1] * w[2] * w[0] + drive->angular[1];
-    k->w[2] = p->gyration[2] * w[0] * w[1] + drive->angular[2];
+    memcpy(k->w, drive->angular, sizeof k->w);
+    add_gyroscopic(p->gyration, w, k->w);
     if (derive) {
         const real by_q[3][4] = {{twice * q[2], twice * q[3], twice * q[0], twice * q[1]},
                                  {-twice * q[1], -twice * q[0], twice * q[3], twice * q[2]},
                                  {R(0.0), R(-2.0) * twice * q[1], R(-2.0) * twice * q[2], R(0.0)}};
         memcpy(k->by_q, by_q, sizeof by_q);
     }
-    if (drags) {
-        add_drag(world, q, v, derive, k);
+    if (air) {
+        add_air(p, world, drive, q, v, w, derive, k);
     }
 }
 
-/* Slopes of the turning columns D: m of them, the first four of the quaternion, which leave body rates alone. */
-INLINED void turning_slopes(const quadsim_nmpc_problem *p, const struct slope *k, const real *q, const real *w, int drags,
-                            real by_share[4][NU], const int m, const int targets, const int actuators,
-                            const struct drive *drive, real D[10][TURNING], real K[10][TURNING])
+/* Slopes of the turning columns D: m of them, the first four of the quaternion, which leave body rates alone unless the
+ * air turns the body. */
+INLINED void turning_slopes(const quadsim_nmpc_problem *p, const struct slope *k, const real *q, const real *w, int air,
+                            real by_share[5][NU], const int m, const int targets, const int actuators,
+                            const int moments, const struct drive *drive, real D[10][TURNING], real K[10][TURNING])
 {
+    const int still = moments ? 0 : 4;
     int c, i;
-    for (c = 0; c < 4; c++) {
+    for (c = 0; c < still; c++) {
         K[0][c] = R(0.5) * (-w[0] * D[1][c] - w[1] * D[2][c] - w[2] * D[3][c]);
         K[1][c] = R(0.5) * (w[0] * D[0][c] + w[2] * D[2][c] - w[1] * D[3][c]);
         K[2][c] = R(0.5) * (w[1] * D[0][c] - w[2] * D[1][c] + w[0] * D[3][c]);
         K[3][c] = R(0.5) * (w[2] * D[0][c] + w[1] * D[1][c] - w[0] * D[2][c]);
     }
-    for (c = 4; c < m; c++) {
+    for (c = still; c < m; c++) {
         const real *const a = &D[7][c], *const b = &D[8][c], *const d = &D[9][c];
         K[0][c] = R(0.5) * (-w[0] * D[1][c] - w[1] * D[2][c] - w[2] * D[3][c] - q[1] * *a - q[2] * *b - q[3] * *d);
         K[1][c] = R(0.5) * (w[0] * D[0][c] + w[2] * D[2][c] - w[1] * D[3][c] + q[0] * *a + q[2] * *d - q[3] * *b);
@@ -158,7 +215,7 @@ INLINED void turning_slopes(const quadsim_nmpc_problem *p, const struct slope *k
         for (c = 0; c < m; c++) {
             K[4 + i][c] = by[0] * D[0][c] + by[1] * D[1][c] + by[2] * D[2][c] + by[3] * D[3][c];
         }
-        if (drags) {
+        if (air) {
             const real *pull = k->by_v[i];
             for (c = 0; c < m; c++) {
                 K[4 + i][c] += pull[0] * D[4][c] + pull[1] * D[5][c] + pull[2] * D[6][c];
@@ -168,34 +225,43 @@ INLINED void turning_slopes(const quadsim_nmpc_problem *p, const struct slope *k
     if (targets) {
         return;
     }
-    for (c = 4; c < m; c++) {
+    for (c = still; c < m; c++) {
         K[7][c] = p->gyration[0] * (w[1] * D[9][c] + w[2] * D[8][c]);
         K[8][c] = p->gyration[1] * (w[2] * D[7][c] + w[0] * D[9][c]);
         K[9][c] = p->gyration[2] * (w[0] * D[8][c] + w[1] * D[7][c]);
     }
+    for (i = 0; moments && i < 3; i++) {
+        const real *by = k->w_by_q[i], *pull = k->w_by_v[i], *damping = p->damping + 3 * i;
+        for (c = 0; c < m; c++) {
+            K[7 + i][c] += by[0] * D[0][c] + by[1] * D[1][c] + by[2] * D[2][c] + by[3] * D[3][c] + pull[0] * D[4][c] +
+                           pull[1] * D[5][c] + pull[2] * D[6][c] -
+                           (damping[0] * D[7][c] + damping[1] * D[8][c] + damping[2] * D[9][c]);
+        }
+    }
     for (c = 0; c < NU; c++) {
         const real left = actuators ? drive->left[c] : R(0.0);
         for (i = 0; i < 3; i++) {
+            const real turned = by_share[i + 1][c] + (moments ? k->w_by_speed[i] * by_share[4][c] : R(0.0));
             if (actuators) {
                 K[4 + i][7 + c] += k->axis[i] * by_share[0][c] * left;
-                K[7 + i][7 + c] += by_share[i + 1][c] * left;
+                K[7 + i][7 + c] += turned * left;
             }
             K[4 + i][7 + actuators + c] += k->axis[i] * by_share[0][c] * (R(1.0) - left);
-            K[7 + i][7 + actuators + c] += by_share[i + 1][c] * (R(1.0) - left);
+            K[7 + i][7 + actuators + c] += turned * (R(1.0) - left);
         }
     }
 }
 
 /* Slopes of the pushing columns E: velocity, and with targets thrust and its target. */
 INLINED void pushing_slopes(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct slope *k,
-                            const struct drive *drive, int drags, const int targets, real E[3][PUSHING],
+                            const struct drive *drive, int air, const int targets, real E[3][PUSHING],
                             real K[3][PUSHING])
 {
     const real thrust = p->effect[0] * world->thrust_scale;
     int c, i;
     for (i = 0; i < 3; i++) {
         for (c = 0; c < PUSHING; c++) {
-            K[i][c] = drags ? k->by_v[i][0] * E[0][c] + k->by_v[i][1] * E[1][c] + k->by_v[i][2] * E[2][c] : R(0.0);
+            K[i][c] = air ? k->by_v[i][0] * E[0][c] + k->by_v[i][1] * E[1][c] + k->by_v[i][2] * E[2][c] : R(0.0);
         }
         if (targets) {
             K[i][3] += k->axis[i] * thrust * drive->left[0];
@@ -227,16 +293,17 @@ static void actuators_after(const quadsim_nmpc_problem *p, const real *x, const 
     }
 }
 
-/* One node: m turning columns, padded, with targets or not, and so many actuators. */
-INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, int drags, const real *x, const real *u,
+/* One node: m turning columns, padded, with targets or not, so many actuators, and with the air's torque or not. */
+INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
                             const real *frame, const real *next, const int m, const int targets, const int actuators,
-                            int n, real *map, real *end)
+                            const int moments, int n, real *map, real *end)
 {
     static const real UNITS[4][4] = {{R(1.0)}, {R(0.0), R(1.0)}, {R(0.0), R(0.0), R(1.0)}, {R(0.0), R(0.0), R(0.0), R(1.0)}};
     const real h = p->step / (real)p->substeps, part[4] = {R(0.0), R(0.5) * h, R(0.5) * h, h};
     const int width = columns_of(n), turning = targets ? 10 : 11 + actuators, befores = n - BODY - actuators;
+    const int air = meets_air(p, world);
     real D[10][TURNING] = {{R(0.0)}}, E[3][PUSHING] = {{R(0.0)}}, moved[3][TURNING] = {{R(0.0)}};
-    real pushed[3][PUSHING] = {{R(0.0)}}, K[10][TURNING], L[3][PUSHING], y[10], travelled[3], by_share[4][NU];
+    real pushed[3][PUSHING] = {{R(0.0)}}, K[10][TURNING], L[3][PUSHING], y[10], travelled[3], by_share[5][NU];
     struct drive drive;
     struct slope k;
     int s, stage, i, c;
@@ -251,6 +318,9 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
     }
     for (i = 0; i < 3; i++) {
         D[7 + i][4 + i] = E[i][i] = R(1.0);
+        if (moments) {
+            D[4 + i][turning + i] = R(1.0);
+        }
         travelled[i] = R(0.0);
     }
     for (s = 0; s < p->substeps; s++) {
@@ -282,9 +352,9 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
             if (targets) {
                 set_rates(p, &drive, ys, Ds);
             }
-            slope_at(p, world, &drive, drags, 1, ys, ys + 4, ys + 7, &k);
-            turning_slopes(p, &k, ys, ys + 7, drags, by_share, m, targets, actuators, &drive, Ds, K);
-            pushing_slopes(p, world, &k, &drive, drags, targets, Es, L);
+            slope_at(p, world, &drive, air, 1, ys, ys + 4, ys + 7, &k);
+            turning_slopes(p, &k, ys, ys + 7, air, by_share, m, targets, actuators, moments, &drive, Ds, K);
+            pushing_slopes(p, world, &k, &drive, air, targets, Es, L);
             if (stage == 3) { /* of the position, whose slope is the velocity */
                 for (i = 0; i < 3; i++) {
                     for (c = 0; c < m; c++) {
@@ -336,9 +406,10 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
     }
     /* The map's columns: quaternion, velocity, body rates, actuators, inputs. */
     memset(map, 0, sizeof(real) * (size_t)(BODY * width));
-    for (c = 0; c < turning; c++) {
+    for (c = 0; c < turning + (moments ? 3 : 0); c++) {
         const int of_input = c >= 7 + (targets ? 0 : actuators);
-        const int at = (c < 4 ? c : targets && of_input ? c + 5 : c + 3) + (of_input ? befores : 0);
+        const int of_turning = c < 4 ? c : targets && of_input ? c + 5 : c + 3;
+        const int at = c < turning ? of_turning + (of_input ? befores : 0) : 4 + c - turning;
         real q[4], turned[4];
         for (i = 0; i < 4; i++) {
             q[i] = D[i][c];
@@ -353,7 +424,7 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
             map[(Q + i) * width + at] = turned[i];
         }
     }
-    for (c = 0; c < (targets ? 5 : 3); c++) {
+    for (c = moments ? 3 : 0; c < (targets ? 5 : 3); c++) {
         const int at = c < 3 ? 4 + c : 7 + c + (c == 4 ? befores : 0);
         for (i = 0; i < 3; i++) {
             map[i * width + at] = pushed[i][c];
@@ -411,13 +482,15 @@ static void find_axis(const real *q, const real *frame, real *rows, real *known)
 void quadsim_nmpc_slopes(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
                          const real *frames, real *map, real *end)
 {
-    const int n = states_of(p), drags = has_drag(world);
+    const int n = states_of(p);
     if (p->targets) {
-        linearise_node(p, world, drags, x, u, frames, frames + 4, 10, 1, 1, n, map, end);
+        linearise_node(p, world, x, u, frames, frames + 4, 10, 1, 1, 0, n, map, end);
+    } else if (p->moments) {
+        linearise_node(p, world, x, u, frames, frames + 4, 18, 0, p->actuators, 1, n, map, end);
     } else if (p->actuators) {
-        linearise_node(p, world, drags, x, u, frames, frames + 4, 16, 0, 4, n, map, end);
+        linearise_node(p, world, x, u, frames, frames + 4, 16, 0, 4, 0, n, map, end);
     } else {
-        linearise_node(p, world, drags, x, u, frames, frames + 4, 12, 0, 0, n, map, end);
+        linearise_node(p, world, x, u, frames, frames + 4, 12, 0, 0, 0, n, map, end);
     }
 }
 
@@ -440,9 +513,9 @@ void quadsim_nmpc_linearise(quadsim_nmpc_work *work, const quadsim_nmpc_world *w
 /* The next state, without derivatives. */
 static void advance(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u, real *end)
 {
-    const int drags = has_drag(world);
+    const int air = meets_air(p, world);
     const real h = p->step / (real)p->substeps, part[4] = {R(0.0), R(0.5) * h, R(0.5) * h, h};
-    real y[10], by_share[4][NU];
+    real y[10], by_share[5][NU];
     struct drive drive;
     int s, stage, i;
     memcpy(y, x + Q, sizeof y);
@@ -457,7 +530,7 @@ static void advance(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wor
             for (i = 0; p->targets && i < 3; i++) {
                 ys[7 + i] = drive.rates[i];
             }
-            slope_at(p, world, &drive, drags, 0, ys, ys + 4, ys + 7, &k);
+            slope_at(p, world, &drive, air, 0, ys, ys + 4, ys + 7, &k);
             for (i = 0; i < 3; i++) {
                 end[i] += stage < 3 ? h * h / R(6.0) * k.v[i] : h * y[4 + i];
             }

@@ -23,13 +23,12 @@ enum { SIDES = QUADSIM_NMPC_SIDES, TILT = 2 * NU, SPIN = TILT + SIDES, STATED = 
 static const real FEASIBLE = 2e-5F;  /* violation of a bound */
 static const real DEPENDENT = 3e-6F; /* share of a row's response to itself that others leave of it */
 static const real NOTHING = 1e-6F;   /* change of a multiplier by that of a row */
-static const real COMPLEMENTARY = 1e-6F;
 #else
 static const real FEASIBLE = 1e-10;
 static const real DEPENDENT = 1e-11;
 static const real NOTHING = 1e-13;
-static const real COMPLEMENTARY = 1e-8; /* mean product of multipliers and distances, where bounds tell */
 #endif
+static const real COMPLEMENTARY = R(1e-4); /* mean product of multipliers and distances, where bounds tell */
 static const real HARD = R(1e29), NEVER = R(1e30);
 static const real CURVATURE = R(1e-5); /* of a linear price, in its proportion */
 enum { WARM_ROUNDS = 8, MOST_ROUNDS = 4, MOST_INNER = 30, MOST_AGAIN = 20 };
@@ -78,7 +77,13 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
                 row[j] += by * map[k * width + j];
             }
         }
-        for (k = W; k < BODY; k++) { /* body rates do not depend on the quaternion or the velocity */
+        for (k = W; p->moments && k < BODY; k++) { /* body rates depend on these by the air alone */
+            const real by = cost[r * n + k];
+            for (j = 0; j < 6; j++) {
+                row[j] += by * map[k * width + j];
+            }
+        }
+        for (k = W; k < BODY; k++) {
             const real by = cost[r * n + k];
             for (j = 6; j < width; j++) {
                 row[j] += by * map[k * width + j];
@@ -97,6 +102,12 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
         real row[WIDE + 1] = {R(0.0)};
         const int past = (j + 2) & ~1;
         for (k = 0; k < (j < 7 ? W : BODY); k++) {
+            const real by = map[k * width + j];
+            for (r = 0; r < past; r++) {
+                row[r] += by * both[k][r];
+            }
+        }
+        for (k = W; p->moments && j < 7 && k < BODY; k++) {
             const real by = map[k * width + j];
             for (r = 0; r < past; r++) {
                 row[r] += by * both[k][r];
@@ -1122,7 +1133,8 @@ static real shortened(real share, real now, real step)
 }
 
 /* Mehrotra's (1992) primal-dual interior point method for the inputs' bounds, with a Riccati recursion in every
- * iteration, until the complementarity is below `tolerance`.  What it holds at bounds is then in work->held, the inputs
+ * iteration, until the complementarity is below `tolerance`.  Multipliers start at half the largest of the set that did
+ * not settle: much smaller ones cost twice the iterations.  What it holds at bounds is then in work->held, the inputs
  * are at the start of work->response.  Returns the iterations. */
 static int interior(quadsim_nmpc_work *work, real tolerance, int most)
 {
@@ -1130,11 +1142,16 @@ static int interior(quadsim_nmpc_work *work, real tolerance, int most)
     const int size = p->horizon * NU;
     real *u = work->response, *low = u + size, *high = low + size, *effort = high + size, *push = effort + size;
     real *affine = push + size, *v = affine + size, *known = v + size, mu = NEVER;
+    real start = R(1.0);
     int i, k, pass;
+    for (i = 0; i < size; i++) {
+        const real half = work->held[i] != 0 ? R(0.5) * magnitude(work->own[i]) : R(0.0);
+        start = half > start ? half : start;
+    }
     for (i = 0; i < size; i++) {
         const real lower = p->lower[i % NU], upper = p->upper[i % NU], gap = upper - lower;
         u[i] = clipped(work->u[i], lower + R(0.1) * gap, upper - R(0.1) * gap);
-        low[i] = high[i] = R(0.1);
+        low[i] = high[i] = start;
     }
     for (k = 0; k < most && mu > tolerance; k++) {
         real centre = R(0.0), primal = R(1.0), dual = R(1.0), after = R(0.0);

@@ -128,36 +128,6 @@ static void take_preview(quadsim_nonlinear *law, const real *reference, real yaw
 
 /* ---- what disturbs ------------------------------------------------------------------------------------------------ */
 
-/* R of a unit quaternion, row by row. */
-static void put_rotation(const real *q, real turn[9])
-{
-    const real w = q[0], x = q[1], y = q[2], z = q[3];
-    turn[0] = R(1.0) - R(2.0) * (y * y + z * z);
-    turn[1] = R(2.0) * (x * y - w * z);
-    turn[2] = R(2.0) * (x * z + w * y);
-    turn[3] = R(2.0) * (x * y + w * z);
-    turn[4] = R(1.0) - R(2.0) * (x * x + z * z);
-    turn[5] = R(2.0) * (y * z - w * x);
-    turn[6] = R(2.0) * (x * z - w * y);
-    turn[7] = R(2.0) * (y * z + w * x);
-    turn[8] = R(1.0) - R(2.0) * (x * x + y * y);
-}
-
-/* Add to an acceleration what drag causes at a velocity, world axes. */
-static void add_drag(const quadsim_nmpc_world *world, const real *q, const real *velocity, real sign, real *acceleration)
-{
-    real turn[9], pull[3];
-    int i;
-    put_rotation(q, turn);
-    for (i = 0; i < 3; i++) {
-        const real air = turn[i] * velocity[0] + turn[3 + i] * velocity[1] + turn[6 + i] * velocity[2];
-        pull[i] = -(world->drag[i] * air + world->square_drag[i] * magnitude(air) * air);
-    }
-    for (i = 0; i < 3; i++) {
-        acceleration[i] += sign * dot(turn + 3 * i, pull, 3);
-    }
-}
-
 static int is_any(const real *numbers, int count)
 {
     int i;
@@ -234,32 +204,34 @@ static void turn_least(const real *unit, const real *to, real size, real *q)
     }
 }
 
-/* Add to the reference what balances drag and disturbance: thrust turned by the least rotation, and torque. */
+/* Add to the reference what balances air and disturbance: thrust turned by the least rotation, and torque. */
 static void balance(quadsim_nonlinear *law)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     const quadsim_nmpc_world *world = &law->world;
     const int N = numbers->problem->horizon;
     int i, j;
-    if (!is_any(world->acceleration, 3) && !is_any(world->angular, 3) && !is_any(world->drag, 3) &&
-        !is_any(world->square_drag, 3)) {
+    if (!numbers->problem->moments && !is_any(world->acceleration, 3) && !is_any(world->angular, 3) &&
+        !is_any(world->drag, 3) && !is_any(world->square_drag, 3)) {
         return;
     }
     for (i = N; i >= 0; i--) { /* the last node has the thrusts of the one before, as they were */
         real *state = law->states + i * BODY, *thrusts = law->thrusts + (i < N ? i : N - 1) * NU;
         const real total = ((thrusts[0] + thrusts[1]) + (thrusts[2] + thrusts[3])) / numbers->mass;
-        real axis[3], wanted[3], effort[NU], size;
+        real turn[3][3], along[3], pull[3], drag[3] = {R(0.0)}, turned[3], axis[3], wanted[3], effort[NU], size;
         thrust_axis(state + Q, axis);
+        rotation_of(state + Q, R(2.0), turn);
+        add_air_drag(world->drag, world->square_drag, turn, state + V, along, pull, drag);
+        quadsim_nmpc_turned(numbers->problem, state, thrusts, turned);
         for (j = 0; j < 3; j++) {
-            wanted[j] = total * axis[j] - world->acceleration[j];
+            wanted[j] = total * axis[j] - world->acceleration[j] - drag[j];
         }
-        add_drag(world, state + Q, state + V, R(-1.0), wanted);
         size = square_root(dot(wanted, wanted, 3));
         size = size > R(1e-9) ? size : R(1e-9);
         turn_least(axis, wanted, size, state + Q);
         effort[0] = size - total;
         for (j = 0; j < 3; j++) {
-            effort[1 + j] = -world->angular[j];
+            effort[1 + j] = -world->angular[j] - turned[j];
         }
         for (j = 0; j < NU && i < N; j++) {
             thrusts[j] += dot(numbers->inverse + j * NU, effort, NU);
@@ -273,22 +245,23 @@ static void follow_force(quadsim_nonlinear *law, int follows, const real *acting
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     quadsim_nmpc_world *world = &law->world;
     const real *velocity = law->measured + V, length = square_root(dot(law->measured + Q, law->measured + Q, 4));
-    real q[4], turn[9], change[3], drag[3], along[3];
+    real q[4], turn[3][3], attitude[9], change[3], drag[3], along[3];
     int i;
     for (i = 0; i < 4; i++) {
         q[i] = law->measured[Q + i] / length;
     }
-    put_rotation(q, turn);
-    quadsim_ramp_update(&law->ramp, numbers->ramp, follows, velocity, turn, law->measured + W, acting);
+    rotation_of(q, R(2.0), turn);
+    memcpy(attitude, turn, sizeof(attitude));
+    quadsim_ramp_update(&law->ramp, numbers->ramp, follows, velocity, attitude, law->measured + W, acting);
     quadsim_ramp_foreseen(&law->ramp, numbers->ramp, R(0.5) * numbers->control_period, world->acceleration, change,
                           world->angular);
     quadsim_ramp_drag(&law->ramp, numbers->ramp, drag);
     for (i = 0; i < 3; i++) {
-        along[i] = drag[i] * (turn[i] * velocity[0] + turn[3 + i] * velocity[1] + turn[6 + i] * velocity[2]);
+        along[i] = drag[i] * along_axis(turn, i, velocity);
         world->drag[i] = numbers->drag[i] + drag[i];
     }
     for (i = 0; i < 3; i++) {
-        world->acceleration[i] += dot(turn + 3 * i, along, 3);
+        world->acceleration[i] += dot(turn[i], along, 3);
     }
     world->thrust_scale = quadsim_ramp_scale(&law->ramp, numbers->ramp);
     find_trim(law);

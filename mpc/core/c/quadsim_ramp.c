@@ -17,7 +17,7 @@ void quadsim_ramp_reset(quadsim_ramp *ramp, const ramp_numbers *n, const quadsim
 static void mean_wrench(quadsim_ramp *ramp, const ramp_numbers *n, const real *command, real *thrust, real torque[3])
 {
     const real scale = quadsim_ramp_scale(ramp, n), lost = R(1.0) - n->left;
-    real squares[NU], spun = R(0.0);
+    real squares[NU] = {R(0.0)}, spun = R(0.0);
     int i;
     memset(torque, 0, 3 * sizeof(real));
     if (n->targets) {
@@ -55,17 +55,17 @@ static void known_drag(const ramp_numbers *n, const real *attitude, const real v
 static void resisting_torque(const quadsim_ramp *ramp, const ramp_numbers *n, const real v_b[3], const real *rates,
                              real torque[3])
 {
+    static const real ONES[NU] = {R(1.0), R(1.0), R(1.0), R(1.0)};
     real momentum[3];
     int i;
     turn_by(n->inertia, rates, momentum);
     momentum[2] += dot(n->momentum, ramp->acting, NU);
     cross_product(rates, momentum, torque);
     if (n->moment) {
-        const real spinning = ramp->acting[0] + ramp->acting[1] + ramp->acting[2] + ramp->acting[3];
-        torque[0] -= spinning * n->across[0] * v_b[1];
-        torque[1] += spinning * n->across[1] * v_b[0];
+        real air[3];
+        air_moment(n->across, n->damping, dot(ramp->acting, ONES, NU), v_b, rates, air);
         for (i = 0; i < 3; i++) {
-            torque[i] += n->damping[i] * rates[i];
+            torque[i] -= air[i];
         }
     }
 }

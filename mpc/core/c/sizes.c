@@ -1,6 +1,7 @@
 /* sizeof the structs that Python mirrors; see check_sizes in quadsim/core/library.py. */
 #include <stddef.h>
 
+#include "quadsim_geometric.h"
 #include "quadsim_mpc.h"
 #include "quadsim_nonlinear.h"
 #include "quadsim_ramp.h"
@@ -25,3 +26,9 @@ SIZE(quadsim_nonlinear_numbers);
 SIZE(quadsim_nonlinear);
 SIZE(quadsim_ramp_numbers);
 SIZE(quadsim_ramp);
+SIZE(quadsim_geometric_numbers);
+SIZE(quadsim_geometric_motion);
+SIZE(quadsim_geometric_target);
+SIZE(quadsim_geometric_disturbance);
+SIZE(quadsim_geometric_attitude);
+SIZE(quadsim_geometric);

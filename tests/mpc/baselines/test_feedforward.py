@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy_geometric import desired_attitude
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import DesiredAttitude, Measured, desired_attitude, hat
-from mpc.baselines.geometric import Geometric, GeometricController, Integrals
-from mpc.baselines.preview import Target, target_of_motion
+from mpc.baselines.attitude import Measured, hat
+from mpc.baselines.geometric import DesiredAttitude, Geometric, GeometricController, Integrals
+from mpc.baselines.preview import Target
 from mpc.flatness import motion_along
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -105,8 +106,8 @@ def test_a_motion_s_samples_give_its_derivatives_and_near_its_end_as_many_as_the
     period = 0.02
     samples = [sine(period * k)[:3] for k in range(40)]
     motion = motion_along(*np.array(samples).transpose(1, 0, 2), period=period, vehicle=vehicle)
-    yaw = np.zeros(3)
-    result, desired = target_of_motion(motion.after(10), yaw, period), sine(10 * period)
+    law, preview = GeometricController(vehicle, period, Geometric(feedforward=True)), np.zeros((10, 4))
+    result, desired = law.target(preview, motion.after(10)), sine(10 * period)
     for value, exact, share in zip(
         (result.position, result.velocity, result.acceleration, result.jerk, result.snap),
         desired,
@@ -118,7 +119,7 @@ def test_a_motion_s_samples_give_its_derivatives_and_near_its_end_as_many_as_the
     w, x, y, z = motion.attitude[10]
     np.testing.assert_allclose(result.heading[0], Rotation.from_quat([x, y, z, w]).as_matrix()[:, 0], atol=1e-12)
     for left in (1, 2, 3, 6):
-        near_end = target_of_motion(motion.after(40 - left), yaw, period)
+        near_end = law.target(preview, motion.after(40 - left))
         np.testing.assert_allclose(near_end.position, motion.position[-left], atol=1e-12)
         assert bool(np.any(near_end.acceleration)) == (left >= 3)
         assert bool(np.any(near_end.snap)) == (left >= 5)

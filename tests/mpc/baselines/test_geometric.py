@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy_geometric import vee
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import DesiredAttitude, Measured, motion_of, vee
-from mpc.baselines.geometric import GeometricController, Integrals
+from mpc.baselines.attitude import Measured, motion_of
+from mpc.baselines.geometric import DesiredAttitude, GeometricController, Integrals
 from mpc.baselines.preview import Target
 from quadsim.assets import vehicle_path
 from quadsim.controller import StepInputs
@@ -113,7 +114,7 @@ def test_a_heading_half_a_turn_away_is_sought_a_quarter_turn_away(vehicle: Vehic
 
 def test_integrals_stop_at_their_limits(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     law, integrals = build("geometric", vehicle, integral=True), NONE
-    law.gains = replace(law.gains, sigma=0.5, sigma_R=0.25)
+    law.numbers.sigma, law.numbers.sigma_R = 0.5, 0.25
     for _ in range(200):
         _, desired = law.wrench(MOTION, TARGET, integrals)
         integrals = law.integrate(integrals, MOTION, TARGET, desired)

@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numpy_geometric import attitude_error
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import attitude_error, motion_of
+from mpc.baselines.attitude import motion_of
 from mpc.baselines.geometric import Geometric, GeometricController, Integrals
-from mpc.baselines.preview import Target, target_of
+from mpc.baselines.preview import Target
 from mpc.bounded import TargetBounds
 from mpc.builders import build, law_of
 from mpc.disturbance import RampSettings
@@ -185,8 +186,8 @@ def test_an_observed_scale_of_the_thrust_leaves_no_offset(
     flown = fly(observing, vehicle, at_rest, 200, lag=lag, scale=0.8, force=np.array([0.8, -0.4, 0.0]))
     np.testing.assert_allclose(flown.position[-1], at_rest(0.0)[:3], atol=1e-4)
     assert np.linalg.norm(flown.position - at_rest(0.0)[:3], axis=1).max() < 0.05
-    assert observing._observer is not None
-    assert observing._observer.thrust_scale == pytest.approx(0.8, abs=1e-4)
+    assert observing.observer is not None
+    assert observing.observer.thrust_scale == pytest.approx(0.8, abs=1e-4)
 
 
 def test_rotors_that_give_less_are_asked_for_more_thrust_and_torque(
@@ -196,8 +197,8 @@ def test_rotors_that_give_less_are_asked_for_more_thrust_and_torque(
     law = build("geometric", vehicle, disturbance=RampSettings(thrust_scale=True))
     log = fly_from(law, weak, make_state(), periods=150, course=np.array([0.5, 0.0, 0.0, 0.3]))
     np.testing.assert_allclose(log.control.truth[-1, [0, 2, 4]], [0.5, 0.0, 0.0], atol=2e-3)
-    assert law._observer.thrust_scale == pytest.approx(0.8, abs=1e-3)
-    np.testing.assert_allclose(law._observer.foreseen(0.0)[2], 0.0, atol=1e-2)
+    assert law.observer.thrust_scale == pytest.approx(0.8, abs=1e-3)
+    np.testing.assert_allclose(law.observer.foreseen(0.0)[2], 0.0, atol=1e-2)
 
 
 @COMMANDS
@@ -207,7 +208,7 @@ def test_the_translation_s_integral_removes_the_offset_and_the_autopilot_has_the
     law = geometric(vehicle, FAST, commands, integral=True)
     flown = fly(law, vehicle, at_rest, 700, lag=FAST, scale=0.8)
     np.testing.assert_allclose(flown.position[-1], at_rest(0.0)[:3], atol=2e-3)
-    assert not law._integrals.rotation.any()
+    assert not law.integrals.rotation.any()
 
 
 @pytest.mark.witness("targets")
@@ -226,7 +227,7 @@ def test_targets_stay_within_their_bounds_and_integrals_hold_there(vehicle: Vehi
     law.reset(np.array([weight, 0.0, 0.0, 0.0]))
     for _ in range(20):
         assert law.step(StepInputs(), make_state(position=(0.0, 0.0, -30.0)), 0.0 * far).speeds[0] == 1.2 * weight
-    assert not law._integrals.translation.any()
+    assert not law.integrals.translation.any()
 
 
 def test_the_commanded_attitude_is_that_in_the_middle_of_the_period(vehicle: Vehicle) -> None:
@@ -237,8 +238,9 @@ def test_the_commanded_attitude_is_that_in_the_middle_of_the_period(vehicle: Veh
         law = geometric(vehicle, FAST, "attitude", feedforward=feedforward)
         reference = np.array([circle((i + 1) * PERIOD) for i in range(law.horizon)])
         row = law.step(StepInputs(attitude=np.array([1.0, 0, 0, 0]), body_rates=np.zeros(3)), state, reference).speeds
-        target = target_of(reference, law._operator)
-        _, desired = law.targets(motion_of(state), target, Integrals(translation=np.zeros(3), rotation=np.zeros(3)))
+        _, desired = law.targets(
+            motion_of(state), law.target(reference), Integrals(translation=np.zeros(3), rotation=np.zeros(3))
+        )
         rows.append((row, desired))
     for (row, desired), half in zip(rows, (0.0, 0.5 * PERIOD), strict=True):
         commanded = Rotation.from_quat(np.roll(row[4:], -1)).as_matrix()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from support import advance_nodes, derivative, frame, linearise_nodes
 
 from mpc.nonlinear.model import nonlinear_model
@@ -33,7 +35,7 @@ from quadsim.rotation import (
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, tilt
 from quadsim.vehicle import load_vehicle
 
-VEHICLE = load_vehicle(vehicle_path("lopes2011"))
+VEHICLE = replace(load_vehicle(vehicle_path("lopes2011")), rotor_moment=(2e-5, -3e-5), rate_damping=(0.01, 0.02, 0.03))
 DRAG = {"drag": np.array([0.3, 0.2, 0.1]), "quadratic_drag": np.array([0.08, 0.05, 0.02])}
 DISTURBED = {"acceleration": np.array([0.3, -0.2, 0.5]), "angular_acceleration": np.array([1.0, -2.0, 0.5])}
 
@@ -43,11 +45,13 @@ def points(model: RigidBody, rng: np.random.Generator, count: int = 10) -> tuple
     x = rng.normal(size=(count, model.n))
     x[:, Q] *= rng.uniform(0.2, 1.2, (count, 1)) / np.linalg.norm(x[:, Q], axis=1, keepdims=True)
     u = model.shares(np.full(4, VEHICLE.mass * VEHICLE.gravity / 4.0)) + 0.02 * rng.normal(size=(count, 4))
+    u[-1, 0] = 0.003  # a rotor that hardly turns
     x[:, N_BODY:] = u[:, : model.n - N_BODY] + 0.02 * rng.normal(size=(count, model.n - N_BODY))
     return x, u
 
 
-CASES = [*itertools.product((Inputs.THRUST, Inputs.SPEED), (None, 0.03), (1, 3), ({}, DRAG, DISTURBED))]
+OTHERS = ({}, DRAG, DISTURBED, {"moment": True}, DRAG | DISTURBED | {"moment": True})
+CASES = [*itertools.product((Inputs.THRUST, Inputs.SPEED), (None, 0.03), (1, 3), OTHERS)]
 
 
 @pytest.mark.parametrize(("inputs", "lag", "substeps", "others"), CASES)
@@ -83,6 +87,33 @@ def test_derivatives_in_frames_are_those_of_multiplied_quaternions() -> None:
         before[Q, Q], after[Q, Q] = frame(frames[i]), frame(frames[i + 1])
         np.testing.assert_allclose(A[i], after @ plain[i] @ before.T, atol=1e-12)
         np.testing.assert_allclose(B[i], after @ inputs[i], atol=1e-12)
+
+
+@pytest.mark.parametrize("inputs", [Inputs.THRUST, Inputs.SPEED])
+def test_it_moves_by_the_equations_of_a_rigid_body_in_air(inputs: Inputs) -> None:
+    """A variable-step integrator of the equations as they are written, with drag and the air's torque."""
+    model = rigid_body(VEHICLE, 0.1, inputs=inputs, substeps=50, moment=True, thrust_scale=0.9, **DRAG, **DISTURBED)
+    x, u = points(model, np.random.default_rng(5), 3)
+    x[:, Q] /= np.linalg.norm(x[:, Q], axis=1, keepdims=True)
+    thrusts = model.thrusts(u)
+    wrenches = 0.9 * thrusts @ (VEHICLE.allocation / VEHICLE.mean_coefficient).T
+    turning = np.sqrt(thrusts / VEHICLE.mean_coefficient).sum(axis=1)
+
+    def slopes(_: float, y: Array, wrench: Array, turning: float) -> Array:
+        (w, *vector), v, omega = y[Q], y[V], y[W]
+        R = rotation(y[Q])
+        air = R.T @ v
+        force = np.array([0.0, 0.0, wrench[0]]) - (model.drag + model.quadratic_drag * np.abs(air)) * air
+        turn = 0.5 * np.array([-np.dot(vector, omega), *(w * omega + np.cross(vector, omega))])
+        v_slope = R @ force / VEHICLE.mass + model.acceleration - [0.0, 0.0, VEHICLE.gravity]
+        torque = wrench[1:] + VEHICLE.air_moment(turning, air, omega) - np.cross(omega, VEHICLE.momentum(omega))
+        return np.concatenate([v, turn, v_slope, VEHICLE.angular_acceleration(torque) + model.angular_acceleration])
+
+    ends = [
+        solve_ivp(slopes, (0.0, 0.1), x[i], args=(wrenches[i], turning[i]), rtol=1e-11, atol=1e-12).y[:, -1]
+        for i in range(2)
+    ]
+    np.testing.assert_allclose(advance_nodes(model, x, u)[:2], ends, atol=1e-8)
 
 
 @pytest.mark.parametrize("others", [{}, DRAG])

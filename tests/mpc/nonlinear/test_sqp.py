@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,10 @@ from quadsim.space import Sphere
 from quadsim.state import N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import load_vehicle
 
-VEHICLE, PERIOD = load_vehicle(vehicle_path("hummingbird")), 0.02
+VEHICLE = replace(
+    load_vehicle(vehicle_path("hummingbird")), rotor_moment=(2e-5, -3e-5), rate_damping=(0.01, 0.02, 0.03)
+)
+PERIOD = 0.02
 HOVER = np.full(4, VEHICLE.hover_speed)
 RATES: dict[str, Any] = {"commands": "rates", "inner_lag": (0.03, 0.02, 0.02, 0.05), "tilt": 15.0, "body_rate": 40.0}
 FENCE = Polytope(name="fence", of=("x", "vy", "z"), rows=((1.0, 0.5, 0.0), (0.0, 0.0, 1.0)), upper=(0.3, 0.2))
@@ -47,6 +52,8 @@ MANY: dict[str, dict[str, Any]] = {
     "polytopes": {"inputs": "speed", "polytopes": (FENCE, LIFT)},
     "targets": RATES | {"soft": Soft(linear=20.0, quadratic=5.0)},
     "targets and moves": RATES | {"soft": Soft(linear=20.0, quadratic=5.0), "weights": Weights(move=0.5)},
+    "moment": {"moment": True},
+    "moment and moves with lag": {"moment": True, "inputs": "speed", "rotor_lag": 0.02, "weights": Weights(move=0.5)},
     "drag": {"drag": (0.3, 0.3, 0.1), "quadratic_drag": (0.05, 0.05, 0.02), "terminal": "lqr", "tilt": 12.0},
 }
 
@@ -178,6 +185,25 @@ def test_the_start_makes_no_difference() -> None:
 
 
 @pytest.mark.slow("nonlinear")
+@pytest.mark.parametrize("settings", [{}, RATES | {"soft": Soft(linear=20.0, quadratic=5.0)}])
+def test_steps_end_with_the_time_and_keep_the_plan(settings: dict[str, Any]) -> None:
+    """By a clock that is a second later whenever it is asked: the plan is that of as many steps without a limit."""
+    x = thrown(np.random.default_rng(4), 1.0)
+    whole, three, limited = (
+        law(**settings, iterations=iterations, time_limit=limit)
+        for iterations, limit in ((8, None), (3, None), (8, 2.5))
+    )
+    limited._sqp.clock = partial(next, itertools.count(1.0))
+    plans = [call(controller, x).plan for controller in (whole, three, limited)]
+    assert [controller._sqp._work.iterations for controller in (whole, three, limited)] == [8, 3, 3]
+    np.testing.assert_array_equal(plans[1], plans[2])
+    assert np.abs(plans[0] - plans[2]).max() > 0.0
+    again, same = limited._sqp.plan, three._sqp.plan
+    assert again is not None
+    assert same is not None
+    np.testing.assert_array_equal(again[0], same[0])
+
+
 def test_ten_thousand_thrown_states_have_typed_answers() -> None:
     """From near to absurd: no hang, no number that is none, no status without a name."""
     rng = np.random.default_rng(1)

@@ -24,6 +24,7 @@ from scenarios.identify.prediction import (
     HORIZONS,
     IDENTIFIED,
     QUANTITIES,
+    RESIDUAL_AFTER,
     START,
     THRUST_ONLY,
     PredictionErrors,
@@ -107,7 +108,7 @@ def test_the_file_loads_flies_and_says_where_each_number_is_from(identified: Ide
 def test_the_page_has_every_parameter(identified: IdentifiedVehicle) -> None:
     assert identified.page is not None
     page = identified.page.read_text(encoding="utf-8")
-    assert [f'id="{key}"' in page for key in ("intervals", "trace", "horizon")] == [True] * 3
+    assert [f'id="{key}"' in page for key in ("intervals", "trace", "residuals", "horizon")] == [True] * 4
     assert all(entry.name in page for entry in identified.identification.estimates)
 
 
@@ -117,8 +118,8 @@ def test_the_page_draws_in_a_browser(identified: IdentifiedVehicle, width: int, 
     assert identified.page is not None
     with opened(identified.page, width=width, dark=dark) as tab:
         plots = tab.locator(".plot")
-        assert plots.count() == 3
-        assert [plots.nth(i).evaluate(CLASHES) for i in range(3)] == [0, 0, 0]
+        assert plots.count() == 4
+        assert [plots.nth(i).evaluate(CLASHES) for i in range(4)] == [0, 0, 0, 0]
         assert tab.locator("text=NaN").count() == 0
 
 
@@ -220,6 +221,10 @@ def test_the_true_vehicle_predicts_and_thrust_alone_holds_the_rates(eight: Fligh
     assert held == pytest.approx(np.broadcast_to(held[:, :1], held.shape), abs=1e-12)
     assert found.trace.predicted[THRUST_ONLY][:, 0] == pytest.approx(found.trace.measured[:, 0])
     assert [*QUANTITIES] == ["position", "velocity", "attitude", "body rates"]
+    for name, left in found.residuals.items():
+        norms = [np.linalg.norm(left[:, of], axis=1).mean() for of in (slice(3), slice(3, 6))]
+        assert norms == pytest.approx(found.errors[name][HORIZONS.index(RESIDUAL_AFTER), [1, 3]])
+    assert np.diff(found.ends) == pytest.approx(0.25)
 
 
 def test_the_prediction_knows_delay_offset_and_wind(place: Path) -> None:
@@ -291,7 +296,7 @@ def test_the_last_fifth_of_the_airborne_samples_is_held_out(place: Path) -> None
 
 
 REFUSED: list[tuple[str, str]] = [
-    ("", "identify needs a flight log: CSV, Parquet, ULog, or a run directory"),
+    ("", "identify needs a flight log: CSV, Parquet, an autopilot's, or a run directory"),
     ("eight.csv", "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template"),
     ("eight.csv --vehicle none.toml", "none.toml: no such vehicle file"),
     ("none.csv --vehicle start.toml", "none.csv: is missing"),

@@ -273,7 +273,7 @@ def test_an_accelerometer_takes_the_place_of_velocity() -> None:
     force += 0.1 * np.random.default_rng(0).standard_normal(force.shape)
     fields = ("attitude", "rates", "commands")
     series = {name: SampledSeries(t=record.t, values=np.asarray(getattr(record, name))) for name in fields}
-    read = to_record("imu", series | {"force": SampledSeries(t=record.t, values=force)})
+    read = to_record("imu", series | {"specific_force": SampledSeries(t=record.t, values=force)})
     assert read.inertial
     assert read.notes == ("imu: no velocity is logged; the accelerometer stands in for it",)
     found = identify(read)
@@ -286,7 +286,7 @@ def test_an_accelerometer_takes_the_place_of_velocity() -> None:
     assert np.isfinite(errors[:, 2:]).all()
     for spoilt, why in ((force / 9.81, "likely in g"), (-force, "likely z points down")):
         with pytest.raises(InputError, match=why):
-            to_record("imu", series | {"force": SampledSeries(t=record.t, values=spoilt)})
+            to_record("imu", series | {"specific_force": SampledSeries(t=record.t, values=spoilt)})
 
 
 def test_two_logs_are_fitted_together_and_narrow_the_intervals() -> None:

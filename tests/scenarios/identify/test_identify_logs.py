@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import struct
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter1d
 
 import quadsim
 from quadsim.errors import FileError, InputError, MissingPackageError, ParameterError
@@ -18,6 +20,7 @@ from quadsim.flight.parquet import write_log
 from quadsim.rotation import conjugate, quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
+from scenarios.commands.cli import main
 from scenarios.flown import Flight
 from scenarios.identify.checks import check_log, spans
 from scenarios.identify.record import Record, read_record
@@ -29,6 +32,7 @@ FIELDS = {"position": "x y z", "velocity": "vx vy vz", "attitude": "qw qx qy qz"
 FIELDS |= {"commands": "u1 u2 u3 u4"}
 NOISE = {"position": 0.002, "velocity": 0.02, "attitude": 0.26, "rates": 0.43}
 Spoil = Callable[[Record], Record]
+Topics = dict[str, tuple[str, Array, Array]]
 
 
 def flown(vehicle: str, course: str, **changes: Any) -> Flight:
@@ -219,7 +223,7 @@ def test_columns_of_one_name_are_refused(tmp_path: Path, eight: Record) -> None:
 
 def test_files_that_are_no_logs(tmp_path: Path, eight: Record) -> None:
     (tmp_path / "empty").mkdir()
-    (tmp_path / "log.bin").write_bytes(b"")
+    (tmp_path / "log.txt").write_bytes(b"")
     (tmp_path / "log.csv").write_bytes(b"\x00\xff")
     (tmp_path / "log.ulg").write_bytes(b"no log at all")
     text = write_csv(tmp_path / "text.csv", columns(eight))
@@ -227,7 +231,7 @@ def test_files_that_are_no_logs(tmp_path: Path, eight: Record) -> None:
     for name, problem in {
         "none.csv": "is missing",
         "empty": "has no flight.parquet",
-        "log.bin": r"can be read \(these can: .csv, .parquet, .ulg",
+        "log.txt": r"can be read \(these can: .csv, .parquet, .ulg",
         "log.csv": "lacks a column of time|is not a readable CSV",
         "log.ulg": "is not a readable ULog",
         "text.csv": "column t must be numbers",
@@ -327,6 +331,8 @@ SPOILT: dict[str, Spoil] = {
     "wx stands still while the others change": lambda record: replace(
         record, rates=np.column_stack([np.full(len(record.t), 0.1), record.rates[:, 1:]])
     ),
+    "wx, wy, wz stand still while the motors run": scaled(rates=0.0),
+    "qw, qx, qy, qz stand still": lambda record: replace(record, attitude=np.tile(record.attitude[0], (800, 1))),
     "outputs of rotor 2 never change": lambda record: replace(
         record,
         commands=record.commands * [1.0, 0.0, 1.0, 1.0],  # type: ignore[operator]
@@ -436,7 +442,12 @@ def test_ground_is_cut(tmp_path: Path) -> None:
 # ULog
 
 
-def ulog(path: Path, topics: dict[str, tuple[str, Array, Array]], formats: str = "") -> Path:
+def ulog(
+    path: Path,
+    topics: dict[str, tuple[str, Array, Array]],
+    formats: str = "",
+    parameters: dict[str, float] | None = None,
+) -> Path:
     """Write a ULog: topics with the format of their fields, times [s] and rows of numbers."""
 
     def message(kind: str, payload: bytes) -> bytes:
@@ -445,9 +456,13 @@ def ulog(path: Path, topics: dict[str, tuple[str, Array, Array]], formats: str =
     parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)]
     parts += [message("F", line.encode()) for line in formats.splitlines()]
     parts += [message("F", f"{name}:uint64_t timestamp;{fields}".encode()) for name, (fields, _, _) in topics.items()]
+    for name, value in (parameters or {}).items():
+        key = f"{'int32_t' if isinstance(value, int) else 'float'} {name}".encode()
+        number = struct.pack("<i" if isinstance(value, int) else "<f", value)
+        parts.append(message("P", bytes([len(key)]) + key + number))
     parts += [message("A", struct.pack("<BH", 0, i) + name.encode()) for i, name in enumerate(topics)]
     for i, (fields, times, rows) in enumerate(topics.values()):
-        kind = "i" if "esc" in fields else "f"
+        kind = "i" if "esc" in fields else "?" if "bool" in fields else "f"
         for t, row in zip(times, rows, strict=True):
             values = [int(value) for value in row] if kind == "i" else row.tolist()
             stamp = struct.pack("<HQ", i, round(1e6 * t))
@@ -456,7 +471,7 @@ def ulog(path: Path, topics: dict[str, tuple[str, Array, Array]], formats: str =
     return path
 
 
-def px4_topics(record: Record) -> dict[str, tuple[str, Array, Array]]:
+def px4_topics(record: Record) -> Topics:
     """A record as PX4 logs it: NED, FRD, every topic at its own rate."""
     down = z_down(record)
     assert down.position is not None
@@ -497,14 +512,96 @@ def test_ulog_with_outputs_and_speeds(tmp_path: Path, eight: Record) -> None:
     np.testing.assert_allclose(record.speeds, 838.0 * record.throttle, rtol=0.1)
 
 
+def test_ulog_pulses_are_those_of_each_motor(tmp_path: Path, eight: Record) -> None:
+    """Motors on outputs 5 to 8; a shortest pulse of -1 is the common one; below it, a motor stands."""
+    topics = px4_topics(eight)
+    _, t, throttle = topics.pop("actuator_motors")
+    outputs = np.concatenate([np.full((len(t), 4), 900.0), 1100.0 + 800.0 * throttle], axis=1)
+    outputs[:20, 4:] = 900.0
+    topics["actuator_outputs"] = ("float[8] output;", t, outputs)
+    stated = {f"PWM_MAIN_FUNC{5 + i}": 101 + i for i in range(4)} | {f"PWM_MAIN_MIN{5 + i}": -1 for i in range(4)}
+    stated |= {"PWM_MAIN_MIN": 1100, "PWM_MAIN_MAX": 2000} | {f"PWM_MAIN_MAX{5 + i}": 1900 for i in range(4)}
+    record = read_record(ulog(tmp_path / "pwm.ulg", topics, parameters=stated))
+    assert record.throttle is not None
+    at = np.searchsorted(eight.t, record.t[50:600] - 1e-4) - 1
+    np.testing.assert_allclose(record.throttle[50:600], eight.commands[at] / 838.0, rtol=1e-5)  # type: ignore[index]
+    np.testing.assert_array_equal(record.throttle[:10], 0.0)
+
+
+def test_ulog_knows_when_it_flies(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
+    """What is armed and not landed is flown; a log that never is says so."""
+    topics = px4_topics(eight)
+    topics["actuator_armed"] = ("bool armed;", np.array([0.0, 0.5, 7.8]), np.array([[False], [True], [False]]))
+    topics["vehicle_land_detected"] = ("bool landed;", np.array([0.0, 1.0]), np.array([[True], [False]]))
+    record = read_record(ulog(tmp_path / "armed.ulg", topics))
+    (part,) = spans(record, hummingbird)
+    np.testing.assert_allclose(record.t[[part.start, part.stop - 1]], [1.0, 7.8], atol=0.011)
+    topics["actuator_armed"] = ("bool armed;", np.zeros(1), np.array([[False]]))
+    with pytest.raises(InputError, match=r"parked\.ulg: never flies: by its autopilot it is disarmed or landed all"):
+        spans(read_record(ulog(tmp_path / "parked.ulg", topics)), hummingbird)
+
+
+def test_accelerometer_fills_in_a_slow_velocity(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
+    """By default, PX4 logs its velocity at 10 Hz and its accelerometer at full rate; without velocity, that is all."""
+    eight = replace(eight, velocity=uniform_filter1d(eight.velocity, 9, axis=0))
+    topics = px4_topics(eight)
+    acceleration = np.gradient(eight.velocity, eight.t, axis=0) + np.array([0.0, 0.0, 9.81])
+    force = to_world(conjugate(eight.attitude), acceleration) * [1.0, -1.0, -1.0]
+    topics["sensor_combined"] = ("float[3] accelerometer_m_s2;", eight.t, force)
+    fields, t, local = topics["vehicle_local_position"]
+    topics["vehicle_local_position"] = (fields, t[::5], local[::5])
+    record = read_record(ulog(tmp_path / "slow.ulg", topics))
+    assert record.notes == ("slow.ulg: the velocity is logged at 10 Hz; the accelerometer fills it in",)
+    del topics["sensor_combined"]
+    alone = read_record(ulog(tmp_path / "alone.ulg", topics))
+    errors = [
+        np.std(np.diff(np.interp(read.t[100:600], eight.t, eight.velocity[:, 0]) - read.velocity[100:600, 0]))
+        for read in (record, alone)
+    ]
+    assert errors[0] < 0.6 * errors[1]
+    topics["sensor_combined"] = ("float[3] accelerometer_m_s2;", eight.t, force)
+    del topics["vehicle_local_position"]
+    assert read_record(ulog(tmp_path / "imu.ulg", topics)).inertial
+
+
+def test_advice_names_the_setting_of_the_autopilot(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
+    topics = px4_topics(eight)
+    fields, t, throttle = topics["actuator_motors"]
+    for rarely in ((t, np.repeat(throttle[::10], 10, axis=0)), (t[::10], throttle[::10])):
+        topics["actuator_motors"] = (fields, *rarely)
+        with pytest.raises(InputError, match=r"outputs change (9|10)\b.* log the outputs .*set SDLOG_PROFILE to 17"):
+            spans(read_record(ulog(tmp_path / "default.ulg", topics)), hummingbird)
+
+
+def test_rotors_that_a_ulog_states_are_offered_for_the_start(
+    tmp_path: Path, eight: Record, capsys: pytest.CaptureFixture[str]
+) -> None:
+    x, y, turns = (0.1, -0.12, 0.11, -0.1), (0.2, -0.21, -0.2, 0.2), (1.0, 1.0, -1.0, -1.0)
+    stated: dict[str, float] = {"CA_ROTOR_COUNT": 4}
+    for i in range(4):
+        stated |= {f"CA_ROTOR{i}_PX": x[i], f"CA_ROTOR{i}_PY": y[i], f"CA_ROTOR{i}_PZ": -0.05}
+        stated |= {f"CA_ROTOR{i}_KM": 0.06 * turns[i]}
+    path = ulog(tmp_path / "px4.ulg", px4_topics(eight), parameters=stated)
+    assert main(["identify", str(path)]) == 2
+    (message,) = capsys.readouterr().err.splitlines()
+    tables = tomllib.loads("\n".join(message.partition("rotor_azimuths: ")[2].split("; ")))
+    hubs = [[x[i], -y[i], 0.05] for i in range(4)]
+    np.testing.assert_allclose(tables["rotor_positions"]["value"], hubs)
+    assert tables["rotor_spins"]["value"] == [-1, -1, 1, 1]
+    assert tables["drag_to_thrust"] == {"value": 0.06, "unit": "m", "source": "CA_ROTOR of px4.ulg"}
+
+
 def test_ulog_needs_its_topics_and_pyulog(tmp_path: Path, eight: Record, monkeypatch: pytest.MonkeyPatch) -> None:
     topics = px4_topics(eight)
     del topics["vehicle_attitude"]
     path = ulog(tmp_path / "short.ulg", topics)
-    with pytest.raises(FileError, match="lacks the topic vehicle_attitude; of those used it has"):
+    with pytest.raises(
+        FileError,
+        match=r"lacks attitude: columns vehicle_attitude\.q\[0\].*; it has (actuator_motors|vehicle_|battery_)",
+    ):
         read_record(path)
     with pytest.raises(InputError, match="leave poles out"):
-        read_record(path, poles=14)
+        read_record(ulog(tmp_path / "px4.ulg", px4_topics(eight)), poles=14)
     real = builtins.__import__
 
     def without(name: str, *arguments: Any) -> Any:

@@ -318,7 +318,9 @@ def test_fields_of_the_baselines_arrive() -> None:
     assert isinstance(geometric, GeometricController)
     for law in (lqr, pid, geometric):
         assert same(law.bounds, ActuatorBounds.alike((1.0, 300.0), (-20.0, 30.0)))
-        assert (law._largest_tilt, law.horizon) == (math.radians(12.0), 7)
+        assert law.horizon == 7
+    assert lqr._largest_tilt == pid._largest_tilt == math.radians(12.0)
+    assert geometric.numbers.slope == math.tan(math.radians(12.0))
     vehicle = Assembly(scenario("lqr")).vehicle
     assert same(lqr.objective, bryson_objective(vehicle))
     assert not lqr._heading

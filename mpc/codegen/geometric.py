@@ -1,0 +1,100 @@
+"""The C files of a geometric controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from mpc.answer import ActuatorBounds
+from mpc.baselines.geometric import Geometric, GeometricController
+from mpc.codegen.ctext import CText
+from mpc.codegen.source import SHARED_FILES, CSource
+from mpc.core.numbers import fallback_numbers
+from mpc.fallback.settings import USUAL_FALLBACK
+from mpc.nonlinear.law import WIDTH_OF_MOTION
+from quadsim.errors import ExportError
+from quadsim.state import N_STATES
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+
+@dataclass(frozen=True, kw_only=True)
+class CGeometric(CSource):
+    """A geometric controller of thrust and body rates as C source; it solves no problem, so it has no active rows.
+
+    Raises:
+        ExportError: it commands something else.
+    """
+
+    table: Geometric
+    vehicle: Vehicle
+    control_period: float  # [s]
+    motion: bool = False  # whether the course has a motion, which feed-forward takes
+
+    law_name = "quadsim_geometric"
+    law_files = (*SHARED_FILES, "quadsim_ramp.h", "quadsim_ramp.c", "quadsim_geometric.h", "quadsim_geometric.c")
+    state = N_STATES + 7
+    tolerances = ("1e-9", "5e-2")  # in floats, positions show a snap of several m/s^4 that is none
+    plan = "law->plan"
+    changes = "(void)law, 0"
+    rows = 0
+
+    def __post_init__(self) -> None:
+        if self.table.commands != "rates":
+            raise ExportError(f'it is \'geometric\' with commands = "{self.table.commands}"; exported is "rates"')
+
+    @cached_property
+    def law(self) -> GeometricController:
+        """The controller, of whose numbers these are."""
+        return GeometricController(self.vehicle, self.control_period, self.table)
+
+    @property
+    def period(self) -> float:
+        """See `CSource`."""
+        return self.control_period
+
+    @property
+    def horizon(self) -> int:
+        """See `CSource`."""
+        return self.table.horizon
+
+    @property
+    def bounds(self) -> ActuatorBounds:
+        """See `CSource`."""
+        return self.law.bounds
+
+    @property
+    def commands(self) -> str:
+        """See `CSource`."""
+        return self.table.commands
+
+    @property
+    def motion_rows(self) -> int:
+        """See `CSource`."""
+        return self.law.motion_rows if self.motion else 0
+
+    @property
+    def reference(self) -> tuple[int, int, str]:
+        """See `CSource`."""
+        if self.motion_rows:
+            return self.motion_rows, WIDTH_OF_MOTION, "position, quaternion, and ten that do not count"
+        return super().reference
+
+    @property
+    def reals(self) -> int:
+        """See `CSource`: as counted by `quadsim_geometric_reals`."""
+        return 2 * self.horizon * N_ROTORS
+
+    def numbers(self, text: CText) -> list[str]:
+        """See `CSource`."""
+        law, prefix = self.law, text.prefix
+        settings = USUAL_FALLBACK.within({})
+        fallback = fallback_numbers(law.model, law.bounds, settings, self.horizon)
+        blocks = [text.array(name, array) for name, array in law.pointed.items()]
+        values = {name: text.value(value) for name, value in fallback.items()}
+        blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **values))
+        addresses = {name: f"{prefix}{name}" for name in law.pointed} | {"fallback": f"&{prefix}fallback"}
+        if law.observer is not None:
+            blocks.append(text.struct("quadsim_ramp_numbers", f"{prefix}ramp", **text.mirrored(law.observer.numbers)))
+            addresses["ramp"] = f"&{prefix}ramp"
+        members = text.mirrored(law.numbers, addresses, motion=int(self.motion_rows > 0))
+        return [*blocks, text.struct("quadsim_geometric_numbers", "QUADSIM_CONTROLLER", **members)]

@@ -1,0 +1,79 @@
+"""Betaflight's Blackbox logs (`.bbl`, `.bfl`), read by orangebox."""
+
+from __future__ import annotations
+
+import logging
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.errors import FileError
+from scenarios.identify.libraries import reading
+from scenarios.identify.quantities import RPM, LoggedColumns, NamedQuantity, logged_as
+from scenarios.identify.series import Column, on_one_clock
+
+_ADVICE: Final = (
+    "in Betaflight, set blackbox_disable_attitude, _acc, _rpm and _gyro to OFF, blackbox_sample_rate to 1/8"
+)
+_WHOLE: Final = 32767.0  # 1 in a component of the quaternion
+_G: Final = 9.80665  # [m/s^2]
+_POLES: Final = 14  # of a motor, by default
+
+
+def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
+    """Read the columns of a Blackbox log by their names in it; of several in one file, the longest.
+
+    Betaflight's axes are ours: x forward, y left, z up. Of its quaternion a log has x, y, z; w is not negative.
+
+    Raises:
+        MissingPackageError: orangebox is not installed.
+        FileError: it is not a Blackbox log.
+    """
+    logging.getLogger("orangebox").addHandler(logging.NullHandler())  # else it warns of what it guesses
+    rows: list[tuple[Any, ...]] = []
+    with reading(path, "Blackbox log", "orangebox"):
+        from orangebox import Parser
+
+        log = Parser.load(str(path), allow_invalid_header=True)
+        begins = [*log.reader.log_pointers, path.stat().st_size]
+        log = Parser.load(str(path), 1 + int(np.argmax(np.diff(begins))), allow_invalid_header=True)
+        names, headers = log.field_names, log.headers
+        try:
+            for frame in log.frames():
+                rows.append(frame.data[: len(names)])
+        except (IndexError, RuntimeError, TypeError, ValueError):  # a log that is cut off ends there
+            if not rows:
+                raise
+    table = np.array([[np.nan if value == "" else value for value in row] for row in rows], float)
+    if "time" not in names or not table.size:
+        raise FileError(path, "has no frame with a time")
+    columns = on_one_clock(table[:, names.index("time")] * 1e-6, dict(zip(names, table.T, strict=True)))
+    turn = [columns.get(f"imuQuaternion[{i}]") for i in range(3)]
+    if all(turn):
+        x, y, z = (of.values / _WHOLE for of in turn if of is not None)
+        columns["imuQuaternion.w"] = Column(
+            columns["time"].t, _WHOLE * np.sqrt(np.maximum(1.0 - x * x - y * y - z * z, 0.0))
+        )
+    flights = len(begins) - 1
+    notes = (f"{path.name}: the longest of its {flights} flights is read",) if flights > 1 else ()
+    return LoggedColumns(columns=columns, quantities=_quantities(headers), advice=_ADVICE, notes=notes)
+
+
+def _quantities(headers: Mapping[str, Any]) -> tuple[NamedQuantity, ...]:
+    """What the columns are, in the units that the log's header states."""
+    (degrees,) = struct.unpack("<f", struct.pack("<I", int(headers.get("gyro_scale", 0x3F800000))))
+    degrees *= 0.1 if headers.get("blackbox_high_resolution") == 1 else 1.0
+    low, high = headers.get("motorOutput", (1000, 2000))
+    rpm = 100.0 / (0.5 * float(headers.get("motor_poles", _POLES)))
+    gravity = _G / float(headers.get("acc_1G", 2048))
+    return (
+        logged_as("rates", "gyroADC[{}]", scale=np.radians(degrees)),
+        logged_as("attitude", "imuQuaternion{}", each=".w [0] [1] [2]", scale=1.0 / _WHOLE),
+        logged_as("specific_force", "accSmooth[{}]", scale=gravity),
+        logged_as("throttle", "motor[{}]", scale=1.0 / (high - low), zero=low),
+        logged_as("speeds", "eRPM[{}]", scale=rpm * RPM),
+        logged_as("voltage", "vbatLatest", unit="cV"),
+    )

@@ -1,0 +1,531 @@
+"""Logs of autopilots, written here by their documented formats: each gives the flight back, in our units and frames."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flown_logs import fly_eight, write_log
+
+import quadsim
+from quadsim.assets import vehicle_path
+from quadsim.errors import FileError, InputError
+from quadsim.rotation import conjugate, quaternion_to_euler
+from quadsim.state import Array
+from quadsim.vehicle import load_vehicle
+from scenarios.commands.cli import main
+from scenarios.identify.checks import check_log, spans
+from scenarios.identify.model import stretch
+from scenarios.identify.quantities import NamedQuantity, read_map
+from scenarios.identify.record import Record, read_record, to_record
+from scenarios.identify.rotor_response import rotor_response
+from scenarios.identify.rotors import lagging
+from scenarios.identify.series import SampledSeries
+from scenarios.identify.windows import to_world
+
+pytestmark = pytest.mark.slow("identification")
+
+DOWN = np.array([1.0, -1.0, -1.0])
+FULL = 838.0  # [rad/s] at full throttle
+
+
+@pytest.fixture(scope="module")
+def eight(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    return read_record(write_log(fly_eight("hummingbird"), tmp_path_factory.mktemp("eight") / "eight.csv"))
+
+
+def throttle(record: Record) -> Array:
+    assert record.commands is not None
+    return record.commands / FULL
+
+
+def check_flight(read: Record, eight: Record, *, exact: float, shift: float = 0.0) -> None:
+    """The log says what flew: attitude and rates at its times, the throttle of its rows, and passes the checks."""
+    inner = slice(10, len(read.t) - 10)
+    t = read.t[inner] - shift
+    for name in ("rates", "attitude", "velocity"):
+        if name == "velocity" and read.inertial:
+            continue
+        known = np.stack([np.interp(t, eight.t, column) for column in getattr(eight, name).T], axis=1)
+        np.testing.assert_allclose(getattr(read, name)[inner], known, atol=0.06 if name == "velocity" else exact)
+    sent = throttle(eight)[np.clip(np.searchsorted(eight.t, t + 1e-4) - 1, 0, None)]
+    driving = read.throttle if read.throttle is not None else np.asarray(read.commands) / FULL
+    np.testing.assert_allclose(driving[inner], sent, atol=exact)
+    start = quadsim.load_vehicle("hummingbird")
+    check_log(read, start, spans(read, start))
+
+
+# ArduPilot
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message of a dataflash log: its format's letters and columns, then a row per time."""
+
+    name: str
+    letters: str
+    columns: str
+    t: Array
+    rows: Array
+    instances: tuple[int, ...] = ()  # of each row, in the column after the time
+
+
+STRUCT = {"Q": "Q", "B": "B", "f": "f", "h": "h", "H": "H", "c": "h", "C": "H", "N": "16s"}
+
+
+def dataflash(path: Path, messages: list[Message], parameters: dict[str, float]) -> Path:
+    """Write a `.bin`: FMT of every message, the FMTU that tells instances, PARM, and the rows in order of time."""
+    head = b"\xa3\x95"
+    types = {name: 129 + i for i, name in enumerate(["PARM", "FMTU", *(message.name for message in messages)])}
+    formats = {"PARM": ("QNff", "TimeUS,Name,Value,Default"), "FMTU": ("QBNN", "TimeUS,FmtType,UnitIds,MultIds")}
+    formats |= {message.name: (f"Q{message.letters}", f"TimeUS,{message.columns}") for message in messages}
+    parts = [
+        head + b"\x80" + struct.pack("<BB4s16s64s", 0x80, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
+    ]
+    packers = {}
+    for name, (letters, columns) in formats.items():
+        packers[name] = struct.Struct("<" + "".join(STRUCT[letter] for letter in letters))
+        stated = types[name], 3 + packers[name].size, name.encode(), letters.encode(), columns.encode()
+        parts.append(head + b"\x80" + struct.pack("<BB4s16s64s", *stated))
+    for message in messages:
+        if message.instances:
+            units = b"s#" + b"-" * (len(message.letters) - 1)
+            parts.append(head + bytes([types["FMTU"]]) + packers["FMTU"].pack(0, types[message.name], units, b""))
+    for name, value in parameters.items():
+        parts.append(head + bytes([types["PARM"]]) + packers["PARM"].pack(0, name.encode(), value, value))
+    rows = []
+    for message in messages:
+        for i, (t, row) in enumerate(zip(message.t, message.rows, strict=True)):
+            values = [*message.instances[i : i + 1], *row.tolist()]
+            whole = [v if letter == "f" else round(v) for v, letter in zip(values, message.letters, strict=True)]
+            packed = packers[message.name].pack(round(1e6 * t), *whole)
+            rows.append((t, head + bytes([types[message.name]]) + packed))
+    path.write_bytes(b"".join(parts + [row for _, row in sorted(rows, key=lambda row: row[0])]))
+    return path
+
+
+def ardupilot(record: Record) -> list[Message]:
+    """What ArduPilot logs with fast attitude: front, right, down; angles in centidegrees; pulses of each motor."""
+    angles = np.degrees(quaternion_to_euler(record.attitude)) * DOWN
+    angles[:, 2] %= 360.0
+    assert record.position is not None
+    place = np.concatenate([record.velocity * DOWN, record.position * DOWN], axis=1)
+    pulses = np.full((len(record.t), 8), 1500.0)
+    pulses[:, 4:] = 1000.0 + 1000.0 * throttle(record)[:, [1, 0, 2, 3]]
+    gyro, two = np.repeat(record.rates * DOWN, 2, axis=0), (0, 1) * len(record.t)
+    gyro[1::2] += 1.0  # a second one that is wrong
+    return [
+        Message("IMU", "Bfff", "I,GyrX,GyrY,GyrZ", np.repeat(record.t, 2), gyro, two),
+        Message("ATT", "ccC", "Roll,Pitch,Yaw", record.t, 100.0 * angles),
+        Message("XKF1", "Bffffff", "C,VN,VE,VD,PN,PE,PD", record.t[::2], place[::2], (0,) * len(record.t[::2])),
+        Message("RCOU", "HHHHHHHH", "C1,C2,C3,C4,C5,C6,C7,C8", record.t, pulses),
+        Message("BAT", "f", "Volt", record.t[::50], np.full((len(record.t[::50]), 1), 11.1)),
+        Message("ARM", "B", "ArmState", np.array([0.0, 0.3]), np.array([[0.0], [1.0]])),
+    ]
+
+
+SERVOS = {"SERVO5_FUNCTION": 34.0, "SERVO6_FUNCTION": 33.0, "SERVO7_FUNCTION": 35.0, "SERVO8_FUNCTION": 36.0}
+
+
+def test_dataflash(tmp_path: Path, eight: Record) -> None:
+    """The first instance of each sensor, the outputs that are motors, and what is flown while armed."""
+    pytest.importorskip("pymavlink", reason="the extra logs is not installed")
+    read = read_record(dataflash(tmp_path / "00000007.BIN", ardupilot(eight), SERVOS))
+    check_flight(read, eight, exact=0.02)
+    assert read.voltage == pytest.approx(11.1, abs=1e-6)
+    assert read.flying is not None
+    np.testing.assert_array_equal(read.flying, read.t >= 0.3)
+
+
+def test_dataflash_of_another_kind_or_torn(tmp_path: Path, eight: Record, capfd: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pymavlink", reason="the extra logs is not installed")
+    (tmp_path / "log.bin").write_bytes(b"no log")
+    with pytest.raises(FileError, match="is not a readable dataflash log"):
+        read_record(tmp_path / "log.bin")
+    path = dataflash(tmp_path / "torn.bin", ardupilot(eight), SERVOS)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2] + b"\x00" * 700 + whole[len(whole) // 2 : -7])
+    assert len(read_record(path).t) > 900
+    assert capfd.readouterr() == ("", "")
+    messages = [message for message in ardupilot(eight) if message.name != "ATT"]
+    with pytest.raises(
+        FileError,
+        match=r"lacks attitude: columns XKQ\.Q1,.* or ATT\.Roll,.*; it has IMU\.TimeUS, IMU\.I, IMU\.GyrX",
+    ):
+        read_record(dataflash(tmp_path / "no.bin", messages, SERVOS))
+
+
+# Columns by a map
+
+
+MAP = """
+[t]
+columns = ["time (us)"]
+unit = "us"
+
+[rates]
+columns = ["gyroADC[0]", "gyroADC[1]", "gyroADC[2]"]
+unit = "deg/s"
+frame = "FRD"
+
+[velocity]
+columns = ["north", "west", "vz"]
+unit = "km/h"
+sign = [1, 1, -1]
+
+[attitude]
+columns = ["q0", "q1", "q2", "q3"]
+frame = "NED/FRD"
+
+[throttle]
+columns = ["motor[0]", "motor[1]", "motor[2]", "motor[3]"]
+unit = "us"
+"""
+
+
+def foreign(path: Path, record: Record) -> Path:
+    """A table with names, units and frames of its own."""
+    table = {"time (us)": 1e6 * record.t}
+    table |= {f"gyroADC[{i}]": column for i, column in enumerate((np.degrees(record.rates) * DOWN).T)}
+    table |= dict(zip(("north", "west", "vz"), (3.6 * record.velocity * [1.0, 1.0, -1.0]).T, strict=True))
+    table |= {f"q{i}": column for i, column in enumerate((record.attitude * np.append(1.0, DOWN)).T)}
+    table |= {f"motor[{i}]": column for i, column in enumerate((1000.0 + 1000.0 * throttle(record)).T)}
+    np.savetxt(path, np.stack([*table.values()], axis=1), delimiter=", ", header=", ".join(table), comments="")
+    return path
+
+
+def mapped(path: Path, text: str) -> tuple[NamedQuantity, ...]:
+    (path / "map.toml").write_text(text, encoding="utf-8")
+    return read_map(path / "map.toml")
+
+
+def test_any_table_by_a_map(tmp_path: Path, eight: Record) -> None:
+    read = read_record(foreign(tmp_path / "foreign.csv", eight), columns=mapped(tmp_path, MAP))
+    check_flight(read, eight, exact=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[rates]", "[gyro]", r"map.toml: has no table 'gyro'; there are t, position, velocity"),
+        ('unit = "deg/s"', 'unit = "dps"', r"rates\.unit must be one of 'rad/s', 'deg/s'; got 'dps'"),
+        ('frame = "FRD"', 'frame = "NED"', r"rates\.frame must be one of 'FLU', 'FRD'; got 'NED'"),
+        ("[1, 1, -1]", "[1, 1]", r"velocity\.sign must be a list of 3 of 1 and -1; got \[1, 1\]"),
+        ('["q0", ', "[", r"attitude\.columns must be a list of 4 names; got \['q1'"),
+        ('unit = "km/h"', 'units = "km/h"', r"velocity has no 'units'; its fields are columns, unit, sign, frame"),
+        ("[t]", "t = 3\n[t.x]", "not valid TOML|must be a table"),
+        ("gyroADC[2]", "gyroADC[3]", r"foreign.csv: lacks what the map's rates\.columns names 'gyroADC\[3\]'; it has"),
+        ('unit = "us"\n\n', "\n", r"[0-9.e-]+ samples per second, period"),
+    ],
+)
+def test_maps_that_cannot_be_used(tmp_path: Path, eight: Record, old: str, new: str, message: str) -> None:
+    assert old in MAP
+    with pytest.raises(InputError, match=message):
+        read_record(foreign(tmp_path / "foreign.csv", eight), columns=mapped(tmp_path, MAP.replace(old, new, 1)))
+
+
+def test_the_command_takes_a_map(tmp_path: Path, eight: Record, capsys: pytest.CaptureFixture[str]) -> None:
+    path = foreign(tmp_path / "foreign.csv", eight)
+    mapped(tmp_path, MAP)
+    words = ["--vehicle", "hummingbird", "--columns", str(tmp_path / "map.toml")]
+    assert main(["identify", str(path), *words, "--out", str(tmp_path / "mine.toml"), "--anyway"]) == 0
+    assert load_vehicle(tmp_path / "mine.toml").inertia[0] == pytest.approx(0.007, rel=0.1)
+    assert main(["identify", str(path), *words[:2], "--columns", str(tmp_path / "none.toml")]) == 2
+    assert "none.toml: cannot be read" in capsys.readouterr().err
+
+
+# Bags
+
+
+BAG_MAP = """
+[rates]
+columns = ["/imu.angular_velocity.x", "/imu.angular_velocity.y", "/imu.angular_velocity.z"]
+
+[velocity]
+columns = ["/odom.twist.twist.linear.x", "/odom.twist.twist.linear.y", "/odom.twist.twist.linear.z"]
+
+[attitude]
+columns = ["/odom.pose.pose.orientation.w", "/odom.pose.pose.orientation.x", "/odom.pose.pose.orientation.y",
+           "/odom.pose.pose.orientation.z"]
+
+[throttle]
+columns = ["/motors.data[0]", "/motors.data[1]", "/motors.data[2]", "/motors.data[3]"]
+"""
+
+
+def write_bag(path: Path, record: Record) -> Path:
+    """A bag of ROS 1, a directory of ROS 2, or its one file: the motors' messages have no header."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    one = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
+    kind = store.types
+    plugin = StoragePlugin.SQLITE3 if path.suffix == ".db3" else StoragePlugin.MCAP
+    whole = path if one else path.with_suffix("")
+    with Writer1(whole) if one else Writer2(whole, version=9, storage_plugin=plugin) as writer:
+        names = ("sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry", "std_msgs/msg/Float32MultiArray")
+        imu, odometry, motors = (
+            writer.add_connection(topic, name, typestore=store)
+            for topic, name in zip(("/imu", "/odom", "/motors"), names, strict=True)
+        )
+        time, vector = kind["builtin_interfaces/msg/Time"], kind["geometry_msgs/msg/Vector3"]
+        point, turn = kind["geometry_msgs/msg/Point"], kind["geometry_msgs/msg/Quaternion"]
+        none = vector(0.0, 0.0, 0.0)
+        for t, rates, velocity, q, u in zip(
+            record.t, record.rates, record.velocity, record.attitude, throttle(record), strict=True
+        ):
+            stamp, arrived = round(1e9 * (t + 50.0)), round(1e9 * (t + 50.0))
+            extra = {"seq": 0} if one else {}
+            header = kind["std_msgs/msg/Header"](stamp=time(stamp // 10**9, stamp % 10**9), frame_id="", **extra)
+            attitude = turn(*q[[1, 2, 3, 0]].tolist())
+            pose = kind["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), attitude)
+            twist = kind["geometry_msgs/msg/Twist"](vector(*velocity.tolist()), none)
+            pose = kind["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36))
+            twist = kind["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36))
+            unknown = np.zeros(9)
+            messages = (
+                (imu, kind[names[0]](header, attitude, unknown, vector(*rates.tolist()), unknown, none, unknown)),
+                (odometry, kind[names[1]](header, "", pose, twist)),
+                (motors, kind[names[2]](kind["std_msgs/msg/MultiArrayLayout"]([], 0), u.astype(np.float32))),
+            )
+            for connection, message in messages:
+                late = arrived + 3_000_000 * (connection is not motors)  # they arrive after they were stamped
+                serialize = store.serialize_ros1 if one else store.serialize_cdr
+                writer.write(connection, late, serialize(message, connection.msgtype))
+    return whole
+
+
+@pytest.mark.parametrize("name", ["ros1.bag", "ros2.mcap", "ros2.db3"])
+def test_bags(tmp_path: Path, eight: Record, name: str) -> None:
+    """By the stamps of the headers, where there are any."""
+    pytest.importorskip("rosbags", reason="the extra logs is not installed")
+    path = write_bag(tmp_path / name, eight)
+    columns = mapped(tmp_path, BAG_MAP)
+    check_flight(read_record(path, columns=columns), eight, exact=1e-6, shift=50.0)
+    if path.is_dir():
+        (alone,) = (file for file in path.iterdir() if file.suffix == Path(name).suffix)
+        assert len(read_record(alone, columns=columns).t) == len(eight.t)
+
+
+def test_bags_that_cannot_be_read(tmp_path: Path, eight: Record) -> None:
+    pytest.importorskip("rosbags", reason="the extra logs is not installed")
+    path = write_bag(tmp_path / "ros1.bag", eight)
+    with pytest.raises(InputError, match=r"ros1\.bag: a bag names no quantities: give --columns"):
+        read_record(path)
+    for old, new, message in (
+        ("velocity.x", "velocities.x", r"'/imu\.angular_velocities\.x': no angular_velocities in header, orientation"),
+        ("data[0]", "data[7]", r"'/motors\.data\[7\]': no 7 in 4 numbers"),
+        ("/imu.angular_velocity.x", "/imu.angular_velocity", r"is not a number but .*Vector3.*: name a field of it"),
+        ("/imu", "/gyro", r"the map's rates\.columns names '/gyro.*; it has /imu, /odom, /motors"),
+        ("[attitude]", "[position]", r"position\.columns must be a list of 3 names"),
+    ):
+        with pytest.raises(FileError, match=message):
+            read_record(path, columns=mapped(tmp_path, BAG_MAP.replace(old, new)))
+    with pytest.raises(InputError, match=r"ros1\.bag: has a clock of its own; leave \[t\] out of the map"):
+        read_record(path, columns=mapped(tmp_path, BAG_MAP + '[t]\ncolumns = ["/imu.header.stamp.sec"]'))
+    cut = BAG_MAP.partition("[throttle]")[0]
+    with pytest.raises(FileError, match=r"lacks rotor commands or speeds: columns \[commands\] of the map or"):
+        read_record(path, columns=mapped(tmp_path, cut))
+    (tmp_path / "torn.mcap").write_bytes(b"\x89MCAP0\r\n nothing")
+    with pytest.raises(FileError, match="is not a readable bag"):
+        read_record(tmp_path / "torn.mcap", columns=mapped(tmp_path, BAG_MAP))
+
+
+# Betaflight
+
+
+def variable(value: int, *, signed: bool) -> bytes:
+    """A number in 7 bits per byte, the lowest first; a signed one in zigzag."""
+    value = (value << 1 ^ value >> 31) & 0xFFFFFFFF if signed else value
+    parts = []
+    while value > 127:
+        parts.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*parts, value])
+
+
+def blackbox(path: Path, columns: dict[str, Array], **headers: object) -> Path:
+    """Write a `.bbl`: every 8th frame whole, the others as changes from the one before, and the end of the log."""
+    n = len(columns)
+    stated: dict[str, object] = {"Data version": 2, "I interval": 8, "P interval": 1}
+    stated["Field I name"] = ",".join(columns)
+    for field, number in (
+        ("I signed", 1),
+        ("I predictor", 0),
+        ("I encoding", 0),
+        ("P predictor", 1),
+        ("P encoding", 0),
+    ):
+        stated[f"Field {field}"] = ",".join([str(number)] * n)
+    product = "H Product:Blackbox flight data recorder by Nicholas Sherlock\n"
+    head = "".join(f"H {name}:{value}\n" for name, value in {**stated, **headers}.items())
+    table = np.rint(np.stack([*columns.values()], axis=1)).astype(int)
+    parts = [f"{product}{head}".encode()]
+    for k, row in enumerate(table):
+        parts.append(b"P" if k % 8 else b"I")
+        parts += [variable(int(v), signed=True) for v in (row - table[k - 1] if k % 8 else row)]
+    path.write_bytes(b"".join([*parts, b"E\xffEnd of log\x00"]))
+    return path
+
+
+def betaflight(record: Record) -> dict[str, Array]:
+    """Gyro in 0.1 deg/s, accelerometer of 2048 per g, the quaternion's vector, DShot, speeds in 100 eRPM."""
+    falling = np.gradient(record.velocity, record.t, axis=0) + np.array([0.0, 0.0, 9.81])
+    force = to_world(conjugate(record.attitude), falling)
+    turn = record.attitude * np.sign(record.attitude[:, :1])
+    speeds = throttle(record) * FULL * 60.0 / (2.0 * np.pi) * 6.0 / 100.0
+    groups = {"gyroADC": 10.0 * np.degrees(record.rates), "accSmooth": force * 2048.0 / 9.80665}
+    groups |= {
+        "imuQuaternion": 32767.0 * turn[:, 1:],
+        "motor": 158.0 + (2047.0 - 158.0) * throttle(record),
+        "eRPM": speeds,
+    }
+    table = {"loopIteration": np.arange(len(record.t)) * 1.0, "time": 1e6 * (record.t + 3.0)}
+    table |= {f"{name}[{i}]": column for name, of in groups.items() for i, column in enumerate(of.T)}
+    return {**table, "vbatLatest": np.full(len(record.t), 1587.0)}
+
+
+HEADERS = {
+    "Firmware revision": "Betaflight 4.6.0",
+    "gyro_scale": "0x3f800000",
+    "acc_1G": 2048,
+    "motorOutput": "158,2047",
+}
+HEADERS |= {"motor_poles": 12, "blackbox_high_resolution": 1}
+
+
+def test_blackbox(tmp_path: Path, eight: Record) -> None:
+    """Units by its header; the longest of the flights in a file; a log that is cut off ends there."""
+    pytest.importorskip("orangebox", reason="the extra logs is not installed")
+    path = blackbox(tmp_path / "LOG00001.BFL", betaflight(eight), **HEADERS)
+    whole = path.read_bytes()
+    short = blackbox(tmp_path / "short.bbl", {name: of[:50] for name, of in betaflight(eight).items()}, **HEADERS)
+    path.write_bytes(short.read_bytes() + whole)
+    read = read_record(path)
+    assert read.inertial
+    assert read.notes[0] == "LOG00001.BFL: the longest of its 2 flights is read"
+    check_flight(read, eight, exact=2e-3, shift=3.0)
+    assert read.voltage == pytest.approx(15.87)
+    assert read.speeds is not None
+    np.testing.assert_allclose(read.speeds, FULL * np.asarray(read.throttle), atol=2.0)
+    path.write_bytes(whole[: len(whole) * 3 // 4])
+    assert 0.6 * len(eight.t) < len(read_record(path).t) < 0.9 * len(eight.t)
+
+
+def test_blackbox_that_cannot_be_used(tmp_path: Path, eight: Record) -> None:
+    pytest.importorskip("orangebox", reason="the extra logs is not installed")
+    (tmp_path / "log.bbl").write_bytes(b"H Product:Blackbox flight data recorder\nnothing")
+    with pytest.raises(FileError, match=r"is not a readable Blackbox log|has no frame"):
+        read_record(tmp_path / "log.bbl")
+    table = {name: of for name, of in betaflight(eight).items() if not name.startswith(("imuQ", "acc"))}
+    with pytest.raises(FileError, match=r"lacks velocity: .*it has loopIteration.*set blackbox_disable_attitude, _acc"):
+        read_record(blackbox(tmp_path / "default.bbl", table, **HEADERS))
+
+
+def test_a_log_without_attitude_is_levelled_by_its_accelerometer(tmp_path: Path, eight: Record) -> None:
+    """As Betaflight up to 4.5 logs it: its tilt comes within 2 deg, its heading begins at 0."""
+    pytest.importorskip("orangebox", reason="the extra logs is not installed")
+    table = {name: of for name, of in betaflight(eight).items() if not name.startswith("imuQ")}
+    read = read_record(blackbox(tmp_path / "default.bbl", table, **HEADERS))
+    assert read.notes[-1] == "default.bbl: no attitude is logged; it is the gyro's, levelled by the accelerometer"
+    vertical = np.tile([0.0, 0.0, 1.0], (len(eight.t), 1))
+    up, known = (to_world(conjugate(record.attitude), vertical) for record in (read, eight))  # which no heading changes
+    assert np.abs(known[:, :2]).max() > 0.2
+    np.testing.assert_allclose(up, known, atol=np.radians(2.0))
+    commanded = {name: of for name, of in table.items() if not name.startswith("eRPM")}
+    blackbox(tmp_path / "default.bbl", commanded, **HEADERS)
+    identified = quadsim.identify(tmp_path / "default.bbl", vehicle="hummingbird").vehicle
+    np.testing.assert_allclose(identified.inertia, load_vehicle(vehicle_path("hummingbird")).inertia, rtol=0.03)
+
+
+# Crazyflie
+
+
+def micro_sd(path: Path, events: dict[str, dict[str, Array]], version: int) -> Path:
+    """Write a log of the micro SD card deck: events by name, each with `t` [s] and variables by `name(letter)`."""
+    parts = [b"\xbc" + struct.pack("<HH", version, len(events))]
+    rows = []
+    for number, (event, variables) in enumerate(events.items()):
+        names = [name for name in variables if name != "t"]
+        texts = b"".join(f"{name}\0".encode() for name in names)
+        parts.append(struct.pack("<H", number) + f"{event}\0".encode() + struct.pack("<H", len(names)) + texts)
+        letters = [name[-2] for name in names]
+        for t, *values in zip(*(variables[name] for name in ("t", *names)), strict=True):
+            whole = [v if letter == "f" else round(v) for v, letter in zip(values, letters, strict=True)]
+            stamp = round(1e3 * t) if version == 1 else round(1e6 * t)
+            rows.append((t, struct.pack(f"<H{'I' if version == 1 else 'Q'}{''.join(letters)}", number, stamp, *whole)))
+    data = b"".join(parts + [row for _, row in sorted(rows, key=lambda row: row[0])])
+    path.write_bytes(data + struct.pack("<I", zlib.crc32(data)))
+    return path
+
+
+def crazyflie(record: Record, *, angles: bool) -> dict[str, dict[str, Array]]:
+    """What its estimator has, gyro in deg/s, outputs of 16 bit; the battery in an event of its own."""
+    names = {"stateEstimate.v{}(f)": ("xyz", record.velocity), "gyro.{}(f)": ("xyz", np.degrees(record.rates))}
+    if angles:
+        table = np.degrees(quaternion_to_euler(record.attitude)) * [1.0, -1.0, 1.0]
+        fixed = dict(zip(("roll", "pitch", "yaw"), table.T, strict=True))
+        fixed = {f"stateEstimate.{name}(f)": column for name, column in fixed.items()}
+    else:
+        names |= {"stateEstimate.q{}(f)": ("wxyz", record.attitude)}
+        fixed = {}
+    names |= {"pwm.m{}_pwm(H)" if angles else "motor.m{}(I)": ("1234", 65535.0 * throttle(record))}
+    for pattern, (letters, rows) in names.items():
+        fixed |= {pattern.format(letter): column for letter, column in zip(letters, rows.T, strict=True)}
+    slow = record.t[::20]
+    battery = {"t": slow, "pm.vbatMV(H)": np.full(len(slow), 3912.0)}
+    return {"fixedFrequency": {"t": record.t, **fixed}, "battery": battery}
+
+
+@pytest.mark.parametrize(("version", "angles"), [(1, False), (2, True)])
+def test_crazyflie(tmp_path: Path, eight: Record, version: int, angles: bool) -> None:
+    read = read_record(micro_sd(tmp_path / "log00", crazyflie(eight, angles=angles), version))
+    check_flight(read, eight, exact=2e-5)
+    assert read.voltage == pytest.approx(3.912)
+
+
+def test_crazyflie_that_cannot_be_used(tmp_path: Path, eight: Record) -> None:
+    path = micro_sd(tmp_path / "log00", crazyflie(eight, angles=False), 2)
+    whole = path.read_bytes()
+    for spoilt in (whole[:5] + b"\xff" + whole[6:], whole[:200], whole[:20]):
+        path.write_bytes(spoilt)
+        with pytest.raises(FileError, match="is not a readable log of a Crazyflie"):
+            read_record(path)
+    path.write_bytes(whole[: len(whole) // 2])
+    assert read_record(path).notes == ("log00: its check sum is wrong: it is cut off or damaged",)
+    events = crazyflie(eight, angles=False)
+    del events["fixedFrequency"]["gyro.y(f)"]
+    with pytest.raises(FileError, match=r"lacks body rates: columns gyro\.x,gyro\.y,gyro\.z; .*in config\.txt of the"):
+        read_record(micro_sd(tmp_path / "log01", events, 2))
+
+
+def test_a_voltage_that_stands_still_shows_nothing(eight: Record) -> None:
+    vehicle = quadsim.load_vehicle("hummingbird")
+    turning = lagging(np.asarray(eight.commands), eight.period, rise=0.02, fall=0.03, delay=0.0)
+    flown = replace(eight, speeds=turning.speeds, throttle=throttle(eight), commands=None)
+    names = {}
+    for what, voltage in {"still": np.full(len(eight.t), 11.1), "sags": np.linspace(12.0, 11.0, len(eight.t))}.items():
+        response = rotor_response([stretch(replace(flown, voltage=voltage), 0)], vehicle, 11.1)
+        names[what] = {*response}
+        assert response["rotor_rise"].value == pytest.approx(0.02, abs=3e-3)
+    assert names["sags"] - names["still"] == {"voltage_exponent"}
+
+
+def test_a_fast_log_is_averaged_without_a_shift() -> None:
+    """At 1 kHz, three samples each: what is measured about their middle, commands over the time they are held."""
+    t = np.arange(4000) * 1e-3
+    motion = np.sin(t[:, None] * [20.0, 21.0, 22.0])
+    rows = {"rates": motion, "velocity": motion, "attitude": np.tile([1.0, 0.0, 0.0, 0.0], (4000, 1))}
+    rows["commands"] = 100.0 + np.arange(4000.0)[:, None] * [1.0, 1.0, 1.0, 1.0]
+    read = to_record("fast", {name: SampledSeries(t=t, values=of) for name, of in rows.items()})
+    assert read.notes == ("fast: 1000 Hz, of which means at 333 Hz are used",)
+    np.testing.assert_allclose(read.rates, np.sin(read.t[:, None] * [20.0, 21.0, 22.0]), atol=2e-4)
+    assert read.commands is not None
+    np.testing.assert_allclose(read.commands[:, 0], 100.0 + 1e3 * read.t + 1.0)  # k, k + 1 and k + 2 from t_k on
