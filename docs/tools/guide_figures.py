@@ -18,6 +18,7 @@ import quadsim.gym
 from quadsim.flight.audit import SIGNALS
 from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import Area, Bound, Figure, Panel, Series, outlines
+from quadsim.report.flight_figures import signals
 from quadsim.sim.effects.battery import LIPO
 from quadsim.state import POSITION
 from scenarios.identify.identification_figures import trace_figure
@@ -256,6 +257,16 @@ def betaflight() -> Figure:
     return Figure(key="betaflight", title="", panels=panels)
 
 
+def chain() -> Figure:
+    """Path, error and margin of the flight of examples/flight_chain.py, which takes a compiler and an emulator too."""
+    sys.path.append(str(ROOT / "examples"))
+    import flight_chain
+
+    with tempfile.TemporaryDirectory() as folder:
+        flight, _ = flight_chain.fly(Path(folder))
+    return replace(signals([flight.run], flight_chain.SIGNALS), key="chain", title="")
+
+
 FIGURES: Final[dict[str, Callable[[], Figure]]] = {
     made.__name__: made
     for made in (
@@ -269,7 +280,7 @@ FIGURES: Final[dict[str, Callable[[], Figure]]] = {
     )
 }
 
-OF_FIRMWARE: Final = {"betaflight": betaflight}
+OF_FIRMWARE: Final = {"betaflight": betaflight, "chain": chain}
 """Figures that are drawn only by name: they take a firmware."""
 
 

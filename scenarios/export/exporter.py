@@ -198,13 +198,15 @@ def export(
     return absolute(out)
 
 
-def c_controller(scenario: Scenario, precision: Precision = "double", rows: int | None = None) -> CSource:
+def c_controller(scenario: Scenario | Assembly, precision: Precision = "double", rows: int | None = None) -> CSource:
     """The controller's own files, with room for active `rows`; see `export`.
 
     Raises:
         ExportError: this controller cannot be exported.
     """
-    table, assembly, title = scenario.controller, Assembly(scenario), _title(scenario)
+    assembly = scenario if isinstance(scenario, Assembly) else Assembly(scenario)
+    scenario = assembly.scenario
+    table, title = scenario.controller, _title(scenario)
     if not isinstance(table, Nonlinear | Geometric):
         return CController(law=exported_law(scenario), precision=precision, title=title, asked=rows)
     if isinstance(table, Nonlinear) and table.avoidance is not None and (scenario.obstacles or assembly.regions):

@@ -39,6 +39,7 @@ from quadsim.controller import (
     NOT_CONVERGED,
     SOLVED,
     UNCONSTRAINED,
+    AutopilotLoop,
     Command,
     Phase,
     StepInputs,
@@ -282,6 +283,7 @@ def fly_exported(
     *,
     precision: Precision = "double",
     target: str = "cortex-m7",
+    autopilot: AutopilotLoop | None = None,
     progress: Progress | bool = True,
 ) -> Flight:
     """Fly a scenario with its controller exported, compiled and run by its target: processor in the loop.
@@ -295,6 +297,8 @@ def fly_exported(
         out: the run directory, without a film; nothing is written where absent.
         precision: of the controller's numbers, `double` or `float`.
         target: `cortex-m7`, `cortex-m4f` or `posix`.
+        autopilot: flies the targets of the exported controller in place of the built-in one, and gives it its lags; see
+            `quadsim.fly`.
         progress: see `quadsim.fly`.
 
     Raises:
@@ -305,13 +309,13 @@ def fly_exported(
         >>> import quadsim
         >>> flight = quadsim.fly_exported("hover", target="cortex-m4f", precision="float")  # doctest: +SKIP
     """
-    scenario = load_scenario(scenario)
-    machine = TARGETS[target]
-    source, assembly = c_controller(scenario, precision), Assembly(scenario)
+    assembly, machine = Assembly(load_scenario(scenario)), TARGETS[target]
+    assembly.user_autopilot = autopilot
+    source = c_controller(assembly, precision)
     files = source.files | programs(source, machine)
     require_programs(machine, "to fly an exported controller")
     if precision == "float" and source.bounds is not None:
-        scenario = _allowing(scenario, float(np.spacing(np.float32(source.bounds.u_max.max()))))
+        assembly = _allowing(assembly, float(np.spacing(np.float32(source.bounds.u_max.max()))))
     with tempfile.TemporaryDirectory(prefix="quadsim-") as scratch, reporting(progress) as report:
         directory = Path(scratch)
         for name, text in files.items():
@@ -319,18 +323,18 @@ def fly_exported(
         # The emulated clock is not the flight's.
         image = make_program(directory, "serial.elf", "CPPFLAGS=-DWATCHDOG_MS=0")
         with Program(machine, image) as line:
-            law = MPCInTheLoop(line, source, scenario.controller.type, machine)
+            law = MPCInTheLoop(line, source, assembly.scenario.controller.type, machine)
             pilot = assembly.with_autopilot(Pilot(law, assembly.vehicle))
             if out is None:
-                return Rollout(scenario, pilot).fly(report)
+                return Rollout(assembly, pilot).fly(report)
             with reserving(out) as place:
-                flight = Rollout(scenario, pilot).fly(report)
+                flight = Rollout(assembly, pilot).fly(report)
                 flight.save(place, video=False, progress=report)
                 return replace(flight, directory=place)
 
 
-def _allowing(scenario: Scenario, spacing: float) -> Scenario:
-    """The scenario with tolerances of at least `spacing` [rad/s] on speeds and their steps."""
+def _allowing(assembly: Assembly, spacing: float) -> Assembly:
+    """The same with tolerances of at least `spacing` [rad/s] on speeds and their steps."""
 
     def widened(limit: Limit) -> Limit:
         if limit.signal not in COMMAND_SIGNALS:
@@ -338,5 +342,5 @@ def _allowing(scenario: Scenario, spacing: float) -> Scenario:
         plant, sampled = (max(spacing, tolerance) for tolerance in limit.tolerances)
         return replace(limit, tolerance=plant, tolerance_sampled=sampled)
 
-    limits = [*map(widened, Assembly(scenario).with_bounds.constraints)]
-    return scenario.altered(constraints=limits)
+    limits = [*map(widened, assembly.with_bounds.constraints)]
+    return assembly.of(assembly.scenario.altered(constraints=limits))

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import quadsim
 from mpc.codegen.targets import TARGETS
 from quadsim.errors import FlightError, MissingProgramError
+from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from scenarios.commands.cli import main
 from scenarios.export.in_the_loop import Frames, Program, SerialMPC, fly_exported, require_programs
 from scenarios.loading import load_scenario
@@ -40,6 +42,23 @@ def test_a_flight_by_the_target_is_the_flight_by_python(name: str) -> None:
     assert result.log.control.status == desired.log.control.status
     assert np.abs(result.command - desired.command).max() <= apart
     assert [finding.satisfied for finding in result.findings] == [finding.satisfied for finding in desired.findings]
+
+
+def test_an_autopilot_passed_in_flies_the_targets_and_gives_the_law_its_lags() -> None:
+    if shutil.which("cc") is None:
+        pytest.skip("cc is not installed: make firmware")
+    short = load_scenario("autopilot", ["duration=2.0", "effects.rotors={}", "sensors={}"])
+    slow = Autopilot(quadsim.load_vehicle("hummingbird"), AutopilotSettings(p=(10.0, 10.0, 5.0)))
+    result, desired, built_in = (
+        fly_exported(short, target="posix", autopilot=slow, progress=False),
+        quadsim.fly(short, autopilot=slow, progress=False),
+        quadsim.fly(short, progress=False),
+    )
+    assert np.abs(result.command - desired.command).max() <= 1e-9
+    flown, own, usual = (each.summary["controller"]["autopilot"] for each in (result, desired, built_in))
+    assert flown == own
+    assert flown["name"] == "Autopilot"
+    assert min(flown["inner_lag"][1:3]) > 1.5 * max(usual["inner_lag"][1:3])
 
 
 FAILURES = {
