@@ -127,6 +127,43 @@ def test_the_robust_controller_too(other: str, precision: str, answers: Answers)
     assert bits(answers(target, precision, *make, scenario="robust")) == bits(host)
 
 
+WASM = [
+    *("clang", "--target=wasm32", "-O3", "-std=c99", "-ffp-contract=off", "-fno-builtin", "-nostdlib", "-Dmain=answer"),
+    *("-Wl,--no-entry,--allow-undefined", "-Wl,--export=answer,--export=memory"),
+]
+STRING = """#include <stddef.h>
+void *memcpy(void *restrict to, const void *restrict from, size_t bytes);
+void *memmove(void *to, const void *from, size_t bytes);
+void *memset(void *to, int value, size_t bytes);
+"""
+NODE = """
+const bytes = new Uint8Array(require("fs").readFileSync(process.argv[1]));
+let memory;
+const text = at => { const all = new Uint8Array(memory.buffer), end = all.indexOf(0, at);
+  return Buffer.from(all.subarray(at, end)).toString(); };
+const env = { target_print: at => process.stdout.write(text(at)) };
+WebAssembly.instantiate(bytes, { env }).then(({ instance }) => {
+  memory = instance.exports.memory; process.exitCode = instance.exports.answer(); });
+"""
+
+
+@pytest.mark.parametrize(
+    ("law", "precision"), [("paper-constrained", "double"), ("nonlinear", "double"), ("autopilot", "float")]
+)
+def test_webassembly_answers_the_same_bits(
+    law: str, precision: str, exported: Export, answers: Answers, run: Run, tmp_path: Path
+) -> None:
+    directory = exported("posix", precision, scenario=law)
+    (tmp_path / "string.h").write_text(STRING)
+    programs = [directory / "main.c", directory / "vectors.c", HERE / "wasm.c"]
+    include = ["-I", tmp_path, "-I", directory]
+    module = tmp_path / "answer.wasm"
+    run(*WASM, *DEFINES[precision], *include, "-o", module, *programs, *sources_of(directory))
+    done = run("node", "-e", NODE, module)
+    lines = [tuple(line.split()) for line in done.stdout.splitlines()]
+    assert bits([line for line in lines if len(line) == 8]) == bits(answers("posix", precision, scenario=law))
+
+
 def test_contraction_would_change_bits(answers: Answers) -> None:
     """The flag is there for a reason: with it on, an aarch64 fuses products and sums."""
     assert bits(answers("posix", "double", *AARCH64, CONTRACTED)) != bits(answers("posix", "double"))
