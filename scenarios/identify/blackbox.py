@@ -64,7 +64,8 @@ def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
 
 def _quantities(headers: Mapping[str, Any]) -> tuple[NamedQuantity, ...]:
     """What the columns are, in the units that the log's header states."""
-    (degrees,) = struct.unpack("<f", struct.pack("<I", int(headers.get("gyro_scale", 0x3F800000))))
+    bits = headers.get("gyro_scale")  # of a float
+    degrees = 1.0 if bits is None else struct.unpack("<f", struct.pack("<I", int(bits)))[0]
     degrees *= 0.1 if headers.get("blackbox_high_resolution") == 1 else 1.0
     low, high = headers.get("motorOutput", (1000, 2000))
     rpm = 100.0 / (0.5 * float(headers.get("motor_poles", _POLES)))
