@@ -7,8 +7,11 @@
 
 #include <string.h>
 
-/* A function whose sizes are constants wherever it is called: the compiler makes one of each size. */
-#if defined __GNUC__
+/* A function whose sizes are constants wherever it is called: the compiler makes one of each size, and with
+ * QUADSIM_ANY_SIZE one for all, smaller and slower. */
+#if defined QUADSIM_ANY_SIZE
+#define INLINED static
+#elif defined __GNUC__
 #define INLINED static inline __attribute__((always_inline))
 #else
 #define INLINED static inline

@@ -587,6 +587,9 @@ INLINED void finish_sized(quadsim_nmpc_work *work, const int actuators, const in
 }
 
 /* Call a function that is made for each number of actuators, with moves and without. */
+#ifdef QUADSIM_ANY_SIZE
+#define SIZED(function, ...) function(__VA_ARGS__, work->p->actuators, work->p->moves ? 1 : 0);
+#else
 #define SIZED(function, ...)                                              \
     switch (2 * work->p->actuators + (work->p->moves ? 1 : 0)) {          \
     case 0:                                                               \
@@ -607,6 +610,7 @@ INLINED void finish_sized(quadsim_nmpc_work *work, const int actuators, const in
     default:                                                              \
         function(__VA_ARGS__, 4, 1);                                      \
     }
+#endif
 
 static void optimum(quadsim_nmpc_work *work)
 {
