@@ -148,7 +148,7 @@ def test_more_active_rows_than_there_is_room_for_end_as_defined() -> None:
     usual, small = Host(scenario, rows=160), Host(scenario, rows=20)
     flight = recording("paper-constrained")
     for host in (usual, small):
-        host.reset(flight.speeds)
+        host.reset(flight.before)
     arguments = flight.state[0], flight.path[: usual.horizon], flight.acting[0]
     assert usual.step(*arguments).status == 2
     reply = small.step(*arguments)
