@@ -81,10 +81,9 @@ LAWS = {
 }
 BOARDED = [(law, *board) for law, limits in LAWS.items() for board in limits.boards]
 SAME = [
-    (law, precision, other)
-    for law, precisions in {"paper-constrained": DEFINES, "nonlinear": ("double",), "autopilot": ("float",)}.items()
-    for precision in precisions
-    for other in OTHERS
+    *(("paper-constrained", precision, other) for precision in DEFINES for other in OTHERS),
+    *(("nonlinear", "double", other) for other in ("cortex-m7", "host, clang")),
+    *(("autopilot", "float", other) for other in ("cortex-m7", "cortex-m4f", "aarch64")),
 ]
 
 
