@@ -67,7 +67,7 @@ LAWS = {
         {"double": 115},
         (21_000, 22_000),
         600,
-        {0, 2},
+        {0, 2, 14},
     ),
     "autopilot": Limits(
         (("cortex-m7", "float"), ("cortex-m4f", "float")),
