@@ -35,15 +35,14 @@ class Reply:
 
 
 @functools.cache
-def library(files: tuple[tuple[str, str], ...], precision: Precision) -> ctypes.CDLL:
+def library(files: tuple[tuple[str, str], ...], defines: str) -> ctypes.CDLL:
     """A controller's files, compiled."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in files:
             (folder / file).write_text(text)
-        define = ["-DQUADSIM_FLOAT"] if precision == "float" else []
         sources = [HOST, *sorted(folder.glob("*.c"))]
-        subprocess.run(["cc", *FLAGS, *define, "-I", folder, "-o", folder / "host.so", *sources], check=True)
+        subprocess.run(["cc", *FLAGS, *defines.split(), "-I", folder, "-o", folder / "host.so", *sources], check=True)
         return ctypes.CDLL(str(folder / "host.so"))
 
 
@@ -52,7 +51,7 @@ class Host:
 
     def __init__(self, scenario: Scenario, precision: Precision = "double", rows: int | None = None) -> None:
         source, right = c_controller(scenario, precision, rows), ctypes.c_int()
-        self.library = library(tuple(source.files.items()), precision)
+        self.library = library(tuple(source.files.items()), source.defines)
         self.library.host_size.restype = ctypes.c_size_t
         self.memory = np.zeros(self.library.host_size(ctypes.byref(right)) // 8 + 1)
         assert right.value, "the memory that the export states is not what the controller needs"

@@ -5,20 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import Geometric, GeometricController
 from mpc.codegen.ctext import CText
-from mpc.codegen.source import SHARED_FILES, CSource
+from mpc.codegen.follower import CFollower
+from mpc.codegen.source import SHARED_FILES
 from mpc.core.numbers import fallback_numbers
 from mpc.fallback.settings import USUAL_FALLBACK
-from mpc.nonlinear.law import WIDTH_OF_MOTION
 from quadsim.errors import ExportError
-from quadsim.state import N_STATES
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.vehicle import N_ROTORS
 
 
 @dataclass(frozen=True, kw_only=True)
-class CGeometric(CSource):
+class CGeometric(CFollower):
     """A geometric controller of thrust and body rates as C source; it solves no problem, so it has no active rows.
 
     Raises:
@@ -26,15 +24,11 @@ class CGeometric(CSource):
     """
 
     table: Geometric
-    vehicle: Vehicle
-    control_period: float  # [s]
-    motion: bool = False  # whether the course has a motion, which feed-forward takes
 
     law_name = "quadsim_geometric"
     law_files = (*SHARED_FILES, "quadsim_ramp.h", "quadsim_ramp.c", "quadsim_geometric.h", "quadsim_geometric.c")
-    state = N_STATES + 7
+    motion_row = "position, quaternion, and ten that do not count"
     tolerances = ("1e-9", "5e-2")  # in floats, positions show a snap of several m/s^4 that is none
-    plan = "law->plan"
     changes = "(void)law, 0"
     rows = 0
 
@@ -46,38 +40,6 @@ class CGeometric(CSource):
     def law(self) -> GeometricController:
         """The controller, of whose numbers these are."""
         return GeometricController(self.vehicle, self.control_period, self.table)
-
-    @property
-    def period(self) -> float:
-        """See `CSource`."""
-        return self.control_period
-
-    @property
-    def horizon(self) -> int:
-        """See `CSource`."""
-        return self.table.horizon
-
-    @property
-    def bounds(self) -> ActuatorBounds:
-        """See `CSource`."""
-        return self.law.bounds
-
-    @property
-    def commands(self) -> str:
-        """See `CSource`."""
-        return self.table.commands
-
-    @property
-    def motion_rows(self) -> int:
-        """See `CSource`."""
-        return self.law.motion_rows if self.motion else 0
-
-    @property
-    def reference(self) -> tuple[int, int, str]:
-        """See `CSource`."""
-        if self.motion_rows:
-            return self.motion_rows, WIDTH_OF_MOTION, "position, quaternion, and ten that do not count"
-        return super().reference
 
     @property
     def reals(self) -> int:

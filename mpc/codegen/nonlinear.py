@@ -9,20 +9,18 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds
 from mpc.codegen.ctext import CText
-from mpc.codegen.source import CHANGES, SHARED_FILES, CSource
+from mpc.codegen.follower import CFollower
+from mpc.codegen.source import CHANGES, SHARED_FILES
 from mpc.core.numbers import fallback_numbers
 from mpc.core.tables import NO_BOUND
 from mpc.model import LinearModel, hover_model, target_model
 from mpc.nonlinear.body import ProblemStruct
 from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.law import WIDTH_OF_MOTION, memory_of
+from mpc.nonlinear.law import memory_of
 from mpc.nonlinear.settings import Nonlinear
 from quadsim.controller import ROTORS
 from quadsim.errors import ExportError
-from quadsim.state import N_STATES
-from quadsim.vehicle import Vehicle
 
 FILES: Final = (
     *SHARED_FILES,
@@ -36,7 +34,7 @@ FEWEST_ROWS: Final = 32
 
 
 @dataclass(frozen=True, kw_only=True)
-class CNonlinear(CSource):
+class CNonlinear(CFollower):
     """A nonlinear controller as C source, with room for 2 active rows per node, and at least 32.
 
     Raises:
@@ -44,14 +42,10 @@ class CNonlinear(CSource):
     """
 
     table: Nonlinear
-    vehicle: Vehicle
-    control_period: float  # [s]
-    motion: bool = False  # whether references are motions, not x y z yaw
 
     law_name = "quadsim_nonlinear"
     law_files = FILES
-    state = N_STATES + 7
-    plan = "law->plan"
+    motion_row = "position, quaternion, velocity, body rates, thrusts of the rotors"
 
     def __post_init__(self) -> None:
         if self.table.indi is not None:
@@ -72,42 +66,15 @@ class CNonlinear(CSource):
         )
 
     @property
-    def period(self) -> float:
-        """See `CSource`."""
-        return self.control_period
-
-    @property
-    def horizon(self) -> int:
-        """See `CSource`."""
-        return self.law.horizon
-
-    @property
-    def bounds(self) -> ActuatorBounds:
-        """See `CSource`."""
-        return self.table.actuators(self.vehicle)
-
-    @property
     def tolerances(self) -> tuple[str, str]:
         """See `CSource`; of thrust [N] and rates [rad/s] as well."""
         return "1e-9", "2.0" if self.commands == ROTORS else "0.05"
 
     @property
-    def commands(self) -> str:
-        """See `CSource`."""
-        return self.table.commands
-
-    @property
-    def motion_rows(self) -> int:
-        """See `CSource`."""
-        return self.law.motion_rows if self.motion else 0
-
-    @property
-    def reference(self) -> tuple[int, int, str]:
-        """See `CSource`."""
-        if self.motion:
-            what = "position, quaternion, velocity, body rates, thrusts of the rotors"
-            return self.motion_rows, WIDTH_OF_MOTION, what
-        return super().reference
+    def defines(self) -> str:
+        """See `CSource`: with its sizes, of which alone the kernel then has code."""
+        struct = self.law._sqp.struct
+        return f"{super().defines} -DQUADSIM_SIZES={struct.actuators},{int(struct.moves > 0)}".strip()
 
     @property
     def rows(self) -> int:

@@ -128,6 +128,11 @@ class CSource(abc.ABC):
         return {name: part(name, "mpc.core") for name in self.law_files} | body | {DATA: self.filled(part(DATA))}
 
     @property
+    def defines(self) -> str:
+        """Flags of a compiler that its files take."""
+        return "-DQUADSIM_FLOAT" if self.precision == "float" else ""
+
+    @property
     def objects(self) -> str:
         """Its object files, as the Makefile lists them."""
         return " ".join(sorted(name.replace(".c", ".o") for name in self.law_files if name.endswith(".c")))

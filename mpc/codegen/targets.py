@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from mpc.codegen.ctext import Precision
-
 EMULATOR: Final = "qemu-system-arm"
 INSTRUCTIONS_PER_TICK: Final = 40
 """Instructions per tick of the emulated processors' clock, with `-icount shift=0`."""
@@ -32,7 +30,7 @@ class Machine:
         options = f"-M {self.board} -nographic -monitor none -semihosting -icount shift=0"
         return (EMULATOR, *options.split())
 
-    def makefile(self, precision: Precision) -> str:
+    def makefile(self, defines: str) -> str:
         """Return the first lines of the Makefile."""
         run = " ".join(["timeout 600", *self.emulation, "-serial none -kernel"]) if self.board else ""
         lines = {
@@ -41,7 +39,7 @@ class Machine:
             "MACHINE_LINK": self.link,
             "TARGET": self.sources[0].replace(".c", ".o"),
             "RUN": run,
-            "PRECISION": "-DQUADSIM_FLOAT" if precision == "float" else "",
+            "DEFINES": defines,
         }
         return "".join(f"{name} = {value}".rstrip() + "\n" for name, value in lines.items())
 

@@ -260,7 +260,7 @@ def room_sentence(facts: Mapping[str, Any]) -> str:
 def programs(controller: CSource, target: Machine) -> dict[str, str]:
     """Return the files that run the controller on a target, by name."""
     names = ("main.c", "serial.c", "target.h", *target.sources, "LICENSE")
-    makefile = f"{target.makefile(controller.precision)}CONTROLLER = {controller.objects}\n{part('Makefile')}"
+    makefile = f"{target.makefile(controller.defines)}CONTROLLER = {controller.objects}\n{part('Makefile')}"
     return {name: part(name) for name in names} | {"Makefile": makefile}
 
 
@@ -295,7 +295,7 @@ def vector_files(recording: Recording, controller: CSource) -> dict[str, str]:
 
 def _readme(scenario: Scenario, controller: CSource, room: str) -> str:
     precision, law = controller.precision, controller.law_name
-    solves_none = isinstance(controller, CGeometric)
+    solves_none, flags = isinstance(controller, CGeometric), f"-ffp-contract=off {controller.defines}".strip()
     what = "geometric" if solves_none else "model predictive"
     files = *controller.law_files, *BODY_FILES
     sources = ", ".join(f"`{name}`" for name in files if not name.startswith(("quadsim_guard", law)))
@@ -328,6 +328,5 @@ status = quadsim_law_step(&law, QUADSIM_PHASE_FLYING, state, reference, acting, 
 
 {room[0].upper()}{room[1:]}.
 
-{"" if solves_none else WARM}Compile with `-ffp-contract=off`, and every processor gives
-the same bits{", and with `-DQUADSIM_FLOAT`, as the Makefile does" if precision == "float" else ""}.
+{"" if solves_none else WARM}Compile with `{flags}`, as the Makefile does; every processor then gives the same bits.
 """

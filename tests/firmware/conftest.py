@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -30,6 +31,12 @@ MEASURED = Path(__file__).resolve().parents[2] / "runs" / "numbers" / "export.js
 def sources_of(directory: Path) -> list[Path]:
     """The controller's own C files in an export."""
     return sorted(directory.glob("quadsim_*.c"))
+
+
+def defines_of(directory: Path) -> list[str]:
+    """Flags that its files take, as its Makefile states them."""
+    (line,) = re.findall(r"^DEFINES = ?(.*)$", (directory / "Makefile").read_text(), re.MULTILINE)
+    return str(line).split()
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from firmware.conftest import Export, Run, sources_of
+from firmware.conftest import Export, Run, defines_of, sources_of
 
 HERE = Path(__file__).parent
 SANITIZERS = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
@@ -35,9 +35,8 @@ def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Exp
     """A short horizon makes many steps; the whole one has the paths that only many active rows take."""
     scenario, *settings = CONTROLLERS[name]
     directory, program = exported("posix", *settings, scenario=scenario), tmp_path / "fuzz"
-    define = ["-DQUADSIM_FLOAT"] if "float" in settings else []
-    define += ["-DQUADSIM_ANY_SIZE"] if scenario in ("nonlinear", "autopilot") else []  # else a compiler takes minutes
-    compile = ["clang", "-g", "-O3", "-std=c99", "-ffp-contract=off", *SANITIZERS, *define, "-I", directory]
+    define = [*defines_of(directory), "-I", directory]
+    compile = ["clang", "-g", "-O3", "-std=c99", "-ffp-contract=off", *SANITIZERS, *define]
     built = run(*compile, "-o", program, HERE / "fuzz.c", *sources_of(directory), check=False)
     if "cannot find" in built.stderr:
         pytest.skip("clang has no sanitizers: make firmware")

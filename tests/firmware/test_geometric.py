@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from exported_c import Host
-from firmware.conftest import Run
+from firmware.conftest import Run, defines_of
 from firmware.test_fuzz import HANGS, HERE, SANITIZERS
-from firmware.test_static import ALLOWED, CPPCHECK, DEFINES, EXPORTS, TIDY, WARNINGS, undefined
+from firmware.test_static import ALLOWED, CPPCHECK, EXPORTS, TIDY, WARNINGS, undefined
 
 import quadsim
 from mpc.codegen.ctext import Precision
@@ -95,7 +95,7 @@ def test_compilers_give_no_warning(
     machine = TARGETS[EXPORTS[precision][0]].machine.split() if compiler.startswith("arm") else []
     directory = exported("fed forward", precision)
     for name in (*OWN, "main.c", "serial.c"):
-        run(compiler, *machine, *DEFINES[precision], *WARNINGS, "-c", directory / name, "-o", tmp_path / "object.o")
+        run(compiler, *machine, *defines_of(directory), *WARNINGS, "-c", directory / name, "-o", tmp_path / "object.o")
 
 
 def test_analysers_find_nothing(exported: Exported, run: Run, tmp_path: Path) -> None:
@@ -111,8 +111,9 @@ def test_analysers_find_nothing(exported: Exported, run: Run, tmp_path: Path) ->
 def test_it_needs_the_library_for_copies_only(
     precision: Precision, exported: Exported, run: Run, tmp_path: Path
 ) -> None:
-    sources = [exported("fed forward", precision) / name for name in SOURCES]
-    assert undefined(sources, precision, run, tmp_path / "needed.o") <= ALLOWED
+    directory = exported("fed forward", precision)
+    sources = [directory / name for name in SOURCES]
+    assert undefined(sources, directory, precision, run, tmp_path / "needed.o") <= ALLOWED
 
 
 def test_sanitizers_find_nothing_in_recorded_periods(exported: Exported, run: Run, tmp_path: Path) -> None:
@@ -127,7 +128,7 @@ def test_arbitrary_bytes_lead_to_commands_within_bounds(
     precision: Precision, exported: Exported, run: Run, tmp_path: Path
 ) -> None:
     directory, program = exported("fed forward", precision), tmp_path / "fuzz"
-    flags = ["-g", "-O1", "-std=c99", *SANITIZERS, *DEFINES[precision], "-DMOST_CHANGES=0", "-I", directory]
+    flags = ["-g", "-O1", "-std=c99", *SANITIZERS, *defines_of(directory), "-DMOST_CHANGES=0", "-I", directory]
     built = run("clang", *flags, "-o", program, HERE / "fuzz.c", *(directory / name for name in SOURCES), check=False)
     if "cannot find" in built.stderr:
         pytest.skip("clang has no sanitizers: make firmware")

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from firmware.conftest import Export, Run, sources_of
+from firmware.conftest import Export, Run, defines_of, sources_of
 
 from mpc.codegen.targets import TARGETS
 
@@ -25,7 +25,6 @@ TIDY = ",".join(
 CPPCHECK = ["--quiet", "--std=c99", "--enable=warning,style,performance,portability", "--error-exitcode=1"]
 CPPCHECK += ["--suppress=variableScope", "--suppress=unusedStructMember"]  # of members that other controllers use
 ALLOWED = {"memcpy", "memmove", "memset"}
-DEFINES = {"double": [], "float": ["-DQUADSIM_FLOAT"]}
 EXPORTS = {"double": ("cortex-m7", "double"), "float": ("cortex-m4f", "float")}
 PROGRAMS = ("main.c", "serial.c", "vectors.c")
 LAWS = {"linear": ("paper-constrained",), "nonlinear": ("autopilot", "duration=2.0")}
@@ -44,7 +43,7 @@ def test_compilers_give_no_warning(
     machine = TARGETS[EXPORTS[precision][0]].machine.split() if bare else []
     programs = [directory / name for name in (*PROGRAMS, "startup.c" if bare else "posix.c")]
     for source in (*sources_of(directory), *programs):
-        run(compiler, *machine, *DEFINES[precision], *WARNINGS, "-c", source, "-o", tmp_path / "object.o")
+        run(compiler, *machine, *defines_of(directory), *WARNINGS, "-c", source, "-o", tmp_path / "object.o")
 
 
 def test_files_of_two_precisions_do_not_make_a_program(exported: Export, run: Run, tmp_path: Path) -> None:
@@ -65,16 +64,16 @@ def test_analysers_find_nothing(law: str, exported: Export, run: Run, tmp_path: 
     directory = exported("posix", "double", *settings, scenario=scenario)
     sources = [*sources_of(directory), *(directory / name for name in ("main.c", "serial.c", "posix.c"))]
     for source in sources:
-        run("gcc", *WARNINGS, "-O1", "-fanalyzer", "-c", source, "-o", tmp_path / "object.o")
+        run("gcc", *defines_of(directory), *WARNINGS, "-O1", "-fanalyzer", "-c", source, "-o", tmp_path / "object.o")
     # In one precision: else cppcheck takes lengths in floats for those in doubles.
     run("cppcheck", *CPPCHECK, "-UQUADSIM_FLOAT", *sources, exported("cortex-m7", "double") / "startup.c")
     run("clang-tidy", "-quiet", f"-checks={TIDY}", "-warnings-as-errors=*", *sources, "--", "-std=c99")
 
 
-def undefined(sources: list[Path], precision: str, run: Run, made: Path) -> set[str]:
-    """Undefined symbols of sources together."""
+def undefined(sources: list[Path], directory: Path, precision: str, run: Run, made: Path) -> set[str]:
+    """Undefined symbols of sources together, compiled as the export in a directory."""
     target = TARGETS[EXPORTS[precision][0]]
-    flags = [*target.machine.split(), *DEFINES[precision], "-std=c99", "-O3", "-nostdlib", "-r"]
+    flags = [*target.machine.split(), *defines_of(directory), "-std=c99", "-O3", "-nostdlib", "-r"]
     run(target.compiler, *flags, *sources, "-o", made)
     return {line.split()[-1] for line in run("arm-none-eabi-nm", "-u", made).stdout.splitlines()}
 
@@ -87,7 +86,7 @@ def test_a_controller_needs_the_library_for_copies_only(
     """No malloc, no mathematics, and in float no emulated doubles, which a Cortex-M4F would need."""
     scenario, *settings = LAWS[law]
     directory = exported(*EXPORTS[precision], *settings, scenario=scenario)
-    assert undefined(sources_of(directory), precision, run, tmp_path / "needed.o") <= ALLOWED
+    assert undefined(sources_of(directory), directory, precision, run, tmp_path / "needed.o") <= ALLOWED
 
 
 PLANTED = """
@@ -125,13 +124,15 @@ def test_planted_faults_are_detected(fault: str, exported: Export, run: Run, tmp
     if tool == "nm":
         for name in ("quadsim_core.h", "quadsim_guard.h", "quadsim_mpc.h"):
             shutil.copy(header / name, tmp_path)
-        assert any(name.startswith(finding) for name in undefined([source], "float", run, tmp_path / "planted.o"))
+        assert any(
+            name.startswith(finding) for name in undefined([source], header, "float", run, tmp_path / "planted.o")
+        )
         return
     commands = {
         "tidy": ["clang-tidy", "-quiet", f"-checks={TIDY}", "-warnings-as-errors=*", source, "--", "-std=c99", include],
         "cppcheck": ["cppcheck", *CPPCHECK, include, source],
     }
-    compile = [*tool.split(), *DEFINES["float"], *WARNINGS, include, "-c", source, "-o", tmp_path / "planted.o"]
+    compile = [*tool.split(), *defines_of(header), *WARNINGS, include, "-c", source, "-o", tmp_path / "planted.o"]
     done = run(*commands.get(tool, compile), check=False)
     assert done.returncode != 0
     assert finding in done.stdout + done.stderr

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from firmware.conftest import Answer, Answers, Export, Measured, Run, sources_of
+from firmware.conftest import Answer, Answers, Export, Measured, Run, defines_of, sources_of
 
 from mpc.codegen.targets import INSTRUCTIONS_PER_TICK, TARGETS
 from scenarios.export.in_the_loop import make_program
@@ -23,7 +23,7 @@ OTHERS = {
     "host, unoptimised": ("posix", "CFLAGS=-O0 -std=c99"),
     "host, clang": ("posix", "CC=clang", "CFLAGS=-O3 -std=c99"),
 }
-DEFINES = {"double": [], "float": ["-DQUADSIM_FLOAT"]}
+PRECISIONS = ("double", "float")
 CONTRACTED = "ALWAYS=-ffp-contract=fast"
 
 
@@ -81,7 +81,7 @@ LAWS = {
 }
 BOARDED = [(law, *board) for law, limits in LAWS.items() for board in limits.boards]
 SAME = [
-    *(("paper-constrained", precision, other) for precision in DEFINES for other in OTHERS),
+    *(("paper-constrained", precision, other) for precision in PRECISIONS for other in OTHERS),
     *(("nonlinear", "double", other) for other in ("cortex-m7", "host, clang")),
     *(("autopilot", "float", other) for other in ("cortex-m7", "cortex-m4f", "aarch64")),
 ]
@@ -157,7 +157,7 @@ def test_webassembly_answers_the_same_bits(
     programs = [directory / "main.c", directory / "vectors.c", HERE / "wasm.c"]
     include = ["-I", tmp_path, "-I", directory]
     module = tmp_path / "answer.wasm"
-    run(*WASM, *DEFINES[precision], *include, "-o", module, *programs, *sources_of(directory))
+    run(*WASM, *defines_of(directory), *include, "-o", module, *programs, *sources_of(directory))
     done = run("node", "-e", NODE, module)
     lines = [tuple(line.split()) for line in done.stdout.splitlines()]
     assert bits([line for line in lines if len(line) == 8]) == bits(answers("posix", precision, scenario=law))
@@ -190,7 +190,7 @@ def test_a_controller_fits(
     make_program(directory, "vectors.elf")
     numbers = tmp_path / "numbers.c"
     numbers.write_text('#include "quadsim_data.h"\nconst void *const used = &QUADSIM_CONTROLLER;\n')
-    flags = [*TARGETS[board].machine.split(), *DEFINES[precision], "-std=c99", "-I", directory]
+    flags = [*TARGETS[board].machine.split(), *defines_of(directory), "-std=c99", "-I", directory]
     run(TARGETS[board].compiler, *flags, "-c", numbers, "-o", tmp_path / "numbers.o")
     sources = sources_of(directory)
     objects = [*(path.with_suffix(".o") for path in sources), tmp_path / "numbers.o"]
@@ -215,7 +215,9 @@ def test_the_stack_is_small(board: str, precision: str, law: str, exported: Expo
     directory = exported(board, precision, scenario=law)
     target, image = TARGETS[board], tmp_path / "stack.elf"
     sources = [*sources_of(directory), *(directory / f"{name}.c" for name in ("vectors", "startup"))]
-    flags = f"{target.machine} {' '.join(DEFINES[precision])} -O3 -std=gnu99 -ffp-contract=off -I {directory}".split()
+    flags = (
+        f"{target.machine} {' '.join(defines_of(directory))} -O3 -std=gnu99 -ffp-contract=off -I {directory}".split()
+    )
     link = f"-nostartfiles -T {directory / 'mps2.ld'} --specs=nano.specs".split()
     run(target.compiler, *flags, "-o", image, HERE / "stack.c", *sources, *link)
     done = run(*target.emulation, "-serial", "none", "-kernel", image)

@@ -586,9 +586,12 @@ INLINED void finish_sized(quadsim_nmpc_work *work, const int actuators, const in
     }
 }
 
-/* Call a function that is made for each number of actuators, with moves and without. */
-#ifdef QUADSIM_ANY_SIZE
+/* Call a function that is made for each number of actuators, with moves and without; with QUADSIM_SIZES, as 4,0, for
+ * these alone. */
+#if defined QUADSIM_ANY_SIZE
 #define SIZED(function, ...) function(__VA_ARGS__, work->p->actuators, work->p->moves ? 1 : 0);
+#elif defined QUADSIM_SIZES
+#define SIZED(function, ...) function(__VA_ARGS__, QUADSIM_SIZES);
 #else
 #define SIZED(function, ...)                                              \
     switch (2 * work->p->actuators + (work->p->moves ? 1 : 0)) {          \
