@@ -9,15 +9,12 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-from timing import Record, Stopwatch, options, run, undisturbed
+from timing import Record, flown, options, run, undisturbed
 
 from quadsim.core.structs import SAMPLE, TrackStruct, plant_library
-from quadsim.errors import FlightError
 from scenarios.assembly import Assembly
 from scenarios.commands.app import load
 from scenarios.progress import Progress
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
 
 SHORT: Final = 10.0  # [s] that is flown of a longer flight
 GUSTY: Final = {
@@ -44,20 +41,6 @@ FLIGHTS: Final[dict[str, tuple[str, Mapping[str, Any]]]] = {
 """Flights by what a row says: a scenario, and what is changed of it."""
 
 
-def flown(scenario: Scenario) -> tuple[float, float, int]:
-    """Processor time of a flight without its controller, and of all of it [s]; and the physics steps flown."""
-    with Rollout(scenario) as flight:
-        watch = Stopwatch(clock.thread_time)
-        watch.watch(flight.loop.controller, "step", "controller")
-        try:
-            while not flight.done:
-                flight.loop.step()
-        except FlightError:
-            pass
-        whole = watch.elapsed
-        return whole - sum(watch.laps["controller"]), whole, round(flight.loop.time / scenario.plant.timestep)
-
-
 def measure(quick: bool, report: Progress) -> list[Record]:
     """The best of rounds, of each flight."""
     rounds, records = 1 if quick else 3, []
@@ -68,7 +51,8 @@ def measure(quick: bool, report: Progress) -> list[Record]:
             length = min(scenario.duration, 1.0 if quick else SHORT)
             scenario = scenario.replace({**changes, "duration": length, "constraints": []})
             times = [flown(scenario) for _ in range(rounds)]
-            without, whole, steps = (min(column) for column in zip(*times, strict=True))
+            without = min(whole - sum(controller) for controller, whole, _ in times)
+            _, whole, steps = min(times, key=lambda one: one[1])
             seconds = steps * scenario.plant.timestep
             records.append(
                 {

@@ -17,11 +17,13 @@ from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from quadsim.errors import QuadsimError
+from quadsim.errors import FlightError, QuadsimError
 from quadsim.flight.metrics import percentiles
 from quadsim.state import Array
 from scenarios.machine import machine, versions
 from scenarios.progress import Progress, reporting, silent
+from scenarios.rollout import Rollout
+from scenarios.schema.scenario import Scenario
 
 Record = dict[str, Any]
 
@@ -115,6 +117,19 @@ class Stopwatch:
                 laps.append(self._now() - started)
 
         setattr(owner, method, timed)
+
+
+def flown(scenario: Scenario) -> tuple[list[float], float, int]:
+    """Processor time of each step of a flight's controller, and of all of the flight [s]; and its physics steps."""
+    with Rollout(scenario) as flight:
+        watch = Stopwatch(clock.thread_time)
+        watch.watch(flight.loop.controller, "step", "controller")
+        try:
+            while not flight.done:
+                flight.loop.step()
+        except FlightError:
+            pass
+        return watch.laps["controller"], watch.elapsed, round(flight.loop.time / scenario.plant.timestep)
 
 
 def step_quantiles(ms: Array) -> Record:

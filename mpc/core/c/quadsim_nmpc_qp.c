@@ -459,6 +459,20 @@ static void pull_active(const quadsim_nmpc_work *work, int node, real *inputs, r
 
 /* ---- passes, made for each number of states ------------------------------------------------------------------------ */
 
+/* The quadratic and linear cost of the last state. */
+INLINED void cost_at_end(const quadsim_nmpc_work *work, const int n, real *cost, real *g)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    int j, k;
+    memcpy(cost, p->terminal, sizeof(real) * (size_t)(n * n));
+    for (j = 0; j < n; j++) {
+        g[j] = R(0.0);
+        for (k = 0; k < n; k++) {
+            g[j] -= cost[j * n + k] * work->goal[p->horizon * n + k];
+        }
+    }
+}
+
 /* Gains, and the optimum with the held inputs at their bounds and no other bounds. */
 INLINED void optimum_sized(quadsim_nmpc_work *work, const int actuators, const int moves)
 {
@@ -466,13 +480,7 @@ INLINED void optimum_sized(quadsim_nmpc_work *work, const int actuators, const i
     const int N = p->horizon, n = BODY + actuators + (moves ? NU : 0);
     real cost[MOST * MOST], g[MOST];
     int i, j, k;
-    memcpy(cost, p->terminal, sizeof(real) * (size_t)(n * n));
-    for (j = 0; j < n; j++) {
-        g[j] = R(0.0);
-        for (k = 0; k < n; k++) {
-            g[j] -= cost[j * n + k] * work->goal[N * n + k];
-        }
-    }
+    cost_at_end(work, n, cost, g);
     for (i = N - 1; i >= 0; i--) {
         real push[NU];
         for (j = 0; j < n; j++) {
@@ -1089,13 +1097,7 @@ INLINED void barrier_sized(quadsim_nmpc_work *work, const real *effort, const re
     const int N = p->horizon, n = BODY + actuators + (moves ? NU : 0);
     real cost[MOST * MOST], g[MOST], s[MOST], next[MOST];
     int i, j, k;
-    memcpy(cost, p->terminal, sizeof(real) * (size_t)(n * n));
-    for (j = 0; j < n; j++) {
-        g[j] = R(0.0);
-        for (k = 0; k < n; k++) {
-            g[j] -= cost[j * n + k] * work->goal[N * n + k];
-        }
-    }
+    cost_at_end(work, n, cost, g);
     for (i = N - 1; i >= 0; i--) {
         for (j = 0; j < n; j++) {
             if (factorise) { /* P c */
