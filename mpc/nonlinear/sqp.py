@@ -51,7 +51,7 @@ class WorkStruct(ctypes.Structure):
 
     _fields_ = [
         *struct_members(AT, "p"),
-        *struct_members(INT, "planned shifted doubtful iterations count changes rounds inner patience ends"),
+        *struct_members(INT, "planned shifted doubtful iterations count changes rounds inner patience allowed ends"),
         *struct_members(REAL, "defect moved violation share largest least measured:21 start:21 before:4"),
         *struct_members(AT, "x u frame goal aim face beyond map offset end axis known gain inverse feed more s v"),
         *struct_members(AT, "value own response factor multiplier r d price rate origin x_before u_before last"),

@@ -103,6 +103,7 @@ typedef struct quadsim_nmpc_work {
     int changes;       /* of the active set in the last program */
     int rounds, inner; /* of holding and releasing inputs in it, and of the interior point method */
     int patience;      /* see relax in quadsim_nmpc.c */
+    int allowed;       /* changes of the active set in the present search */
     int ends;          /* the caller's, between _begin and _keep: whether no SQP step is to follow, as time is up */
     quadsim_real defect, moved, violation; /* of the plan; the largest violation of a row by the optimum, less its slack */
     quadsim_real share, largest, least;

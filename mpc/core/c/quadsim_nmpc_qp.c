@@ -23,15 +23,18 @@ enum { SIDES = QUADSIM_NMPC_SIDES, TILT = 2 * NU, SPIN = TILT + SIDES, STATED = 
 static const real FEASIBLE = 2e-5F;  /* violation of a bound */
 static const real DEPENDENT = 3e-6F; /* share of a row's response to itself that others leave of it */
 static const real NOTHING = 1e-6F;   /* change of a multiplier by that of a row */
+static const real COMPLEMENTARY_ROWS = 1e-4F; /* see below; of all rows */
 #else
 static const real FEASIBLE = 1e-10;
 static const real DEPENDENT = 1e-11;
 static const real NOTHING = 1e-13;
+static const real COMPLEMENTARY_ROWS = 1e-6;
 #endif
 static const real COMPLEMENTARY = R(1e-4); /* mean product of multipliers and distances, where bounds tell */
 static const real HARD = R(1e29), NEVER = R(1e30);
 static const real CURVATURE = R(1e-5); /* of a linear price, in its proportion */
-enum { WARM_ROUNDS = 8, MOST_ROUNDS = 4, MOST_INNER = 30, MOST_AGAIN = 20 };
+enum { WARM_ROUNDS = 8, MOST_ROUNDS = 4, MOST_INNER = 30, MOST_INNER_ROWS = 60, MOST_AGAIN = 20 };
+enum { LONG_SEARCH = 5 }; /* changes per node that a search has before the interior point method of all rows */
 enum { OF_TILT, OF_RATES, OF_FACES, OF_STATED }; /* slacks of a node */
 
 static const int FREE_INPUTS[NU] = {0, 0, 0, 0};
@@ -918,7 +921,7 @@ static enum quadsim_nmpc_status add_row(quadsim_nmpc_work *work, int row)
         const real whole = mutual(work, row, slot, slot, work->own);
         real left = whole, longest = NEVER, full;
         int j, blocks = -1, opens;
-        if (++work->changes > p->changes) {
+        if (++work->changes > work->allowed) {
             return QUADSIM_NMPC_GIVEN_UP;
         }
         for (j = 0; j < work->count; j++) {
@@ -1089,9 +1092,39 @@ static int settle(quadsim_nmpc_work *work, int rounds)
     return 0;
 }
 
-/* One Newton step of the interior point method: with these weights and pushes of inputs, all inputs v [N][4]. */
+/* Rows that an interior point method weighs: w z^2 / 2 + c z each, [N][kinds without slacks]; those of inputs are part of
+ * their effort. */
+typedef struct weighed {
+    const real *weight, *slope;
+    real *value; /* [N+1][w] the entries that follow */
+} weighed;
+
+/* Add the weighed rows of a node's end to the cost of that state. */
+INLINED void weigh_rows(const quadsim_nmpc_work *work, int i, const int n, const weighed *rows, int factorise, real *cost,
+                        real *g)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int kinds = slacks_from(p);
+    int kind, j, k;
+    for (kind = TILT; kind < kinds; kind++) {
+        const real weight = rows->weight[i * kinds + kind], slope = rows->slope[i * kinds + kind];
+        real inputs[NU] = {R(0.0)}, z[MOST] = {R(0.0)};
+        if (weight == R(0.0)) {
+            continue;
+        }
+        pull(work, i * kinds_of(p) + kind, 0, R(1.0), inputs, z);
+        for (j = 0; j < BODY; j++) {
+            for (k = 0; factorise && z[j] != R(0.0) && k < BODY; k++) {
+                cost[j * n + k] += weight * z[j] * z[k];
+            }
+            g[j] += slope * z[j];
+        }
+    }
+}
+
+/* One Newton step of an interior point method: with these weights and pushes of inputs, and rows, all inputs v [N][4]. */
 INLINED void barrier_sized(quadsim_nmpc_work *work, const real *effort, const real *push, int factorise, real *known,
-                           real *v, const int actuators, const int moves)
+                           real *v, const weighed *rows, const int actuators, const int moves)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int N = p->horizon, n = BODY + actuators + (moves ? NU : 0);
@@ -1099,6 +1132,9 @@ INLINED void barrier_sized(quadsim_nmpc_work *work, const real *effort, const re
     int i, j, k;
     cost_at_end(work, n, cost, g);
     for (i = N - 1; i >= 0; i--) {
+        if (rows != NULL) {
+            weigh_rows(work, i, n, rows, factorise, cost, g);
+        }
         for (j = 0; j < n; j++) {
             if (factorise) { /* P c */
                 known[i * n + j] = R(0.0);
@@ -1120,13 +1156,17 @@ INLINED void barrier_sized(quadsim_nmpc_work *work, const real *effort, const re
     memcpy(s, work->start, sizeof(real) * (size_t)n);
     for (i = 0; i < N; i++) {
         forward_node(work, i, actuators, moves, work->more + i * NU, work->offset + i * n, s, v + i * NU, next);
+        if (rows != NULL) {
+            entries_at(work, i, 1, v + i * NU, next, rows->value);
+        }
         memcpy(s, next, sizeof(real) * (size_t)n);
     }
 }
 
-static void barrier(quadsim_nmpc_work *work, const real *effort, const real *push, int factorise, real *known, real *v)
+static void barrier(quadsim_nmpc_work *work, const real *effort, const real *push, int factorise, real *known, real *v,
+                    const weighed *rows)
 {
-    SIZED(barrier_sized, work, effort, push, factorise, known, v)
+    SIZED(barrier_sized, work, effort, push, factorise, known, v, rows)
 }
 
 /* Steps of a pair of multipliers and of their distances, for a step du of the input towards a centre. */
@@ -1179,7 +1219,7 @@ static int interior(quadsim_nmpc_work *work, real tolerance, int most)
                 }
                 push[i] = -p->effort[i % NU] * work->aim[i] - (effort[i] - p->effort[i % NU]) * u[i] - one / below + two / above;
             }
-            barrier(work, effort, push, pass == 0, known, to);
+            barrier(work, effort, push, pass == 0, known, to, NULL);
             primal = dual = R(1.0);
             for (i = 0; i < size; i++) {
                 const real below = u[i] - p->lower[i % NU], above = p->upper[i % NU] - u[i], du = to[i] - u[i];
@@ -1223,6 +1263,190 @@ static int interior(quadsim_nmpc_work *work, real tolerance, int most)
         work->held[i] = low[i] > u[i] - p->lower[i % NU] ? -1 : high[i] > p->upper[i % NU] - u[i] ? 1 : 0;
     }
     return k;
+}
+
+/* An interior point method's numbers of each row [N][kinds without slacks]: its distance t > 0, multiplier, slack e and
+ * the slack's multiplier; t = 0: there is no such row.  Each soft row has a slack of its own here. */
+typedef struct inner {
+    real *t, *by, *e, *nu;
+    real *one, *two;             /* products of affine steps */
+    real *dt, *dby, *de, *dnu;   /* steps */
+} inner;
+
+typedef struct inner_step {
+    real t, by, e, nu;
+    real weight, slope; /* the multiplier that follows is weight z + slope */
+} inner_step;
+
+/* What follows of a row from the value z that follows, towards the complementarity `centre`. */
+static inner_step step_of_row(const quadsim_nmpc_work *work, const inner *at, int index, int row, real z, real centre)
+{
+    const int slot = slot_of(work->p, row);
+    const real t = at->t[index], by = at->by[index], w = by / t, most = bound(work, row);
+    inner_step to = {R(0.0), R(0.0), R(0.0), R(0.0), w, (centre - at->one[index]) / t + by - w * most};
+    if (slot < 0) {
+        to.by = w * z + to.slope;
+        to.t = most - z;
+    } else {
+        const real e = at->e[index], nu = at->nu[index], l = linear_of(work, slot), q = quadratic_of(work->p, slot);
+        const real slope = q + nu / e, from = (centre - at->two[index]) / e + nu - l, share = R(1.0) / (R(1.0) + w / slope);
+        to.weight *= share;
+        to.slope = (to.slope - w * from / slope) * share;
+        to.by = to.weight * z + to.slope;
+        to.e = (from + to.by) / slope;
+        to.t = most + to.e - z;
+        to.nu = l + q * to.e - to.by;
+    }
+    to.t -= t;
+    to.by -= by;
+    to.e -= at->e[index];
+    to.nu -= at->nu[index];
+    return to;
+}
+
+/* Whether the interior point method takes all rows: those that the caller states are of states alone; and whether the
+ * responses' memory holds its numbers. */
+static int takes_rows(const quadsim_nmpc_problem *p)
+{
+    const long N = p->horizon, kinds = slacks_from(p);
+    int j;
+    for (j = 0; p->rows > 0 && j < p->first[p->rows]; j++) {
+        if (p->terms[j].lag != 0 || p->terms[j].entry < NU) {
+            return 0;
+        }
+    }
+    return p->room * entries_size(p) >= 12 * N * kinds + 2 * entries_size(p) + N * (3 * NU + states_of(p));
+}
+
+/* The same method for all rows: where the search finds too many that it has to exchange.  What it finds active is then
+ * held, among the active rows, or a free slack. */
+static void interior_rows(quadsim_nmpc_work *work)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int N = p->horizon, kinds = slacks_from(p), size = N * kinds;
+    const long entries = entries_size(p);
+    real *weight = work->response, *slope = weight + size, *z = slope + size, *next = z + entries;
+    real *effort = next + entries, *push = effort + N * NU, *v = push + N * NU, *known = v + N * NU;
+    real *own = known + N * states_of(p);
+    const inner at = {own,            own + size,     own + 2 * size, own + 3 * size, own + 4 * size,
+                      own + 5 * size, own + 6 * size, own + 7 * size, own + 8 * size, own + 9 * size};
+    const weighed rows = {weight, slope, next};
+    real mu = NEVER;
+    long j;
+    int i, index, kind, pass, pairs = 0;
+    memset(work->held, 0, sizeof(int) * (size_t)(N * NU));
+    optimum(work);
+    memcpy(z, work->value, sizeof(real) * (size_t)entries);
+    memcpy(next, work->value, sizeof(real) * (size_t)entries);
+    memset(weight, 0, sizeof(real) * (size_t)(2 * size));
+    memset(own, 0, sizeof(real) * (size_t)(10 * size));
+    for (index = 0; index < size; index++) {
+        const int row = index / kinds * kinds_of(p) + index % kinds, slot = slot_of(p, row);
+        const real most = bound(work, row), least = R(0.1) * magnitude(most) + R(0.01);
+        real beyond;
+        kind = index % kinds;
+        if (most >= HARD || (kind >= TILT && kind < SPIN && !p->tilts) || (kind >= SPIN && kind < STATED && !p->turns)) {
+            continue;
+        }
+        beyond = product(work, row, z) - most;
+        at.by[index] = R(1.0);
+        pairs++;
+        if (slot >= 0) {
+            const real l = linear_of(work, slot);
+            at.by[index] = l < R(2.0) ? R(0.5) * l : R(1.0);
+            at.e[index] = beyond > R(0.0) ? beyond + least : least;
+            at.nu[index] = l + quadratic_of(p, slot) * at.e[index] - at.by[index];
+            beyond -= at.e[index];
+            pairs++;
+        }
+        at.t[index] = beyond < -least ? -beyond : least;
+    }
+    for (; work->inner < MOST_INNER_ROWS && mu > COMPLEMENTARY_ROWS; work->inner++) {
+        real centre = R(0.0), length = R(1.0), after = R(0.0);
+        for (pass = 0; pass < 2; pass++) {
+            for (i = 0; i < N * NU; i++) {
+                effort[i] = p->effort[i % NU];
+                push[i] = -p->effort[i % NU] * work->aim[i];
+            }
+            for (index = 0; index < size; index++) {
+                const int node = index / kinds, row = node * kinds_of(p) + index % kinds;
+                inner_step to;
+                kind = index % kinds;
+                if (at.t[index] == R(0.0)) {
+                    continue;
+                }
+                if (pass == 0) {
+                    at.one[index] = at.two[index] = R(0.0);
+                }
+                to = step_of_row(work, &at, index, row, R(0.0), centre);
+                weight[index] = to.weight;
+                slope[index] = to.slope;
+                if (kind < TILT) {
+                    effort[node * NU + kind % NU] += to.weight;
+                    push[node * NU + kind % NU] += kind < NU ? to.slope : -to.slope;
+                } else if (kind < SPIN) {
+                    slope[index] += to.weight * (SIDE[kind - TILT][0] * work->known[2 * node] +
+                                                 SIDE[kind - TILT][1] * work->known[2 * node + 1]);
+                }
+            }
+            barrier(work, effort, push, pass == 0, known, v, &rows);
+            length = R(1.0);
+            for (index = 0; index < size; index++) {
+                const int row = index / kinds * kinds_of(p) + index % kinds;
+                inner_step to;
+                if (at.t[index] == R(0.0)) {
+                    continue;
+                }
+                to = step_of_row(work, &at, index, row, product(work, row, next), centre);
+                length = shortened(shortened(length, at.t[index], to.t), at.by[index], to.by);
+                length = shortened(shortened(length, at.e[index], to.e), at.nu[index], to.nu);
+                at.dt[index] = to.t;
+                at.dby[index] = to.by;
+                at.de[index] = to.e;
+                at.dnu[index] = to.nu;
+            }
+            length *= pass == 0 ? R(1.0) : R(0.995);
+            mu = after = R(0.0);
+            for (index = 0; index < size; index++) { /* zeros where there is no row */
+                const real dt = length * at.dt[index], dby = length * at.dby[index];
+                const real de = length * at.de[index], dnu = length * at.dnu[index];
+                mu += at.t[index] * at.by[index] + at.e[index] * at.nu[index];
+                after += (at.t[index] + dt) * (at.by[index] + dby) + (at.e[index] + de) * (at.nu[index] + dnu);
+                if (pass == 0) {
+                    at.one[index] = at.dt[index] * at.dby[index];
+                    at.two[index] = at.de[index] * at.dnu[index];
+                } else {
+                    at.t[index] += dt;
+                    at.by[index] += dby;
+                    at.e[index] += de;
+                    at.nu[index] += dnu;
+                }
+            }
+            mu /= (real)pairs;
+            after /= (real)pairs;
+            centre = (after / mu) * (after / mu) * after;
+        }
+        for (j = 0; j < entries; j++) {
+            z[j] += length * (next[j] - z[j]);
+        }
+        mu = after;
+    }
+    work->count = 0;
+    for (index = 0; index < size; index++) {
+        const int row = index / kinds * kinds_of(p) + index % kinds, slot = slot_of(p, row);
+        kind = index % kinds;
+        if (at.t[index] == R(0.0) || at.by[index] <= at.t[index]) {
+            continue;
+        }
+        if (kind < TILT) {
+            work->held[index / kinds * NU + kind % NU] = kind < NU ? 1 : -1;
+        } else if (work->count < p->room) {
+            work->row[work->count++] = row;
+            if (slot >= 0 && at.e[index] > at.nu[index]) {
+                work->free[slot] = 1;
+            }
+        }
+    }
 }
 
 /* Whether the responses' memory holds what the interior point method needs. */
@@ -1377,6 +1601,10 @@ enum quadsim_nmpc_status quadsim_nmpc_solve(quadsim_nmpc_work *work)
     enum quadsim_nmpc_status status = QUADSIM_NMPC_FREE;
     int i;
     work->changes = work->rounds = work->inner = 0;
+    work->allowed = work->p->changes;
+    if (takes_rows(work->p) && work->allowed > LONG_SEARCH * work->p->horizon) {
+        work->allowed = LONG_SEARCH * work->p->horizon;
+    }
     memset(work->origin, 0, sizeof(real) * (size_t)(work->p->slacks * work->p->horizon));
     entries_at(work, -1, 1, work->before, work->start, work->value);
     hold_rows(work);
@@ -1390,6 +1618,11 @@ enum quadsim_nmpc_status quadsim_nmpc_solve(quadsim_nmpc_work *work)
         }
     } else {
         status = search_held(work);
+        if (status == QUADSIM_NMPC_GIVEN_UP && work->allowed < work->p->changes) {
+            work->allowed = work->p->changes;
+            interior_rows(work);
+            status = search_held(work);
+        }
         if (status == QUADSIM_NMPC_BOUNDED) {
             status = solve_again(work);
         }
