@@ -10,6 +10,9 @@
  *  3. the dual active-set method of Goldfarb and Idnani (1983), which adds violated rows one by one, and which takes soft
  *     rows, too.  What a row's multiplier does to all others, its response, is one pass backwards and forwards.
  *
+ * A search that exchanges more than LONG_SEARCH rows per node starts again from what an interior point method of all rows
+ * finds active: far from the reference it would exchange thousands.
+ *
  * A slack that several soft rows of a node share is a variable of its own, zero and out of the way until the rows'
  * multipliers reach its linear price.
  *
@@ -33,7 +36,7 @@ static const real COMPLEMENTARY_ROWS = 1e-6;
 static const real COMPLEMENTARY = R(1e-4); /* mean product of multipliers and distances, where bounds tell */
 static const real HARD = R(1e29), NEVER = R(1e30);
 static const real CURVATURE = R(1e-5); /* of a linear price, in its proportion */
-enum { WARM_ROUNDS = 8, MOST_ROUNDS = 4, MOST_INNER = 30, MOST_INNER_ROWS = 60, MOST_AGAIN = 20 };
+enum { WARM_ROUNDS = 30, MOST_ROUNDS = 4, MOST_INNER = 30, MOST_INNER_ROWS = 60, MOST_AGAIN = 20 };
 enum { LONG_SEARCH = 5 }; /* changes per node that a search has before the interior point method of all rows */
 enum { OF_TILT, OF_RATES, OF_FACES, OF_STATED }; /* slacks of a node */
 
