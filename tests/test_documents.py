@@ -15,6 +15,7 @@ import drawings
 import gallery
 import library
 import matplotlib as mpl
+import notebook
 import pytest
 import remake
 from golden_numbers import ABLATION, PAPER, ablation_entry, paper_entry, read
@@ -155,6 +156,17 @@ def test_python_on_the_pages_runs(page: Path, tmp_path: Path, monkeypatch: pytes
     module = ModuleType("page")
     for block in PYTHON[page]:
         exec(compile(block, page, "exec"), module.__dict__)
+
+
+def test_the_notebook_is_the_tutorial_whose_blocks_run() -> None:
+    """Its cells are the blocks that the test above runs."""
+    stored, page = notebook.NOTEBOOK.read_text(encoding="utf-8"), notebook.PAGE.read_text(encoding="utf-8")
+    assert stored == notebook.notebook(page), "python docs/tools/notebook.py"
+    cells = json.loads(stored)["cells"]
+    assert ["".join(cell["source"]) + "\n" for cell in cells if cell["cell_type"] == "code"] == PYTHON[notebook.PAGE]
+    texts = "".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+    for target in re.findall(r"\]\(([^)#]+)", texts):
+        assert (notebook.NOTEBOOK.parent / target).is_file(), target
 
 
 def test_code_on_the_pages_is_not_cut_in_a_window_of_1280_pixels() -> None:
