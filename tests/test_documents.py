@@ -111,7 +111,7 @@ def test_every_table_that_is_filled_is_known_and_stays_where_its_file_is_not(
     assert (text[:7], text[-7:]) == ("before\n", "\nafter\n")
     made = {"commit": "0123abcd", "date": "2026-01-02", "solver": "PIQP 1.2.3"}
     (tmp_path / "solvers.origin.json").write_text(json.dumps(made))
-    stated = "*`make numbers OPTIONS=solvers`, commit 0123abcd, 2026-01-02; QPs by PIQP 1.2.3 where no other solver"
+    stated = "*`make numbers OPTIONS=solvers`, commit 0123abcd, 2026-01-02, PIQP 1.2.3.*"
     assert stated in remake.filled(page)[0]
 
 

@@ -105,7 +105,7 @@ def stated_origin(name: str) -> str:
     if not (file := MADE / f"{name}.origin.json").is_file():
         return ""
     made = json.loads(file.read_text(encoding="utf-8"))
-    by = "" if name in WITHOUT_SOLVER else f"; QPs by {made['solver']} where no other solver is named"
+    by = "" if name in WITHOUT_SOLVER else f", {made['solver']}"
     return f"\n*`make numbers OPTIONS={name}`, commit {made['commit']}, {made['date']}{by}.*\n"
 
 
@@ -167,12 +167,10 @@ On rotors that saturate at 250 rad/s (`paper-unconstrained-clipped`) the unconst
 
 def ablation(flights: Record) -> str:
     """The constrained controller's weights and horizon with none, one and all of its constraints."""
-    titles = ("none", "tilt within 5 deg", "speeds within 0 .. 250 rad/s", "steps within -10 .. 5 rad/s", "all")
-    rows = [
-        (title, *([f"{error:.3f}" for error in flights[title.split()[0]]["rmse"]] or ["lost", "", "", ""]))
-        for title in titles
-    ]
-    return table(("constraints", *(f"RMS error {axis}" for axis in ("x [m]", "y [m]", "z [m]", "yaw [deg]"))), rows)
+    titles = ("none", "tilt within 5 deg", *(title for title in PAPER if title[:5] in ("speed", "steps")), "all")
+    rows = [[f"{error:.3f}" for error in flights[title.split()[0]]["rmse"]] or ["lost", "", "", ""] for title in titles]
+    head = ("constraints", *(title for title in PAPER if title.startswith("RMS")))
+    return table(head, [(title, *row) for title, row in zip(titles, rows, strict=True)])
 
 
 def papers(reproduction: Record) -> str:
@@ -227,18 +225,14 @@ def export(boards: list[Record]) -> str:
 
 def first_flights(flights: list[Record]) -> str:
     """How many first scenarios of each controller satisfied everything, and the largest error."""
-    by: dict[str, dict[str, list[Record]]] = {}
-    for flight in flights:
-        by.setdefault(flight["law"], {}).setdefault(flight["course"], []).append(flight)
-    rows = [
-        (law, *(
-            f"{sum(flight['outcome'] == 'satisfied' for flight in flown)} of {len(flown)}, "
-            f"{100.0 * max(flight['largest'] for flight in flown):.1f} %"
-            for flown in courses.values()
-        ))
-        for law, courses in by.items()
-    ]  # fmt: skip
-    return table(("controller", *next(iter(by.values()))), rows)
+    laws, courses = ([*dict.fromkeys(flight[key] for flight in flights)] for key in ("law", "course"))
+
+    def cell(law: str, course: str) -> str:
+        flown = [flight for flight in flights if (flight["law"], flight["course"]) == (law, course)]
+        held = sum(flight["outcome"] == "satisfied" for flight in flown)
+        return f"{held} of {len(flown)}, {100.0 * max(flight['largest'] for flight in flown):.1f} %"
+
+    return table(("controller", *courses), [(law, *(cell(law, course) for course in courses)) for law in laws])
 
 
 def campaigns(summaries: Record) -> str:
@@ -273,21 +267,16 @@ def solvers(data: Any) -> str:
 
 def nonlinear(data: Any) -> str:
     """The law in C beside acados."""
-    rows = [row for row in records(data) if "case" in row]
-    p50, p99 = (span((row[f"{key}_ratio"] for row in rows), ".2g") for key in ("p50", "p99"))
+    p50, p99 = (span((row[f"{key}_ratio"] for row in records(data) if "case" in row), ".2g") for key in ("p50", "p99"))
     return f"The median step of C takes {p50} times as long as that of acados, its 99th percentile {p99} times.\n"
 
 
 def flight(data: Any) -> str:
     """How long a second of flight takes."""
-    rows = [row for row in records(data) if row.get("whole_ms_per_s")]
-    slowest, fastest = (pick(rows, key=lambda row: row["whole_ms_per_s"]) for pick in (max, min))
+    rows = sorted((row for row in records(data) if row.get("whole_ms_per_s")), key=lambda row: row["whole_ms_per_s"])
+    ends = " to ".join(f"{row['whole_ms_per_s']:.0f} ms ({row['flight']})" for row in (rows[0], rows[-1]))
     bare = span((row["without_the_controller_ms_per_s"] for row in rows), ".0f")
-    return (
-        f"A second of flight takes from {fastest['whole_ms_per_s']:.0f} ms ({fastest['flight']}) to "
-        f"{slowest['whole_ms_per_s']:.0f} ms ({slowest['flight']}), of which {bare} ms go to all but the controller "
-        "([flight.csv](data/flight.csv)).\n"
-    )
+    return f"A second of flight takes {ends}, {bare} ms of it without the controller ([flight.csv](data/flight.csv)).\n"
 
 
 def campaign(data: Any) -> str:
@@ -297,8 +286,9 @@ def campaign(data: Any) -> str:
 
 def film(data: Any) -> str:
     """How long a film takes."""
-    (row,) = records(data)
-    return f"A frame takes {row['frame_ms']:.0f} ms, a minute of film {row['s_per_minute_of_film']:.0f} s.\n"
+    return "A frame takes {frame_ms:.0f} ms, a minute of film {s_per_minute_of_film:.0f} s.\n".format(
+        **records(data)[0]
+    )
 
 
 def identification(data: Any) -> str:
