@@ -54,7 +54,7 @@ FIGURES: Final = {
 COLOURS: Final = 128
 SOLVERS: Final = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "core", "clarabel")
 """The solvers that `make setup` installs."""
-DRAWN: Final = ("drawings.py", "live_picture.py", "figures.py", "guide_figures.py", "film.py", "gallery.py thumbnails")
+DRAWN: Final = ("drawings.py", "live_picture.py", "figures.py", "film.py", "gallery.py thumbnails")
 WITHOUT_SOLVER: Final = ("film", "nonlinear")
 """Tables whose numbers come from no QP."""
 Record = dict[str, Any]
