@@ -137,7 +137,6 @@ PAPER: Final[dict[str, Callable[[Record], str]]] = {
     "pitch within 5 deg": lambda flight: _bound(flight["bounds"]["pitch"], "deg"),
     "speeds within 0 .. 250 rad/s": lambda flight: _bound(flight["bounds"]["speed"], "rad/s"),
     "steps within -10 .. 5 rad/s": lambda flight: _bound(flight["bounds"]["slew"], "rad/s"),
-    "highest rotor speed acting [rad/s]": lambda flight: f"{flight['highest_speed']:.1f}",
     "largest step commanded [rad/s]": lambda flight: f"{flight['largest_step']:.1f}",
     "total variation of the commands [rad/s]": lambda flight: f"{flight['total_variation']:.0f}",
 }
