@@ -380,8 +380,8 @@ def main() -> None:
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         text, missing = filled(page.read_text(encoding="utf-8"))
         page.write_text(text, encoding="utf-8")
-        for source in missing:
-            print(f"{page.relative_to(ROOT)}: stays as it is without {source}")
+        for file in missing:
+            print(f"{page.relative_to(ROOT)}: stays as it is without {file}")
     for name in CSV:
         if (source := MADE / f"{name}.json").is_file():
             write_csv(name, source)
