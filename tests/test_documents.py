@@ -179,6 +179,13 @@ def test_code_on_the_pages_is_not_cut_in_a_window_of_1280_pixels() -> None:
             assert language == "text" or not too_wide, f"{page.name}: {too_wide}"
 
 
+def test_rows_of_a_table_stand_together() -> None:
+    """After a blank line a row is the head of a table, else the site shows it as text."""
+    for page in PAGES:
+        for head, rule in re.findall(r"(?<=\n\n)(\|.*)\n(.*)", page.read_text(encoding="utf-8")):
+            assert rule.startswith("| ---"), f"{page.name}: {head}"
+
+
 def test_pages_open_with_what_their_reader_can_do_and_stay_few_words() -> None:
     pages = {page.name: page.read_text(encoding="utf-8") for page in PAGES if page.parent == ROOT / "docs"}
     for name, text in pages.items():
