@@ -89,6 +89,7 @@ build: setup  ## source archive and wheel in dist/; the wheel is installed alone
 
 docs: setup $(VENV)/.docs  ## build the documentation into site/, with films; a broken link or a missing docstring fails
 	@$(PY) -m ruff check --quiet --select D1 --ignore D105,D107 quadsim mpc scenarios
+	@$(PY) docs/tools/notebook.py
 	@$(PY) docs/tools/gallery.py films
 	@$(VENV)/bin/zensical build --clean
 	@sed -i 's|https://unpkg.com/iframe-worker/shim|assets/iframe-worker.js|' site/*.html

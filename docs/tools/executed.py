@@ -1,6 +1,7 @@
 """Python on the pages is run as the site is built: blocks marked ```` ```python exec ```` get their output and plots.
 
 The blocks of a page share their names, as cells of a notebook do.  Elsewhere they read, and highlight, as plain Python.
+The page on the library gets its table.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ import matplotlib as mpl
 from markdown import Markdown
 from markdown.extensions import Extension
 from markdown.preprocessors import Preprocessor
+
+from docs.tools import library
 
 BLOCK = re.compile(r"^```python exec\n(.*?)^```\n", re.MULTILINE | re.DOTALL)
 
@@ -57,8 +60,10 @@ class Executed(Preprocessor):
             return f"```python\n{match[1]}```\n\n{self.md.htmlStash.store(output) if output else ''}\n"
 
         text = "\n".join(lines) + "\n"
+        if library.PLACE in text:
+            text = text.replace(library.PLACE, self.md.htmlStash.store(library.html()))
         if not BLOCK.search(text):
-            return lines
+            return text.split("\n")
         mpl.use("agg")
         here = os.getcwd()  # noqa: PTH109
         with tempfile.TemporaryDirectory() as folder:

@@ -13,6 +13,7 @@ import film
 import imageio
 import numpy as np
 from drawings import svg
+from library import FILMS as NAMES
 
 from quadsim.errors import RenderingUnavailableError
 from quadsim.flight.rundir import Run
@@ -106,7 +107,6 @@ def main() -> None:
     from scenarios.machine import usable_cores
     from scenarios.progress import reporting
 
-    names = re.findall(r"films/([\w-]+)\.mp4", (DOCS / "gallery.md").read_text(encoding="utf-8"))
     for folder in (FILMS, FILES):
         folder.mkdir(exist_ok=True)
     for name, text in texts().items():
@@ -114,7 +114,7 @@ def main() -> None:
     try:
         with ProcessPoolExecutor(usable_cores()) as pool, reporting(True) as report:
             films = sys.argv[1:] == ["films"]
-            stages = {film_flight: names} if films else {thumbnail: scenario_names(), poster: names}
+            stages = {film_flight: NAMES} if films else {thumbnail: scenario_names(), poster: NAMES}
             for make, of in stages.items():
                 for i, _ in enumerate(pool.map(make, of), 1):
                     report(make.__name__.replace("_", " "), i, len(of))
