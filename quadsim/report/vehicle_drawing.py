@@ -22,7 +22,7 @@ _HEIGHT: Final = 4.0  # of the panel, which makes it about square
 _ARC: Final = np.radians(np.linspace(0.0, 270.0, 61))  # of an arrow
 _INNER: Final = 0.82  # radius of an arrow over the propeller's
 _DIRECTIONS: Final = {1: ("clockwise", CYCLE[1]), -1: ("counter-clockwise", CYCLE[0])}
-"""How a rotor turns, seen from above, by the sign of its reaction torque about body +z: the torque is the opposite."""
+"""How a rotor turns, seen from above, by the sign of its reaction torque about body +z, which opposes the turn."""
 
 
 def drawing_file(path: Path | str, *, overwrite: bool = False) -> Path:
@@ -53,9 +53,10 @@ def vehicle_figure(vehicle: Vehicle) -> Figure:
         arrow = place + _INNER * radius * _unit(0.5 * math.pi + spin * (0.75 * math.pi - _ARC))
         areas.append(Area(outline=place + radius * _unit(np.linspace(0.0, math.tau, 73)), colour=colour, opacity=0.15))
         areas.append(_arrow_head(arrow[-5], arrow[-1], 0.12 * radius, colour))
-        lines.append(_line(np.stack([np.zeros(2), max(0.0, 1.0 - radius / arm) * place]), COLOUR.measured, width=2.0))
+        if arm > radius:
+            lines.append(_line(np.stack([np.zeros(2), (1.0 - radius / arm) * place]), COLOUR.measured, width=2.0))
         lines.append(_line(arrow, colour, label=f"turns {turning}"))
-        where = ", ".join(f"{value:.{digits}f}" for value in hub[: 2 if level else 3] + 0.0)
+        where = ", ".join(f"{value:z.{digits}f}" for value in hub[: 2 if level else 3])
         for height, text in ((0.32, str(number)), (0.0, where), (-0.28, f"arm {arm:.{digits}f}")):
             labels.append(_label(place + np.array([0.0, height * radius]), text, bold=text == str(number)))
     for tip, name, colour in (((0.0, 1.0), "x", COLOUR.axis_x), ((-1.0, 0.0), "y", COLOUR.axis_y)):

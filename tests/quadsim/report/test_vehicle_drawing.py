@@ -113,3 +113,11 @@ def test_the_size_is_stated_and_an_unknown_propeller_too() -> None:
     assert "0.54 m across" in drawn(known).get_title(loc="left")  # 2 (0.17 + 0.1)
     unknown = replace(known, rotor_radius=None)
     assert "unknown size" in drawn(unknown).get_title(loc="left")
+
+
+def test_a_rotor_at_the_centre_of_mass_has_no_arm() -> None:
+    (vehicle,) = (vehicle for vehicle in VEHICLES if vehicle.name == "cf2x")
+    places = ((0.0, -1e-17, 0.0), (0.04, 0.0, 0.0), (-0.02, 0.035, 0.0), (-0.02, -0.035, 0.0))
+    axes = drawn(replace(vehicle, rotor_positions=places, rotor_spins=(1, -1, -1, -1), speed_max=4000.0))
+    assert {"0.0000, 0.0000", "arm 0.0000"} <= {text.get_text() for text in axes.texts}
+    assert sum(line.get_color() == COLOUR.measured for line in axes.get_lines()) == 3
