@@ -19,6 +19,7 @@ from quadsim.flight.audit import SIGNALS
 from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import Area, Bound, Figure, Panel, Series, outlines
 from quadsim.report.flight_figures import signals
+from quadsim.report.vehicle_drawing import vehicle_figure
 from quadsim.sim.effects.battery import LIPO
 from quadsim.state import POSITION
 from scenarios.identify.identification_figures import trace_figure
@@ -57,6 +58,12 @@ def curves(
 def fly(name: str, changes: Mapping[str, Any]) -> quadsim.Flight:
     """A scenario of the library with changes."""
     return quadsim.fly(quadsim.load(name, changes), progress=False)
+
+
+def vehicle() -> Figure:
+    """What `quadsim vehicle FILE --out` draws, of a vehicle with unequal arms."""
+    dead_cat = quadsim.load_vehicle(str(ROOT / "tests" / "vehicles" / "deadcat.toml"))
+    return replace(vehicle_figure(dead_cat), title="")
 
 
 def linear() -> Figure:
@@ -226,6 +233,14 @@ def learning() -> Figure:
     return Figure(key="learning", title="", panels=(panel,), columns=1, end=5.0)
 
 
+def ppo() -> Figure:
+    """The learning curve of examples/ppo.py, which takes stable-baselines3 and five minutes: as it wrote it."""
+    example, data = run_path(str(ROOT / "examples" / "ppo.py")), ROOT / "docs" / "data"
+    curve = example["read_csv"](data / "ppo.csv", example["Rollout"])
+    figure: Figure = example["curve_figure"](curve, example["read_csv"](data / "ppo-evaluation.csv", example["Score"]))
+    return figure
+
+
 def identification() -> Figure:
     """Velocity and body rate of a flight in gusts, measured and predicted half a second at a time."""
     eight = quadsim.scenario(vehicle="hummingbird", course="figure-eight", controller="geometric").scenario
@@ -270,12 +285,14 @@ def chain() -> Figure:
 FIGURES: Final[dict[str, Callable[[], Figure]]] = {
     made.__name__: made
     for made in (
+        vehicle,
         linear,
         effects,
         autopilot,
         battery,
         space,
         learning,
+        ppo,
         identification,
     )
 }
