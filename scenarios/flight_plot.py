@@ -9,10 +9,9 @@ from typing import Any, Final
 
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.rundir import Run
-from quadsim.outputs import require_file, writing_file
 from quadsim.report.comparison import check_names
 from quadsim.report.flight_figures import signals as draw_signals
-from quadsim.report.to_matplotlib import SUFFIXES, draw, show_window, write_figure
+from quadsim.report.to_matplotlib import draw, figure_file, show_window, write_figure
 from scenarios.results import Result, Shown
 
 PAGE_WIDTH: Final = 7.16  # of a figure across both columns of a journal's page [in]; 3.5 is one column
@@ -68,13 +67,10 @@ def plot_runs(
     if labels:
         runs = [replace(run, label=label) for run, label in zip(runs, labels, strict=True)]
     if out is not None:
-        if Path(out).suffix not in SUFFIXES:
-            raise ParameterError("", "out", str(out), f"a file ending in {', '.join(SUFFIXES)}")
-        out = require_file(out, overwrite=overwrite)
+        out = figure_file(out, overwrite=overwrite)
     figure = draw_signals(runs, signals or _USUAL)
     if out is None:
         return Overlay(draw(figure, interactive=True, width=width).axes)
-    with writing_file(out, overwrite=overwrite) as path:
-        plot = Overlay(write_figure(figure, path, width=width))
+    plot = Overlay(write_figure(figure, out, width=width, overwrite=overwrite))
     plot.path = out
     return plot

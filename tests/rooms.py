@@ -45,6 +45,7 @@ USING: Final = {
     "quadsim/test_palette.py": ("live",),
     "quadsim/test_plausibility.py": ("design",),
     "scenarios/gym/test_environment.py": ("campaign",),
+    "scenarios/gym/test_ppo.py": ("campaign",),
     "scenarios/identify/test_identify.py": ("design",),
     "scenarios/identify/test_identify_fit.py": ("design",),
     "scenarios/identify/test_identify_logs.py": ("design",),

@@ -22,6 +22,7 @@ from quadsim.palette import COLOUR, CYCLE
 from quadsim.report import flight_figures
 from quadsim.report.figure import Area, Bound, Figure, Panel, Series, outlines
 from quadsim.report.to_matplotlib import STYLE, draw
+from quadsim.report.vehicle_drawing import vehicle_figure
 from quadsim.sim.effects.battery import LIPO
 from quadsim.state import POSITION, Array
 from scenarios.identify.identification_figures import trace_figure
@@ -75,6 +76,12 @@ def curves(name: str, flights: Mapping[str, quadsim.Flight], **looks: Any) -> Pa
     plants = {label: flight.log.plant for label, flight in flights.items()}
     lines = [line(log.t, signal.plant(log), CYCLE[i], label) for i, (label, log) in enumerate(plants.items())]
     return Panel(**{"title": name, "unit": signal.unit, **looks}, series=tuple(lines))
+
+
+def vehicle() -> Figure:
+    """What `quadsim vehicle FILE --out` draws, of a vehicle with unequal arms."""
+    dead_cat = quadsim.load_vehicle(str(ROOT / "tests" / "vehicles" / "deadcat.toml"))
+    return replace(vehicle_figure(dead_cat), title="")
 
 
 def linear() -> Figure:
@@ -223,6 +230,14 @@ def learning() -> Figure:
     return Figure(key="learning", title="", panels=(panel,), columns=1, end=5.0)
 
 
+def ppo() -> Figure:
+    """The learning curve of examples/ppo.py, which takes stable-baselines3 and five minutes: as it wrote it."""
+    example, data = run_path(str(ROOT / "examples" / "ppo.py")), ROOT / "docs" / "data"
+    curve = example["read_csv"](data / "ppo.csv", example["Rollout"])
+    figure: Figure = example["curve_figure"](curve, example["read_csv"](data / "ppo-evaluation.csv", example["Score"]))
+    return figure
+
+
 def identification() -> Figure:
     """Velocity and body rate of a flight in gusts, measured and predicted half a second at a time."""
     eight = quadsim.scenario(vehicle="hummingbird", course="figure-eight", controller="geometric").scenario
@@ -265,7 +280,7 @@ def chain() -> Figure:
 
 
 OF_GUIDES: Final[tuple[Callable[[], Figure], ...]] = (
-    *(linear, effects, autopilot, battery, space, learning, identification),
+    *(vehicle, linear, effects, autopilot, battery, space, learning, ppo, identification),
 )
 OF_FIRMWARE: Final = (betaflight, chain)
 """Figures that are drawn only by name: they take a firmware."""

@@ -1,4 +1,4 @@
-"""A figure as plain data: panels of curves, bounds, bands and areas.
+"""A figure as plain data: panels of curves, bounds, bands, areas and labels.
 
 `quadsim.report.to_matplotlib` draws it for files and notebooks, `quadsim.report.to_plotly` for pages.
 """
@@ -161,6 +161,17 @@ class Area:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Label:
+    """A text centred on a point; without a colour it has that of the axes' texts."""
+
+    x: float
+    y: float
+    text: str
+    colour: str = ""
+    bold: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
 class Panel:
     """Axes and their content.
 
@@ -173,6 +184,7 @@ class Panel:
     bounds: tuple[Bound, ...] = ()
     bands: tuple[Band, ...] = ()
     areas: tuple[Area, ...] = ()
+    labels: tuple[Label, ...] = ()
     x_label: str = ""
     y_label: str = ""
     y_log: bool = False

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from quadsim.errors import OutputError
+from quadsim.errors import OutputError, ParameterError
+from quadsim.outputs import require_file, writing_file
 from quadsim.palette import COLOUR
 from quadsim.report.figure import Bound, Figure, Panel, Series
 
@@ -113,16 +114,33 @@ def figure_html(figure: Figure) -> str:
     return f'<img alt="{figure.key}" src="data:image/png;base64,{png}">'
 
 
-def write_figure(figure: Figure, path: Path, *, width: float) -> list[Axes]:
+def figure_file(path: Path | str, *, overwrite: bool = False) -> Path:
+    """Return the absolute path of a figure to be written by `write_figure`; call it before the work for it starts.
+
+    Raises:
+        ParameterError: it ends in none of `SUFFIXES`.
+        OutputError: it cannot be written, or exists and may not be overwritten.
+    """
+    if Path(path).suffix not in SUFFIXES:
+        raise ParameterError("", "out", str(path), f"a file ending in {', '.join(SUFFIXES)}")
+    return require_file(path, overwrite=overwrite)
+
+
+def write_figure(figure: Figure, path: Path | str, *, width: float, overwrite: bool = False) -> list[Axes]:
     """Write a figure for a journal as PDF, SVG or PNG, by the suffix of its path; the same numbers give the same bytes.
 
     Returns:
         Its axes, panel by panel.
+
+    Raises:
+        InputError: as of `figure_file`.
     """
+    path = figure_file(path, overwrite=overwrite)
     metadata: dict[str, Any] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix, {})
     with _style({**JOURNAL, "svg.hashsalt": figure.key}):
         canvas = _draw(figure, interactive=False, width=width)
-        canvas.savefig(path, metadata=metadata, dpi=JOURNAL_DPI)
+        with writing_file(path, overwrite=overwrite) as new:
+            canvas.savefig(new, metadata=metadata, dpi=JOURNAL_DPI)
     return canvas.axes
 
 
@@ -239,6 +257,10 @@ def _draw_panel(axes: Axes, panel: Panel, letters: int) -> dict[str, Artist]:
         shown.setdefault(series.label, _draw_series(axes, series))
     for bound in panel.bounds:
         shown["bound"] = _draw_bound(axes, bound)
+    for label in panel.labels:
+        look: dict[str, Any] = {"color": label.colour} if label.colour else {}
+        axes.text(label.x, label.y, label.text, ha="center", va="center", fontweight="bold" if label.bold else None,
+                  **look)  # fmt: skip
     if panel.y_log:
         axes.set_yscale("log")
         bottom, top = axes.get_ylim()

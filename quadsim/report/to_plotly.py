@@ -176,6 +176,10 @@ def _draw_panel(canvas: Canvas, panel: Panel, place: dict[str, int], points: int
         else:
             x, y = [bound.start, bound.stop], [bound.value, bound.value]
             canvas.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="bound", hoverinfo="skip"), **place)
+    for label in panel.labels:
+        shown = f"<b>{html.escape(label.text)}</b>" if label.bold else html.escape(label.text)
+        font = {"color": label.colour} if label.colour else {}
+        canvas.add_annotation(x=label.x, y=label.y, text=shown, font=font, showarrow=False, **place)
     if panel.x_label:
         canvas.update_xaxes(title={"text": html.escape(panel.x_label), "standoff": 6}, **place)
     if panel.y_label:

@@ -108,7 +108,7 @@ def vehicle_report(
         thrust_stand: CSV table of one rotor on a stand (rpm or throttle, thrust [N], torque [N m]): print the vehicle's
             file, or the template, with the numbers that it gives, and the fit.
         scenario: scenario whose bounds the vehicle may be unable to meet; they are listed.
-        out: PNG file for a picture of the vehicle on a floor of 10 cm squares.
+        out: PDF, SVG or PNG file for a drawing from above: numbers, spins, places and arms of the rotors, front, axes.
         overwrite: replace an existing file.
 
     Returns:
@@ -116,8 +116,8 @@ def vehicle_report(
         is given; or the `content` of a vehicle file.
 
     Raises:
-        InputError: the vehicle or scenario does not exist, the vehicle cannot fly, or the file does not end in .png.
-        RenderingUnavailableError: this machine cannot render.
+        InputError: the vehicle or scenario does not exist, the vehicle cannot fly, or the file has another ending.
+        OutputError: the file exists, or cannot be written.
 
     Examples:
         >>> import quadsim
@@ -128,7 +128,7 @@ def vehicle_report(
         'controller.input_bounds.speed: hover is 453.2 rad/s, the scenario allows 250'
     """
     from quadsim.assets import vehicle_path
-    from quadsim.report.film.video import render_portrait
+    from quadsim.report import vehicle_drawing
     from quadsim.sim.autopilot import AutopilotSettings
     from quadsim.vehicle import load_vehicle, vehicle_sources
     from scenarios import loading, results
@@ -154,8 +154,7 @@ def vehicle_report(
     path = vehicle_path(str(name))
     loaded = load_vehicle(path)
     against = None if scenario is None else loading.load_scenario(scenario)
-    if out is not None and Path(out).suffix != ".png":
-        raise ParameterError("", "--out", str(out), "a file ending in .png")
+    picture = None if out is None else vehicle_drawing.drawing_file(out, overwrite=overwrite)
     autopilot = (stated_autopilot(path) or AutopilotSettings()).resolved(loaded)
     report = vehicle_report.VehicleReport(
         vehicle=loaded,
@@ -166,8 +165,8 @@ def vehicle_report(
         scenario=None if against is None else against.name,
         shortfalls=None if against is None else shortfalls.shortfalls(against, loaded),
     )
-    if out is None:
+    if picture is None:
         return report
-    with results.after(report, Path(out)):
-        render_portrait(loaded, Path(out), overwrite=overwrite)
-    return replace(report, picture=Path(out))
+    with results.after(report, picture):
+        vehicle_drawing.write_drawing(loaded, picture, overwrite=overwrite)
+    return replace(report, picture=picture)

@@ -13,6 +13,8 @@ import numpy as np
 from mpc.model import continuous_model, discretise
 from quadsim.errors import ParameterError, QuadsimError
 from quadsim.plausibility import implausible
+from quadsim.report import vehicle_drawing
+from quadsim.report.figure import Figure
 from quadsim.report.table import Cell, Grid, format_number
 from quadsim.sim.autopilot import AutopilotSettings, built_in_lags
 from quadsim.state import INDEX
@@ -100,6 +102,10 @@ class VehicleReport(Result):
         yield from implausible(self.vehicle)
         if self.picture is not None:
             yield console.written_to(self.picture)
+
+    def small_plot(self) -> Figure:
+        """See `Result.small_plot`."""
+        return vehicle_drawing.vehicle_figure(self.vehicle)
 
     def to_json(self) -> dict[str, Any]:
         """All of it as plain values: the vehicle, each parameter with unit and source, and what follows from them."""

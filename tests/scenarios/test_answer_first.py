@@ -75,7 +75,7 @@ def test_runs_and_their_comparison_stand_without_figures(here: Path, capsys: pyt
     [
         (("check", "hover", *SHORT, "--junit", "v.xml"), "scenarios.commands.junit.write_junit", "verdict"),
         (("compare", "r", "r", "--out", "pair"), "quadsim.report.comparison_page.render_page", "outcome"),
-        (("vehicle", "hummingbird", "--out", "v.png"), "quadsim.report.film.video.render_portrait", "hummingbird"),
+        (("vehicle", "hummingbird", "--out", "v.png"), "quadsim.report.vehicle_drawing.write_figure", "hummingbird"),
     ],
     ids=["junit", "page", "picture"],
 )

@@ -36,11 +36,6 @@ CAMERA_DISTANCE: Final = 6.8  # from camera to aim, in arm lengths; its azimuth 
 CAMERA_AZIMUTH: Final = 125.0
 CAMERA_ELEVATION: Final = -18.0
 BLADE_SLOWDOWN: Final = 20.0  # blades are drawn turning this much slower than they do, so that an eye can follow
-PORTRAIT_DISTANCE: Final = 3.3
-"""From camera to vehicle in a portrait, in arm lengths; its azimuth and elevation below in degrees."""
-PORTRAIT_AZIMUTH: Final = -150.0
-PORTRAIT_ELEVATION: Final = -28.0
-PORTRAIT_SQUARE: Final = 0.1  # side of a portrait's floor squares [m]
 _DEEPEST_FLOOR: Final = 30.0  # the floor lies below the whole flight, but no deeper than this [m]
 _LONGEST_ARROW: Final = 2.5  # cap on a thrust arrow, in arrows at hover
 _MOST_GEOMS: Final = 2000
@@ -214,29 +209,6 @@ def film_shot(shot: Shot, path: Path) -> None:
             print(i, flush=True)
 
 
-def draw_portrait(vehicle: Vehicle, path: Path, width: int, height: int) -> None:
-    """Draw a vehicle standing on a floor of 10 cm squares, seen from its front left."""
-    model = compile_model(vehicle, visuals=True)
-    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    model.mat_texrepeat[model.material(FLOOR).id] = 0.5 / PORTRAIT_SQUARE  # the texture is two squares wide
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    camera = mujoco.MjvCamera()
-    camera.distance = PORTRAIT_DISTANCE * vehicle.longest_arm
-    camera.azimuth, camera.elevation = PORTRAIT_AZIMUTH, PORTRAIT_ELEVATION
-    camera.lookat[2] = 0.5 * float(model.geom(FLOOR).pos[2])
-    with mujoco.Renderer(model, height, width) as renderer:
-        scene = renderer.scene
-        scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0  # too coarse for what is small: a disc on the floor instead
-        renderer.update_scene(data, camera)
-        size, place = np.array([0.9, 0.002, 0.0]) * vehicle.longest_arm, np.array([0.0, 0.0, model.geom(FLOOR).pos[2]])
-        shadow = scene.geoms[scene.ngeom]
-        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
-        mujoco.mjv_initGeom(shadow, kind, size, place, np.eye(3).ravel(), np.array(_SHADOW_COLOUR, np.float32))
-        scene.ngeom += 1
-        imageio.imwrite(path, renderer.render())
-
-
 def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
     """Draw one state after the other, as `quadsim.report.film.camera.Camera` requests them, until there are no more."""
     vehicle, obstacles, width, height = pickle.load(requests)
@@ -262,14 +234,12 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
 
 
 def carry_out(arguments: list[str]) -> None:
-    """Do `serve`, `film SHOT MP4` or `portrait VEHICLE PNG W H`."""
+    """Do `serve` or `film SHOT MP4`."""
     match arguments:
         case ["serve"]:
             serve(sys.stdin.buffer, sys.stdout.buffer)
         case ["film", shot, path]:
             film_shot(Shot(**json.loads(shot)), Path(path))
-        case ["portrait", vehicle, path, width, height]:
-            draw_portrait(Vehicle(**json.loads(vehicle)), Path(path), int(width), int(height))
         case _:
             raise SystemExit(carry_out.__doc__)
 

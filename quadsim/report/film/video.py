@@ -25,7 +25,6 @@ from quadsim.errors import OutputError, ParameterError, RenderingUnavailableErro
 from quadsim.flight.rundir import load_run
 from quadsim.outputs import writing_file
 from quadsim.report.film.frames import Shot, film_end
-from quadsim.vehicle import Vehicle
 
 BACKENDS: Final = ("egl", "osmesa")  # off-screen back ends, in the order tried
 _WORKER: Final = (sys.executable, "-P", "-m", "quadsim.report.film.render_worker")
@@ -139,15 +138,6 @@ def render_gif(
         colours = "[a]palettegen=max_colors=96:stats_mode=diff[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
         looping = ("-i", film.name, "-filter_complex", f"{scaled};{colours}", "-loop", "0", new.name)
         _work([(*_ffmpeg(), *looping)], backend, new.parent, there=True)
-
-
-def render_portrait(
-    vehicle: Vehicle, path: Path, *, width: int = 1280, height: int = 720, overwrite: bool = False
-) -> None:
-    """Draw a vehicle standing on a floor of 10 cm squares, as a PNG of so many pixels; errors as `render_video`."""
-    with _making(path, overwrite) as new:
-        command = (*_WORKER, "portrait", json.dumps(asdict(vehicle)), str(new), str(width), str(height))
-        _work([command], rendering_backend(), new.parent)
 
 
 def write_poster(film: Path, poster: Path) -> bool:

@@ -27,6 +27,7 @@ from quadsim.report.figure import (
     Band,
     Bound,
     Figure,
+    Label,
     Panel,
     Series,
     break_at_wraps,
@@ -165,6 +166,7 @@ def test_both_libraries_draw_the_same_numbers(x_label: str) -> None:
         series=tuple(series(y, style) for style, y in styles.items()),
         bounds=(Bound(value=5.0, start=1.0, stop=2.0),),
         bands=(Band(x=x, low=-x, high=x, colour="#654321"),),
+        labels=(Label(x=1.0, y=2.0, text="<c>", colour="#abcdef", bold=True),),
         x_label=x_label,
         y_range=(-3.0, 9.0),
     )
@@ -175,10 +177,15 @@ def test_both_libraries_draw_the_same_numbers(x_label: str) -> None:
     assert axes.get_ylim() == (-3.0, 9.0)
     np.testing.assert_array_equal(lines["default-"], styles["line"])
     np.testing.assert_array_equal(lines["steps-post-"], styles["steps"])
+    (text,) = axes.texts
+    assert (text.get_text(), text.get_position(), text.get_color()) == ("<c>", (1.0, 2.0), "#abcdef")
     drawn = json.loads(to_plot(figure).json)
     assert "&lt;b&gt;" in drawn["layout"]["annotations"][0]["text"]
     assert drawn["layout"]["yaxis"]["range"] == [-3.0, 9.0]
     assert [trace["name"] for trace in drawn["data"] if "name" in trace] == [*styles, "bound"]
+    label = drawn["layout"]["annotations"][1]
+    assert (label["text"], label["x"], label["y"]) == ("<b>&lt;c&gt;</b>", 1.0, 2.0)
+    assert label["font"]["color"] == "#abcdef"
     (bound,) = (trace for trace in drawn["data"] if trace.get("name") == "bound")
     assert (bound["x"], bound["y"], bound["line"]["color"]) == ([1.0, 2.0], [5.0, 5.0], COLOUR.bound)
 

@@ -14,9 +14,11 @@ from xml.etree import ElementTree
 import pytest
 import tomlkit
 
+import quadsim
 from scenarios.commands.cli import main
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
+EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 MASS = {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
 CAMPAIGN = {
     "name": "little",
@@ -120,6 +122,20 @@ def test_two_campaigns_are_compared_flight_by_flight(
     assert "of 6 paired flights" in page
     result = json.loads((pairs / "comparison.json").read_text(encoding="utf-8"))
     assert result["differences"] == [{"field": "initial.position.2", "values": [0.0, 0.05]}]
+
+
+@pytest.mark.slow("campaigns")
+@pytest.mark.usefixtures("campaigns_here")
+def test_the_campaigns_of_the_example_are_pairs_with_one_audit(tmp_path: Path) -> None:
+    """docs/own-controller.md compares them; here the first seconds of two flights."""
+    for name in ("my", "paper"):
+        file = EXAMPLES / f"{name}_campaign.toml"
+        options = {"flights": 2, "changes": ["duration=2.0"], "workers": 1, "report": False}
+        result = quadsim.campaign(file, out=tmp_path / name, progress=False, **options)
+        assert result.summary["events"]["lost"]["count"] == 0
+    pair = quadsim.compare(tmp_path / "my", tmp_path / "paper", names=["mine", "paper"])
+    assert (pair.flights, pair.shared_draws, pair.own_draws, pair.audits) == (2, ("mass", "wind"), (), ())
+    assert pair.verdict != "not comparable"
 
 
 @pytest.mark.parametrize(

@@ -9,14 +9,13 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 
+import quadsim
 from mpc.model import continuous_model, hover_model
 from quadsim.assets import vehicle_names, vehicle_path
-from quadsim.errors import InputError, RenderingUnavailableError
-from quadsim.report.film.video import render_portrait, rendering_backend
+from quadsim.errors import InputError
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.assembly import Assembly
@@ -24,10 +23,10 @@ from scenarios.commands.cli import main
 from scenarios.design.authority import torque_ranges
 from scenarios.design.vehicle_report import make_sheet
 from scenarios.loading import load_scenario
-from scenarios.results import EXIT_DONE
+from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
 
 VEHICLES = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]
-CRAZYFLIE, HUMMINGBIRD, LOPES = (load_vehicle(vehicle_path(n)) for n in ("crazyflie2", "hummingbird", "lopes2011"))
+HUMMINGBIRD, LOPES = (load_vehicle(vehicle_path(n)) for n in ("hummingbird", "lopes2011"))
 SKEWED = replace(HUMMINGBIRD, rotor_azimuths=(10.0, 100.0, -170.0, -80.0), speed_min=250.0)
 EVERY = pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda vehicle: vehicle.name)
 
@@ -167,15 +166,32 @@ def test_a_vehicle_whose_autopilot_has_no_lag_is_reported_and_flies(
         _ = Assembly(load_scenario("hover").replace({"vehicle.file": str(file)})).inner_lag
 
 
-@pytest.mark.slow("figures")
-def test_the_portrait_shows_the_vehicle(tmp_path: Path) -> None:
-    try:
-        rendering_backend()
-    except RenderingUnavailableError as error:
-        pytest.skip(str(error))
-    render_portrait(CRAZYFLIE, tmp_path / "cf.png", width=320, height=180)
-    picture = iio.imread(tmp_path / "cf.png").astype(int)
-    assert picture.shape[:2] == (180, 320)
-    orange = (picture[..., 0] - picture[..., 2] > 80).nonzero()  # what points forward; the rest is grey and blue
-    assert np.ptp(orange[1]) > 100  # both front arms, across a third of the picture
-    assert [path.name for path in tmp_path.iterdir()] == ["cf.png"]
+@pytest.mark.parametrize(("suffix", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_the_command_draws_the_vehicle(
+    suffix: str, start: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / f"drawing.{suffix}"
+    command = ["vehicle", "hummingbird", "--out", str(file)]
+    assert main(command) == EXIT_DONE
+    assert f"drawing.{suffix}" in capsys.readouterr().out
+    content = file.read_bytes()
+    assert content.startswith(start)
+    assert main(command) == EXIT_WRONG_INPUT
+    output = capsys.readouterr()
+    assert (output.out, "it already exists" in output.err) == ("", True)
+    assert main([*command, "--overwrite"]) == EXIT_DONE
+    assert file.read_bytes() == content
+
+
+def test_another_ending_is_refused_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["vehicle", "hummingbird", "--out", str(tmp_path / "v.jpg")]) == EXIT_WRONG_INPUT
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "out must be a file ending in .pdf, .svg, .png; got" in output.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_notebook_shows_the_drawing() -> None:
+    page = quadsim.vehicle_report("hummingbird")._repr_html_()
+    assert "<svg" in page
+    assert all(f">{text}</text>" in page for text in ("front", "arm 0.170", "turns clockwise"))

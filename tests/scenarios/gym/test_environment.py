@@ -6,14 +6,18 @@ import itertools
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium
+import imageio.v2
+import imageio.v3
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
+from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import RecordVideo
 
 import quadsim
 import quadsim.gym
@@ -291,3 +295,41 @@ def test_without_gymnasium_the_extra_is_named() -> None:
     code += "try:\n    import quadsim.gym\nexcept quadsim.errors.MissingPackageError as error:\n    print(error)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "quadsim.gym needs the package 'gymnasium': pip install 'quadsim[gym]'"
+
+
+class Clip:
+    """As much of moviepy as gymnasium calls; moviepy itself wants another Pillow than the rest."""
+
+    def __init__(self, frames: list[np.ndarray], fps: float) -> None:
+        self.frames, self.fps = frames, fps
+
+    def write_videofile(self, path: str, logger: object) -> None:
+        imageio.v2.mimwrite(path, self.frames, fps=self.fps)
+
+
+def test_record_video_films_an_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    try:
+        rendering_backend()
+    except RenderingUnavailableError as error:
+        pytest.skip(str(error))
+    for name in ("moviepy", "moviepy.video", "moviepy.video.io", "moviepy.video.io.ImageSequenceClip"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    monkeypatch.setattr(sys.modules["moviepy.video.io.ImageSequenceClip"], "ImageSequenceClip", Clip, raising=False)
+    env = RecordVideo(
+        quadsim.gym.make_env(short("hover", 0.5, control_period=0.1), render_mode="rgb_array", width=320, height=240),
+        str(tmp_path / "films"),
+    )
+    infos = flown(env)
+    env.close()
+    film = tmp_path / "films" / "rl-video-episode-0.mp4"
+    pictures = imageio.v3.imread(film)
+    assert pictures.shape == (len(infos), 240, 320, 3) == (6, 240, 320, 3)
+    assert imageio.v3.immeta(film)["fps"] == 10.0  # as fast as it is flown
+    assert pictures[0].std() > 10.0  # something is seen
+
+
+def test_record_video_names_what_it_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "moviepy", None)
+    env = quadsim.gym.make_env("hover", render_mode="rgb_array")
+    with pytest.raises(DependencyNotInstalled, match=r"(?i)moviepy is not installed"):
+        RecordVideo(env, str(tmp_path / "films"))
