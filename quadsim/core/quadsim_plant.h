@@ -47,7 +47,8 @@ typedef struct quadsim_vehicle {
 
     /* constants */
     double mass, gravity, inertia[3], products[3], inverse[3][3], torque_of_thrust[3][ROTORS]; /* of the own method */
-    double coefficient[ROTORS], hover, demand[ROTORS]; /* demand: of power at hover, over the mean rotor's */
+    double linear, coefficient[ROTORS]; /* of a rotor's thrust: linear w + coefficient w^2 */
+    double hover, demand[ROTORS], linear_demand; /* of power, at hover speed, over the mean rotor's in hover */
     double slowest, fastest, place[ROTORS][3], spin[ROTORS];
     double rotor_drag, rotor_inertia, rotor_moment[2], rate_damping[3], linear_drag[3], quadratic_drag[3];
     double floor, disc, radius;      /* of the ground effect; radius 0: none */

@@ -20,6 +20,7 @@ import tomlkit
 
 from quadsim.errors import FileError
 from quadsim.state import Array
+from quadsim.vehicle import THRUST
 
 _GRAM: Final = 9.80665e-3  # [N]
 _UNITS: Final[dict[str, dict[str, float]]] = {
@@ -112,6 +113,8 @@ def stand_vehicle_text(stand: Path, start: str) -> tuple[str, dict[str, Any]]:
         full = throttle is None or throttle.max() >= _FULL
         at = "the fastest row" if full or throttle is None else f"only {throttle.max():.0%} throttle: it turns faster"
         sources["speed_max"] = f"thrust stand {of}: {at}"
+    for name in {*THRUST} - {*numbers}:
+        document.pop(name, None)
     for name, value in numbers.items():
         table: Any = document.get(name)
         if table is None:

@@ -16,7 +16,12 @@ def field_of(name: str) -> str:
 
 
 def number_in(vehicle: Vehicle, name: str) -> float | None:
-    """Return what a vehicle has for a parameter; of `body_drag` the first number, as the others follow it."""
+    """Return what a vehicle has for a parameter; of `body_drag` the first number, as the others follow it.
+
+    What `thrust_coefficient` is where a map of thrust takes its place, or each rotor has its own: the mean b.
+    """
+    if name == "thrust_coefficient":
+        return vehicle.mean_coefficient
     value = getattr(vehicle, field_of(name), None)
     axis = name[-1] if field_of(name) != name else "x"
     return value["xyz".index(axis)] if isinstance(value, tuple) else value

@@ -16,7 +16,7 @@ from scipy.stats import t as student
 
 from quadsim.errors import InputError
 from quadsim.state import Array
-from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle, altered
 from scenarios.identify.estimate import FlightNumbers, Identification, ParameterEstimate, field_of, number_in
 from scenarios.identify.model import INCREMENTS, stretch
 from scenarios.identify.record import Record
@@ -298,7 +298,7 @@ class _Fit:
         held = {name: estimate.start or 0.0 for name, estimate in refused.items() if estimate.in_file}
         held |= {name: 0.0 for name in refused if name in ("offset_x", "offset_y")}
         held |= {"delay": 0.0} if {"delay", "lateness"} & {*refused} else {}
-        held |= {"throttle_curve": 1.0} if "throttle_curve" in refused else {}
+        held |= {"throttle_curve": self.vehicle.throttle_share} if "throttle_curve" in refused else {}
         held |= {"voltage_exponent": 0.0} if "voltage_exponent" in refused else {}
         sought = {number.name for number in self.search.sought}
         return {name: value for name, value in held.items() if name in sought} | {"inflow": 0.0}
@@ -361,7 +361,7 @@ class _Fit:
         if "body_drag" in known:
             ratio: Array = np.array(self.vehicle.body_drag or LEVEL_PLATE)
             changes["body_drag"] = tuple((values["body_drag"] * ratio / ratio[0]).tolist())
-        return replace(self.vehicle, **changes)
+        return altered(self.vehicle, changes)
 
 
 def _impossible(search: Search) -> dict[str, float]:

@@ -54,8 +54,9 @@ class Parameters:
         own: dict[str, Any] = {name: getattr(vehicle, name) or AT_ONCE for name in ("rotor_rise", "rotor_fall")}
         own |= {name: getattr(vehicle, name) or 0.0 for name in ("rotor_inertia", "rotor_drag")}
         own |= {"thrust_coefficient": vehicle.mean_coefficient, "drag_to_thrust": vehicle.drag_to_thrust}
+        own |= {"throttle_curve": vehicle.throttle_share}
         own |= {name: np.array(getattr(vehicle, name) or (0.0,) * n) for name, n in VECTORS.items()}
-        return cls(inertia=np.array(vehicle.inertia), **own, **others)
+        return cls(**({"inertia": np.array(vehicle.inertia)} | own | others))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -83,7 +83,7 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterat
     if record.speeds is None:
         yield from (Sought(name, getattr(vehicle, name) or lag, None, 1.5) for name in ("rotor_rise", "rotor_fall"))
         if record.throttle is not None:
-            yield Sought("throttle_curve", 1.0, 0.3, 1.0)
+            yield Sought("throttle_curve", vehicle.throttle_share, 0.3, 1.0)
         if record.voltage is not None and record.throttle is None:
             yield Sought("voltage_exponent", 1.0, 0.5, 2.0)
     for flight in range(1 + parts[-1].flight):
@@ -149,6 +149,7 @@ class Search:
         area, given = own.pop("body_drag"), self.vehicle.body_drag or LEVEL_PLATE
         vectors = {"inertia": "xyz", "rotor_moment": "xy", "rate_damping": "xyz", "offset": "xy"}
         own |= {name: np.array([own.pop(f"{name}_{axis}") for axis in axes]) for name, axes in vectors.items()}
+        own.setdefault("throttle_curve", self.vehicle.throttle_share)
         return Parameters(body_drag=area / given[0] * np.array(given), voltage=self.voltage, **own)
 
     def misfit(self, x: Array, part: int, rotors: Turning | None = None) -> tuple[Array, Turning]:

@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 from browser import CLASHES, opened
 from flown_logs import fly_eight, write_log
+from uneven import FILES, published
 
 import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError, ParameterError
-from quadsim.vehicle import load_vehicle, vehicle_sources
+from quadsim.vehicle import altered, load_vehicle, vehicle_sources
 from scenarios.commands.cli import main
 from scenarios.flown import Flight
-from scenarios.identify.estimate import Identification, ParameterEstimate
+from scenarios.identify.estimate import Identification, ParameterEstimate, number_in
+from scenarios.identify.model import Parameters, commanded, stretch
 from scenarios.identify.prediction import (
     HORIZONS,
     IDENTIFIED,
@@ -31,8 +33,9 @@ from scenarios.identify.prediction import (
     hold_out,
     predict,
 )
-from scenarios.identify.record import read_record
+from scenarios.identify.record import Record, read_record
 from scenarios.identify.report import IdentifiedVehicle
+from scenarios.identify.search import Search
 from scenarios.identify.vehicle_file import rounded, vehicle_text
 
 pytestmark = pytest.mark.slow("identification")
@@ -166,6 +169,31 @@ def test_what_a_gate_refuses_keeps_the_number_of_the_start_and_says_why(place: P
     assert sources["inertia"].startswith("x identified: 95 % within 0.007029 to 0.007171; start 0.009; y identified")
     assert sources["inertia"].endswith(f"; z kept: no yaw excitation; logs a.csv, b.csv; {before['inertia']}")
     assert written == replace(new, thrust_coefficient=rounded(8.54321e-6, estimates[0]))
+
+
+def test_an_identified_coefficient_takes_the_place_of_a_map(place: Path) -> None:
+    start, path = published("cf21b"), place / "unmapped.toml"
+    assert number_in(start, "thrust_coefficient") == start.mean_coefficient
+    thrust = estimate("thrust_coefficient", 3.9e-8, start.mean_coefficient)
+    for refused in ("", "not excited"):
+        new = start if refused else altered(start, {"thrust_coefficient": 3.9e-8})
+        one = replace(thrust, refused=refused)
+        identification = Identification(estimates=(one,), vehicle=new, delay=0.0, offset=(0.0, 0.0))
+        path.write_text(vehicle_text(identification, FILES / "cf21b.toml", ["a.csv"]), encoding="utf-8")
+        assert load_vehicle(path) == new
+
+
+def test_a_throttle_map_gives_the_speeds_of_the_throttle() -> None:
+    start = load_vehicle(vehicle_path(TRUE))
+    top = start.mean_coefficient * start.speed_max**2
+    mapped, u = altered(start, {"thrust_of_throttle": (0.4 * top, 0.6 * top)}), np.linspace(0.1, 1.0, 40)
+    columns = {name: np.zeros((40, 3)) for name in ("rates", "velocity")}
+    throttle, level = np.stack([u] * 4, axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (40, 1))
+    record = Record(name="a", t=0.01 * np.arange(40), attitude=level, throttle=throttle, **columns)
+    speeds = commanded(record, mapped, Parameters.of(mapped))
+    np.testing.assert_allclose(mapped.thrusts(speeds), top * (0.4 * throttle + 0.6 * throttle**2), rtol=1e-12)
+    search = Search([stretch(record, 0)], mapped, wind=False)
+    assert search.parameters(search.x, 0).throttle_curve == pytest.approx(0.6)
 
 
 def test_a_parameter_that_the_start_lacks_is_added(place: Path) -> None:
