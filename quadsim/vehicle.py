@@ -15,13 +15,11 @@ from annotated_types import DocInfo, Len, doc
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, ParameterError, UnknownNameError
-from quadsim.fields import Number, Positive, Vector
+from quadsim.fields import Number, Pair, Positive, Vector
 from quadsim.state import Array, read_only
 
 N_ROTORS: Final = 4
 AUTOPILOT: Final = "autopilot"  # table of a vehicle file; see `quadsim.sim.autopilot.AutopilotSettings`
-PerAxis = Annotated[tuple[Number, ...], Len(2, 2)]
-Map = Annotated[tuple[Number, ...], Len(2, 2)]
 OfRotors = Annotated[tuple[Number, ...], Len(N_ROTORS, N_ROTORS)]
 Positions = Annotated[tuple[Vector, ...], Len(N_ROTORS, N_ROTORS)]
 ARMS: Final = ("arm_length", "rotor_azimuths")
@@ -95,11 +93,11 @@ class Vehicle:
         Positive | OfRotors | None, doc("[N s^2/rad^2] b, thrust b w^2; one number, or one for each rotor")
     ] = None
     thrust_of_speed: Annotated[
-        Map | None,
+        Pair | None,
         doc("[N s/rad, N s^2/rad^2] a1 and a2, thrust a1 w + a2 w^2 of a rotor, in place of thrust_coefficient"),
     ] = None
     thrust_of_throttle: Annotated[
-        Map | None,
+        Pair | None,
         doc("[N] a1 and a2, thrust a1 u + a2 u^2 of a rotor at throttle u, 0 to 1, in place of thrust_coefficient"),
     ] = None
     drag_to_thrust: Annotated[float, doc("[m] d / b, reaction torque d w^2")]
@@ -111,7 +109,7 @@ class Vehicle:
     rotor_radius: Annotated[float | None, doc("[m] R, of a propeller")] = None
     rotor_drag: Annotated[float | None, doc("[N s^2/(m rad)] linear drag of one rotor")] = None
     rotor_moment: Annotated[
-        PerAxis | None, doc("[N m s^2/(m rad)] of one rotor about its hub's x and y, per speed and air speed across it")
+        Pair | None, doc("[N m s^2/(m rad)] of one rotor about its hub's x and y, per speed and air speed across it")
     ] = None
     rate_damping: Annotated[Vector | None, doc("[N m s/rad] of the whole vehicle about body x, y, z")] = None
     body_drag: Annotated[Vector | None, doc("[m^2] C_d A along body x, y, z")] = None

@@ -20,7 +20,6 @@ import tomlkit
 
 from quadsim.errors import FileError
 from quadsim.state import Array
-from quadsim.vehicle import THRUST
 
 _GRAM: Final = 9.80665e-3  # [N]
 _UNITS: Final[dict[str, dict[str, float]]] = {
@@ -113,7 +112,7 @@ def stand_vehicle_text(stand: Path, start: str) -> tuple[str, dict[str, Any]]:
         full = throttle is None or throttle.max() >= _FULL
         at = "the fastest row" if full or throttle is None else f"only {throttle.max():.0%} throttle: it turns faster"
         sources["speed_max"] = f"thrust stand {of}: {at}"
-    for name in {*THRUST} - {*numbers}:
+    for name in ("thrust_of_speed", "thrust_of_throttle"):  # which the coefficient replaces
         document.pop(name, None)
     for name, value in numbers.items():
         table: Any = document.get(name)

@@ -16,8 +16,8 @@ from scipy.stats import t as student
 
 from quadsim.errors import InputError
 from quadsim.state import Array
-from quadsim.vehicle import VEHICLE_UNITS, Vehicle, altered
-from scenarios.identify.estimate import FlightNumbers, Identification, ParameterEstimate, field_of, number_in
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from scenarios.identify.estimate import VECTORS, FlightNumbers, Identification, ParameterEstimate, field_of, number_in
 from scenarios.identify.model import INCREMENTS, stretch
 from scenarios.identify.record import Record
 from scenarios.identify.rotor_response import rotor_response
@@ -355,13 +355,15 @@ class _Fit:
         changes: dict[str, Any] = {
             name: values[name] for name in known if name in VEHICLE_UNITS and name != "body_drag" and name in values
         }
-        for name, axes in {"inertia": "xyz", "rotor_moment": "xy", "rate_damping": "xyz"}.items():
+        for name, axes in VECTORS.items():
             if known & {*(of := [f"{name}_{axis}" for axis in axes])}:
                 changes[name] = tuple(values.get(one, number_in(self.vehicle, one) or 0.0) for one in of)
         if "body_drag" in known:
             ratio: Array = np.array(self.vehicle.body_drag or LEVEL_PLATE)
             changes["body_drag"] = tuple((values["body_drag"] * ratio / ratio[0]).tolist())
-        return altered(self.vehicle, changes)
+        if "thrust_coefficient" in changes:
+            changes |= {"thrust_of_speed": None, "thrust_of_throttle": None}
+        return replace(self.vehicle, **changes)
 
 
 def _impossible(search: Search) -> dict[str, float]:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import tomlkit
 
-from quadsim.vehicle import THRUST, VEHICLE_UNITS, Vehicle
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.identify.estimate import Identification, ParameterEstimate, field_of, number_in
 
 _DIGITS: Final = 100.0  # the last digit is no more than this part of an interval
@@ -50,8 +50,8 @@ def vehicle_text(identification: Identification, start: Path, logs: Sequence[str
     for estimate in identification.estimates:
         if estimate.in_file:
             of_field.setdefault(field_of(estimate.name), []).append(estimate)
-    for name in THRUST:  # a map that an identified coefficient replaces
-        if getattr(identification.vehicle, name) is None:
+    for name in VEHICLE_UNITS:
+        if getattr(identification.vehicle, name) is None:  # a map that an identified coefficient replaces
             document.pop(name, None)
     for name, estimates in of_field.items():
         value = getattr(identification.vehicle, name)

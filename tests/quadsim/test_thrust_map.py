@@ -160,7 +160,7 @@ def test_an_impossible_map_is_refused(changes: dict[str, Any], message: str) -> 
 def test_a_wrong_map_is_one_message_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, text = tmp_path / "mine.toml", (FILES / "cf21b.toml").read_text(encoding="utf-8")
     path.write_text(text.replace("[-2.9922e-06, 4.01903e-08]", "[-2.9922e-06, -4.01903e-08]"), encoding="utf-8")
-    assert main(["vehicle", str(path)]) == EXIT_WRONG_INPUT
+    assert main(["check", "hover", "--set", f"vehicle.file={path}"]) == EXIT_WRONG_INPUT
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith("quadsim: ")

@@ -24,11 +24,8 @@ from scenarios.identify.estimate import Identification, ParameterEstimate, numbe
 from scenarios.identify.model import Parameters, commanded, stretch
 from scenarios.identify.prediction import (
     HORIZONS,
-    IDENTIFIED,
     QUANTITIES,
     RESIDUAL_AFTER,
-    START,
-    THRUST_ONLY,
     PredictionErrors,
     hold_out,
     predict,
@@ -90,8 +87,8 @@ def test_the_command_finds_the_vehicle_that_flew(identified: IdentifiedVehicle) 
     assert found.thrust_coefficient == pytest.approx(true.thrust_coefficient, rel=0.02)
     assert found.inertia[:2] == pytest.approx(true.inertia[:2], rel=0.05)
     errors = identified.prediction.errors
-    assert (errors[IDENTIFIED][-1] < 0.5 * errors[THRUST_ONLY][-1]).all()
-    assert (errors[IDENTIFIED][-1, 1:] < errors[START][-1, 1:]).all()
+    assert (errors["identified"][-1] < 0.5 * errors["thrust only"][-1]).all()
+    assert (errors["identified"][-1, 1:] < errors["start"][-1, 1:]).all()
 
 
 def test_the_file_loads_flies_and_says_where_each_number_is_from(identified: IdentifiedVehicle) -> None:
@@ -143,8 +140,8 @@ def test_another_log_can_be_predicted_and_json_has_all_of_it(
     data = json.loads(capsys.readouterr().out)
     assert (data["logs"], data["test"], data["written"]) == (["eight.csv"], ["other.csv"], [])
     assert data["prediction"]["windows"] > 30
-    assert data["prediction"]["errors"].keys() == {IDENTIFIED, START, THRUST_ONLY}
-    assert all(len(errors) == len(HORIZONS) for errors in data["prediction"]["errors"][IDENTIFIED].values())
+    assert data["prediction"]["errors"].keys() == {"identified", "start", "thrust only"}
+    assert all(len(errors) == 10 for errors in data["prediction"]["errors"]["identified"].values())
     assert {"low", "high", "start", "refused"} <= data["estimates"][0].keys()
     assert sorted(path.name for path in here.iterdir()) == ["eight.csv", "other.csv", "start.toml"]
 
@@ -242,12 +239,12 @@ def test_the_true_vehicle_predicts_and_thrust_alone_holds_the_rates(eight: Fligh
     identification = Identification(estimates=(), vehicle=true, delay=0.0, offset=(0.0, 0.0))
     found = predict([record], [[slice(100, len(record.t))]], identification, wrong)
     noise = np.array([1e-3, 1e-2, 0.0, 1e-2]) * np.sqrt(8.0 / np.pi)  # mean norm of three normal numbers
-    at_start, after = found.errors[IDENTIFIED][1], found.errors[IDENTIFIED][-1]
+    at_start, after = found.errors["identified"][1], found.errors["identified"][-1]
     assert (at_start < 2.0 * noise + [1e-3, 1e-3, 3e-3, 1e-2]).all()
-    assert (after < 0.1 * found.errors[START][-1] + 3.0 * noise + [0.01, 0.02, 0.01, 0.02]).all()
-    held = found.trace.predicted[THRUST_ONLY][..., 3:]
+    assert (after < 0.1 * found.errors["start"][-1] + 3.0 * noise + [0.01, 0.02, 0.01, 0.02]).all()
+    held = found.trace.predicted["thrust only"][..., 3:]
     assert held == pytest.approx(np.broadcast_to(held[:, :1], held.shape), abs=1e-12)
-    assert found.trace.predicted[THRUST_ONLY][:, 0] == pytest.approx(found.trace.measured[:, 0])
+    assert found.trace.predicted["thrust only"][:, 0] == pytest.approx(found.trace.measured[:, 0])
     assert [*QUANTITIES] == ["position", "velocity", "attitude", "body rates"]
     for name, left in found.residuals.items():
         norms = [np.linalg.norm(left[:, of], axis=1).mean() for of in (slice(3), slice(3, 6))]
@@ -262,7 +259,7 @@ def test_the_prediction_knows_delay_offset_and_wind(place: Path) -> None:
 
     def end(**changes: object) -> np.ndarray:
         changed = replace(known, **changes)  # type: ignore[arg-type]
-        return predict([record], [[slice(300, 360)]], changed, true).trace.predicted[IDENTIFIED][0, -1]
+        return predict([record], [[slice(300, 360)]], changed, true).trace.predicted["identified"][0, -1]
 
     still, t = end(), 0.5
     weight = true.mass * true.gravity
@@ -282,7 +279,7 @@ def test_a_vehicle_that_predicts_worse_is_said_to_and_written_only_anyway(
     def exchanged(*arguments: Any, **options: Any) -> PredictionErrors:
         found = predict(*arguments, **options)
         errors = {name: of.copy() for name, of in found.errors.items()}
-        errors[IDENTIFIED][:, 3] = 2.0 * errors[THRUST_ONLY][:, 3]
+        errors["identified"][:, 3] = 2.0 * errors["thrust only"][:, 3]
         return replace(found, errors=errors)
 
     monkeypatch.setattr("scenarios.identify.report.predict", exchanged)
@@ -300,7 +297,8 @@ def test_a_vehicle_that_predicts_worse_is_said_to_and_written_only_anyway(
 
 def test_the_verdict_comes_first_with_the_errors_over_those_of_each_rival(identified: IdentifiedVehicle) -> None:
     errors = {
-        name: np.full((len(HORIZONS), 4), of) for name, of in ((IDENTIFIED, 1.0), (START, 4.0), (THRUST_ONLY, 2.0))
+        name: np.full((len(HORIZONS), 4), of)
+        for name, of in (("identified", 1.0), ("start", 4.0), ("thrust only", 2.0))
     }
     better = replace(identified.prediction, errors=errors)
     assert better.verdict == (
