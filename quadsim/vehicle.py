@@ -48,8 +48,9 @@ class Vehicle:
     A map may replace `thrust_coefficient`.  `thrust_of_throttle`, T(u) = a_1 u + a_2 u^2 of the throttle u, gives
     b = T(1) / speed_max^2; identification starts from the speeds sqrt(T(u) / b) that it gives a throttle.
     `thrust_of_speed`, f(w) = a_1 w + a_2 w^2, is what the plant flies, reaction torque and power in proportion; a rotor
-    so slow that f is negative gives no thrust.  Controllers, mixers and the estimator, which model b w^2, take for each
-    rotor the b of hover, f(w_i) / w_i^2: their trim is exact, and the slope of the linear model, a_1 + 2 a_2 w_i, too.
+    so slow that f is negative gives no thrust.  The autopilot and the allocation of a wrench invert it.  Where MPC and
+    estimator model b w^2, each rotor has the b of hover, f(w_i) / w_i^2: their trim is exact, and the slope of the
+    linear model, a_1 + 2 a_2 w_i, too.
 
     Linear drag is a force -rotor_drag w v_perp on a rotor, v_perp its velocity through the air in the rotor's plane
     (Martin and Salaun, 2010; Furrer et al., 2016).  The same velocity v turns the vehicle, by (rotor_moment[0] w v_y,

@@ -78,6 +78,8 @@ typedef struct quadsim_inner {
     /* autopilot; thrusts over four times the rotor's share of the weight, so that hover is the same for all */
     double p[3], i[3], d[3], i_max[3], attitude[3], largest[3], gyro_share, d_share;
     double to_thrusts[ROTORS][4], coefficient[ROTORS], low[ROTORS], high[ROTORS];
+    /* a thrust over its coefficient: linear w + quadratic w^2, just w^2 unless the vehicle has a map of thrust */
+    double linear[ROTORS], quadratic[ROTORS];
     int64_t airmode, delay, oldest;
     double *queue; /* [delay][4] */
     /* incremental nonlinear dynamic inversion */

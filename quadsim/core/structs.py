@@ -70,8 +70,8 @@ class InnerStruct(Structure):
     _fields_ = _members(
         "#kind #stride #until #measures command:8 answer:4 #holds_attitude step inertia:3 products:3 integral:3 "
         "filtered:3 slope:3 p:3 i:3 d:3 i_max:3 attitude:3 largest:3 gyro_share d_share to_thrusts:4x4 coefficient:4 "
-        "low:4 high:4 #airmode #delay #oldest *queue effect:4x4 inverse:4x4 scale:4 omega least:4 most:4 last_time "
-        "last_rates:3 #started"
+        "low:4 high:4 linear:4 quadratic:4 #airmode #delay #oldest *queue effect:4x4 inverse:4x4 scale:4 omega least:4 "
+        "most:4 last_time last_rates:3 #started"
     )
 
 

@@ -13,10 +13,12 @@ from support import NO_PRODUCTS
 from uneven import FILES, published, uneven
 
 import quadsim
+from mpc.allocation import allocate, make_allocation
 from mpc.model import continuous_model
 from quadsim.assets import vehicle_path
 from quadsim.errors import FileError, ParameterError
 from quadsim.plausibility import implausible
+from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.battery import Battery
 from quadsim.sim.physics import Integrator
@@ -83,6 +85,23 @@ def test_models_have_its_hover_and_its_slope(layout: str) -> None:
         plant.reset(np.zeros(N_STATES))
         plant.advance(hover, 500)
         np.testing.assert_allclose(plant.state(), 0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("vehicle", [mapped(-0.05), mapped(), mapped(1.0), published("cf21b")], ids=lambda v: v.name)
+def test_allocation_and_autopilot_invert_it(vehicle: Vehicle) -> None:
+    allocation, weight = make_allocation(vehicle), vehicle.mass * vehicle.gravity
+    speeds = vehicle.hover_speed * np.array([0.9, 1.0, 1.1, 1.2])
+    thrusts, (x, y, _) = vehicle.thrusts(speeds), vehicle.hubs.T
+    yaw = vehicle.drag_to_thrust * thrusts @ np.array(vehicle.rotor_spins)
+    wrench = np.array([thrusts.sum(), thrusts @ y, -thrusts @ x, yaw])
+    np.testing.assert_allclose(allocation.wrench(speeds), wrench, rtol=1e-9, atol=1e-12 * weight)
+    low, high = (np.full(4, limit) for limit in (vehicle.speed_min, vehicle.speed_max))
+    np.testing.assert_allclose(allocate(allocation, wrench, low, high), speeds, rtol=1e-9)
+    assert allocate(allocation, 9.0 * weight * np.array([1.0, 0.0, 0.0, 0.0]), low, high) == pytest.approx(high)
+    autopilot, level = Autopilot(vehicle, AutopilotSettings(delay=0.0)), np.array([1.0, 0.0, 0.0, 0.0])
+    for share in (0.7, 1.0, 1.4):
+        answer = autopilot.speeds(0.0, share * weight * level, np.zeros(3), vehicle.hover_speeds, level)
+        assert vehicle.thrusts(answer).sum() == pytest.approx(share * weight, rel=1e-9)
 
 
 def test_power_is_torque_times_speed() -> None:
