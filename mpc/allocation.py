@@ -44,10 +44,10 @@ def make_allocation(vehicle: Vehicle) -> Allocation:
     """Return the allocation of a vehicle."""
     M = vehicle.allocation
     scale = np.asarray(np.abs(M).max(axis=1) * vehicle.hover_speed**2, np.float64)
-    linear, quadratic = vehicle.thrust_law
+    linear, quadratic = vehicle.square_law
     return Allocation(
-        linear=read_only(np.asarray(linear / vehicle.coefficients)),
-        quadratic=read_only(np.asarray(quadratic / vehicle.coefficients)),
+        linear=read_only(linear),
+        quadratic=read_only(quadratic),
         M=read_only(M),
         inverse=read_only(np.asarray(np.linalg.inv(M), np.float64)),
         scale=read_only(scale),

@@ -232,6 +232,12 @@ class Vehicle:
         return self.thrust_of_speed[0], np.full(N_ROTORS, self.thrust_of_speed[1])
 
     @property
+    def square_law(self) -> tuple[Array, Array]:
+        """(4,) r_i [rad/s] and q_i [-] of the thrust over its coefficient, r w + q w^2; 0 and 1 for b w^2."""
+        linear, quadratic = self.thrust_law
+        return linear / self.coefficients, quadratic / self.coefficients
+
+    @property
     def mean_coefficient(self) -> float:
         """The mean of the rotors' thrust coefficients [N s^2/rad^2]."""
         return math.fsum(self.coefficients) / N_ROTORS

@@ -157,8 +157,7 @@ class Autopilot(CompiledLoop):
         a.inertia[:], a.products[:] = vehicle.inertia, vehicle.products_of_inertia or (0.0, 0.0, 0.0)
         share = N_ROTORS * vehicle.thrust_shares
         fill(a.to_thrusts, np.linalg.inv(vehicle.allocation / vehicle.coefficients) / share[:, None])
-        b, (a1, a2) = vehicle.coefficients / share, vehicle.thrust_law
-        linear, quadratic = a1 / vehicle.coefficients, a2 / vehicle.coefficients
+        b, (linear, quadratic) = vehicle.coefficients / share, vehicle.square_law
         low, high = (b * (linear * speed + quadratic * speed**2) for speed in (slowest, fastest))
         a.coefficient[:], a.low[:], a.high[:], a.linear[:], a.quadratic[:] = b, low, high, linear, quadratic
         super().__init__(a, delay=delay)

@@ -11,7 +11,6 @@ from scipy.optimize import linprog
 
 from quadsim.sim.airframe import added_mass
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
-from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 FORCE_AXES: Final = ("x", "y", "z")
@@ -49,7 +48,8 @@ class Authority:
 
 def authority(vehicle: Vehicle) -> Authority:
     """The figures of a vehicle."""
-    hover, (lowest, highest) = vehicle.thrusts(vehicle.hover_speeds), _thrust_range(vehicle)
+    hover = vehicle.thrusts(vehicle.hover_speeds)
+    lowest, highest = (vehicle.thrusts(np.full(N_ROTORS, speed)) for speed in (vehicle.speed_min, vehicle.speed_max))
     ratio = float((highest / hover).min())
     x, y, z = (
         min(-torque.lowest_pure, torque.highest_pure) / inertia
@@ -65,11 +65,6 @@ def authority(vehicle: Vehicle) -> Authority:
         lag=max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0),
         munk=_munk(vehicle),
     )
-
-
-def _thrust_range(vehicle: Vehicle) -> tuple[Array, Array]:
-    """The thrusts (4,) of the lowest and of the highest speed [N]."""
-    return vehicle.thrusts(np.full(N_ROTORS, vehicle.speed_min)), vehicle.thrusts(np.full(N_ROTORS, vehicle.speed_max))
 
 
 def _munk(vehicle: Vehicle) -> float:
@@ -89,8 +84,9 @@ def _munk(vehicle: Vehicle) -> float:
 def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
     """The largest torques of each sign about x, y, z with the thrust held at the weight and every rotor in its range.
 
-    A linear programme in the rotors' thrusts f: the torque about an axis and the thrust are a row of the allocation
-    matrix over b times f, and f_i lies between the thrusts of the speed limits.
+    A linear programme in the rotors' thrusts over their coefficients, the squared speeds v_i = w_i^2 unless the vehicle
+    has a map of thrust: the torque about an axis is a row of the allocation matrix times v, the thrust is its first row
+    times v, and v_i lies between those of the speed limits.
     """
     ranges = []
     for axis, name in enumerate(FORCE_AXES):
@@ -111,8 +107,9 @@ def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
 
 def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
     """Smallest and largest torque [N m] of one row of the allocation matrix; `pure`: the other torques vanish."""
-    lowest, highest = _thrust_range(vehicle)
-    matrix = highest / vehicle.coefficients * vehicle.allocation  # in f / highest: the programme is well scaled
+    linear, quadratic = vehicle.square_law
+    low, top = (linear * speed + quadratic * speed**2 for speed in (vehicle.speed_min, vehicle.speed_max))
+    matrix = top * vehicle.allocation  # in v / top, so that the programme is well scaled
     units = np.abs(matrix).max(axis=1)
     fixed = [0, *(other for other in (1, 2, 3) if pure and other != row)]
     equal = np.zeros(len(fixed))
@@ -123,7 +120,7 @@ def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
             sign * matrix[row] / units[row],
             A_eq=matrix[fixed] / units[fixed, None],
             b_eq=equal,
-            bounds=[(share, 1.0) for share in lowest / highest],
+            bounds=[(share, 1.0) for share in low / top],
             method="highs",
         )
         assert solution.success, "hover itself is feasible"
