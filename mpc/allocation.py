@@ -24,19 +24,33 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class Allocation:
-    """A vehicle's map between squared rotor speeds [rad^2/s^2] and the wrench [U, tau_x, tau_y, tau_z] [N, N m]."""
+    """A vehicle's map between squared rotor speeds [rad^2/s^2] and the wrench [U, tau_x, tau_y, tau_z] [N, N m].
 
+    Where thrust is a map of the speed, s = linear w + quadratic w^2 takes the place of the squared speed w^2.
+    """
+
+    linear: Array  # (4,) 0 where there is no such map [rad/s]
+    quadratic: Array  # (4,) 1 where there is no such map [-]
     M: Array  # (4, 4), wrench = M s
     inverse: Array  # (4, 4), s = inverse wrench
     scale: Array  # (4,) wrench of one rotor at hover speed, the unit of each error
+
+    def wrench(self, speeds: Array) -> Array:
+        """Return the wrench (4,) of rotor speeds (4,) [rad/s]; a negative one pulls."""
+        return np.asarray(self.M @ (self.linear * speeds + self.quadratic * speeds * np.abs(speeds)))
 
 
 def make_allocation(vehicle: Vehicle) -> Allocation:
     """Return the allocation of a vehicle."""
     M = vehicle.allocation
     scale = np.asarray(np.abs(M).max(axis=1) * vehicle.hover_speed**2, np.float64)
+    linear, quadratic = vehicle.square_law
     return Allocation(
-        M=read_only(M), inverse=read_only(np.asarray(np.linalg.inv(M), np.float64)), scale=read_only(scale)
+        linear=read_only(linear),
+        quadratic=read_only(quadratic),
+        M=read_only(M),
+        inverse=read_only(np.asarray(np.linalg.inv(M), np.float64)),
+        scale=read_only(scale),
     )
 
 
@@ -54,6 +68,7 @@ def allocation_struct(allocation: Allocation, lower: Array, upper: Array) -> Inn
     struct = InnerStruct()
     fill(struct.effect, allocation.M)
     fill(struct.inverse, allocation.inverse)
+    struct.linear[:], struct.quadratic[:] = allocation.linear, allocation.quadratic
     struct.scale[:], struct.least[:], struct.most[:] = allocation.scale, lower, upper
     return struct
 

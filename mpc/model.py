@@ -56,8 +56,10 @@ def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0) -> tuple[Array, A
         A[INDEX[name], INDEX[name] + 1] = 1.0
     A[INDEX["vx"], INDEX["pitch"]] = vehicle.gravity
     A[INDEX["vy"], INDEX["roll"]] = -vehicle.gravity
-    # [U, tau_x, tau_y, tau_z] = allocation w^2, so its slope at hover is allocation diag(2 w_bar).
-    wrench_slope = 2.0 * vehicle.hover_speeds * vehicle.allocation
+    # [U, tau_x, tau_y, tau_z] = allocation w^2, so its slope at hover is allocation diag(2 w_bar); of a thrust
+    # a_1 w + a_2 w^2 = b w_bar^2 it is a_1 + 2 a_2 w_bar = b (2 w_bar - a_1 / b).
+    linear, _ = vehicle.thrust_law
+    wrench_slope = (2.0 * vehicle.hover_speeds - linear / vehicle.coefficients) * vehicle.allocation
     B[[INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]] = vehicle.accelerations(wrench_slope)
     if rotor_lag == 0.0:
         return A, B

@@ -12,8 +12,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+import numpy as np
+
 from quadsim.errors import ParameterError
-from quadsim.vehicle import ARMS, N_ROTORS, VEHICLE_UNITS, Vehicle
+from quadsim.vehicle import ARMS, N_ROTORS, THRUST, VEHICLE_UNITS, Vehicle
 
 AIR_DENSITY: Final = 1.225  # [kg/m^3]
 UNKNOWN_RADIUS: Final = 0.5  # radius of a propeller whose file states none, in arm lengths
@@ -96,7 +98,7 @@ RATIOS: Final = (
     Ratio(
         of=("speed_max", "thrust_coefficient", "mass"),
         text="largest thrust over weight",
-        value=lambda v: (v.speed_max / v.hover_speed) ** 2,
+        value=lambda v: float(v.thrusts(np.full(N_ROTORS, v.speed_max)).sum()) / (v.mass * v.gravity),
         low=1.0,
         high=12.0,
     ),
@@ -195,16 +197,20 @@ RATIOS: Final = (
         high=3.0,
     ),
 )
-_LENGTHS: Final = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
-_TIMES: Final = {"ms": 1e-3}
-_MOMENTS: Final = {"kg cm^2": 1e-4, "g cm^2": 1e-7, "kg mm^2": 1e-6, "g mm^2": 1e-9}
-_SPEEDS: Final = {"rpm": math.pi / 30.0}
-UNITS: Final[dict[str, dict[str, float]]] = {
+Factors = dict[str, float | tuple[float, ...]]
+_LENGTHS: Final[Factors] = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
+_TIMES: Final[Factors] = {"ms": 1e-3}
+_MOMENTS: Final[Factors] = {"kg cm^2": 1e-4, "g cm^2": 1e-7, "kg mm^2": 1e-6, "g mm^2": 1e-9}
+_RPM: Final = 30.0 / math.pi  # in a rad/s
+_SPEEDS: Final[Factors] = {"rpm": math.pi / 30.0}
+UNITS: Final[dict[str, Factors]] = {
     **dict.fromkeys(("arm_length", "rotor_positions", "rotor_radius", "drag_to_thrust", "extent"), _LENGTHS),
     **dict.fromkeys(("inertia", "products_of_inertia", "rotor_inertia"), _MOMENTS),
     **dict.fromkeys(("rotor_rise", "rotor_fall"), _TIMES),
     **dict.fromkeys(("speed_min", "speed_max"), _SPEEDS),
-    "thrust_coefficient": {"N/rpm^2": (30.0 / math.pi) ** 2, "g/rpm^2": 9.80665e-3 * (30.0 / math.pi) ** 2},
+    "thrust_coefficient": {"N/rpm^2": _RPM**2, "g/rpm^2": 9.80665e-3 * _RPM**2},
+    "thrust_of_speed": {"N/rpm and N/rpm^2": (_RPM, _RPM**2), "g s/rad and g s^2/rad^2": 9.80665e-3},
+    "thrust_of_throttle": {"g": 9.80665e-3},
     "body_drag": {"cm^2": 1e-4, "mm^2": 1e-6},
     "mass": {"g": 1e-3},
 }
@@ -221,8 +227,10 @@ def implausible(vehicle: Vehicle) -> list[str]:
 
 
 def _stated(names: Sequence[str], vehicle: Vehicle) -> list[str]:
-    """Return the parameters as the vehicle states them: arms by `rotor_positions`."""
+    """Return the parameters as the vehicle states them: arms by `rotor_positions`, thrust by a map."""
     placed = vehicle.rotor_positions is not None
+    (thrust,) = (name for name in THRUST if getattr(vehicle, name) is not None)
+    names = [thrust if name == THRUST[0] else name for name in names]
     return ["rotor_positions" if placed and name in ARMS else name for name in names]
 
 
@@ -247,11 +255,12 @@ def _misfit(vehicle: Vehicle) -> float:
 
 def _converted(vehicle: Vehicle) -> Iterator[tuple[str, str, Vehicle]]:
     """Yield the vehicle with one parameter, or all that depend on rotor speeds, taken to be in another unit."""
-    rpm = _SPEEDS["rpm"]
-    speeds: dict[str, Any] = {"speed_min": rpm * vehicle.speed_min, "speed_max": rpm * vehicle.speed_max}
-    with contextlib.suppress(ParameterError):
-        together = replace(vehicle, thrust_coefficient=_scaled(vehicle.thrust_coefficient, rpm**-2.0), **speeds)
-        yield "speed_max", "rpm, and thrust_coefficient in N/rpm^2", together
+    speeds = {name: _scaled(getattr(vehicle, name), _SPEEDS["rpm"]) for name in ("speed_min", "speed_max")}
+    for name, unit in (("thrust_coefficient", "N/rpm^2"), ("thrust_of_speed", "N/rpm and N/rpm^2")):
+        if (thrust := getattr(vehicle, name)) is not None:
+            with contextlib.suppress(ParameterError):
+                together = {**speeds, name: _scaled(thrust, UNITS[name][unit])}
+                yield "speed_max", f"rpm, and {name} in {unit}", replace(vehicle, **together)
     for name, units in UNITS.items():
         value: Any = getattr(vehicle, name)
         if value is None:
@@ -264,7 +273,9 @@ def _converted(vehicle: Vehicle) -> Iterator[tuple[str, str, Vehicle]]:
                 continue
 
 
-def _scaled(value: Any, factor: float) -> Any:
+def _scaled(value: Any, factor: float | tuple[float, ...]) -> Any:
+    if isinstance(factor, tuple):
+        return tuple(_scaled(entry, one) for entry, one in zip(value, factor, strict=True))
     return tuple(_scaled(entry, factor) for entry in value) if isinstance(value, tuple) else factor * value
 
 

@@ -15,16 +15,17 @@ from annotated_types import DocInfo, Len, doc
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, ParameterError, UnknownNameError
-from quadsim.fields import Number, Positive, Vector
+from quadsim.fields import Number, Pair, Positive, Vector
 from quadsim.state import Array, read_only
 
 N_ROTORS: Final = 4
 AUTOPILOT: Final = "autopilot"  # table of a vehicle file; see `quadsim.sim.autopilot.AutopilotSettings`
-PerAxis = Annotated[tuple[Number, ...], Len(2, 2)]
 OfRotors = Annotated[tuple[Number, ...], Len(N_ROTORS, N_ROTORS)]
 Positions = Annotated[tuple[Vector, ...], Len(N_ROTORS, N_ROTORS)]
 ARMS: Final = ("arm_length", "rotor_azimuths")
 """The parameters that `rotor_positions` replaces."""
+THRUST: Final = ("thrust_coefficient", "thrust_of_speed", "thrust_of_throttle")
+"""The parameters of which one states a rotor's thrust."""
 SMALLEST, LARGEST = 1e-12, 1e6
 """Allowed magnitudes of a vehicle's numbers; MuJoCo refuses smaller inertias, and larger numbers overflow."""
 LEAST_SHARE: Final = 1e-3
@@ -43,6 +44,13 @@ class Vehicle:
     f_i = b w_i^2 [N] and the reaction torque spin_i d w_i^2 [N m] about body +z (Sec. 2.2), with a b of its own where
     `thrust_coefficient` has four numbers.  The rotors are placed by arms, or by `rotor_positions`.  They turn at
     `hover_speeds` in hover, which are equal only where their torques then cancel.
+
+    A map may replace `thrust_coefficient`.  `thrust_of_throttle`, T(u) = a_1 u + a_2 u^2 of the throttle u, gives
+    b = T(1) / speed_max^2; identification starts from the speeds sqrt(T(u) / b) that it gives a throttle.
+    `thrust_of_speed`, f(w) = a_1 w + a_2 w^2, is what the plant flies, reaction torque and power in proportion; a rotor
+    so slow that f is negative gives no thrust.  The autopilot and the allocation of a wrench invert it.  Where MPC and
+    estimator model b w^2, each rotor has the b of hover, f(w_i) / w_i^2: their trim is exact, and the slope of the
+    linear model, a_1 + 2 a_2 w_i, too.
 
     Linear drag is a force -rotor_drag w v_perp on a rotor, v_perp its velocity through the air in the rotor's plane
     (Martin and Salaun, 2010; Furrer et al., 2016).  The same velocity v turns the vehicle, by (rotor_moment[0] w v_y,
@@ -83,8 +91,16 @@ class Vehicle:
         doc("[-] 1 or -1, sign of each rotor's reaction torque about body +z"),
     ]
     thrust_coefficient: Annotated[
-        Positive | OfRotors, doc("[N s^2/rad^2] b, thrust b w^2; one number, or one for each rotor")
-    ]
+        Positive | OfRotors | None, doc("[N s^2/rad^2] b, thrust b w^2; one number, or one for each rotor")
+    ] = None
+    thrust_of_speed: Annotated[
+        Pair | None,
+        doc("[N s/rad, N s^2/rad^2] a1 and a2, thrust a1 w + a2 w^2 of a rotor, in place of thrust_coefficient"),
+    ] = None
+    thrust_of_throttle: Annotated[
+        Pair | None,
+        doc("[N] a1 and a2, thrust a1 u + a2 u^2 of a rotor at throttle u, 0 to 1, in place of thrust_coefficient"),
+    ] = None
     drag_to_thrust: Annotated[float, doc("[m] d / b, reaction torque d w^2")]
     speed_min: Annotated[float, doc("[rad/s] lowest speed that a rotor holds")]
     speed_max: Annotated[float, doc("[rad/s] highest speed that a rotor holds")]
@@ -94,7 +110,7 @@ class Vehicle:
     rotor_radius: Annotated[float | None, doc("[m] R, of a propeller")] = None
     rotor_drag: Annotated[float | None, doc("[N s^2/(m rad)] linear drag of one rotor")] = None
     rotor_moment: Annotated[
-        PerAxis | None, doc("[N m s^2/(m rad)] of one rotor about its hub's x and y, per speed and air speed across it")
+        Pair | None, doc("[N m s^2/(m rad)] of one rotor about its hub's x and y, per speed and air speed across it")
     ] = None
     rate_damping: Annotated[Vector | None, doc("[N m s/rad] of the whole vehicle about body x, y, z")] = None
     body_drag: Annotated[Vector | None, doc("[m^2] C_d A along body x, y, z")] = None
@@ -124,6 +140,7 @@ class Vehicle:
             if not moments[2] <= (moments[0] + moments[1]) * (1.0 + 1e-12):
                 self._refuse("products_of_inertia", "such that no principal moment exceeds the sum of the other two")
         self._check_layout()
+        self._check_thrust()
         self._check_hover()
 
     def _refuse(self, name: str, rule: str) -> NoReturn:
@@ -164,6 +181,26 @@ class Vehicle:
         x, y, _ = self.hubs.T / self.longest_arm
         return np.stack([np.ones(N_ROTORS), y, -x, np.array(spins, float)])
 
+    def _check_thrust(self) -> None:
+        stated = [name for name in THRUST if getattr(self, name) is not None]
+        if not stated:
+            self._refuse(THRUST[0], f"given, or {' or '.join(THRUST[1:])} in place of it")
+        if len(stated) > 1:
+            self._refuse(stated[1], f"left out where {stated[0]} is given: one or the other")
+        if (name := stated[0]) == THRUST[0]:
+            return
+        a1, a2 = getattr(self, name)
+        u, (low, top), unit = "u", (0.0, 1.0), ""
+        if name == "thrust_of_speed":
+            u, (low, top), unit = "w", (self.speed_min, self.speed_max), " rad/s"
+        if a1 + a2 * low < 0.0 or a1 + 2.0 * a2 * low < 0.0 or a1 + 2.0 * a2 * top <= 0.0:
+            rule = f"such that a1 {u} + a2 {u}^2 is not negative and rises from {u} = {low:g} to {top:g}{unit}"
+            self._refuse(name, rule)
+        largest, carried = a1 * top + a2 * top**2, float(self.thrust_shares.max()) * self.mass * self.gravity
+        if largest < carried:
+            rule = f"such that a rotor lifts {carried:.4g} N or more, or it cannot hover: it lifts {largest:.4g} N at"
+            self._refuse(name, f"{rule} {u} = {top:g}{unit}")
+
     def _check_hover(self) -> None:
         weight = self.mass * self.gravity
         for name, sign, side in (("speed_max", 1.0, "no lower than"), ("speed_min", -1.0, "no higher than")):
@@ -179,8 +216,26 @@ class Vehicle:
 
     @property
     def coefficients(self) -> Array:
-        """(4,) thrust coefficient b of each rotor [N s^2/rad^2]."""
+        """(4,) thrust coefficient b of each rotor [N s^2/rad^2]; with `thrust_of_speed` that of hover."""
+        if self.thrust_of_speed is not None:
+            hover = self.mass * self.gravity * self.thrust_shares
+            return np.asarray(hover / np.square(self.speeds(hover)))
+        if self.thrust_of_throttle is not None:
+            return np.full(N_ROTORS, sum(self.thrust_of_throttle) / self.speed_max**2)
         return np.broadcast_to(np.asarray(self.thrust_coefficient, np.float64), N_ROTORS).copy()
+
+    @property
+    def thrust_law(self) -> tuple[float, Array]:
+        """a_1 [N s/rad] and a_2 (4,) [N s^2/rad^2] of the thrust a_1 w + a_2 w^2; 0 and b without `thrust_of_speed`."""
+        if self.thrust_of_speed is None:
+            return 0.0, self.coefficients
+        return self.thrust_of_speed[0], np.full(N_ROTORS, self.thrust_of_speed[1])
+
+    @property
+    def square_law(self) -> tuple[Array, Array]:
+        """(4,) r_i [rad/s] and q_i [-] of the thrust over its coefficient, r w + q w^2; 0 and 1 for b w^2."""
+        linear, quadratic = self.thrust_law
+        return linear / self.coefficients, quadratic / self.coefficients
 
     @property
     def mean_coefficient(self) -> float:
@@ -209,12 +264,26 @@ class Vehicle:
         return math.sqrt(self.mass * self.gravity / (N_ROTORS * self.mean_coefficient))
 
     def thrusts(self, speeds: Array) -> Array:
-        """Return the thrusts b_i w_i^2 (..., 4) [N] of rotor speeds (..., 4) [rad/s]."""
-        return np.asarray(self.coefficients * np.square(speeds))
+        """Return the thrusts b_i w_i^2, or `thrust_of_speed`, (..., 4) [N] of rotor speeds (..., 4) [rad/s]."""
+        linear, quadratic = self.thrust_law
+        return np.maximum(quadratic * np.square(speeds) + linear * np.asarray(speeds), 0.0)
+
+    def speeds(self, thrusts: Array) -> Array:
+        """Return the rotor speeds (..., 4) [rad/s] of thrusts (..., 4), 0 or more [N]: the inverse of `thrusts`."""
+        if self.thrust_of_speed is None:
+            return np.sqrt(thrusts / self.coefficients)
+        a1, a2 = self.thrust_of_speed
+        root = np.sqrt(np.maximum(a1**2 + 4.0 * a2 * thrusts, 0.0))  # beyond the map's top, its top
+        return np.asarray(2.0 * thrusts / (a1 + root) if a1 > 0.0 else (root - a1) / (2.0 * a2))
 
     def level_thrust(self, speed: float) -> float:
         """Return the collective thrust [N], without torque, at which the fastest rotor has a speed [rad/s]."""
-        return float((self.coefficients * speed**2 / self.thrust_shares).min())
+        return float((self.thrusts(np.full(N_ROTORS, speed)) / self.thrust_shares).min())
+
+    @property
+    def throttle_share(self) -> float:
+        """Share a of (w / speed_max)^2 = (1 - a) u + a u^2, u the throttle; 1, where no map states it: w ~ u."""
+        return 1.0 if self.thrust_of_throttle is None else self.thrust_of_throttle[1] / sum(self.thrust_of_throttle)
 
     @property
     def inertia_matrix(self) -> Array:
@@ -390,8 +459,10 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
 
 
 def overridden(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters with some replaced; where these place all rotors, the other form of placing them is dropped."""
-    replaced = ARMS if "rotor_positions" in overrides else ("rotor_positions",) if set(ARMS) <= {*overrides} else ()
+    """Return parameters with some replaced; another form of placing the rotors, or of their thrust, is then dropped."""
+    placed, thrust = "rotor_positions" in overrides, {*THRUST} & {*overrides}
+    replaced: tuple[str, ...] = ARMS if placed else ("rotor_positions",) if set(ARMS) <= {*overrides} else ()
+    replaced += THRUST if thrust else ()
     return {**values, **dict.fromkeys(name for name in replaced if name in values), **overrides}
 
 
@@ -402,9 +473,11 @@ def altered(vehicle: Vehicle, overrides: Mapping[str, Any]) -> Vehicle:
 
 def missing_parameters(values: Mapping[str, Any]) -> list[str]:
     """Return the parameters that these lack to make a vehicle."""
-    placed = values.get("rotor_positions") is not None
-    needed = [name for name in VEHICLE_UNITS if name not in OPTIONAL_PARAMETERS or (name in ARMS and not placed)]
-    return [name for name in needed if name not in values]
+    there = {name for name, value in values.items() if value is not None}
+    needed = {name for name in VEHICLE_UNITS if name not in OPTIONAL_PARAMETERS}
+    needed |= set() if "rotor_positions" in there else {*ARMS}
+    needed |= set() if there & {*THRUST} else {THRUST[0]}
+    return [name for name in VEHICLE_UNITS if name in needed - {*values}]
 
 
 @contextmanager
@@ -471,10 +544,11 @@ MEANT: Final[dict[str, tuple[str, ...]]] = {"rotor_lag": ("rotor_rise", "rotor_f
 OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if field.default is None)
 """Parameters that a vehicle file may leave out."""
 _LENGTHS: Final = {
+    **{"thrust_of_speed": 2, "thrust_of_throttle": 2},
     **{"inertia": 3, "products_of_inertia": 3, "rotor_moment": 2, "rate_damping": 3, "body_drag": 3},
     **{"rotor_azimuths": N_ROTORS, "rotor_positions": N_ROTORS, "rotor_spins": N_ROTORS},
 }
 _ANY_SIGN: Final = (
     *("rotor_azimuths", "rotor_positions", "rotor_spins", "speed_min"),
-    *("products_of_inertia", "rotor_moment", "rate_damping"),
+    *("products_of_inertia", "rotor_moment", "rate_damping", "thrust_of_speed", "thrust_of_throttle"),
 )

@@ -218,7 +218,7 @@ class GeometricController(FeedbackLaw):
         if self._targets:
             return self._held_for_a_period(command)
         speeds = allocate(self._allocation, command, *self.bounds.reach(before))
-        given, smallest = self._allocation.M @ speeds**2, 1e-6 * self._allocation.scale.max()
+        given, smallest = self._allocation.wrench(speeds), 1e-6 * self._allocation.scale.max()
         if flying and np.allclose(given, command, rtol=0.0, atol=smallest):
             self._library.quadsim_geometric_integrate(self._at, *self._here)
         return self._held_for_a_period(speeds)

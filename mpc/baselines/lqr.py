@@ -154,7 +154,7 @@ class LQR(FeedbackLaw):
         if ((lower <= speeds) & (speeds <= upper)).all():
             return speeds
         # Thrust is quadratic in speed; a negative speed demands an impossible thrust, and counts with its sign.
-        return allocate(self._allocation, self._allocation.M @ (speeds * np.abs(speeds)), lower, upper)
+        return allocate(self._allocation, self._allocation.wrench(speeds), lower, upper)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -115,7 +115,7 @@ class CascadedPID(FeedbackLaw):
         wrench = np.concatenate([[np.linalg.norm(force)], self._vehicle.momentum(acceleration)])
         speeds = allocate(self.allocation, wrench, lower, upper)
         # Anti-windup: an integral stops where it would ask for more than the mixer can give.
-        given = self._vehicle.angular_acceleration((self.allocation.M @ np.square(speeds))[1:])
+        given = self._vehicle.angular_acceleration(self.allocation.wrench(speeds)[1:])
         missed = acceleration - given
         windup = missed * error > 1e-9 * (1.0 + np.abs(acceleration)) * np.abs(error)
         summed = np.where(windup, 0.0, error)

@@ -14,6 +14,23 @@ static double clip(double number, double low, double high) /* what is no number 
     return number < low ? low : number > high ? high : number;
 }
 
+/* ---- thrust over its coefficient --------------------------------------------------------------------------------- */
+
+static double square_of(const quadsim_inner *a, int i, double speed)
+{
+    return a->linear[i] * speed + a->quadratic[i] * (speed * speed);
+}
+
+static double speed_of(const quadsim_inner *a, int i, double square)
+{
+    const double linear = a->linear[i], quadratic = a->quadratic[i], under = linear * linear + 4.0 * quadratic * square;
+    const double root = sqrt(under < 0.0 ? 0.0 : under); /* beyond the map's top, its top; NaN stays so */
+    if (linear == 0.0) {
+        return sqrt(square);
+    }
+    return linear > 0.0 ? 2.0 * square / (linear + root) : (root - linear) / (2.0 * quadratic);
+}
+
 /* ---- autopilot --------------------------------------------------------------------------------------------------- */
 
 /* The parts of a torque need room: with airmode each pair's difference, else the size of each part, either way. */
@@ -110,7 +127,7 @@ static void fly_autopilot(quadsim_inner *a, const double *rates, const double *a
         }
     }
     for (int i = 0; i < ROTORS; i++) {
-        answer[i] = sqrt(thrusts[i] / a->coefficient[i]);
+        answer[i] = speed_of(a, i, thrusts[i] / a->coefficient[i]);
     }
     if (a->delay > 0) {
         double *oldest = a->queue + ROTORS * a->oldest;
@@ -226,8 +243,8 @@ void quadsim_allocate(const quadsim_inner *a, const double *wrench, double *spee
     double squares[ROTORS], low[ROTORS], high[ROTORS];
     int within = 1;
     for (int i = 0; i < ROTORS; i++) {
-        low[i] = a->least[i] * a->least[i];
-        high[i] = a->most[i] * a->most[i];
+        low[i] = square_of(a, i, a->least[i]);
+        high[i] = square_of(a, i, a->most[i]);
         squares[i] = 0.0;
         for (int j = 0; j < 4; j++) {
             squares[i] += a->inverse[i][j] * wrench[j];
@@ -238,7 +255,8 @@ void quadsim_allocate(const quadsim_inner *a, const double *wrench, double *spee
         nearest(a, wrench, low, high, squares);
     }
     for (int i = 0; i < ROTORS; i++) {
-        speeds[i] = clip(sqrt(squares[i] < 0.0 ? 0.0 : squares[i]), a->least[i], a->most[i]); /* NaN stays so */
+        const double speed = speed_of(a, i, squares[i] < 0.0 ? 0.0 : squares[i]);
+        speeds[i] = clip(speed, a->least[i], a->most[i]); /* NaN stays so */
     }
 }
 
@@ -259,7 +277,7 @@ static void invert_dynamics(quadsim_inner *a, double time, const double *rates, 
         for (int i = 0; i < 3; i++) {
             double torque = 0.0;
             for (int j = 0; j < ROTORS; j++) {
-                torque += a->effect[1 + i][j] * (rotors[j] * rotors[j]);
+                torque += a->effect[1 + i][j] * square_of(a, j, rotors[j]);
             }
             const double missed = torque - gained[i] / step - gyroscopic[i];
             a->slope[i] = (a->slope[i] + step * (w * w) * (missed - a->filtered[i]))
@@ -272,7 +290,7 @@ static void invert_dynamics(quadsim_inner *a, double time, const double *rates, 
     memcpy(a->last_rates, rates, sizeof a->last_rates);
     for (int i = 0; i < 4; i++) {
         for (int j = 0; j < ROTORS; j++) {
-            wrench[i] += a->effect[i][j] * (a->command[j] * a->command[j]);
+            wrench[i] += a->effect[i][j] * square_of(a, j, a->command[j]);
         }
         wrench[i] += i ? a->filtered[i - 1] : 0.0;
     }

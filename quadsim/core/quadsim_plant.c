@@ -82,6 +82,7 @@ static double discharge(quadsim_vehicle *v, const double *speeds, double *row)
     for (int i = 0; i < ROTORS; i++) {
         const double ratio = speeds[i] / v->hover;
         demand += v->efficiency[i] * v->demand[i] * ratio * (ratio * ratio);
+        demand += v->efficiency[i] * v->linear_demand * (ratio * ratio);
     }
     const double conductance = v->hover_current * (demand / ROTORS) / (v->reference_voltage * v->reference_voltage);
     const double rest = fmax(open_circuit(v) - v->resistance * v->idle_current, 0.0);
@@ -109,7 +110,9 @@ static rotor_state drive_rotors(quadsim_vehicle *v, const quadsim_steps *rows, i
         factor = discharge(v, midway, rows->battery + rows->width * row);
     }
     for (int i = 0; i < ROTORS; i++) {
-        double thrust = v->efficiency[i] * v->coefficient[i] * (midway[i] * midway[i]) * factor;
+        double thrust = v->efficiency[i] * v->coefficient[i] * (midway[i] * midway[i]);
+        thrust = (thrust + v->efficiency[i] * v->linear * midway[i]) * factor;
+        thrust = thrust < 0.0 ? 0.0 : thrust; /* NaN stays so */
         if (v->largest[i] > 0.0) {
             thrust = noisy(v, thrust, v->largest[i], rows->noise[ROTORS * row + i]);
         }

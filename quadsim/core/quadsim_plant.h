@@ -47,7 +47,8 @@ typedef struct quadsim_vehicle {
 
     /* constants */
     double mass, gravity, inertia[3], products[3], inverse[3][3], torque_of_thrust[3][ROTORS]; /* of the own method */
-    double coefficient[ROTORS], hover, demand[ROTORS]; /* demand: of power at hover, over the mean rotor's */
+    double linear, coefficient[ROTORS]; /* of a rotor's thrust: linear w + coefficient w^2 */
+    double hover, demand[ROTORS], linear_demand; /* of power, at hover speed, over the mean rotor's in hover */
     double slowest, fastest, place[ROTORS][3], spin[ROTORS];
     double rotor_drag, rotor_inertia, rotor_moment[2], rate_damping[3], linear_drag[3], quadratic_drag[3];
     double floor, disc, radius;      /* of the ground effect; radius 0: none */
@@ -77,6 +78,8 @@ typedef struct quadsim_inner {
     /* autopilot; thrusts over four times the rotor's share of the weight, so that hover is the same for all */
     double p[3], i[3], d[3], i_max[3], attitude[3], largest[3], gyro_share, d_share;
     double to_thrusts[ROTORS][4], coefficient[ROTORS], low[ROTORS], high[ROTORS];
+    /* a thrust over its coefficient: linear w + quadratic w^2, just w^2 unless the vehicle has a map of thrust */
+    double linear[ROTORS], quadratic[ROTORS];
     int64_t airmode, delay, oldest;
     double *queue; /* [delay][4] */
     /* incremental nonlinear dynamic inversion */

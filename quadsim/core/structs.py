@@ -56,11 +56,11 @@ class VehicleStruct(Structure):
 
     _fields_ = _members(
         "*step *model *data *motion *velocity *applied *control *wind *obstacles *fluid #mocaps timestep plausible "
-        "fastest_valid mass gravity inertia:3 products:3 inverse:3x3 torque_of_thrust:3x4 coefficient:4 hover "
-        "demand:4 slowest fastest place:4x3 spin:4 rotor_drag rotor_inertia rotor_moment:2 rate_damping:3 "
-        "linear_drag:3 quadratic_drag:3 floor disc radius loss deviation largest:4 cells capacity resistance "
-        "hover_current idle_current reference_voltage exponent *curve #points #follows_motion rise fall "
-        "acceleration efficiency:4 #at_once *pushes #pushing #now time speeds:4 target:4 before:6 charge"
+        "fastest_valid mass gravity inertia:3 products:3 inverse:3x3 torque_of_thrust:3x4 linear "
+        "coefficient:4 hover demand:4 linear_demand slowest fastest place:4x3 spin:4 rotor_drag rotor_inertia "
+        "rotor_moment:2 rate_damping:3 linear_drag:3 quadratic_drag:3 floor disc radius loss deviation largest:4 cells "
+        "capacity resistance hover_current idle_current reference_voltage exponent *curve #points #follows_motion rise "
+        "fall acceleration efficiency:4 #at_once *pushes #pushing #now time speeds:4 target:4 before:6 charge"
     )
 
 
@@ -70,8 +70,8 @@ class InnerStruct(Structure):
     _fields_ = _members(
         "#kind #stride #until #measures command:8 answer:4 #holds_attitude step inertia:3 products:3 integral:3 "
         "filtered:3 slope:3 p:3 i:3 d:3 i_max:3 attitude:3 largest:3 gyro_share d_share to_thrusts:4x4 coefficient:4 "
-        "low:4 high:4 #airmode #delay #oldest *queue effect:4x4 inverse:4x4 scale:4 omega least:4 most:4 last_time "
-        "last_rates:3 #started"
+        "low:4 high:4 linear:4 quadratic:4 #airmode #delay #oldest *queue effect:4x4 inverse:4x4 scale:4 omega least:4 "
+        "most:4 last_time last_rates:3 #started"
     )
 
 

@@ -111,7 +111,8 @@ def demand(
     inner = slice(1, -1)
     wrench = np.column_stack([vehicle.mass * force[inner], torque])
     squared = np.linalg.solve(vehicle.allocation, wrench.T).T
-    speeds = np.sqrt(np.maximum(squared, 0.0))
+    thrusts = vehicle.coefficients * squared
+    speeds = vehicle.speeds(np.maximum(thrusts, 0.0))
     between = smooth[1:] & smooth[:-1]
 
     state = np.zeros((smooth.size, N_STATES))
@@ -126,7 +127,7 @@ def demand(
         acceleration=acceleration[inner],
         thrust=wrench[:, 0],
         torque=torque,
-        thrusts=vehicle.coefficients * squared,
+        thrusts=thrusts,
         speeds=speeds,
         slews=np.where(between[:, None], np.diff(speeds, axis=0), np.nan),
     )

@@ -157,8 +157,9 @@ class Autopilot(CompiledLoop):
         a.inertia[:], a.products[:] = vehicle.inertia, vehicle.products_of_inertia or (0.0, 0.0, 0.0)
         share = N_ROTORS * vehicle.thrust_shares
         fill(a.to_thrusts, np.linalg.inv(vehicle.allocation / vehicle.coefficients) / share[:, None])
-        b = vehicle.coefficients / share
-        a.coefficient[:], a.low[:], a.high[:] = b, b * slowest**2, b * fastest**2
+        b, (linear, quadratic) = vehicle.coefficients / share, vehicle.square_law
+        low, high = (b * (linear * speed + quadratic * speed**2) for speed in (slowest, fastest))
+        a.coefficient[:], a.low[:], a.high[:], a.linear[:], a.quadratic[:] = b, low, high, linear, quadratic
         super().__init__(a, delay=delay)
         self._hover = vehicle.hover_speeds
         self.reset()

@@ -211,9 +211,13 @@ class Plant:
         v.mass, v.gravity, v.inertia[:] = vehicle.mass, vehicle.gravity, vehicle.inertia
         v.products[:] = vehicle.products_of_inertia or (0.0, 0.0, 0.0)
         fill(v.inverse, np.linalg.inv(vehicle.inertia_matrix))
-        v.coefficient[:], v.hover = vehicle.coefficients, vehicle.hover_speed
-        power = vehicle.coefficients / vehicle.mean_coefficient  # of each rotor at a speed, over the mean rotor's
-        v.demand[:] = N_ROTORS * power / float(power @ (vehicle.hover_speeds / vehicle.hover_speed) ** 3)
+        v.linear, quadratic = vehicle.thrust_law
+        v.coefficient[:], v.hover = quadratic, vehicle.hover_speed
+        # Power is torque times speed, (a_1 w + a_2 w^2) w; of each rotor at hover speed, over the mean rotor's.
+        ratios, mean = vehicle.hover_speeds / vehicle.hover_speed, vehicle.mean_coefficient
+        power, linear_power = quadratic / mean, v.linear / (mean * vehicle.hover_speed)
+        total = float(power @ ratios**3) + linear_power * float((ratios**2).sum())
+        v.demand[:], v.linear_demand = N_ROTORS * power / total, N_ROTORS * linear_power / total
         v.slowest, v.fastest = self._speed_range
         v.spin[:] = [float(spin) for spin in vehicle.rotor_spins]
         fill(v.place, vehicle.hubs)

@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 
 from quadsim.sim.airframe import added_mass
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
-from quadsim.vehicle import Vehicle
+from quadsim.vehicle import N_ROTORS, Vehicle
 
 FORCE_AXES: Final = ("x", "y", "z")
 
@@ -48,8 +48,9 @@ class Authority:
 
 def authority(vehicle: Vehicle) -> Authority:
     """The figures of a vehicle."""
-    slowest, fastest = float(vehicle.hover_speeds.min()), float(vehicle.hover_speeds.max())
-    ratio = (vehicle.speed_max / fastest) ** 2
+    hover = vehicle.thrusts(vehicle.hover_speeds)
+    lowest, highest = (vehicle.thrusts(np.full(N_ROTORS, speed)) for speed in (vehicle.speed_min, vehicle.speed_max))
+    ratio = float((highest / hover).min())
     x, y, z = (
         min(-torque.lowest_pure, torque.highest_pure) / inertia
         for torque, inertia in zip(torque_ranges(vehicle), vehicle.inertia, strict=True)
@@ -59,7 +60,7 @@ def authority(vehicle: Vehicle) -> Authority:
         hover_share=(vehicle.hover_speed - vehicle.speed_min) / (vehicle.speed_max - vehicle.speed_min),
         steady_tilt=math.acos(min(1.0, 1.0 / ratio)),
         climb=(ratio - 1.0) * vehicle.gravity,
-        sink=(1.0 - (vehicle.speed_min / slowest) ** 2) * vehicle.gravity,
+        sink=(1.0 - float((lowest / hover).max())) * vehicle.gravity,
         turning=(x, y, z),
         lag=max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0),
         munk=_munk(vehicle),
@@ -83,8 +84,9 @@ def _munk(vehicle: Vehicle) -> float:
 def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
     """The largest torques of each sign about x, y, z with the thrust held at the weight and every rotor in its range.
 
-    A linear programme in the squared speeds v_i = w_i^2: the torque about an axis is a row of the allocation matrix
-    times v, the thrust is its first row times v, and v_i lies between the squares of the speed limits.
+    A linear programme in the rotors' thrusts over their coefficients, the squared speeds v_i = w_i^2 unless the vehicle
+    has a map of thrust: the torque about an axis is a row of the allocation matrix times v, the thrust is its first row
+    times v, and v_i lies between those of the speed limits.
     """
     ranges = []
     for axis, name in enumerate(FORCE_AXES):
@@ -105,8 +107,9 @@ def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:
 
 def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
     """Smallest and largest torque [N m] of one row of the allocation matrix; `pure`: the other torques vanish."""
-    top = vehicle.speed_max**2
-    matrix = top * vehicle.allocation  # in v / speed_max^2, so that the programme is well scaled
+    linear, quadratic = vehicle.square_law
+    low, top = (linear * speed + quadratic * speed**2 for speed in (vehicle.speed_min, vehicle.speed_max))
+    matrix = top * vehicle.allocation  # in v / top, so that the programme is well scaled
     units = np.abs(matrix).max(axis=1)
     fixed = [0, *(other for other in (1, 2, 3) if pure and other != row)]
     equal = np.zeros(len(fixed))
@@ -117,7 +120,7 @@ def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
             sign * matrix[row] / units[row],
             A_eq=matrix[fixed] / units[fixed, None],
             b_eq=equal,
-            bounds=(vehicle.speed_min**2 / top, 1.0),
+            bounds=[(share, 1.0) for share in low / top],
             method="highs",
         )
         assert solution.success, "hover itself is feasible"

@@ -112,6 +112,8 @@ def stand_vehicle_text(stand: Path, start: str) -> tuple[str, dict[str, Any]]:
         full = throttle is None or throttle.max() >= _FULL
         at = "the fastest row" if full or throttle is None else f"only {throttle.max():.0%} throttle: it turns faster"
         sources["speed_max"] = f"thrust stand {of}: {at}"
+    for name in ("thrust_of_speed", "thrust_of_throttle"):  # which the coefficient replaces
+        document.pop(name, None)
     for name, value in numbers.items():
         table: Any = document.get(name)
         if table is None:

@@ -56,7 +56,7 @@ class VehicleSheet:
     # largest tilt at which the rotors still carry the weight, cos(tilt) = 1 / thrust_to_weight [deg]
     steady_tilt: float
     torques: tuple[TorqueRange, ...]  # about x, y and z
-    thrust_slope: float  # of one rotor, 2 b omega_bar [N s/rad]
+    thrust_slope: float  # of one rotor at hover, 2 b omega_bar, or a1 + 2 a2 omega_bar [N s/rad]
     # largest entry of B_c in the rows of vz [m/s^2 per rad/s] and of the three rates [rad/s^2 per rad/s]: the modelled
     # effect of one rotor per rad/s
     input_slopes: dict[str, float]
@@ -152,7 +152,7 @@ def make_sheet(vehicle: Vehicle) -> VehicleSheet:
         climb_acceleration=can.climb,
         steady_tilt=math.degrees(can.steady_tilt),
         torques=torque_ranges(vehicle),
-        thrust_slope=2.0 * vehicle.mean_coefficient * vehicle.hover_speed,
+        thrust_slope=2.0 * vehicle.mean_coefficient * vehicle.hover_speed - vehicle.thrust_law[0],
         input_slopes={
             name: float(np.abs(B_c[INDEX[name]]).max()) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
         },

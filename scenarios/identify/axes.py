@@ -41,7 +41,9 @@ def check_axes(record: Record, parts: Sequence[slice], gravity: float) -> None:
     Raises:
         InputError: naming the columns that are negated, swapped, or in another frame.
     """
-    _check_rates(record, parts)
+    readings = {reading: turning_pairs(record, parts, meant) for reading, meant in READINGS.items()}
+    if better := _better(readings, ("wx", "wy", "wz"), record.period):
+        raise InputError(f"{record.name}: the rates are not those at which the attitude turns: {better}")
     if record.position is not None:
         _check_velocity(record, parts, record.position)
     _check_tilt(record, parts, gravity)
@@ -87,13 +89,6 @@ def tilt_fit(motion: Lateral, *, mirrored: bool = False, shift: int = 0) -> tupl
     total = float(np.square(side).sum())
     explained = 1.0 - float(np.square(side - matrix @ solution).sum()) / total if total else 0.0
     return explained, complex(solution[0], solution[1])
-
-
-def _check_rates(record: Record, parts: Sequence[slice]) -> None:
-    """Refuse rates that are not those at which the attitude turns."""
-    readings = {reading: turning_pairs(record, parts, meant) for reading, meant in READINGS.items()}
-    if better := _better(readings, ("wx", "wy", "wz"), record.period):
-        raise InputError(f"{record.name}: the rates are not those at which the attitude turns: {better}")
 
 
 def _check_velocity(record: Record, parts: Sequence[slice], position: Array) -> None:

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
+from scipy.ndimage import find_objects, label, maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from quadsim.errors import InputError
 from quadsim.state import Array
@@ -164,8 +164,7 @@ def _bridged(rows: Array, logged: NDArray[np.bool_]) -> Array:
 
 def _runs(mask: NDArray[np.bool_], shortest: int) -> list[slice]:
     """Runs of true samples with at least the shortest length."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= max(shortest, 2)]
+    return [run for (run,) in find_objects(label(mask)[0]) if run.stop - run.start >= max(shortest, 2)]
 
 
 def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:

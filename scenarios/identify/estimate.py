@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from quadsim.vehicle import Vehicle
 
-_AXES = ("_x", "_y", "_z")
+VECTORS: Final = {"inertia": "xyz", "rotor_moment": "xy", "rate_damping": "xyz"}
+"""Fields of a vehicle file whose numbers are parameters of their own, with their axes: `inertia_x`."""
 
 
 def field_of(name: str) -> str:
     """Return the field of a vehicle file that holds a parameter: `inertia` of `inertia_x`."""
-    return name[:-2] if name.endswith(_AXES) and name[:-2] in VEHICLE_UNITS else name
+    return name[:-2] if name[:-2] in VECTORS else name
 
 
 def number_in(vehicle: Vehicle, name: str) -> float | None:
-    """Return what a vehicle has for a parameter; of `body_drag` the first number, as the others follow it."""
+    """Return what a vehicle has for a parameter; of `body_drag` the first number, as the others follow it.
+
+    What `thrust_coefficient` is where a map of thrust takes its place, or each rotor has its own: the mean b.
+    """
+    if name == "thrust_coefficient":
+        return vehicle.mean_coefficient
     value = getattr(vehicle, field_of(name), None)
     axis = name[-1] if field_of(name) != name else "x"
     return value["xyz".index(axis)] if isinstance(value, tuple) else value

@@ -17,7 +17,7 @@ from scipy.stats import t as student
 from quadsim.errors import InputError
 from quadsim.state import Array
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.identify.estimate import FlightNumbers, Identification, ParameterEstimate, field_of, number_in
+from scenarios.identify.estimate import VECTORS, FlightNumbers, Identification, ParameterEstimate, field_of, number_in
 from scenarios.identify.model import INCREMENTS, stretch
 from scenarios.identify.record import Record
 from scenarios.identify.rotor_response import rotor_response
@@ -298,7 +298,7 @@ class _Fit:
         held = {name: estimate.start or 0.0 for name, estimate in refused.items() if estimate.in_file}
         held |= {name: 0.0 for name in refused if name in ("offset_x", "offset_y")}
         held |= {"delay": 0.0} if {"delay", "lateness"} & {*refused} else {}
-        held |= {"throttle_curve": 1.0} if "throttle_curve" in refused else {}
+        held |= {"throttle_curve": self.vehicle.throttle_share} if "throttle_curve" in refused else {}
         held |= {"voltage_exponent": 0.0} if "voltage_exponent" in refused else {}
         sought = {number.name for number in self.search.sought}
         return {name: value for name, value in held.items() if name in sought} | {"inflow": 0.0}
@@ -355,12 +355,14 @@ class _Fit:
         changes: dict[str, Any] = {
             name: values[name] for name in known if name in VEHICLE_UNITS and name != "body_drag" and name in values
         }
-        for name, axes in {"inertia": "xyz", "rotor_moment": "xy", "rate_damping": "xyz"}.items():
+        for name, axes in VECTORS.items():
             if known & {*(of := [f"{name}_{axis}" for axis in axes])}:
                 changes[name] = tuple(values.get(one, number_in(self.vehicle, one) or 0.0) for one in of)
         if "body_drag" in known:
             ratio: Array = np.array(self.vehicle.body_drag or LEVEL_PLATE)
             changes["body_drag"] = tuple((values["body_drag"] * ratio / ratio[0]).tolist())
+        if "thrust_coefficient" in changes:
+            changes |= {"thrust_of_speed": None, "thrust_of_throttle": None}
         return replace(self.vehicle, **changes)
 
 

@@ -23,11 +23,12 @@ from scenarios.identify.prediction import (
 )
 
 _COLOURS: Final = dict(zip((IDENTIFIED, THRUST_ONLY, START), CYCLE, strict=False))
-_TRACED: Final = (
-    *((f"v{axis}, world", "m/s") for axis in "xyz"),
-    *((f"{axis} rate", "rad/s") for axis in ("roll", "pitch", "yaw")),
+_TRACED: Final = tuple(
+    (i, title, *shown_unit(si))
+    for axis, (velocity, rate) in enumerate(zip("xyz", ("roll", "pitch", "yaw"), strict=True))
+    for i, title, si in ((axis, f"v{velocity}, world", "m/s"), (3 + axis, f"{rate} rate", "rad/s"))
 )
-_COLUMNS: Final = (0, 3, 1, 4, 2, 5)  # velocities in the left one
+"""Place, title, unit and scale of what is drawn, velocities in the left column."""
 
 
 def interval_figure(estimates: Sequence[ParameterEstimate]) -> Figure:
@@ -82,8 +83,7 @@ def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)
     t = trace.t - trace.t[0, 0]
     gap = np.full((len(t), 1), np.nan)
     panels = []
-    for i in _COLUMNS:
-        title, (unit, scale) = _TRACED[i][0], shown_unit(_TRACED[i][1])
+    for i, title, unit, scale in _TRACED:
         predicted = (
             Series(
                 x=np.hstack([t, t[:, -1:]]).ravel(), y=np.hstack([scale * trace.predicted[name][..., i], gap]).ravel(),
@@ -116,8 +116,7 @@ def horizon_figure(prediction: PredictionErrors) -> Figure:
 def residual_figure(prediction: PredictionErrors) -> Figure:
     """Return what is left of velocity and body rates, axis by axis, of the identified vehicle and of thrust alone."""
     panels = []
-    for i in _COLUMNS:
-        title, (unit, scale) = _TRACED[i][0], shown_unit(_TRACED[i][1])
+    for i, title, unit, scale in _TRACED:
         series = []
         for name in (THRUST_ONLY, IDENTIFIED):
             left = scale * prediction.residuals[name][:, i]

@@ -17,8 +17,6 @@ from scenarios.identify.record import Record
 from scenarios.identify.rotors import Turning, lagging, measured, smoothed
 
 INCREMENTS: Final = ("roll", "pitch", "yaw", "vx", "vy", "vz")
-VECTORS: Final = {"rotor_moment": 2, "rate_damping": 3, "body_drag": 3}
-"""Parameters that are vectors and that a vehicle file may leave out."""
 AT_ONCE: Final = 1e-6  # lag of rotors that have none [s]
 _SMOOTHING: Final = 0.1
 """Time constant [s] below which the attitude follows the gyro: it averages the noise of the attitude itself."""
@@ -54,8 +52,10 @@ class Parameters:
         own: dict[str, Any] = {name: getattr(vehicle, name) or AT_ONCE for name in ("rotor_rise", "rotor_fall")}
         own |= {name: getattr(vehicle, name) or 0.0 for name in ("rotor_inertia", "rotor_drag")}
         own |= {"thrust_coefficient": vehicle.mean_coefficient, "drag_to_thrust": vehicle.drag_to_thrust}
-        own |= {name: np.array(getattr(vehicle, name) or (0.0,) * n) for name, n in VECTORS.items()}
-        return cls(inertia=np.array(vehicle.inertia), **own, **others)
+        own |= {"throttle_curve": vehicle.throttle_share}
+        vectors = {"rotor_moment": 2, "rate_damping": 3, "body_drag": 3}
+        own |= {name: np.array(getattr(vehicle, name) or (0.0,) * n) for name, n in vectors.items()}
+        return cls(**({"inertia": np.array(vehicle.inertia)} | own | others))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from quadsim.assets import read_toml
 from quadsim.errors import FileError, InputError, ParameterError
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import Array
-from scenarios.identify.series import Column, SampledSeries
+from scenarios.identify.series import Column
 
 RPM: Final = math.tau / 60.0  # [rad/s]
 NO_ERPM: Final = 65535  # of 16 bits: no value, but a gap
@@ -149,7 +149,7 @@ def _named_in(path: Path, quantity: str, table: Any) -> NamedQuantity:
 
 def to_series(
     path: Path, log: LoggedColumns, given: Sequence[NamedQuantity] = (), poles: int | None = None
-) -> dict[str, SampledSeries]:
+) -> dict[str, Column]:
     """Return the series of a log by field of `scenarios.identify.record.Record`, in our units and frames.
 
     Args:
@@ -181,7 +181,7 @@ def to_series(
     name = path.name
     if (erpm := series.pop("erpm", None)) is not None:
         if "speeds" not in series:
-            series["speeds"] = SampledSeries(t=erpm.t, values=_speeds(name, erpm.values, poles))
+            series["speeds"] = Column(t=erpm.t, values=_speeds(name, erpm.values, poles))
     elif poles is not None:
         raise InputError(f"{name}: poles turn eRPM into speeds, and there is no erpm1..4; leave poles out")
     if (
@@ -196,12 +196,12 @@ def to_series(
             if not (low <= np.nanmin(rows, initial=0.0) and np.nanmax(rows, initial=0.0) <= high):
                 raise InputError(f"{name}: {rule}; got {np.nanmin(rows):.4g} to {np.nanmax(rows):.4g}")
     if (euler := series.pop("euler", None)) is not None and "attitude" not in series:
-        series["attitude"] = SampledSeries(t=euler.t, values=euler_to_quaternion(euler.values))
+        series["attitude"] = Column(t=euler.t, values=euler_to_quaternion(euler.values))
         known["attitude"] = known["euler"]
     for quantity in {*series} & {*known}:
         if known[quantity].down:
             turn = np.append(1.0, HALF_TURN) if quantity == "attitude" else HALF_TURN
-            series[quantity] = SampledSeries(t=series[quantity].t, values=series[quantity].values * turn)
+            series[quantity] = Column(t=series[quantity].t, values=series[quantity].values * turn)
     return series
 
 
@@ -213,13 +213,13 @@ def listed(columns: Iterable[str]) -> str:
     return ", ".join(names) or "none"
 
 
-def _series(columns: Mapping[str, Column], one: NamedQuantity) -> SampledSeries:
+def _series(columns: Mapping[str, Column], one: NamedQuantity) -> Column:
     """The columns on the clock of the first of them."""
     t = columns[one.columns[0]].t
     rows = [c.values if c.t is t else np.interp(t, c.t, c.values) for c in (columns[name] for name in one.columns)]
     values = (np.stack(rows, axis=1) - one.zero) * one.scale
     values = np.maximum(values, 0.0) if np.any(one.zero) else values  # a motor that is stopped has a shorter pulse
-    return SampledSeries(t=t, values=values * one.sign if one.sign else values)
+    return Column(t=t, values=values * one.sign if one.sign else values)
 
 
 def _speeds(name: str, erpm: Array, poles: int | None) -> Array:

@@ -19,7 +19,7 @@ from scenarios.identify.blackbox import read_blackbox
 from scenarios.identify.dataflash import read_dataflash
 from scenarios.identify.inertial import filled_in, integrated_velocity, levelled_attitude
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, to_series
-from scenarios.identify.series import Column, SampledSeries, held
+from scenarios.identify.series import Column, held
 from scenarios.identify.tables import read_columns
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
@@ -127,7 +127,7 @@ def _format_of(file: Path) -> LogFormat:
     return found
 
 
-def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
+def to_record(name: str, series: Mapping[str, Column]) -> Record:
     """Sample the series of a log, by field of `Record`, on one uniform clock.
 
     Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
@@ -149,16 +149,16 @@ def to_record(name: str, series: Mapping[str, SampledSeries]) -> Record:
     elif "velocity" not in series:
         place = series["position"]
         slope = np.gradient(place.values, place.t, axis=0)
-        series = {**series, "velocity": SampledSeries(t=place.t, values=slope)}
+        series = {**series, "velocity": Column(t=place.t, values=slope)}
         notes = (f"{name}: no velocity is logged; it is the central difference of the position",)
     if "attitude" not in series:
         assert force is not None
         gyro = series["rates"]
         known = np.stack([np.interp(gyro.t, force.t, column) for column in force.values.T], axis=1)
-        series["attitude"] = SampledSeries(t=gyro.t, values=levelled_attitude(gyro.t, gyro.values, known))
+        series["attitude"] = Column(t=gyro.t, values=levelled_attitude(gyro.t, gyro.values, known))
         notes = (*notes, f"{name}: no attitude is logged; it is the gyro's, levelled by the accelerometer")
     turn = series["attitude"]
-    series = {**series, "attitude": replace(turn, values=_continuous(name, turn.values))}
+    series = {**series, "attitude": turn._replace(values=_continuous(name, turn.values))}
     grid = _clock(name, series)
     values: dict[str, Any] = {
         field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()
@@ -232,7 +232,7 @@ def _usual_period(t: Array) -> float:
     return float(steps[steps <= 1.5 * np.median(steps)].mean())
 
 
-def _clock(name: str, series: Mapping[str, SampledSeries]) -> Array:
+def _clock(name: str, series: Mapping[str, Column]) -> Array:
     """The common clock: of the rates or of the commands, whichever is slower; where all fields have samples.
 
     Commands that are logged too rarely do not count: the checks name them.
@@ -265,7 +265,7 @@ def _clock(name: str, series: Mapping[str, SampledSeries]) -> Array:
     return np.asarray(start + period * np.arange(int((stop - start) / period + 1e-6) + 1))
 
 
-def _sampled(series: SampledSeries, grid: Array, *, held: bool) -> Array:
+def _sampled(series: Column, grid: Array, *, held: bool) -> Array:
     """Values (N, n) of a series at the times of a grid, NaN in gaps."""
     there = np.isfinite(series.values).all(axis=1)
     if series.t is grid and there.all():

@@ -53,7 +53,10 @@ def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) 
             if explained.mean() > best.mean() + 1e-9:
                 best, order, turn = explained, columns, angle
     if best.mean() > EXPLAINED and usual.mean() < INFERIOR * best.mean() and (best > usual).mean() >= AGREEING:
-        raise InputError(f"{record.name}: {_named(order, turn, vehicle, _column(record))}, {_shares(best, usual)}")
+        raise InputError(
+            f"{record.name}: {_named(order, turn, vehicle, record)}, which explains {100.0 * best.mean():.0f} % of the "
+            f"roll and pitch acceleration (as given: {100.0 * usual.mean():.0f} %)"
+        )
     _check_spins(record.name, blocks, vehicle)
 
 
@@ -91,12 +94,7 @@ def _explained(blocks: Moments, arms: Array) -> Array:
     return np.asarray(((2.0 * gain * along - gain**2 * power) / total).mean(axis=1))
 
 
-def _column(record: Record) -> str:
-    """What the columns of the rotors' outputs are called."""
-    return "w" if record.speeds is not None else "u" if record.commands is not None else "throttle"
-
-
-def _named(order: Sequence[int], turn: float, vehicle: Vehicle, column: str) -> str:
+def _named(order: Sequence[int], turn: float, vehicle: Vehicle, record: Record) -> str:
     if turn:
         azimuths = [0.0] * N_ROTORS
         for place, i in enumerate(order):
@@ -104,16 +102,10 @@ def _named(order: Sequence[int], turn: float, vehicle: Vehicle, column: str) -> 
         return f"the arms are 45 deg off: try rotor_azimuths = [{', '.join(f'{a:g}' for a in azimuths)}]"
     mirrored = np.allclose(vehicle.hubs[list(order)], vehicle.hubs * [-1.0, 1.0, 1.0])
     moved = [i + 1 for i in range(N_ROTORS) if order[i] != i]
+    column = "w" if record.speeds is not None else "u" if record.commands is not None else "throttle"
     swapped = f"rotors {moved[0]} and {moved[1]} are swapped" if len(moved) == 2 else "the rotors are in another order"
     return f"{swapped}: try the order {','.join(f'{column}{i + 1}' for i in order)}" + (
         " (or body axes are x forward, y right, z down)" if mirrored else ""
-    )
-
-
-def _shares(best: Array, usual: Array) -> str:
-    return (
-        f"which explains {100.0 * best.mean():.0f} % of the roll and pitch acceleration "
-        f"(as given: {100.0 * usual.mean():.0f} %)"
     )
 
 

@@ -48,7 +48,7 @@ def rotor_response(parts: Sequence[Stretch], vehicle: Vehicle, voltage: float) -
     record = parts[0].record
     lag = vehicle.rotor_rise or vehicle.rotor_fall or 0.03
     start = {"rotor_rise": lag, "rotor_fall": lag, "delay": 0.0}
-    start |= {"throttle_curve": 1.0} if record.commands is None else {}
+    start |= {"throttle_curve": vehicle.throttle_share} if record.commands is None else {}
     voltages = [part.record.voltage for part in parts if part.record.voltage is not None]
     sags = bool(voltages) and np.ptp(np.concatenate(voltages)) > _SAG * voltage
     start |= {"voltage_exponent": 1.0} if sags else {}

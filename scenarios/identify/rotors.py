@@ -75,16 +75,13 @@ def measured(speeds: Array, period: float, *, delay: float) -> Turning:
     """Rotors whose speeds (N, 4) [rad/s] were logged `delay` [s] after they were turning so; linear in between."""
     n = len(speeds)
     when = np.arange(n) + delay / period
-    return _linear(np.stack([np.interp(when, np.arange(n), column) for column in speeds.T], axis=1))
+    at = np.stack([np.interp(when, np.arange(n), column) for column in speeds.T], axis=1)
+    before, after = at[:-1], at[1:]
+    square = (before**2 + before * after + after**2) / 3.0
+    return Turning(speeds=at, mean=0.5 * (before + after), square=square)
 
 
 def smoothed(speeds: Array) -> Array:
     """Measured speeds (N, 4) [rad/s] without their noise, which would make torques look larger than they are."""
     when = np.arange(len(speeds), dtype=float)
     return np.stack([make_smoothing_spline(when, column, lam=_ROUGHNESS)(when) for column in speeds.T], axis=1)
-
-
-def _linear(speeds: Array) -> Turning:
-    before, after = speeds[:-1], speeds[1:]
-    square = (before**2 + before * after + after**2) / 3.0
-    return Turning(speeds=speeds, mean=0.5 * (before + after), square=square)

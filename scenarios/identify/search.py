@@ -19,6 +19,7 @@ from scipy.signal import lfilter
 
 from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
+from scenarios.identify.estimate import VECTORS
 from scenarios.identify.model import INCREMENTS, Parameters, Stretch, predicted_increments, turning
 from scenarios.identify.rotors import Turning
 
@@ -83,7 +84,7 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterat
     if record.speeds is None:
         yield from (Sought(name, getattr(vehicle, name) or lag, None, 1.5) for name in ("rotor_rise", "rotor_fall"))
         if record.throttle is not None:
-            yield Sought("throttle_curve", 1.0, 0.3, 1.0)
+            yield Sought("throttle_curve", vehicle.throttle_share, 0.3, 1.0)
         if record.voltage is not None and record.throttle is None:
             yield Sought("voltage_exponent", 1.0, 0.5, 2.0)
     for flight in range(1 + parts[-1].flight):
@@ -147,8 +148,9 @@ class Search:
         if len(self._winds[part]):
             own["wind"] = x[self._winds[part]]
         area, given = own.pop("body_drag"), self.vehicle.body_drag or LEVEL_PLATE
-        vectors = {"inertia": "xyz", "rotor_moment": "xy", "rate_damping": "xyz", "offset": "xy"}
-        own |= {name: np.array([own.pop(f"{name}_{axis}") for axis in axes]) for name, axes in vectors.items()}
+        for name, axes in {**VECTORS, "offset": "xy"}.items():
+            own[name] = np.array([own.pop(f"{name}_{axis}") for axis in axes])
+        own.setdefault("throttle_curve", self.vehicle.throttle_share)
         return Parameters(body_drag=area / given[0] * np.array(given), voltage=self.voltage, **own)
 
     def misfit(self, x: Array, part: int, rotors: Turning | None = None) -> tuple[Array, Turning]:
@@ -165,22 +167,16 @@ class Search:
         fading = self._fading ** np.arange(_ORDER + 1) if axis >= 3 else 1.0
         return fading * _polynomial(np.tanh(noise[:_ORDER])), _polynomial(np.tanh(noise[_ORDER:]))
 
-    def _filtered(self, misfit: Array, axis: int, noise: Array, start: float) -> Array:
-        """(N,) innovations of one axis: e = A(z) / C(z) d, the first d less `start`, what is wrong with its sample."""
-        driven = misfit[:, axis].copy()
-        driven[0] += start
-        filtered: Array = lfilter(*self._polynomials(noise, axis), driven)
-        return filtered
-
     def _noise(self, part: int, axis: int) -> tuple[range, int]:
         """Where in `x` the noise model of an axis of a stretch is, and what is wrong with its first sample."""
         first = self._physical + 2 * _ORDER * (len(INCREMENTS) * self.parts[part].flight + axis)
         return range(first, first + 2 * _ORDER), self._starts + len(INCREMENTS) * part + axis
 
     def _innovations_of(self, misfit: Array, x: Array, part: int, axis: int) -> Array:
-        noise, start = self._noise(part, axis)
-        wrong = x[start] * self.sigma[self.parts[part].flight, axis]
-        return self._filtered(misfit, axis, x[noise.start : noise.stop], wrong)
+        """(N,) innovations of one axis: e = A(z) / C(z) d, the first d less what is wrong with its sample."""
+        (noise, start), driven = self._noise(part, axis), misfit[:, axis].copy()
+        driven[0] += x[start] * self.sigma[self.parts[part].flight, axis]
+        return np.asarray(lfilter(*self._polynomials(x[noise.start : noise.stop], axis), driven))
 
     def _innovations(self, misfit: Array, x: Array, part: int) -> Array:
         return np.stack([self._innovations_of(misfit, x, part, axis) for axis in range(len(INCREMENTS))], axis=1)

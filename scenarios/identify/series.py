@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,18 +11,10 @@ from quadsim.state import Array
 
 
 class Column(NamedTuple):
-    """M samples of one number, as a log has them."""
+    """M samples of one number, as a log has them, or of the n numbers of a quantity."""
 
     t: Array  # (M,) [s]
-    values: Array  # (M,), NaN where there is none
-
-
-@dataclass(frozen=True, kw_only=True)
-class SampledSeries:
-    """M samples of n numbers."""
-
-    t: Array  # (M,) [s]
-    values: Array  # (M, n), NaN where there is none
+    values: Array  # (M,) or (M, n), NaN where there is none
 
 
 def held(column: Column, t: Array) -> Array:

@@ -23,7 +23,7 @@ _NAMES: Final = (
     *(logged_as("specific_force", way) for way in ("ax ay az", "acc_x acc_y acc_z", "accel_x accel_y accel_z")),
     *(logged_as("attitude", way) for way in ("qw qx qy qz", "q_w q_x q_y q_z")),
     logged_as("euler", "roll pitch yaw"),
-    *(logged_as("rates", f"{way}") for way in ("wx wy wz", "p q r", "gyro_x gyro_y gyro_z")),
+    *(logged_as("rates", way) for way in ("wx wy wz", "p q r", "gyro_x gyro_y gyro_z")),
     logged_as("rates", "body_rate_x body_rate_y body_rate_z"),
     logged_as("commands", "u1 u2 u3 u4"),
     logged_as("throttle", "throttle1 throttle2 throttle3 throttle4"),

@@ -50,6 +50,9 @@ def vehicle_text(identification: Identification, start: Path, logs: Sequence[str
     for estimate in identification.estimates:
         if estimate.in_file:
             of_field.setdefault(field_of(estimate.name), []).append(estimate)
+    for name in VEHICLE_UNITS:
+        if getattr(identification.vehicle, name) is None:  # a map that an identified coefficient replaces
+            document.pop(name, None)
     for name, estimates in of_field.items():
         value = getattr(identification.vehicle, name)
         if value is None:  # neither the start has it, nor is it identified

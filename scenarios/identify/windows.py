@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Rotation
 
 from quadsim.rotation import conjugate, multiply
 from quadsim.state import Array
@@ -29,18 +30,14 @@ def mean(values: Array, period: float, window: float) -> Array:
 
 def turn_rate(quaternion: Array, period: float, window: float) -> Array:
     """Body rates (N, 3) [rad/s] by which attitudes (N, 4) turn over a window [s] about each sample."""
-    half = half_window(period, window)
-    turn = multiply(conjugate(quaternion[: -2 * half]), quaternion[2 * half :])
-    turn *= np.where(turn[:, :1] < 0.0, -1.0, 1.0)
-    sine = np.linalg.norm(turn[:, 1:], axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, turn[:, :1])
-    return _padded(turn[:, 1:] * angle / np.maximum(sine, 1e-12) / (2 * half * period), half)
+    half, attitude = half_window(period, window), Rotation.from_quat(quaternion, scalar_first=True)
+    turn = attitude[: -2 * half].inv() * attitude[2 * half :]
+    return _padded(turn.as_rotvec() / (2 * half * period), half)
 
 
 def body_z(quaternion: Array) -> Array:
     """Thrust axis (N, 3) in the world of attitudes (N, 4), body to world."""
-    w, x, y, z = quaternion.T
-    return np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
+    return np.asarray(Rotation.from_quat(quaternion, scalar_first=True).apply([0.0, 0.0, 1.0]))
 
 
 def to_world(quaternion: Array, vectors: Array) -> Array:

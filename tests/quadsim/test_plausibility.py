@@ -115,6 +115,6 @@ def test_no_wrong_number_is_satisfied_in_silence(vehicle: Vehicle, name: str, fa
 def test_every_number_of_a_vehicle_is_in_a_ratio_or_checked_by_its_construction() -> None:
     from quadsim.plausibility import RATIOS
 
-    built = {"rotor_positions", "products_of_inertia", "speed_min"}
+    built = {"rotor_positions", "products_of_inertia", "speed_min", "thrust_of_speed", "thrust_of_throttle"}
     covered = {name for ratio in RATIOS for name in ratio.of} | built
     assert {field.name for field in fields(Vehicle)} - {"name", "description"} == covered

@@ -121,8 +121,10 @@ def test_the_trim_carries_the_weight_without_torque(name: str) -> None:
     np.testing.assert_allclose(wrench, [weight, 0.0, 0.0, 0.0], atol=1e-12 * weight)
     assert vehicle.thrust_shares.sum() == pytest.approx(1.0)
     assert (np.ptp(vehicle.hover_speeds) > 1.0) == (name in ("deadcat", "uneven"))
-    fastest = vehicle.speed_max / vehicle.hover_speeds.max()
-    assert vehicle.level_thrust(vehicle.speed_max) == pytest.approx(weight * fastest**2)
+    most = (vehicle.thrusts(np.full(4, vehicle.speed_max)) / vehicle.thrusts(vehicle.hover_speeds)).min()
+    assert vehicle.level_thrust(vehicle.speed_max) == pytest.approx(weight * most)
+    if vehicle.thrust_of_speed is None:
+        assert most == pytest.approx((vehicle.speed_max / vehicle.hover_speeds.max()) ** 2)
 
 
 def test_turning_and_its_inverse_have_the_products_of_inertia() -> None:

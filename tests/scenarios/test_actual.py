@@ -39,6 +39,8 @@ ACTUAL: dict[str, Any] = {
     "rotor_positions": [[0.3, 0.0, 0.1], [0.0, -0.3, 0.0], [-0.28, 0.0, 0.0], [0.0, 0.3, 0.0]],
     "rotor_spins": [-1, 1, -1, 1],
     "thrust_coefficient": 3e-4,
+    "thrust_of_speed": [0.01, 2.2e-4],
+    "thrust_of_throttle": [2.0, 14.0],
     "drag_to_thrust": 0.03,
     "speed_min": 150.0,
     "speed_max": 210.0,

@@ -11,10 +11,10 @@ import numpy as np
 from annotated_types import Len, doc
 
 from quadsim.errors import InputError
-from quadsim.fields import Instant, NonNegative, Positive, Vector, filled
+from quadsim.fields import Instant, NonNegative, Pair, Positive, Vector, filled
 from quadsim.sim.effects.turbulence import FASTEST_AIRSPEED, SLOWEST_AIRSPEED, Dryden, Turbulence
 from quadsim.state import Array
-from quadsim.vehicle import PerAxis, Vehicle
+from quadsim.vehicle import Vehicle
 
 SEA_LEVEL_DENSITY: Final = 1.225
 """Density of air [kg/m^3] at sea level in the International Standard Atmosphere (ISO 2533)."""
@@ -33,7 +33,7 @@ class Air:
         doc("[kg/rad] drag of one rotor per speed and air speed in its plane; absent: the vehicle's, or 0"),
     ] = None
     rotor_moment: Annotated[
-        PerAxis | None,
+        Pair | None,
         doc(
             "[N m s^2/(m rad)] moment of one rotor about body x and y, per speed and air speed across it; absent: the "
             "vehicle's, or 0"

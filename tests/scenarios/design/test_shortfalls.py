@@ -11,7 +11,7 @@ import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.errors import ParameterError
 from quadsim.sim.autopilot import AutopilotSettings
-from quadsim.vehicle import ARMS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
+from quadsim.vehicle import ARMS, OPTIONAL_PARAMETERS, THRUST, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.commands.cli import main
 from scenarios.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
 from scenarios.design.shortfalls import shortfalls
@@ -62,13 +62,17 @@ def test_a_first_scenario_suits_its_vehicle(course: str, law: str) -> None:
 
 def test_the_template_documents_every_parameter() -> None:
     tables = tomllib.loads(TEMPLATE)
-    instead = tomllib.loads(TEMPLATE.partition("# [rotor_positions]\n")[2].partition("\n\n")[0].replace("# ", ""))
-    assert [*tables] == ["name", "description", *(name for name in VEHICLE_UNITS if name != "rotor_positions")]
-    tables["rotor_positions"] = instead
+    instead = ("rotor_positions", "thrust_of_speed", "thrust_of_throttle")
+    assert [*tables] == ["name", "description", *(name for name in VEHICLE_UNITS if name not in instead)]
     numbers = {name: table["value"] for name, table in tables.items() if isinstance(table, dict)}
-    with pytest.raises(ParameterError, match="one or the other"):
-        Vehicle(name="mine", **numbers)
-    Vehicle(name="mine", **{name: value for name, value in numbers.items() if name not in ARMS})
+    for name in instead:
+        commented = TEMPLATE.partition(f"# [{name}]\n")[2].partition("\n\n")[0]
+        tables[name] = tomllib.loads(commented.replace("# ", ""))
+        with pytest.raises(ParameterError, match="one or the other"):
+            Vehicle(name="mine", **numbers, **{name: tables[name]["value"]})
+        replaced = ARMS if name == "rotor_positions" else THRUST
+        kept = {key: value for key, value in numbers.items() if key not in replaced}
+        Vehicle(name="mine", **kept, **{name: tables[name]["value"]})
     text = " ".join(TEMPLATE.replace("# ", "").split())
     for name, unit in VEHICLE_UNITS.items():
         assert tables[name]["unit"] == unit

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from uneven import FILES
 
 import quadsim
 from quadsim.assets import vehicle_path
@@ -65,6 +66,15 @@ def test_throttle_alone_gives_its_curve_and_a_coefficient_for_the_speed_kept(
     printed = capsys.readouterr().out
     assert "thrust over that of full throttle = 0.3 u + 0.7 u^2" in printed
     assert "for speed_max = 750 rad/s, as kept" in printed
+
+
+def test_its_coefficient_takes_the_place_of_a_map(tmp_path: Path) -> None:
+    speeds = np.linspace(800.0, 2268.0, 8)
+    path = stand(tmp_path / "stand.csv", "speed [rad/s],thrust [N]", speeds, 3.9e-8 * speeds**2)
+    mine = tmp_path / "mine.toml"
+    mine.write_text(quadsim.vehicle_report(FILES / "cf21b.toml", thrust_stand=path).content, encoding="utf-8")
+    vehicle = load_vehicle(mine)
+    assert (vehicle.thrust_of_speed, vehicle.thrust_coefficient) == (None, 3.9e-8)
 
 
 def test_a_stand_that_stops_below_full_throttle_says_so(tmp_path: Path) -> None:

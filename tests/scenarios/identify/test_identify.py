@@ -12,27 +12,27 @@ import numpy as np
 import pytest
 from browser import CLASHES, opened
 from flown_logs import fly_eight, write_log
+from uneven import FILES, published
 
 import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError, ParameterError
-from quadsim.vehicle import load_vehicle, vehicle_sources
+from quadsim.vehicle import altered, load_vehicle, vehicle_sources
 from scenarios.commands.cli import main
 from scenarios.flown import Flight
-from scenarios.identify.estimate import Identification, ParameterEstimate
+from scenarios.identify.estimate import Identification, ParameterEstimate, number_in
+from scenarios.identify.model import Parameters, commanded, stretch
 from scenarios.identify.prediction import (
     HORIZONS,
-    IDENTIFIED,
     QUANTITIES,
     RESIDUAL_AFTER,
-    START,
-    THRUST_ONLY,
     PredictionErrors,
     hold_out,
     predict,
 )
-from scenarios.identify.record import read_record
+from scenarios.identify.record import Record, read_record
 from scenarios.identify.report import IdentifiedVehicle
+from scenarios.identify.search import Search
 from scenarios.identify.vehicle_file import rounded, vehicle_text
 
 pytestmark = pytest.mark.slow("identification")
@@ -87,8 +87,8 @@ def test_the_command_finds_the_vehicle_that_flew(identified: IdentifiedVehicle) 
     assert found.thrust_coefficient == pytest.approx(true.thrust_coefficient, rel=0.02)
     assert found.inertia[:2] == pytest.approx(true.inertia[:2], rel=0.05)
     errors = identified.prediction.errors
-    assert (errors[IDENTIFIED][-1] < 0.5 * errors[THRUST_ONLY][-1]).all()
-    assert (errors[IDENTIFIED][-1, 1:] < errors[START][-1, 1:]).all()
+    assert (errors["identified"][-1] < 0.5 * errors["thrust only"][-1]).all()
+    assert (errors["identified"][-1, 1:] < errors["start"][-1, 1:]).all()
 
 
 def test_the_file_loads_flies_and_says_where_each_number_is_from(identified: IdentifiedVehicle) -> None:
@@ -140,8 +140,8 @@ def test_another_log_can_be_predicted_and_json_has_all_of_it(
     data = json.loads(capsys.readouterr().out)
     assert (data["logs"], data["test"], data["written"]) == (["eight.csv"], ["other.csv"], [])
     assert data["prediction"]["windows"] > 30
-    assert data["prediction"]["errors"].keys() == {IDENTIFIED, START, THRUST_ONLY}
-    assert all(len(errors) == len(HORIZONS) for errors in data["prediction"]["errors"][IDENTIFIED].values())
+    assert data["prediction"]["errors"].keys() == {"identified", "start", "thrust only"}
+    assert all(len(errors) == 10 for errors in data["prediction"]["errors"]["identified"].values())
     assert {"low", "high", "start", "refused"} <= data["estimates"][0].keys()
     assert sorted(path.name for path in here.iterdir()) == ["eight.csv", "other.csv", "start.toml"]
 
@@ -166,6 +166,31 @@ def test_what_a_gate_refuses_keeps_the_number_of_the_start_and_says_why(place: P
     assert sources["inertia"].startswith("x identified: 95 % within 0.007029 to 0.007171; start 0.009; y identified")
     assert sources["inertia"].endswith(f"; z kept: no yaw excitation; logs a.csv, b.csv; {before['inertia']}")
     assert written == replace(new, thrust_coefficient=rounded(8.54321e-6, estimates[0]))
+
+
+def test_an_identified_coefficient_takes_the_place_of_a_map(place: Path) -> None:
+    start, path = published("cf21b"), place / "unmapped.toml"
+    assert number_in(start, "thrust_coefficient") == start.mean_coefficient
+    thrust = estimate("thrust_coefficient", 3.9e-8, start.mean_coefficient)
+    for refused in ("", "not excited"):
+        new = start if refused else altered(start, {"thrust_coefficient": 3.9e-8})
+        one = replace(thrust, refused=refused)
+        identification = Identification(estimates=(one,), vehicle=new, delay=0.0, offset=(0.0, 0.0))
+        path.write_text(vehicle_text(identification, FILES / "cf21b.toml", ["a.csv"]), encoding="utf-8")
+        assert load_vehicle(path) == new
+
+
+def test_a_throttle_map_gives_the_speeds_of_the_throttle() -> None:
+    start = load_vehicle(vehicle_path(TRUE))
+    top = start.mean_coefficient * start.speed_max**2
+    mapped, u = altered(start, {"thrust_of_throttle": (0.4 * top, 0.6 * top)}), np.linspace(0.1, 1.0, 40)
+    columns = {name: np.zeros((40, 3)) for name in ("rates", "velocity")}
+    throttle, level = np.stack([u] * 4, axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (40, 1))
+    record = Record(name="a", t=0.01 * np.arange(40), attitude=level, throttle=throttle, **columns)
+    speeds = commanded(record, mapped, Parameters.of(mapped))
+    np.testing.assert_allclose(mapped.thrusts(speeds), top * (0.4 * throttle + 0.6 * throttle**2), rtol=1e-12)
+    search = Search([stretch(record, 0)], mapped, wind=False)
+    assert search.parameters(search.x, 0).throttle_curve == pytest.approx(0.6)
 
 
 def test_a_parameter_that_the_start_lacks_is_added(place: Path) -> None:
@@ -214,12 +239,12 @@ def test_the_true_vehicle_predicts_and_thrust_alone_holds_the_rates(eight: Fligh
     identification = Identification(estimates=(), vehicle=true, delay=0.0, offset=(0.0, 0.0))
     found = predict([record], [[slice(100, len(record.t))]], identification, wrong)
     noise = np.array([1e-3, 1e-2, 0.0, 1e-2]) * np.sqrt(8.0 / np.pi)  # mean norm of three normal numbers
-    at_start, after = found.errors[IDENTIFIED][1], found.errors[IDENTIFIED][-1]
+    at_start, after = found.errors["identified"][1], found.errors["identified"][-1]
     assert (at_start < 2.0 * noise + [1e-3, 1e-3, 3e-3, 1e-2]).all()
-    assert (after < 0.1 * found.errors[START][-1] + 3.0 * noise + [0.01, 0.02, 0.01, 0.02]).all()
-    held = found.trace.predicted[THRUST_ONLY][..., 3:]
+    assert (after < 0.1 * found.errors["start"][-1] + 3.0 * noise + [0.01, 0.02, 0.01, 0.02]).all()
+    held = found.trace.predicted["thrust only"][..., 3:]
     assert held == pytest.approx(np.broadcast_to(held[:, :1], held.shape), abs=1e-12)
-    assert found.trace.predicted[THRUST_ONLY][:, 0] == pytest.approx(found.trace.measured[:, 0])
+    assert found.trace.predicted["thrust only"][:, 0] == pytest.approx(found.trace.measured[:, 0])
     assert [*QUANTITIES] == ["position", "velocity", "attitude", "body rates"]
     for name, left in found.residuals.items():
         norms = [np.linalg.norm(left[:, of], axis=1).mean() for of in (slice(3), slice(3, 6))]
@@ -234,7 +259,7 @@ def test_the_prediction_knows_delay_offset_and_wind(place: Path) -> None:
 
     def end(**changes: object) -> np.ndarray:
         changed = replace(known, **changes)  # type: ignore[arg-type]
-        return predict([record], [[slice(300, 360)]], changed, true).trace.predicted[IDENTIFIED][0, -1]
+        return predict([record], [[slice(300, 360)]], changed, true).trace.predicted["identified"][0, -1]
 
     still, t = end(), 0.5
     weight = true.mass * true.gravity
@@ -254,7 +279,7 @@ def test_a_vehicle_that_predicts_worse_is_said_to_and_written_only_anyway(
     def exchanged(*arguments: Any, **options: Any) -> PredictionErrors:
         found = predict(*arguments, **options)
         errors = {name: of.copy() for name, of in found.errors.items()}
-        errors[IDENTIFIED][:, 3] = 2.0 * errors[THRUST_ONLY][:, 3]
+        errors["identified"][:, 3] = 2.0 * errors["thrust only"][:, 3]
         return replace(found, errors=errors)
 
     monkeypatch.setattr("scenarios.identify.report.predict", exchanged)
@@ -272,7 +297,8 @@ def test_a_vehicle_that_predicts_worse_is_said_to_and_written_only_anyway(
 
 def test_the_verdict_comes_first_with_the_errors_over_those_of_each_rival(identified: IdentifiedVehicle) -> None:
     errors = {
-        name: np.full((len(HORIZONS), 4), of) for name, of in ((IDENTIFIED, 1.0), (START, 4.0), (THRUST_ONLY, 2.0))
+        name: np.full((len(HORIZONS), 4), of)
+        for name, of in (("identified", 1.0), ("start", 4.0), ("thrust only", 2.0))
     }
     better = replace(identified.prediction, errors=errors)
     assert better.verdict == (

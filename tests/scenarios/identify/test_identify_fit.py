@@ -22,7 +22,7 @@ from scenarios.identify.prediction import predict
 from scenarios.identify.record import Record, to_record
 from scenarios.identify.rotors import lagging
 from scenarios.identify.search import _polynomial
-from scenarios.identify.series import SampledSeries
+from scenarios.identify.series import Column
 from scenarios.identify.windows import to_world
 
 pytestmark = pytest.mark.slow("identification")
@@ -272,8 +272,8 @@ def test_an_accelerometer_takes_the_place_of_velocity() -> None:
     force = to_world(conjugate(euler_to_quaternion(state[:-1:stride, ANGLES])), change)
     force += 0.1 * np.random.default_rng(0).standard_normal(force.shape)
     fields = ("attitude", "rates", "commands")
-    series = {name: SampledSeries(t=record.t, values=np.asarray(getattr(record, name))) for name in fields}
-    read = to_record("imu", series | {"specific_force": SampledSeries(t=record.t, values=force)})
+    series = {name: Column(t=record.t, values=np.asarray(getattr(record, name))) for name in fields}
+    read = to_record("imu", series | {"specific_force": Column(t=record.t, values=force)})
     assert read.inertial
     assert read.notes == ("imu: no velocity is logged; the accelerometer stands in for it",)
     found = identify(read)
@@ -286,7 +286,7 @@ def test_an_accelerometer_takes_the_place_of_velocity() -> None:
     assert np.isfinite(errors[:, 2:]).all()
     for spoilt, why in ((force / 9.81, "likely in g"), (-force, "likely z points down")):
         with pytest.raises(InputError, match=why):
-            to_record("imu", series | {"specific_force": SampledSeries(t=record.t, values=spoilt)})
+            to_record("imu", series | {"specific_force": Column(t=record.t, values=spoilt)})
 
 
 def test_two_logs_are_fitted_together_and_narrow_the_intervals() -> None:

@@ -24,7 +24,7 @@ from scenarios.identify.quantities import NamedQuantity, read_map
 from scenarios.identify.record import Record, read_record, to_record
 from scenarios.identify.rotor_response import rotor_response
 from scenarios.identify.rotors import lagging
-from scenarios.identify.series import SampledSeries
+from scenarios.identify.series import Column
 from scenarios.identify.windows import to_world
 
 pytestmark = pytest.mark.slow("identification")
@@ -524,7 +524,7 @@ def test_a_fast_log_is_averaged_without_a_shift() -> None:
     motion = np.sin(t[:, None] * [20.0, 21.0, 22.0])
     rows = {"rates": motion, "velocity": motion, "attitude": np.tile([1.0, 0.0, 0.0, 0.0], (4000, 1))}
     rows["commands"] = 100.0 + np.arange(4000.0)[:, None] * [1.0, 1.0, 1.0, 1.0]
-    read = to_record("fast", {name: SampledSeries(t=t, values=of) for name, of in rows.items()})
+    read = to_record("fast", {name: Column(t=t, values=of) for name, of in rows.items()})
     assert read.notes == ("fast: 1000 Hz, of which means at 333 Hz are used",)
     np.testing.assert_allclose(read.rates, np.sin(read.t[:, None] * [20.0, 21.0, 22.0]), atol=2e-4)
     assert read.commands is not None
