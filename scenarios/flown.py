@@ -505,6 +505,8 @@ def require_film(video: bool | None, fps: int | None = None) -> None:
         ParameterError: `fps` is out of range.
         RenderingUnavailableError: this machine cannot render.
     """
+    if not video and fps is None:
+        return
     from quadsim.report.film.video import frame_rate, rendering_backend
 
     frame_rate(0.0, fps)

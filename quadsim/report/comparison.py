@@ -15,7 +15,7 @@ import numpy as np
 
 from quadsim.controller import Phase, law_name
 from quadsim.errors import ParameterError, printable
-from quadsim.flight.audit import VERDICT_TEXT, Finding, Limit, SpaceLimit, worst_finding
+from quadsim.flight.audit import VERDICT_TEXT, Finding, Limit, SpaceLimit, limit_differences, worst_finding
 from quadsim.flight.rundir import findings_of
 from quadsim.report.table import ABSENT, Cell, Mark, QuantityRow, format_number, short_number
 from quadsim.space import Obstacle
@@ -115,8 +115,8 @@ def _who_holds(runs: Sequence[Run], names: Sequence[str], findings: Sequence[Seq
         missed = [finding.limit.name for finding in each if finding.verdict == "incomplete"]
         verdict = run.summary["verdict"]
         deeds = [f"was {verdict}"] if verdict in ("lost", "aborted") else []
-        deeds += [f"violates {listed(failing)}"] if failing else []
-        deeds += [f"does not reach {listed(missed)}"] if missed and not deeds else []
+        deeds += [f"violates {_joined(failing)}"] if failing else []
+        deeds += [f"does not reach {_joined(missed)}"] if missed and not deeds else []
         if verdict == "violated" and not failing and (reason := violated_otherwise(run.summary)):
             deeds = [f"holds its constraints, {reason}"]
         deeds += ["is not audited"] if not each and not deeds else []
@@ -124,13 +124,13 @@ def _who_holds(runs: Sequence[Run], names: Sequence[str], findings: Sequence[Seq
             others.append(f"{name} {' and '.join(deeds)}")
         else:
             holds.append(name)
+    alike = not any(limit_differences(runs[0].limits, run.limits, demands=False) for run in runs[1:])
+    one = "holds every constraint" if alike else "holds its own constraints"
+    held = one if len(holds) == 1 else one.replace("holds its", "hold their").replace("holds", "hold")
     if not others:
-        subject = {1: listed(holds), 2: "both flights"}.get(len(holds), f"all {len(holds)} flights")
-        text = f"{subject} {'holds' if len(holds) == 1 else 'hold'} every constraint"
-    elif holds:
-        text = f"{listed(holds)} {'holds' if len(holds) == 1 else 'hold'} every constraint, {listed(others)}"
+        text = {1: _joined(holds), 2: "both flights"}.get(len(holds), f"all {len(holds)} flights") + f" {held}"
     else:
-        text = listed(others)
+        text = ", ".join([*([f"{_joined(holds)} {held}"] if holds else []), _joined(others)])
     return text if text.startswith(tuple(names)) else text[0].upper() + text[1:]
 
 
@@ -158,7 +158,7 @@ def _metres(length: float) -> str:
     return shown if shown.startswith("<") else f"{shown} m"
 
 
-def listed(names: Sequence[str]) -> str:
+def _joined(names: Sequence[str]) -> str:
     """Join names as in a sentence."""
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 

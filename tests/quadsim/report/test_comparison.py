@@ -107,6 +107,9 @@ def test_the_conclusion_says_who_holds_and_who_is_closer_by_how_much(short_run: 
     assert says(mine, judged(short_run, "twin", 0.25, roll=1.0)) == Cell(text=same, mark=Mark.GOOD)
     still = [judged(short_run, name, rmse, roll=1.0) for name, rmse in (("still", 1e-12), ("rest", 2e-12))]
     assert says(*still).text == "Both flights hold every constraint; position errors are equal: < 1 nm RMS."
+    strict = dataclasses.replace(paper, limits=paper.limits[:1])
+    assert says(mine, strict).text == f"Both flights hold their own constraints; {closer}"
+    assert says(strict, wild).text.startswith("paper holds its own constraints, wild violates roll and pitch; ")
     assert says(mine) == Cell(text="mine holds every constraint.", mark=Mark.GOOD)
     three = "mine and paper hold every constraint, wild violates roll and pitch; wild tracks closest: "
     assert says(mine, paper, wild).text == f"{three}0.1 m RMS position error against 0.25 m of the next (60 % less)."
