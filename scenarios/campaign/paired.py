@@ -171,11 +171,12 @@ class PairedComparison(Result):
         """See `Result.shown`."""
         from scenarios import console
 
-        yield self.sentence
-        if self.audits and self.verdict != "not comparable":
+        if self.audits:
             yield different_audits(*self.names, self.audits)
         yield self.pairing
         yield from console.grids(self.difference_tables)
+        if self.verdict != "not comparable":
+            yield self.sentence
         yield from console.grids(self.tables)
         if self.page is not None:
             yield console.to_open(self.page)
