@@ -43,10 +43,11 @@ help:  ## list these targets
 
 setup: $(VENV)/.installed $(VENV)/.renders  ## make .venv with everything pinned, ready for the others
 
-demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIONS=--no-video to do without films)
-	@$(QUADSIM) run paper-unconstrained --out $(RUNS)/paper-unconstrained --overwrite $(OPTIONS)
-	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained --overwrite $(OPTIONS)
-	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite
+demo: setup  ## fly the paper's two flights, compare them on a page, then film them (OPTIONS=--no-video: no films)
+	@$(QUADSIM) run paper-unconstrained --out $(RUNS)/paper-unconstrained --overwrite $(OPTIONS) --no-video
+	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained --overwrite $(OPTIONS) --no-video
+	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite \
+		$(if $(filter --no-video,$(OPTIONS)),,$$([ ! -e $(VENV)/.renders ] || echo --video))
 
 test test-all rooms peers firmware betaflight chain numbers reproduce: export OMP_NUM_THREADS := 1
 test test-all rooms peers firmware betaflight chain numbers reproduce: export OPENBLAS_NUM_THREADS := 1

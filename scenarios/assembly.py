@@ -60,7 +60,7 @@ from quadsim.vehicle import (
     missing_parameters,
     vehicle_autopilot,
 )
-from scenarios.courses.course import Course
+from scenarios.courses.course import Course, repeated
 from scenarios.courses.followed import FollowedCourse
 from scenarios.courses.steps import Steps, switches
 from scenarios.limits import audit_notes, flyable, signal_limits, space_limits, sum_limits, with_law_bounds
@@ -248,7 +248,11 @@ class Assembly:
         Raises:
             InputError: its file is wrong, or it does not match the initial position.
         """
-        return self.scenario.reference.build(self.initial_pose, self.vehicle.gravity)
+        reference = self.scenario.reference
+        course = reference.build(self.initial_pose, self.vehicle.gravity)
+        if reference.repeat is None:
+            return course
+        return repeated(course, reference.repeat, until=self.scenario.duration)
 
     @property
     def initial_pose(self) -> Array:

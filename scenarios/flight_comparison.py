@@ -5,19 +5,19 @@ from __future__ import annotations
 import contextlib
 import logging
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from quadsim.errors import ParameterError
+from quadsim.errors import OutputError, ParameterError
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
 from quadsim.outputs import reserving
 from quadsim.report.comparison import check_names, different_audits
-from quadsim.report.table import QuantityRow
-from scenarios.flown import Flight, require_rendering, worst_margin
+from quadsim.report.table import Cell, QuantityRow
+from scenarios.flown import INTERRUPTED, Flight, add_films, require_film, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import reaudit, stored_run
@@ -55,6 +55,13 @@ class FlightComparison(Result):
         more = f"\n and {len(flights) - _FIRST} more" if len(flights) > _FIRST else ""
         return f"<FlightComparison of {len(flights)} flights{''.join(flights[:_FIRST])}{more}>"
 
+    @property
+    def conclusion(self) -> Cell:
+        """Who holds the constraints, and who tracks closer."""
+        from quadsim.report.comparison import conclusion
+
+        return conclusion(self.runs, self.names)
+
     def small_plot(self) -> Figure | None:
         """See `Result.small_plot`: position over time."""
         from quadsim.report.flight_figures import signals
@@ -72,6 +79,7 @@ class FlightComparison(Result):
         """See `Result.shown`."""
         from scenarios import console
 
+        yield console.styled_cell(self.conclusion)
         yield from self.notes
         lines = [
             (
@@ -82,6 +90,11 @@ class FlightComparison(Result):
             if row.label.startswith(_BRIEF)
         ]
         yield console.table("comparison", ["", *self.names], lines)
+
+    def outputs(self) -> Shown:
+        """See `Result.outputs`."""
+        from scenarios import console
+
         if self.page is not None:
             yield "every number, plots and films:"
             yield console.to_open(self.page)
@@ -108,25 +121,28 @@ def compare_flights(
     names: Sequence[str] = (),
     products: Mapping[str, bool | None] = MappingProxyType({}),
     constraints: Compared | None = None,
+    fps: int | None = None,
+    flown: Callable[[FlightComparison], object] | None = None,
 ) -> FlightComparison:
     """Compare flights, and write the page to `out`; scenarios are flown and saved beside it, in `OUT-runs`.
 
-    `names` are the columns'; `products` the options of `Flight.save` for what is saved; with `constraints`, one of the
-    targets, all are audited against its constraints.
+    `names` are the columns'; `products` and `fps` the options of `Flight.save` for what is saved; with `constraints`,
+    one of the targets, all are audited against its constraints.  Films come last: `flown` is called with the comparison
+    before they are made, and the page is written again with them.
 
     Raises:
         InputError: a target is neither a flight nor a scenario, `constraints` is none of them, or the names are wrong;
             nothing was flown.
-        OutputError: the directory cannot be written.
+        OutputError: the directory, or a film that is requested, cannot be written.
         RenderingUnavailableError: a video is requested but cannot be rendered; nothing was flown.
     """
     from quadsim.report.comparison import comparison_rows, run_names
     from quadsim.report.comparison_page import write_comparison
+    from scenarios.console import short_path
 
     whose = None if constraints is None else place_of(constraints, targets)
     check_names(names, len(targets))
-    if products.get("video"):
-        require_rendering()
+    require_film(products.get("video"), fps)
     for target in targets:
         _check(target)
     with contextlib.ExitStack() as stack:
@@ -134,7 +150,7 @@ def compare_flights(
         if out is not None:
             stack.enter_context(reserving(out, overwrite=overwrite))
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
-        saved = dict.fromkeys(("video", "recording", "figures"), False) if out is None else products
+        saved = dict.fromkeys(("recording", "figures"), False) if out is None else products
         runs = tuple(_run_of(target, beside, progress, saved, pictures=out is not None) for target in targets)
         if names:
             runs = tuple(replace(run, label=name) for run, name in zip(runs, names, strict=True))
@@ -150,7 +166,29 @@ def compare_flights(
         if out is None:
             return comparison
         with after(comparison, out):
-            return replace(comparison, page=write_comparison(runs, out, notes=notes, overwrite=overwrite))
+            page = write_comparison(runs, out, notes=notes, overwrite=overwrite)
+            comparison = replace(comparison, page=page)
+            if flown is not None:
+                flown(comparison)
+            if unfilmed := _unfilmed(runs, beside, products.get("video")):
+                note = f"the page without them: {short_path(page)}"
+                failed = add_films(unfilmed, note=note, progress=progress, fps=fps)
+                write_comparison(runs, out, notes=notes, overwrite=True)
+                for path, problem in failed.items():
+                    if products.get("video") and problem != INTERRUPTED:
+                        raise OutputError(path, f"{problem}; all else is there")
+            return comparison
+
+
+def _unfilmed(runs: Sequence[rundir.Run], beside: Path, video: bool | None) -> list[rundir.Run]:
+    """Return what to film: on request all flights that have no film, else those that were saved beside the page."""
+    directories = {run.directory: run for run in runs if video or run.directory.parent == beside}
+    filmed = {place for place in directories if (place / rundir.VIDEO_FILE).exists()}
+    return [
+        run
+        for place, run in directories.items()
+        if video is not False and place not in filmed and run.log.control.t.size and not run.log.interrupted
+    ]
 
 
 def place_of(target: Compared, targets: Sequence[Compared]) -> int:
@@ -213,6 +251,6 @@ def _run_of(
 
 
 def _saved(flight: Flight, place: Path, progress: Progress, products: Mapping[str, bool | None]) -> rundir.Run:
-    video, recording, figures = (products.get(name) for name in ("video", "recording", "figures"))
-    flight.save(place, video=video, recording=recording, figures=figures, progress=progress)
+    recording, figures = (products.get(name) for name in ("recording", "figures"))
+    flight.save(place, video=False, recording=recording, figures=figures, progress=progress)
     return rundir.load_run(place)

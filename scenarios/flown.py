@@ -6,7 +6,7 @@ import contextlib
 import logging
 import shlex
 import time as clock
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from html import escape
@@ -57,6 +57,8 @@ if TYPE_CHECKING:
     from scenarios.flight_plot import Overlay
 
 _log: Final = logging.getLogger("quadsim")
+_PRODUCTS: Final = {rundir.RECORDING_FILE: "recording", rundir.FIGURES_DIR: "figures", rundir.VIDEO_FILE: "video"}
+INTERRUPTED: Final = "interrupted (Ctrl-C)"
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -308,6 +310,7 @@ class Flight(Result):
         video: bool | None = None,
         recording: bool | None = None,
         figures: bool | None = None,
+        fps: int | None = None,
         progress: Progress = silent,
     ) -> Path:
         """Write the run directory, as `quadsim run` does: tables and summary first, then figures, recording and video.
@@ -318,22 +321,24 @@ class Flight(Result):
             video: whether to film the flight; None: if possible; True: raise if it fails.
             recording: whether to write `flight.rrd` for the rerun viewer, as for `video`.
             figures: whether to plot the flight, as for `video`.
+            fps: frames per second of the video; None: 30, or 20 from half a minute on.
             progress: called with (activity, done, total).
 
         Returns:
             The directory.
 
         Raises:
+            ParameterError: `fps` is out of range.
             RenderingUnavailableError: a video is requested but cannot be rendered.
             OutputError: the directory cannot be written or contains other files, the flight was read from a directory,
                 or a requested product failed; in that case the tables and the summary are written.
         """
         if self.recorded is not None:
             raise OutputError(directory, f"this flight is on disk already, in {self.directory}; copy that directory")
-        if video:
-            require_rendering()
+        require_film(video, fps)
         if self.write_tables(directory, overwrite=overwrite):
-            self.add_products(directory, video=video, recording=recording, figures=figures, progress=progress)
+            products = {"video": video, "recording": recording, "figures": figures}
+            self.add_products(directory, **products, fps=fps, progress=progress)
         return Path(directory)
 
     def write_tables(self, directory: str | Path, *, overwrite: bool = False) -> bool:
@@ -375,15 +380,17 @@ class Flight(Result):
         video: bool | None = None,
         recording: bool | None = None,
         figures: bool | None = None,
+        fps: int | None = None,
         progress: Progress = silent,
     ) -> None:
         """Add figures, recording and video to the run directory; arguments and errors as `save`."""
         target, started = absolute(directory), clock.perf_counter()
         before = rundir.read_summary(target)["wall_s"]["total"]
-        failed = _add_products(self, target, {"recording": recording, "figures": figures, "video": video}, progress)
+        requested = {"recording": recording, "figures": figures, "video": video}
+        failed = _add_products(self, target, requested, progress, fps)
         amend(target, {"wall_s": {"total": before + clock.perf_counter() - started}})
-        for name, problem in failed.items():
-            raise OutputError(target / name, f"{problem}; all else is there")
+        for path, problem in failed.items():
+            raise OutputError(path, f"{problem}; all else is there")
 
     @property
     def exit_status(self) -> int:
@@ -473,6 +480,7 @@ def write_run(
     products: Mapping[str, bool | None],
     *,
     overwrite: bool,
+    fps: int | None = None,
     progress: Progress | bool,
     flown: Callable[[Flight], object] | None,
 ) -> None:
@@ -483,22 +491,27 @@ def write_run(
     if more:
         with reporting(progress) as report:
             try:
-                flight.add_products(directory, progress=report, **products)
+                flight.add_products(directory, fps=fps, progress=report, **products)
             except OutputError as error:
                 if error.path.parent == directory:  # a product that was requested explicitly
                     error.result = flight
                 raise
 
 
-def require_rendering() -> None:
+def require_film(video: bool | None, fps: int | None = None) -> None:
     """Raise if a requested video cannot be made here, before the flight.
 
     Raises:
+        ParameterError: `fps` is out of range.
         RenderingUnavailableError: this machine cannot render.
     """
-    from quadsim.report.film.video import rendering_backend
+    if not video and fps is None:
+        return
+    from quadsim.report.film.video import frame_rate, rendering_backend
 
-    rendering_backend()
+    frame_rate(0.0, fps)
+    if video:
+        rendering_backend()
 
 
 def summarise(flight: Flight) -> dict[str, Any]:
@@ -556,52 +569,73 @@ def summarise(flight: Flight) -> dict[str, Any]:
 
 
 def _add_products(
-    flight: Flight, directory: Path, requested: Mapping[str, bool | None], progress: Progress
-) -> dict[str, str]:
+    flight: Flight, directory: Path, requested: Mapping[str, bool | None], progress: Progress, fps: int | None
+) -> dict[Path, str]:
     """Add recording, figures and video, made from the files; return which requested ones failed, and why.
 
     Ctrl-C stops the current one and skips the rest.
     """
-    run, failed = rundir.load_run(directory), dict[str, str]()
-    has_periods, interrupted = bool(run.log.control.t.size), flight.log.interrupted
-
-    @contextlib.contextmanager
-    def product(name: str, demanded: bool | None) -> Iterator[Path]:
-        nonlocal interrupted
-        try:
-            with adding(directory, products={name: "made"}) as folder:
-                yield folder
-        except KeyboardInterrupt:
-            interrupted, problem = True, "interrupted (Ctrl-C)"
-        except Exception as error:
-            problem = failure_line(error)
-            if demanded:
-                failed[name] = problem
-        else:
-            return
-        amend(directory, {"products": {name: problem}})
-        _log.warning("%s %s", name, problem)
-
+    run, failed = rundir.load_run(directory), dict[Path, str]()
+    has_periods = bool(run.log.control.t.size)
     if requested["recording"] is not False:
-        with product(rundir.RECORDING_FILE, requested["recording"]) as folder:
+        with _product(directory, rundir.RECORDING_FILE, failed) as folder:
             from quadsim.report.recording import write_recording
 
             progress("recording", 0, 1)
             write_recording(run, folder / rundir.RECORDING_FILE)
         progress("recording", 1, 1)
-    if requested["figures"] is not False and has_periods and (not interrupted or flight.log.interrupted):
-        with product(rundir.FIGURES_DIR, requested["figures"]) as folder:
+    if requested["figures"] is not False and has_periods and INTERRUPTED not in failed.values():
+        with _product(directory, rundir.FIGURES_DIR, failed) as folder:
             from quadsim.report.flight_figures import write_figures
 
             progress("figures", 0, 1)
             write_figures(run, folder / rundir.FIGURES_DIR)
             progress("figures", 1, 1)
+    interrupted = flight.log.interrupted or INTERRUPTED in failed.values()
     if requested["video"] is not False and has_periods and not interrupted:
-        with product(rundir.VIDEO_FILE, requested["video"]) as folder:
-            from quadsim.report.film.video import render_video
+        from scenarios.console import short_path
 
-            progress("video", 0, 1)  # until the renderer has started
-            render_video(
-                directory, folder / rundir.VIDEO_FILE, progress=lambda done, total: progress("video", done, total)
-            )
+        failed |= add_films([run], note=f"all else is in {short_path(directory)}", progress=progress, fps=fps)
+    demanded = {name: requested[product] for name, product in _PRODUCTS.items()}
+    return {path: problem for path, problem in failed.items() if demanded[path.name] and problem != INTERRUPTED}
+
+
+def add_films(
+    runs: Sequence[rundir.Run], *, note: str, progress: Progress = silent, fps: int | None = None
+) -> dict[Path, str]:
+    """Film flights into their run directories; return which films failed, and why.
+
+    Ctrl-C stops the current one and skips the rest.  `note` says, beside the estimated time, what can be opened
+    meanwhile.
+    """
+    from quadsim.report.film.video import Estimate, frame_count, frame_rate, render_video
+
+    failed: dict[Path, str] = {}
+    estimate = Estimate([frame_count(run.end, frame_rate(run.end, fps)) for run in runs], note)
+
+    def follow(done: int, total: int) -> None:
+        estimate(done, total)
+        progress("video", done, total)
+
+    for run in runs:
+        if INTERRUPTED not in failed.values():
+            with _product(run.directory, rundir.VIDEO_FILE, failed) as folder:
+                progress("video", 0, 1)  # until the renderer has started
+                render_video(run.directory, folder / rundir.VIDEO_FILE, progress=follow, fps=fps)
     return failed
+
+
+@contextlib.contextmanager
+def _product(directory: Path, name: str, failed: dict[Path, str]) -> Iterator[Path]:
+    """A folder for a product of a run directory; if it cannot be made, the summary and `failed` say why."""
+    try:
+        with adding(directory, products={name: "made"}) as folder:
+            yield folder
+        return
+    except KeyboardInterrupt:
+        problem = INTERRUPTED
+    except Exception as error:
+        problem = failure_line(error)
+    failed[directory / name] = problem
+    amend(directory, {"products": {name: problem}})
+    _log.warning("%s %s", name, problem)

@@ -12,7 +12,8 @@ TESTS = Path(__file__).parent
 def marked() -> Iterator[tuple[str, str, Path]]:
     """The mark and group of every `pytest.mark.MARK("group")` of these, and its file."""
     for path in sorted(TESTS.rglob("test_*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = path.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if "mark.slow" in text or "mark.witness" in text else ():
             match node:
                 case ast.Call(func=ast.Attribute(attr="slow" | "witness" as mark), args=[ast.Constant(value=group)]):
                     yield mark, group, path

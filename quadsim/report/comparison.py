@@ -15,9 +15,9 @@ import numpy as np
 
 from quadsim.controller import Phase, law_name
 from quadsim.errors import ParameterError, printable
-from quadsim.flight.audit import VERDICT_TEXT, Finding, Limit, SpaceLimit, worst_finding
+from quadsim.flight.audit import VERDICT_TEXT, Finding, Limit, SpaceLimit, limit_differences, worst_finding
 from quadsim.flight.rundir import findings_of
-from quadsim.report.table import ABSENT, Cell, Mark, QuantityRow, format_number
+from quadsim.report.table import ABSENT, Cell, Mark, QuantityRow, format_number, short_number
 from quadsim.space import Obstacle
 from quadsim.state import VELOCITY
 
@@ -85,6 +85,82 @@ def different_audits(first: str, second: str, differences: Sequence[str]) -> str
         f"Audited differently: {shown} (first: {first}, second: {second}). Compare their margins, not their verdicts, "
         "or audit all against the same constraints with --constraints."
     )
+
+
+def conclusion(runs: Sequence[Run], names: Sequence[str]) -> Cell:
+    """Return who holds the constraints, and who tracks closer by how much, as a sentence.
+
+    Errors are compared among completed flights of one course.
+    """
+    findings = [findings_of(run.summary) for run in runs]
+    marks = [_holding_mark(run, each) for run, each in zip(runs, findings, strict=True)]
+    mark = next((mark for mark in (Mark.BAD, Mark.WARN, Mark.NONE) if mark in marks), Mark.GOOD)
+    parts = [_who_holds(runs, names, findings), *filter(None, [_who_is_closer(runs, names)])]
+    return Cell(text=f"{'; '.join(parts)}.", mark=mark)
+
+
+def _holding_mark(run: Run, findings: Sequence[Finding]) -> Mark:
+    if run.summary["verdict"] in ("violated", "lost", "aborted"):
+        return Mark.BAD
+    if not findings:
+        return Mark.NONE
+    return Mark.GOOD if all(finding.verdict == "satisfied" for finding in findings) else Mark.WARN
+
+
+def _who_holds(runs: Sequence[Run], names: Sequence[str], findings: Sequence[Sequence[Finding]]) -> str:
+    """Name the flights that hold their constraints, and what the others do instead."""
+    holds, others = list[str](), list[str]()
+    for run, name, each in zip(runs, names, findings, strict=True):
+        failing = [finding.limit.name for finding in each if finding.verdict == "violated"]
+        missed = [finding.limit.name for finding in each if finding.verdict == "incomplete"]
+        verdict = run.summary["verdict"]
+        deeds = [f"was {verdict}"] if verdict in ("lost", "aborted") else []
+        deeds += [f"violates {_joined(failing)}"] if failing else []
+        deeds += [f"does not reach {_joined(missed)}"] if missed and not deeds else []
+        if verdict == "violated" and not failing and (reason := violated_otherwise(run.summary)):
+            deeds = [f"holds its constraints, {reason}"]
+        deeds += ["is not audited"] if not each and not deeds else []
+        if deeds:
+            others.append(f"{name} {' and '.join(deeds)}")
+        else:
+            holds.append(name)
+    alike = not any(limit_differences(runs[0].limits, run.limits, demands=False) for run in runs[1:])
+    one = "holds every constraint" if alike else "holds its own constraints"
+    held = one if len(holds) == 1 else one.replace("holds its", "hold their").replace("holds", "hold")
+    if not others:
+        text = {1: _joined(holds), 2: "both flights"}.get(len(holds), f"all {len(holds)} flights") + f" {held}"
+    else:
+        text = ", ".join([*([f"{_joined(holds)} {held}"] if holds else []), _joined(others)])
+    return text if text.startswith(tuple(names)) else text[0].upper() + text[1:]
+
+
+def _who_is_closer(runs: Sequence[Run], names: Sequence[str]) -> str | None:
+    """Compare position errors (RMS); None unless two completed flights or more followed one course."""
+    errors = {
+        name: (error, run)
+        for run, name in zip(runs, names, strict=True)
+        if (error := _position_error(run.summary)) is not None and run.summary["status"] == "completed"
+    }
+    if len(errors) < 2 or len(distinct_courses([run for _, run in errors.values()])) > 1:
+        return None
+    (first, (least, _)), (_, (second, _)), *_ = sorted(errors.items(), key=lambda entry: entry[1][0])
+    shown, other = map(_metres, (least, second))
+    if shown == other:
+        return f"position errors are equal: {shown} RMS"
+    closer, whose = ("closer", "") if len(errors) == 2 else ("closest", " of the next")
+    less = 100.0 * (1.0 - least / second)
+    return f"{first} tracks {closer}: {shown} RMS position error against {other}{whose} ({less:.0f} % less)"
+
+
+def _metres(length: float) -> str:
+    """A length [m] with its unit, also one that is only rounding."""
+    shown = short_number(length, "m")
+    return shown if shown.startswith("<") else f"{shown} m"
+
+
+def _joined(names: Sequence[str]) -> str:
+    """Join names as in a sentence."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def comparison_rows(runs: Sequence[Run]) -> list[QuantityRow]:

@@ -23,7 +23,7 @@ from quadsim.flight.rundir import (
 )
 from quadsim.outputs import optional, writing
 from quadsim.palette import line_colour
-from quadsim.report.comparison import comparison_rows, distinct_courses, mismatch, run_names
+from quadsim.report.comparison import comparison_rows, conclusion, distinct_courses, mismatch, run_names
 from quadsim.report.figure import Scene
 from quadsim.report.flight_figures import overview, page_figures
 from quadsim.report.page import PAGE_FILE, RunView, Section, render_page
@@ -89,7 +89,10 @@ def write_comparison(
         files = {"overlay of all runs (PNG)": OVERVIEW_FILE, "table (Markdown)": TABLE_FILE}
         files = {label: name for label, name in files.items() if (partial / name).exists()}
         notes = (*notes, *([warning] if courses > 1 else []))
-        page = render_page("comparison", title, [plots], notes=notes, runs=views, rows=rows, files=files)
+        verdict = conclusion(runs, names)
+        page = render_page(
+            "comparison", title, [plots], verdict=verdict, notes=notes, runs=views, rows=rows, files=files
+        )
         (partial / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
 

@@ -232,12 +232,11 @@ def replay(
     """
     from quadsim.outputs import run_directory
     from scenarios.campaign.campaign import compare_replay, recorded_flight
-    from scenarios.flown import require_rendering, write_run
+    from scenarios.flown import require_film, write_run
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
 
-    if video:
-        require_rendering()
+    require_film(video)
 
     if worst and flight is not None:
         raise ParameterError("", "--flight", flight, "absent with --worst")

@@ -195,14 +195,14 @@ class PairedComparison(Result):
         """
         sections = [
             Section(title="What is compared", text=(self.pairing,), tables=self.difference_tables),
-            Section(title="Which is better", text=(self.sentence,), tables=self.tables),
+            Section(title="Which is better", tables=self.tables),
         ]
-        title = f"{self.names[1]} against {self.names[0]}"
+        title, verdict = f"{self.names[1]} against {self.names[0]}", Cell(text=self.sentence)
         files = {file: file for file in (COMPARISON_FILE, TABLE_FILE)}
         texts = {
             COMPARISON_FILE: to_json(self.to_json()),
             TABLE_FILE: self.to_markdown(),
-            PAGE_FILE: render_page("campaign comparison", title, sections, files=files),
+            PAGE_FILE: render_page("campaign comparison", title, sections, verdict=verdict, files=files),
         }
         with writing(directory, overwrite=overwrite) as partial:
             for name, text in texts.items():

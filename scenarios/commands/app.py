@@ -258,6 +258,7 @@ def run(
     video: bool | None = None,
     recording: bool | None = None,
     figures: bool | None = None,
+    fps: Whole | None = None,
     controller: UserCode = None,
     forces: UserForces = (),
     reference: UserReference = None,
@@ -277,6 +278,7 @@ def run(
         video: film the flight (default: if possible).
         recording: write flight.rrd for the rerun viewer (default: if possible).
         figures: plot the flight (default: if possible).
+        fps: frames per second of the video (default: 30, or 20 from half a minute on).
         controller: as in `fly`.
         forces: as in `fly`.
         reference: as in `fly`.
@@ -299,12 +301,11 @@ def run(
     from quadsim.outputs import run_directory
     from scenarios import loading, user_code
     from scenarios.feasibility_check import hover_notes
-    from scenarios.flown import require_rendering, write_run
+    from scenarios.flown import require_film, write_run
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
 
-    if video:
-        require_rendering()
+    require_film(video, fps)
     parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces, reference)
     products = {"video": video, "recording": recording, "figures": figures}
     for note in hover_notes(parts[0]):
@@ -312,7 +313,7 @@ def run(
     with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory:
         with reporting(progress) as report:
             flight = replace(Rollout(*parts).fly(report), directory=directory)
-        write_run(flight, directory, products, overwrite=overwrite, progress=progress, flown=flown)
+        write_run(flight, directory, products, overwrite=overwrite, fps=fps, progress=progress, flown=flown)
     return flight
 
 
@@ -476,11 +477,14 @@ def compare(
     video: bool | None = None,
     recording: bool | None = None,
     figures: bool | None = None,
+    fps: Whole | None = None,
     progress: Watched = True,
+    flown: Flown = None,
 ) -> Result:
     """Compare flights, or two campaigns flight by flight: table, figures, HTML page.
 
-    With `out`, scenarios are flown into run directories below OUT-runs, beside the page.
+    With `out`, scenarios are flown into run directories below OUT-runs, beside the page.  The page is there before the
+    films, which are added to it.
 
     Args:
         targets: run directories, scenarios to fly, or the directories of two campaigns.
@@ -490,14 +494,17 @@ def compare(
             apart).
         markdown: print the table as Markdown.
         constraints: one of the targets, whose constraints and tolerances all are audited against, from their tables.
-        video: film the scenarios that it flies (default: if possible).
-        recording: write their flight.rrd for the rerun viewer (default: if possible).
+        video: film every flight that has no film (default: those that it flies, if possible).
+        recording: write flight.rrd for the rerun viewer, of the scenarios that it flies (default: if possible).
         figures: plot them (default: if possible).
+        fps: frames per second of the films (default: 30, or 20 from half a minute on).
         progress: as in `fly`.
+        flown: called with the comparison of flights as soon as its page is written, before the films.
 
     Raises:
         InputError: a target is neither a run, a scenario nor a campaign, or the names are wrong; nothing was flown.
-        OutputError: the page cannot be written.
+        OutputError: the page, or a requested film, cannot be written; in the second case its `result` is the
+            comparison.
         RenderingUnavailableError: a video is requested but cannot be rendered; nothing was flown.
 
     Examples:
@@ -528,9 +535,10 @@ def compare(
             directories, page, overwrite=overwrite, names=names, constraints=constraints
         )
     else:
-        options: dict[str, Any] = {"names": names, "products": products, "constraints": constraints}
+        options: dict[str, Any] = {"names": names, "products": products, "constraints": constraints, "fps": fps}
+        first = None if markdown else flown
         with reporting(progress) as report:
-            compared = compare_flights(targets, page, report, overwrite=overwrite, **options)
+            compared = compare_flights(targets, page, report, overwrite=overwrite, flown=first, **options)
     return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared
 
 
@@ -599,6 +607,7 @@ def film(
     out: File | None = None,
     overwrite: Flag = False,
     workers: Whole | None = None,
+    fps: Whole | None = None,
     progress: Watched = True,
 ) -> Path:
     """Film a finished run.
@@ -608,6 +617,7 @@ def film(
         out: MP4 or GIF file (default: flight.mp4 in the run directory, replacing an earlier one).
         overwrite: replace an existing file.
         workers: rendering processes (default: one per core).
+        fps: frames per second (default: 30, or 20 from half a minute on; 8 of a GIF).
         progress: as in `fly`.
 
     Returns:
@@ -628,7 +638,7 @@ def film(
     """
     from quadsim.flight import rundir
     from quadsim.outputs import absolute, adding
-    from quadsim.report.film.video import render_gif, render_video
+    from quadsim.report.film.video import Estimate, render_gif, render_video
     from scenarios.progress import reporting
     from scenarios.reaudit import reaudit
 
@@ -640,8 +650,13 @@ def film(
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
     with reporting(progress) as report:
-        make = render_video if path.suffix == ".mp4" else render_gif
-        render = partial(make, directory, workers=workers, progress=partial(report, "video"))
+        make, estimate = render_video if path.suffix == ".mp4" else render_gif, Estimate()
+
+        def follow(done: int, total: int) -> None:
+            estimate(done, total)
+            report("video", done, total)
+
+        render = partial(make, directory, workers=workers, fps=fps, progress=follow)
         if path.parent != directory:
             render(path, overwrite=overwrite)
         else:  # a product of the run, which its summary lists

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     UserReference: TypeAlias = Callable[[float], ArrayLike] | None
     Fields: TypeAlias = Mapping[str, Any] | None
     Watched: TypeAlias = Progress | bool
-    Flown: TypeAlias = Callable[[Flight], object] | None
+    Flown: TypeAlias = Callable[[Any], object] | None
 else:  # as cyclopts reads them: it resolves all annotations where a command is declared
 
     def one_of(names: Callable[[], Sequence[str]]) -> Any:

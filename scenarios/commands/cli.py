@@ -39,15 +39,20 @@ def _parse(
     if json and "progress" in ignored:
         bound.arguments["progress"] = False
     if not json and "flown" in ignored:
-        bound.arguments["flown"] = _show_verdict
+        bound.arguments["flown"] = _Verdict()
     return command, bound, json
 
 
-def _show_verdict(flight: Result) -> None:
-    """Print a flight before its figures and its film are made."""
-    from scenarios import console
+class _Verdict:
+    """Prints a result before its figures and its films are made."""
 
-    console.show(flight.shown())
+    shown = False
+
+    def __call__(self, result: Result) -> None:
+        from scenarios import console
+
+        self.shown = True
+        console.show(result.shown())
 
 
 def _stdout_for(json: bool) -> contextlib.AbstractContextManager[None]:
@@ -90,13 +95,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parsed: Any = app.meta(words, exit_on_error=False, print_error=False, result_action="return_value")
             if parsed is not None:  # as after --help
                 command, bound, json = parsed
-                judged = "flown" in bound.arguments
+                verdict = bound.arguments.get("flown")
                 try:
                     with _stdout_for(json):
                         result = command(*bound.args, **bound.kwargs)
-                    status = _show(result, json, judged=judged)
+                    status = _show(result, json, judged=verdict is not None and verdict.shown)
                 except QuadsimError as error:  # a failure may carry a partial result
-                    _show(error.result, json, judged=judged)
+                    _show(error.result, json, judged=verdict is not None and verdict.shown)
                     raise
         sys.stdout.flush()
         return status

@@ -92,11 +92,37 @@ def begin(path: Path, *, start: float, initial: Array) -> Course:
     )
 
 
+def repeated(course: Course, period: float, *, until: float) -> Course:
+    """Return a course that starts again every `period` [s], backwards every other time if it ends elsewhere.
+
+    It states positions only.  Jumps and kinks are those before `until` [s].
+    """
+    first, last = course.sample(np.array([0.0, period]))
+    closed = math.dist(first[:3], last[:3]) < CLOSEST and abs(math.remainder(last[3] - first[3], TURN)) < CLOSEST
+
+    def sample(t: Array) -> Array:
+        rounds, since = np.divmod(np.round(t, 9), period)
+        return course.sample(since if closed else np.where(rounds % 2.0 == 0.0, since, period - since))
+
+    def spread(times: Sequence[float]) -> tuple[float, ...]:
+        within = [time for time in times if time <= period]
+        starts = [(i * period, closed or i % 2 == 0) for i in range(math.ceil(until / period))]
+        each = {start + (time if forward else period - time) for start, forward in starts for time in within}
+        return tuple(sorted(time for time in each if time < until))
+
+    kinks = spread((0.0, *course.kinks, period))
+    return replace(course, sample=sample, jumps=spread(course.jumps), kinks=kinks, derivatives=None, end=math.inf)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Filtered:
     """A table `[reference]`, in the units of files."""
 
     response_time: Annotated[NonNegative, doc("[s] tau_r of Eq. (31); 0 for no filter")] = 0.0
+    repeat: Annotated[
+        Annotated[float, Ge(0.1), Le(1e6)] | None,
+        doc("[s] time after which the course starts again, or turns back if it is elsewhere by then; absent: never"),
+    ] = None
 
     def build(self, initial: Array, gravity: float) -> Course:
         """Return the course before its filter, from the initial pose (4,) x, y, z [m], yaw [rad]; gravity in m/s^2.

@@ -45,16 +45,42 @@ async function ask() {{
 }}
 ask()
 </script>"""
+DEAD_ZONE: Final = 0.15  # share of its way that a stick may be off centre
+_STEPS: Final = 4  # presses of a key that a stick at its end stands for
+_GAMEPAD: Final = f"""<script>
+const sticks = [{{axis: 1, back: "w", on: "s"}}, {{axis: 0, back: "a", on: "d"}}, {{axis: 3, back: "r", on: "f"}}]
+const held = [0, 0, 0]
+function press(key) {{
+  const event = {{key, code: "Key" + key.toUpperCase(), bubbles: true, cancelable: true}}
+  for (const kind of ["keydown", "keyup"]) document.documentElement.dispatchEvent(new KeyboardEvent(kind, event))
+}}
+function presses(value) {{
+  const beyond = Math.max(0, Math.abs(value) - {DEAD_ZONE}) / (1 - {DEAD_ZONE})
+  return Math.sign(value) * Math.round({_STEPS} * beyond)
+}}
+function steer() {{
+  const pad = [...navigator.getGamepads()].find((each) => each?.connected)
+  const before = held.some(Boolean)
+  sticks.forEach(({{axis, back, on}}, i) => {{
+    const change = Math.sign(presses(pad?.axes[axis] ?? 0) - held[i])
+    if (change) press(change > 0 ? on : back)
+    held[i] += change
+  }})
+  if (before && !held.some(Boolean)) press("x")
+}}
+if (navigator.getGamepads) setInterval(steer, 50)
+</script>"""
+"""Sticks press the keys that steer, as often as they are deflected; centred again, they stop the set-point."""
 
 
 def dressed(page: str, title: str, *, served: bool = False) -> str:
     """Return viser's page with our title, icon and sky, in the theme of the system.
 
-    Where it is `served`, it asks whether it may connect, and shows the reason if it may not.
+    Where it is `served`, it asks whether it may connect, and shows the reason if it may not; a gamepad steers.
     """
     page = re.sub('data:image/svg[^"]*', "data:image/svg+xml," + quote(_ICON), page, count=1)
     page = re.sub("<title>.*?</title>", lambda found: f"<title>{escape(title)}</title>", page, count=1)
-    return page.replace("</head>", f"{_HEAD}{_ASKING if served else ''}</head>", 1)
+    return page.replace("</head>", f"{_HEAD}{_ASKING + _GAMEPAD if served else ''}</head>", 1)
 
 
 def airframe(model: mujoco.MjModel) -> Iterator[tuple[str, tuple[float, ...], trimesh.Trimesh]]:

@@ -14,8 +14,9 @@ import socket
 import time as clock
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import Future
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from typing import Any, Final, TypeVar
@@ -26,11 +27,11 @@ from viser import _messages
 
 from quadsim.controller import law_name
 from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.palette import CYCLE
+from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import least_range
 from quadsim.rotation import quaternion_to_euler
 from quadsim.sim.physics import Period
-from quadsim.state import POSITION, wrapped
+from quadsim.state import POSITION, Array, wrapped
 from scenarios.flown import Flight
 from scenarios.live import readout
 from scenarios.live.controls import ControllerTab, Steering, Widgets, disturb
@@ -47,11 +48,13 @@ _EVERY: Final = 4
 _SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "4")
 _STRANGE: Final = 5.0  # [s] after which a page's camera is where a person has turned it
 _PLOTS: Final = {
-    "Position error [m]": ("x", "y", "z"),
-    "Tilt and yaw error [deg]": ("tilt", "yaw"),
-    "Rotor speeds [rad/s]": ("1", "2", "3", "4"),
-    "Step [ms]": ("step",),
+    "Position error [m]": {"x": "x_error", "y": "y_error", "z": "z_error"},
+    "Attitude [deg]": {"roll": "roll", "pitch": "pitch", "tilt": "tilt", "yaw error": "yaw_error"},
+    "Rotor speeds [rad/s]": dict.fromkeys(("1", "2", "3", "4"), "speed"),
+    "Step [ms]": {"step": ""},
 }
+"""The signal that a constraint on each curve has, by its label; the step has its deadline."""
+_BOUND: Final = {"label": "bound", "stroke": COLOUR.bound, "dash": (6.0, 4.0), "width": 1.0}
 _TIME: Final = {"x": {"time": False}}  # not a date
 T = TypeVar("T")
 
@@ -147,18 +150,22 @@ class Page:
                 self._widgets.follow()
                 loops = [flight.loop for flight in self._session.flights[1:]]
                 lost = [f"{law_name(loop.controller.name)} lost: {loop.reason}" for loop in loops if loop.reason]
-                states = [(value[3], math.hypot(*value[:3])) for value in values if value is not None]
+                states = [(value[5], math.hypot(*value[:3])) for value in values if value is not None]
                 self._numbers.content = readout.readings(frame, states, lost)
                 audited = {limit.name for limit in self._session.limits}
                 self._margins.content = self._constraints.rows(frame, audited)
             if (frame.k % (2 * _EVERY) == 0 or self._pace.paused) and len(self._history) > 1:
                 time, *rows = np.array(self._history)[::2].T  # plots are the most of what is sent
-                left = iter(rows)
-                for plot, (title, names) in zip(self._plots, _PLOTS.items(), strict=True):
-                    curves = list(islice(left, len(names)))
+                left, ends = iter(rows), {limit.name: limit.stop for limit in self._session.limits}
+                for plot, bounds, (title, names) in zip(self._plots, self._bounds, _PLOTS.items(), strict=True):
+                    lines = [bound.curve(time, ends) for bound in bounds]
+                    curves = [*islice(left, len(names)), *lines]
+                    series = _series(names, [bool(np.isfinite(line).any()) for line in lines])
+                    if series != plot.series:  # which draws the plot anew
+                        plot.series = series
                     least = least_range(curves, title[title.index("[") + 1 : -1])
                     scales = _TIME if least is None else {**_TIME, "y": {"range": least}}
-                    if scales != plot.scales:  # which draws the plot anew
+                    if scales != plot.scales:  # likewise
                         plot.scales = scales
                     plot.data = (time, *curves)
 
@@ -202,15 +209,16 @@ class Page:
         with tabs.add_tab("Controller"):
             self._controller = ControllerTab(self._widgets, others, self._doing)
         with tabs.add_tab("Plots"):
+            self._bounds = [_lines_of(self._session, title) for title in _PLOTS]
             self._plots = [
                 gui.add_uplot(
-                    (np.array([0.0, 1.0]), *([np.zeros(2)] * len(names))),
-                    ({"label": "t [s]"}, *({"label": n, "stroke": c} for n, c in zip(names, CYCLE, strict=False))),
+                    (np.array([0.0, 1.0]), *([np.zeros(2)] * (len(names) + len(bounds)))),
+                    _series(names, [False] * len(bounds)),
                     scales=_TIME,
                     aspect=1.9,
                     title=title,
                 )
-                for title, names in _PLOTS.items()
+                for (title, names), bounds in zip(_PLOTS.items(), self._bounds, strict=True)
             ]
         self._announce()
 
@@ -342,15 +350,49 @@ class Page:
                     widget.visible = client != driver
 
 
+def _series(names: Collection[str], bounds: Collection[bool]) -> tuple[dict[str, Any], ...]:
+    """The look of a plot's curves, and of its bounds, which are shown or not: one without values spoils the axis."""
+    curves = [{"label": name, "stroke": colour} for name, colour in zip(names, CYCLE, strict=False)]
+    return {"label": "t [s]"}, *curves, *({**_BOUND, "show": shown} for shown in bounds)
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A line in a plot."""
+
+    name: str  # of its constraint; empty of the deadline
+    value: float
+    start: float  # [s]
+
+    def curve(self, time: Array, ends: Mapping[str, float]) -> Array:
+        """(M,) its value at times [s], NaN where it does not hold; `ends` has those of the constraints in force [s]."""
+        until = ends.get(self.name, -math.inf) if self.name else math.inf
+        return np.where((time >= self.start) & (time <= until), self.value, np.nan)
+
+
+def _lines_of(session: Session, title: str) -> list[_Line]:
+    """Return the bounds of a plot, each once."""
+    if title.startswith("Step"):
+        return [_Line("", 1e3 * session.period, 0.0)]
+    limits = [limit for limit in session.limits if limit.signal in _PLOTS[title].values()]
+    ends = {
+        (value, limit.start, limit.stop): _Line(limit.name, value, limit.start)
+        for limit in limits
+        for value in (limit.lower, limit.upper)
+    }
+    return [bound for bound in ends.values() if math.isfinite(bound.value)]
+
+
 def _values(sample: Period) -> tuple[float, ...]:
-    """Return what is plotted of a period, in the order of `_PLOTS`."""
+    """Return what is plotted of a period, in the order of `_PLOTS`; angles at their largest."""
     observed, (_, x, y, _) = sample.observation, sample.attitude.T
     up = 1.0 - 2.0 * (x**2 + y**2)
     tilt = math.degrees(math.acos(np.clip(up.min(), -1.0, 1.0)))
-    yaw = quaternion_to_euler(sample.attitude[-1:])[0, 2] - observed.reference[3]
+    euler = quaternion_to_euler(sample.attitude)
+    roll, pitch = (math.degrees(max(angles, key=abs)) for angles in euler[:, :2].T.tolist())
     error = observed.truth[[*POSITION]] - observed.reference[:3]
-    turned = math.degrees(wrapped(float(yaw)))
-    return (*error, tilt, turned, *sample.speeds, 1e3 * sample.step_s)
+    turned = math.degrees(wrapped(float(euler[-1, 2] - observed.reference[3])))
+    return (*error, roll, pitch, tilt, turned, *sample.speeds, 1e3 * sample.step_s)
 
 
 @contextlib.contextmanager

@@ -31,7 +31,8 @@ OUTPUT: Final = (
 STEER: Final = (
     "Type a set-point, drag its arrows, or "
     '<span class="touch">tap the floor.</span><span class="mouse">shift-click the floor. '
-    "Keys W, S, A, D, R, F fly the set-point along x, y and z; X stops it.</span>"
+    "Keys W, S, A, D, R, F fly the set-point along x, y and z; X stops it.</span> So do the sticks of a gamepad: the "
+    "left one x and y, the right one z."
 )
 
 READOUT_STYLE: Final = f"""<style>

@@ -6,6 +6,7 @@ scenario and on the periods at which they act alone.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping
@@ -136,8 +137,10 @@ class Session:
     """
 
     def __init__(self, scenario: Scenario, against: AnyController | None = None) -> None:
-        self.scenario, self._against = preferring_core(scenario), against
+        self.scenario, self._against = looping(preferring_core(scenario)), against
         self._effects = Assembly(self.scenario).effects
+        repeat = self.scenario.reference.repeat
+        self._round = None if repeat is None else round(repeat / self.period)  # periods until the course starts again
         self._queue: deque[tuple[Mapping[str, Any], str, Successor | None, str]] = deque()
         self.flights: tuple[Rollout, ...] = ()
         self.reset()
@@ -217,6 +220,9 @@ class Session:
                     self._apply(table, successor)
                 except InputError as error:
                     refused.append(f"{name}{error}")
+        if not self._steered and self.k == self._round:  # an arrival, say, was one at the end of the first round
+            for flight in self.flights:
+                flight.leave_course()
         pull, shown = self._hold(refused), []
         for flight in self.flights:
             entry: tuple[Period | None, Mapping[str, float], Array | None] = None, {}, None
@@ -348,6 +354,22 @@ class Session:
             self._held = _Hand()
             return np.zeros(3)
         return force
+
+
+def looping(scenario: Scenario) -> Scenario:
+    """Return a scenario whose course starts again when it has ended, but not before the scenario has.
+
+    Courses that never end, do not move, or state velocities stay as they are.
+    """
+    course, period = Assembly(scenario).course, scenario.control_period
+    moves = bool(np.ptp(course.sample(period * np.arange(scenario.periods + 1, dtype=np.float64)), axis=0).any())
+    end = max((scenario.duration, *course.jumps, *course.kinks)) if math.isinf(course.end) else course.end
+    if scenario.reference.repeat is not None or course.derivatives is not None or not moves or math.isinf(end):
+        return scenario
+    length = round(period * math.ceil(max(scenario.duration, end) / period - 1e-6), 9)
+    reference = copy.copy(scenario.reference)  # with the content that a table may have in memory
+    vars(reference).update(repeat=length)
+    return scenario.altered(reference=reference)
 
 
 def read_script(path: str | Path) -> Script:

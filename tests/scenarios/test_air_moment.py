@@ -53,6 +53,8 @@ def position_error(flight: Flight) -> float:
     return math.hypot(*(flight.metrics[f"rmse.{axis}"] for axis in "xyz"))
 
 
+@pytest.mark.slow("air")
+@pytest.mark.witness("air")
 def test_geometric_control_that_knows_it_follows_a_figure_eight_ten_times_as_closely() -> None:
     without, knowing = (quadsim.fly(figure_eight(**known), progress=False) for known in ({}, {"moment": True}))
     assert (without.outcome, knowing.outcome) == ("satisfied", "satisfied")
@@ -60,6 +62,7 @@ def test_geometric_control_that_knows_it_follows_a_figure_eight_ten_times_as_clo
     assert position_error(knowing) < 0.1 * position_error(without)
 
 
+@pytest.mark.slow("air")
 @pytest.mark.parametrize("inputs", ["thrust", "speed"])
 def test_nonlinear_mpc_that_predicts_it_follows_a_circle_twenty_times_as_closely(inputs: str) -> None:
     """At 4 m/s; without it, the error is that of a torque that nothing balances."""
@@ -78,6 +81,7 @@ def test_nonlinear_mpc_that_predicts_it_follows_a_circle_twenty_times_as_closely
     assert errors[1] < 0.05 * errors[0]
 
 
+@pytest.mark.slow("air")
 def test_its_observer_does_not_estimate_again_what_it_knows() -> None:
     """Of the observed torque, averaged over the flight, hardly anything is left."""
     left = []
@@ -93,6 +97,7 @@ def test_its_observer_does_not_estimate_again_what_it_knows() -> None:
     assert left[1] < 0.2 * left[0]
 
 
+@pytest.mark.slow("air")
 def test_the_estimator_that_knows_it_estimates_rates_without_a_gyro_better() -> None:
     sensing = {
         "sensors": {"position": {"rate": 100.0, "noise": 0.01}, "attitude": {"rate": 50.0, "noise": 1.0}},
@@ -114,6 +119,7 @@ def rate_error(log: FlightLog) -> float:
     return float(np.sqrt(np.mean(np.square(estimated - true)[50:, :2])))
 
 
+@pytest.mark.slow("air")
 def test_linear_mpc_takes_it_through_its_disturbance_also_in_wind() -> None:
     """Hovering in wind, J^-1 m W v is a constant torque: the observer finds it, and the offset disappears."""
     wind, vehicle = (3.0, -2.0), quadsim.load_vehicle("hummingbird")

@@ -20,7 +20,7 @@ from quadsim import __version__
 from quadsim.assets import vehicle_names
 from quadsim.core import library
 from quadsim.core.build import LIBRARY
-from quadsim.errors import RenderingUnavailableError
+from quadsim.errors import OutputError, RenderingUnavailableError
 from quadsim.flight import rundir
 from scenarios import flown
 from scenarios.campaign.plan import read_campaign
@@ -321,6 +321,45 @@ def test_compare_leaves_out_what_it_is_told_to_and_names_its_columns(
     assert ">A</h3>" in (here / "page" / "index.html").read_text()
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_the_page_is_there_before_its_films_which_are_added_to_it(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "short.toml").write_text('base = "hover"\nname = "short"\nduration = 0.2\nconstraints = []\n')
+    page, seen, rates = here / "page" / "index.html", list[tuple[str, str]](), list[int | None]()
+
+    def render(run: Path, path: Path, *, progress: Any, fps: int | None) -> None:
+        seen.append((page.read_text(), capsys.readouterr().out))
+        rates.append(fps)
+        if len(seen) == 2:
+            raise OutputError(path, "the disk is full")
+        path.write_bytes(b"film")
+
+    monkeypatch.setattr("quadsim.report.film.video.render_video", render)
+    monkeypatch.setattr("quadsim.report.film.video.rendering_backend", lambda: "egl")
+    products = ["--no-recording", "--no-figures", "--fps", "12"]
+    assert main(["compare", "short.toml", "short.toml", "--out", "page", *products]) == EXIT_DONE
+    (first, printed), (again, nothing) = seen
+    assert first == again
+    assert "<video" not in first
+    assert printed.startswith("Both flights hold every constraint; ")
+    assert nothing == ""
+    assert page.read_text().count("<video") == 1
+    done = capsys.readouterr()
+    assert done.out.splitlines()[-1] == "open page/index.html"
+    assert "flight.mp4 failed: " in done.err
+    assert rates == [12, 12]
+    made = [rundir.read_summary(here / "page-runs" / name)["products"]["flight.mp4"] for name in ("short", "short-2")]
+    assert made == ["made", made[1]]
+    assert "the disk is full" in made[1]
+    runs = ["compare", "page-runs/short", "page-runs/short-2", "--out", "again"]
+    assert main(runs) == EXIT_DONE
+    assert len(seen) == 2, "nothing is filmed that was not flown, unless asked for"
+    assert main([*runs, "--overwrite", "--video"]) == EXIT_DONE
+    assert len(seen) == 3, "the one without a film"
+    assert (here / "again" / "index.html").read_text().count("<video") == 2
+
+
 @pytest.mark.slow("commands")
 def test_compare_prints_markdown(hover_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", str(hover_directory), "--out", "page", "--markdown"]) == EXIT_DONE
@@ -340,6 +379,10 @@ WRONG: dict[str, tuple[list[str], str]] = {
     "one name for two flights": (
         ["compare", "hover", "gust", "--name", "mine", "--out", "page"],
         "names must be 2 different texts, one for each target; got ['mine']",
+    ),
+    "a film without frames": (
+        [*RUN, "--fps", "0"],
+        "--fps must be a whole number from 1 to 120; got 0",
     ),
     "a film of a comparison that writes nothing": (
         ["compare", "hover", "gust", "--video"],

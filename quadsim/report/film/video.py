@@ -10,11 +10,13 @@ import contextlib
 import functools
 import itertools
 import json
+import logging
 import os
 import selectors
 import shutil
 import subprocess
 import sys
+import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -42,6 +44,10 @@ _PROBE: Final = (
 _PROBE_SECONDS: Final = 60.0
 _LEAST_FREE_BYTES: Final = 1024 * 1024
 _FEWEST_FRAMES: Final = 30  # smallest number of frames that justifies a further worker
+_LONG: Final = 30.0  # from this length on [s] a film has fewer frames per second
+_TIMED: Final = 2.0  # for how long frames are timed before an estimate [s]
+FPS_RANGE: Final = (1, 120)  # frames per second that a film may have
+_log: Final = logging.getLogger("quadsim")
 
 FrameProgress = Callable[[int, int], None]
 
@@ -87,6 +93,62 @@ def worker_count(frames: int, most: int | None = None) -> int:
     return max(1, min(most, frames // _FEWEST_FRAMES))
 
 
+def frame_rate(length: float, fps: int | None = None) -> int:
+    """Return `fps`, or else the default of a film of a length [s]: 30 frames per second, 20 of a long one.
+
+    Raises:
+        ParameterError: `fps` is no whole number within `FPS_RANGE`.
+    """
+    if fps is None:
+        return 30 if length < _LONG else 20
+    least, most = FPS_RANGE
+    if isinstance(fps, bool) or not isinstance(fps, int) or not least <= fps <= most:
+        raise ParameterError("", "--fps", fps, f"a whole number from {least} to {most}")
+    return fps
+
+
+def frame_count(length: float, fps: int) -> int:
+    """Number of frames of a film of a length [s]."""
+    return max(1, round(length * fps))
+
+
+class Estimate:
+    """Tells the user once, from the time that the first frames take, how long films will take.
+
+    Args:
+        frames: of each film, in their order; a single film may leave it to its `total`.
+        note: what can be opened meanwhile.
+    """
+
+    def __init__(self, frames: Sequence[int] = (), note: str = "") -> None:
+        self._frames, self._note, self._film, self._told = frames, note, 0, False
+        self._begun = clock.monotonic()
+        self._first: tuple[float, int] | None = None  # when frames of this film were first reported, and how many
+
+    def __call__(self, done: int, total: int) -> None:
+        """Take note of the frames done of the present film, of its `total`."""
+        now = clock.monotonic()
+        if self._told or not done:
+            return
+        if self._first is None:
+            self._first = now, done
+        since, before = self._first
+        if done == total:
+            self._film, self._begun, self._first = self._film + 1, now, None
+        elif done > before and now - since >= _TIMED:
+            starts, per_frame = since - self._begun, (now - since) / (done - before)
+            further = self._frames[self._film + 1 :]
+            seconds = (total - done + sum(further)) * per_frame + len(further) * starts
+            name, note = "films" if len(self._frames) > 1 else "film", self._note and f"; {self._note}"
+            _log.info("%s: about %s%s", name, rough_time(seconds), note)
+            self._told = True
+
+
+def rough_time(seconds: float) -> str:
+    """Format a time that is only estimated: to 5 s, or to the minute from 90 s on."""
+    return f"{round(seconds / 60.0)} min" if seconds >= 90.0 else f"{max(5, 5 * round(seconds / 5.0))} s"
+
+
 def render_video(
     run_directory: Path,
     path: Path,
@@ -95,22 +157,24 @@ def render_video(
     progress: FrameProgress | None = None,
     width: int = 1280,
     height: int = 720,
-    fps: int = 30,
+    fps: int | None = None,
     overwrite: bool = False,
 ) -> None:
     """Film a run as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all.
 
     Width and height are even [pixels].  `workers` is how many processes render, at most; the machine's cores when None.
-    `progress` is called with frames done and frames in all, in the caller's thread.
+    `progress` is called with frames done and frames in all, in the caller's thread.  `fps` is in frames per second;
+    None as in `frame_rate`.
 
     Raises:
         FileError: the run cannot be read, or holds nothing to film.
         OutputError: the film cannot be written, or a renderer failed; nothing is left behind.
-        ParameterError: there are to be no workers.
+        ParameterError: there are to be no workers, or `fps` is outside `FPS_RANGE`.
         RenderingUnavailableError: this machine cannot render.
     """
     end = film_end(load_run(run_directory))
-    shot = Shot(run=str(run_directory), width=width, height=height, fps=fps, count=max(1, round(end * fps)))
+    rate = frame_rate(end, fps)
+    shot = Shot(run=str(run_directory), width=width, height=height, fps=rate, count=frame_count(end, rate))
     with _making(path, overwrite) as new:
         _film(shot, new, workers, progress)
 
@@ -121,15 +185,16 @@ def render_gif(
     *,
     workers: int | None = None,
     progress: FrameProgress | None = None,
+    fps: int | None = None,
     overwrite: bool = False,
 ) -> None:
     """Film a run as a small looping GIF without captions, six times as fast; arguments and errors as `render_video`.
 
-    It is rendered at twice its size and scaled down, which smooths its edges.
+    It is rendered at twice its size and scaled down, which smooths its edges.  Its `fps` is 8 by default.
     """
-    fps, speed = 8, 6.0
-    count = max(1, round(film_end(load_run(run_directory)) * fps / speed))
-    shot = Shot(run=str(run_directory), width=960, height=540, fps=fps, speed=speed, count=count, captions=False)
+    speed, rate = 6.0, frame_rate(0.0, 8 if fps is None else fps)
+    count = frame_count(film_end(load_run(run_directory)) / speed, rate)
+    shot = Shot(run=str(run_directory), width=960, height=540, fps=rate, speed=speed, count=count, captions=False)
     with _making(path, overwrite) as new:
         film = new.with_suffix(".mp4")
         backend = _film(shot, film, workers, progress)

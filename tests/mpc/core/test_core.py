@@ -54,7 +54,10 @@ def worst(problem: Problem, answer: Answer) -> float:
     return max(residuals.primal, residuals.dual, residuals.stationarity / scale, residuals.complementarity / scale)
 
 
-@pytest.mark.parametrize(("name", "draws"), [("paper-constrained", 70), ("robust", 40), ("robust-lag50", 10)])
+@pytest.mark.parametrize(
+    ("name", "draws"),
+    [("paper-constrained", 70), pytest.param("robust", 40, marks=pytest.mark.slow("core")), ("robust-lag50", 10)],
+)
 def test_drawn_states_are_answered_cold_and_warm_as_by_daqp(name: str, draws: int) -> None:
     """Warm, from the active set of another state altogether."""
     rng, problem = np.random.default_rng(1), paper_problem(name)

@@ -35,8 +35,14 @@ def both(scenario: Scenario) -> tuple[Flight, Flight]:
     """Its flight by the law in Python, with the core as solver, and by the law in C."""
     by_python = {"controller.compiled": False} if scenario.controller.type == "unconstrained" else PYTHON
     python, c = (quadsim.fly(scenario.replace(law), progress=False) for law in (by_python, COMPILED))
-    assert c.summary["controller"]["solver"] == "compiled"
+    assert c.solver == "compiled"
     return python, c
+
+
+def why(flight: Flight) -> str | None:
+    """The sentence about its first QP without an answer; its remedies, which are flown, have tests of their own."""
+    diagnosis = flight.undiagnosed_run.summary["diagnosis"]
+    return None if diagnosis is None else diagnosis["sentence"]
 
 
 @pytest.mark.slow("core")
@@ -85,7 +91,7 @@ def test_without_an_optimum_both_fall_back_alike(failure: str) -> None:
     assert [*control.status] == [*expected.status]
     assert [*control.answered_by] == [*expected.answered_by]
     assert control.speeds == pytest.approx(expected.speeds, abs=1e-5)
-    assert (c.summary.get("diagnosis") or {}).get("sentence") == (python.summary.get("diagnosis") or {}).get("sentence")
+    assert why(c) == why(python)
     assert c.outcome == python.outcome
 
 
@@ -94,7 +100,7 @@ def test_the_papers_plan_is_held_to_its_end_and_diagnosed() -> None:
     assert c.log.reason == python.log.reason
     assert "after holding the last plan" in (c.log.reason or "")
     assert [*c.log.control.fallback] == [*python.log.control.fallback]
-    assert c.summary["diagnosis"]["sentence"] == python.summary["diagnosis"]["sentence"]
+    assert why(c) == why(python) is not None
 
 
 def solver(name: str, changes: dict[str, object]) -> str:

@@ -121,6 +121,7 @@ def test_without_faults_the_flight_is_the_same_to_the_last_bit(vehicle: Vehicle,
     np.testing.assert_allclose(log.predicted, undisturbed.predicted[:periods], atol=1e-6)
 
 
+@pytest.mark.slow("fallback")
 def test_single_failures_of_every_kind_do_not_show(vehicle: Vehicle, undisturbed: FlightLog) -> None:
     kinds: list[str | Exception] = sorted({*STATUS.values()} - ACCEPTED)
     faults = {
@@ -132,7 +133,9 @@ def test_single_failures_of_every_kind_do_not_show(vehicle: Vehicle, undisturbed
     assert distance(log, undisturbed).max() < 0.03
 
 
-@pytest.mark.parametrize("fault", ["primal_infeasible", RuntimeError("of a back end")])
+@pytest.mark.parametrize(
+    "fault", ["primal_infeasible", pytest.param(RuntimeError("of a back end"), marks=pytest.mark.slow("fallback"))]
+)
 def test_ten_failures_on_end_are_flown_by_the_plan(
     fault: str | Exception, vehicle: Vehicle, undisturbed: FlightLog
 ) -> None:
@@ -141,6 +144,7 @@ def test_ten_failures_on_end_are_flown_by_the_plan(
     assert distance(log, undisturbed).max() < 0.01
 
 
+@pytest.mark.slow("fallback")
 def test_two_seconds_of_failures_are_hovered_through(vehicle: Vehicle, undisturbed: FlightLog) -> None:
     log = fly_paper(vehicle, solver=dict.fromkeys(range(40, 80), "numerics"), duration=LONGER)
     assert sorted(set(log.control.fallback)) == [0, 1, 2]
@@ -169,6 +173,7 @@ def test_missing_and_frozen_measurements_are_bridged(
     assert distance(log, undisturbed).max() < 0.1
 
 
+@pytest.mark.slow("fallback")
 def test_a_stall_is_flown_through(vehicle: Vehicle, undisturbed: FlightLog) -> None:
     log = fly_paper(vehicle, computation=Computation(stalls=(Stall(at=FAULT, duration=0.1),)))
     assert "missed" in log.control.status

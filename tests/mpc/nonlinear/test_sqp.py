@@ -231,12 +231,14 @@ def test_steps_end_with_the_time_and_keep_the_plan(settings: dict[str, Any]) -> 
     np.testing.assert_array_equal(again[0], same[0])
 
 
-def test_ten_thousand_thrown_states_have_typed_answers() -> None:
+@pytest.mark.slow("nonlinear")
+@pytest.mark.parametrize("count", [pytest.param(80, marks=pytest.mark.witness("nonlinear")), 800])
+def test_ten_thousand_thrown_states_have_typed_answers(count: int) -> None:
     """From near to absurd: no hang, no number that is none, no status without a name."""
     rng = np.random.default_rng(1)
     for case, settings in MANY.items():
         controller = law(**settings)
-        for k in range(800):
+        for k in range(count):
             size = 10.0 ** rng.uniform(-2.0, 2.0)
             command = call(controller, thrown(rng, size), k * PERIOD)
             assert np.isfinite(command.speeds).all(), case

@@ -187,7 +187,8 @@ def test_stated_mismatch_is_not_attributed_to_a_disturbance(vehicle: Vehicle, de
     assert np.abs(np.diff(moved, axis=0)[:, [7, 9, 11]]).max() > 0.05
 
 
-@pytest.mark.parametrize("factor", [0.7, 1.3])
+@pytest.mark.slow("robust")
+@pytest.mark.parametrize("factor", [0.7, pytest.param(1.3, marks=pytest.mark.witness("robust"))])
 def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> None:
     """On a course that tilts the vehicle back and forth; at rest thrust explains it all."""
     heavy = nonlinear_model(replace(vehicle, mass=factor * vehicle.mass), PERIOD)
@@ -204,6 +205,7 @@ def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> N
     assert preparation_of(controller).disturbance[2] == pytest.approx(vehicle.gravity * (1.0 - factor), abs=0.05)
 
 
+@pytest.mark.slow("robust")
 def test_the_effect_of_a_worn_rotor_is_predicted_at_any_thrust(vehicle: Vehicle) -> None:
     """Climbing with more thrust, it turns the vehicle more, by as much: nothing is left to learn."""
     worn = nonlinear_model(vehicle, PERIOD)

@@ -320,6 +320,7 @@ def peak_tilt(vehicle: Vehicle, *sets: str, tight: bool = True, rotor_lag: float
     return float(tilts.max())
 
 
+@pytest.mark.slow("tightening")
 def test_without_margins_the_tilt_passes_its_bound(vehicle: Vehicle) -> None:
     assert peak_tilt(vehicle, CHANGING, tight=False) > LIMIT
 

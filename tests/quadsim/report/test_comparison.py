@@ -13,6 +13,7 @@ from quadsim.flight.rundir import Run, findings_of
 from quadsim.report.comparison import (
     GLANCE,
     comparison_rows,
+    conclusion,
     distinct_courses,
     failure_sentences,
     run_names,
@@ -68,6 +69,73 @@ def texts(rows: list[QuantityRow], label: str, group: str | None = None) -> list
 
 def marks(rows: list[QuantityRow], label: str, group: str | None = None) -> list[Mark]:
     return [cell.mark for cell in cells(rows, label, group)]
+
+
+def judged(run: Run, name: str, rmse: float, **margins: float) -> Run:
+    """The short flight with an RMS error in x alone, and no constraints but these, with their worst margins."""
+    entry, verdict = run.summary["constraints"][0], "satisfied" if min(margins.values()) >= 0.0 else "violated"
+    constraints = [{**with_margin(entry, margin), "name": each} for each, margin in margins.items()]
+    rmse_table = {**run.summary["tracking"]["rmse"], "x": rmse, "y": 0.0, "z": 0.0}
+    return having(
+        dataclasses.replace(run, label=name),
+        name,
+        verdict=verdict,
+        constraints=constraints,
+        tracking={**run.summary["tracking"], "rmse": rmse_table},
+    )
+
+
+def test_the_conclusion_says_who_holds_and_who_is_closer_by_how_much(short_run: Run) -> None:
+    def says(*runs: Run) -> Cell:
+        return conclusion(runs, run_names(runs))
+
+    mine = judged(short_run, "mine", 0.25, roll=1.0, pitch=2.0)
+    paper = judged(short_run, "paper", 0.5, roll=1.0, pitch=2.0)
+    wild = judged(short_run, "wild", 0.1, roll=-1.0, pitch=-2.0)
+    closer = "mine tracks closer: 0.25 m RMS position error against 0.5 m (50 % less)."
+    assert says(mine, paper) == Cell(text=f"Both flights hold every constraint; {closer}", mark=Mark.GOOD)
+    assert says(paper, mine) == says(mine, paper)
+    assert says(mine, wild) == Cell(
+        text="mine holds every constraint, wild violates roll and pitch; "
+        "wild tracks closer: 0.1 m RMS position error against 0.25 m (60 % less).",
+        mark=Mark.BAD,
+    )
+    torn = judged(short_run, "torn", 0.1, roll=1.0, pitch=-2.0)
+    neither = "wild violates roll and pitch and torn violates pitch; position errors are equal: 0.1 m RMS."
+    assert says(wild, torn) == Cell(text=neither, mark=Mark.BAD)
+    same = "Both flights hold every constraint; position errors are equal: 0.25 m RMS."
+    assert says(mine, judged(short_run, "twin", 0.25, roll=1.0)) == Cell(text=same, mark=Mark.GOOD)
+    still = [judged(short_run, name, rmse, roll=1.0) for name, rmse in (("still", 1e-12), ("rest", 2e-12))]
+    assert says(*still).text == "Both flights hold every constraint; position errors are equal: < 1 nm RMS."
+    strict = dataclasses.replace(paper, limits=paper.limits[:1])
+    assert says(mine, strict).text == f"Both flights hold their own constraints; {closer}"
+    assert says(strict, wild).text.startswith("paper holds its own constraints, wild violates roll and pitch; ")
+    assert says(mine) == Cell(text="mine holds every constraint.", mark=Mark.GOOD)
+    three = "mine and paper hold every constraint, wild violates roll and pitch; wild tracks closest: "
+    assert says(mine, paper, wild).text == f"{three}0.1 m RMS position error against 0.25 m of the next (60 % less)."
+    for entry in wild.summary["constraints"]:
+        entry["required"] = False
+    reported = dataclasses.replace(wild, summary={**wild.summary, "verdict": "satisfied"})
+    assert (says(mine, reported).mark, says(mine, reported).text) == (Mark.WARN, says(mine, wild).text)
+
+
+def test_the_conclusion_compares_no_errors_of_lost_flights_or_other_courses(short_run: Run, aborted_run: Run) -> None:
+    mine = judged(short_run, "mine", 0.25, roll=1.0)
+    lost = having(aborted_run, "lost", verdict="lost", constraints=[])
+    assert conclusion([mine, lost], ["mine", "lost"]).text == "mine holds every constraint, lost was lost."
+    control = dataclasses.replace(short_run.log.control, reference=short_run.log.control.reference + 1.0)
+    other = judged(short_run, "other", 0.1, roll=1.0)
+    elsewhere = dataclasses.replace(other, log=dataclasses.replace(short_run.log, control=control))
+    assert conclusion([mine, elsewhere], ["mine", "other"]).text == "Both flights hold every constraint."
+    bare = having(short_run, "bare", verdict="unaudited", constraints=[], status="aborted")
+    assert conclusion([bare], ["bare"]) == Cell(text="bare is not audited.")
+    unmet = {**with_margin(short_run.summary["constraints"][0], 1.0), "name": "arrival"}
+    unmet.update(dict.fromkeys(("worst_margin", "worst_margin_sampled", "worst_time")), satisfied=False)
+    short = having(short_run, "short", verdict="incomplete", constraints=[unmet])
+    assert conclusion([short], ["short"]) == Cell(text="short does not reach arrival.", mark=Mark.WARN)
+    stuck = judged(short_run, "stuck", 0.1, roll=1.0)
+    stuck.summary.update(verdict="violated", controller={**stuck.summary["controller"], "unrecovered": 40})
+    assert conclusion([stuck], ["stuck"]).text == "stuck holds its constraints, but in permanent fallback."
 
 
 def test_values_are_the_summarys_with_angles_in_degrees(short_run: Run, worse_run: Run, empty_run: Run) -> None:

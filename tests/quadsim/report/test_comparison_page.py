@@ -80,6 +80,8 @@ def test_the_text_gives_outcomes_reasons_and_numbers_and_nothing_is_fetched(page
     assert "lost (expected satisfied): at t = 6.000 s: the plant&#39;s state is &lt;not&gt; finite &amp; more" in text
     assert "holds (margin 5 deg, tolerance 0.05)" in text
     assert text.count("<video") == 1
+    (opening,) = re.findall(r'</h1>\s*<p class="verdict bad">([^<]*)</p>', text)
+    assert re.fullmatch(r"paper-constrained does not reach arrival_x, .* and lost was lost\.", opening)
     assert "Without video: lost." in text
     assert "paper-constrained/flight.rrd" in text
     assert "lost/flight.rrd" not in text
@@ -172,6 +174,8 @@ def test_the_first_screen_has_the_video_and_five_rows_and_a_phone_all_of_it(page
         for shown in (tab.locator("video"), *rows.all()):
             box = shown.bounding_box()
             assert box["y"] + box["height"] <= 800, "below the first screen"
+        film = tab.locator("video").bounding_box()
+        assert film["height"] >= 9.0 / 16.0 * film["width"] + 78.0, "the controls, 76 px high, cover what it says"
         poster = "src => new Promise((done) => Object.assign(new Image(), { src, onload() { done(this.width); } }))"
         assert tab.evaluate(poster, tab.locator("video").get_attribute("poster")) == 640
         light = tab.evaluate(INK)

@@ -156,7 +156,7 @@ def test_it_answers_as_its_equations_do(vehicle: Vehicle, airmode: bool, size: i
     settings = AutopilotSettings(airmode=airmode, delay=2e-3, idle=0.05, d=(1.0, 0.5, 0.2))
     autopilot, expected = Autopilot(vehicle, settings), NumpyAutopilot(vehicle, settings)
     weight = vehicle.mass * vehicle.gravity
-    for k in range(400):
+    for k in range(120):
         wild = (0.1, 1.0, 10.0)[k % 3]
         attitude, aim = ((q := rng.normal(size=4)) / np.linalg.norm(q) for _ in range(2))
         target = np.concatenate([[weight * rng.uniform(0.0, 2.5)], wild * rng.normal(size=3), aim])[:size]

@@ -118,8 +118,7 @@ def test_two_campaigns_are_compared_flight_by_flight(
     page, table = ((pairs / name).read_text(encoding="utf-8") for name in ("index.html", "comparison.md"))
     for text in (output, table):
         assert 0 < text.index("initial.position.2") < text.index("of 6 paired flights")
-    assert "initial.position.2" in page
-    assert "of 6 paired flights" in page
+    assert 0 < page.index("of 6 paired flights") < page.index("initial.position.2"), "a page opens with the conclusion"
     result = json.loads((pairs / "comparison.json").read_text(encoding="utf-8"))
     assert result["differences"] == [{"field": "initial.position.2", "values": [0.0, 0.05]}]
 

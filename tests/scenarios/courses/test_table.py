@@ -48,6 +48,32 @@ def sampled(kind: str, *times: float, **fields: Any) -> Array:
 # --- what is right -------------------------------------------------------------------------------------------------
 
 
+def test_a_course_that_repeats_starts_again_where_it_is_closed_and_else_turns_back() -> None:
+    t = np.linspace(0.0, 4.95, 100)
+    out = sampled("waypoints", *t, repeat=5.0)
+    np.testing.assert_allclose(out, sampled("waypoints", *t), atol=1e-12, err_msg="its first round")
+    np.testing.assert_allclose(sampled("waypoints", *(10.0 - t), repeat=5.0), out, atol=1e-9)
+    np.testing.assert_allclose(sampled("waypoints", *(20.0 + t), repeat=5.0), out, atol=1e-9)
+    there = [*POINTS, {"position": list(INITIAL), "yaw": 390.0}]
+    closed = sampled("waypoints", *t, points=there, repeat=10.0)
+    np.testing.assert_allclose(sampled("waypoints", *(10.0 + t), points=there, repeat=10.0), closed, atol=1e-9)
+    np.testing.assert_allclose(sampled("waypoints", 10.0 - 1e-6, points=there, repeat=10.0)[0, :3], INITIAL, atol=1e-4)
+    steps = Assembly(scenario("steps", repeat=2.0)).course
+    assert steps.sample(np.array([0.5, 1.5, 2.5, 3.5, 4.5, 5.5]))[:, 0].tolist() == [1.0, 2.0, 2.0, 1.0, 1.0, 2.0]
+    assert math.isinf(steps.end)
+
+
+def test_jumps_and_kinks_of_a_course_that_repeats_are_those_of_every_round() -> None:
+    flown = scenario("steps", repeat=2.0).replace({"duration": 6.0})
+    assert Assembly(flown).course.jumps == (1.0, 3.0, 5.0)
+    legs = scenario("waypoints", repeat=5.0, start=1.0).replace({"duration": 12.0})
+    kinks = Assembly(legs).course.kinks
+    t = np.array(kinks)
+    assert {0.0, 1.0, 5.0, 9.0, 10.0, 11.0} <= set(kinks)
+    first = t[t <= 5.0]
+    np.testing.assert_allclose(np.sort(10.0 - first), t[(t >= 5.0) & (t <= 10.0)])
+
+
 @pytest.mark.parametrize("kind", [kind for kind in REFERENCES if kind != "steps"])
 def test_every_course_begins_at_the_initial_position_and_stays_at_its_end(kind: str) -> None:
     course = Assembly(scenario(kind)).course

@@ -11,9 +11,18 @@ from uneven import FILES, PUBLISHED, published, uneven
 from scenarios.commands.cli import main
 from scenarios.results import EXIT_DONE
 
+FIRST = [(name, course) for name in (*PUBLISHED, "uneven") for course in ("step", "figure-eight")]
+QUICK = (("iris", "step"), ("uneven", "figure-eight"))
 
-@pytest.mark.parametrize("course", ["step", "figure-eight"])
-@pytest.mark.parametrize("name", [*PUBLISHED, "uneven"])
+
+@pytest.mark.slow("vehicles")
+@pytest.mark.parametrize(
+    ("name", "course"),
+    [
+        *[pytest.param(*pair, marks=pytest.mark.witness("vehicles")) for pair in QUICK],
+        *[p for p in FIRST if p not in QUICK],
+    ],
+)
 def test_it_flies_a_step_and_a_figure_eight(name: str, course: str) -> None:
     flight = fly_first(uneven() if name == "uneven" else published(name), course, "robust")
     assert flight.outcome == "satisfied"
@@ -21,7 +30,7 @@ def test_it_flies_a_step_and_a_figure_eight(name: str, course: str) -> None:
 
 
 @pytest.mark.parametrize(("law", "course"), [("lqr", "hover"), ("pid", "figure-eight"), ("geometric", "figure-eight")])
-@pytest.mark.parametrize("name", ["deadcat", "uneven"])
+@pytest.mark.parametrize("name", [pytest.param("deadcat", marks=pytest.mark.slow("vehicles")), "uneven"])
 def test_every_law_flies_about_the_trim_of_unequal_rotors(name: str, law: str, course: str) -> None:
     flight = fly_first(uneven() if name == "uneven" else published(name), course, law)
     assert flight.outcome == "satisfied"

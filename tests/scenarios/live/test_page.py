@@ -263,6 +263,10 @@ def test_disturbances_show_what_acts_and_change_only_what_was_given(windy: Serve
         give(label, value)
     fly(8)
     assert shown() == start | given
+    roll, speed, deadline = (session.limits[0], *[page._bounds[i] for i in (2, 3)])
+    shown_bounds = {float(values[-1]) for values in page._plots[1].data[5:]}
+    assert shown_bounds == {roll.lower, roll.upper} == {-25.0, 25.0}
+    assert ([bound.value for bound in speed], [bound.value for bound in deadline]) == ([0.0, 838.0], [50.0])
     now = session.disturbances
     assert (now.wind, now.mass_factor, now.lag) == ((4.0, -2.0, 0.5), 1.1, (0.015, 0.03))  # the air still rises
     assert now.loss == pytest.approx([0.19, 0.0, 0.0, 0.0])
@@ -354,6 +358,26 @@ def test_keys_and_clicks_give_set_points(tab: Any, served: Served) -> None:
     tab.mouse.click(box["x"] + 0.2 * box["width"], box["y"] + 0.9 * box["height"])
     tab.keyboard.up("Shift")
     served.wait(lambda: len(set_points()) > count)
+
+
+STICKS = """navigator.getGamepads = () => [null, {connected: true, axes: window.axes}]; window.axes = [0, 0, 0, 0]"""
+
+
+def test_sticks_steer_beyond_their_dead_zone_and_stop_when_they_are_let_go(tab: Any, served: Served) -> None:
+    def steered() -> list[float]:
+        return list(served.session._held.steer)
+
+    tab.evaluate(STICKS)
+    tab.evaluate("axes = [0.1, -0.14, 0, 0.1]")
+    k = served.session.k
+    served.wait(lambda: served.session.k > k + 10)
+    assert steered() == [0.0, 0.0, 0.0], "within the dead zone"
+    tab.evaluate("axes = [-1, -0.6, 0, 1]")
+    served.wait(lambda: steered() == [1.0, 2.0, -2.0])
+    tab.evaluate("axes = [0.36, 0, 0, 0]")
+    served.wait(lambda: steered() == [0.0, -0.5, 0.0])
+    tab.evaluate("window.axes = null; navigator.getGamepads = () => [null]")
+    served.wait(lambda: steered() == [0.0, 0.0, 0.0])
 
 
 def test_a_slider_turns(tab: Any, served: Served) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +21,7 @@ from scenarios.commands.cli import main
 from scenarios.live.commands import live
 from scenarios.live.knobs import knobs
 from scenarios.live.pace import LATE, Pace
-from scenarios.live.session import STRONGEST, Frame, Session, read_script
+from scenarios.live.session import STRONGEST, Frame, Session, looping, read_script
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.rollout import Rollout
@@ -342,6 +343,32 @@ def test_a_finished_run_is_flown_on_unless_check_refuses_it_and_none_of_its_code
     assert main([*command, "--out", str(tmp_path / "refused")]) == EXIT_WRONG_INPUT
     assert "imported" not in capsys.readouterr().err
     assert not (tmp_path / "refused").exists()
+
+
+def test_a_course_that_ends_starts_again_and_is_saved_as_it_was_flown() -> None:
+    there = {"type": "waypoints", "speed": 2.0, "points": [{"position": [0.5, 0.0, 1.0]}]}
+    arrival = {"name": "arrival", "signal": "x_error", "lower": -0.5, "upper": 0.5, "start": 0.4}
+    scenario = load_scenario("hover", ["controller.horizon=10"]).replace(
+        {"reference": there, "duration": 0.5, "constraints": [arrival]}
+    )
+    session = Session(scenario)
+    frames = flown(session, 25)
+    x = [frame.samples[0].observation.reference[0] for frame in frames if frame.samples[0] is not None]
+    assert x[5] == pytest.approx(0.5)
+    assert x[:11] == pytest.approx(x[20:9:-1]), "there and back"
+    assert x[20:25] == pytest.approx(x[:5]), "and there again"
+    assert "arrival" in [limit.name for limit in session.limits if limit.stop == 0.5], "it was at the first round's end"
+    assert session.flight().scenario.reference.repeat == 0.5
+    assert same_bits(session)
+    session.reset()
+    assert [limit.stop for limit in session.limits if limit.name == "arrival"] == [math.inf]
+    session.close()
+
+
+@pytest.mark.parametrize("name", ["hover", "autopilot"])
+def test_a_course_that_does_not_move_or_has_velocities_stays_as_it_is(name: str) -> None:
+    scenario = load_scenario(name)
+    assert looping(scenario) is scenario
 
 
 def test_constraints_on_the_course_end_once_a_person_steers() -> None:

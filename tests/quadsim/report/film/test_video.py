@@ -17,14 +17,22 @@ import numpy as np
 import pytest
 from support import NO_PRODUCTS
 
-from quadsim.errors import FileError, OutputError, RenderingUnavailableError
+from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnavailableError
 from quadsim.flight.audit import Limit, audit
 from quadsim.flight.rundir import Run
 from quadsim.palette import ON_DARK, rgb
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
 from quadsim.report.film.frames import make_footage
-from quadsim.report.film.video import render_gif, render_video, rendering_backend, write_poster
+from quadsim.report.film.video import (
+    Estimate,
+    frame_count,
+    frame_rate,
+    render_gif,
+    render_video,
+    rendering_backend,
+    write_poster,
+)
 from quadsim.rotation import body_to_world
 from quadsim.state import EULER, INDEX, POSITION
 from scenarios.loading import load_scenario
@@ -77,6 +85,42 @@ def test_the_film_has_the_frames_requested(
     assert ground.min() > 60.0
     assert np.abs(frames[5].astype(int) - frames[0]).mean() > 2.0
     assert path.stat().st_size < 2_000_000
+
+
+def test_a_long_film_has_fewer_frames_per_second_unless_told() -> None:
+    assert [frame_rate(length) for length in (6.0, 29.9, 30.0, 60.0)] == [30, 30, 20, 20]
+    assert frame_rate(60.0, 50) == 50
+    assert (frame_count(60.0, 20), frame_count(0.01, 30)) == (1200, 1)
+    for wrong in (0, 121, 24.0, True):
+        with pytest.raises(ParameterError, match="--fps must be a whole number from 1 to 120"):
+            frame_rate(6.0, wrong)  # type: ignore[arg-type]
+
+
+def told(frames: tuple[int, ...], reports: list[tuple[float, int, int]], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What an estimate of films of so many frames says, of which (time, done, total) are reported."""
+    times, said = iter([0.0, *(time for time, _, _ in reports)]), list[str]()
+    monkeypatch.setattr(video.clock, "monotonic", lambda: next(times))
+    monkeypatch.setattr(video._log, "info", lambda text, *values: said.append(text % values))
+    estimate = Estimate(frames, "the page is there")
+    for _, *report in reports:
+        estimate(*report)
+    monkeypatch.undo()
+    return said
+
+
+def test_the_estimate_is_what_the_first_frames_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The renderer starts in 2 s; 10 frames/s: 880 are left, and as many as of the other film, which starts too."""
+    reports = [(2.0, 1, 900), (3.0, 11, 900), (4.0, 21, 900), (90.0, 899, 900)]
+    assert told((900,), reports, monkeypatch) == ["film: about 90 s; the page is there"]
+    assert told((900, 600), reports, monkeypatch) == ["films: about 2 min; the page is there"]
+    slow = [(time if time < 3.0 else 2.0 + 10.0 * (time - 2.0), *rest) for time, *rest in reports]
+    assert told((900,), slow, monkeypatch) == ["film: about 15 min; the page is there"]
+
+
+def test_an_estimate_waits_for_a_film_that_is_long_enough_to_be_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert told((5,), [(0.0, 0, 5), (1.0, 1, 5), (1.5, 5, 5)], monkeypatch) == []
+    two = [(1.0, 1, 5), (1.5, 5, 5), (2.0, 1, 500), (4.0, 21, 500)]
+    assert told((5, 500), two, monkeypatch) == ["films: about 50 s; the page is there"]
 
 
 def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path) -> None:

@@ -44,6 +44,7 @@ def rms(errors: list[np.ndarray], block: slice) -> float:
     return float(np.sqrt(np.mean([np.square(e[:, block]) for e in errors])))
 
 
+@pytest.mark.slow("estimator")
 def test_without_disturbance_and_with_little_noise_the_estimate_becomes_the_truth(
     vehicle: Vehicle, simulate_motion: SIMULATE, run_filter: SIMULATE
 ) -> None:
@@ -60,12 +61,15 @@ def test_without_disturbance_and_with_little_noise_the_estimate_becomes_the_trut
     assert np.abs(errors[-1]).max() < 3e-4
 
 
+@pytest.mark.slow("estimator")
+@pytest.mark.witness("estimator")
 def test_the_estimate_is_better_than_the_samples(gentle: Any, run_filter: SIMULATE) -> None:
     errors = [run_filter(gentle, SENSORS, SETTINGS, seed=seed)[1][20:] for seed in range(4)]
     assert rms(errors, slice(0, 3)) < 0.5 * in_si(SensorName.POSITION, SENSORS[SensorName.POSITION].noise)[0]
     assert rms(errors, slice(6, 9)) < 0.5 * in_si(SensorName.ATTITUDE, SENSORS[SensorName.ATTITUDE].noise)[0]
 
 
+@pytest.mark.slow("estimator")
 def test_late_samples_are_weighted_by_their_time_stamp(
     vehicle: Vehicle, simulate_motion: SIMULATE, run_filter: SIMULATE
 ) -> None:
