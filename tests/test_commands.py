@@ -46,8 +46,8 @@ LINES = [
     for line in block.splitlines()
 ]
 QUADSIM = [*dict.fromkeys(line.partition("#")[0].strip() for line in LINES if line.startswith("quadsim "))]
-ELSEWHERE = ("quadsim view", "--cluster", "--fly")
-"""`view` opens a window and stays; a cluster, and what takes an emulator, have tests of their own."""
+ELSEWHERE = ("quadsim view", "--cluster", "--fly", "casadi")
+"""`view` opens a window and stays; a cluster, and what takes an emulator or CasADi, have tests of their own."""
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 SLOW, WITNESS = pytest.mark.slow("commands"), pytest.mark.witness("commands")
 RUNNABLE = [
@@ -80,9 +80,11 @@ def workplace(
     """
     if "eight.csv" in line:
         shutil.copy(request.getfixturevalue("eight"), tmp_path)
-    if re.search(r"runs/(campaigns|mine|other)", line):
+    if "examples/" in line:
+        shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    if re.search(r"runs/(campaigns|mine|other|paper)\b(?!-)", line):
         campaign = request.getfixturevalue("campaign")
-        for place in (f"campaigns/{campaign.name}", "mine", "other"):
+        for place in (f"campaigns/{campaign.name}", "mine", "other", "paper"):
             shutil.copytree(campaign, tmp_path / "runs" / place)
     (tmp_path / "mine.toml").write_text('base = "paper-nominal"\nname = "mine"\nfailure = ["lost"]\n')
     for name in ("mine-vehicle", "start", "identified"):
