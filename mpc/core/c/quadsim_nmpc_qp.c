@@ -1622,10 +1622,11 @@ enum quadsim_nmpc_status quadsim_nmpc_solve(quadsim_nmpc_work *work)
     } else {
         status = search_held(work);
         if (status == QUADSIM_NMPC_GIVEN_UP && work->allowed < work->p->changes) {
-            work->allowed = work->p->changes;
             interior_rows(work);
+            work->allowed = work->p->changes;
             status = search_held(work);
         }
+        work->allowed = work->p->changes;
         if (status == QUADSIM_NMPC_BOUNDED) {
             status = solve_again(work);
         }

@@ -147,7 +147,7 @@ def test_many_active_rows_are_found_by_the_interior_point_method(case: str) -> N
         command = call(controller, x, k * PERIOD)
         assert command.status in ACCEPTED
         assert work.changes < 1000
-        if work.allowed == controller._sqp.struct.changes:
+        if work.changes > 5 * 40:  # from where on it takes over
             checked(controller, share=1e-7)
             found += 1
     assert found > 2
