@@ -138,3 +138,11 @@ def test_the_example_of_what_constraints_cost_runs(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "inf" in done.stdout
     assert picture.is_file()
+
+
+def test_moments_that_each_suit_the_log_make_a_body_together() -> None:
+    """Within their intervals, those of this noisy log would not: no moment exceeds the sum of the others."""
+    log = "import sys; sys.path[:0] = ['benchmarks']; import intervals; print(intervals.identify(%s))"
+    done = script("-c", log % "('torque 0.01, eight', 5901)")
+    assert done.returncode == 0, done.stderr
+    assert "inertia_z" in done.stdout

@@ -320,6 +320,14 @@ class _Fit:
                 mean = values.get(name, float(np.clip(np.mean(found), estimate.low, estimate.high)))
                 estimate = replace(estimate, value=mean)
             estimates.append(estimate)
+        # Each within its interval, the three together may make no body.
+        inertia = [values.get(f"inertia_{axis}", number_in(self.vehicle, f"inertia_{axis}") or 0.0) for axis in "xyz"]
+        if not _is_body(inertia):
+            values["inertia_z"] = float(f"{PLATE[0] * (inertia[0] + inertia[1]):.6g}")
+            estimates = [
+                replace(each, value=values["inertia_z"]) if each.name == "inertia_z" and not each.refused else each
+                for each in estimates
+            ]
         flights = tuple(self._numbers_of(refined, flight) for flight in range(refined.flights))
         delay, offset, wind = (np.mean([numbers[i] for numbers in flights], axis=0).tolist() for i in range(3))
         return Identification(
