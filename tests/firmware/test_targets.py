@@ -63,7 +63,7 @@ LAWS = {
     "nonlinear": Limits(
         (("cortex-m7", "double"),),
         (2.0, 10.0, 12.0, 12.0),
-        {"double": 240},
+        {"double": 140},
         {"double": 115},
         (21_000, 22_000),
         600,
@@ -72,7 +72,7 @@ LAWS = {
     "autopilot": Limits(
         (("cortex-m7", "float"), ("cortex-m4f", "float")),
         (2.0, 5.0, 5.0, 5.0),
-        {"float": 240},
+        {"float": 150},
         {"float": 40},
         (14_500, 8000),
         302,
