@@ -79,8 +79,8 @@ class FlightComparison(Result):
         """See `Result.shown`."""
         from scenarios import console
 
-        yield console.styled_cell(self.conclusion)
         yield from self.notes
+        yield console.styled_cell(self.conclusion)
         lines = [
             (
                 (row.group if row.headline else row.label) + (f" [{row.unit}]" if row.unit else ""),
