@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import gc
+import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -363,3 +368,17 @@ def fly_once(
     loop = closed_loop(Assembly(scenario), plant, controller, reference, navigation=navigation)
     complete(loop, periods=scenario.periods)
     return loop.log()
+
+
+def decode(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    """All frames of an MP4, and its metadata by ffmpeg."""
+    gc.freeze()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # imageio leaves ffmpeg's pipes in cycles
+        reader = imageio_ffmpeg.read_frames(path)
+        meta: dict[str, Any] = next(reader)
+        reader.close()
+        del reader
+        frames = iio.imread(path, plugin="FFMPEG")
+        gc.collect()
+    return frames, meta

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import subprocess
 import sys
-import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
-import imageio_ffmpeg
 import numpy as np
 import pytest
-from support import NO_PRODUCTS
+from support import NO_PRODUCTS, decode
 
 from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnavailableError
 from quadsim.flight.audit import Limit, audit
@@ -47,20 +43,6 @@ def backend() -> str:
         return rendering_backend()
     except RenderingUnavailableError as error:
         pytest.skip(str(error))
-
-
-def decode(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
-    """All frames of an MP4, and its metadata by ffmpeg."""
-    gc.freeze()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)  # imageio leaves ffmpeg's pipes in cycles
-        reader = imageio_ffmpeg.read_frames(path)
-        meta: dict[str, Any] = next(reader)
-        reader.close()
-        del reader
-        frames = iio.imread(path, plugin="FFMPEG")
-        gc.collect()
-    return frames, meta
 
 
 @pytest.mark.witness("films")
