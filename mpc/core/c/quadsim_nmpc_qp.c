@@ -1318,7 +1318,7 @@ static int takes_rows(const quadsim_nmpc_problem *p)
             return 0;
         }
     }
-    return p->room * entries_size(p) >= 12 * N * kinds + 2 * entries_size(p) + N * (3 * NU + states_of(p));
+    return p->room * entries_size(p) >= 12 * N * kinds + entries_size(p) + N * (3 * NU + states_of(p));
 }
 
 /* The same method for all rows: where the search finds too many that it has to exchange.  What it finds active is then
@@ -1328,18 +1328,16 @@ static void interior_rows(quadsim_nmpc_work *work)
     const quadsim_nmpc_problem *p = work->p;
     const int N = p->horizon, kinds = slacks_from(p), size = N * kinds;
     const long entries = entries_size(p);
-    real *weight = work->response, *slope = weight + size, *z = slope + size, *next = z + entries;
+    real *weight = work->response, *slope = weight + size, *next = slope + size;
     real *effort = next + entries, *push = effort + N * NU, *v = push + N * NU, *known = v + N * NU;
     real *own = known + N * states_of(p);
     const inner at = {own,            own + size,     own + 2 * size, own + 3 * size, own + 4 * size,
                       own + 5 * size, own + 6 * size, own + 7 * size, own + 8 * size, own + 9 * size};
     const weighed rows = {weight, slope, next};
     real mu = NEVER;
-    long j;
     int i, index, kind, pass, pairs = 0;
     memset(work->held, 0, sizeof(int) * (size_t)(N * NU));
     optimum(work);
-    memcpy(z, work->value, sizeof(real) * (size_t)entries);
     memcpy(next, work->value, sizeof(real) * (size_t)entries);
     memset(weight, 0, sizeof(real) * (size_t)(2 * size));
     memset(own, 0, sizeof(real) * (size_t)(10 * size));
@@ -1351,7 +1349,7 @@ static void interior_rows(quadsim_nmpc_work *work)
         if (most >= HARD || (kind >= TILT && kind < SPIN && !p->tilts) || (kind >= SPIN && kind < STATED && !p->turns)) {
             continue;
         }
-        beyond = product(work, row, z) - most;
+        beyond = product(work, row, next) - most;
         at.by[index] = R(1.0);
         pairs++;
         if (slot >= 0) {
@@ -1428,9 +1426,6 @@ static void interior_rows(quadsim_nmpc_work *work)
             mu /= (real)pairs;
             after /= (real)pairs;
             centre = (after / mu) * (after / mu) * after;
-        }
-        for (j = 0; j < entries; j++) {
-            z[j] += length * (next[j] - z[j]);
         }
         mu = after;
     }
