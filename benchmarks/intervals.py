@@ -21,10 +21,13 @@ from timing import Record, options, run
 import quadsim
 from quadsim.errors import QuadsimError
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
+from quadsim.sim.airframe import munk_moment
+from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.design.first_scenario import first_scenario
 from scenarios.flown import Flight
+from scenarios.identify.estimate import VECTORS
 from scenarios.identify.fit import identify_records
 from scenarios.identify.record import Record as Log
 from scenarios.loading import parse_scenario
@@ -79,7 +82,7 @@ def drawn(rng: np.random.Generator, *, body_drag: bool, moments: bool = False) -
     inertia = rng.uniform(0.75, 1.4) * base.inertia[0] * np.array([1.0, rng.uniform(0.85, 1.15), 0.0])
     inertia[2] = rng.uniform(0.7, 0.97) * inertia.sum()
     lag, ratio = rng.uniform(0.02, 0.05), rng.choice([1.0, rng.uniform(1.0, 1.6)])
-    return replace(
+    vehicle = replace(
         base,
         rotor_azimuths=(-45.0, -135.0, 135.0, 45.0),
         rotor_spins=(-1, 1, -1, 1),
@@ -94,6 +97,11 @@ def drawn(rng: np.random.Generator, *, body_drag: bool, moments: bool = False) -
         rotor_moment=tuple((rng.uniform(0.4, 3.0, 2) * 1e-5).tolist()) if moments else None,
         rate_damping=tuple((rng.uniform(0.2, 2.0, 3) * inertia).tolist()) if moments else None,
     )
+    if not moments:
+        return vehicle
+    turning = float(vehicle.hover_speeds.sum())
+    gone = rng.uniform(0.1, 0.5, 2)  # share of the moment that a climb of 1 m/s takes
+    return replace(vehicle, inflow_moment=tuple((gone * turning * np.array(vehicle.rotor_moment)).tolist()))
 
 
 def wrong(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
@@ -112,6 +120,7 @@ def wrong(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
         rotor_drag=1e-4,
         body_drag=None,
         rotor_moment=None,
+        inflow_moment=None,
         rate_damping=None,
     )
 
@@ -158,9 +167,12 @@ def logged(flight: Flight, late: int) -> Log:
 def truth_of(vehicle: Vehicle, late: int) -> dict[str, float]:
     """What the estimates are to hold, by name."""
     true = {name: getattr(vehicle, name) or 0.0 for name in VEHICLE_UNITS}
-    for name, axes in {"inertia": "xyz", "rotor_moment": "xy", "rate_damping": "xyz"}.items():
+    for name, axes in VECTORS.items():
         numbers = getattr(vehicle, name) or [0.0] * len(axes)
         true |= {f"{name}_{axis}": value for axis, value in zip(axes, numbers, strict=True)}
+    if vehicle.body_drag is not None:
+        munk = munk_moment(vehicle.body_drag, SEA_LEVEL_DENSITY)
+        true |= dict(zip(("inflow_moment_x", "inflow_moment_y"), munk, strict=True))
     return true | {
         "body_drag": (vehicle.body_drag or [0.0])[0],
         "lateness": 0.0,

@@ -104,7 +104,7 @@ class RampNumbers(ctypes.Structure):
     _fields_ = [
         *struct_members(INT, "scaled targets moment"),
         *struct_members(REAL, "period mass gravity least_lift gain:6 gain_of_change:6 largest:6 inertia:9 inverse:9"),
-        *struct_members(REAL, "allocation:16 momentum:4 lag left drag:3 square_drag:3 across:2 damping:3"),
+        *struct_members(REAL, "allocation:16 momentum:4 lag left drag:3 square_drag:3 across:2 inflow:2 damping:3"),
         *struct_members(REAL, "decay ballast"),
     ]
 
@@ -268,6 +268,7 @@ def _fill(
         allocation=vehicle.allocation,
         momentum=-rotor_inertia * np.array(vehicle.rotor_spins, float),
         across=vehicle.rotor_moment or (0.0, 0.0),
+        inflow=vehicle.inflow_moment or (0.0, 0.0),
         damping=vehicle.rate_damping or (0.0, 0.0, 0.0),
     )
     numbers.decay = math.exp(-period / settings.drag_memory)

@@ -159,6 +159,13 @@ RATIOS: Final = (
         high=300.0,
     ),
     Ratio(
+        of=("inflow_moment", "inertia"),
+        text="angular acceleration of inflow_moment per squared air speed [rad/m^2]",
+        value=lambda v: _over(max(map(abs, v.inflow_moment or (0.0,))) or None, min(v.inertia[:2])),
+        low=1e-2,
+        high=300.0,
+    ),
+    Ratio(
         of=("rate_damping", "inertia"),
         text="share of a body rate that rate_damping takes per second",
         value=lambda v: _over(max(v.rate_damping or (0.0,)) or None, min(v.inertia)),

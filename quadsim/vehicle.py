@@ -54,9 +54,10 @@ class Vehicle:
 
     Linear drag is a force -rotor_drag w v_perp on a rotor, v_perp its velocity through the air in the rotor's plane
     (Martin and Salaun, 2010; Furrer et al., 2016).  The same velocity v turns the vehicle, by (rotor_moment[0] w v_y,
-    -rotor_moment[1] w v_x, 0) for each rotor: its disc flaps, and its drag acts above the centre of mass.  Turning is
-    damped by -rate_damping times the body rates.  What is in `OPTIONAL_PARAMETERS` is None where its file does not
-    give it.
+    -rotor_moment[1] w v_x, 0) for each rotor: its disc flaps, and its drag acts above the centre of mass.  Flow along
+    body z adds (-inflow_moment[0] v_y v_z, inflow_moment[1] v_x v_z, 0), of rotors and body together: blades flap less
+    in a climb (Bramwell's Helicopter Dynamics, 2nd ed., Ch. 3).  Turning is damped by -rate_damping times the body
+    rates.  What is in `OPTIONAL_PARAMETERS` is None where its file does not give it.
 
     Raises:
         ParameterError: a value is not finite or impossible, or the vehicle cannot hover within its rotors' range.
@@ -111,6 +112,9 @@ class Vehicle:
     rotor_drag: Annotated[float | None, doc("[N s^2/(m rad)] linear drag of one rotor")] = None
     rotor_moment: Annotated[
         Pair | None, doc("[N m s^2/(m rad)] of one rotor about its hub's x and y, per speed and air speed across it")
+    ] = None
+    inflow_moment: Annotated[
+        Pair | None, doc("[N m s^2/m^2] of the whole vehicle about body x and y, per air speed along z and across it")
     ] = None
     rate_damping: Annotated[Vector | None, doc("[N m s/rad] of the whole vehicle about body x, y, z")] = None
     body_drag: Annotated[Vector | None, doc("[m^2] C_d A along body x, y, z")] = None
@@ -308,25 +312,30 @@ class Vehicle:
         return np.concatenate([wrench[:1] / self.mass, self.angular_acceleration(wrench[1:].T).T])
 
     def air_moment(self, turning: float, velocity: Array, rates: Array) -> Array:
-        """Return the torque (3,) [N m] of `rotor_moment` and `rate_damping`: (m_x W v_y, -m_y W v_x, 0) - D omega.
+        """Return the torque (3,) [N m] of `rotor_moment`, `inflow_moment` and `rate_damping`.
+
+        It is ((m_x W - k_x v_z) v_y, -(m_y W - k_y v_z) v_x, 0) - D omega.
 
         Args:
             turning: W, sum of the rotors' speeds [rad/s].
             velocity: (3,) v through the air, body axes [m/s].
             rates: (3,) omega, body axes [rad/s].
         """
-        m_x, m_y = self.rotor_moment or (0.0, 0.0)
-        across = np.array([m_x * velocity[1], -m_y * velocity[0], 0.0])
-        return np.asarray(turning * across - np.array(self.rate_damping or (0.0, 0.0, 0.0)) * rates)
+        (m_x, m_y), (k_x, k_y) = self.rotor_moment or (0.0, 0.0), self.inflow_moment or (0.0, 0.0)
+        v_x, v_y, v_z = velocity
+        across = np.array([(m_x * turning - k_x * v_z) * v_y, -(m_y * turning - k_y * v_z) * v_x, 0.0])
+        return np.asarray(across - np.array(self.rate_damping or (0.0, 0.0, 0.0)) * rates)
 
     def require_moment(self, owner: str) -> None:
         """Refuse a model of the air's moment where nothing is known of it.
 
         Raises:
-            ParameterError: the vehicle states neither `rotor_moment` nor `rate_damping`.
+            ParameterError: the vehicle states neither `rotor_moment` nor `inflow_moment` nor `rate_damping`.
         """
-        if self.rotor_moment is None and self.rate_damping is None:
-            rule = f"false, or {self.name} with rotor_moment or rate_damping, of which its file states neither"
+        if self.rotor_moment is None and self.inflow_moment is None and self.rate_damping is None:
+            rule = (
+                f"false, or {self.name} with rotor_moment, inflow_moment or rate_damping, of which its file states none"
+            )
             raise ParameterError(owner, "moment", True, rule)
 
     @property
@@ -545,10 +554,17 @@ OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if fi
 """Parameters that a vehicle file may leave out."""
 _LENGTHS: Final = {
     **{"thrust_of_speed": 2, "thrust_of_throttle": 2},
-    **{"inertia": 3, "products_of_inertia": 3, "rotor_moment": 2, "rate_damping": 3, "body_drag": 3},
+    **{
+        "inertia": 3,
+        "products_of_inertia": 3,
+        "rotor_moment": 2,
+        "inflow_moment": 2,
+        "rate_damping": 3,
+        "body_drag": 3,
+    },
     **{"rotor_azimuths": N_ROTORS, "rotor_positions": N_ROTORS, "rotor_spins": N_ROTORS},
 }
 _ANY_SIGN: Final = (
     *("rotor_azimuths", "rotor_positions", "rotor_spins", "speed_min"),
-    *("products_of_inertia", "rotor_moment", "rate_damping", "thrust_of_speed", "thrust_of_throttle"),
+    *("products_of_inertia", "rotor_moment", "inflow_moment", "rate_damping", "thrust_of_speed", "thrust_of_throttle"),
 )

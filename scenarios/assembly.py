@@ -83,6 +83,7 @@ _SIZES: Final = {
     "rotor_inertia": ("rotors", "inertia", RotorDynamics),
     "rotor_drag": ("air", "rotor_drag", Air),
     "rotor_moment": ("air", "rotor_moment", Air),
+    "inflow_moment": ("air", "inflow_moment", Air),
     "rate_damping": ("air", "rate_damping", Air),
     "body_drag": ("air", "body_drag", Air),
     "rotor_radius": ("ground", "rotor_radius", None),

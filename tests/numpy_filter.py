@@ -92,6 +92,7 @@ class MotionModel:
     gravity: float  # g [m/s^2]
     inertia: Array  # (3, 3) J [kg m^2]
     moment: tuple[float, ...]  # m of the air [N m s^2/(m rad)]
+    inflow: tuple[float, float]  # and per velocity along the body's z [N m s^2/m^2]
     damping: Array  # (3, 3) D [N m s/rad]
     allocation: Array  # (4, 4) from squared rotor speeds to thrust and torque
     noise: tuple[Array, Array, Array]
@@ -109,6 +110,7 @@ def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:
         gravity=vehicle.gravity,
         inertia=vehicle.inertia_matrix,
         moment=(settings.moment and vehicle.rotor_moment) or (0.0, 0.0),
+        inflow=(settings.moment and vehicle.inflow_moment) or (0.0, 0.0),
         damping=np.diag((settings.moment and vehicle.rate_damping) or (0.0, 0.0, 0.0)),
         allocation=read_only(vehicle.allocation),
         noise=_gathered(np.diag(density)),
@@ -131,8 +133,9 @@ def predict_estimate(model: MotionModel, estimate: Estimate, driven: Drive, dura
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, p, q, r, *bias = estimate.mean.tolist()
     attitude = (qw, qx, qy, qz)
     J, J_inverse = model.inertia, np.linalg.inv(model.inertia)
-    v_x, v_y, _ = Rotation.from_quat(attitude, scalar_first=True).inv().apply([vx, vy, vz])
-    across = driven.turning * np.array([model.moment[0] * v_y, -model.moment[1] * v_x, 0.0])
+    v_x, v_y, v_z = Rotation.from_quat(attitude, scalar_first=True).inv().apply([vx, vy, vz])
+    m_x, m_y = driven.turning * np.array(model.moment) - v_z * np.array(model.inflow)
+    across = np.array([m_x * v_y, -m_y * v_x, 0.0])
 
     def turned(rates: Array) -> Array:
         return J_inverse @ (driven.torque + across - model.damping @ rates - np.cross(rates, J @ rates))

@@ -83,6 +83,12 @@ def rotor_moment(
     return torque
 
 
+def inflow_moment(moment: tuple[float, float], turn: Rotation, air: Array) -> Array:
+    """v_z (-k_x v_y, k_y v_x, 0), v the body's velocity through the air, body (3,)."""
+    x, y, z = turn.inv().apply(air)
+    return np.asarray(z * np.array([-moment[0] * y, moment[1] * x, 0.0]))
+
+
 def axis_drag(linear: Sequence[float], quadratic: Sequence[float], turn: Rotation, air: Array) -> Array:
     """F_i = -(l_i + k_i |v_i|) v_i along the body's axes, world (3,)."""
     along = turn.inv().apply(air)

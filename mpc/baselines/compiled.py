@@ -17,7 +17,7 @@ class GeometricNumbersStruct(ctypes.Structure):
         *struct_members(INT, "commands feedforward moment exact motion horizon orders"),
         *struct_members(REAL, "period mass gravity k_x k_v k_R:3 k_Omega:3 k_attitude:3 k_i k_I c_1 c_2 sigma sigma_R"),
         *struct_members(
-            REAL, "least_lift slope ahead lead:3 drag:3 inertia:9 across:2 damping:3 turning least:4 most:4"
+            REAL, "least_lift slope ahead lead:3 drag:3 inertia:9 across:2 inflow:2 damping:3 turning least:4 most:4"
         ),
         *struct_members(AT, "preview course ramp fallback"),
     ]

@@ -380,6 +380,7 @@ def geometric_numbers(
         drag=settings.drag,
         inertia=vehicle.inertia_matrix,
         across=vehicle.rotor_moment or (0.0, 0.0),
+        inflow=vehicle.inflow_moment or (0.0, 0.0),
         damping=vehicle.rate_damping or (0.0, 0.0, 0.0),
         least=bounds.u_min,
         most=bounds.u_max,
@@ -403,7 +404,7 @@ class Geometric(Tuned):
     ] = (0.0, 0.0, 0.0)
     moment: Annotated[
         bool,
-        doc("whether feedforward balances the vehicle's rotor_moment and rate_damping, at the reference's motion"),
+        doc("whether feedforward balances rotor_moment, inflow_moment and rate_damping, at the reference's motion"),
     ] = False
     disturbance: Annotated[RampSettings | None, doc("absent: no disturbance observer")] = None
     indi: Annotated[INDISettings | None, doc("absent: rotors hold each command for a period")] = None

@@ -25,7 +25,7 @@ class ProblemStruct(ctypes.Structure):
             INT, "horizon actuators targets speeds moments substeps difference shifts moves tilts turns places"
         ),
         *struct_members(INT, "rows faces slacks room changes iterations corrections"),
-        *struct_members(REAL, "tolerance step gravity largest effect:16 gyration:3 moment:6 damping:9 lead:4"),
+        *struct_members(REAL, "tolerance step gravity largest effect:16 gyration:3 moment:6 inflow:6 damping:9 lead:4"),
         *struct_members(AT, "left"),
         *struct_members(REAL, "weight:21 effort:4 move"),
         *struct_members(AT, "terminal"),
@@ -84,9 +84,8 @@ def body_numbers(model: RigidBody, p: ProblemStruct) -> Array:
     ixx, iyy, izz = model.inertia.tolist()
     gyration = (0.0, 0.0, 0.0) if model.targets else ((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz)
     lag = np.array(model.lags)
-    set_arrays(
-        p, effect=model.effect, gyration=gyration, moment=model.moment, damping=model.damping, lead=lag / model.step
-    )
+    air = {"moment": model.moment, "inflow": model.inflow, "damping": model.damping}
+    set_arrays(p, effect=model.effect, gyration=gyration, lead=lag / model.step, **air)
     instants = np.arange(2 * model.substeps + 1)[:, None] * (0.5 * model.step / model.substeps)
     left = np.where(lag > 0.0, np.exp(-instants / np.where(lag > 0.0, lag, 1.0)), 0.0)
     p.left = left.ctypes.data

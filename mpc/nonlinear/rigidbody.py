@@ -86,6 +86,7 @@ class RigidBody:
     drag: Array = field(default_factory=zero)  # (3,) D_1, linear, body axes [N s/m]
     quadratic_drag: Array = field(default_factory=zero)  # (3,) D_2, body axes [N s^2/m^2]
     moment: Array = field(default_factory=partial(_zeros, 2))  # (3, 2) maps v_x, v_y [m/s] to I^-1 tau_a per share of W
+    inflow: Array = field(default_factory=partial(_zeros, 2))  # (3, 2) maps v_x v_z, v_y v_z [m^2/s^2] to I^-1 tau_a
     damping: Array = field(default_factory=partial(_zeros, 3))  # (3, 3) I^-1 D [1/s]; neither with targets
     acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
     angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha, body frame [rad/s^2]; none with targets
@@ -98,7 +99,7 @@ class RigidBody:
     @cached_property
     def moments(self) -> bool:
         """Whether the air turns the body."""
-        return bool(np.any(self.moment) or np.any(self.damping))
+        return any(map(np.any, (self.moment, self.inflow, self.damping)))
 
     @property
     def targets(self) -> bool:
@@ -148,9 +149,11 @@ def rigid_body(vehicle: Vehicle, step: float, *, moment: bool = False, **others:
     """Return the vehicle's model, undisturbed, with `moment` also in the air's torque; `others` sets other fields."""
     if moment:
         still, units = np.zeros(3), np.eye(3)
-        rolls = [vehicle.air_moment(vehicle.speed_max, unit, still) for unit in units[:2]]
+        across = [vehicle.air_moment(vehicle.speed_max, unit, still) for unit in units[:2]]
+        climbing = [vehicle.air_moment(0.0, unit + units[2], still) for unit in units[:2]]
         damped = [vehicle.air_moment(0.0, still, unit) for unit in units]
-        others["moment"] = read_only(vehicle.angular_acceleration(np.array(rolls)).T)
+        others["moment"] = read_only(vehicle.angular_acceleration(np.array(across)).T)
+        others["inflow"] = read_only(vehicle.angular_acceleration(np.array(climbing)).T)
         others["damping"] = read_only(-vehicle.angular_acceleration(np.array(damped)).T)
     return RigidBody(
         effectiveness=read_only(vehicle.accelerations(vehicle.allocation / vehicle.mean_coefficient)),

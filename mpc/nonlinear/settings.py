@@ -155,7 +155,8 @@ class Nonlinear(ControllerTable):
         0.0,
     )
     moment: Annotated[
-        bool, doc("whether the prediction has the vehicle's rotor_moment, in still air, and its rate_damping")
+        bool,
+        doc("whether the prediction has the vehicle's rotor_moment, inflow_moment, in still air, and rate_damping"),
     ] = False
     output_bounds: Annotated[
         dict[str, Pair], doc("[m, m/s] lower and upper bound, of positions and velocities by their states' names")

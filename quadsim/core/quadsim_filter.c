@@ -225,14 +225,16 @@ static int alike(const double *commands, const uint8_t *grounded, int64_t one, i
            && !memcmp(commands + ROTORS * one, commands + ROTORS * other, ROTORS * sizeof *commands);
 }
 
-/* The moment of the rotors at the mean's velocity, for the sum of their speeds; the covariance knows nothing of it. */
-static void add_rotor_moment(const quadsim_filter *f, const quadsim_track *t, double turning, double *torque)
+/* The moment of the air at the mean's velocity, for the sum of the rotors' speeds; the covariance knows nothing of it. */
+static void add_air_moment(const quadsim_filter *f, const quadsim_track *t, double turning, double *torque)
 {
-    double R[3][3];
-    const double *v = t->mean + V_;
+    double R[3][3], along[3];
     to_matrix(t->mean + QUATERNION, R);
-    torque[0] += f->rotor_moment[0] * turning * along_axis(R, 1, v);
-    torque[1] -= f->rotor_moment[1] * turning * along_axis(R, 0, v);
+    for (int i = 0; i < 3; i++) {
+        along[i] = along_axis(R, i, t->mean + V_);
+    }
+    torque[0] += (f->rotor_moment[0] * turning - f->inflow_moment[0] * along[2]) * along[1];
+    torque[1] -= (f->rotor_moment[1] * turning - f->inflow_moment[1] * along[2]) * along[0];
 }
 
 static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *commands, const uint8_t *grounded, int64_t base,
@@ -252,7 +254,7 @@ static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *
                 turning += i == 0 ? speed : 0.0;
             }
         }
-        add_rotor_moment(f, t, turning, wrench + 1);
+        add_air_moment(f, t, turning, wrench + 1);
         memcpy(mean, t->mean, sizeof mean);
         const double acceleration = wrench[0] / f->mass, h = (double)length * f->timestep;
         if (grounded[first] && !(acceleration > f->gravity)) {

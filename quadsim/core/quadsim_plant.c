@@ -207,7 +207,7 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
         wrench[i] = 0.0;
         wrench[3 + i] = -v->rate_damping[i] * rate[i];
     }
-    for (int i = 0; i < 2; i++) {
+    for (int i = 0; i < 3; i++) {
         along[i] = along_axis(R, i, air);
     }
     wrench[3] -= rate[1] * rotors->momentum;
@@ -224,6 +224,8 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
     add_air_drag(v->linear_drag, v->quadratic_drag, R, air, along, pull, wrench);
     wrench[3] += v->rotor_moment[0] * (along[1] * rotors->turning + rate[2] * rotors->turning_x);
     wrench[4] -= v->rotor_moment[1] * (along[0] * rotors->turning - rate[2] * rotors->turning_y);
+    wrench[3] -= v->inflow_moment[0] * along[1] * along[2];
+    wrench[4] += v->inflow_moment[1] * along[0] * along[2];
     add_height(v, R, along, rate, rotors->speed, wrench);
     add_pushes(v, R, wrench);
     if (v->radius > 0.0) {

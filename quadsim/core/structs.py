@@ -58,9 +58,10 @@ class VehicleStruct(Structure):
         "*step *model *data *motion *velocity *applied *control *wind *obstacles *fluid #mocaps timestep plausible "
         "fastest_valid mass gravity inertia:3 products:3 inverse:3x3 torque_of_thrust:3x4 linear "
         "coefficient:4 hover demand:4 linear_demand slowest fastest place:4x3 spin:4 rotor_drag rotor_inertia "
-        "rotor_moment:2 rate_damping:3 linear_drag:3 quadratic_drag:3 floor disc radius loss deviation largest:4 cells "
-        "capacity resistance hover_current idle_current reference_voltage exponent *curve #points #follows_motion rise "
-        "fall acceleration efficiency:4 #at_once *pushes #pushing #now time speeds:4 target:4 before:6 charge"
+        "rotor_moment:2 inflow_moment:2 rate_damping:3 linear_drag:3 quadratic_drag:3 floor disc radius loss deviation "
+        "largest:4 cells capacity resistance hover_current idle_current reference_voltage exponent *curve #points "
+        "#follows_motion rise fall acceleration efficiency:4 #at_once *pushes #pushing #now time speeds:4 target:4 "
+        "before:6 charge"
     )
 
 
@@ -99,8 +100,8 @@ class FilterStruct(Structure):
     """A `quadsim_filter`."""
 
     _fields_ = _members(
-        "timestep mass gravity inertia:3 products:3 inverse:3x3 allocation:4x4 rotor_moment:2 rate_damping:3 density:5 "
-        "variance:4x3 initial:15 gate patience #stride"
+        "timestep mass gravity inertia:3 products:3 inverse:3x3 allocation:4x4 rotor_moment:2 inflow_moment:2 "
+        "rate_damping:3 density:5 variance:4x3 initial:15 gate patience #stride"
     )
 
 

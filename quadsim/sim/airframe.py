@@ -93,7 +93,7 @@ def compile_model(
         reweighed: whether the body's mass may change after compilation; see `quadsim.sim.effects.load.apply_mass`.
         body_drag: drag areas C_d A along the body axes [m^2], or None.  The drag is MuJoCo's own, on the ellipsoid
             with these projected areas: -rho A |v| v / 2 against the air that `option.wind` moves.  It includes the
-            ellipsoid's added-mass terms: a few grams of air, and a torque in oblique flow (Munk's moment), which a
+            ellipsoid's added-mass terms: a few grams of air, and a torque in oblique flow, `munk_moment`, which a
             vehicle of some 200 g feels at 5 m/s.
         air_density: rho [kg/m^3].
         obstacles: objects that the vehicle's bounding ball touches; moving ones are mocap bodies with their names.
@@ -247,3 +247,12 @@ def added_mass(areas: Sequence[float], density: float) -> Array:
     squares, product = np.square(r), float(np.prod(r))
     alpha = 2.0 / 3.0 * product * elliprd(np.roll(squares, -1), np.roll(squares, -2), squares)
     return np.asarray(density * 4.0 / 3.0 * np.pi * product * alpha / (2.0 - alpha))
+
+
+def munk_moment(areas: Sequence[float], density: float) -> tuple[float, float]:
+    """The `inflow_moment` [N m s^2/m^2] of the ellipsoid's added mass: (m_z - m_y, m_z - m_x).
+
+    Munk, "The Aerodynamic Forces on Airship Hulls", NACA report 184, 1924; arguments as of `added_mass`.
+    """
+    x, y, z = added_mass(areas, density).tolist()
+    return z - y, z - x

@@ -82,7 +82,10 @@ class EstimatorSettings:
     """
 
     moment: Annotated[
-        bool, doc("whether the model has the vehicle's rotor_moment, at the velocity over ground, and rate_damping")
+        bool,
+        doc(
+            "whether the model has the vehicle's rotor_moment, inflow_moment, at velocity over ground, and rate_damping"
+        ),
     ] = False
     acceleration_noise: Annotated[NonNegative, doc("[m/s^2/sqrt(Hz)] unmodelled white acceleration")] = 0.3
     angular_acceleration_noise: Annotated[
@@ -152,6 +155,7 @@ class ErrorStateFilter:
         if settings.moment:
             vehicle.require_moment("estimator")
             f.rotor_moment[:] = vehicle.rotor_moment or (0.0, 0.0)
+            f.inflow_moment[:] = vehicle.inflow_moment or (0.0, 0.0)
             f.rate_damping[:] = vehicle.rate_damping or (0.0, 0.0, 0.0)
         fill(f.allocation, vehicle.allocation)
         deviations = settings.acceleration_noise, settings.angular_acceleration_noise

@@ -25,7 +25,7 @@ from quadsim.core.structs import (
 )
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError, RaisedError
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
-from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
+from quadsim.sim.airframe import BODY, compile_model, munk_moment, obstacle_body, outline
 from quadsim.sim.effects import LOADING, Change, Effects, Force, PushChange
 from quadsim.sim.effects.load import Load, MassChange, Payload, PayloadDrop, apply_mass, mass_properties
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
@@ -228,6 +228,9 @@ class Plant:
         if (air := effects.air) is not None:
             v.rotor_drag = air.rotor_drag or 0.0
             v.rotor_moment[:], v.rate_damping[:] = air.rotor_moment or (0.0, 0.0), air.rate_damping or (0.0, 0.0, 0.0)
+            if air.inflow_moment is not None:  # of which MuJoCo's ellipsoid gives a part
+                by_body = (0.0, 0.0) if air.body_drag is None else munk_moment(air.body_drag, air.density)
+                v.inflow_moment[:] = np.subtract(air.inflow_moment, by_body)
             v.linear_drag[:], v.quadratic_drag[:] = air.linear_drag, air.quadratic_drag
         if (ground := effects.ground) is not None and ground.effect:
             shape = outline(vehicle)

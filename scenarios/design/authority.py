@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linprog
 
-from quadsim.sim.airframe import added_mass
+from quadsim.sim.airframe import munk_moment
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -70,15 +70,14 @@ def authority(vehicle: Vehicle) -> Authority:
 def _munk(vehicle: Vehicle) -> float:
     """The larger p / v of roll and pitch [1/m].
 
-    At a level speed v and a small tilt, air of added mass m turns the body by (m_z - m_x) v^2 tilt further across its
-    way (Munk, "The Aerodynamic Forces on Airship Hulls", NACA report 184, 1924): J tilt'' = (m_z - m_x) v^2 tilt, which
-    grows as exp(p t).
+    At a level speed v and a small tilt, an inflow moment k, the vehicle's or that of its body, turns it by k v^2 tilt
+    further across its way: J tilt'' = k v^2 tilt, which grows as exp(p t).
     """
-    if vehicle.body_drag is None:
-        return 0.0
-    along = added_mass(vehicle.body_drag, SEA_LEVEL_DENSITY)
-    ixx, iyy, _ = vehicle.inertia
-    return math.sqrt(max(0.0, (along[2] - along[0]) / iyy, (along[2] - along[1]) / ixx))
+    inflow = vehicle.inflow_moment
+    if inflow is None and vehicle.body_drag is not None:
+        inflow = munk_moment(vehicle.body_drag, SEA_LEVEL_DENSITY)
+    (about_x, about_y), (ixx, iyy, _) = inflow or (0.0, 0.0), vehicle.inertia
+    return math.sqrt(max(0.0, about_x / ixx, about_y / iyy))
 
 
 def torque_ranges(vehicle: Vehicle) -> tuple[TorqueRange, ...]:

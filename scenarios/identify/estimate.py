@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 from quadsim.vehicle import Vehicle
 
-VECTORS: Final = {"inertia": "xyz", "rotor_moment": "xy", "rate_damping": "xyz"}
+VECTORS: Final = {"inertia": "xyz", "rotor_moment": "xy", "inflow_moment": "xy", "rate_damping": "xyz"}
 """Fields of a vehicle file whose numbers are parameters of their own, with their axes: `inertia_x`."""
 
 
@@ -49,7 +49,7 @@ class FlightNumbers(NamedTuple):
 
     delay: float
     offset: tuple[float, float]
-    wind: tuple[float, float]
+    wind: tuple[float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class Identification:
     vehicle: Vehicle  # the start with what was identified in its place
     delay: float  # of the commands, or by which measured speeds are logged late [s]
     offset: tuple[float, float]  # x and y of the centre of mass in the rotors' frame [m]
-    wind: tuple[float, float] = (0.0, 0.0)  # mean, world x and y [m/s]
+    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)  # mean, world [m/s]
     flights: tuple[FlightNumbers, ...] = ()  # of each log, what the three above are the means of
     throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle [-]
     yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]

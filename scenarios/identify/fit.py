@@ -35,9 +35,12 @@ _NORMAL: Final = 1.96  # standard deviations on either side, of a normal distrib
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
 _YAW: Final = "yaw steps of 40 deg, one per second, for 10 s"
 _GUSTS: Final = 0.015  # of drag, by wind that changes faster than its knots
+_BLOWN: Final = 0.01  # of what torques show, by such wind where `rotor_moment` turns it into torque
+_MAPPED: Final = 3.0  # how much more the prediction leaves out where speeds follow from a throttle's curve
 _SPUN: Final = 0.004  # of inertia: noise of the gyro shrinks what commands explain, by 0.5 % where it is loud
 _TURNS: Final = "a figure eight with yaw steps, 20 s"
 _FAST: Final = "a figure eight at 2 m/s or more, 20 s"
+_CLIMBING: Final = "climbs and descents of 1 m/s while moving sideways at 2 m/s, 20 s"
 _MEASURE: Final = "log the rotors' speeds too"
 
 
@@ -63,6 +66,8 @@ _KINDS: Final = {
     "rotor_drag": _Kind(("vx", "vy"), _FAST, floor=_GUSTS),
     "rotor_moment_x": _Kind(("roll",), _FAST, floor=0.02, widest=0.5),
     "rotor_moment_y": _Kind(("pitch",), _FAST, floor=0.02, widest=0.5),
+    "inflow_moment_x": _Kind(("roll",), _CLIMBING, floor=0.02, widest=1.0),
+    "inflow_moment_y": _Kind(("pitch",), _CLIMBING, floor=0.02, widest=1.0),
     **{
         f"rate_damping_{axis}": _Kind((of,), _TURNS, floor=0.02, widest=4.0)
         for axis, of in zip("xyz", INCREMENTS, strict=False)
@@ -150,6 +155,7 @@ class _Fit:
         self._alone = record.commands is None and record.throttle is None  # measured speeds, without commands
         self.colour = _colour(search)
         self.most_colour = max(MOST_COLOUR, CHANCE / min(map(len, search.innovations(search.x))) ** 0.5)
+        self._blown = self._gusts_turn()
         self.set_anew: set[str] = set()
         """Numbers that are refused and yet sought once more: where the log speaks against the start."""
         self.estimates = self._every_estimate()
@@ -166,9 +172,25 @@ class _Fit:
         scatter = math.sqrt((len(each) - 1) * each.var())
         colour = max(self.colour[axis] for axis in axes)
         widened = math.sqrt((1.0 + colour) / (1.0 - colour)) if colour > self.most_colour else 1.0
-        floor = max(_KINDS[self._kind(i)].floor for i in shares)
         explained = math.sqrt(row @ self.cov @ row)
-        return math.hypot(_NORMAL * widened * explained, self.quantile * scatter, self.quantile * floor)
+        return math.hypot(
+            _NORMAL * widened * explained, self.quantile * scatter, self.quantile * self._floor(shares, axes)
+        )
+
+    def _floor(self, shares: Mapping[int, float], axes: Sequence[str]) -> float:
+        """Deviation of a sum of shares of x by what the prediction leaves out."""
+        floor = max(_KINDS[self._kind(i)].floor for i in shares) * (_MAPPED if self._throttle else 1.0)
+        turns = {*axes} <= {"roll", "pitch", "yaw"} and all(self.search.sought[i].scale is None for i in shares)
+        return math.hypot(floor, _BLOWN) if turns and self._blown else floor
+
+    def _gusts_turn(self) -> bool:
+        """Whether there is wind and, by two standard deviations, a moment that it makes a torque of."""
+        sought, deviations = self.search.sought, np.sqrt(np.diag(self.cov))
+        moments = [i for i, number in enumerate(sought) if number.name.startswith("rotor_moment")]
+        blows = any(number.name == "wind" for number in sought)
+        return blows and any(
+            abs(sought[i].value(self.search.x[i])) > 2.0 * deviations[i] * (sought[i].scale or 0.0) for i in moments
+        )
 
     def _kind(self, i: int) -> str:
         name = self.search.sought[i].name
@@ -315,10 +337,9 @@ class _Fit:
             known = name == "lateness" or (name == "delay" and not self._blind)
             found = numbers.get("delay", ()) if name == "lateness" else () if known else numbers.get(name, ())
             if len(found) == 1:
-                values[name] = float(f"{np.clip(found[0], estimate.low, estimate.high):.6g}")
+                values[name] = float(f"{found[0]:.6g}")
             if found and not estimate.refused:
-                mean = values.get(name, float(np.clip(np.mean(found), estimate.low, estimate.high)))
-                estimate = replace(estimate, value=mean)
+                estimate = _moved(estimate, values.get(name, float(np.mean(found))))
             estimates.append(estimate)
         # Each within its interval, the three together may make no body.
         inertia = [values.get(f"inertia_{axis}", number_in(self.vehicle, f"inertia_{axis}") or 0.0) for axis in "xyz"]
@@ -353,8 +374,7 @@ class _Fit:
         places = [i for i, part in enumerate(refined.parts) if part.flight == flight]
         each = [refined.parameters(refined.x, i) for i in places]
         wind = np.mean([p.wind.mean(axis=0) for p in each], axis=0)
-        offset = each[0].offset
-        return FlightNumbers(each[0].delay, (float(offset[0]), float(offset[1])), (float(wind[0]), float(wind[1])))
+        return FlightNumbers(each[0].delay, tuple(each[0].offset.tolist()), tuple(wind.tolist()))
 
     def _assembled(self, values: Mapping[str, float]) -> Vehicle:
         """The start's vehicle with other values; a vector that the start lacks is there if a number of it is known."""
@@ -384,6 +404,13 @@ def _impossible(search: Search) -> dict[str, float]:
     if not _is_body(inertia) and search.fixed.get("inertia_z") != (flat := PLATE[0] * (inertia[0] + inertia[1])):
         held["inertia_z"] = flat
     return held
+
+
+def _moved(estimate: ParameterEstimate, value: float) -> ParameterEstimate:
+    """What the second search found, its interval that of both: what they differ by is not known either."""
+    moved = value - estimate.value
+    low, high = estimate.low + min(moved, 0.0), estimate.high + max(moved, 0.0)
+    return replace(estimate, value=value, low=low, high=high)
 
 
 def _is_body(inertia: Sequence[float]) -> bool:

@@ -36,10 +36,11 @@ class Parameters:
     rotor_drag: float
     body_drag: Array  # (3,)
     rotor_moment: Array  # (2,)
+    inflow_moment: Array  # (2,)
     rate_damping: Array  # (3,)
     offset: Array = field(default_factory=lambda: np.zeros(2))  # (2,) centre of mass in the rotors' frame [m]
-    wind: Array = field(default_factory=lambda: np.zeros((2, 2)))
-    """(W, 2) world x and y, linear between W instants from first sample to last [m/s]."""
+    wind: Array = field(default_factory=lambda: np.zeros((2, 3)))
+    """(W, 3) world, linear between W instants from first sample to last [m/s]."""
     inflow: float = 0.0  # thrust lost per rotor speed and air speed along the axis [N s^2/(m rad)]
     yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
     throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle [-]
@@ -53,7 +54,7 @@ class Parameters:
         own |= {name: getattr(vehicle, name) or 0.0 for name in ("rotor_inertia", "rotor_drag")}
         own |= {"thrust_coefficient": vehicle.mean_coefficient, "drag_to_thrust": vehicle.drag_to_thrust}
         own |= {"throttle_curve": vehicle.throttle_share}
-        vectors = {"rotor_moment": 2, "rate_damping": 3, "body_drag": 3}
+        vectors = {"rotor_moment": 2, "inflow_moment": 2, "rate_damping": 3, "body_drag": 3}
         own |= {name: np.array(getattr(vehicle, name) or (0.0,) * n) for name, n in vectors.items()}
         return cls(**({"inertia": np.array(vehicle.inertia)} | own | others))
 
@@ -137,7 +138,7 @@ def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, 
     spin = np.array(vehicle.rotor_spins, float)
     dt, jx, jy, jz = motion.period, *p.inertia
     when = np.linspace(0.0, len(p.wind) - 1.0, len(motion.rates))
-    wind = np.stack([*(np.interp(when, np.arange(len(p.wind)), w) for w in p.wind.T), np.zeros(len(when))], axis=1)
+    wind = np.stack([np.interp(when, np.arange(len(p.wind)), w) for w in p.wind.T], axis=1)
     air = np.einsum("kji,kj->ki", motion.turn, motion.velocity - wind)  # body axes
     roll, pitch, yaw = motion.rates.T
     axial = air[:, 2:] + roll[:, None] * y - pitch[:, None] * x
@@ -153,11 +154,13 @@ def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, 
             thrust @ y
             - p.offset[1] * total
             + p.rotor_moment[0] * (rotors.mean.sum(axis=1) * air[:, 1] + yaw * (rotors.mean @ x))
+            - p.inflow_moment[0] * air[:, 1] * air[:, 2]
             - momentum * pitch
             - (jz - jy) * pitch * yaw,
             p.offset[0] * total
             - thrust @ x
             - p.rotor_moment[1] * (rotors.mean.sum(axis=1) * air[:, 0] - yaw * (rotors.mean @ y))
+            + p.inflow_moment[1] * air[:, 0] * air[:, 2]
             + momentum * roll
             - (jx - jz) * roll * yaw,
             p.drag_to_thrust * (thrust @ spin)

@@ -24,12 +24,12 @@ from scenarios.identify.model import INCREMENTS, Parameters, Stretch, predicted_
 from scenarios.identify.rotors import Turning
 
 TURN_ON: Final = 0.5  # time [s] after a stretch begins until the rotors have forgotten the speeds assumed there
-KNOT: Final = 1.5  # time between two instants of the wind [s]
+KNOT: Final = 0.5  # time between two instants of the wind [s], where `_MOST_KNOTS` allow
 LONGEST_FORCE: Final = 2.0
 """Time [s] that an unknown force lasts: one that may last for ever would carry the weight in the thrust's place."""
 BALANCE: Final = 0.002
 """Standard deviation of the mean lift over a log that is not the rotors' or drag, over the weight [-]."""
-_MOST_KNOTS: Final = 40
+_MOST_KNOTS: Final = 120  # of all stretches
 SHORTEST_FOLD: Final = 3.0  # shortest part of a log that is left out in turn [s]
 FEWEST: Final = 6  # parts, shorter ones of a log of less than 18 s: of 2, Student's t makes intervals useless
 _MOST_BLOCKS: Final = 20
@@ -39,7 +39,8 @@ PLATE: Final = (0.87, 0.12)
 """Inertia_z over inertia_x + inertia_y, and its standard deviation in logarithms; of a plate it is 1."""
 LEVEL_PLATE: Final = (1.0, 1.0, 2.0)  # drag areas along x, y, z to each other, where the start has none
 _LAG_RATIO: Final = 0.5  # standard deviation of log(rise / fall)
-_WIND_STEP: Final = 1.0  # standard deviation of the wind's change from knot to knot [m/s]
+_WIND: Final = (2.0, 2.0, 0.7)  # standard deviation of the mean wind of a stretch, world axes [m/s]
+_WIND_STEP: Final = 0.2  # of its change in one second, over that of the mean
 _STEPS, _TRIES, _SMALL = 60, 8, 5e-3  # of the search: how many, shortened how often, until the likelihood gains less
 ROTOR_PARAMETERS: Final = ("rotor_rise", "rotor_fall", "delay", "throttle_curve", "voltage_exponent")
 """Parameters that the rotors' speeds depend on."""
@@ -76,6 +77,9 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterat
     for i, axis in enumerate("xy"):
         moment = vehicle.rotor_moment[i] if vehicle.rotor_moment else 0.0
         yield Sought(f"rotor_moment_{axis}", moment, 0.01 * weight * arm / (4.0 * hover), 10.0)
+    for i, axis in enumerate("xy"):
+        moment = vehicle.inflow_moment[i] if vehicle.inflow_moment else 0.0
+        yield Sought(f"inflow_moment_{axis}", moment, 0.01 * weight * arm, 10.0)
     for i, axis in enumerate("xyz"):
         damping = vehicle.rate_damping[i] if vehicle.rate_damping else 0.0
         yield Sought(f"rate_damping_{axis}", damping, vehicle.inertia[i], 10.0)
@@ -91,11 +95,12 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterat
         yield Sought("delay", 0.0, 0.005, 4.0, flight)
         yield from (Sought(f"offset_{axis}", 0.0, 0.01 * arm, 10.0, flight) for axis in "xy")
     for i, part in enumerate(parts if wind else ()):
-        yield from (Sought("wind", 0.0, 1.0, 2.0, part.flight, i) for _ in range(2 * _knots(part)))
+        knots = int(np.clip(np.ceil(_seconds(part) / KNOT), 2, max(2, _MOST_KNOTS // len(parts))))
+        yield from (Sought("wind", 0.0, of, knots**0.5, part.flight, i) for _ in range(knots) for of in _WIND)
 
 
-def _knots(part: Stretch) -> int:
-    return int(np.clip(np.ceil(len(part.increments) * part.record.period / KNOT), 2, _MOST_KNOTS))
+def _seconds(part: Stretch) -> float:
+    return len(part.increments) * part.record.period
 
 
 class NormalEquations(NamedTuple):
@@ -135,8 +140,8 @@ class Search:
         self._weights = np.append(self._weights, np.full(len(self.x) - self._starts, 1 / 16.0))
         winds = [[i for i, n in enumerate(self.sought) if n.part == k] for k in range(len(parts))]
         self._winds = [
-            np.array(wind, int).reshape(-1, 2) for wind in winds
-        ]  # (K, 2) where each stretch's wind is in `x`
+            np.array(wind, int).reshape(-1, 3) for wind in winds
+        ]  # (K, 3) where each stretch's wind is in `x`
 
     def parameters(self, x: Array, part: int) -> Parameters:
         """The prediction's parameters for a stretch."""
@@ -146,7 +151,7 @@ class Search:
             if n.flight in (None, self.parts[part].flight) and n.part is None
         } | dict(self.fixed)
         if len(self._winds[part]):
-            own["wind"] = x[self._winds[part]]
+            own["wind"] = x[self._winds[part]] * _WIND
         area, given = own.pop("body_drag"), self.vehicle.body_drag or LEVEL_PLATE
         for name, axes in {**VECTORS, "offset": "xy"}.items():
             own[name] = np.array([own.pop(f"{name}_{axis}") for axis in axes])
@@ -222,10 +227,10 @@ class Search:
             rise, fall = place["rotor_rise"], place["rotor_fall"]
             ratio = self.sought[rise].value(x[rise]) / self.sought[fall].value(x[fall])
             yield [(rise, 1.0), (fall, -1.0)], float(np.log(ratio)), _LAG_RATIO
-        for before, after in (
-            (b, a) for wind in self._winds for b, a in zip(wind[:-1].flat, wind[1:].flat, strict=True)
-        ):
-            yield [(before, -1.0), (after, 1.0)], x[after] - x[before], _WIND_STEP
+        for part, wind in zip(self.parts, self._winds, strict=True):
+            step = _WIND_STEP * math.sqrt(_seconds(part) / max(len(wind) - 1, 1))
+            for before, after in zip(wind[:-1].flat, wind[1:].flat, strict=True):
+                yield [(before, -1.0), (after, 1.0)], x[after] - x[before], step
 
     def cost(self, x: Array) -> float:
         """Negative logarithm of the likelihood, each axis at its most likely variance, and of the priors."""

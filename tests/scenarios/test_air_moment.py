@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy_laws import rotor_moment
+from numpy_laws import inflow_moment, rotor_moment
 from scipy.spatial.transform import Rotation
 from uneven import published
 
@@ -42,10 +42,10 @@ def figure_eight(**controller: Any) -> Scenario:
 def test_the_model_is_that_of_the_plant() -> None:
     """With rotors that turn alike, whatever the motion."""
     vehicle, rng = quadsim.load_vehicle("hummingbird"), np.random.default_rng(3)
-    vehicle = replace(vehicle, rotor_moment=(2e-5, -3e-5), rate_damping=(0.1, 0.2, 0.3))
+    vehicle = replace(vehicle, rotor_moment=(2e-5, -3e-5), inflow_moment=(3e-3, -4e-3), rate_damping=(0.1, 0.2, 0.3))
     velocity, rates = rng.normal(size=(2, 3))
     expected = rotor_moment(vehicle, (2e-5, -3e-5), np.full(4, 400.0), Rotation.identity(), velocity, rates)
-    expected -= np.array([0.1, 0.2, 0.3]) * rates
+    expected += inflow_moment((3e-3, -4e-3), Rotation.identity(), velocity) - np.array([0.1, 0.2, 0.3]) * rates
     np.testing.assert_allclose(vehicle.air_moment(1600.0, velocity, rates), expected, atol=1e-15)
 
 
@@ -153,11 +153,11 @@ def test_linear_mpc_takes_it_through_its_disturbance_also_in_wind() -> None:
 
 
 def test_an_unknown_moment_is_refused() -> None:
-    with pytest.raises(InputError, match=r"controller\.moment must be false, or deadcat with rotor_moment or rate_dam"):
+    with pytest.raises(InputError, match=r"controller\.moment must be false, or deadcat with rotor_moment, inflow_m"):
         GeometricController(published("deadcat"), 0.02, Geometric(feedforward=True, moment=True))
     with pytest.raises(InputError, match="moment must be false where feedforward is not true"):
         Geometric(moment=True)
-    with pytest.raises(InputError, match=r"controller\.moment must be false, or deadcat with rotor_moment or rate_dam"):
+    with pytest.raises(InputError, match=r"controller\.moment must be false, or deadcat with rotor_moment, inflow_m"):
         NonlinearMPC(published("deadcat"), period=0.02, settings=Nonlinear(moment=True))
     with pytest.raises(
         ValueError, match='moment must be absent where commands = "rates": the autopilot turns the rotors'

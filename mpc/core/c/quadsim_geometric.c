@@ -398,7 +398,7 @@ void quadsim_geometric_wrench(quadsim_geometric *law, const motion_now *motion, 
         const real share = wrench[0] / (n->mass * n->gravity); /* speeds as the root of the thrust */
         real velocity[3], air[3];
         turn_back_by(motion->attitude, target->path[VELOCITY], velocity);
-        air_moment(n->across, n->damping, n->turning * square_root(share), velocity, Omega_d, air);
+        air_moment(n->across, n->inflow, n->damping, n->turning * square_root(share), velocity, Omega_d, air);
         for (i = 0; i < 3; i++) {
             wrench[1 + i] -= air[i];
         }

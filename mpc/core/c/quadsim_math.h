@@ -251,13 +251,13 @@ static inline void attitude_of(const real *q, real attitude[9])
     }
 }
 
-/* The torque of the air on rotors whose speeds add up to `turning`: (m_x W v_y, -m_y W v_x, 0) - D omega; velocity
- * through the air, and rates, along the body's axes. */
-static inline void air_moment(const real *across, const real *damping, real turning, const real *velocity,
-                              const real *rates, real torque[3])
+/* The torque of the air on rotors whose speeds add up to `turning`: ((m_x W - k_x v_z) v_y, -(m_y W - k_y v_z) v_x, 0)
+ * - D omega; velocity through the air, and rates, along the body's axes. */
+static inline void air_moment(const real *across, const real *inflow, const real *damping, real turning,
+                              const real *velocity, const real *rates, real torque[3])
 {
-    torque[0] = turning * across[0] * velocity[1] - damping[0] * rates[0];
-    torque[1] = -turning * across[1] * velocity[0] - damping[1] * rates[1];
+    torque[0] = (turning * across[0] - inflow[0] * velocity[2]) * velocity[1] - damping[0] * rates[0];
+    torque[1] = -(turning * across[1] - inflow[1] * velocity[2]) * velocity[0] - damping[1] * rates[1];
     torque[2] = -damping[2] * rates[2];
 }
 

@@ -60,8 +60,9 @@ typedef struct quadsim_nmpc_problem {
     quadsim_real largest;       /* thrust that is a share of 1 [N]: of a rotor, or with targets the weight */
     quadsim_real effect[16];    /* maps shares to T [m/s^2] and I^-1 tau; with targets its diagonal to T and body rates */
     quadsim_real gyration[3];   /* (Iyy - Izz) / Ixx, ... */
-    quadsim_real moment[6], damping[9]; /* I^-1 torque: [3][2] of velocity along body x and y, per sum of the rotors'
-                                         * speeds as shares, and [3][3] of body rates, which it opposes */
+    quadsim_real moment[6], inflow[6], damping[9]; /* I^-1 torque: [3][2] of velocity along body x and y, per sum of the
+                                         * rotors' speeds as shares, and per velocity along z, and [3][3] of body rates,
+                                         * which it opposes */
     quadsim_real lead[4];       /* targets: time constants over the step, for the reference */
     const quadsim_real *left;   /* [2 substeps + 1][4] of a distance from the input, after each half substep */
     quadsim_real weight[QUADSIM_NMPC_MOST], effort[QUADSIM_INPUTS], move; /* diagonals of Q and R; of steps of inputs */

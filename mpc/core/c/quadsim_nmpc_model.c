@@ -94,8 +94,9 @@ static void turn_by_air(const quadsim_nmpc_problem *p, real speed, const real *a
 {
     int i;
     for (i = 0; i < 3; i++) {
-        const real *m = p->moment + 2 * i, *c = p->damping + 3 * i;
-        turned[i] = speed * (m[0] * along[0] + m[1] * along[1]) - (c[0] * w[0] + c[1] * w[1] + c[2] * w[2]);
+        const real *m = p->moment + 2 * i, *k = p->inflow + 2 * i, *c = p->damping + 3 * i;
+        turned[i] = (speed * m[0] + along[2] * k[0]) * along[0] + (speed * m[1] + along[2] * k[1]) * along[1] -
+                    (c[0] * w[0] + c[1] * w[1] + c[2] * w[2]);
     }
 }
 
@@ -122,8 +123,7 @@ static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wor
                                   {{R(0.0), y, z}, {y, R(-2.0) * x, -w}, {z, w, R(-2.0) * x}},
                                   {{R(-2.0) * y, x, w}, {x, R(0.0), z}, {-w, z, R(-2.0) * y}},
                                   {{R(-2.0) * z, -w, x}, {w, R(-2.0) * z, y}, {x, y, R(0.0)}}}; /* halves */
-    const real *const m = p->moment;
-    real turn[3][3], pull[3], damped[3][3], along[3], turned[3];
+    real turn[3][3], pull[3], damped[3][3], along[3], turned[3], by_along[3][3];
     int i, j, a;
     rotation_of(q, R(2.0), turn);
     add_air_drag(world->drag, world->square_drag, turn, v, along, pull, k->v);
@@ -137,10 +137,14 @@ static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wor
         turn_by_air(p, drive->speed, along, w_b, turned);
     }
     for (i = 0; p->moments && i < 3; i++) {
-        k->w_by_speed[i] = m[2 * i] * along[0] + m[2 * i + 1] * along[1];
+        const real *const m = p->moment + 2 * i, *const inflow = p->inflow + 2 * i;
+        k->w_by_speed[i] = m[0] * along[0] + m[1] * along[1];
         k->w[i] += turned[i];
+        by_along[i][0] = drive->speed * m[0] + along[2] * inflow[0];
+        by_along[i][1] = drive->speed * m[1] + along[2] * inflow[1];
+        by_along[i][2] = inflow[0] * along[0] + inflow[1] * along[1];
         for (j = 0; j < 3; j++) {
-            k->w_by_v[i][j] = drive->speed * (m[2 * i] * turn[j][0] + m[2 * i + 1] * turn[j][1]);
+            k->w_by_v[i][j] = dot(by_along[i], turn[j], 3);
         }
     }
     for (i = 0; derive && i < 3; i++) {
@@ -160,7 +164,7 @@ static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wor
             }
             k->by_q[i][j] += R(2.0) * sum;
             if (p->moments) {
-                k->w_by_q[i][j] = R(2.0) * drive->speed * (m[2 * i] * air[0] + m[2 * i + 1] * air[1]);
+                k->w_by_q[i][j] = R(2.0) * dot(by_along[i], air, 3);
             }
         }
     }

@@ -63,7 +63,7 @@ static void resisting_torque(const quadsim_ramp *ramp, const ramp_numbers *n, co
     cross_product(rates, momentum, torque);
     if (n->moment) {
         real air[3];
-        air_moment(n->across, n->damping, dot(ramp->acting, ONES, NU), v_b, rates, air);
+        air_moment(n->across, n->inflow, n->damping, dot(ramp->acting, ONES, NU), v_b, rates, air);
         for (i = 0; i < 3; i++) {
             torque[i] -= air[i];
         }

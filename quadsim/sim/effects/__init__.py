@@ -10,6 +10,10 @@ The compiled core evaluates the forces that follow from how the vehicle moves (`
 - Rotor moment, (m_x w_i v_y, -m_y w_i v_x, 0) about the hub, v rotor i's velocity through the air, body frame:
   blade flapping tilts its disc, and its drag acts above the centre of mass (Martin & Salaun 2010; Mahony, Kumar and
   Corke 2012, "Multirotor Aerial Vehicles", Eqs. (5)-(7)): the part that the hubs' heights do not give.
+  Inflow moment, v_z (-k_x v_y, k_y v_x, 0), v the body's velocity through the air: blades flap less where the flow
+  along the axis is more (Bramwell, Done and Balmford, "Bramwell's Helicopter Dynamics", 2nd ed., Ch. 3, a_1 =
+  2 mu (4 theta_0 / 3 + lambda) / (1 - mu^2 / 2)).  Munk's moment of the ellipsoid that drags, which MuJoCo has, is of
+  the same form; where k is stated, it is that of both.
   Rate damping, -d_i times the body rate about axis i, is what the same effects leave of a rotation.
 - Gyroscopic and spin-up torque of rotors with inertia, -(d/dt + rates x) h z_b, with the angular momentum
   h = -sum_i spin_i J_r w_i of rotors that turn against their reaction torque.

@@ -39,6 +39,13 @@ class Air:
             "vehicle's, or 0"
         ),
     ] = None
+    inflow_moment: Annotated[
+        Pair | None,
+        doc(
+            "[N m s^2/m^2] moment about body x and y, per air speed along z and across it; absent: the vehicle's, or "
+            "that of the ellipsoid that drags"
+        ),
+    ] = None
     rate_damping: Annotated[
         _Drag | None,
         doc("[N m s/rad] torque against the body rates, about each body axis; absent: the vehicle's, or 0"),
@@ -70,7 +77,8 @@ class Air:
     @property
     def drags(self) -> bool:
         """Whether anything drags, once resolved: without it, wind pushes nothing."""
-        return bool(self.rotor_drag) or self.body_drag is not None or self.axis_drag or any(self.rotor_moment or ())
+        turns = any(self.rotor_moment or ()) or any(self.inflow_moment or ())
+        return bool(self.rotor_drag) or self.body_drag is not None or self.axis_drag or turns
 
     def resolved(self, vehicle: Vehicle) -> Air:
         """With the sizes that are left to the vehicle, and to the mean wind."""
@@ -78,6 +86,7 @@ class Air:
             self,
             rotor_drag=vehicle.rotor_drag or 0.0,
             rotor_moment=vehicle.rotor_moment or (0.0, 0.0),
+            inflow_moment=vehicle.inflow_moment,
             rate_damping=vehicle.rate_damping or (0.0, 0.0, 0.0),
             body_drag=vehicle.body_drag,
         )

@@ -43,6 +43,7 @@ def heavy(vehicle: Vehicle) -> Vehicle:
         inertia=(Ixx, 1.1 * Ixx, 1.5 * Ixx),
         products_of_inertia=(0.05 * Ixx, -0.1 * Ixx, 0.15 * Ixx),
         rotor_moment=(2e-5, -3e-5),
+        inflow_moment=(3e-3, -4e-3),
         rate_damping=(0.1, 0.2, 0.3),
     )
 

@@ -35,7 +35,10 @@ from quadsim.rotation import (
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, tilt
 from quadsim.vehicle import load_vehicle
 
-VEHICLE = replace(load_vehicle(vehicle_path("lopes2011")), rotor_moment=(2e-5, -3e-5), rate_damping=(0.01, 0.02, 0.03))
+VEHICLE = replace(
+    load_vehicle(vehicle_path("lopes2011")),
+    **{"rotor_moment": (2e-5, -3e-5), "inflow_moment": (3e-3, -4e-3), "rate_damping": (0.01, 0.02, 0.03)},
+)
 DRAG = {"drag": np.array([0.3, 0.2, 0.1]), "quadratic_drag": np.array([0.08, 0.05, 0.02])}
 DISTURBED = {"acceleration": np.array([0.3, -0.2, 0.5]), "angular_acceleration": np.array([1.0, -2.0, 0.5])}
 

@@ -267,7 +267,7 @@ def test_the_prediction_knows_delay_offset_and_wind(place: Path) -> None:
     assert pitched == pytest.approx(1e-5 * weight * t / true.inertia[1], rel=0.2)
     turned = (end(yaw_trim=1e-5) - still)[5]
     assert turned == pytest.approx(1e-5 * t / true.inertia[2], rel=0.1)
-    assert abs(end(wind=(1.0, 0.0)) - still)[0] > 0.01
+    assert abs(end(wind=(1.0, 0.0, 0.0)) - still)[0] > 0.01
     assert abs(end(delay=0.02) - still)[3:].max() > 0.01
 
 

@@ -6,11 +6,21 @@ import math
 
 import numpy as np
 import pytest
-from numpy_laws import LOWEST_RATIO, axis_drag, ground_effect, pushed, respond, rotor_drag, rotor_moment, thrust_ratio
+from numpy_laws import (
+    LOWEST_RATIO,
+    axis_drag,
+    ground_effect,
+    inflow_moment,
+    pushed,
+    respond,
+    rotor_drag,
+    rotor_moment,
+    thrust_ratio,
+)
 from scipy.spatial.transform import Rotation
 from uneven import uneven
 
-from quadsim.sim.airframe import added_mass, compile_model, outline, semi_axes
+from quadsim.sim.airframe import added_mass, compile_model, munk_moment, outline, semi_axes
 from quadsim.sim.effects import Disturbance, Effects, Ground, Push, PushChange
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.wind import Air, Gust, WindField
@@ -65,6 +75,33 @@ def test_a_rotor_moment_lifts_the_side_that_meets_the_air(vehicle: Vehicle) -> N
             rates.append(plant.advance(plant.vehicle.hover_speeds, 50)["physics"][-1, 12])
     expected = -moment * 4.0 * vehicle.hover_speed / vehicle.inertia[1] * 0.05
     np.testing.assert_allclose(rates, [0.0, 2.0 * expected, 4.0 * expected], rtol=1e-3, atol=1e-12)
+
+
+def test_a_climb_takes_from_the_rotor_moment(vehicle: Vehicle) -> None:
+    """J_y dq/dt = -(m_y (sum w) - k_y v_z) v_x: at v_z = m_y (sum w) / k_y nothing turns."""
+    moment, inflow = 1e-5, 0.01
+    gone = moment * 4.0 * vehicle.hover_speed / inflow
+    rates = []
+    for climb in (0.0, gone, -gone):
+        with Plant(vehicle, effects=Effects(air=Air(rotor_moment=(0.0, moment), inflow_moment=(0.0, inflow)))) as plant:
+            plant.reset(moving(vx=2.0, vz=climb))
+            rates.append(plant.advance(plant.vehicle.hover_speeds, 50)["physics"][-1, 12])
+    expected = -moment * 4.0 * vehicle.hover_speed / vehicle.inertia[1] * 0.05 * 2.0
+    np.testing.assert_allclose(rates, [expected, 0.0, 2.0 * expected], rtol=5e-3, atol=1e-3 * abs(expected))
+
+
+@pytest.mark.parametrize("stated", [None, (0.0, 0.0), (0.01, 0.02)])
+def test_a_stated_inflow_moment_is_that_of_rotors_and_body(
+    vehicle: Vehicle, stated: tuple[float, float] | None
+) -> None:
+    """Without it, the ellipsoid that drags has Munk's."""
+    drag, seconds = (0.02, 0.03, 0.06), 0.02
+    with Plant(vehicle, effects=Effects(air=Air(body_drag=drag, inflow_moment=stated))) as plant:
+        plant.reset(moving(vx=2.0, vy=1.0, vz=1.0))
+        rates = plant.advance(plant.vehicle.hover_speeds, 20)["physics"][-1, 11:14]
+    about_x, about_y = munk_moment(drag, 1.225) if stated is None else stated
+    expected = np.array([-about_x, 2.0 * about_y]) / vehicle.inertia[:2] * seconds
+    np.testing.assert_allclose(rates[:2], expected, rtol=0.02, atol=1e-4)
 
 
 def test_rate_damping_slows_a_turn_exponentially(vehicle: Vehicle) -> None:
@@ -238,11 +275,12 @@ def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: I
     vehicle = uneven() if layout == "uneven" else vehicle
     rng, radius, drag, inertia, step = np.random.default_rng(6), 0.15, 3e-3, 2e-4, 1e-6
     linear, quadratic = (0.3, 0.2, 0.05), (0.08, 0.1, 0.12)
-    moment, damping = (2e-4, -3e-4), (0.02, 0.03, 0.01)
+    moment, inflow, damping = (2e-4, -3e-4), (0.1, -0.2), (0.02, 0.03, 0.01)
     dynamics = RotorDynamics(rise=0.03, fall=0.05, inertia=inertia)
     effects = Effects(
         air=Air(
-            rotor_drag=drag, rotor_moment=moment, rate_damping=damping, linear_drag=linear, quadratic_drag=quadratic
+            **{"rotor_drag": drag, "linear_drag": linear, "quadratic_drag": quadratic},
+            **{"rotor_moment": moment, "inflow_moment": inflow, "rate_damping": damping},
         ),
         ground=Ground(contact=False, effect=True, rotor_radius=radius),
         rotors=dynamics,
@@ -266,6 +304,7 @@ def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: I
             expected = rotor_drag(vehicle, drag, middle, turn, air, rates) + pushed(push, turn)
             expected[:3] += axis_drag(linear, quadratic, turn, air)
             expected[3:] += rotor_moment(vehicle, moment, middle, turn, air, rates) - np.array(damping) * rates
+            expected[3:] += inflow_moment(inflow, turn, air)
             momentum = -inertia * np.array(vehicle.rotor_spins) @ middle
             expected[3:] += [
                 -rates[1] * momentum,
