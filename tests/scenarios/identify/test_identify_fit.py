@@ -225,7 +225,7 @@ def test_throttle_alone_shows_thrust_only_for_the_highest_speed_as_kept() -> Non
     throttle, _ = throttled(record)
     start = replace(START, speed_max=1.3 * START.speed_max)
     found = identify(replace(record, commands=None, throttle=throttle), start)
-    assert not wrong(found, throttle_curve=0.7)
+    assert len(wrong(found, throttle_curve=0.7)) <= 1  # of 17 intervals of 95 %
     known = by_name(found)
     for name in ("thrust_coefficient", "rotor_inertia", "rotor_drag"):
         assert known[name].refused == "a log of the throttle shows it only for the highest speed of 1089.4 rad/s, kept"
