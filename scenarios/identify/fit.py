@@ -113,18 +113,25 @@ def identify_records(
         names = ", ".join(record.name for record in records)
         raise InputError(f"logs fitted together must have the same columns of rotors and battery; got {names}")
     blows = wind or any(record.position is None or record.inertial for record in records)  # or its velocity drifts
-    search = Search(flown, vehicle, wind=blows)
-    search.run()
+
+    def searched(fixed: Mapping[str, float], found: Search | None = None) -> Search:
+        search = Search(flown, vehicle, wind=blows, fixed=fixed)
+        if found is not None:
+            search.adopt(found)
+        search.run()
+        return search
+
+    search = searched({})
     fit = _Fit(search)
-    held, found = fit.held(), search
-    while True:
-        refined = Search(flown, vehicle, wind=blows, fixed=held)
-        refined.adopt(found)
-        refined.run()
-        impossible = _impossible(refined)
-        if not impossible:
-            return fit.result(refined)
-        held, found = held | impossible, refined
+    while undamped := {name: 0.0 for name in _impossible(search) if name.startswith("rate_damping")}:
+        search = searched({**search.fixed, **undamped}, search)  # negative damping would stand for lag
+        fit = _Fit(search, fit)
+    held = fit.held()
+    refined = searched(held, search)
+    while impossible := _impossible(refined):
+        held |= impossible
+        refined = searched(held, refined)
+    return fit.result(refined)
 
 
 def part_of(record: Record, span: slice) -> Record:
@@ -139,9 +146,9 @@ _NEARLY: Final = 2.0  # how much too wide an interval may be for more of the sam
 
 
 class _Fit:
-    """What a search of every number found, judged."""
+    """What a search found, judged; of numbers that it held, what another found `before`."""
 
-    def __init__(self, search: Search) -> None:
+    def __init__(self, search: Search, before: _Fit | None = None) -> None:
         self.search, self.vehicle = search, search.vehicle
         blocks, prior = search.blocks(), search.prior(search.x)[1].H
         H = sum((block.H for block in blocks), prior)
@@ -159,6 +166,10 @@ class _Fit:
         self.set_anew: set[str] = set()
         """Numbers that are refused and yet sought once more: where the log speaks against the start."""
         self.estimates = self._every_estimate()
+        if before is not None:
+            self.set_anew |= before.set_anew & {*search.fixed}
+            known = self.estimates | {name: before.estimates[name] for name in search.fixed}
+            self.estimates = {name: known[name] for name in _KINDS if name in known}
 
     def _half_width(self, shares: Mapping[int, float], axes: Sequence[str]) -> float:
         """Half of the interval of a sum of shares of x, in units of the search.
@@ -323,7 +334,7 @@ class _Fit:
         held |= {"throttle_curve": self.vehicle.throttle_share} if "throttle_curve" in refused else {}
         held |= {"voltage_exponent": 0.0} if "voltage_exponent" in refused else {}
         sought = {number.name for number in self.search.sought}
-        return {name: value for name, value in held.items() if name in sought} | {"inflow": 0.0}
+        return {**self.search.fixed} | {name: held[name] for name in held if name in sought} | {"inflow": 0.0}
 
     def result(self, refined: Search) -> Identification:
         """Every estimate, and the vehicle with those that are not refused."""
