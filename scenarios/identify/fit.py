@@ -333,8 +333,8 @@ class _Fit:
         held |= {"delay": 0.0} if {"delay", "lateness"} & {*refused} else {}
         held |= {"throttle_curve": self.vehicle.throttle_share} if "throttle_curve" in refused else {}
         held |= {"voltage_exponent": 0.0} if "voltage_exponent" in refused else {}
-        sought = {number.name for number in self.search.sought}
-        return {**self.search.fixed} | {name: held[name] for name in held if name in sought} | {"inflow": 0.0}
+        known = {number.name for number in self.search.sought} | {*self.search.fixed}
+        return {**self.search.fixed} | {name: held[name] for name in held if name in known} | {"inflow": 0.0}
 
     def result(self, refined: Search) -> Identification:
         """Every estimate, and the vehicle with those that are not refused."""

@@ -131,8 +131,9 @@ def commanded(record: Record, vehicle: Vehicle, p: Parameters) -> Array:
 def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:
     """(M, 6) increments of body rates and velocity in each period, as the parameters predict them.
 
-    J dw/dt = sum r_i x f_i - w x (J w + h e_z) - dh/dt e_z with h = -sum spin_i J_r w_i, f_i = (b w_i^2 -
-    inflow w_i v_axial,i) e_z - rotor_drag w_i v_perp,i; m dv/dt = R (sum f_i + body drag) - m g e_z.
+    J dw/dt = sum r_i x f_i + tau_air - w x (J w + h e_z) - dh/dt e_z with h = -sum spin_i J_r w_i, f_i = (b w_i^2 -
+    inflow w_i v_axial,i) e_z - rotor_drag w_i v_perp,i, tau_air that of `Vehicle.air_moment` at each hub;
+    m dv/dt = R (sum f_i + body drag) - m g e_z.
     """
     x, y, _ = vehicle.hubs.T
     spin = np.array(vehicle.rotor_spins, float)
