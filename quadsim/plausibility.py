@@ -59,8 +59,8 @@ def _slowing(vehicle: Vehicle) -> float | None:
     return _over(vehicle.rotor_drag, vehicle.mass / (N_ROTORS * vehicle.hover_speed))
 
 
-def _turning(vehicle: Vehicle) -> float | None:
-    """Angular acceleration that the moment of the rotors takes at hover, per speed of the air [rad/(m s)]."""
+def turned_by_air(vehicle: Vehicle) -> float | None:
+    """Return the angular acceleration by the moment of the rotors at hover, per speed of the air [rad/(m s)]."""
     moment = max(map(abs, vehicle.rotor_moment or (0.0,)))
     return N_ROTORS * vehicle.hover_speed * moment / min(vehicle.inertia[:2]) if moment else None
 
@@ -154,7 +154,7 @@ RATIOS: Final = (
     Ratio(
         of=("rotor_moment", "thrust_coefficient", "inertia"),
         text="angular acceleration of rotor_moment at hover per air speed [rad/(m s)]",
-        value=_turning,
+        value=turned_by_air,
         low=1e-3,
         high=300.0,
     ),

@@ -12,8 +12,11 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from mpc.baselines.bandwidths import lag_to_allow_for
+from mpc.baselines.preview import PREVIEW_DEGREE
 from mpc.model import SHORTEST_LAG
+from mpc.observer import ObserverSettings
 from quadsim.errors import UnknownNameError, printable
+from quadsim.plausibility import turned_by_air
 from quadsim.vehicle import Vehicle, span
 from scenarios.design.rules import (
     HEADING_RATIO,
@@ -45,6 +48,8 @@ EIGHT_RATIO: Final = 0.3
 """Turns of a figure eight per time [rad/s] over the loop's bandwidth: across it moves twice as fast."""
 STEP_RATIO: Final = 0.28  # bandwidth of the filter of steps over the loop's
 STEP: Final = 1.0  # [m]
+WALK_SHARE: Final = 0.8
+"""Standard deviation of an unknown torque's change per period, over the largest change of that of the air."""
 ALLOWED_SHARE: Final = 0.15
 """The tracking requirement, the same for every controller: the largest error along x, y and z over the course's size.
 The robust controller's is 11 % on steps and 5 % on figure eights, at most (docs/own-vehicle.md)."""
@@ -125,7 +130,7 @@ position = [0.0, 0.0, {_height(vehicle, size)}]  # m, world; at rest
 limit_speeds = true  # rotors saturate at their lowest and highest speed
 
 {reference}
-{_controller(law, vehicle, tuning)}
+{_controller(law, vehicle, tuning, course)}
 {_rotors(vehicle)}
 [effects.air]  # drag of the vehicle file
 {_constraints(law, vehicle, tuning, size)}"""
@@ -223,10 +228,10 @@ ramp = {round(0.5 * turn, 3)}  # s, half a turn to gain its speed, and to lose i
     return text, None, length
 
 
-def _controller(law: str, vehicle: Vehicle, tuning: Design) -> str:
+def _controller(law: str, vehicle: Vehicle, tuning: Design, course: str) -> str:
     if law == "rates":
         return _rates(tuning)
-    return f"""{_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning)}
+    return f"""{_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning, course)}
 [controller.input_bounds]
 speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {span(vehicle.hover_speeds)}
 slew = {[*_slew(tuning)]}  # rad/s per period: what a rotor's own speed makes in one, from hover towards its limits
@@ -273,7 +278,7 @@ move_weight = {_rounded(tuning.move_weight)}  # of changes: as much as speed cos
 speed / ({MOVE_RATIO:g} w tau)^2
 
 [controller.offset_free]  # force and torque that the model does not know are estimated and compensated
-
+{_walk(vehicle, tuning)}
 [controller.soft]
 linear = {_rounded(SOFT_WEIGHTS[0] * place)}  # l1: {SOFT_WEIGHTS[0]:g} times the weight of x
 quadratic = {_rounded(SOFT_WEIGHTS[1] * place)}  # l2: {SOFT_WEIGHTS[1]:g} times the weight of x
@@ -295,14 +300,28 @@ pitch = {[-tilt, tilt]}  # as roll
 """
 
 
-def _baseline(law: str, vehicle: Vehicle, tuning: Design) -> str:
+def _walk(vehicle: Vehicle, tuning: Design) -> str:
+    """How fast the torque changes that the hover model does not know: that of the air on the rotors."""
+    if (turned := turned_by_air(vehicle)) is None:
+        return ""
+    usual = ObserverSettings()
+    walk = turned * WALK_SHARE * SHARE * tuning.acceleration * vehicle.gravity * tuning.period
+    walk, most = max(walk, usual.torque_walk), max(0.5 * min(tuning.authority.turning[:2]), usual.largest_torque)
+    return f"""torque_walk = {_rounded(walk)}  # rad/s^2 per period: {WALK_SHARE:g} of what rotor_moment changes on a \
+figure eight; at hover it is {turned:.3g} rad/s^2 per m/s, which nonlinear MPC (rates) bears best
+largest_torque = {_rounded(most)}  # rad/s^2, half of what is in reserve
+"""
+
+
+def _baseline(law: str, vehicle: Vehicle, tuning: Design, course: str) -> str:
     rules = "  # weights by Bryson's rule, its defaults; it tracks pose and velocity, not acceleration"
     steepest, w = BASELINE_SHARE * _tilt(tuning), tuning.bandwidth
     tilt = round(min(LQR_TILT, steepest) if law == "lqr" else steepest, 3)
+    preview = max(math.ceil(PREVIEW / (w * tuning.period)), PREVIEW_DEGREE + 1)
     text = f"""[controller]
 type = {_text(law)}{rules if law == "lqr" else ""}
 tilt = {tilt}  # deg, largest that it commands; below the audit's, which it overshoots
-horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for the reference's velocity: \
+horizon = {preview}  # periods of preview for the reference's velocity: \
 {PREVIEW:g} / w = {PREVIEW / w:.3g} s
 """
     if law != "lqr":
@@ -311,7 +330,15 @@ horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for t
         text += f"{1e3 * lag:.3g} ms, the rotors' lag or half a period\n"
     if law == "geometric":
         text += "integral = true  # against drag and what else is not modelled\n"
+    if law == "geometric" and course == "figure-eight" and _turns_in_air(vehicle):
+        text += "feedforward = true  # of the reference's jerk and snap\n"
+        text += "moment = true  # the air's torque on the vehicle at the reference's motion is balanced\n"
     return text
+
+
+def _turns_in_air(vehicle: Vehicle) -> bool:
+    """Whether the file states a torque of the air."""
+    return any(any(numbers or ()) for numbers in (vehicle.rotor_moment, vehicle.inflow_moment, vehicle.rate_damping))
 
 
 def _constraints(law: str, vehicle: Vehicle, tuning: Design, size: float) -> str:
