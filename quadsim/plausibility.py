@@ -59,12 +59,6 @@ def _slowing(vehicle: Vehicle) -> float | None:
     return _over(vehicle.rotor_drag, vehicle.mass / (N_ROTORS * vehicle.hover_speed))
 
 
-def turned_by_air(vehicle: Vehicle) -> float | None:
-    """Return the angular acceleration by the moment of the rotors at hover, per speed of the air [rad/(m s)]."""
-    moment = max(map(abs, vehicle.rotor_moment or (0.0,)))
-    return N_ROTORS * vehicle.hover_speed * moment / min(vehicle.inertia[:2]) if moment else None
-
-
 RATIOS: Final = (
     Ratio(of=("gravity",), text="gravity [m/s^2]", value=lambda v: v.gravity, low=1.3, high=26.0),
     Ratio(
@@ -154,7 +148,7 @@ RATIOS: Final = (
     Ratio(
         of=("rotor_moment", "thrust_coefficient", "inertia"),
         text="angular acceleration of rotor_moment at hover per air speed [rad/(m s)]",
-        value=turned_by_air,
+        value=lambda v: v.turned_by_air or None,
         low=1e-3,
         high=300.0,
     ),

@@ -326,6 +326,12 @@ class Vehicle:
         across = np.array([(m_x * turning - k_x * v_z) * v_y, -(m_y * turning - k_y * v_z) * v_x, 0.0])
         return np.asarray(across - np.array(self.rate_damping or (0.0, 0.0, 0.0)) * rates)
 
+    @property
+    def turned_by_air(self) -> float:
+        """Angular acceleration by `rotor_moment` at hover, per air speed across the rotors [rad/(m s)]."""
+        moment = max(map(abs, self.rotor_moment or (0.0,)))
+        return float(self.hover_speeds.sum()) * moment / min(self.inertia[:2])
+
     def require_moment(self, owner: str) -> None:
         """Refuse a model of the air's moment where nothing is known of it.
 

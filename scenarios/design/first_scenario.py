@@ -12,11 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from mpc.baselines.bandwidths import lag_to_allow_for
-from mpc.baselines.preview import PREVIEW_DEGREE
 from mpc.model import SHORTEST_LAG
-from mpc.observer import ObserverSettings
 from quadsim.errors import UnknownNameError, printable
-from quadsim.plausibility import turned_by_air
 from quadsim.vehicle import Vehicle, span
 from scenarios.design.rules import (
     HEADING_RATIO,
@@ -50,6 +47,7 @@ STEP_RATIO: Final = 0.28  # bandwidth of the filter of steps over the loop's
 STEP: Final = 1.0  # [m]
 WALK_SHARE: Final = 0.8
 """Standard deviation of an unknown torque's change per period, over the largest change of that of the air."""
+LEAST_WALK: Final = 0.5  # [rad/s^2] from which the observer is told
 ALLOWED_SHARE: Final = 0.15
 """The tracking requirement, the same for every controller: the largest error along x, y and z over the course's size.
 The robust controller's is 11 % on steps and 5 % on figure eights, at most (docs/own-vehicle.md)."""
@@ -302,14 +300,13 @@ pitch = {[-tilt, tilt]}  # as roll
 
 def _walk(vehicle: Vehicle, tuning: Design) -> str:
     """How fast the torque changes that the hover model does not know: that of the air on the rotors."""
-    if (turned := turned_by_air(vehicle)) is None:
-        return ""
-    usual = ObserverSettings()
+    turned = vehicle.turned_by_air
     walk = turned * WALK_SHARE * SHARE * tuning.acceleration * vehicle.gravity * tuning.period
-    walk, most = max(walk, usual.torque_walk), max(0.5 * min(tuning.authority.turning[:2]), usual.largest_torque)
+    if walk < LEAST_WALK:
+        return ""
     return f"""torque_walk = {_rounded(walk)}  # rad/s^2 per period: {WALK_SHARE:g} of what rotor_moment changes on a \
 figure eight; at hover it is {turned:.3g} rad/s^2 per m/s, which nonlinear MPC (rates) bears best
-largest_torque = {_rounded(most)}  # rad/s^2, half of what is in reserve
+largest_torque = {_rounded(min(tuning.authority.turning[:2]))}  # rad/s^2, what is in reserve
 """
 
 
@@ -317,11 +314,10 @@ def _baseline(law: str, vehicle: Vehicle, tuning: Design, course: str) -> str:
     rules = "  # weights by Bryson's rule, its defaults; it tracks pose and velocity, not acceleration"
     steepest, w = BASELINE_SHARE * _tilt(tuning), tuning.bandwidth
     tilt = round(min(LQR_TILT, steepest) if law == "lqr" else steepest, 3)
-    preview = max(math.ceil(PREVIEW / (w * tuning.period)), PREVIEW_DEGREE + 1)
     text = f"""[controller]
 type = {_text(law)}{rules if law == "lqr" else ""}
 tilt = {tilt}  # deg, largest that it commands; below the audit's, which it overshoots
-horizon = {preview}  # periods of preview for the reference's velocity: \
+horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for the reference's velocity: \
 {PREVIEW:g} / w = {PREVIEW / w:.3g} s
 """
     if law != "lqr":
