@@ -560,14 +560,8 @@ OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if fi
 """Parameters that a vehicle file may leave out."""
 _LENGTHS: Final = {
     **{"thrust_of_speed": 2, "thrust_of_throttle": 2},
-    **{
-        "inertia": 3,
-        "products_of_inertia": 3,
-        "rotor_moment": 2,
-        "inflow_moment": 2,
-        "rate_damping": 3,
-        "body_drag": 3,
-    },
+    **{"inertia": 3, "products_of_inertia": 3, "body_drag": 3},
+    **{"rotor_moment": 2, "inflow_moment": 2, "rate_damping": 3},
     **{"rotor_azimuths": N_ROTORS, "rotor_positions": N_ROTORS, "rotor_spins": N_ROTORS},
 }
 _ANY_SIGN: Final = (

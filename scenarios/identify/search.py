@@ -265,7 +265,7 @@ class Search:
 
     def _rows(self, part: int) -> list[Indices]:
         """The samples of each block of a stretch."""
-        long = sum(len(one.increments) * one.record.period for one in self.parts)
+        long = sum(map(_seconds, self.parts))
         size = len(self.parts[part].increments) - self._skip[part]
         seconds = size * self.parts[part].record.period
         count = max(math.ceil(FEWEST / len(self.parts)), round(seconds / max(SHORTEST_FOLD, long / _MOST_BLOCKS)))
