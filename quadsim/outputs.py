@@ -1,8 +1,9 @@
 """The only code that replaces and removes files.
 
 An existing output directory that is not empty is refused.  A new one is built beside its place and renamed into it;
-`files` in its `summary.json` has the SHA-256 of every other file.  Overwriting unlinks, by name, the regular files on
-that list, and refuses a directory that holds anything else.  A directory that grows in place, such as a campaign's, is
+`files` in its `summary.json` has the SHA-256 of the other files, `unhashed` the names of those that differ between
+directories with the same results.  Overwriting unlinks, by name, the regular files that these list, and refuses a
+directory that holds anything else.  A directory that grows in place, such as a campaign's, is
 locked.  What a killed process of ours leaves, a lock or a half-written folder under a private name, is in nobody's way.
 """
 
@@ -27,6 +28,7 @@ from typing import Any, Final
 from quadsim.errors import OutputError, failure_line, printable
 
 SUMMARY_FILE: Final = "summary.json"
+UNHASHED: Final = "unhashed"  # entry of a summary: files that it lists without their SHA-256
 LOCK_FILE: Final = ".lock"  # in a directory that grows
 _LOCK_MARK: Final = b"quadsim\n"  # its content
 _PARTIAL: Final = re.compile(r"\.quadsim-[a-z0-9_]{8}\.partial")  # folders as `_beside` names them
@@ -140,7 +142,7 @@ def adding(directory: Path, **changes: Any) -> Iterator[Path]:
     """
     with _beside(directory) as work:
         yield work
-        hashes, listed = file_hashes(work), _listed(directory) or {}
+        hashes, listed = file_hashes(work), _listed(directory) or set()
         for name in hashes:
             if os.path.lexists(directory / name) and name not in listed:
                 raise OutputError(directory / name, f"{SUMMARY_FILE} does not list it; move it away first")
@@ -216,9 +218,17 @@ class Growing:
             with contextlib.suppress(OSError):
                 folder.rmdir()
 
-    def finish(self, summary: Mapping[str, Any]) -> None:
-        """Write `summary.json`, with the list of all other files."""
-        self.write({SUMMARY_FILE: to_json({**summary, "files": file_hashes(self.path)}).encode()})
+    def finish(self, summary: Mapping[str, Any], *, unhashed: Sequence[str] = ()) -> None:
+        """Write `summary.json`, with the list of all other files.
+
+        Those named `unhashed` are listed without their SHA-256: it would differ where the results are the same.
+        """
+        hashes = file_hashes(self.path)
+        named = [name for name in unhashed if hashes.pop(name, None) is not None]
+        listed: dict[str, Any] = {"files": hashes}
+        if named:
+            listed[UNHASHED] = sorted(named)
+        self.write({SUMMARY_FILE: to_json({**summary, **listed}).encode()})
 
 
 @contextlib.contextmanager
@@ -303,11 +313,13 @@ def _remove(partial: Path) -> None:
     shutil.rmtree(partial, ignore_errors=True)
 
 
-def _listed(directory: Path) -> dict[str, str] | None:
-    """Return the files that a directory's summary lists, with their SHA-256; None if it has no list."""
+def _listed(directory: Path) -> set[str] | None:
+    """Return the files that a directory's summary lists; None if it has no list."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        files = json.loads((directory / SUMMARY_FILE).read_bytes())["files"]
-        return files if files and all(value.startswith("sha256:") for value in files.values()) else None
+        summary = json.loads((directory / SUMMARY_FILE).read_bytes())
+        files = summary["files"]
+        if files and all(digest.startswith("sha256:") for digest in files.values()):
+            return {*files, *map(str, summary.get(UNHASHED, ()))}
     return None
 
 

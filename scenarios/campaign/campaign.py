@@ -21,7 +21,7 @@ import pyarrow.compute as pc
 
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.flight.rundir import SCENARIO_FILE
-from quadsim.outputs import Growing, growing, optional
+from quadsim.outputs import Growing, digest_of, growing, optional
 from quadsim.report.figure import Figure
 from scenarios.campaign import store as records
 from scenarios.campaign.campaign_report import campaign_overview, write_report
@@ -164,15 +164,16 @@ def fly_campaign(
         processors = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
         manifest["machines"] = dict(sorted(Counter(processors).items()))
         manifest["status"] = "complete" if progress.wanted == spec.flights else "stopped"
+        manifest["files"] = {TIMES_FILE: digest_of(directory / TIMES_FILE)}
         records.write(manifest, files)
 
         def write(place: Path) -> None:
             write_report(place, table, summary, spec, campaign=directory)
 
-        files.finish(summary)
+        files.finish(summary, unhashed=records.MEASURED)
         with optional("the report"):
             _put_report(files, REPORT_FILES, write if report else None)
-        files.finish(summary)  # now with the report among its files
+        files.finish(summary, unhashed=records.MEASURED)  # now with the report among its files
     return CampaignResult(directory=directory, manifest=manifest, table=table, summary=summary)
 
 

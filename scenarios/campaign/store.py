@@ -24,6 +24,7 @@ from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FORMAT, format_of, require_format
 from quadsim.flight.rundir import SCENARIO_FILE, read_json, require_inside
 from quadsim.outputs import SUMMARY_FILE, Growing, digest_of, to_json
+from quadsim.report.page import PAGE_FILE
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.rows import TIMES, make_table, read_table, split_times
@@ -39,6 +40,11 @@ FLIGHTS_FILE: Final = "flights.parquet"
 TIMES_FILE: Final = "timing.parquet"
 FLUSH_S: Final = 5.0  # how long an answer may wait in memory before it is on the disk [s]
 PARTS_DIR: Final = "parts"
+MEASURED: Final = (TIMES_FILE, MANIFEST_FILE, PAGE_FILE)
+"""Files with clock times, the machine or the directory's name, so that they differ where the flights are the same.
+
+`summary.json` has no SHA-256 of them; `manifest.json` has that of `timing.parquet`.
+"""
 
 
 def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
@@ -165,7 +171,7 @@ def start_session(plan: Plan, files: Growing, session: Mapping[str, Any], *, fly
                 f"({', '.join(differing)}): half of the numbers would be another program's; choose another --out"
             )
         manifest = {**known, "status": "running", "flights": plan.spec.flights}
-        files.remove([SUMMARY_FILE])  # which is there, with the hashes of all others, while nothing is being flown
+        files.remove([SUMMARY_FILE])  # which is there, with the list of all others, while nothing is being flown
     manifest["sessions"].append(session)
     texts = {
         CAMPAIGN_FILE: _stored(plan).to_toml(),
@@ -272,9 +278,11 @@ def stored_plan(directory: Path) -> Plan:
     Raises:
         FileError: it is none, or a file is missing or not the one that was flown.
     """
-    read_manifest(directory)
-    path = directory / SUMMARY_FILE  # of a finished campaign
-    listed = read_json(path, {}, "a campaign's summary").get("files", {}) if path.exists() else {}
+    manifest = read_manifest(directory)
+    listed: dict[str, str] = {}
+    if (directory / SUMMARY_FILE).exists():  # it is finished
+        summary = read_json(directory / SUMMARY_FILE, {}, "a campaign's summary")
+        listed = {**manifest.get("files", {}), **summary.get("files", {})}
     for name in (CAMPAIGN_FILE, SCENARIO_FILE, *(name for name in (FLIGHTS_FILE, TIMES_FILE) if name in listed)):
         path = directory / name
         if not path.is_file() or (name in listed and digest_of(path) != listed[name]):

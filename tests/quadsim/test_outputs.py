@@ -178,6 +178,10 @@ def test_a_directory_grows_in_place_and_ends_with_its_list(tmp_path: Path) -> No
         files.finish({"name": "x"})
     assert tree(target).keys() == {".lock", "manifest.json", "rows", "summary.json"}
     assert set(json.loads((target / "summary.json").read_text())["files"]) == {"manifest.json", "rows"}
+    with growing(target, "manifest.json") as files:
+        files.finish({"name": "x"}, unhashed=["manifest.json", "gone"])
+    summary = json.loads((target / "summary.json").read_text())
+    assert (set(summary["files"]), summary["unhashed"]) == ({"rows"}, ["manifest.json"])
     with growing(target, "manifest.json", overwrite=True) as files:
         assert tree(target).keys() == {".lock"}
     assert not list(tmp_path.glob("campaign/*"))

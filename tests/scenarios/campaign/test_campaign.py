@@ -19,7 +19,7 @@ import pytest
 import tomlkit
 
 from quadsim.errors import InputError, OutputError
-from quadsim.outputs import SUMMARY_FILE, Growing
+from quadsim.outputs import SUMMARY_FILE, Growing, digest_of
 from scenarios.campaign import campaign as module
 from scenarios.campaign import store as records
 from scenarios.campaign.campaign import CampaignProgress, compare_replay, recorded_flight
@@ -103,11 +103,9 @@ def flown(whole: Result, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole.directory, tmp_path / "c"))
 
 
-def content(result: Result) -> tuple[bytes, str]:
-    """The flights, and the summary but for the digests of its files, of which some hold clock times."""
-    summary = json.loads((result.directory / SUMMARY_FILE).read_text())
-    del summary["files"]
-    return (result.directory / "flights.parquet").read_bytes(), json.dumps(summary)
+def content(result: Result) -> tuple[bytes, bytes]:
+    """The bytes of the flights and of the summary, in which no clock and no machine has a part."""
+    return (result.directory / "flights.parquet").read_bytes(), (result.directory / SUMMARY_FILE).read_bytes()
 
 
 @pytest.mark.witness("campaigns")
@@ -117,6 +115,16 @@ def test_results_are_the_same_bytes_with_any_worker(plan: Plan, whole: Result, b
     assert len({content(result) for result in results}) == 1
     assert results[0].table.num_rows == 12
     assert 0 < sum(results[0].table["failed"].to_pylist()) < 12
+
+
+def test_the_summary_with_a_report_is_the_same_bytes_by_one_worker_and_by_two(plan: Plan, tmp_path: Path) -> None:
+    """The page names its directory, the manifest and the clock times their session: none of these has a hash."""
+    results = [fly_campaign(plan, tmp_path / f"by-{workers}", workers, report=True) for workers in (1, 2)]
+    assert content(results[0]) == content(results[1])
+    summary = json.loads((results[0].directory / SUMMARY_FILE).read_text())
+    assert set(summary["files"]) == {"campaign.png", "campaign.toml", "flights.parquet", "scenario.toml"}
+    again = fly_campaign(plan, results[0].directory, 2, overwrite=True)
+    assert again.table.equals(results[0].table)
 
 
 def test_what_was_flown_stays_and_the_rest_follows(plan: Plan, whole: Result, tmp_path: Path) -> None:
@@ -236,8 +244,7 @@ def test_a_campaign_that_is_killed_resumes_to_the_same_bytes(tmp_path: Path) -> 
     subprocess.run(command, cwd=tmp_path, env=environment, check=True)
     again = fly_campaign(plan, tmp_path / "whole", 2)
     assert (tmp_path / "c" / "flights.parquet").read_bytes() == (again.directory / "flights.parquet").read_bytes()
-    summaries = [json.loads((path / SUMMARY_FILE).read_text()) for path in (tmp_path / "c", again.directory)]
-    assert summaries[0] | {"files": {}} == summaries[1] | {"files": {}}  # the hashes are also of clock times
+    assert (tmp_path / "c" / SUMMARY_FILE).read_bytes() == (again.directory / SUMMARY_FILE).read_bytes()
 
 
 def test_it_stops_when_the_interval_is_narrow_enough_at_the_same_flight(tmp_path: Path) -> None:
@@ -262,8 +269,10 @@ def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     manifest = read_manifest(result.directory)
     assert manifest == result.manifest
     assert (manifest["name"], manifest["status"], manifest["flights"]) == ("little", "complete", 12)
-    listed = json.loads((result.directory / SUMMARY_FILE).read_text())["files"]
-    assert {"campaign.toml", "scenario.toml", "flights.parquet", "index.html", "manifest.json"} <= set(listed)
+    summary = json.loads((result.directory / SUMMARY_FILE).read_text())
+    assert {"campaign.toml", "scenario.toml", "flights.parquet"} <= set(summary["files"])
+    assert summary["unhashed"] == ["index.html", "manifest.json", "timing.parquet"]
+    assert manifest["files"] == {"timing.parquet": digest_of(result.directory / "timing.parquet")}
     page = html.unescape((result.directory / "index.html").read_text(encoding="utf-8"))
     assert "Status: complete, 12 of 12 flights flown." in page
     assert '<a href="summary.json">' in page
@@ -390,6 +399,12 @@ def test_a_replay_reports_when_numbers_differ(whole: Result, monkeypatch: pytest
 
 
 def test_a_campaign_whose_files_were_changed_is_not_replayed(flown: Path) -> None:
+    times = flown / "timing.parquet"
+    kept = times.read_bytes()
+    times.write_bytes(b"")
+    with pytest.raises(InputError, match=r"timing\.parquet: is missing or not the file that was written"):
+        recorded_flight(flown, 0)
+    times.write_bytes(kept)
     path = flown / "scenario.toml"
     path.write_text(path.read_text().replace("duration = 0.5", "duration = 0.6"))
     with pytest.raises(InputError, match=r"scenario\.toml: is missing or not the file that was written"):
