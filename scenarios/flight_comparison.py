@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import logging
 import tempfile
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
+from quadsim.assets import read_toml
 from quadsim.errors import OutputError, ParameterError
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
@@ -43,7 +45,7 @@ class FlightComparison(Result):
 
     runs: tuple[rundir.Run, ...]  # the flights
     rows: list[QuantityRow]  # the table, a row per quantity
-    notes: tuple[str, ...]  # in what the audits differ, and whose constraints they were audited against
+    notes: tuple[str, ...]  # in what controllers and audits differ, and whose constraints they were audited against
     names: tuple[str, ...]  # column names, one per flight
     page: Path | None  # `index.html`, if it was written
 
@@ -161,6 +163,8 @@ def compare_flights(
             limits = runs[whose].limits
             runs = tuple(audited_against(run, limits) for run in runs)
             notes = (f"All are audited against the constraints of {names[whose]}, at the rate of their tables.",)
+        controllers = [_controller_of(target, run) for target, run in zip(targets, runs, strict=True)]
+        notes = (*controller_differences(controllers, names), *notes)
         progress("comparison", 0, 1)
         comparison = FlightComparison(runs=runs, rows=comparison_rows(runs), names=names, notes=notes, page=None)
         if out is None:
@@ -206,6 +210,50 @@ def _differences(runs: Sequence[rundir.Run], names: Sequence[str]) -> tuple[str,
         if differences := limit_differences(runs[0].limits, run.limits, demands=False):
             return (different_audits(names[0], name, differences),)
     return ()
+
+
+def _controller_of(target: Compared, run: rundir.Run) -> Mapping[str, Any] | None:
+    """Return the table of a flight's controller; None where no scenario states what flew."""
+    if isinstance(target, Flight) and target.directory is None:
+        if target.own_code:
+            return None
+        tables = tomllib.loads(target.scenario.to_toml())
+    else:
+        path = run.directory / rundir.SCENARIO_FILE
+        if not path.is_file():
+            return None
+        tables = read_toml(path)
+    controller = tables.get("controller")
+    return {"type": controller} if isinstance(controller, str) else controller
+
+
+def controller_differences(controllers: Sequence[Mapping[str, Any] | None], names: Sequence[str]) -> tuple[str, ...]:
+    """Return a sentence for each flight whose controller has other fields than the first one's, naming these fields."""
+    first = controllers[0]
+    sentences = []
+    for controller, name in zip(controllers[1:], names[1:], strict=True):
+        if first is None or controller is None:
+            continue
+        parts = _controller_difference(names[0], first, name, controller)
+        if parts:
+            sentences.append(f"The controllers of {names[0]} and {name}: {'; '.join(parts)}.")
+    return tuple(sentences)
+
+
+def _controller_difference(a: str, first: Mapping[str, Any], b: str, second: Mapping[str, Any]) -> list[str]:
+    """Return the fields in which two controllers differ, scalars with their values, and those that one alone has."""
+    common = [field for field in first if field in second and first[field] != second[field]]
+    shown = []
+    for field in common:
+        values = (first[field], second[field])
+        is_nested = any(isinstance(value, Mapping | list) for value in values)
+        shown.append(field if is_nested else f"{field} ({values[0]}, {values[1]})")
+    parts = [f"differ in {', '.join(shown)}"] if shown else []
+    for name, one, other in ((a, first, second), (b, second, first)):
+        alone = [field for field, value in one.items() if field not in other and value != []]
+        if alone:
+            parts.append(f"only that of {name} has {', '.join(alone)}")
+    return parts
 
 
 def audited_against(run: rundir.Run, limits: Sequence[Limit]) -> rundir.Run:

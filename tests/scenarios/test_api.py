@@ -348,6 +348,28 @@ def test_flights_are_compared(hover: Scenario, flight: Flight, tmp_path: Path) -
     assert "hover" in page.read_text()
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_comparison_says_first_in_which_fields_the_controllers_differ(tmp_path: Path) -> None:
+    """As the flights of `make demo`, which differ in weights and horizon, too; equal ones are not mentioned."""
+    brief = {"duration": 0.2, "constraints": []}
+    free, bounded = (quadsim.load(name, brief) for name in ("paper-unconstrained", "paper-constrained"))
+    sentence = (
+        "The controllers of paper-unconstrained and paper-constrained: "
+        "differ in type (unconstrained, constrained), horizon (100, 50), output_weights, input_weights; "
+        "only that of paper-constrained has "
+    )
+    flights = (quadsim.fly(free, progress=False), quadsim.fly(bounded, progress=False))
+    note = quadsim.compare(*flights, progress=False).notes[0]
+    assert note.startswith(sentence)
+    assert {"output_bounds", "input_bounds"} <= {*re.findall(r"\w+", note[len(sentence) :])}
+    page = quadsim.compare(free, bounded, out=tmp_path / "page", video=False, progress=False).page
+    opening = page.read_text(encoding="utf-8").partition("</h1>")[2].partition("<h2")[0]
+    assert note in opening
+    assert quadsim.compare(flights[1], bounded.replace({"seed": 3}), progress=False).notes == ()
+    longer = quadsim.compare(flights[1], bounded.replace({"controller.horizon": 60}), progress=False)
+    assert longer.notes[0].endswith(": differ in horizon (50, 60).")
+
+
 def test_columns_of_a_comparison_have_the_names_that_they_are_given(hover: Scenario, flight: Flight) -> None:
     def falls(now: Any, state: Any, reference: Any) -> list[float]:
         return [0.0] * 4
