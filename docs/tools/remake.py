@@ -26,6 +26,7 @@ from typing import Any, Final
 from PIL import Image
 
 from scenarios.campaign.statistics import interval
+from scenarios.papers.reproduction import KINDS
 from scenarios.progress import reporting
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -173,22 +174,25 @@ def ablation(flights: Record) -> str:
 
 
 def papers(reproduction: Record) -> str:
-    """How many of each paper's numbers are reproduced."""
-    parts = []
+    """How many of each paper's numbers are reproduced, each kind apart."""
+    lines = []
     for each in reproduction["papers"]:
         about = ", ".join(filter(None, [f"*{each['title']}*", each["authors"], each["publication"]]))
-        parts.append(f"{sum(n['within'] for n in each['numbers'])} of {len(each['numbers'])} numbers of {about}")
-    return f"Reproduced: {'; '.join(parts)}.\n"
+        sentence = each["sentence"]
+        lines.append(f"- {about}. {sentence[0].upper()}{sentence[1:]}.\n")
+    return "".join(lines)
 
 
 def paper_rows(reproduction: Record) -> list[Record]:
-    """Published numbers and ours."""
+    """Numbers of papers, a column for each kind, and ours."""
     rows = []
     for each in reproduction["papers"]:
         for number in each["numbers"]:
-            values = number["published"] if isinstance(number["published"], list) else [number["published"]]
-            row = {"paper": each["title"], **{key: number[key] for key in ("name", "unit", "relation")}}
-            row["published"] = " to ".join(f"{value:g}" for value in sorted({*values}))
+            row = {"paper": each["title"], **{key: number[key] for key in ("name", "unit", "role", "relation")}}
+            for kind in KINDS:
+                stated = number[kind]
+                values = stated if isinstance(stated, list) else [stated]
+                row[kind] = " to ".join(f"{value:g}" for value in values if value is not None)
             rows.append(row | {key: number[key] for key in ("ours", "tolerance", "within")})
     return rows
 

@@ -68,7 +68,7 @@ ROOMS: Final[dict[str, Room]] = {
         commands={
             "reproduce": RoomCommand(
                 function="reproduce",
-                help="Reproduce published numbers: published, ours, difference; exit 1 if one is off.",
+                help="Reproduce papers' numbers: theirs, ours, difference; exit 1 if one is off.",
                 examples=("quadsim reproduce", "quadsim reproduce torrente2021 --junit numbers.xml"),
             )
         }

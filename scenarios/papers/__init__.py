@@ -1,1 +1,1 @@
-"""Published numbers of papers, one TOML file per paper, and their reproduction by flight."""
+"""Numbers of papers, one TOML file per paper, and their reproduction by flight."""

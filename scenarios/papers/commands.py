@@ -21,7 +21,10 @@ else:
 def reproduce(
     paper: PaperName | None = None, /, *, junit: File | None = None, progress: Watched = True
 ) -> Reproductions:
-    """Reproduce published numbers: published, ours, difference; exit 1 if one is off.
+    """Reproduce papers' numbers: theirs, ours, difference; exit 1 if one is off.
+
+    A number is published, obtained by running the authors' code, or by another implementation: a column and a count
+    each.  Claims, which are put as numbers, and bars, published of something else, are counted apart.
 
     Args:
         paper: name, or path to a TOML file (default: every shipped paper).
@@ -29,7 +32,7 @@ def reproduce(
         progress: as in `fly`.
 
     Returns:
-        One reproduction per paper: its `numbers` with `ours`, `difference` and `within`, and a table, `grid`.
+        One reproduction per paper: its `numbers` with `ours`, `difference` and `within`, `counts`, and a table, `grid`.
 
     Raises:
         InputError: the paper does not exist, or one of its numbers cannot be flown.

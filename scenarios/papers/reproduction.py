@@ -1,10 +1,15 @@
-"""Published numbers of papers, one TOML file per paper, and their reproduction: published, ours, difference."""
+"""Numbers of papers, one TOML file per paper, and their reproduction: theirs, ours, difference.
+
+A number is of one of three kinds, which are never counted together: the paper prints it (`published`), somebody ran the
+authors' public code to obtain it (`authors_code`), or another implementation of the same rules gave it
+(`other_implementation`).
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -28,14 +33,24 @@ from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import parse_table
 from scenarios.schema.scenario import Scenario
 
-HEAD: Final = ("number", "unit", "published", "ours", "difference", "tolerance", "reproduced")
+KINDS: Final = {
+    "published": "published",
+    "authors_code": "by the authors' code",
+    "other_implementation": "by another implementation",
+}
+"""Where a number is from: the field of a paper's file that has it, and its name in tables."""
+COUNTED: Final = {**KINDS, "claim": "claims checked and confirmed", "bar": "bars of something else, met"}
+"""What is counted apart, and its name in sentences."""
 _RULE: Final = "measure must lead to a number of the flight's summary"
 Text = Annotated[str, MinLen(1), MaxLen(300)]
 
 
+Stated = Number | PairList
+
+
 @dataclass(frozen=True, kw_only=True)
-class PublishedNumber:
-    """One published number, and the flight that reproduces it."""
+class PaperNumber:
+    """A number of a paper, of its authors' code or of another implementation, and the flight that reproduces it."""
 
     name: Annotated[Text, doc("what it is, for tables")]
     scenario: Annotated[str, doc("a library name, or a path ending in .toml, relative to the paper's file")]
@@ -46,28 +61,60 @@ class PublishedNumber:
         "tracking.position_error.mean"
     )
     unit: Annotated[str, MaxLen(20), doc("of the number, for tables")] = "m"
-    published: Annotated[Number | PairList, doc("[unit] the number, or the lowest and the highest of several")]
-    relation: Annotated[Literal["equal", "at most", "at least"], doc("what ours is to be to the published one")] = (
-        "equal"
-    )
+    published: Annotated[
+        Stated | None, doc("[unit] the number that the paper prints, or the lowest and the highest of several")
+    ] = None
+    authors_code: Annotated[Stated | None, doc("[unit] in its place: obtained by running the authors' code")] = None
+    other_implementation: Annotated[Stated | None, doc("[unit] in its place: by another implementation")] = None
+    role: Annotated[
+        Literal["number", "claim", "bar"],
+        doc(
+            "of a published number: one that the paper reports of what is flown; a claim of the paper, in words or a "
+            "figure, put as a number; or a bar, which the paper reports of something else"
+        ),
+    ] = "number"
+    relation: Annotated[Literal["equal", "at most", "at least"], doc("what ours is to be to theirs")] = "equal"
     absolute: Annotated[NonNegative | None, doc("[unit] tolerance; either absolute or relative")] = None
-    relative: Annotated[Positive | None, doc("[-] tolerance as a share of the published number")] = None
-    source: Annotated[Text, doc("where the published number is from")]
+    relative: Annotated[Positive | None, doc("[-] tolerance as a share of the number")] = None
+    source: Annotated[Text, doc("where the number is from")]
 
     def __post_init__(self) -> None:
+        given = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if len(given) != 1:
+            raise ValueError(f"exactly one of {', '.join(KINDS)} must be given; got {', '.join(given) or 'none'}")
+        if self.role != "number" and self.published is None:
+            raise ValueError(f"role must be number where published is absent; got {self.role}")
         if (self.absolute is None) == (self.relative is None):
             raise ValueError("absolute must be given, or relative, but not both")
         if self.relative is not None and not any(self.span):
-            raise ValueError("absolute must be given where the published number is 0")
-        if isinstance(self.published, list):
-            low, high = self.published
+            raise ValueError("absolute must be given where the number is 0")
+        if isinstance(self.stated, list):
+            low, high = self.stated
             if self.relation != "equal" or not low < high:
-                raise ValueError(f"published must be a lower and a higher number of relation equal; got {[low, high]}")
+                raise ValueError(
+                    f"{self.kind} must be a lower and a higher number of relation equal; got {[low, high]}"
+                )
+
+    @property
+    def kind(self) -> str:
+        """Where the number is from: a key of `KINDS`."""
+        return next(kind for kind in KINDS if getattr(self, kind) is not None)
+
+    @property
+    def counted_as(self) -> str:
+        """What it is counted as: its kind, or its role where it is none of the paper's numbers of what is flown."""
+        return self.kind if self.role == "number" else self.role
+
+    @property
+    def stated(self) -> float | list[float]:
+        """The number [unit], or the lowest and the highest of several."""
+        value: float | list[float] = getattr(self, self.kind)
+        return value
 
     @property
     def span(self) -> tuple[float, float]:
-        """The lowest and the highest published number."""
-        low, high = self.published if isinstance(self.published, list) else (self.published, self.published)
+        """The lowest and the highest of the stated numbers [unit]."""
+        low, high = self.stated if isinstance(self.stated, list) else (self.stated, self.stated)
         return low, high
 
     @property
@@ -84,7 +131,8 @@ class PaperFile:
     authors: Annotated[Text | None, doc("of the paper; absent where it names none")] = None
     publication: Annotated[Text | None, doc("where and when it was published")] = None
     about: Annotated[Text, doc("what is reproduced, and what it is written from")]
-    numbers: Annotated[list[PublishedNumber], MinLen(1), MaxLen(MOST_ENTRIES), doc("its numbers, in order")]
+    subject: Annotated[Text | None, doc("what its published numbers are of, for the count of these")] = None
+    numbers: Annotated[list[PaperNumber], MinLen(1), MaxLen(MOST_ENTRIES), doc("its numbers, in order")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +146,7 @@ class Paper(PaperFile):
         """Short name of the paper."""
         return self.path.stem
 
-    def scenario_of(self, number: PublishedNumber) -> Scenario:
+    def scenario_of(self, number: PaperNumber) -> Scenario:
         """Return the scenario of a number."""
         beside = self.path.parent / number.scenario
         own_file = number.scenario.endswith(".toml") and beside.is_file()
@@ -119,13 +167,13 @@ def load_paper(name: str) -> Paper:
 class Reproduced:
     """One number."""
 
-    spec: PublishedNumber  # the published one
+    spec: PaperNumber  # theirs
     ours: float | None  # of our flight [unit]; None where it ended early
     reason: str | None = None  # why it did
 
     @property
     def difference(self) -> float | None:
-        """Ours minus the published number, or the nearest of several [unit]."""
+        """Ours minus theirs, or minus the nearest of several [unit]."""
         low, high = self.spec.span
         return None if self.ours is None else self.ours - min(max(self.ours, low), high)
 
@@ -142,33 +190,45 @@ class Reproduced:
         spec = self.spec
         return {
             **{name: getattr(spec, name) for name in ("name", "scenario", "set", "measure", "unit", "source")},
-            **{name: getattr(spec, name) for name in ("published", "relation", "tolerance")},
+            **{kind: getattr(spec, kind) for kind in KINDS},
+            **{name: getattr(spec, name) for name in ("kind", "role", "relation", "tolerance")},
             **{name: getattr(self, name) for name in ("ours", "difference", "within", "reason")},
         }
 
     @property
     def sentence(self) -> str:
         """The verdict for a report."""
-        _, unit, published, ours, difference, tolerance, _ = (cell.text for cell in self.cells())
-        text = f"published {published} {unit}, ours {ours} (difference {difference}, tolerance {tolerance})"
+        unit, ours, difference = self.spec.unit, self._shown(self.ours), self._shown(self.difference, "+")
+        role = "" if self.spec.role == "number" else f", a {self.spec.role}"
+        theirs = f"{KINDS[self.spec.kind]}{role}: {self._theirs} {unit}"
+        text = f"{theirs}; ours {ours} (difference {difference}, tolerance {self._tolerance})"
         return f"{text}: {self.reason}" if self.reason else text
 
-    def cells(self) -> tuple[Cell, ...]:
-        """Its line of the table."""
+    def cells(self, kinds: Sequence[str]) -> tuple[Cell, ...]:
+        """Its line of a table with a column for each of some kinds."""
         spec = self.spec
-        published = " to ".join(f"{value:g}" for value in sorted(set(spec.span)))
-        relation = "" if spec.relation == "equal" else f"{spec.relation} "
-        tolerance = f"{spec.tolerance:.2g}" if spec.relative is None else f"{100.0 * spec.relative:g} %"
+        theirs = [self._theirs if kind == spec.kind else ABSENT for kind in kinds]
         verdict = Cell(text="yes", mark=Mark.GOOD) if self.within else Cell(text="no", mark=Mark.BAD)
         return line(
             spec.name,
             spec.unit,
-            f"{relation}{published}",
+            *theirs,
             self._shown(self.ours),
             self._shown(self.difference, "+"),
-            tolerance,
+            self._tolerance,
             verdict,
         )
+
+    @property
+    def _theirs(self) -> str:
+        """What ours is compared with: `0.241`, `0.1163 to 0.1164` or `at most 0.02`."""
+        relation = "" if self.spec.relation == "equal" else f"{self.spec.relation} "
+        return relation + " to ".join(f"{value:g}" for value in sorted(set(self.spec.span)))
+
+    @property
+    def _tolerance(self) -> str:
+        spec = self.spec
+        return f"{spec.tolerance:.2g}" if spec.relative is None else f"{100.0 * spec.relative:g} %"
 
     def _shown(self, value: float | None, sign: str = "") -> str:
         """Return a value to a tenth of the tolerance, or to four digits without a tolerance."""
@@ -192,22 +252,53 @@ class Reproduction:
         """Whether all numbers are reproduced."""
         return all(number.within for number in self.numbers)
 
+    @property
+    def counts(self) -> dict[str, tuple[int, int]]:
+        """How many are within their tolerance, of how many, by `PaperNumber.counted_as`."""
+        counts: dict[str, tuple[int, int]] = {}
+        for name in COUNTED:
+            verdicts = [number.within for number in self.numbers if number.spec.counted_as == name]
+            if verdicts:
+                counts[name] = (sum(verdicts), len(verdicts))
+        return counts
+
+    @property
+    def sentence(self) -> str:
+        """The counts, each kind apart: `published: 1 of 1; by the authors' code: 8 of 8`."""
+        parts = []
+        for name, (within, count) in self.counts.items():
+            of = f" of {self.paper.subject}" if name == "published" and self.paper.subject else ""
+            parts.append(f"{COUNTED[name]}: {within} of {count}{of}")
+        return "; ".join(parts)
+
     def to_json(self) -> dict[str, Any]:
-        """Return the number and its reproduction as plain data."""
+        """Return the paper, how many of its numbers are reproduced, and each of them as plain data."""
         about = {name: getattr(self.paper, name) for name in ("name", "title", "authors", "publication")}
-        return {**about, "reproduced": self.within, "numbers": [number.to_json() for number in self.numbers]}
+        counts = {name: {"within": within, "of": count} for name, (within, count) in self.counts.items()}
+        return {
+            **about,
+            "reproduced": self.within,
+            "sentence": self.sentence,
+            "counts": counts,
+            "numbers": [number.to_json() for number in self.numbers],
+        }
 
     @property
     def grid(self) -> Grid:
-        """The table."""
+        """The table; a kind that no number is of has no column."""
         paper = self.paper
         citation = ", ".join(filter(None, [paper.authors, paper.publication]))
+        used = {number.spec.kind for number in self.numbers}
+        kinds = [kind for kind in KINDS if kind in used]
+        columns = [KINDS[kind] for kind in kinds]
+        if {number.spec.counted_as for number in self.numbers} == {"claim"}:
+            columns = ["claimed"]
         return Grid(
             key=paper.name,
             title=paper.title,
-            head=HEAD,
-            lines=tuple(number.cells() for number in self.numbers),
-            note=". ".join(filter(None, [citation, paper.about])),
+            head=("number", "unit", *columns, "ours", "difference", "tolerance", "within"),
+            lines=tuple(number.cells(kinds) for number in self.numbers),
+            note=". ".join(filter(None, [self.sentence, citation, paper.about])),
         )
 
 
@@ -250,7 +341,7 @@ def reproduce_paper(paper: Paper, progress: Progress = silent) -> Reproduction:
     return Reproduction(paper=paper, numbers=tuple(reproduced))
 
 
-def _measured(spec: PublishedNumber, summary: dict[str, Any]) -> Reproduced:
+def _measured(spec: PaperNumber, summary: dict[str, Any]) -> Reproduced:
     if summary["status"] != "completed":
         return Reproduced(spec=spec, ours=None, reason=summary["reason"])
     value: Any = summary

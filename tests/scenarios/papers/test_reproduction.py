@@ -1,9 +1,11 @@
-"""Published numbers flown again: the short ones of every paper, and the messages for one that is off."""
+"""Numbers of papers flown again: the short ones of every paper, and the messages for one that is off."""
 
 from __future__ import annotations
 
+import csv
 import json
 import re
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +23,9 @@ from scenarios.commands.cli import main
 from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.papers.reproduction import (
-    PublishedNumber,
+    COUNTED,
+    KINDS,
+    PaperNumber,
     Reproduced,
     Reproduction,
     load_paper,
@@ -33,6 +37,7 @@ from scenarios.schema.problems import ScenarioError
 
 pytestmark = pytest.mark.slow("papers")
 
+ROOT = Path(__file__).resolve().parents[3]
 HEAD = 'title = "A paper"\nauthors = "N. N."\nabout = "A hover"\n'
 NUMBER = """
 [[numbers]]
@@ -64,7 +69,7 @@ def loop4(fly_once: Callable[..., Flight]) -> Reproduction:
 
 
 def test_the_circle_at_4_m_s_is_reproduced(loop4: Reproduction) -> None:
-    assert [number.spec.published for number in loop4.numbers] == [0.0001, 0.1162, [0.1163, 0.1164]]
+    assert [number.spec.authors_code for number in loop4.numbers] == [0.0001, 0.1162, [0.1163, 0.1164]]
     assert loop4.within, [number.sentence for number in loop4.numbers]
 
 
@@ -110,7 +115,7 @@ def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
     ],
 )
 def test_a_number_is_judged_by_its_relation_and_tolerance(relation: Any, ours: float, within: bool) -> None:
-    spec = PublishedNumber(name="n", scenario="hover", published=1.0, relation=relation, absolute=0.01, source="s")
+    spec = PaperNumber(name="n", scenario="hover", published=1.0, relation=relation, absolute=0.01, source="s")
     assert Reproduced(spec=spec, ours=ours).within is within
 
 
@@ -148,7 +153,72 @@ def test_the_command_prints_and_fails_beyond_tolerance(tmp_path: Path, capsys: p
     assert not second["within"]
     assert (second["published"], second["ours"], second["tolerance"]) == (0.6, 0.5, pytest.approx(0.006))
     assert second["difference"] == pytest.approx(-0.1)
-    assert ElementTree.parse(report).getroot().attrib["failures"] == "1"
+    assert (second["kind"], second["authors_code"], second["other_implementation"]) == ("published", None, None)
+    assert result["papers"][0]["counts"] == {"published": {"within": 1, "of": 2}}
+    root = ElementTree.parse(report).getroot()
+    assert root.attrib["failures"] == "1"
+    assert root.findtext("testcase/system-out") == "published: 0.5 s; ours 0.5 (difference +0, tolerance 0)"
+
+
+@pytest.mark.witness("papers")
+def test_only_what_a_paper_prints_of_what_is_flown_is_called_published() -> None:
+    """Three kinds by their sources, counted apart; bars and claims are no reproduced numbers."""
+    numbers = load_paper("torrente2021").numbers
+    sources = {
+        "published": "published",
+        "authors_code": "obtained by running the public code",
+        "other_implementation": "another implementation",
+    }
+    for number in numbers:
+        assert number.source.startswith(sources[number.kind]), number.name
+    assert Counter(number.counted_as for number in numbers) == {
+        "published": 1,
+        "authors_code": 8,
+        "other_implementation": 9,
+        "bar": 2,
+    }
+    for number in load_paper("quadrotor-uav").numbers:
+        assert (number.kind, number.role) == ("published", "claim")
+
+
+@pytest.mark.witness("papers")
+def test_each_kind_has_its_column_and_its_count() -> None:
+    paper = load_paper("torrente2021")
+    numbers = tuple(Reproduced(spec=number, ours=number.span[0]) for number in paper.numbers)
+    missed = (replace(numbers[0], ours=1.0), *numbers[1:])
+    text = "published: 1 of 1 of the nominal controller; by the authors' code: %d of 8; "
+    text += "by another implementation: 9 of 9; bars of something else, met: 2 of 2"
+    assert Reproduction(paper=paper, numbers=numbers).sentence == text % 8
+    assert Reproduction(paper=paper, numbers=missed).sentence == text % 7
+    grid = Reproduction(paper=paper, numbers=numbers).grid
+    assert grid.note.startswith(text % 8)
+    assert grid.head[2:5] == ("published", "by the authors' code", "by another implementation")
+    stated = {cells[0].text: [cell.text for cell in cells[2:5]] for cells in grid.lines}
+    assert stated["circle, 8 m/s, drag, noise"] == ["0.241", "-", "-"]
+    assert stated["circle, 4 m/s, drag, noise"] == ["-", "0.1163 to 0.1164", "-"]
+    assert stated["circle, drag: true RMS"] == ["-", "-", "0.29523"]
+    claims = load_paper("quadrotor-uav")
+    confirmed = Reproduction(
+        paper=claims, numbers=tuple(Reproduced(spec=claim, ours=claim.span[0]) for claim in claims.numbers)
+    )
+    assert confirmed.sentence == "claims checked and confirmed: 18 of 18"
+    assert confirmed.grid.head[2:4] == ("claimed", "ours")
+
+
+@pytest.mark.witness("papers")
+def test_the_table_of_the_page_states_each_kind() -> None:
+    rows = list(csv.DictReader((ROOT / "docs/data/papers.csv").read_text(encoding="utf-8").splitlines()))
+    for name in paper_names():
+        paper = load_paper(name)
+        of_paper = [row for row in rows if row["paper"] == paper.title]
+        assert [row["name"] for row in of_paper] == [number.name for number in paper.numbers]
+        for row, number in zip(of_paper, paper.numbers, strict=True):
+            assert [kind for kind in KINDS if row[kind]] == [number.kind]
+            assert row["role"] == number.role
+        page = (ROOT / "docs/evidence.md").read_text(encoding="utf-8")
+        (line,) = re.findall(rf"^- \*{paper.title}\*.*$", page, re.MULTILINE)
+        for name, count in Counter(number.counted_as for number in paper.numbers).items():
+            assert re.search(rf"{COUNTED[name]}: \d+ of {count}\b", line, re.IGNORECASE), name
 
 
 def test_a_scenario_beside_the_papers_file_is_found(tmp_path: Path) -> None:
@@ -167,6 +237,17 @@ def test_a_scenario_beside_the_papers_file_is_found(tmp_path: Path) -> None:
             "published = 0.5",
             "published = [0.6, 0.5]",
             "published must be a lower and a higher number of relation equal",
+        ),
+        (
+            "published = 0.5",
+            "published = 0.5\nauthors_code = 0.5",
+            "exactly one of published, authors_code, other_implementation must be given; got published, authors_code",
+        ),
+        ("published = 0.5", "", "other_implementation must be given; got none"),
+        (
+            "published = 0.5",
+            'authors_code = 0.5\nrole = "bar"',
+            "role must be number where published is absent; got bar",
         ),
     ],
 )
