@@ -5,7 +5,7 @@
     flight = quadsim.fly("paper-constrained")
     flight.outcome, flight.metrics["rmse.x"], flight.margins["roll"].min()
 
-Public names are in `__all__` and imported on first use (PEP 562), so `import quadsim` costs nothing.
+Public names are in `__all__` and imported on first use (PEP 562): `import quadsim` alone imports none of them.
 """
 
 from __future__ import annotations

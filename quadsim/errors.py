@@ -1,4 +1,4 @@
-"""Every error that the project raises: the value given, the values allowed, and a remedy.
+"""The errors that users meet: the value given, the values allowed, and a remedy.
 
 Two families have one root.  An `InputError` is for the user to correct (exit status 2). A `FlightError` happens in
 flight: it ends the flight, is recorded as its reason, and gives exit status 1.

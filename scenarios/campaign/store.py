@@ -1,6 +1,7 @@
-"""A growing campaign directory: no flight is lost or stored twice, whichever process is killed.
+"""A growing campaign directory: no stored flight is lost or stored twice, whichever process is killed.
 
-Rows are appended as files of their own below `parts/`.  When all is flown the parts become `flights.parquet` and
+Rows are appended as files of their own below `parts/`, every few seconds; those that a killed process had not yet
+appended are flown again.  When all is flown the parts become `flights.parquet` and
 `timing.parquet`, and go.  The manifest has what was flown, by which code, and how far it is.
 """
 

@@ -1,4 +1,4 @@
-"""Verdicts as JUnit XML, which every CI server reads."""
+"""Verdicts as JUnit XML, which CI servers read."""
 
 from __future__ import annotations
 

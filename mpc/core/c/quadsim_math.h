@@ -95,7 +95,7 @@ static inline real dot(const real *left, const real *right, int count)
     return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
-/* ---- elementary functions, by arithmetic alone: every processor has the same bits ------------------------------ */
+/* ---- elementary functions, by arithmetic alone: the same bits wherever it is IEEE 754 and not contracted -------- */
 
 /* After FreeBSD's msun, by Sun Microsystems, 1993: permission to use, copy, modify, and distribute this software is
  * freely granted, provided that this notice is preserved. */
