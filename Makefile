@@ -55,7 +55,7 @@ test test-all rooms peers firmware betaflight chain numbers reproduce: export MK
 test: setup $(VENV)/.browser  ## all tests but the slow groups, of which it runs a witness each (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope -m "not slow or witness" --hypothesis-profile=quick $(OPTIONS)
 
-test-all: setup $(VENV)/.browser  ## run every test that needs no peer
+test-all: setup $(VENV)/.browser  ## run every test but those of make peers and make firmware
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
 rooms: setup  ## take each feature room away, in a copy, and see the rest pass (OPTIONS=live for one)
