@@ -26,7 +26,7 @@ from typing import Any, Final
 from PIL import Image
 
 from scenarios.campaign.statistics import interval
-from scenarios.papers.reproduction import KINDS
+from scenarios.papers.reproduction import NUMBER_KINDS
 from scenarios.progress import reporting
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -189,7 +189,7 @@ def paper_rows(reproduction: Record) -> list[Record]:
     for each in reproduction["papers"]:
         for number in each["numbers"]:
             row = {"paper": each["title"], **{key: number[key] for key in ("name", "unit", "role", "relation")}}
-            for kind in KINDS:
+            for kind in NUMBER_KINDS:
                 stated = number[kind]
                 values = stated if isinstance(stated, list) else [stated]
                 row[kind] = " to ".join(f"{value:g}" for value in values if value is not None)

@@ -170,10 +170,10 @@ def fly_campaign(
         def write(place: Path) -> None:
             write_report(place, table, summary, spec, campaign=directory)
 
-        files.finish(summary, unhashed=records.MEASURED)
+        files.finish(summary, unhashed=records.UNREPRODUCIBLE)
         with optional("the report"):
             _put_report(files, REPORT_FILES, write if report else None)
-        files.finish(summary, unhashed=records.MEASURED)  # now with the report among its files
+        files.finish(summary, unhashed=records.UNREPRODUCIBLE)  # now with the report among its files
     return CampaignResult(directory=directory, manifest=manifest, table=table, summary=summary)
 
 

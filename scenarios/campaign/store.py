@@ -41,7 +41,7 @@ FLIGHTS_FILE: Final = "flights.parquet"
 TIMES_FILE: Final = "timing.parquet"
 FLUSH_S: Final = 5.0  # how long an answer may wait in memory before it is on the disk [s]
 PARTS_DIR: Final = "parts"
-MEASURED: Final = (TIMES_FILE, MANIFEST_FILE, PAGE_FILE)
+UNREPRODUCIBLE: Final = (TIMES_FILE, MANIFEST_FILE, PAGE_FILE)
 """Files with clock times, the machine or the directory's name, so that they differ where the flights are the same.
 
 `summary.json` has no SHA-256 of them; `manifest.json` has that of `timing.parquet`.

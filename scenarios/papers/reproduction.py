@@ -33,13 +33,13 @@ from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import parse_table
 from scenarios.schema.scenario import Scenario
 
-KINDS: Final = {
+NUMBER_KINDS: Final = {
     "published": "published",
     "authors_code": "by the authors' code",
     "other_implementation": "by another implementation",
 }
 """Where a number is from: the field of a paper's file that has it, and its name in tables."""
-COUNTED: Final = {**KINDS, "claim": "claims checked and confirmed", "bar": "bars of something else, met"}
+COUNTED: Final = {**NUMBER_KINDS, "claim": "claims checked and confirmed", "bar": "bars of something else, met"}
 """What is counted apart, and its name in sentences."""
 _RULE: Final = "measure must lead to a number of the flight's summary"
 Text = Annotated[str, MinLen(1), MaxLen(300)]
@@ -79,9 +79,11 @@ class PaperNumber:
     source: Annotated[Text, doc("where the number is from")]
 
     def __post_init__(self) -> None:
-        given = [kind for kind in KINDS if getattr(self, kind) is not None]
+        given = [kind for kind in NUMBER_KINDS if getattr(self, kind) is not None]
         if len(given) != 1:
-            raise ValueError(f"exactly one of {', '.join(KINDS)} must be given; got {', '.join(given) or 'none'}")
+            raise ValueError(
+                f"exactly one of {', '.join(NUMBER_KINDS)} must be given; got {', '.join(given) or 'none'}"
+            )
         if self.role != "number" and self.published is None:
             raise ValueError(f"role must be number where published is absent; got {self.role}")
         if (self.absolute is None) == (self.relative is None):
@@ -97,8 +99,8 @@ class PaperNumber:
 
     @property
     def kind(self) -> str:
-        """Where the number is from: a key of `KINDS`."""
-        return next(kind for kind in KINDS if getattr(self, kind) is not None)
+        """Where the number is from: a key of `NUMBER_KINDS`."""
+        return next(kind for kind in NUMBER_KINDS if getattr(self, kind) is not None)
 
     @property
     def counted_as(self) -> str:
@@ -190,7 +192,7 @@ class Reproduced:
         spec = self.spec
         return {
             **{name: getattr(spec, name) for name in ("name", "scenario", "set", "measure", "unit", "source")},
-            **{kind: getattr(spec, kind) for kind in KINDS},
+            **{kind: getattr(spec, kind) for kind in NUMBER_KINDS},
             **{name: getattr(spec, name) for name in ("kind", "role", "relation", "tolerance")},
             **{name: getattr(self, name) for name in ("ours", "difference", "within", "reason")},
         }
@@ -200,7 +202,7 @@ class Reproduced:
         """The verdict for a report."""
         unit, ours, difference = self.spec.unit, self._shown(self.ours), self._shown(self.difference, "+")
         role = "" if self.spec.role == "number" else f", a {self.spec.role}"
-        theirs = f"{KINDS[self.spec.kind]}{role}: {self._theirs} {unit}"
+        theirs = f"{NUMBER_KINDS[self.spec.kind]}{role}: {self._theirs} {unit}"
         text = f"{theirs}; ours {ours} (difference {difference}, tolerance {self._tolerance})"
         return f"{text}: {self.reason}" if self.reason else text
 
@@ -289,8 +291,8 @@ class Reproduction:
         paper = self.paper
         citation = ", ".join(filter(None, [paper.authors, paper.publication]))
         used = {number.spec.kind for number in self.numbers}
-        kinds = [kind for kind in KINDS if kind in used]
-        columns = [KINDS[kind] for kind in kinds]
+        kinds = [kind for kind in NUMBER_KINDS if kind in used]
+        columns = [NUMBER_KINDS[kind] for kind in kinds]
         if {number.spec.counted_as for number in self.numbers} == {"claim"}:
             columns = ["claimed"]
         return Grid(

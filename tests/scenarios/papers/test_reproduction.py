@@ -24,7 +24,7 @@ from scenarios.flown import Flight
 from scenarios.loading import load_scenario
 from scenarios.papers.reproduction import (
     COUNTED,
-    KINDS,
+    NUMBER_KINDS,
     PaperNumber,
     Reproduced,
     Reproduction,
@@ -213,7 +213,7 @@ def test_the_table_of_the_page_states_each_kind() -> None:
         of_paper = [row for row in rows if row["paper"] == paper.title]
         assert [row["name"] for row in of_paper] == [number.name for number in paper.numbers]
         for row, number in zip(of_paper, paper.numbers, strict=True):
-            assert [kind for kind in KINDS if row[kind]] == [number.kind]
+            assert [kind for kind in NUMBER_KINDS if row[kind]] == [number.kind]
             assert row["role"] == number.role
         page = (ROOT / "docs/evidence.md").read_text(encoding="utf-8")
         (line,) = re.findall(rf"^- \*{paper.title}\*.*$", page, re.MULTILINE)
