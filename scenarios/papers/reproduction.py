@@ -38,7 +38,9 @@ NUMBER_KINDS: Final = {
     "authors_code": "by the authors' code",
     "other_implementation": "by another implementation",
 }
-"""Where a number is from: the field of a paper's file that has it, and its name in tables."""
+"""Where a number is from: the field of a paper's file that has it, and its name in sentences."""
+_COLUMNS: Final = {"published": "published", "authors_code": "authors' code", "other_implementation": "other code"}
+"""Their columns, short enough for a console."""
 COUNTED: Final = {**NUMBER_KINDS, "claim": "claims checked and confirmed", "bar": "bars of something else, met"}
 """What is counted apart, and its name in sentences."""
 _RULE: Final = "measure must lead to a number of the flight's summary"
@@ -292,7 +294,7 @@ class Reproduction:
         citation = ", ".join(filter(None, [paper.authors, paper.publication]))
         used = {number.spec.kind for number in self.numbers}
         kinds = [kind for kind in NUMBER_KINDS if kind in used]
-        columns = [NUMBER_KINDS[kind] for kind in kinds]
+        columns = [_COLUMNS[kind] for kind in kinds]
         if {number.spec.counted_as for number in self.numbers} == {"claim"}:
             columns = ["claimed"]
         return Grid(

@@ -192,7 +192,7 @@ def test_each_kind_has_its_column_and_its_count() -> None:
     assert Reproduction(paper=paper, numbers=missed).sentence == text % 7
     grid = Reproduction(paper=paper, numbers=numbers).grid
     assert grid.note.startswith(text % 8)
-    assert grid.head[2:5] == ("published", "by the authors' code", "by another implementation")
+    assert grid.head[2:5] == ("published", "authors' code", "other code")
     stated = {cells[0].text: [cell.text for cell in cells[2:5]] for cells in grid.lines}
     assert stated["circle, 8 m/s, drag, noise"] == ["0.241", "-", "-"]
     assert stated["circle, 4 m/s, drag, noise"] == ["-", "0.1163 to 0.1164", "-"]
