@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quadsim.errors import FileError, MissingPackageError, QuadsimError
+from quadsim.errors import FileError, InputError, MissingPackageError, QuadsimError
 
 _LARGEST: Final = 1e9  # of a number that a log states of itself
 
@@ -35,6 +35,25 @@ def reading(path: Path, what: str, library: str = "") -> Iterator[None]:
             raise MissingPackageError(f"a {what}", library, extra="logs") from error
         problem = f"{type(error).__name__}: {error}"
         raise FileError(path, f"is not a readable {what} ({problem[:120]})") from error
+
+
+@contextmanager
+def judging(names: str) -> Iterator[None]:
+    """Check, fit and predict logs: what their numbers make fail is a fault of theirs.
+
+    Raises:
+        InputError: a matrix is singular, or a number is none.
+    """
+    try:
+        yield
+    except QuadsimError:
+        raise
+    except (ArithmeticError, LookupError, ValueError) as error:
+        problem = f"{type(error).__name__}: {error}"
+        raise InputError(
+            f"{names}: no fit is possible ({problem[:120]}); a column that stands still, or samples far beyond the "
+            "others, do that: plot rates, velocity and the rotors' outputs"
+        ) from error
 
 
 def stated_number(

@@ -250,13 +250,13 @@ def _clock(name: str, series: Mapping[str, Column]) -> Array:
     if driver != "speeds" and _usual_period(clocks[1]) > 1.0 / (0.9 * SLOWEST_COMMANDS):
         del clocks[1]
     slower = max(clocks, key=_usual_period)
+    period = _usual_period(slower)
     pause = int(np.argmax(np.diff(slower)))
-    if slower[pause + 1] - slower[pause] > LONGEST_PAUSE:
+    if slower[pause + 1] - slower[pause] > max(LONGEST_PAUSE, 100.0 * period):
         raise InputError(
             f"{name}: its time jumps from {slower[pause]:.6g} to {slower[pause + 1]:.6g} s; at most "
             f"{LONGEST_PAUSE:g} s may be between two samples: give one flight per log"
         )
-    period = _usual_period(slower)
     if 1.0 / period < 0.95 * SLOWEST_RATE:
         raise InputError(
             f"{name}: {1.0 / period:.3g} samples per second, period {period:.4g} s; at least {SLOWEST_RATE:g} Hz are "
