@@ -220,8 +220,8 @@ def _check_samples(name: str, columns: Mapping[str, Column], one: NamedQuantity)
             row = int(np.argmax(beyond))
             unit = next(iter(LOGGED[one.quantity].units))
             raise InputError(
-                f"{name}: {column} is {logged[row]:.4g} at t = {t[row]:.6g} s; the {one.quantity} of a vehicle stay "
-                f"within {largest:g} {unit}: correct the sample or its unit, or leave it empty"
+                f"{name}: {column} is {logged[row]:.4g} at t = {t[row]:.6g} s; {one.quantity} must be within "
+                f"+-{largest:g} {unit}: correct the sample or its unit, or leave it empty"
             )
 
 
