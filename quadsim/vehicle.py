@@ -15,7 +15,7 @@ from annotated_types import DocInfo, Len, doc
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, ParameterError, UnknownNameError
-from quadsim.fields import FLOORS, Number, Pair, Positive, Vector, floor
+from quadsim.fields import FLOORS, Number, Pair, Positive, Vector, floor_of
 from quadsim.state import Array, read_only
 
 N_ROTORS: Final = 4
@@ -448,7 +448,7 @@ def _check_number(name: str, value: object, *, positive: bool) -> None:
     if positive and value <= 0.0:
         raise ParameterError("vehicle", name, value, "positive")
     unit = VEHICLE_UNITS[name]
-    least = floor(unit)
+    least = floor_of(unit)
     if abs(value) > LARGEST or (positive and value < least):
         raise ParameterError("vehicle", name, value, f"between {least:g} and {LARGEST:g} {unit}")
 

@@ -23,7 +23,7 @@ from jsonschema import Draft202012Validator
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError
-from quadsim.fields import floor
+from quadsim.fields import floor_of
 from quadsim.vehicle import VEHICLE_UNITS, load_vehicle
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import load_plan, parse_campaign, read_campaign
@@ -260,7 +260,8 @@ def test_what_must_be_positive_has_the_floor_of_its_unit(kind: Kind) -> None:
     wrong, checked = [], 0
     for table in kind.tables:
         for name, field in fields_of(table).items():
-            unit = re.match(r"\[([^\]]+)\]", field.description or "")
+            stated = re.match(r"\[([^\]]+)\]", field.description or "")
+            unit = stated[1] if stated else ""
             for allowed in kinds_of(field.annotation, tuple(field.metadata)):
                 for number in (allowed, *allowed.entries):
                     least = number.limits.get("ge", 0.0)
@@ -268,7 +269,7 @@ def test_what_must_be_positive_has_the_floor_of_its_unit(kind: Kind) -> None:
                     if number.type is not float or not (above_zero or 0.0 < least < 1e-3):
                         continue
                     checked += 1
-                    right = unit and unit[1] in ("-", "deg") if above_zero else least >= floor(unit[1] if unit else "")
+                    right = unit in ("-", "deg") if above_zero else least >= floor_of(unit)
                     if not right:
                         wrong.append(f"{table.__name__}.{name}")
     assert not wrong

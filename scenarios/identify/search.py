@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from quadsim.fields import floor
+from quadsim.fields import floor_of
 from quadsim.state import Array, Indices
 from quadsim.vehicle import LARGEST, VEHICLE_UNITS, Vehicle
 from scenarios.identify.estimate import VECTORS, field_of
@@ -61,7 +61,7 @@ class Sought(NamedTuple):
         """The number itself; one that is positive by nature stays within what a vehicle's numbers may be."""
         if self.scale is not None:
             return float(self.start + self.scale * x)
-        least = floor(VEHICLE_UNITS[field_of(self.name)])
+        least = floor_of(VEHICLE_UNITS[field_of(self.name)])
         within = np.clip(x, math.log(least / self.start), math.log(LARGEST / self.start))
         return float(self.start * np.exp(within))
 
