@@ -58,8 +58,8 @@ Horizon = Annotated[int, Ge(1), Le(LARGEST_HORIZON)]
 KktEvery = Annotated[
     int, Ge(1), doc("[periods] interval at which KKT residuals are computed and logged; 1: every period")
 ]
-Seconds = Annotated[float, Ge(0.0), Le(10.0)]
-Lag = Seconds | Literal["vehicle"]  # a time constant, or the one in the vehicle file
+LagSeconds = Annotated[float, Ge(0.0), Le(10.0)]
+Lag = LagSeconds | Literal["vehicle"]  # a time constant, or the one in the vehicle file
 Rates = Positive | Annotated[tuple[Positive, ...], Len(3, 3)]
 """One largest magnitude for three body rates, or one per axis."""
 RotorWeights = Weight | Annotated[tuple[Weight, ...], Len(N_ROTORS, N_ROTORS)]

@@ -53,7 +53,7 @@ from numpy.typing import ArrayLike
 
 from quadsim.controller import StepInputs
 from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, set_arrays, struct_members
-from quadsim.fields import NonNegative, Positive
+from quadsim.fields import NonNegative, Positive, Seconds
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -81,7 +81,7 @@ class RampSettings:
         Positive | None, doc(f"[rad/s] bandwidth of the torque estimate; absent: {TORQUE_SHARE:g} / control period")
     ] = None
     drag_memory: Annotated[
-        Positive, doc("[s] window for fitting linear drag to the force, for a nonlinear MPC's predictions")
+        Seconds, doc("[s] window for fitting linear drag to the force, for a nonlinear MPC's predictions")
     ] = 1.0
     rotor_lag: Annotated[
         NonNegative | None,

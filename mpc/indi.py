@@ -27,7 +27,7 @@ from annotated_types import doc
 from mpc.allocation import allocation_struct, make_allocation
 from quadsim.core.inner import CompiledLoop
 from quadsim.core.structs import LoopKind, fill
-from quadsim.fields import Positive
+from quadsim.fields import Hertz
 from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 class INDISettings:
     """INDI of the angular acceleration in an inner loop."""
 
-    rate: Annotated[Positive, doc("[Hz] inner loop; its period is a whole number of physics steps")] = 500.0
-    cutoff: Annotated[Positive, doc("[Hz] cutoff of the filter on measured angular accelerations and torques")] = 30.0
+    rate: Annotated[Hertz, doc("[Hz] inner loop; its period is a whole number of physics steps")] = 500.0
+    cutoff: Annotated[Hertz, doc("[Hz] cutoff of the filter on measured angular accelerations and torques")] = 30.0
 
 
 def require_one_scale(indi: INDISettings | None, disturbance: RampSettings | None) -> None:

@@ -10,20 +10,48 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
-from annotated_types import Ge, Gt, Le, Len, doc
+from annotated_types import Ge, Le, Len, doc
+
+from quadsim.errors import ParameterError
 
 Declaration = TypeVar("Declaration")
 
+SMALLEST: Final = 1e-12
+FLOORS: Final = {"s": 1e-6, "m": 1e-6, "kg": 1e-6, "Hz": 1e-6}
+"""Least positive number of a unit, and of any other: what is smaller means nothing here, and its inverse overflows."""
+
 Number = Annotated[float, Ge(-1e6), Le(1e6)]
 NonNegative = Annotated[float, Ge(0.0), Le(1e6)]
-Positive = Annotated[float, Gt(0.0), Le(1e6)]
+Positive = Annotated[float, Ge(SMALLEST), Le(1e6)]
+Seconds = Annotated[float, Ge(FLOORS["s"]), Le(1e6)]
+Metres = Annotated[float, Ge(FLOORS["m"]), Le(1e6)]
+Kilograms = Annotated[float, Ge(FLOORS["kg"]), Le(1e6)]
+Hertz = Annotated[float, Ge(FLOORS["Hz"]), Le(1e6)]
 Fraction = Annotated[float, Ge(0.0), Le(1.0)]
-Weight = Annotated[float, Gt(0.0), Le(1e12)]  # weight in a cost function
+Weight = Annotated[float, Ge(SMALLEST), Le(1e12)]  # weight in a cost function
 Vector = Annotated[tuple[Number, ...], Len(3, 3)]  # x, y, z
 Pair = Annotated[tuple[Number, ...], Len(2, 2)]
 Instant = Annotated[float, Ge(0.0), Le(1e6), doc("[s] when it happens")]  # of an event
+
+
+def floor_of(unit: str) -> float:
+    """Return the least positive number of a unit."""
+    return FLOORS.get(unit, SMALLEST)
+
+
+def require_floor(settings: object, *names: str, unit: str) -> None:
+    """Refuse fields that may be 0, for none, and are smaller than any that means something.
+
+    Raises:
+        ParameterError: one is between 0 and the unit's floor.
+    """
+    least = floor_of(unit)
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None and 0.0 < value < least:
+            raise ParameterError("", name, value, f"0, or at least {least:g} {unit}")
 
 
 def filled(settings: Declaration, **values: object) -> Declaration:

@@ -18,6 +18,20 @@ from quadsim.errors import ParameterError
 from quadsim.vehicle import ARMS, N_ROTORS, THRUST, VEHICLE_UNITS, Vehicle
 
 AIR_DENSITY: Final = 1.225  # [kg/m^3]
+LARGEST_SAMPLES: Final = {
+    "position": 1e7,
+    "velocity": 1e3,
+    "specific_force": 1e4,
+    "attitude": 1e3,
+    "euler": 1e5,
+    "rates": 1e3,
+    "commands": 1e6,
+    "throttle": 1e6,
+    "speeds": 1e6,
+    "erpm": 1e7,
+    "voltage": 1e5,
+}
+"""Largest magnitude of a logged quantity, in the unit of a table: far above what a vehicle does."""
 UNKNOWN_RADIUS: Final = 0.5  # radius of a propeller whose file states none, in arm lengths
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from annotated_types import Len, MaxLen, doc
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from quadsim.fields import NonNegative, Number, Pair, Positive, Vector
+from quadsim.fields import Metres, NonNegative, Number, Pair, Vector
 from quadsim.state import Array
 
 MAX_POSITIONS: Final = 1000  # of one obstacle's path, or half-spaces of one polytope
@@ -28,7 +28,7 @@ _PARALLEL: Final = 1e-9  # determinant of three unit normals below which their p
 _ROUNDING: Final = 1e-9  # of lengths along a path [m]
 
 ReportName = Annotated[str, doc("name in reports")]
-Sizes = Annotated[tuple[Positive, ...], Len(3, 3)]  # along x, y, z
+Sizes = Annotated[tuple[Metres, ...], Len(3, 3)]  # along x, y, z
 
 
 def _clearance(kind: str, size: Array, centre: Array, turn: Array, points: Array) -> tuple[Array, Array]:
@@ -206,7 +206,7 @@ class Sphere(Obstacle):
     """A sphere."""
 
     type: Annotated[Literal["sphere"], doc("kind of obstacle: sphere")] = "sphere"
-    radius: Annotated[Positive, doc("[m]")]
+    radius: Annotated[Metres, doc("[m]")]
 
     @cached_property
     def solids(self) -> tuple[Solid, ...]:
@@ -220,7 +220,7 @@ class Capsule(Obstacle):
 
     type: Annotated[Literal["capsule"], doc("kind of obstacle: capsule")] = "capsule"
     axis: Annotated[Vector, doc("[m] from one end of its axis to the other")]
-    radius: Annotated[Positive, doc("[m] about its axis")]
+    radius: Annotated[Metres, doc("[m] about its axis")]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -259,8 +259,8 @@ class Cylinder(Obstacle):
     """A vertical cylinder."""
 
     type: Annotated[Literal["cylinder"], doc("kind of obstacle: cylinder")] = "cylinder"
-    radius: Annotated[Positive, doc("[m]")]
-    height: Annotated[Positive, doc("[m]")]
+    radius: Annotated[Metres, doc("[m]")]
+    height: Annotated[Metres, doc("[m]")]
 
     @cached_property
     def solids(self) -> tuple[Solid, ...]:
@@ -275,7 +275,7 @@ class Wall(Obstacle):
     type: Annotated[Literal["wall"], doc("kind of obstacle: wall")] = "wall"
     size: Annotated[Sizes, doc("[m] thickness along its x axis, width along y, height along z")]
     yaw: Annotated[Number, doc("[deg] angle from the world's x axis to its x axis, which is normal to the wall")] = 0.0
-    window: Annotated[Annotated[tuple[Positive, ...], Len(2, 2)], doc("[m] width and height of the opening")]
+    window: Annotated[Annotated[tuple[Metres, ...], Len(2, 2)], doc("[m] width and height of the opening")]
     window_centre: Annotated[Pair, doc("[m] along its y and z axes, from its centre")] = (0.0, 0.0)
 
     def __post_init__(self) -> None:

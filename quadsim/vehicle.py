@@ -15,7 +15,7 @@ from annotated_types import DocInfo, Len, doc
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, ParameterError, UnknownNameError
-from quadsim.fields import Number, Pair, Positive, Vector
+from quadsim.fields import FLOORS, Number, Pair, Positive, Vector, floor_of
 from quadsim.state import Array, read_only
 
 N_ROTORS: Final = 4
@@ -26,8 +26,8 @@ ARMS: Final = ("arm_length", "rotor_azimuths")
 """The parameters that `rotor_positions` replaces."""
 THRUST: Final = ("thrust_coefficient", "thrust_of_speed", "thrust_of_throttle")
 """The parameters of which one states a rotor's thrust."""
-SMALLEST, LARGEST = 1e-12, 1e6
-"""Allowed magnitudes of a vehicle's numbers; MuJoCo refuses smaller inertias, and larger numbers overflow."""
+LARGEST: Final = 1e6
+"""Largest magnitude of a vehicle's numbers: larger ones overflow."""
 LEAST_SHARE: Final = 1e-3
 """Least share of the weight that a rotor carries in hover."""
 BALANCED: Final = 1e-9
@@ -158,7 +158,7 @@ class Vehicle:
             self._refuse("rotor_azimuths", "within -360 and 360 deg")
         if self.rotor_positions is None and (absent := [name for name in ARMS if name not in arms]):
             self._refuse(absent[0], f"given with {arms[0] if arms else ARMS[1]}, or rotor_positions in place of both")
-        if not self.longest_arm >= SMALLEST:
+        if not self.longest_arm >= FLOORS["m"]:
             self._refuse("rotor_positions", "away from the centre of mass")
         rule = self._layout_problem(self.rotor_spins)
         if rule is None:
@@ -447,8 +447,10 @@ def _check_number(name: str, value: object, *, positive: bool) -> None:
         raise ParameterError("vehicle", name, value, "a finite number")
     if positive and value <= 0.0:
         raise ParameterError("vehicle", name, value, "positive")
-    if abs(value) > LARGEST or (positive and value < SMALLEST):
-        raise ParameterError("vehicle", name, value, f"between {SMALLEST:g} and {LARGEST:g}")
+    unit = VEHICLE_UNITS[name]
+    least = floor_of(unit)
+    if abs(value) > LARGEST or (positive and value < least):
+        raise ParameterError("vehicle", name, value, f"between {least:g} and {LARGEST:g} {unit}")
 
 
 def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehicle:

@@ -23,6 +23,7 @@ from jsonschema import Draft202012Validator
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError
+from quadsim.fields import floor_of
 from quadsim.vehicle import VEHICLE_UNITS, load_vehicle
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import load_plan, parse_campaign, read_campaign
@@ -32,7 +33,7 @@ from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.base import fields_of
 from scenarios.schema.bases import read_scenario
 from scenarios.schema.json_schema import scenario_schema
-from scenarios.schema.problems import adapter
+from scenarios.schema.problems import adapter, kinds_of
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting
 from scenarios.schema.writing import tables_in
@@ -253,6 +254,28 @@ def test_a_field_is_accepted_as_declared_or_named_with_what_was_given_and_what_i
     assert allowed > 20
 
 
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
+def test_what_must_be_positive_has_the_floor_of_its_unit(kind: Kind) -> None:
+    """Nothing that is divided by may be so small that it overflows; shares and angles alone begin above 0."""
+    wrong, checked = [], 0
+    for table in kind.tables:
+        for name, field in fields_of(table).items():
+            stated = re.match(r"\[([^\]]+)\]", field.description or "")
+            unit = stated[1] if stated else ""
+            for allowed in kinds_of(field.annotation, tuple(field.metadata)):
+                for number in (allowed, *allowed.entries):
+                    least = number.limits.get("ge", 0.0)
+                    above_zero = number.limits.get("gt") == 0.0
+                    if number.type is not float or not (above_zero or 0.0 < least < 1e-3):
+                        continue
+                    checked += 1
+                    right = unit in ("-", "deg") if above_zero else least >= floor_of(unit)
+                    if not right:
+                        wrong.append(f"{table.__name__}.{name}")
+    assert not wrong
+    assert checked
+
+
 @pytest.mark.parametrize("name", VEHICLE_UNITS)
 def test_a_number_of_a_vehicle_is_accepted_as_declared_or_named_with_what_was_given(name: str, tmp_path: Path) -> None:
     path = tmp_path / FILE
@@ -320,6 +343,13 @@ MISTAKES = {
     "vehicle.mass=40": "vehicle.speed_max must be no lower than its hover speed, 609.687 rad/s, or it cannot hover (@",
     "vehicle.inertia=[0.03, 0.03, 0.07]": "vehicle.inertia must be such that no moment exceeds the sum of the @",
     "actual.mas=4.4": "actual.mas is not a field of the scenario file; did you mean 'mass'?@",
+    "effects.rotors={rise=1e-310, fall=1e-310}": "effects.rotors.rise must be a number >= 1e-06 and <= 1000000; got "
+    "1e-310@effects.rotors.fall must be a number >= 1e-06 @",
+    "events=[{type='rotor_lag', at=1, rise=1e-310}]": "events.0.rise must be 0, or at least 1e-06 s; got 1e-310",
+    "autopilot={gyro_cutoff=1e-310}": "autopilot.gyro_cutoff must be 0, or at least 1e-06 Hz; got 1e-310",
+    "effects.load.payloads=[{mass=1e-310}]": "effects.load.payloads.0.mass must be a number >= 1e-06 and @; got 1e-310",
+    "vehicle.rotor_rise=1e-310": "vehicle.rotor_rise must be between 1e-06 and 1e+06 s; got 1e-310",
+    "vehicle.inertia=[1e-310, 0.04, 0.05]": "vehicle.inertia must be between 1e-12 and 1e+06 kg m^2; got 1e-310",
     "control_period=0.0503": "control_period must be a whole multiple of the physics step plant.timestep = 0.001 s; "
     "got 0.0503",
     "log_rate=3": "log_rate must have a period that is a whole multiple of the physics step plant.timestep = 0.001 s; "
@@ -350,8 +380,8 @@ MISTAKES = {
     "seed=0x1ffffffffffffffff": f"seed {SEED}; got a whole number of 65 bits",
     "seed=" + 5000 * "9": f"seed {SEED}; got '9999@",
     "seed=" + 99_999 * "[": NESTED,
-    "duration=1\nseed=2": "duration must be a number > 0 and <= 86400; got '1\\nseed=2'",
-    "duration=" + 300 * "x": "duration must be a number > 0 and <= 86400; got '" + 196 * "x" + "...",
+    "duration=1\nseed=2": "duration must be a number >= 1e-06 and <= 86400; got '1\\nseed=2'",
+    "duration=" + 300 * "x": "duration must be a number >= 1e-06 and <= 86400; got '" + 196 * "x" + "...",
     ".".join(40_000 * "a") + "=1": NESTED,
     "controller={" + ".".join(40_000 * "a") + "=1}": NESTED,
     "constraints=[" + ",".join(["{}"] * 1001) + "]": "constraints must be a list of 1000 or fewer entries; got [{}@",
@@ -398,7 +428,7 @@ FILES: dict[Callable[[Path, str], None], dict[str, str]] = {
         "failure = ['lots']": "failure has an entry 'lots' that is no event: @; did you mean 'lost'?@",
         "failure = ['rmse.q > 1']": "failure: no column named 'rmse.q'; did you mean 'rmse.z'?@",
         "failure = ['status > 0']": "failure: event 'status > 0' compares with a number; the column @ holds text",
-        "set = {duration=-1.0}": "x.toml, hover: duration must be a number > 0 and <= 86400; got -1.0",
+        "set = {duration=-1.0}": "x.toml, hover: duration must be a number >= 1e-06 and <= 86400; got -1.0",
         vary("low=1.1, high=0.9"): "vary.mass.low must be below high; got 1.1 and 0.9",
         vary("low=0.01, high=1.1"): "vary.mass at 0.01: effects.load.mass_factor must be a number >= 0.05 and <= 20; "
         "got 0.01",

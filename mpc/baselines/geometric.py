@@ -30,7 +30,7 @@ from mpc.baselines.compiled import (
 )
 from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIEW_DEGREE, Target, differentiator
-from mpc.bounded import USUAL_TARGETS, Range, Seconds, TargetBounds, law_of, require_lags, require_space
+from mpc.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, law_of, require_lags, require_space
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
 from mpc.model import target_model
@@ -412,7 +412,7 @@ class Geometric(Tuned):
         Commands, doc("rotor speeds, or to an autopilot thrust and body rates, or thrust and attitude")
     ] = "rotors"
     inner_lag: Annotated[
-        Annotated[tuple[Seconds, ...], Len(4, 4)] | None,
+        Annotated[tuple[LagSeconds, ...], Len(4, 4)] | None,
         doc("[s] time constants of thrust, p, q, r behind an autopilot's targets; absent: identified by steps on it"),
     ] = None
     target_bounds: Annotated[TargetBounds, doc('only where commands is not "rotors"')] = USUAL_TARGETS

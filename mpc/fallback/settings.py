@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 from annotated_types import Gt, Lt, doc
 
-from quadsim.fields import Positive
+from quadsim.fields import Metres, Positive, Seconds
 from quadsim.state import Array, by_group
 
 USUAL_TILT: Final = 10.0
@@ -27,13 +27,13 @@ class FallbackSettings:
     """
 
     enabled: Annotated[bool, doc("false: the controller handles missing answers itself")] = True
-    unseen: Annotated[Positive, doc("[s] longest time that predictions may replace a missing measurement")] = 1.5
-    plan_age: Annotated[Positive, doc("[s] longest time that one shifted plan is flown")] = 1.0
-    position: Annotated[Positive, doc("[m] largest distance from the plan")] = 0.5
+    unseen: Annotated[Seconds, doc("[s] longest time that predictions may replace a missing measurement")] = 1.5
+    plan_age: Annotated[Seconds, doc("[s] longest time that one shifted plan is flown")] = 1.0
+    position: Annotated[Metres, doc("[m] largest distance from the plan")] = 0.5
     velocity: Annotated[Positive, doc("[m/s] largest velocity deviation from the plan")] = 1.0
     angle: Annotated[Positive, doc("[deg] largest deviation of roll, pitch and yaw from the plan")] = 11.5
     rate: Annotated[Positive, doc("[deg/s] largest deviation of their rates from the plan")] = 57.3
-    hover: Annotated[Positive, doc("[s] longest time in level hover, before the descent")] = 5.0
+    hover: Annotated[Seconds, doc("[s] longest time in level hover, before the descent")] = 5.0
     sink: Annotated[Positive, doc("[m/s] speed of the descent")] = 0.5
     tilt: Annotated[
         Annotated[float, Gt(0.0), Lt(90.0)] | None,

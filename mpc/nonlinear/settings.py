@@ -18,11 +18,11 @@ from mpc.bounded import (
     Horizon,
     KktEvery,
     Lag,
+    LagSeconds,
     Polytope,
     Range,
     Rates,
     RotorBounds,
-    Seconds,
     Soft,
     TargetBounds,
     ranges,
@@ -42,7 +42,7 @@ from mpc.obstacles import Shape, Space
 from mpc.qp import KKT_EVERY
 from quadsim.controller import ROTORS
 from quadsim.errors import ParameterError
-from quadsim.fields import NonNegative, Pair, Positive, Weight
+from quadsim.fields import NonNegative, Pair, Seconds, Weight
 from quadsim.input_limits import MOST_ENTRIES
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
@@ -99,7 +99,7 @@ class Nonlinear(ControllerTable):
 
     type: Annotated[Literal["nonlinear"], doc("the control law, by its name in `quadsim list`")] = "nonlinear"
     horizon: Annotated[Horizon, doc("[periods] prediction horizon, a whole number of nodes")] = 20
-    node: Annotated[Positive | None, doc("[s] time between nodes, whole periods; absent: one period")] = None
+    node: Annotated[Seconds | None, doc("[s] time between nodes, whole periods; absent: one period")] = None
     iterations: Annotated[
         int,
         Ge(1),
@@ -107,7 +107,7 @@ class Nonlinear(ControllerTable):
         doc("most steps of sequential quadratic programming in a period; 1: the real-time iteration"),
     ] = 1
     time_limit: Annotated[
-        Positive | None,
+        Seconds | None,
         doc(
             "[s] wall-clock time after which a period takes no further step; one is always taken; absent: no limit; "
             "with one, a flight depends on the machine and is not reproducible"
@@ -122,7 +122,7 @@ class Nonlinear(ControllerTable):
         doc("what it commands: rotor speeds, or collective thrust and body rates to an autopilot's inner loop"),
     ] = "rotors"
     inner_lag: Annotated[
-        Annotated[tuple[Seconds, ...], Len(4, 4)] | None,
+        Annotated[tuple[LagSeconds, ...], Len(4, 4)] | None,
         doc(
             '[s] time constants of thrust, p, q, r behind their targets, 0 for none; only where commands = "rates"; '
             "absent: identified by steps on the autopilot at set-up"

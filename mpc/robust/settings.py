@@ -12,7 +12,7 @@ from annotated_types import Gt, Le, doc
 from mpc.bounded import (
     Bounded,
     Lag,
-    Seconds,
+    LagSeconds,
     Soft,
     objective_of,
     require_lag,
@@ -54,7 +54,7 @@ class Robust(Bounded):
         doc('[s] rotor time constant in the prediction, 0 for none; "vehicle": the rotor_rise of the vehicle'),
     ] = 0.0
     delay: Annotated[
-        Seconds,
+        LagSeconds,
         doc("[s] known delay from measurement to command, bridged by prediction; at most the horizon"),
     ] = 0.0
     offset_free: ObserverSettings | None = None

@@ -28,7 +28,7 @@ from quadsim.controller import AutopilotLoop
 from quadsim.core.inner import CompiledLoop
 from quadsim.core.structs import InnerStruct, LoopKind, fill
 from quadsim.errors import InputError, ParameterError
-from quadsim.fields import Fraction, NonNegative, Positive, filled
+from quadsim.fields import Fraction, Hertz, NonNegative, filled, require_floor
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.physics import PHYSICS, inner_steps, whole
@@ -55,7 +55,7 @@ class AutopilotSettings:
     """An autopilot's loops and mixer; what is absent follows from the vehicle file, or from inertia and rotor lag."""
 
     rate: Annotated[
-        Positive | None, doc("[Hz] of the loops; the period is a whole number of physics steps; absent: 1000")
+        Hertz | None, doc("[Hz] of the loops; the period is a whole number of physics steps; absent: 1000")
     ] = None
     p: Annotated[Gains | None, doc("[1/s] gain of the rate error, about body x, y, z; absent: by rule")] = None
     i: Annotated[Gains | None, doc("[1/s^2] gain of its integral; absent: p per second")] = None
@@ -82,6 +82,9 @@ class AutopilotSettings:
         Fraction | None, doc("[-] slowest rotor, as a share of speed_max; absent: the vehicle's speed_min")
     ] = None
     airmode: Annotated[bool | None, doc("whether thrust yields to torques; absent: true")] = None
+
+    def __post_init__(self) -> None:
+        require_floor(self, "gyro_cutoff", "d_cutoff", unit="Hz")
 
     def resolved(self, vehicle: Vehicle) -> AutopilotSettings:
         """Fill in what is absent, by rule.

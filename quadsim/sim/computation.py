@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Ge, Le, doc
 
 from quadsim.controller import Command
-from quadsim.fields import Instant, Positive
+from quadsim.fields import Instant, Seconds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +19,7 @@ class Stall:
 
     at: Instant
     type: Annotated[Literal["stall"], doc("kind of event: stall")] = "stall"
-    duration: Annotated[Positive, doc("[s] length of the stall")]
+    duration: Annotated[Seconds, doc("[s] length of the stall")]
 
     def text(self) -> str:
         """Describe the event."""

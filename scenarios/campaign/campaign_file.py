@@ -19,7 +19,7 @@ from annotated_types import Ge, Le, MaxLen, MinLen, doc
 from pydantic import Field
 
 from quadsim.errors import InputError
-from quadsim.fields import Number, Positive
+from quadsim.fields import Number, Positive, Seconds
 from quadsim.input_limits import MOST_ENTRIES
 from quadsim.state import Array
 from scenarios.campaign.events import parse_event
@@ -218,7 +218,7 @@ def _require_separate_fields(entries: Sequence[Varied]) -> None:
 class FlightLimits:
     """Limits of one flight; beyond them it ends with the verdict `timeout` or `memory`."""
 
-    flight: Annotated[Positive, doc("[s] wall clock of a flight")] = 600.0
+    flight: Annotated[Seconds, doc("[s] wall clock of a flight")] = 600.0
     memory: Annotated[float, Ge(100.0), Le(1e9), doc("[MB] of the flight's process, beyond what it starts with")] = (
         2000.0
     )

@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import doc
 
 from quadsim.errors import ParameterError
-from quadsim.fields import NonNegative, Number, Pair, Positive
+from quadsim.fields import Metres, NonNegative, Number, Pair
 from quadsim.state import Array
 from scenarios.courses.course import Path, Speed, Started, Time, require_one
 
@@ -150,7 +150,7 @@ class _Round(Started):
 
 @dataclass(frozen=True, kw_only=True)
 class _Circular(_Round):
-    radius: Annotated[Positive, doc("[m] seen from above")]
+    radius: Annotated[Metres, doc("[m] seen from above")]
     centre: Annotated[
         Pair | None, doc("[m] x, y, world; absent: such that the course starts at the initial position")
     ] = None
@@ -200,8 +200,8 @@ class FigureEight(_Round):
     """A level lemniscate of Gerono, starting at its crossing."""
 
     type: Annotated[Literal["figure_eight"], doc("kind of course: a level lemniscate of Gerono")]
-    length: Annotated[Positive, doc("[m] from end to end, through the crossing")]
-    width: Annotated[Positive | None, doc("[m] across; absent: half the length")] = None
+    length: Annotated[Metres, doc("[m] from end to end, through the crossing")]
+    width: Annotated[Metres | None, doc("[m] across; absent: half the length")] = None
     speed: Annotated[Speed | None, doc("[m/s] at the crossing, where it is largest; either period or speed")] = None
     centre: Annotated[Pair | None, doc("[m] x, y of the crossing, world; absent: the initial position")] = None
     angle: Annotated[Number, doc("[deg] direction of the length; 0 is +x")] = 0.0

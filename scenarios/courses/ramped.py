@@ -16,7 +16,7 @@ from annotated_types import doc
 
 from mpc.flatness import attitudes
 from quadsim.errors import ParameterError
-from quadsim.fields import Positive
+from quadsim.fields import Metres
 from quadsim.rotation import quaternion_to_euler
 from quadsim.state import Array
 from scenarios.courses.course import Path, Speed, Started, Time
@@ -150,7 +150,7 @@ class _Ramped(Started):
         ),
     ]
     acceleration: Annotated[Speed, doc("[m/s^2] a, along the path, of radius and phase")] = 1.0
-    radius: Annotated[Positive, doc("[m] r, seen from above; for a lemniscate half its length")]
+    radius: Annotated[Metres, doc("[m] r, seen from above; for a lemniscate half its length")]
     ramp: Annotated[Time, doc("[s] T, time over which the acceleration grows; below speed / acceleration")] = 2.0
     heading: Annotated[
         Literal["free", "held"],

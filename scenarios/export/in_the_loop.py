@@ -131,7 +131,7 @@ _LETTER: Final = {"double": "d", "float": "f"}
 class QueryKind(IntEnum):
     """The kind of a query."""
 
-    START = 0  # begin anew after u(-1), the reference its one row throughout
+    START = 0  # begin anew after u(-1), of hover where it is no number; the reference its one row throughout
     ROW = 1  # take one more row of the reference
     STEP = 2  # take one more row and solve
     STAND = 3  # the same while the ground holds the vehicle, which shows no disturbance

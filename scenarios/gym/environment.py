@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.error import ResetNeeded
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import VectorEnv
 
 from quadsim.controller import Command, Phase, StepInputs
@@ -51,6 +51,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     For observations and actions see `scenarios.gym.spaces`.  An episode is terminated when the vehicle is lost by a
     criterion of `[lost]`, has crashed, or has diverged, and truncated at the scenario's duration, which a campaign's
     `[set]` may change.
+
+    A pickled or copied environment is without its episode, whose plant is native memory: reset it first.
 
     `info` at each step, and at the start:
 
@@ -129,6 +131,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._preview, self._reward, self._action = preview, reward, action
         self._flight: Rollout | None = None
         self._camera: Camera | None = None
+        self._closed = False
         self.scenario, self.limits = self._base, Assembly(self._base).limits
 
     @property
@@ -144,8 +147,16 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             ResetNeeded: there is none yet.
         """
         if self._flight is None:
-            raise ResetNeeded("call env.reset() first")
+            raise ResetNeeded("call env.reset() first; a pickled or copied environment is without its episode")
         return self._flight
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise ClosedEnvironmentError("the environment is closed; make a new one")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is native memory or a process: the episode and the renderer."""
+        return {**self.__dict__, "_flight": None, "_camera": None, "_answered": None}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Start an episode.
@@ -158,7 +169,9 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
         Raises:
             InputError: the seed or an option is not allowed.
+            ClosedEnvironmentError: `close` has been called.
         """
+        self._require_open()
         if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed <= LARGEST_SEED):
             raise ParameterError("", "seed", seed, f"from 0 to {LARGEST_SEED}")
         if seed is None and self._flight is None:
@@ -185,14 +198,14 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         An action that is not finite ends the flight, as a controller's would.
 
         Raises:
-            ParameterError: the action has another shape than `action_space`.
+            ParameterError: the action has another shape than `action_space`, or is not of numbers.
             ResetNeeded: there is no episode, or it has ended.
+            ClosedEnvironmentError: `close` has been called.
         """
+        self._require_open()
         flight = self.started
         if flight.done:
             raise ResetNeeded(f"the episode has ended ({flight.loop.reason or 'the scenario is over'}); call reset()")
-        if np.shape(action) != self.action_space.shape:
-            raise ParameterError("", "action", np.shape(action), f"of shape {self.action_space.shape}")
         seen = self._seen
         if self._answered and self._answered[0] == flight.k and np.array_equal(self._answered[1], action):
             command = self._answered[2]
@@ -231,7 +244,9 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         Raises:
             ParameterError: actions are thrust and rates, which a controller does not answer with.
             FlightError: the controller has no answer; a flight of its own would end here.
+            ClosedEnvironmentError: `close` has been called.
         """
+        self._require_open()
         flight = self.started
         if self._answered is None or self._answered[0] != flight.k:
             seen = self._seen
@@ -265,7 +280,9 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
         Raises:
             RenderingUnavailableError: nothing can render here.
+            ClosedEnvironmentError: `close` has been called.
         """
+        self._require_open()
         if self.render_mode is None:
             return None
         if self._camera is None:
@@ -274,7 +291,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return self._camera.picture(self._truth, self._rotors, self._seen.reference, self.started.loop.time)
 
     def close(self) -> None:
-        """Free native memory and the renderer."""
+        """Free native memory and the renderer; only `flight` remains."""
+        self._closed = True
         if self._flight is not None:
             self._flight.close()
         if self._camera is not None:

@@ -68,6 +68,11 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         self._base, self._spec = base, scenario.controller
         self._vehicle: Vehicle | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the law, which is native memory; the environment leaves out its episode."""
+        kept = {name: value for name, value in self.__dict__.items() if name not in ("_filter", "_law")}
+        return {**kept, "_vehicle": None}
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See `gymnasium.Env.reset`."""
         observed = self.env.reset(seed=seed, options=options)
@@ -87,11 +92,12 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         """See `gymnasium.Env.step`.
 
         Raises:
-            ParameterError: the action has another shape than `action_space`.
+            ParameterError: the action has another shape than `action_space`, or is not of numbers.
             ResetNeeded: there is no episode, or it has ended.
+            ClosedEnvironmentError: `close` has been called.
         """
         if self._vehicle is None:
-            raise ResetNeeded("call env.reset() first")
+            raise ResetNeeded("call env.reset() first; a pickled or copied environment is without its episode")
         requested = self._base.actions.command(action, 1).speeds
         self._filter.requested = requested
         seen, horizon = self._base.started.observation, self._law.horizon

@@ -74,7 +74,16 @@ class Actions:
             self._thrusts = [vehicle.level_thrust(float(speed)) for speed in (low.max(), high.min())]
 
     def command(self, action: Action, horizon: int) -> Command:
-        """The command, a plan of this many rows, for an action."""
+        """The command, a plan of this many rows, for an action.
+
+        Raises:
+            ParameterError: it has another shape than `space`, or is not of numbers.
+        """
+        if np.shape(action) != self.space.shape:
+            raise ParameterError("", "action", np.shape(action), f"of shape {self.space.shape}")
+        kind = np.asarray(action).dtype
+        if kind.kind not in "fiub":
+            raise ParameterError("", "action", kind.name, "of numbers")
         speeds, inner = np.array(action, np.float64), None
         if self._kind == "rates":
             inner, thrust = self._autopilot, float(speeds[0])

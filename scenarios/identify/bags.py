@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError, InputError
-from scenarios.identify.libraries import reading
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity
 from scenarios.identify.series import Column, on_one_clock
 
@@ -24,8 +23,7 @@ def read_bag(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     Each is on the clock of its topic: of the headers of its messages, or of their arrival where they have none.
 
     Raises:
-        MissingPackageError: rosbags is not installed.
-        FileError: it is no bag, or has no message with such a field.
+        FileError: it has no message with such a field.
         InputError: there is no map.
     """
     if not given:
@@ -33,23 +31,22 @@ def read_bag(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     wanted: dict[str, list[str]] = {}
     for name in dict.fromkeys(column for one in given for column in one.columns):
         wanted.setdefault(name.partition(".")[0], []).append(name)
-    with reading(path, "bag", "rosbags"):
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
 
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
-            columns = {connection.topic: Column(np.zeros(0), np.zeros(0)) for connection in bag.connections}
-            for topic, names in wanted.items():
-                connections = [connection for connection in bag.connections if connection.topic == topic]
-                rows = []
-                for connection, arrived, raw in bag.messages(connections) if connections else ():
-                    message: Any = bag.deserialize(raw, connection.msgtype)
-                    stamp = getattr(getattr(message, "header", None), "stamp", None)
-                    t = 1e-9 * arrived if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
-                    rows.append([t, *map(partial(_at, path, message), names)])
-                if rows:
-                    times, *values = np.array(rows, float).T
-                    columns |= on_one_clock(times, dict(zip(names, values, strict=True)))
+    with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
+        columns = {connection.topic: Column(np.zeros(0), np.zeros(0)) for connection in bag.connections}
+        for topic, names in wanted.items():
+            connections = [connection for connection in bag.connections if connection.topic == topic]
+            rows = []
+            for connection, arrived, raw in bag.messages(connections) if connections else ():
+                message: Any = bag.deserialize(raw, connection.msgtype)
+                stamp = getattr(getattr(message, "header", None), "stamp", None)
+                t = 1e-9 * arrived if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
+                rows.append([t, *map(partial(_at, path, message), names)])
+            if rows:
+                times, *values = np.array(rows, float).T
+                columns |= on_one_clock(times, dict(zip(names, values, strict=True)))
     return LoggedColumns(columns=columns, quantities=given)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError
-from scenarios.identify.libraries import reading
+from scenarios.identify.border import between, stated_number
 from scenarios.identify.quantities import RPM, LoggedColumns, NamedQuantity, logged_as
 from scenarios.identify.series import Column, on_one_clock
 
@@ -21,6 +22,8 @@ _ADVICE: Final = (
 _WHOLE: Final = 32767.0  # 1 in a component of the quaternion
 _G: Final = 9.80665  # [m/s^2]
 _POLES: Final = 14  # of a motor, by default
+_BITS_OF_ONE: Final = 0x3F800000  # of a float
+_LARGEST_SCALE: Final = 1e3  # of a gyro's unit [deg/s]
 
 
 def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
@@ -29,24 +32,22 @@ def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     Betaflight's axes are ours: x forward, y left, z up. Of its quaternion a log has x, y, z; w is not negative.
 
     Raises:
-        MissingPackageError: orangebox is not installed.
-        FileError: it is not a Blackbox log.
+        FileError: it has no frame, or a header that says nothing.
     """
     logging.getLogger("orangebox").addHandler(logging.NullHandler())  # else it warns of what it guesses
     rows: list[tuple[Any, ...]] = []
-    with reading(path, "Blackbox log", "orangebox"):
-        from orangebox import Parser
+    from orangebox import Parser
 
-        log = Parser.load(str(path), allow_invalid_header=True)
-        begins = [*log.reader.log_pointers, path.stat().st_size]
-        log = Parser.load(str(path), 1 + int(np.argmax(np.diff(begins))), allow_invalid_header=True)
-        names, headers = log.field_names, log.headers
-        try:
-            for frame in log.frames():
-                rows.append(frame.data[: len(names)])
-        except (IndexError, RuntimeError, TypeError, ValueError):  # a log that is cut off ends there
-            if not rows:
-                raise
+    log = Parser.load(str(path), allow_invalid_header=True)
+    begins = [*log.reader.log_pointers, path.stat().st_size]
+    log = Parser.load(str(path), 1 + int(np.argmax(np.diff(begins))), allow_invalid_header=True)
+    names, headers = log.field_names, log.headers
+    try:
+        for frame in log.frames():
+            rows.append(frame.data[: len(names)])
+    except (IndexError, RuntimeError, TypeError, ValueError):  # a log that is cut off ends there
+        if not rows:
+            raise
     table = np.array([[np.nan if value == "" else value for value in row] for row in rows], float)
     if "time" not in names or not table.size:
         raise FileError(path, "has no frame with a time")
@@ -59,22 +60,27 @@ def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
         )
     flights = len(begins) - 1
     notes = (f"{path.name}: the longest of its {flights} flights is read",) if flights > 1 else ()
-    return LoggedColumns(columns=columns, quantities=_quantities(headers), advice=_ADVICE, notes=notes)
+    return LoggedColumns(columns=columns, quantities=_quantities(path, headers), advice=_ADVICE, notes=notes)
 
 
-def _quantities(headers: Mapping[str, Any]) -> tuple[NamedQuantity, ...]:
+def _quantities(path: Path, headers: Mapping[str, Any]) -> tuple[NamedQuantity, ...]:
     """What the columns are, in the units that the log's header states."""
-    bits = headers.get("gyro_scale")  # of a float
-    degrees = 1.0 if bits is None else struct.unpack("<f", struct.pack("<I", int(bits)))[0]
+    bits = stated_number(path, headers, "gyro_scale", _BITS_OF_ONE, low=0, high=2**32 - 1, whole=True)
+    (degrees,) = struct.unpack("<f", struct.pack("<I", int(bits)))
+    if not 0.0 < degrees < _LARGEST_SCALE:
+        raise FileError(path, f"states gyro_scale = {degrees:g}; it must be above 0 and below {_LARGEST_SCALE:g}")
     degrees *= 0.1 if headers.get("blackbox_high_resolution") == 1 else 1.0
-    low, high = headers.get("motorOutput", (1000, 2000))
-    rpm = 100.0 / (0.5 * float(headers.get("motor_poles", _POLES)))
-    gravity = _G / float(headers.get("acc_1G", 2048))
+    ends = headers.get("motorOutput", (1000, 2000))
+    if not isinstance(ends, list | tuple) or len(ends) != 2:
+        raise FileError(path, f"states motorOutput = {ends!r:.80}; it must be two numbers, low and high")
+    low, high = (stated_number(path, {"motorOutput": end}, "motorOutput", math.nan) for end in ends)
+    rpm = 100.0 / (0.5 * stated_number(path, headers, "motor_poles", _POLES, low=2, high=200, whole=True))
+    gravity = _G / stated_number(path, headers, "acc_1G", 2048, low=1)
     return (
         logged_as("rates", "gyroADC[{}]", scale=np.radians(degrees)),
         logged_as("attitude", "imuQuaternion{}", each=".w [0] [1] [2]", scale=1.0 / _WHOLE),
         logged_as("specific_force", "accSmooth[{}]", scale=gravity),
-        logged_as("throttle", "motor[{}]", scale=1.0 / (high - low), zero=low),
+        logged_as("throttle", "motor[{}]", **between(path, "motorOutput", low, high)),
         logged_as("speeds", "eRPM[{}]", scale=rpm * RPM),
         logged_as("voltage", "vbatLatest", unit="cV"),
     )

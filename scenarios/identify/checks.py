@@ -27,6 +27,8 @@ SLOW, CALM = 0.3, 0.5
 """Speed [m/s] and turn rate [rad/s] below which a vehicle may stand on the ground."""
 CONSTANT: Final = 3e-3  # share of the outputs below which their change in a second is none
 STILL: Final = 1e-3  # share of the largest output below which a rotor's outputs do not change
+ROUNDING: Final = 1e-9  # [rad, rad/s, m/s], and as a share of an output: below it, nothing has changed
+LONGEST_HELD: Final = 1.0  # [s] for which a radio holds a row
 MOST_REPEATED: Final = 0.05  # share of rows that may repeat the one before
 GOOD_RATE: Final = 50.0  # [Hz] below which lag and inertias are poor
 FACTOR: Final = 1.8  # by which hover speed in the log and by the start may differ
@@ -56,7 +58,7 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     logged = _logged(record)
     if np.count_nonzero(logged) > 1:
         _check_rows(record, logged)
-    shortest = round(SHORTEST_SPAN / record.period)
+    shortest = max(round(SHORTEST_SPAN / record.period), 2)
     flying = np.ones_like(logged) if record.flying is None else record.flying
     if not (logged & flying).any() and logged.any():
         raise InputError(f"{record.name}: never flies: by its autopilot it is disarmed or landed all the time")
@@ -89,25 +91,45 @@ def _check_rows(record: Record, logged: NDArray[np.bool_]) -> None:
         raise InputError(f"{name}: the outputs of rotor {rotors} never change while the others do: log all four")
     for field, columns in (("rates", "wx wy wz"), ("velocity", "vx vy vz"), ("attitude", "qw qx qy qz")):
         rows = getattr(record, field)[logged]
-        frozen = [c for c, moved in zip(columns.split(), np.ptp(rows, axis=0) > 0.0, strict=True) if not moved]
+        frozen = [c for c, moved in zip(columns.split(), np.ptp(rows, axis=0) > ROUNDING, strict=True) if not moved]
         if len(frozen) == rows.shape[1]:
             raise InputError(f"{name}: {', '.join(frozen)} stand still while the motors run: log what was measured")
-        if frozen and field != "attitude" and (rows[0, [columns.split().index(c) for c in frozen]] != 0.0).any():
+        offsets = np.abs(rows[0, [columns.split().index(c) for c in frozen]])
+        if frozen and field != "attitude" and (offsets > ROUNDING).any():
             raise InputError(f"{name}: {', '.join(frozen)} stands still while the others change: log all three axes")
-    moving = np.concatenate([record.rates, record.attitude], axis=1)[logged]
-    repeated = float((np.diff(moving, axis=0) == 0.0).all(axis=1).mean())
+    turning = np.concatenate([record.rates, record.attitude], axis=1)[logged]
+    still = np.asarray((np.abs(np.diff(turning, axis=0)) <= ROUNDING).all(axis=1))
+    rest = _rest(still, round(LONGEST_HELD / record.period))
+    repeated = float((still & ~rest).mean())
     if repeated > MOST_REPEATED:
         raise InputError(
             f"{name}: {repeated:.0%} of its rows repeat rates and attitude of the one before, as a radio does that "
             f"holds them; at most {MOST_REPEATED:.0%} may: drop such rows, or log on board"
         )
-    rate = float((np.diff(inputs, axis=0) != 0.0).any(axis=1).mean()) / record.period
+    changed = (np.abs(np.diff(inputs, axis=0)) > ROUNDING * np.abs(inputs).max()).any(axis=1)
+    rate = float(changed[~rest].mean()) / record.period if not rest.all() else 0.0
     if record.speeds is None and rate < 0.9 * SLOWEST_COMMANDS and 1.0 / record.period > 1.5 * rate:
         raise InputError(
             f"{name}: the rotors' outputs change {rate:.3g} times per second, and rates are logged "
             f"{1.0 / record.period:.3g} times: log the outputs as often as they are sent, "
             f"{SLOWEST_COMMANDS:g} times or more{_advised(record)}"
         )
+
+
+def _rest(still: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
+    """Steps (N - 1,) at which a vehicle rests, of those at which nothing turns.
+
+    A row that is held is followed by one that has moved, and a row that is held again: it is between steps that turn.
+    Rest lasts from the log's first step on, or to its last, or longer than `longest` steps until more than one turns.
+    """
+    rest = np.zeros_like(still)
+    for run in _runs(still, 1):
+        before = still[run.start - 2 : run.start] if run.start >= 2 else still[:0]
+        after = still[run.stop : run.stop + 2]
+        at_an_end = run.start == 0 or run.stop == len(still)
+        lasts = run.stop - run.start > longest and not before.any() and not after.any()
+        rest[run] = at_an_end or lasts
+    return rest
 
 
 def _advised(record: Record) -> str:
@@ -164,7 +186,7 @@ def _bridged(rows: Array, logged: NDArray[np.bool_]) -> Array:
 
 def _runs(mask: NDArray[np.bool_], shortest: int) -> list[slice]:
     """Runs of true samples with at least the shortest length."""
-    return [run for (run,) in find_objects(label(mask)[0]) if run.stop - run.start >= max(shortest, 2)]
+    return [run for (run,) in find_objects(label(mask)[0]) if run.stop - run.start >= shortest]
 
 
 def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:

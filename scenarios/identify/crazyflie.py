@@ -15,7 +15,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.errors import FileError
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, logged_as
 from scenarios.identify.series import Column, on_one_clock
 
@@ -38,16 +37,9 @@ _ADVICE: Final = "in config.txt of the card, log stateEstimate.qw .. qz, vx .. v
 
 
 def read_crazyflie(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
-    """Read every variable of the log, by its name, each on the clock of its event type.
-
-    Raises:
-        FileError: it is not such a log.
-    """
+    """Read every variable of the log, by its name, each on the clock of its event type."""
     data = path.read_bytes()
-    try:
-        columns = _columns(data[:-4])
-    except (IndexError, KeyError, ValueError, struct.error) as error:
-        raise FileError(path, f"is not a readable log of a Crazyflie ({type(error).__name__}: {error})") from error
+    columns = _columns(data[:-4])
     whole = zlib.crc32(data[:-4]) == int.from_bytes(data[-4:], "little")
     notes = () if whole else (f"{path.name}: its check sum is wrong: it is cut off or damaged",)
     return LoggedColumns(columns=columns, quantities=_NAMES, advice=_ADVICE, notes=notes)

@@ -13,7 +13,7 @@ import numpy as np
 
 from quadsim.errors import FileError
 from quadsim.vehicle import N_ROTORS
-from scenarios.identify.libraries import reading
+from scenarios.identify.border import between, stated_number
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, logged_as
 from scenarios.identify.series import Column, on_one_clock
 
@@ -39,14 +39,13 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read the messages that are used: columns `MESSAGE.Field`, of the second instance on `MESSAGE[1].Field`.
 
     Raises:
-        MissingPackageError: pymavlink is not installed.
-        FileError: it is not a dataflash log.
+        FileError: it is not a dataflash log, or has a parameter that says nothing.
     """
     used = {column.partition(".")[0].partition("[")[0] for one in (*given, *_NAMES) for column in one.columns}
     columns: dict[str, Column] = {}
     rows: dict[str, list[tuple[float, ...]]] = {}
     fields: dict[str, list[str]] = {}
-    with reading(path, "dataflash log", "pymavlink"), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         from pymavlink.DFReader import DFReader_binary
 
         class Reader(DFReader_binary):  # type: ignore[misc]  # whose own fast index prints past Python
@@ -69,9 +68,11 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     turns = [columns[name].t.size if name in columns else 0 for name in ("XKQ.Q1", "ATT.Roll")]
     if turns[0] < turns[1]:
         columns = {name: column for name, column in columns.items() if not name.startswith("XKQ")}
-    motors = {parameters.get(f"SERVO{i}_FUNCTION"): i for i in range(1, 1 + _OUTPUTS)}
+    functions = (stated_number(path, parameters, f"SERVO{i}_FUNCTION", 0, whole=True) for i in range(1, 1 + _OUTPUTS))
+    motors = {function: i for i, function in enumerate(functions, start=1)}
     outputs = tuple(f"RCOU.C{motors.get(_FIRST_MOTOR + i, 1 + i)}" for i in range(N_ROTORS))
-    low, high = (float(parameters.get(f"MOT_PWM_{end}") or usual) for end, usual in (("MIN", 1000), ("MAX", 2000)))
-    pulses: dict[str, Any] = {"columns": outputs, "zero": low, "scale": 1.0 / max(high - low, 1.0)}
+    low = stated_number(path, parameters, "MOT_PWM_MIN", 0) or 1000.0  # 0: that of the radio
+    high = stated_number(path, parameters, "MOT_PWM_MAX", 0) or 2000.0
+    pulses: dict[str, Any] = {"columns": outputs, **between(path, "MOT_PWM_MIN and MAX", low, high)}
     names = [replace(one, **pulses) if one.quantity == "throttle" else one for one in _NAMES]
     return LoggedColumns(columns=columns, quantities=names, advice=_ADVICE)

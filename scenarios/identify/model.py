@@ -17,7 +17,6 @@ from scenarios.identify.record import Record
 from scenarios.identify.rotors import Turning, lagging, measured, smoothed
 
 INCREMENTS: Final = ("roll", "pitch", "yaw", "vx", "vy", "vz")
-AT_ONCE: Final = 1e-6  # lag of rotors that have none [s]
 _SMOOTHING: Final = 0.1
 """Time constant [s] below which the attitude follows the gyro: it averages the noise of the attitude itself."""
 
@@ -50,7 +49,7 @@ class Parameters:
     @classmethod
     def of(cls, vehicle: Vehicle, **others: Any) -> Parameters:
         """Those of a vehicle, with `others` for what its file has no field for."""
-        own: dict[str, Any] = {name: getattr(vehicle, name) or AT_ONCE for name in ("rotor_rise", "rotor_fall")}
+        own: dict[str, Any] = {name: getattr(vehicle, name) or 0.0 for name in ("rotor_rise", "rotor_fall")}
         own |= {name: getattr(vehicle, name) or 0.0 for name in ("rotor_inertia", "rotor_drag")}
         own |= {"thrust_coefficient": vehicle.mean_coefficient, "drag_to_thrust": vehicle.drag_to_thrust}
         own |= {"throttle_curve": vehicle.throttle_share}

@@ -21,6 +21,7 @@ import numpy as np
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, InputError, ParameterError
+from quadsim.plausibility import LARGEST_SAMPLES
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import Array
 from scenarios.identify.series import Column
@@ -160,7 +161,7 @@ def to_series(
 
     Raises:
         FileError: a column is missing; the message names what is allowed.
-        InputError: a unit cannot be meant, or poles are missing.
+        InputError: a sample or a unit cannot be meant, or poles are missing.
     """
     for one in given:
         if missing := [column for column in one.columns if column not in log.columns]:
@@ -175,10 +176,12 @@ def to_series(
             ways = {one.quantity: ",".join(one.columns) for one in reversed(log.quantities) if one.quantity in needed}
             ways = ways or {quantity: f"[{quantity}] of the map" for quantity in needed}
             columns = " or ".join(ways[quantity] for quantity in needed if quantity in ways)
-            advice = f"; {log.advice}" if log.advice else ""
-            raise FileError(path, f"lacks {what}: columns {columns}; it has {listed(log.columns)}{advice}")
-    series = {quantity: _series(log.columns, one) for quantity, one in known.items() if quantity != "t"}
+            more = "".join(f"; {text}" for text in (log.advice, *log.notes) if text)
+            raise FileError(path, f"lacks {what}: columns {columns}; it has {listed(log.columns)}{more}")
     name = path.name
+    for one in known.values():
+        _check_samples(name, log.columns, one)
+    series = {quantity: _series(log.columns, one) for quantity, one in known.items() if quantity != "t"}
     if (erpm := series.pop("erpm", None)) is not None:
         if "speeds" not in series:
             series["speeds"] = Column(t=erpm.t, values=_speeds(name, erpm.values, poles))
@@ -203,6 +206,23 @@ def to_series(
             turn = np.append(1.0, HALF_TURN) if quantity == "attitude" else HALF_TURN
             series[quantity] = Column(t=series[quantity].t, values=series[quantity].values * turn)
     return series
+
+
+def _check_samples(name: str, columns: Mapping[str, Column], one: NamedQuantity) -> None:
+    """Refuse a quantity with a finite sample that no vehicle has, in whatever unit: by its column, time and value."""
+    largest = LARGEST_SAMPLES.get(one.quantity, math.inf)
+    size = len(one.columns)
+    zeros, scales = np.broadcast_to(one.zero, size), np.broadcast_to(one.scale, size)
+    for column, zero, scale in zip(one.columns, zeros, scales, strict=True):
+        t, logged = columns[column]
+        beyond = np.isfinite(logged) & (np.abs(logged - zero) > largest / scale)
+        if beyond.any():
+            row = int(np.argmax(beyond))
+            unit = next(iter(LOGGED[one.quantity].units))
+            raise InputError(
+                f"{name}: {column} is {logged[row]:.4g} at t = {t[row]:.6g} s; {one.quantity} must be within "
+                f"+-{largest:g} {unit}: correct the sample or its unit, or leave it empty"
+            )
 
 
 def listed(columns: Iterable[str]) -> str:

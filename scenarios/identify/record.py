@@ -16,6 +16,7 @@ from quadsim.state import Array
 from scenarios.identify import crazyflie, ulog
 from scenarios.identify.bags import read_bag
 from scenarios.identify.blackbox import read_blackbox
+from scenarios.identify.border import reading
 from scenarios.identify.dataflash import read_dataflash
 from scenarios.identify.inertial import filled_in, integrated_velocity, levelled_attitude
 from scenarios.identify.quantities import LoggedColumns, NamedQuantity, to_series
@@ -27,6 +28,7 @@ SLOWEST_RATE: Final = 10.0  # [Hz] of a log
 SLOWEST_COMMANDS: Final = 20.0  # [Hz] at which the rotors' outputs must be logged
 FASTEST_RATE: Final = 250.0  # [Hz] above which samples are averaged: none of the parameters is as fast
 SLOWEST_VELOCITY: Final = 0.04  # period [s] of a velocity above which an accelerometer knows it better
+LONGEST_PAUSE: Final = 600.0  # [s] between two samples of one flight
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
 INPUTS: Final = ("commands", "throttle", "speeds")
 
@@ -34,18 +36,20 @@ INPUTS: Final = ("commands", "throttle", "speeds")
 class LogFormat(NamedTuple):
     """A kind of file that is a log."""
 
+    title: str
     suffixes: tuple[str, ...]
     first_bytes: tuple[bytes, ...]  # which also tell it
     read: Callable[[Path, Sequence[NamedQuantity]], LoggedColumns]
+    library: str = ""  # that `read` imports, of the extra `logs`
 
 
 FORMATS: Final = (
-    LogFormat((".csv", ".parquet"), (), read_columns),
-    LogFormat(ulog.ULOGS, (b"ULog",), ulog.read_ulog),
-    LogFormat((".bbl", ".bfl"), (b"H Product:Blackbox",), read_blackbox),
-    LogFormat((), crazyflie.FIRST_BYTES, crazyflie.read_crazyflie),
-    LogFormat((".bag", ".mcap", ".db3"), (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3"), read_bag),
-    LogFormat((".bin",), (b"\xa3\x95",), read_dataflash),
+    LogFormat("table", (".csv", ".parquet"), (), read_columns),
+    LogFormat("ULog", ulog.ULOGS, (b"ULog",), ulog.read_ulog, "pyulog"),
+    LogFormat("Blackbox log", (".bbl", ".bfl"), (b"H Product:Blackbox",), read_blackbox, "orangebox"),
+    LogFormat("log of a Crazyflie", (), crazyflie.FIRST_BYTES, crazyflie.read_crazyflie),
+    LogFormat("bag", (".bag", ".mcap", ".db3"), (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3"), read_bag, "rosbags"),
+    LogFormat("dataflash log", (".bin",), (b"\xa3\x95",), read_dataflash, "pymavlink"),
 )
 
 
@@ -93,7 +97,8 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
         columns: a map of its columns (`scenarios.identify.quantities.read_map`).
 
     Raises:
-        FileError: it is missing or damaged, or lacks a column; the message names what is allowed.
+        FileError: it is missing or damaged, or lacks a column; the message names what is allowed. Whatever else its
+            values make reading raise is such an error.
         MissingPackageError: its format needs a library that is not installed.
         InputError: its clock stands still or goes back, or it has fewer than 10 samples per second.
     """
@@ -102,12 +107,13 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
     file = given / FLIGHT_FILE if given.is_dir() and not bag else given
     if not (file.is_file() or bag):
         raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
-    read = _format_of(file).read
-    if read is not read_columns and any(one.quantity == "t" for one in columns):
+    kind = _format_of(file)
+    if kind.read is not read_columns and any(one.quantity == "t" for one in columns):
         raise InputError(f"{given.name}: has a clock of its own; leave [t] out of the map")
-    log = read(file, columns)
-    series = to_series(file, log, columns, poles)
-    record = to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series)
+    with reading(file, kind.title, kind.library):
+        log = kind.read(file, columns)
+        series = to_series(file, log, columns, poles)
+        record = to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series)
     return replace(record, advice=log.advice, notes=(*log.notes, *record.notes))
 
 
@@ -245,6 +251,12 @@ def _clock(name: str, series: Mapping[str, Column]) -> Array:
         del clocks[1]
     slower = max(clocks, key=_usual_period)
     period = _usual_period(slower)
+    pause = int(np.argmax(np.diff(slower)))
+    if slower[pause + 1] - slower[pause] > max(LONGEST_PAUSE, 100.0 * period):
+        raise InputError(
+            f"{name}: its time jumps from {slower[pause]:.6g} to {slower[pause + 1]:.6g} s; at most "
+            f"{LONGEST_PAUSE:g} s may be between two samples: give one flight per log"
+        )
     if 1.0 / period < 0.95 * SLOWEST_RATE:
         raise InputError(
             f"{name}: {1.0 / period:.3g} samples per second, period {period:.4g} s; at least {SLOWEST_RATE:g} Hz are "

@@ -19,6 +19,7 @@ from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from quadsim.report.to_plotly import to_plot
 from quadsim.state import shown_unit
 from quadsim.vehicle import Vehicle, load_vehicle
+from scenarios.identify.border import judging
 from scenarios.identify.checks import check_log, spans
 from scenarios.identify.estimate import Identification, ParameterEstimate
 from scenarios.identify.fit import identify_records
@@ -207,28 +208,30 @@ def identify_logs(
     for one, other in itertools.combinations([*records, *tested], 2):
         if np.array_equal(one.rates, other.rates):
             raise InputError(f"{one.name} and {other.name} are the same flight: name it once")
-    airborne = [spans(record, vehicle) for record in [*records, *tested]]
-    notes = [
-        note
-        for record, parts in zip([*records, *tested], airborne, strict=True)
-        for note in check_log(record, vehicle, parts)
-    ]
-    fitted, held = airborne[: len(records)], airborne[len(records) :]
-    if not tested:
-        fitted, held = map(list, zip(*map(hold_out, records, fitted), strict=True))
-    try:
-        identification = identify_records(records, fitted, vehicle, wind=wind)
-    except ParameterError as error:
-        if error.owner != "vehicle":
-            raise
-        raise InputError(
-            f"the logs and {start} give a vehicle that cannot be: {error}; correct mass, arm_length or speed range, "
-            "or what was kept and does not suit what was identified"
-        ) from error
     names = tuple(record.name for record in records)
+    with judging(", ".join(names)):
+        airborne = [spans(record, vehicle) for record in [*records, *tested]]
+        notes = [
+            note
+            for record, parts in zip([*records, *tested], airborne, strict=True)
+            for note in check_log(record, vehicle, parts)
+        ]
+        fitted, held = airborne[: len(records)], airborne[len(records) :]
+        if not tested:
+            fitted, held = map(list, zip(*map(hold_out, records, fitted), strict=True))
+        try:
+            identification = identify_records(records, fitted, vehicle, wind=wind)
+        except ParameterError as error:
+            if error.owner != "vehicle":
+                raise
+            raise InputError(
+                f"the logs and {start} give a vehicle that cannot be: {error}; correct mass, arm_length or speed "
+                "range, or what was kept and does not suit what was identified"
+            ) from error
+        prediction = predict(tested or records, held, identification, vehicle, fitted=not tested)
     result = IdentifiedVehicle(
         identification=identification,
-        prediction=predict(tested or records, held, identification, vehicle, fitted=not tested),
+        prediction=prediction,
         notes=tuple(notes),
         logs=names,
         test=tuple(record.name for record in tested),

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.interpolate import make_smoothing_spline
 from scipy.linalg import solve_banded
 
+from quadsim.fields import FLOORS
 from quadsim.state import Array, Indices
 from quadsim.vehicle import N_ROTORS
 
@@ -39,9 +40,11 @@ class Turning:
 def lagging(commands: Array, period: float, *, rise: float, fall: float, delay: float) -> Turning:
     """Rotors that follow commands (N, 4) [rad/s], each held for a period [s] from `delay` [s] after its sample.
 
-    Between two commands w(t) = c + (w_0 - c) exp(-t / tau), tau = `rise` where c > w_0 and `fall` elsewhere [s].  They
-    start at the first command.
+    Between two commands w(t) = c + (w_0 - c) exp(-t / tau), tau = `rise` where c > w_0 and `fall` elsewhere [s], 0 for
+    at once.  They start at the first command.
     """
+    rise = max(rise, FLOORS["s"])
+    fall = max(fall, FLOORS["s"])
     n = len(commands)
     whole = int(np.floor(delay / period + 1e-9))
     late = delay - whole * period

@@ -17,9 +17,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
+from quadsim.fields import floor_of
 from quadsim.state import Array, Indices
-from quadsim.vehicle import Vehicle
-from scenarios.identify.estimate import VECTORS
+from quadsim.vehicle import LARGEST, VEHICLE_UNITS, Vehicle
+from scenarios.identify.estimate import VECTORS, field_of
 from scenarios.identify.model import INCREMENTS, Parameters, Stretch, predicted_increments, turning
 from scenarios.identify.rotors import Turning
 
@@ -57,8 +58,12 @@ class Sought(NamedTuple):
     part: int | None = None  # of the stretch whose own it is
 
     def value(self, x: float) -> float:
-        """The number itself."""
-        return float(self.start * np.exp(x)) if self.scale is None else float(self.start + self.scale * x)
+        """The number itself; one that is positive by nature stays within what a vehicle's numbers may be."""
+        if self.scale is not None:
+            return float(self.start + self.scale * x)
+        least = floor_of(VEHICLE_UNITS[field_of(self.name)])
+        within = np.clip(x, math.log(least / self.start), math.log(LARGEST / self.start))
+        return float(self.start * np.exp(within))
 
 
 def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterator[Sought]:

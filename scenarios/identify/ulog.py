@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,12 +13,14 @@ import numpy as np
 
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.identify.libraries import reading
+from scenarios.identify.border import between, reading, stated_number
 from scenarios.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, logged_as
 from scenarios.identify.series import Column, held, on_one_clock
 
 ULOGS: Final = (".ulg", ".ulog")
 _ROTORS: Final = range(N_ROTORS)
+_MOTORS: Final = logged_as("throttle", "actuator_motors.control[{}]")
+_PULSES: Final = logged_as("throttle", "actuator_outputs.output[{}]", unit="us")
 _NAMES: Final = (
     logged_as("rates", "vehicle_angular_velocity.xyz[{}]", down=True),
     logged_as("rates", "sensor_combined.gyro_rad[{}]", down=True),
@@ -25,8 +29,8 @@ _NAMES: Final = (
     logged_as("velocity", "vehicle_local_position.v{}", each="x y z", down=True),
     logged_as("specific_force", "sensor_combined.accelerometer_m_s2[{}]", down=True),
     logged_as("specific_force", "vehicle_acceleration.xyz[{}]", down=True),
-    logged_as("throttle", "actuator_motors.control[{}]"),
-    logged_as("throttle", "actuator_outputs.output[{}]", unit="us"),
+    _MOTORS,
+    _PULSES,
     logged_as("speeds", "esc_status.esc[{}].esc_rpm", unit="rpm"),
     logged_as("voltage", "battery_status.voltage_v"),
     NamedQuantity(quantity="flying", columns=("flying",)),
@@ -40,21 +44,29 @@ def read_ulog(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     """Read the topics of a ULog that are used: columns `topic.field`, each on the clock of its measurement.
 
     Raises:
-        MissingPackageError: pyulog is not installed.
-        FileError: it is not a ULog.
+        FileError: a parameter of it says nothing.
     """
     log = _parsed(path, [*_STATES, *(column.partition(".")[0] for one in (*given, *_NAMES) for column in one.columns)])
     columns: dict[str, Column] = {}
+    notes: list[str] = []
+    if log.file_corruption:
+        notes.append(f"{path.name}: it is damaged; what can be read of it is used")
     for data in sorted(log.data_list, key=lambda data: data.multi_id, reverse=True):  # the first instance of each
-        stamps = data.data.get("timestamp_sample", data.data["timestamp"])
-        stamps = np.asarray(stamps if np.any(stamps) else data.data["timestamp"], float)
-        columns |= on_one_clock(stamps * 1e-6, {f"{data.name}.{name}": of for name, of in data.data.items()})
+        stamps = data.data.get("timestamp_sample")
+        if stamps is None or not np.any(stamps):
+            stamps = data.data.get("timestamp")
+        if stamps is None:
+            notes.append(f"{path.name}: {data.name} has no time and is left out")
+            continue
+        table = {f"{data.name}.{name}": of for name, of in data.data.items()}
+        columns |= on_one_clock(np.asarray(stamps, float) * 1e-6, table)
     columns |= {name: Column(of.t, np.abs(of.values)) for name, of in columns.items() if name.endswith("esc_rpm")}
     if flying := _flying(columns):
         columns["flying"] = flying
-    pulses = _by_pulses(log.initial_parameters)
-    names = [replace(one, **pulses) if one.columns[0] == "actuator_outputs.output[0]" else one for one in _NAMES]
-    return LoggedColumns(columns=columns, quantities=names, advice=_ADVICE)
+    names = [*_NAMES]
+    if _PULSES.columns[0] in columns and _MOTORS.columns[0] not in columns:
+        names[names.index(_PULSES)] = replace(_PULSES, **_by_pulses(path, log.initial_parameters))
+    return LoggedColumns(columns=columns, quantities=names, advice=_ADVICE, notes=tuple(notes))
 
 
 def stated_rotors(path: Path) -> str:
@@ -64,15 +76,16 @@ def stated_rotors(path: Path) -> str:
 
     Raises:
         MissingPackageError: pyulog is not installed.
-        FileError: it is not a ULog.
+        FileError: it is not a ULog, or a parameter of it says nothing.
     """
     if path.suffix.lower() not in ULOGS or not path.is_file():
         return ""
-    stated = _parsed(path, _STATES).initial_parameters
-    if int(stated.get("CA_ROTOR_COUNT", 0)) != N_ROTORS:
+    with reading(path, "ULog", "pyulog"):
+        stated = _parsed(path, _STATES).initial_parameters
+    if stated_number(path, stated, "CA_ROTOR_COUNT", 0, whole=True) != N_ROTORS:
         return ""
-    hubs = [[float(stated.get(f"CA_ROTOR{i}_P{axis}", 0.0)) for axis in "XYZ"] for i in _ROTORS]
-    moments = np.array([float(stated.get(f"CA_ROTOR{i}_KM", 0.05)) for i in _ROTORS])
+    hubs = [[stated_number(path, stated, f"CA_ROTOR{i}_P{axis}", 0.0) for axis in "XYZ"] for i in _ROTORS]
+    moments = np.array([stated_number(path, stated, f"CA_ROTOR{i}_KM", 0.05) for i in _ROTORS])
     values = {
         "rotor_positions": ((np.round(np.array(hubs) * HALF_TURN, 4) + 0.0).tolist(), "m"),
         "rotor_spins": ([-1 if moment > 0.0 else 1 for moment in moments], "-"),
@@ -85,9 +98,9 @@ def stated_rotors(path: Path) -> str:
 
 
 def _parsed(path: Path, topics: Sequence[str]) -> Any:
-    with reading(path, "ULog", "pyulog"), path.open("rb") as file:  # which pyulog leaves open where it fails
-        from pyulog import ULog
+    from pyulog import ULog
 
+    with path.open("rb") as file, redirect_stdout(StringIO()):  # pyulog prints that a file is damaged
         return ULog(file, [*topics])
 
 
@@ -101,16 +114,19 @@ def _flying(columns: Mapping[str, Column]) -> Column | None:
     return Column(t, np.prod([held(column, t) == flying for column, flying in known], axis=0).astype(float))
 
 
-def _by_pulses(parameters: Mapping[str, Any]) -> dict[str, Any]:
+def _by_pulses(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Which outputs are the motors, and their shortest and longest pulses [us]; a negative one is the common one."""
-    functions = {int(parameters.get(f"PWM_MAIN_FUNC{i + 1}", 0)) - _FIRST_MOTOR: i for i in range(2 * N_ROTORS)}
+    functions: dict[float, int] = {}
+    for i in range(2 * N_ROTORS):
+        function = stated_number(path, parameters, f"PWM_MAIN_FUNC{i + 1}", 0, whole=True)
+        functions[function - _FIRST_MOTOR] = i
     outputs = [functions.get(motor, motor) for motor in _ROTORS]
 
     def pulses(end: str, usual: float) -> Array:
         names = [(f"PWM_MAIN_{end}{i + 1}", f"PWM_MAIN_{end}", f"PWM_{end}") for i in outputs]
-        stated = ([float(parameters[name]) for name in ways if name in parameters] for ways in names)
+        stated = [[stated_number(path, parameters, way, -1.0) for way in ways] for ways in names]
         return np.array([next((pulse for pulse in of if pulse >= 0.0), usual) for of in stated])
 
     low, high = pulses("MIN", 1000.0), pulses("MAX", 2000.0)
     columns = tuple(f"actuator_outputs.output[{i}]" for i in outputs)
-    return {"columns": columns, "zero": low, "scale": 1.0 / np.maximum(high - low, 1.0)}
+    return {"columns": columns, **between(path, "pulses of PWM_MAIN", low, high)}

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, doc
+from annotated_types import Ge, Le, doc
 from pydantic import Field
 
 from quadsim.assets import read_toml
 from quadsim.controller import Predicting
 from quadsim.errors import FlightError, InputError, ParameterError
-from quadsim.fields import Fraction, Vector
+from quadsim.fields import FLOORS, Fraction, Vector
 from quadsim.flight.audit import COMMAND_SIGNALS, Limit
 from quadsim.sim.effects.load import Load, MassChange
 from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss
@@ -83,7 +83,7 @@ class _Declared:
 class Script:
     """A session without a browser: inputs as `Session.submit` takes them, and the times [s] at which they are given."""
 
-    duration: Annotated[float, Gt(0.0), Le(36_000.0), doc("[s] of the session")]
+    duration: Annotated[float, Ge(FLOORS["s"]), Le(36_000.0), doc("[s] of the session")]
     inputs: list[dict[str, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:

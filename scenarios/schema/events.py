@@ -10,7 +10,7 @@ from annotated_types import Len, doc
 from pydantic import Field
 
 from quadsim.errors import ParameterError
-from quadsim.fields import Instant, Number, Positive, Vector, is_plain
+from quadsim.fields import Instant, Number, Seconds, Vector, is_plain
 from quadsim.sim.computation import Stall
 from quadsim.sim.effects import Push
 from quadsim.sim.effects.load import MassChange, PayloadDrop, PayloadPickup
@@ -93,7 +93,7 @@ class SensorFaultEvent:
         Literal["dropout", "freeze", "nan", "bias"],
         doc("no samples, the last sample repeated, NaN samples, or an offset"),
     ]
-    duration: Annotated[Positive, doc("[s] duration of the fault")]
+    duration: Annotated[Seconds, doc("[s] duration of the fault")]
     axes: Annotated[
         Annotated[tuple[Literal["x", "y", "z"], ...], Len(1, 3)] | None,
         doc("for nan: affected axes; absent: all"),

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field
 import quadsim
 from mpc.bounded import Polytope
 from quadsim.errors import InputError, ParameterError
-from quadsim.fields import Positive
+from quadsim.fields import FLOORS, Metres, Positive
 from quadsim.flight.audit import FlightVerdict, Limit
 from quadsim.input_limits import MOST_ENTRIES, MOST_STEPS
 from quadsim.sim.autopilot import AutopilotSettings
@@ -111,10 +111,8 @@ class Lost:
             "for loops and flips"
         ),
     ] = 120.0
-    distance: Annotated[Positive | Off, doc("[m] largest distance from the reference at the same time")] = 100.0
-    depth: Annotated[Positive | Off, doc("[m] largest depth below the lowest point of start and reference so far")] = (
-        50.0
-    )
+    distance: Annotated[Metres | Off, doc("[m] largest distance from the reference at the same time")] = 100.0
+    depth: Annotated[Metres | Off, doc("[m] largest depth below the lowest point of start and reference so far")] = 50.0
     speed: Annotated[Positive | Off, doc("[m/s] highest speed in any direction")] = 50.0
 
     @property
@@ -150,13 +148,13 @@ class Scenario:
     ] = "satisfied"
     duration: Annotated[
         float,
-        Gt(0.0),
+        Ge(FLOORS["s"]),
         Le(LONGEST_FLIGHT),
         doc("[s] whole control periods; absent: until the course ends, if it has an end"),
     ] = math.inf
     control_period: Annotated[
         float,
-        Gt(0.0),
+        Ge(FLOORS["s"]),
         Le(10.0),
         doc("[s] tau_s, time for which a command is held; a whole number of physics steps"),
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import subprocess
 import sys
@@ -14,7 +15,9 @@ import pytest
 from firmware.conftest import Answers, Export, Run
 
 from mpc.fallback.structs import STATUSES
+from quadsim.assets import vehicle_path
 from quadsim.state import Array
+from quadsim.vehicle import load_vehicle
 from scenarios.export.in_the_loop import Frames, QueryKind, Reply, SerialMPC, make_program
 from scenarios.export.record import Recording, record
 from scenarios.loading import load_scenario
@@ -86,6 +89,23 @@ def test_answers_are_those_of_the_recorded_periods(terminal: Terminal, recorded:
         reply = pilot.send(pilot.period(k))
         assert (reply.number, reply.status) == (pilot.number, recorded.status[k])
         assert np.abs(reply.command - recorded.command[k]).max() <= 1e-8
+
+
+@pytest.mark.parametrize("acting", [math.nan, math.inf, -math.inf, 2e6])
+def test_a_start_after_what_is_no_command_is_one_after_hover(
+    terminal: Terminal, recorded: Recording, acting: float
+) -> None:
+    """Its answer, and those to rows, are a command that can be flown."""
+    pilot = Autopilot(terminal, recorded)
+    pilot.number = 1
+    started = pilot.send(
+        pilot.frames.question(QueryKind.START, 1, recorded.state[0], recorded.path[0], np.full(4, acting))
+    )
+    row = pilot.send(pilot.question(QueryKind.ROW, recorded.path[0]))
+    hover = load_vehicle(vehicle_path("lopes2011")).hover_speeds
+    np.testing.assert_allclose(started.command, hover, rtol=1e-12)
+    np.testing.assert_array_equal(row.command, started.command)
+    assert {started.status, row.status} == {MISSED}
 
 
 def test_a_doubled_question_is_solved_once_and_answered_twice(terminal: Terminal, recorded: Recording) -> None:

@@ -14,7 +14,8 @@
 #endif
 #define MARK 0x4D504351U
 
-/* anew, after u(-1) = acting; a row of the reference alone; all; the same while the ground holds the vehicle */
+/* anew, after u(-1) = acting, or after the command of hover where acting is none; a row of the reference alone; all;
+ * the same while the ground holds the vehicle */
 enum kind { START, ROW, STEP, STAND };
 
 struct question {
@@ -93,7 +94,7 @@ static int solve(const struct question *question)
     uint32_t rows = question->number - answer.number; /* new ones, those lost included */
     if (question->kind == START) {
         quadsim_law_reset(&law, question->acting);
-        memcpy(answer.command, question->acting, sizeof answer.command);
+        memcpy(answer.command, law.guard.before, sizeof answer.command); /* that of hover for what is no command */
         answer.mark = MARK;
         flying = 0;
         rows = QUADSIM_ROWS;

@@ -46,7 +46,7 @@ import numpy as np
 from annotated_types import doc
 
 from quadsim.errors import ParameterError
-from quadsim.fields import Instant, NonNegative, Positive, Vector, filled
+from quadsim.fields import Instant, Metres, NonNegative, Seconds, Vector, filled
 from quadsim.sim.effects.battery import Battery
 from quadsim.sim.effects.load import Load, MassChange, PayloadDrop, PayloadPickup
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
@@ -61,7 +61,7 @@ class Push:
 
     at: Instant
     type: Annotated[Literal["push"], doc("kind of event: push")] = "push"
-    duration: Annotated[Positive, doc("[s] length of the push")]
+    duration: Annotated[Seconds, doc("[s] length of the push")]
     force: Annotated[Vector, doc("[N] world frame")]
     point: Annotated[Vector, doc("[m] point of application, body frame")] = (0.0, 0.0, 0.0)
 
@@ -76,9 +76,7 @@ class Ground:
 
     contact: Annotated[bool, doc("whether feet and hull meet the floor")] = True
     effect: Annotated[bool, doc("whether thrust grows near the floor (Cheeseman and Bennett)")] = False
-    rotor_radius: Annotated[Positive | None, doc("[m] for the ground effect; absent: the vehicle's rotor_radius")] = (
-        None
-    )
+    rotor_radius: Annotated[Metres | None, doc("[m] for the ground effect; absent: the vehicle's rotor_radius")] = None
 
     def resolved(self, vehicle: Vehicle) -> Ground:
         """Fill in the vehicle's rotor radius, if the ground effect needs it.

@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Ge, Le, Len, MaxLen, doc
 
 from quadsim.errors import ParameterError
-from quadsim.fields import Instant, Positive, Vector
+from quadsim.fields import Instant, Kilograms, Vector
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -20,7 +20,7 @@ from quadsim.vehicle import Vehicle
 class Payload:
     """A point mass fixed to the vehicle."""
 
-    mass: Annotated[Positive, doc("[kg]")]
+    mass: Annotated[Kilograms, doc("[kg]")]
     position: Annotated[Vector, doc("[m] in the body frame")] = (0.0, 0.0, 0.0)
 
 

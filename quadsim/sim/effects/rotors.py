@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Le, Len, doc
 
 from quadsim.errors import ParameterError
-from quadsim.fields import Fraction, Instant, NonNegative, Positive, filled
+from quadsim.fields import Fraction, Instant, NonNegative, Positive, Seconds, filled, require_floor
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 
@@ -24,11 +24,11 @@ class RotorDynamics:
     """
 
     rise: Annotated[
-        Positive | None,
+        Seconds | None,
         doc("[s] time constant while speeding up; absent: the vehicle's, or no lag if it has none"),
     ] = None
     fall: Annotated[
-        Positive | None,
+        Seconds | None,
         doc("[s] time constant while slowing down; absent: the vehicle's, or no lag if it has none"),
     ] = None
     acceleration: Annotated[Positive | None, doc("[rad/s^2] largest change of a rotor's speed; absent: no limit")] = (
@@ -84,7 +84,7 @@ class RotorLoss:
     type: Annotated[Literal["rotor_loss"], doc("kind of event: rotor_loss")] = "rotor_loss"
     rotor: Annotated[int, Ge(1), Le(N_ROTORS), doc("number of the rotor, 1 to 4")]
     loss: Annotated[float, Gt(0.0), Le(1.0), doc("[-] share of thrust and torque lost; 1 is all of it")]
-    duration: Annotated[Positive | None, doc("[s] time until the rotor recovers; absent: never")] = None
+    duration: Annotated[Seconds | None, doc("[s] time until the rotor recovers; absent: never")] = None
 
     def text(self) -> str:
         """Describe the event."""
@@ -112,6 +112,9 @@ class LagChange:
     type: Annotated[Literal["rotor_lag"], doc("kind of event: rotor_lag")] = "rotor_lag"
     rise: Annotated[NonNegative, doc("[s] time constant while speeding up; 0: at once")]
     fall: Annotated[NonNegative | None, doc("[s] time constant while slowing down; absent: equal to rise")] = None
+
+    def __post_init__(self) -> None:
+        require_floor(self, "rise", "fall", unit="s")
 
     def text(self) -> str:
         """Describe the event."""

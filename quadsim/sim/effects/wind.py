@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Len, doc
 
 from quadsim.errors import InputError
-from quadsim.fields import Instant, NonNegative, Pair, Positive, Vector, filled
+from quadsim.fields import Instant, NonNegative, Pair, Positive, Seconds, Vector, filled
 from quadsim.sim.effects.turbulence import FASTEST_AIRSPEED, SLOWEST_AIRSPEED, Dryden, Turbulence
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -108,7 +108,7 @@ class Gust:
 
     at: Instant
     type: Annotated[Literal["gust"], doc("kind of event: gust")] = "gust"
-    duration: Annotated[Positive, doc("[s] from calm to calm")]
+    duration: Annotated[Seconds, doc("[s] from calm to calm")]
     velocity: Annotated[Vector, doc("[m/s] in its middle, world frame")]
 
     def text(self) -> str:

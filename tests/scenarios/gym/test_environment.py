@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +15,7 @@ import gymnasium
 import imageio.v2
 import numpy as np
 import pytest
-from gymnasium.error import DependencyNotInstalled, ResetNeeded
+from gymnasium.error import ClosedEnvironmentError, DependencyNotInstalled, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import RecordVideo
@@ -273,6 +275,50 @@ def test_the_inner_loop_flies_thrust_and_body_rates() -> None:
     assert observed[INDEX["vz"]] > 0.5
     with pytest.raises(ParameterError, match="deviations or speeds"):
         env.controller_action()
+
+
+@pytest.mark.witness("gym")
+def test_a_closed_environment_says_so_and_keeps_its_flight() -> None:
+    env = quadsim.gym.QuadrotorEnv(short("hover"), render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(HOVER)
+    env.close()
+    env.close()
+    for use in (env.reset, env.render, env.controller_action, lambda: env.step(HOVER)):
+        with pytest.raises(ClosedEnvironmentError, match="the environment is closed; make a new one"):
+            use()
+    assert len(env.flight().time) == 1
+    filtered = quadsim.gym.MPCSafetyFilter(quadsim.gym.QuadrotorEnv(short("robust")))
+    filtered.reset(seed=0)
+    filtered.close()
+    with pytest.raises(ClosedEnvironmentError):
+        filtered.step(HOVER)
+
+
+@pytest.mark.parametrize("copied", [lambda env: pickle.loads(pickle.dumps(env)), copy.deepcopy])
+@pytest.mark.parametrize("filtered", [False, True])
+def test_a_copy_of_a_reset_environment_flies_the_same_after_its_own_reset(copied: Any, filtered: bool) -> None:
+    """The episode stays behind: the copy says so."""
+    env = quadsim.gym.make_env(short("robust"))
+    env = quadsim.gym.MPCSafetyFilter(env) if filtered else env
+    env.reset(seed=3)
+    env.step(HOVER)
+    other = copied(env)
+    with pytest.raises(ResetNeeded, match="a pickled or copied environment is without its episode"):
+        other.step(HOVER)
+    starts = [one.reset(seed=3)[0] for one in (env, other)]
+    steps = [one.step(HOVER)[0] for one in (env, other)]
+    env.close()
+    other.close()
+    assert np.array_equal(*starts)
+    assert np.array_equal(*steps)
+
+
+def test_an_action_that_is_not_of_numbers_is_refused() -> None:
+    env = quadsim.gym.QuadrotorEnv(short("hover"))
+    env.reset()
+    with pytest.raises(ParameterError, match="action must be of numbers; got 'object'"):
+        env.step(np.array([object()] * 4))
 
 
 def test_processes_reset_in_the_step_after_an_end() -> None:

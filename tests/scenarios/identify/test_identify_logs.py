@@ -24,6 +24,7 @@ from scenarios.commands.cli import main
 from scenarios.flown import Flight
 from scenarios.identify.checks import check_log, spans
 from scenarios.identify.record import Record, read_record
+from scenarios.identify.ulog import stated_rotors
 from scenarios.identify.windows import to_world
 
 pytestmark = pytest.mark.slow("identification")
@@ -526,6 +527,48 @@ def test_ulog_pulses_are_those_of_each_motor(tmp_path: Path, eight: Record) -> N
     at = np.searchsorted(eight.t, record.t[50:600] - 1e-4) - 1
     np.testing.assert_allclose(record.throttle[50:600], eight.commands[at] / 838.0, rtol=1e-5)  # type: ignore[index]
     np.testing.assert_array_equal(record.throttle[:10], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("PWM_MAIN_FUNC1", np.nan),
+        ("PWM_MAIN_FUNC1", np.inf),
+        ("PWM_MAIN_MIN1", np.nan),
+        ("PWM_MAIN_MIN", 2**31 - 1),
+        ("PWM_MAIN_MIN", 2000),
+    ],
+)
+def test_ulog_whose_pulses_say_nothing(tmp_path: Path, eight: Record, name: str, value: float) -> None:
+    """Where its throttle is logged as pulses; where it is logged as a share, they do not matter."""
+    topics = px4_topics(eight)
+    assert read_record(ulog(tmp_path / "share.ulg", topics, parameters={name: value})).throttle is not None
+    _, t, throttle = topics.pop("actuator_motors")
+    topics["actuator_outputs"] = ("float[4] output;", t, 1000.0 + 1000.0 * throttle)
+    with pytest.raises(FileError, match=rf"odd\.ulg: states ({name} = .*; it must be|pulses of PWM_MAIN from )"):
+        read_record(ulog(tmp_path / "odd.ulg", topics, parameters={name: value}))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 4.5])
+def test_rotors_of_a_ulog_that_are_no_number_are_refused(tmp_path: Path, eight: Record, value: float) -> None:
+    path = ulog(tmp_path / "px4.ulg", px4_topics(eight), parameters={"CA_ROTOR_COUNT": value})
+    with pytest.raises(FileError, match=r"px4\.ulg: states CA_ROTOR_COUNT = .*; it must be a whole number"):
+        stated_rotors(path)
+
+
+@pytest.mark.witness("identification")
+def test_ulog_with_a_topic_without_time(tmp_path: Path, eight: Record, capfd: pytest.CaptureFixture[str]) -> None:
+    """It is left out, with a note; where it is needed, the refusal says so. Nothing is printed."""
+    path = ulog(tmp_path / "px4.ulg", px4_topics(eight))
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b"battery_status:uint64_t timestamp;", b"battery_status:uint64_t timestemp;"))
+    record = read_record(path)
+    assert record.voltage is None
+    assert record.notes == ("px4.ulg: battery_status has no time and is left out",)
+    path.write_bytes(whole.replace(b"vehicle_attitude:uint64_t timestamp;", b"vehicle_attitude:uint64_t timestemp;"))
+    with pytest.raises(FileError, match=r"lacks .*px4\.ulg: vehicle_attitude has no time and is left out"):
+        read_record(path)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_ulog_knows_when_it_flies(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from dataclasses import dataclass, replace
@@ -157,6 +158,17 @@ def test_dataflash_of_another_kind_or_torn(tmp_path: Path, eight: Record, capfd:
         match=r"lacks attitude: columns XKQ\.Q1,.* or ATT\.Roll,.*; it has IMU\.TimeUS, IMU\.I, IMU\.GyrX",
     ):
         read_record(dataflash(tmp_path / "no.bin", messages, SERVOS))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("MOT_PWM_MIN", math.nan), ("MOT_PWM_MIN", 1e30), ("MOT_PWM_MIN", 3000.0), ("SERVO5_FUNCTION", math.nan)],
+)
+def test_dataflash_whose_parameters_say_nothing(tmp_path: Path, eight: Record, name: str, value: float) -> None:
+    pytest.importorskip("pymavlink", reason="the extra logs is not installed")
+    path = dataflash(tmp_path / "odd.bin", ardupilot(eight), {**SERVOS, name: value})
+    with pytest.raises(FileError, match=rf"odd\.bin: states {name}( = (nan|1\.0.*e\+30); it must| and MAX from 3000)"):
+        read_record(path)
 
 
 # Columns by a map
@@ -427,6 +439,37 @@ def test_blackbox_that_cannot_be_used(tmp_path: Path, eight: Record) -> None:
     table = {name: of for name, of in betaflight(eight).items() if not name.startswith(("imuQ", "acc"))}
     with pytest.raises(FileError, match=r"lacks velocity: .*it has loopIteration.*set blackbox_disable_attitude, _acc"):
         read_record(blackbox(tmp_path / "default.bbl", table, **HEADERS))
+
+
+@pytest.mark.witness("identification")
+@pytest.mark.parametrize(
+    ("header", "value", "message"),
+    [
+        ("motorOutput", "158,158", r"motorOutput from 158\.0 to 158\.0; the longest must be above the shortest"),
+        ("motorOutput", "158", "motorOutput = 158; it must be two numbers"),
+        ("motorOutput", "1,2,3", r"motorOutput = \[1, 2, 3\]; it must be two numbers"),
+        ("motorOutput", "a,b", "motorOutput = 'a'; it must be a number"),
+        ("motorOutput", "", "motorOutput = ''; it must be two numbers"),
+        ("acc_1G", 0, "acc_1G = 0; it must be a number from 1"),
+        ("acc_1G", "x", "acc_1G = 'x'; it must be a number"),
+        ("motor_poles", 0, "motor_poles = 0; it must be a whole number from 2"),
+        ("motor_poles", "q", "motor_poles = 'q'; it must be a whole number"),
+        ("gyro_scale", "0x1ffffffff", "gyro_scale = 8589934591; it must be a whole number"),
+        ("gyro_scale", "-1", "gyro_scale = -1; it must be a whole number"),
+        ("gyro_scale", "abc", "gyro_scale = 'abc'; it must be a whole number"),
+        ("gyro_scale", "0x7fc00000", "gyro_scale = nan; it must be above 0"),
+        ("gyro_scale", "0x7f800000", "gyro_scale = inf; it must be above 0"),
+        ("gyro_scale", "0", "gyro_scale = 0; it must be above 0"),
+    ],
+)
+def test_a_blackbox_whose_header_says_nothing_is_refused(
+    tmp_path: Path, eight: Record, header: str, value: object, message: str
+) -> None:
+    pytest.importorskip("orangebox", reason="the extra logs is not installed")
+    short = {name: of[:50] for name, of in betaflight(eight).items()}
+    path = blackbox(tmp_path / "log.bbl", short, **{**HEADERS, header: value})
+    with pytest.raises(FileError, match=rf"log\.bbl: states {message}"):
+        read_record(path)
 
 
 def test_a_log_without_attitude_is_levelled_by_its_accelerometer(tmp_path: Path, eight: Record) -> None:

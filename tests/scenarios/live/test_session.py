@@ -281,7 +281,7 @@ def test_the_script_on_the_page_is_saved_as_a_run_that_flies_to_the_same_bytes(
 @pytest.mark.parametrize(
     ("text", "refusal"),
     [
-        ("duration = 0", "duration must be a number > 0"),
+        ("duration = 0", "duration must be a number >= 1e-06"),
         ("duration = 1\ninputs = [{ at = 2.0 }]", "inputs.0.at must be below duration"),
         ("duration = 1\ninputs = 3", "inputs must be a list"),
         ("duration = 1\nspeed = 3", "speed is not a field"),
