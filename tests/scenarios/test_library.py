@@ -40,7 +40,7 @@ SAME = ("verdict", "flown", "nearest", "unit")
 TOLERANCES = {"rmse": 1e-3, "tilt": 0.1, "qps": 1.0, "margin": 0.01}
 """Of golden numbers: the same, and within [m, deg, %, the constraint's unit]."""
 RELATIVE = 1e-3
-"""Or within this share: a flight that diverges multiplies the rounding of the processor that flies it."""
+"""Or within this share."""
 COMPARED = 1.0
 """Of a flight and of the same one again, at least [s]."""
 SHORT = 12.0

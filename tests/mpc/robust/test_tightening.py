@@ -19,6 +19,7 @@ from mpc.linear import LinearMPC
 from mpc.model import discretise
 from mpc.nonlinear.model import next_state, nonlinear_model
 from mpc.observer import ObserverSettings
+from mpc.regulator import observed
 from mpc.robust.tightening import (
     ERROR_SHARE,
     SPEED_SHARE,
@@ -28,7 +29,6 @@ from mpc.robust.tightening import (
     disturbed_model,
     growth,
     margins,
-    observed,
 )
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.errors import ParameterError

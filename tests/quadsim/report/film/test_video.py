@@ -19,7 +19,7 @@ from quadsim.flight.rundir import Run
 from quadsim.palette import ON_DARK, rgb
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
-from quadsim.report.film.frames import make_footage
+from quadsim.report.film.frames import make_footage, ranked_tracks
 from quadsim.report.film.video import (
     Estimate,
     frame_count,
@@ -244,7 +244,7 @@ def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many
 
     limits = (*wide, near, reported, low)
     tracks = make_footage(replace(short_run, limits=limits), np.array([6.0])).margins
-    shown, rest = margin_rows(sorted(tracks, key=lambda track: track.rank), 0)
+    shown, rest = margin_rows(ranked_tracks(tracks), 0)
     assert [track.limit.name for track in shown] == ["low", "reported", "near", "wide_0", "wide_1", "wide_2"]
     assert rest == "and 4 more"
     assert red(*wide, near) == 0
