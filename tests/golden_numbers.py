@@ -39,7 +39,7 @@ ABLATION: Final[dict[str, dict[str, Any]]] = {
 
 
 DIVERGING: Final = ("yaw-180",)
-"""Flights that multiply the rounding of the processor that flies them, of which the verdict alone is compared."""
+"""Flights that multiply the rounding of the processor that flies them (docs/commands.md): their verdict alone counts."""
 
 
 def read(name: str) -> dict[str, Any]:

@@ -259,6 +259,14 @@ def test_disturbances_too_large_for_the_bounds_are_refused(vehicle: Vehicle, nam
         tilt_margins(vehicle, TighteningSettings(**{name: given}))
 
 
+@pytest.mark.parametrize("noise", [-3e-6, 0.0, 3e-6])
+def test_of_outputs_as_narrow_as_each_other_the_first_is_named(vehicle: Vehicle, noise: float) -> None:
+    narrow = replace(tilt_bounds(), y_max=np.array([LIMIT, LIMIT * (1.0 - noise)]))
+    settings = TighteningSettings(angular_acceleration=20.0)
+    with pytest.raises(ParameterError, match="smaller, or the bounds on roll wider"):
+        margins(vehicle, period=PERIOD, horizon=HORIZON, bounds=narrow, settings=settings)
+
+
 def test_the_quickest_rotors_that_are_taken_are_as_good_as_none(vehicle: Vehicle) -> None:
     quickest, none = (tilt_margins(vehicle, rotor_lag=lag) for lag in (SHORTEST_LAG, 0.0))
     np.testing.assert_allclose(quickest, none, rtol=0.01)

@@ -249,3 +249,15 @@ def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many
     assert rest == "and 4 more"
     assert red(*wide, near) == 0
     assert red(*limits) > 0
+
+
+def test_limits_that_are_equally_near_stand_as_in_the_file(short_run: Run) -> None:
+    """Their bounds differ by rounding, as margins do from one processor to another."""
+    rng = np.random.default_rng(0)
+    names = ("zeta", "alpha", "mid")
+    for _ in range(5):
+        bounds = 100.0 * (1.0 + 3e-6 * rng.uniform(-1.0, 1.0, len(names)))
+        limits = [Limit(name=name, signal="z", upper=bound) for name, bound in zip(names, bounds, strict=True)]
+        limits.append(Limit(name="near", signal="z", upper=10.0))
+        tracks = make_footage(replace(short_run, limits=tuple(limits)), np.array([6.0])).margins
+        assert [track.limit.name for track in ranked_tracks(tracks)] == ["near", *names]
