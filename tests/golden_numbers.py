@@ -39,7 +39,7 @@ ABLATION: Final[dict[str, dict[str, Any]]] = {
 
 
 DIVERGING: Final = ("yaw-180",)
-"""Flights that multiply the rounding of the processor that flies them (docs/commands.md): their verdict alone counts."""
+"""Flights that multiply the rounding of the processor that flies them (docs/commands.md): only their verdict counts."""
 
 
 def read(name: str) -> dict[str, Any]:

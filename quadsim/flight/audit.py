@@ -517,9 +517,11 @@ def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
         return math.nan, math.nan, math.nan
     columns = values[inside].reshape(np.count_nonzero(inside), -1)
     margins = limit.margin(columns)
+    smallest = margins.min()
     row = first_smallest(margins, limit.tie)
     distances = np.stack([limit.upper - columns[row], columns[row] - limit.lower])
-    side, column = np.unravel_index(first_smallest(distances.ravel(), limit.tie), distances.shape)
+    first = first_smallest([*distances.ravel(), smallest], limit.tie)  # one of the distances: some are tied with it
+    side, column = np.unravel_index(first, distances.shape)
     nearest = columns[:, column]
     value = nearest.max() if side == 0 else nearest.min()
-    return float(value), float(margins.min()), float(t[inside][row])
+    return float(value), float(smallest), float(t[inside][row])

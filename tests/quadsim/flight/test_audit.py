@@ -175,6 +175,18 @@ def test_a_margin_that_grows_by_more_than_a_tie_has_a_time_of_its_own() -> None:
     assert finding.peak_plant == values[3]
 
 
+def test_the_peak_is_within_a_tie_of_the_smallest_margin_also_near_the_middle() -> None:
+    middle = 0.5
+    values = np.full(7, middle)
+    values[2] += 0.9 * Z.tie
+    values[4] -= 1.8 * Z.tie
+    finding = find(logged("z", samples=(middle,) * 3, plant=values), Z)
+    assert finding.worst_time == pytest.approx(0.1)
+    values[0] += 0.3 * Z.tie
+    finding = find(logged("z", samples=(middle,) * 3, plant=values), Z)
+    assert finding.worst_margin <= Z.margin(np.array([finding.peak_plant]))[0] <= finding.worst_margin + Z.tie
+
+
 def test_the_first_of_tied_rotors_gives_the_peak() -> None:
     log = small_log(3)
     log.control.speeds[:] = 200.0
