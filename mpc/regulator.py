@@ -18,7 +18,7 @@ import scipy.linalg
 from quadsim.state import STATE_NAMES, Array, Indices
 from quadsim.vehicle import N_ROTORS
 
-REST: Final = 1e-6
+LEAST_DECAY: Final = 1e-6
 """Least share of itself that a mode which comes to rest loses in a period.  Rounding moves that of a free heading or
 position, 0, by 1e-7 at most."""
 _NEAR: Final = 1e-3
@@ -91,7 +91,7 @@ def observed(A: Array, C: Array) -> Array:
 
 def _moving(A: Array) -> Array:
     """(n, r) orthonormal basis of the modes of x(k+1) = A x(k) that do not come to rest, and of those near them."""
-    if np.abs(np.linalg.eigvals(A)).max() <= 1.0 - REST:
+    if np.abs(np.linalg.eigvals(A)).max() <= 1.0 - LEAST_DECAY:
         return np.zeros((len(A), 0))
     _, basis, count = scipy.linalg.schur(A, output="complex", sort=lambda value: abs(value) > 1.0 - _NEAR)
     return np.asarray(basis[:, :count])

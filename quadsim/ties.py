@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 
 from quadsim.state import Indices
 
-TIE: Final = 1e-3
+TIE_SHARE: Final = 1e-3
 """Window of ties, as a share of half the band of a limit, or of another scale: rounding moves shares by 1e-5 at most,
 except in flights that diverge."""
 
 
-def tied(values: ArrayLike, window: float = TIE) -> Indices:
+def tied(values: ArrayLike, window: float = TIE_SHARE) -> Indices:
     """Return the indices of all values (K,) within `window` of the smallest, in order; NaN counts as the smallest.
 
     Raises:
@@ -38,12 +38,12 @@ def tied(values: ArrayLike, window: float = TIE) -> Indices:
     return np.flatnonzero(numbers <= numbers.min() + window)
 
 
-def first_smallest(values: ArrayLike, window: float = TIE) -> int:
+def first_smallest(values: ArrayLike, window: float = TIE_SHARE) -> int:
     """Return the index of the first of all values (K,) within `window` of the smallest; see `tied`."""
     return int(tied(values, window)[0])
 
 
-def in_order(values: ArrayLike, window: float = TIE) -> Indices:
+def in_order(values: ArrayLike, window: float = TIE_SHARE) -> Indices:
     """Return the indices of values (K,) from the smallest to the largest, tied ones in order.
 
     Those within `window` of the smallest come first, then those within it of the smallest of the rest, and so on.

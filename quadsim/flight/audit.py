@@ -37,7 +37,7 @@ from quadsim.state import (
     shown_unit,
     tilt,
 )
-from quadsim.ties import TIE, first_smallest, tied
+from quadsim.ties import TIE_SHARE, first_smallest, tied
 from quadsim.vehicle import N_ROTORS
 
 Mask = NDArray[np.bool_]
@@ -260,7 +260,7 @@ class Limit:
     @property
     def tie(self) -> float:
         """Window within which margins are tied, in the limit's unit; see `quadsim.ties`."""
-        return TIE * self.half_band
+        return TIE_SHARE * self.half_band
 
     @property
     def tolerances(self) -> tuple[float, float]:

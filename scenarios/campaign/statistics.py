@@ -23,7 +23,7 @@ from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import UNAUDITED_ADVICE, Limit
 from quadsim.report.table import ABSENT
 from quadsim.state import Array, Indices
-from quadsim.ties import TIE, first_smallest, in_order
+from quadsim.ties import TIE_SHARE, first_smallest, in_order
 from scenarios.campaign.events import (
     EVENT_NAMES,
     OPERATIONS,
@@ -259,7 +259,7 @@ def ranking(table: pa.Table) -> Indices:
 
     By verdict (`Verdict.badness`); of one verdict, failed ones come first, then the smaller worst margin.  Flights
     without a margin come after those with one, by their RMS error in position, the largest first.  Margins that are
-    tied, and errors of which the smaller lacks a share of `TIE` at most, are in the order of the flights' numbers.
+    tied, and errors that differ by a share of `TIE_SHARE` at most, are in the order of the flights' numbers.
     """
     badness = np.array([VERDICTS[name].badness for name in texts(table, "verdict")], int)
     failed = flags(table, "failed", absent=True)
@@ -275,7 +275,7 @@ def ranking(table: pa.Table) -> Indices:
     ranked: list[int] = []
     for kind, members in sorted(groups.items()):
         rows = np.array(members)
-        window = TIE * float(distance[rows].max()) if kind[2] else TIE
+        window = TIE_SHARE * float(distance[rows].max()) if kind[2] else TIE_SHARE
         ranked.extend(rows[in_order(score[rows], window)].tolist())
     return np.array(ranked, int)
 

@@ -34,7 +34,7 @@ import scipy.linalg
 from mpc.model import continuous_model, discretise
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
-from quadsim.ties import TIE, first_smallest
+from quadsim.ties import TIE_SHARE, first_smallest
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.design.authority import Authority, authority
 
@@ -96,7 +96,7 @@ def design_for(vehicle: Vehicle, tilt: float | None = None) -> Design:
     can = authority(vehicle)
     if min(can.climb, can.sink, *can.turning) < LEAST_RESERVE:
         rule = f"further from its hover speed, {vehicle.hover_speed:.4g} rad/s, or nothing is left to control it with"
-        side = ("speed_max", "speed_min")[first_smallest([can.climb, can.sink], TIE * vehicle.gravity)]
+        side = ("speed_max", "speed_min")[first_smallest([can.climb, can.sink], TIE_SHARE * vehicle.gravity)]
         raise ParameterError("vehicle", side, getattr(vehicle, side), rule)
     bound = _tilt_bound(can) if tilt is None else _stated_tilt(can, tilt)
     bandwidth, limited_by, period = _bandwidth(can, bound)
@@ -159,7 +159,7 @@ def _bandwidth(can: Authority, tilt: float) -> tuple[float, Literal["lag", "torq
         bandwidth = min(limits.values())
         if bandwidth * period <= PERIOD_SHARE:
             break
-    limited_by = [*limits][first_smallest([*limits.values()], TIE * bandwidth)]
+    limited_by = [*limits][first_smallest([*limits.values()], TIE_SHARE * bandwidth)]
     return bandwidth, limited_by, period
 
 

@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from quadsim.ties import TIE, first_smallest, in_order, tied
+from quadsim.ties import TIE_SHARE, first_smallest, in_order, tied
 
 NOISE = 3e-6
 """How far other linear algebra kernels moved a share, in a library flight."""
 
 
 def test_the_first_within_the_window_of_the_smallest_counts() -> None:
-    assert first_smallest([0.5, 0.1 + 0.9 * TIE, 0.1, 0.3]) == 1
-    assert first_smallest([0.5, 0.1 + 1.1 * TIE, 0.1, 0.3]) == 2
+    assert first_smallest([0.5, 0.1 + 0.9 * TIE_SHARE, 0.1, 0.3]) == 1
+    assert first_smallest([0.5, 0.1 + 1.1 * TIE_SHARE, 0.1, 0.3]) == 2
     assert tied([0.1, 0.3, 0.1]).tolist() == [0, 2]
     assert first_smallest([3.0, 2.0, 1.5], window=0.6) == 1
     assert first_smallest([3.0, 2.0, 1.5], window=0.0) == 2
@@ -30,13 +30,13 @@ def test_what_is_missing_or_has_no_bound_has_its_place() -> None:
 
 
 def test_the_order_is_by_size_and_of_tied_ones_as_they_stand() -> None:
-    values = np.array([0.3, 0.1 + 0.5 * TIE, 0.2, 0.1, 0.2 - 0.5 * TIE])
+    values = np.array([0.3, 0.1 + 0.5 * TIE_SHARE, 0.2, 0.1, 0.2 - 0.5 * TIE_SHARE])
     assert in_order(values).tolist() == [1, 3, 2, 4, 0]
     assert in_order(values)[0] == first_smallest(values)
     assert in_order(values, window=0.0).tolist() == [3, 1, 4, 2, 0]
 
 
-@pytest.mark.parametrize(("values", "window"), [([], TIE), ([1.0], -1.0), ([1.0], math.nan)])
+@pytest.mark.parametrize(("values", "window"), [([], TIE_SHARE), ([1.0], -1.0), ([1.0], math.nan)])
 def test_nothing_to_choose_from_and_no_window_are_refused(values: list[float], window: float) -> None:
     with pytest.raises(ValueError, match="ties need a value and a window of at least 0"):
         tied(values, window)
