@@ -25,8 +25,10 @@ RowFlags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 LARGEST_QP: Final = 2**20
 """Largest size of the QP's matrices [entries] for which trying the unconstrained optimum first saves time."""
-ILL_CONDITIONED: Final = 1e-4
-"""A Hessian is too ill-conditioned if a constant input, recovered from its gradient, has a larger error than this."""
+LARGEST_CONDITION: Final = 1e10
+"""Largest condition number of a Hessian, in the 1-norm, for which its factor gives the unconstrained optimum: then
+rounding moves the optimum by some 1e-6 of its size at most.  The library's are below 1e7, so that no machine's rounding
+decides who answers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,11 +234,17 @@ class FreeOptimum:
     """
 
     def __init__(self, form: Condensed) -> None:
-        self.form, H = form, form.cost.H
-        self._inputs, hold = len(H), np.ones(len(H))
+        self.form = form
+        H = form.cost.H
+        self._inputs = len(H)
         self._factor, failed = lapack.dpotrf(H)
-        self._usable = form.qp.P.size + form.qp.G.size <= LARGEST_QP and not failed
-        self._usable &= np.abs(lapack.dpotrs(self._factor, H @ hold)[0] - hold).max() < ILL_CONDITIONED
+        small = form.qp.P.size + form.qp.G.size <= LARGEST_QP
+        self._usable = small and not failed and self._condition(H) <= LARGEST_CONDITION
+
+    def _condition(self, H: Array) -> float:
+        """Return the condition number of the Hessian in the 1-norm, estimated from its factor (LAPACK's dpocon)."""
+        reciprocal, _ = lapack.dpocon(self._factor, float(np.abs(H).sum(axis=0).max()))
+        return 1.0 / reciprocal if reciprocal > 0.0 else math.inf
 
     def __call__(self, qp: QP) -> Solution | None:
         """Return the optimum of a QP; None if it violates a constraint."""

@@ -76,12 +76,6 @@ def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
     return exponential[:n, :n], exponential[:n, n:]
 
 
-def lqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """K (nu, n) of u = -K x, which minimises the infinite sum of x' Q x + u' R u, x(k+1) = A x(k) + B u(k)."""
-    P = scipy.linalg.solve_discrete_are(A, B, Q, R)
-    return np.asarray(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
-
-
 def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
     """The vehicle's discrete model at hover, for a control period tau_s [s]."""
     A, B = discretise(*continuous_model(vehicle), period)

@@ -11,17 +11,17 @@ constraints. Every formulation is built from the stacked rows of all constraints
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 import mpc
 from mpc.constraints import Bounds, Constraint, Rows, renumbered
 from mpc.model import LinearModel
+from mpc.regulator import stabilising
 from quadsim.errors import ParameterError
 from quadsim.state import REFERENCE_STATES, Array, Indices
 
@@ -76,19 +76,19 @@ class Objective:
         return np.zeros_like(self.Q_u) if self.Q_d is None else self.Q_d
 
 
-def lqr_terminal_weight(model: LinearModel, objective: Objective) -> Array:
+def lqr_terminal_weight(model: LinearModel, objective: Objective, states: Sequence[str] | None = None) -> Array:
     """Return P (n, n) of the DARE: the unconstrained cost of bringing a state to rest over an infinite horizon.
 
     With it, the unconstrained optimum over N steps is that over an infinite horizon, except for the weight of input
-    changes, which the DARE omits.
+    changes, which the DARE omits.  `states` names those of the model, unless they are a vehicle's.
 
     Raises:
-        ParameterError: the equation has no solution, for example if an undamped state has no weight.
+        ParameterError: some states would not come to rest, for example because an undamped state has no weight.
     """
     try:
-        P = scipy.linalg.solve_discrete_are(model.A, model.B, objective.weights[0], objective.Q_u)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        rule = "left out, or weights on all of x, y, z and yaw: the Riccati equation has no solution with these"
+        P, _ = stabilising(model.A, model.B, objective.C_r, objective.Q_y, objective.Q_u, states)
+    except ValueError as error:
+        rule = f"left out, or weights on all of x, y, z and yaw: {error}"
         raise ParameterError("controller", "terminal", "lqr", rule) from error
     return np.asarray(0.5 * (P + P.T))
 

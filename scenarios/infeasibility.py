@@ -26,6 +26,7 @@ from mpc.robust.settings import Robust
 from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import InputError
 from quadsim.state import N_STATES, REFERENCE_STATES
+from quadsim.ties import in_order
 from quadsim.vehicle import Vehicle
 from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Scenario
@@ -126,9 +127,14 @@ class _Case:
         return self.origin(side).place(upper=side.upper)[0]
 
     def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
-        """Yield the violated bounds, the largest share first, and the blocking ones, with times and amounts."""
+        """Yield the violated bounds, the largest share first, and the blocking ones, with times and amounts.
+
+        Bounds whose shares are tied (`quadsim.ties`) are in the order of the problem's constraints.
+        """
         delay, period = self._infeasible_period.delay, self._period
-        for side, violation in sorted(conflict.violated.items(), key=lambda item: -item[1].share):
+        declared = sorted(conflict.violated.items())
+        for i in in_order([-violation.share for _, violation in declared]):
+            side, violation = declared[i]
             first, last = (round(delay + steps * period, 9) for steps in (violation.first, violation.last))
             origin = self.origin(side)
             yield {**_named(origin, side), "by": violation.amount * origin.factor, "start": first, "stop": last}

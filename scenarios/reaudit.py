@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from quadsim.controller import MISSED, ROTORS
 from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import metrics, rundir
-from quadsim.flight.audit import Finding, FlightVerdict, audit, flight_verdict
+from quadsim.flight.audit import Finding, FlightVerdict, audit, flight_verdict, margins_at
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, columns_of
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import finding_from_json, limit_to_json
@@ -319,9 +319,11 @@ def _constraint_differences(
     rounding = ROUNDING_TILT if limit.signal == "tilt" else ARITHMETIC_TOLERANCE
     sampled = limit.source.plant is None
     whole = sampled or scenario.plant_stride == 1 or not log.control.t.size  # the tables are complete
-    alike = ("peak_sampled", "worst_margin_sampled", *(("peak_plant", "worst_margin", "worst_time") if whole else ()))
+    alike = ("peak_sampled", "worst_margin_sampled", *(("peak_plant", "worst_margin") if whole else ()))
     for key in alike:
         yield from _recorded(key, entry[key], again[key], "the tables give", rounding)
+    if whole and not _is_worst_time(entry["worst_time"], finding, log):
+        yield f"worst_time is recorded as {entry['worst_time']!r:.40}, and the tables give {again['worst_time']}"
     margin, there = entry["worst_margin"], again["worst_margin"]
     milder = there is not None and (margin is None or margin > there + rounding * max(1.0, abs(there)))
     if not whole and milder:
@@ -329,11 +331,25 @@ def _constraint_differences(
     peak = "peak_sampled" if sampled else "peak_plant"
     if margin is not None:
         at_peak = None if entry[peak] is None else float(limit.margin(np.array([entry[peak]]))[0])
-        yield from _recorded("worst_margin", margin, at_peak, f"by its {peak}", rounding)
+        if at_peak is None or not -rounding <= at_peak - margin <= limit.tie:  # of tied peaks the first is recorded
+            yield from _recorded("worst_margin", margin, at_peak, f"by its {peak}", rounding)
     beyond = margin is not None and limit.violated(margin)
     least, most = _time_beyond(finding, scenario, log)
     if (entry["time_violated"] > 0.0 and not beyond) or not least <= entry["time_violated"] <= most:
         yield f"time_violated is recorded as {entry['time_violated']}, and the tables give {again['time_violated']:.6g}"
+
+
+def _is_worst_time(recorded: float | None, finding: Finding, log: FlightLog) -> bool:
+    """Return whether the margin is tied with the smallest at this time [s]; earlier versions recorded another of them.
+
+    `log` has every value of the limit's signal.
+    """
+    if recorded is None or math.isnan(finding.worst_time):
+        return recorded is None and math.isnan(finding.worst_time)
+    limit = finding.limit
+    t, values = limit.source.finest(log)
+    margin = margins_at(limit, t, values)[np.isclose(t, recorded, rtol=0.0, atol=ARITHMETIC_TOLERANCE)]
+    return bool((margin <= finding.worst_margin + limit.tie).any() or np.isnan(margin).any())
 
 
 def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[float, float]:

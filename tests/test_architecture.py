@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("quadsim", "mpc", "scenarios")
 MPC_MAY_IMPORT = {
     f"quadsim.{name}" for name in ("vehicle", "state", "rotation", "errors", "fields", "controller", "motion", "space",
-                                      "input_limits", "core.library", "core.structs", "core.inner")
+                                      "ties", "input_limits", "core.library", "core.structs", "core.inner")
 }  # fmt: skip
 RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it may import at its top what is heavy."""

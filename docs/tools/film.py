@@ -18,7 +18,7 @@ from quadsim.flight.rundir import Run
 from quadsim.palette import ON_DARK
 from quadsim.report.figure import bounds_of
 from quadsim.report.film import painter as ink
-from quadsim.report.film.frames import Footage, MarginTrack, Shot, make_footage
+from quadsim.report.film.frames import Footage, MarginTrack, Shot, make_footage, ranked_tracks
 from quadsim.report.film.painter import Painter
 from quadsim.report.film.video import rendering_backend
 from quadsim.state import Array
@@ -47,7 +47,7 @@ def panels(run: Run, title: str, shot: Shot) -> Iterator[Image.Image]:
     from quadsim.report.film.render_worker import FilmStage
 
     footage = make_footage(run, shot.times)
-    nearest = sorted(footage.margins, key=lambda track: track.rank)[:MOST_ROWS]
+    nearest = ranked_tracks(footage.margins)[:MOST_ROWS]
     tracks = [track for track in footage.margins if track in nearest]
     plot_top = HEAD + shot.height + GAP
     rows_top = plot_top + PLOT + GAP

@@ -18,8 +18,9 @@ from library import FILMS as NAMES
 from quadsim.errors import RenderingUnavailableError
 from quadsim.flight.rundir import Run
 from quadsim.palette import COLOUR
-from quadsim.report.film.frames import Shot, make_footage, thin
+from quadsim.report.film.frames import Shot, make_footage, ranked_tracks, thin
 from quadsim.state import Array
+from quadsim.ties import first_smallest
 
 DOCS: Final = Path(__file__).resolve().parents[1]
 THUMBNAILS, FILMS, FILES = DOCS / "assets" / "gallery", DOCS / "films", DOCS / "scenarios"
@@ -75,8 +76,9 @@ def poster(name: str) -> None:
     """What a film shows before it plays: the instant at which the nearest constraint is nearest."""
     run, title, shot = take(name, POSTER_FPS)
     tracks = [track for track in make_footage(run, shot.times).margins if track.limit.signal not in ("speed", "slew")]
-    nearest = min(tracks, key=lambda track: track.rank)
-    picture = next(islice(film.panels(run, title, shot), int(np.nanargmin(nearest.now)), None))
+    nearest = ranked_tracks(tracks)[0]
+    margins = np.where(np.isnan(nearest.now), np.inf, nearest.now)
+    picture = next(islice(film.panels(run, title, shot), first_smallest(margins, nearest.limit.tie), None))
     picture.save(THUMBNAILS / f"{name}.jpg", quality=80, optimize=True)
 
 

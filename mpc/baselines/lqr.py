@@ -14,9 +14,10 @@ from mpc.allocation import allocate, make_allocation
 from mpc.baselines.law import Baseline, FeedbackLaw
 from mpc.bounded import InputWeights, law_of, objective_of, require_states
 from mpc.heading import turn_horizontally
-from mpc.model import LinearModel, continuous_model, discretise, hover_model, lqr
+from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.obstacles import Shape
 from mpc.ocp import Objective
+from mpc.regulator import stabilising
 from quadsim.controller import Command, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
@@ -72,16 +73,13 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
     Raises:
         ParameterError: no such gain exists, for example because an unstable state has no weight.
     """
-    Q = objective.C_r.T @ objective.Q_y @ objective.C_r
     try:
-        K = lqr(model.A, model.B, Q, objective.Q_u)
-        stable = float(np.abs(np.linalg.eigvals(model.A - model.B @ K)).max()) < 1.0
-    except (np.linalg.LinAlgError, ValueError):
-        stable = False
-    if not stable:
-        rule = "such that every unweighted state comes to rest: weigh x, y, z and yaw"
+        _, K = stabilising(model.A, model.B, objective.C_r, objective.Q_y, objective.Q_u)
+    except ValueError as error:
+        rule = f"such that every unweighted state comes to rest: weigh x, y, z and yaw; {error}"
+        Q = objective.C_r.T @ objective.Q_y @ objective.C_r
         weights = {name: float(weight) for name, weight in zip(STATE_NAMES, Q.diagonal(), strict=True) if weight}
-        raise ParameterError("controller", "output_weights", weights, rule)
+        raise ParameterError("controller", "output_weights", weights, rule) from error
     return read_only(K)
 
 

@@ -23,7 +23,8 @@ import numpy as np
 from mpc.answer import ActuatorBounds
 from mpc.equilibrium import Trim
 from mpc.heading import anchored, slope, turn_horizontally
-from mpc.model import LinearModel, lqr
+from mpc.model import LinearModel
+from mpc.regulator import lqr
 from quadsim.state import INDEX, POSITION, VELOCITY, Array, by_group, read_only
 from quadsim.vehicle import N_ROTORS
 

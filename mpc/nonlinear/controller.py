@@ -96,6 +96,11 @@ further steps keep: that way a stiff soft bound on tilt and unfiltered steps of 
 TILT_SIDES: Final = 12
 """Sides of the polygon that a tilt bound imposes on the thrust axis's horizontal part, inside the circle; it costs up
 to 3.4 % of the bound's sine."""
+_HOVER_STATES: Final = (
+    *("x", "y", "z", "attitude x", "attitude y", "attitude z", "vx", "vy", "vz"),
+    *("body rate x", "body rate y", "body rate z", "rotor 1", "rotor 2", "rotor 3", "rotor 4"),
+)
+"""States of the model near hover: the quaternion's vector part is the attitude."""
 _OPTIMA: Final = {SQPStatus.FREE, SQPStatus.BOUNDED, SQPStatus.UNCONVERGED}
 
 
@@ -329,7 +334,7 @@ class NonlinearMPC:
             reduced = replace(reduced, C_r=reduced.C_r[rows], Q_y=objective.Q_y[np.ix_(rows, rows)])
         part = replace(linear, A=linear.A[np.ix_(others, others)], B=linear.B[others])
         P = np.zeros((linear.n, linear.n))
-        P[np.ix_(others, others)] = lqr_terminal_weight(part, reduced)
+        P[np.ix_(others, others)] = lqr_terminal_weight(part, reduced, _HOVER_STATES)
         return P
 
     def reset(self, speeds: Array) -> None:

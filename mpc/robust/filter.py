@@ -29,9 +29,9 @@ from mpc.equilibrium import Trim
 from mpc.ocp import Objective, Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QPRows
+from mpc.regulator import observed
 from mpc.robust.controller import RobustPreparation
 from mpc.robust.settings import Robust
-from mpc.robust.tightening import observed
 from mpc.solvers import INVALID_DATA, Answer
 from mpc.solvers.piqp import Piqp
 from quadsim.controller import ACCEPTED, GROUNDED, UNCONSTRAINED, Command, StepInputs, stopped

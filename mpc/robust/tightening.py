@@ -33,10 +33,12 @@ import scipy.linalg
 from annotated_types import doc
 
 from mpc.constraints import Bounds
-from mpc.model import SHORTEST_LAG, continuous_model, discretise, lqr
+from mpc.model import SHORTEST_LAG, continuous_model, discretise
+from mpc.regulator import lqr, observed
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.state import INDEX, N_STATES, POSITION, Array, read_only
+from quadsim.ties import first_smallest
 from quadsim.vehicle import Vehicle
 
 LARGEST_SHARE: Final = 0.5  # largest part of the half-width of an output's bounds to give up
@@ -106,15 +108,18 @@ def margins(
     margins = growth(A, B, C, E, K, period=period, horizon=horizon, delay=delay)
     passed = between_samples(settings.turning, period)
     margins += passed
-    worst = int(np.argmax(np.round(margins[-1] / half_band, 9)))  # the first of equal ones
-    if margins[-1, worst] > LARGEST_SHARE * half_band[worst]:
+    shares = margins[-1] / half_band
+    too_large = np.flatnonzero(shares > LARGEST_SHARE)
+    if too_large.size:
+        worst = int(too_large[first_smallest(-shares[too_large])])
         turned = growth(A, B, C, E * _TURNS, K, period=period, horizon=horizon, delay=delay)[-1, worst]
-        shares = {
+        causes = {
             "acceleration": margins[-1, worst] - turned - passed,
             "angular_acceleration": turned,
             "turning": passed,
         }
-        most = max(shares, key=lambda name: float(shares[name]))
+        sizes = np.array([*causes.values()]) / half_band[worst]
+        most = [*causes][first_smallest(-sizes)]
         output = bounds.output(worst)
         name, scale, unit = output.name, output.factor, output.unit
         rule = (
@@ -198,19 +203,6 @@ def disturbed_model(vehicle: Vehicle, rotor_lag: float) -> tuple[Array, Array, A
     E = np.zeros((len(A), len(_ACCELERATED)))
     E[_ACCELERATED, range(len(_ACCELERATED))] = 1.0
     return A, B, E
-
-
-def observed(A: Array, C: Array) -> Array:
-    """(n, r) orthonormal basis of the states observed through C x, the row space of [C; C A; ...]."""
-    basis = scipy.linalg.orth(C.T)
-    while True:
-        # Normalised, so that directions and not magnitudes determine the rank.
-        further = basis @ (basis.T @ A.T @ basis) - A.T @ basis
-        size = np.linalg.norm(further, axis=0)
-        new = further[:, size > 1e-9 * np.linalg.norm(A)]
-        if new.size == 0:
-            return np.asarray(basis)
-        basis = scipy.linalg.orth(np.hstack([basis, new / np.linalg.norm(new, axis=0)]), rcond=1e-9)
 
 
 def correction(A: Array, B: Array, C: Array, size: float) -> Array:

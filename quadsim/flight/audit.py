@@ -37,6 +37,7 @@ from quadsim.state import (
     shown_unit,
     tilt,
 )
+from quadsim.ties import TIE_SHARE, first_smallest, tied
 from quadsim.vehicle import N_ROTORS
 
 Mask = NDArray[np.bool_]
@@ -257,6 +258,11 @@ class Limit:
         return abs(self.lower if math.isfinite(self.lower) else self.upper) or 1.0
 
     @property
+    def tie(self) -> float:
+        """Window within which margins are tied, in the limit's unit; see `quadsim.ties`."""
+        return TIE_SHARE * self.half_band
+
+    @property
     def tolerances(self) -> tuple[float, float]:
         """Violations accepted at the physics rate and at the control samples, stated or by default.
 
@@ -327,11 +333,11 @@ class Finding:
     """The audit's result for one limit; margins and peaks in the limit's unit."""
 
     limit: Limit  # the limit audited
-    peak_sampled: float  # value closest to (or furthest beyond) a bound at the control samples
+    peak_sampled: float  # value closest to (or furthest beyond) a bound at the control samples, of the first such bound
     peak_plant: float  # the same at the physics rate; NaN for signals that exist only at samples
     worst_margin_sampled: float  # smallest signed margin at the control samples
     worst_margin: float  # smallest signed margin at the physics rate, or at the samples if the signal exists only there
-    worst_time: float  # time of the smallest margin [s]
+    worst_time: float  # first time at which the margin is within `Limit.tie` of the smallest [s]
     time_violated: float  # time spent beyond bound plus tolerance [s]
 
     @property
@@ -377,18 +383,32 @@ class Finding:
 
 
 def worst_finding(findings: Iterable[Finding]) -> Finding | None:
-    """Return the finding with the smallest margin as a share of half its band, ties by name; None if none counts.
+    """Return the finding with the smallest margin as a share of half its band; None if none counts.
 
     Limits that were not reached do not count, and limits of the commands only once they are violated: a command at its
-    own bound is no near miss.  Of the others the required ones count, or all if none is required.  Shares are compared
-    to six decimals, so that no machine's rounding decides.
+    own bound is no near miss.  Of the others the required ones count, or all if none is required.  Of findings whose
+    shares are tied (`quadsim.ties`), the violated ones come first, then the first in order.
     """
+    counted = _counted(findings)
+    if not counted:
+        return None
+    nearest = [counted[i] for i in tied([finding.share for finding in counted])]
+    violated = [finding for finding in nearest if finding.verdict == "violated"]
+    return (violated or nearest)[0]
+
+
+def worst_share(findings: Iterable[Finding]) -> float | None:
+    """Return the smallest margin as a share of half its band, of the findings that count for `worst_finding`."""
+    return min((finding.share for finding in _counted(findings)), default=None)
+
+
+def _counted(findings: Iterable[Finding]) -> list[Finding]:
+    """Return the findings that count for `worst_finding`, in order."""
     reached = [finding for finding in findings if math.isfinite(finding.margin)]
     counted = [
         finding for finding in reached if finding.verdict == "violated" or finding.limit.signal not in COMMAND_SIGNALS
     ]
-    required = [finding for finding in counted if finding.limit.required] or counted
-    return min(required, key=lambda finding: (round(finding.share, 6), finding.limit.name), default=None)
+    return [finding for finding in counted if finding.limit.required] or counted
 
 
 def flight_verdict(findings: Sequence[Finding], *, aborted: bool, lost: bool, failed: bool) -> FlightVerdict:
@@ -486,13 +506,22 @@ def _find(log: FlightLog, limit: Limit) -> Finding:
 
 
 def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
-    """Return value, margin and time of the smallest margin; NaN if the window is empty."""
+    """Return value, margin and time of the smallest margin; NaN if the window is empty.
+
+    Of tied instants (`Limit.tie`) the first gives the time, and the bound and rotor whose extreme is the value.
+    """
     inside = limit.holds_at(t)
     if limit.signal == "thrust":  # which has no target on the ground
         inside &= np.isfinite(values)
     if not inside.any():
         return math.nan, math.nan, math.nan
-    t, columns = t[inside], values[inside].reshape(np.count_nonzero(inside), -1)
-    row = int(np.argmin(limit.margin(columns)))
-    column = int(np.argmin(np.minimum(columns[row] - limit.lower, limit.upper - columns[row])))
-    return float(columns[row, column]), float(limit.margin(columns)[row]), float(t[row])
+    columns = values[inside].reshape(np.count_nonzero(inside), -1)
+    margins = limit.margin(columns)
+    smallest = margins.min()
+    row = first_smallest(margins, limit.tie)
+    distances = np.stack([limit.upper - columns[row], columns[row] - limit.lower])
+    first = first_smallest([*distances.ravel(), smallest], limit.tie)  # one of the distances: some are tied with it
+    side, column = np.unravel_index(first, distances.shape)
+    nearest = columns[:, column]
+    value = nearest.max() if side == 0 else nearest.min()
+    return float(value), float(smallest), float(t[inside][row])

@@ -20,6 +20,7 @@ from quadsim.flight.rundir import findings_of
 from quadsim.report.table import ABSENT, Cell, Mark, QuantityRow, format_number, short_number
 from quadsim.space import Obstacle
 from quadsim.state import VELOCITY
+from quadsim.ties import TIE_SHARE, tied
 
 if TYPE_CHECKING:
     from quadsim.flight.rundir import Run
@@ -145,7 +146,7 @@ def _who_is_closer(runs: Sequence[Run], names: Sequence[str]) -> str | None:
         return None
     (first, (least, _)), (_, (second, _)), *_ = sorted(errors.items(), key=lambda entry: entry[1][0])
     shown, other = map(_metres, (least, second))
-    if shown == other:
+    if shown == other or len(tied([least, second], TIE_SHARE * second)) > 1:
         return f"position errors are equal: {shown} RMS"
     closer, whose = ("closer", "") if len(errors) == 2 else ("closest", " of the next")
     less = 100.0 * (1.0 - least / second)

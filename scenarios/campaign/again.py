@@ -11,7 +11,7 @@ import pyarrow as pa
 from quadsim.errors import InputError
 from quadsim.flight.audit import Limit, limit_differences
 from scenarios.campaign.events import HARMLESS, INCOMPLETE, CountedEvent
-from scenarios.campaign.rows import MARGIN, SAMPLED, SATISFIED, TIME_VIOLATED, flags, numbers, texts
+from scenarios.campaign.rows import MARGIN, SAMPLED, SATISFIED, TIME_VIOLATED, flags, null, numbers, texts
 
 
 def judged_by(
@@ -40,7 +40,7 @@ def judged_by(
     held_all = np.ones(table.num_rows, bool)
     for limit in limits:
         margin, sampled = numbers(table, MARGIN + limit.name), numbers(table, SAMPLED + limit.name)
-        unknown = np.array([value is None for value in table[SATISFIED + limit.name].to_pylist()], bool)
+        unknown = null(table, SATISFIED + limit.name)
         held = ~unknown & np.isfinite(margin) & ~limit.violated(margin) & ~limit.violated(sampled, sampled=True)
         table = _put(table, SATISFIED + limit.name, pa.array(held.tolist(), mask=unknown))
         table = table.drop_columns([TIME_VIOLATED + limit.name])
@@ -48,7 +48,7 @@ def judged_by(
     verdict = texts(table, "verdict")
     judged = np.isin(verdict.astype(str), (HARMLESS, "violated", INCOMPLETE))
     failed_by = np.array([value is not None for value in table["failed_by"].to_pylist()], bool)
-    reached = np.all([~_null(table, SATISFIED + limit.name) | (not limit.required) for limit in limits], axis=0)
+    reached = np.all([~null(table, SATISFIED + limit.name) | (not limit.required) for limit in limits], axis=0)
     new = np.where(failed_by | ~held_all, "violated", np.where(reached, HARMLESS, INCOMPLETE))
     verdicts = np.where(judged, new, verdict)
     violated = np.where(judged, verdicts == "violated", flags(table, "violated", absent=True))
@@ -61,10 +61,6 @@ def _alike(limit: Limit, other: Limit) -> Limit:
     """Return a limit with the tolerances and demand of another."""
     tolerance, sampled = other.tolerances
     return replace(limit, tolerance=tolerance, tolerance_sampled=sampled, required=other.required)
-
-
-def _null(table: pa.Table, column: str) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    return np.array([value is None for value in table[column].to_pylist()], bool)
 
 
 def _put(table: pa.Table, name: str, values: pa.Array) -> pa.Table:

@@ -159,7 +159,8 @@ def fly_campaign(
 
         table = progress.store.close(progress.wanted)
         spec, directory = plan.spec, files.path
-        summary = {"campaign": spec.name, "scenario": plan.scenario.name, "failure": [*spec.failure], **estimate(table)}
+        about = {"campaign": spec.name, "scenario": plan.scenario.name, "failure": [*spec.failure]}
+        summary = about | estimate(table, plan.limits)
         # flights by the processor that flew them; those that raised, or that no process came back from, have none
         processors = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
         manifest["machines"] = dict(sorted(Counter(processors).items()))

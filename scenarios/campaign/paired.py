@@ -31,9 +31,10 @@ from scenarios.campaign.rows import (
     constraint_names,
     draw_names,
     failure_of,
-    flags,
     is_counted,
+    not_held,
     numbers,
+    reached,
     texts,
     unit_of,
 )
@@ -84,7 +85,7 @@ class EventComparison:
 
     @property
     def pairs(self) -> int:
-        """Number of pairs."""
+        """Number of pairs; of a constraint, those of which both flights count for it (`rows.reached`)."""
         return self.both + self.only_a + self.only_b + self.neither
 
 
@@ -310,13 +311,16 @@ def _compare_events(a: pa.Table, b: pa.Table, *, audited_alike: bool) -> tuple[E
     """Every event with its test, corrected for all of them but those that no flight of a pair had alone.
 
     These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).  Events
-    that depend on the audit are left out unless both campaigns were audited alike.
+    that depend on the audit are left out unless both campaigns were audited alike.  A constraint is compared over the
+    pairs of which both flights count for it (`rows.reached`), and left out where there is none.
     """
     left_out = () if audited_alike else (*_BY_AUDIT, *([FAILURE.text] if any(map(_by_audit, failure_of(a))) else []))
     names = [name for name in EVENT_NAMES if name not in left_out]
     happened = {name: [parse_event(name).column(table) for table in (a, b)] for name in names}
     for name in constraint_names(a) if audited_alike else ():
-        happened[f"{name} not held"] = [~flags(table, SATISFIED + name, absent=False) for table in (a, b)]
+        both = reached(a, name) & reached(b, name)
+        if both.any():
+            happened[f"{name} not held"] = [not_held(table, name)[both] for table in (a, b)]
     alone = {event: (int((in_a & ~in_b).sum()), int((in_b & ~in_a).sum())) for event, (in_a, in_b) in happened.items()}
     p = {event: mcnemar(*counts) for event, counts in alone.items()}
     tested = [event for event, counts in alone.items() if any(counts)]
@@ -330,7 +334,7 @@ def _compare_events(a: pa.Table, b: pa.Table, *, audited_alike: bool) -> tuple[E
             neither=int((~in_a & ~in_b).sum()),
             p=p[event],
             p_holm=corrected.get(event, 1.0),
-            difference=(alone[event][1] - alone[event][0]) / a.num_rows,
+            difference=(alone[event][1] - alone[event][0]) / in_a.size,
         )
         for event, (in_a, in_b) in happened.items()
     )
@@ -370,8 +374,9 @@ def _event_table(comparison: PairedComparison) -> Grid:
         title="Events",
         head=("event", a, b, f"{a} alone", f"{b} alone", "both", "p", "after Holm"),
         lines=tuple(lines),
-        note="p: McNemar's exact test, two-sided, of each event by itself; the verdict is by that of failure. After "
-        "Holm: corrected for all events that one flight of a pair alone had; bold: beyond chance at "
+        note="Shares are of all pairs; of a constraint not held, of those of which both flights reached it or were "
+        "lost before it. p: McNemar's exact test, two-sided, of each event by itself; the verdict is by that of "
+        "failure. After Holm: corrected for all events that one flight of a pair alone had; bold: beyond chance at "
         f"{100.0 * ALPHA:g} %.",
     )
 

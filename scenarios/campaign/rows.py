@@ -17,7 +17,7 @@ import pyarrow as pa
 from quadsim.controller import ACCEPTED, NO_SOLVER, Phase
 from quadsim.errors import FileError
 from quadsim.flight import metrics
-from quadsim.flight.audit import Finding, Limit, worst_finding
+from quadsim.flight.audit import Finding, Limit, worst_finding, worst_share
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FORMAT, read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
@@ -111,7 +111,7 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
         unknown = finding.verdict == "incomplete" and verdict != "lost"  # a lost flight had to get there
         row[SATISFIED + name] = None if unknown else finding.satisfied
     if (worst := worst_finding(findings)) is not None:
-        row["worst_margin"], row["worst_constraint"] = worst.share, worst.limit.name
+        row["worst_margin"], row["worst_constraint"] = worst_share(findings), worst.limit.name
     return row | (_numbers(log) if log.control.t.size else {})
 
 
@@ -180,6 +180,25 @@ def numbers(table: pa.Table, name: str) -> Array:
 def flags(table: pa.Table, name: str, *, absent: bool) -> FlightFlags:
     """(K,) a column of truth values, with `absent` where a flight has none."""
     return np.array(table[name].fill_null(absent).to_pylist(), bool)
+
+
+def null(table: pa.Table, name: str) -> FlightFlags:
+    """(K,) which flights have no value in a column."""
+    return np.array(table[name].is_null().to_pylist(), bool)
+
+
+def reached(table: pa.Table, name: str) -> FlightFlags:
+    """(K,) which flights count for a constraint: all but those that ended well before its time window.
+
+    Lost flights and those that raised an error or met a limit had to get there, so they count: they did not hold it.
+    """
+    had_to = ~np.isin(texts(table, "verdict").astype(str), (HARMLESS, INCOMPLETE, UNAUDITED, "violated"))
+    return np.asarray(~null(table, SATISFIED + name) | had_to, bool)
+
+
+def not_held(table: pa.Table, name: str) -> FlightFlags:
+    """(K,) which flights did not hold a constraint, of those that count for it; see `reached`."""
+    return reached(table, name) & ~flags(table, SATISFIED + name, absent=False)
 
 
 def texts(table: pa.Table, name: str) -> Texts:

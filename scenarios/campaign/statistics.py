@@ -20,12 +20,12 @@ import scipy
 from numpy.typing import ArrayLike
 
 from quadsim.errors import InputError, ParameterError
-from quadsim.flight.audit import UNAUDITED_ADVICE
+from quadsim.flight.audit import UNAUDITED_ADVICE, Limit
 from quadsim.report.table import ABSENT
-from quadsim.state import Array
+from quadsim.state import Array, Indices
+from quadsim.ties import TIE_SHARE, first_smallest, in_order
 from scenarios.campaign.events import (
     EVENT_NAMES,
-    INCOMPLETE,
     OPERATIONS,
     VERDICTS,
     CountedEvent,
@@ -35,7 +35,6 @@ from scenarios.campaign.events import (
 from scenarios.campaign.rows import (
     DRAW,
     MARGIN,
-    SATISFIED,
     CampaignSummary,
     constraint_names,
     draw_names,
@@ -43,7 +42,9 @@ from scenarios.campaign.rows import (
     is_counted,
     is_number,
     metric_names,
+    not_held,
     numbers,
+    reached,
     texts,
     unaudited,
     unit_of,
@@ -212,8 +213,11 @@ _GROUPS: Final = ((50, 5), (12, 3))
 """Numbers of flights from which a varied parameter is split into this many groups of about equal size."""
 
 
-def estimate(table: pa.Table) -> dict[str, Any]:
+def estimate(table: pa.Table, limits: Sequence[Limit] = ()) -> dict[str, Any]:
     """Return the part of a campaign's summary about its flights, as plain data for JSON.
+
+    `limits` are those of the audit: of flights whose worst margins of one are tied (`Limit.tie`), the first counts as
+    the worst; of limits that are absent, only equal margins are tied.
 
     Keys: `flights`; `confidence` of every interval; `verdicts`, flights of each; `events` and `constraints`, by name,
     as `proportion`, a constraint's being that it did not hold, among the flights that reached it or were lost before;
@@ -223,6 +227,7 @@ def estimate(table: pa.Table) -> dict[str, Any]:
     Incomplete and unaudited flights are neither failures nor successes (`rows.is_counted`): the shares of failure and
     violation, and `parameters`, leave them out.
     """
+    ties = {limit.name: limit.tie for limit in limits}
     return {
         "flights": table.num_rows,
         "confidence": CONFIDENCE,
@@ -232,7 +237,7 @@ def estimate(table: pa.Table) -> dict[str, Any]:
             for event in map(parse_event, EVENT_NAMES)
         },
         "metrics": {name: _metric(table, name) for name in metric_names(table)},
-        "constraints": {name: _constraint(table, name) for name in constraint_names(table)},
+        "constraints": {name: _constraint(table, name, ties.get(name, 0.0)) for name in constraint_names(table)},
         "parameters": parameters(table.filter(is_counted(table, FAILURE))),
         "worst": [_flight(table, int(i)) for i in ranking(table)[:WORST_FLIGHTS]],
     }
@@ -249,25 +254,30 @@ def worst_flight(table: pa.Table) -> int:
     return int(table["flight"][int(ranking(table)[0])].as_py())
 
 
-def ranking(table: pa.Table) -> np.ndarray[Any, np.dtype[np.intp]]:
+def ranking(table: pa.Table) -> Indices:
     """(K,) rows of the table, from the worst flight on.
 
     By verdict (`Verdict.badness`); of one verdict, failed ones come first, then the smaller worst margin.  Flights
-    without a margin come after those with one, by their RMS error in position, the largest first.  What is still equal
-    is in the order of the flights' numbers.
+    without a margin come after those with one, by their RMS error in position, the largest first.  Margins that are
+    tied, and errors that differ by a share of `TIE_SHARE` at most, are in the order of the flights' numbers.
     """
     badness = np.array([VERDICTS[name].badness for name in texts(table, "verdict")], int)
+    failed = flags(table, "failed", absent=True)
     margin = numbers(table, "worst_margin")
     errors = np.stack([np.nan_to_num(numbers(table, f"rmse.{axis}")) for axis in "xyz"])
-    distance = np.where(np.isnan(margin), np.linalg.norm(errors, axis=0), 0.0)
-    keys = (
-        numbers(table, "flight"),
-        -distance,
-        np.where(np.isnan(margin), np.inf, margin),
-        ~flags(table, "failed", absent=True),
-        -badness,
-    )
-    return np.lexsort(keys)
+    distance = np.linalg.norm(errors, axis=0)
+    missing = np.isnan(margin)
+    score = np.where(missing, -distance, margin)  # the smaller, the worse
+    groups: dict[tuple[int, bool, bool], list[int]] = {}
+    for row in np.argsort(numbers(table, "flight"), kind="stable").tolist():
+        kind = (-int(badness[row]), not failed[row], bool(missing[row]))
+        groups.setdefault(kind, []).append(row)
+    ranked: list[int] = []
+    for kind, members in sorted(groups.items()):
+        rows = np.array(members)
+        window = TIE_SHARE * float(distance[rows].max()) if kind[2] else TIE_SHARE
+        ranked.extend(rows[in_order(score[rows], window)].tolist())
+    return np.array(ranked, int)
 
 
 def _metric(table: pa.Table, name: str) -> dict[str, Any]:
@@ -284,18 +294,20 @@ def _metric(table: pa.Table, name: str) -> dict[str, Any]:
     }
 
 
-def _constraint(table: pa.Table, name: str) -> dict[str, Any]:
+def _constraint(table: pa.Table, name: str, tie: float) -> dict[str, Any]:
     margin = numbers(table, MARGIN + name)
-    held = flags(table, SATISFIED + name, absent=False)
-    unknown = [value is None for value in table[SATISFIED + name].to_pylist()]
-    reached = ~(np.array(unknown, bool) & np.isin(texts(table, "verdict").astype(str), (INCOMPLETE, "violated")))
-    worst = int(np.nanargmin(margin)) if np.isfinite(margin).any() else None
-    return {
+    about: dict[str, Any] = {
         "unit": unit_of(table, MARGIN + name),
-        "not_satisfied": share_of(~held[reached]),
-        "worst_margin": None if worst is None else float(margin[worst]),
-        "worst_flight": None if worst is None else table["flight"][worst].as_py(),
+        "not_satisfied": share_of(not_held(table, name)[reached(table, name)]),
+        "worst_margin": None,
+        "worst_flight": None,
     }
+    there = np.flatnonzero(np.isfinite(margin))
+    if there.size:
+        worst = int(there[first_smallest(margin[there], tie)])
+        about["worst_margin"] = float(margin[there].min())
+        about["worst_flight"] = table["flight"][worst].as_py()
+    return about
 
 
 def _flight(table: pa.Table, row: int) -> dict[str, Any]:
@@ -328,8 +340,8 @@ def parameters(table: pa.Table) -> dict[str, Any]:
             continue
         values = numbers(table, DRAW + name)
         outcomes[name] = {"kind": "number", "unit": unit_of(table, DRAW + name)}
-        for outcome, reached in (("worst_margin", margin), ("failed", failed.astype(float))):
-            related = dependence(values, reached, np.random.default_rng(0))  # the same every time
+        for outcome, measured in (("worst_margin", margin), ("failed", failed.astype(float))):
+            related = dependence(values, measured, np.random.default_rng(0))  # the same every time
             outcomes[name][outcome] = None if related is None else asdict(related)
             tested += [] if related is None else [outcomes[name][outcome]]
         outcomes[name]["groups"] = _groups(values, failed)

@@ -19,6 +19,7 @@ from pydantic import StringConstraints
 from quadsim.errors import FileError
 from quadsim.input_limits import LARGEST_CSV
 from quadsim.state import Array, unwrapped
+from quadsim.ties import TIE_SHARE, first_smallest
 from scenarios.courses.course import EXACT, Course, Path, Started, begin
 from scenarios.courses.legs import polyline
 
@@ -189,7 +190,7 @@ def _speed_notes(path: FilePath, t: Array, positions: Array) -> Iterator[str]:
     """Yield a note on positions (n, 3) [m] that move too fast on average; refuse what cannot be meant."""
     lengths = np.abs(np.diff(positions, axis=0)).sum(axis=0)
     speed = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum() / (t[-1] - t[0]))
-    column = "xyz"[int(np.argmax(lengths))]
+    column = "xyz"[first_smallest(-lengths, TIE_SHARE * float(lengths.max()))]
     if speed > FASTEST:
         rule = f"column {column}: must not make the course faster than {FASTEST:g} m/s on average; got {speed:.4g}"
         raise FileError(path, f"{rule} (if it is in mm instead of m, {speed / MILLIMETRES:.4g} m/s)")

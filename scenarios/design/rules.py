@@ -34,6 +34,7 @@ import scipy.linalg
 from mpc.model import continuous_model, discretise
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
+from quadsim.ties import TIE_SHARE, first_smallest
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.design.authority import Authority, authority
 
@@ -95,7 +96,7 @@ def design_for(vehicle: Vehicle, tilt: float | None = None) -> Design:
     can = authority(vehicle)
     if min(can.climb, can.sink, *can.turning) < LEAST_RESERVE:
         rule = f"further from its hover speed, {vehicle.hover_speed:.4g} rad/s, or nothing is left to control it with"
-        side = "speed_max" if can.climb <= can.sink else "speed_min"
+        side = ("speed_max", "speed_min")[first_smallest([can.climb, can.sink], TIE_SHARE * vehicle.gravity)]
         raise ParameterError("vehicle", side, getattr(vehicle, side), rule)
     bound = _tilt_bound(can) if tilt is None else _stated_tilt(can, tilt)
     bandwidth, limited_by, period = _bandwidth(can, bound)
@@ -155,10 +156,11 @@ def _bandwidth(can: Authority, tilt: float) -> tuple[float, Literal["lag", "torq
             "torque": 0.5 * math.sqrt(min(can.turning[:2]) / tilt),
             "period": FASTEST_LOOP,
         }
-        limited_by = min(limits, key=lambda name: limits[name])
-        if limits[limited_by] * period <= PERIOD_SHARE:
+        bandwidth = min(limits.values())
+        if bandwidth * period <= PERIOD_SHARE:
             break
-    return limits[limited_by], limited_by, period
+    limited_by = [*limits][first_smallest([*limits.values()], TIE_SHARE * bandwidth)]
+    return bandwidth, limited_by, period
 
 
 def _reached(period: float, lag: float | None) -> float:

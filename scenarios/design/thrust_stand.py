@@ -20,6 +20,7 @@ import tomlkit
 
 from quadsim.errors import FileError
 from quadsim.state import Array
+from quadsim.ties import TIE_SHARE, first_smallest
 
 _GRAM: Final = 9.80665e-3  # [N]
 _UNITS: Final[dict[str, dict[str, float]]] = {
@@ -184,7 +185,7 @@ def _error(path: Path, name: str, measured: Array, fitted: Array, law: str) -> f
     """RMS of what is left of a column over its largest value."""
     error = float(np.sqrt(np.square(measured - fitted).mean()) / measured.max())
     if error > _WORST:
-        worst = int(np.abs(measured - fitted).argmax())
+        worst = first_smallest(-np.abs(measured - fitted), TIE_SHARE * float(measured.max()))
         pair = f"{measured[worst]:.4g} measured and {fitted[worst]:.4g} fitted"
         what = f"{name} does not follow {law}: {error:.0%} of the largest is left (RMS), at most {_WORST:.0%} may be"
         raise FileError(path, f"{what}; worst is row {worst + 2}, {pair}. Tare the stand, look for another unit")

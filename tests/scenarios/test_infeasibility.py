@@ -205,6 +205,15 @@ def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, 
             assert query_case(file, case, *changed).status in ACCEPTED, changed
 
 
+@pytest.mark.parametrize("noise", [-3e-6, 0.0, 3e-6])
+def test_bounds_that_give_way_alike_stand_in_the_order_of_the_file(noise: float, file: str) -> None:
+    """As far beyond the bound on roll as on pitch, but for rounding."""
+    bound = math.radians(5.0)
+    state = make_state(euler=(1.2 * bound, (1.2 + noise) * bound, 0.0))
+    entries = [entry for entry in query_case(file, Case(state=state)).found["conflict"] if entry["by"]]
+    assert [(entry["name"], entry["side"]) for entry in entries] == [("roll", "upper"), ("pitch", "upper")]
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_a_little_less_than_the_smallest_bound_is_not_enough(name: str, file: str) -> None:
     """The suggestion is rounded up by a hundredth of the change at most."""

@@ -16,7 +16,7 @@ from quadsim.flight.rundir import Run
 from quadsim.palette import ON_DARK
 from quadsim.report.comparison import failure_sentences
 from quadsim.report.film import painter as ink
-from quadsim.report.film.frames import Footage, MarginTrack
+from quadsim.report.film.frames import Footage, MarginTrack, ranked_tracks
 from quadsim.report.film.painter import Painter, Picture, shade, text_width
 from quadsim.report.table import ABSENT
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
@@ -52,7 +52,7 @@ class Overlay:
         controller = run.summary.get("controller", {})
         self._subtitle = law_name(controller.get("name", ""))
         self._grounded = any(phase != Phase.FLYING for phase in run.log.control.phase)
-        self._ranked = sorted(footage.margins, key=lambda track: track.rank)  # fixed, so that rows keep their place
+        self._ranked = ranked_tracks(footage.margins)  # fixed, so that rows keep their place
 
     def draw(self, frame: Picture, i: int) -> Picture:
         """Frame `i` (height, width, 3) with its captions; `frame` itself is changed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -12,6 +13,7 @@ from quadsim.flight.audit import Limit, Mask, margins_at, margins_sampled
 from quadsim.flight.rundir import Run
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import EULER, POSITION, Array, tilt
+from quadsim.ties import in_order
 
 _CAMERA_MEMORY: Final = 0.7  # time constant [s] of the camera's smoothing, forward and backward
 _LEASH: Final = 0.6  # how far the camera's aim may be from the vehicle, in arm lengths per axis
@@ -49,11 +51,23 @@ class MarginTrack:
     violated_before: Mask  # (F,) whether it is or has been violated
     share: float  # smallest margin of the whole flight as a share of half the band; inf if it never applies
 
-    @property
-    def rank(self) -> tuple[bool, bool, float]:
-        """Sorts the limits of a flight: required ones that are violated, others that are, then the nearest first."""
-        violated = bool(self.violated_before[-1:].any())
-        return not violated, violated and not self.limit.required, self.share
+
+def ranked_tracks(tracks: Iterable[MarginTrack]) -> list[MarginTrack]:
+    """Return tracks in order: limits that are violated, the required ones first, then the others.
+
+    In each group the nearest come first, and those whose shares are tied (`quadsim.ties`) in the order of the tracks.
+    """
+    required: list[MarginTrack] = []
+    reported: list[MarginTrack] = []
+    held: list[MarginTrack] = []
+    for track in tracks:
+        if not track.violated_before[-1:].any():
+            held.append(track)
+        elif track.limit.required:
+            required.append(track)
+        else:
+            reported.append(track)
+    return [group[i] for group in (required, reported, held) for i in in_order([track.share for track in group])]
 
 
 @dataclass(frozen=True, kw_only=True)

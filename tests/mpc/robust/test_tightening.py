@@ -19,6 +19,7 @@ from mpc.linear import LinearMPC
 from mpc.model import discretise
 from mpc.nonlinear.model import next_state, nonlinear_model
 from mpc.observer import ObserverSettings
+from mpc.regulator import observed
 from mpc.robust.tightening import (
     ERROR_SHARE,
     SPEED_SHARE,
@@ -28,7 +29,6 @@ from mpc.robust.tightening import (
     disturbed_model,
     growth,
     margins,
-    observed,
 )
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.errors import ParameterError
@@ -257,6 +257,14 @@ def test_disturbances_too_large_for_the_bounds_are_refused(vehicle: Vehicle, nam
     )
     with pytest.raises(ParameterError, match=rule):
         tilt_margins(vehicle, TighteningSettings(**{name: given}))
+
+
+@pytest.mark.parametrize("noise", [-3e-6, 0.0, 3e-6])
+def test_of_outputs_as_narrow_as_each_other_the_first_is_named(vehicle: Vehicle, noise: float) -> None:
+    narrow = replace(tilt_bounds(), y_max=np.array([LIMIT, LIMIT * (1.0 - noise)]))
+    settings = TighteningSettings(angular_acceleration=20.0)
+    with pytest.raises(ParameterError, match="smaller, or the bounds on roll wider"):
+        margins(vehicle, period=PERIOD, horizon=HORIZON, bounds=narrow, settings=settings)
 
 
 def test_the_quickest_rotors_that_are_taken_are_as_good_as_none(vehicle: Vehicle) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import logged, small_log
 
-from quadsim.flight.audit import SIGNALS, Finding, Limit, audit, margins_sampled, worst_finding
+from quadsim.flight.audit import SIGNALS, Finding, Limit, audit, margins_sampled, worst_finding, worst_share
 from quadsim.flight.log import FlightLog
 
 Z = Limit(name="height", signal="z", lower=-1.0, upper=2.0)
@@ -154,3 +154,58 @@ def test_the_worst_finding_is_a_required_one_unless_none_is() -> None:
     tight, roomy = replace(Z, name="tight", required=False), replace(Z, name="roomy", lower=-9.0, upper=9.0)
     assert worst_finding(audit(log, (tight, roomy))) == find(log, roomy)
     assert worst_finding(audit(log, (tight, replace(roomy, required=False)))) == find(log, tight)
+
+
+def test_the_first_of_tied_instants_gives_the_time_and_the_side_of_the_peak() -> None:
+    """Whichever of them rounding makes the smallest; the margin itself is the smallest."""
+    rng = np.random.default_rng(0)
+    for noise in (0.0, *([3e-6 * Z.half_band] * 50)):
+        values = np.array([0.5, 1.5, 0.5, -0.5, 1.5, -0.5, 0.5]) + noise * rng.uniform(-1.0, 1.0, 7)
+        finding = find(logged("z", samples=(0.5, 0.5, 0.5), plant=values), Z)
+        assert finding.worst_time == 0.05
+        assert finding.peak_plant == max(values)
+        assert finding.worst_margin == Z.margin(values).min()
+        assert finding.peak_plant == pytest.approx(1.5, abs=1e-5)
+
+
+def test_a_margin_that_grows_by_more_than_a_tie_has_a_time_of_its_own() -> None:
+    values = [0.5, 1.5, 0.5, -0.5 - 2.0 * Z.tie, 1.5, 0.5, 0.5]
+    finding = find(logged("z", samples=(0.5, 0.5, 0.5), plant=values), Z)
+    assert finding.worst_time == pytest.approx(0.15)
+    assert finding.peak_plant == values[3]
+
+
+def test_the_peak_is_within_a_tie_of_the_smallest_margin_also_near_the_middle() -> None:
+    middle = 0.5
+    values = np.full(7, middle)
+    values[2] += 0.9 * Z.tie
+    values[4] -= 1.8 * Z.tie
+    finding = find(logged("z", samples=(middle,) * 3, plant=values), Z)
+    assert finding.worst_time == pytest.approx(0.1)
+    values[0] += 0.3 * Z.tie
+    finding = find(logged("z", samples=(middle,) * 3, plant=values), Z)
+    assert finding.worst_margin <= Z.margin(np.array([finding.peak_plant]))[0] <= finding.worst_margin + Z.tie
+
+
+def test_the_first_of_tied_rotors_gives_the_peak() -> None:
+    log = small_log(3)
+    log.control.speeds[:] = 200.0
+    log.control.speeds[1] = [251.0, 200.0, 251.0 + 1e-6, -1.0]
+    finding = find(log, Limit(name="speed", signal="speed", lower=0.0, upper=250.0))
+    assert finding.peak_sampled == 251.0
+    assert finding.worst_margin_sampled == pytest.approx(-1.0 - 1e-6)
+
+
+def test_of_tied_findings_the_first_is_the_worst_and_a_violated_one_before_it() -> None:
+    log = logged("z", samples=SAMPLES, plant=PLANT)
+    hard = replace(Z, tolerance=0.0, tolerance_sampled=0.0, upper=2.5 - 1e-6)
+    twins = audit(log, tuple(replace(hard, name=name) for name in ("zeta", "alpha")))
+    lenient = replace(hard, name="lenient", tolerance=0.5, upper=2.5 - 2e-6)
+    rng = np.random.default_rng(0)
+    for noise in (0.0, *([3e-6 * Z.half_band] * 50)):
+        shaken = [replace(twin, worst_margin=twin.worst_margin - noise * rng.random()) for twin in twins]
+        assert worst_finding(shaken) is shaken[0]
+        assert worst_share(shaken) == min(twin.share for twin in shaken)
+        (holds,) = audit(log, (lenient,))
+        assert holds.satisfied
+        assert worst_finding([holds, *shaken]) is shaken[0], "what is violated is no satisfied limit's name"

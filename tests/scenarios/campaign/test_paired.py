@@ -13,7 +13,7 @@ import pytest
 from quadsim.errors import InputError, OutputError
 from scenarios.campaign.events import EVENT_NAMES
 from scenarios.campaign.paired import compare_pairs
-from scenarios.campaign.statistics import holm
+from scenarios.campaign.statistics import estimate, holm
 
 MakeCampaign = Callable[..., pa.Table]
 
@@ -66,6 +66,32 @@ def test_every_event_and_constraint_is_compared_and_corrected(thousand: pa.Table
     assert [event.p_holm for event in tested] == holm([event.p for event in tested])
     assert all(event.p_holm == 1.0 for event in result.events if event not in tested)
     assert result.to_json()["events"]["lost"]["p_holm"] == next(e for e in result.events if e.event == "lost").p_holm
+
+
+def test_a_window_that_was_not_reached_is_neither_held_nor_not(thousand: pa.Table) -> None:
+    """Of ten pairs, three of the first and one of the second ended before it; one was lost before, one flew on."""
+    verdicts = ["satisfied"] * 8 + ["lost", "violated"]
+    held = [None, None, None, True, True, True, True, True, False, False]
+    one = changed(changed(thousand.slice(0, 10), "verdict", verdicts), "satisfied.slew", held)
+    other = changed(one, "satisfied.slew", [True, True, True, None, False, True, True, True, True, True])
+    result = compare_pairs(one, other, NAMES)
+    (event,) = [event for event in result.events if event.event == "slew not held"]
+    assert (event.pairs, event.counts, event.both) == (6, (2, 1), 0)
+    assert (event.only_a, event.only_b, event.neither) == (2, 1, 3)
+    assert event.difference == -1.0 / 6.0
+    share = estimate(one)["constraints"]["slew"]["not_satisfied"]
+    assert (share["count"], share["flights"]) == (2, 7), "as the report of one campaign has it"
+    assert "| slew not held | 2 (33.3 %) | 1 (16.7 %) | 2 | 1 | 0 |" in result.to_markdown()
+
+
+def test_a_constraint_that_no_pair_reached_is_absent(thousand: pa.Table) -> None:
+    calm = changed(thousand.slice(0, 10), "verdict", ["satisfied"] * 10)
+    never = changed(calm, "satisfied.slew", [None] * 10)
+    events = [event.event for event in compare_pairs(never, never, NAMES).events]
+    assert "roll not held" in events
+    assert "slew not held" not in events
+    share = estimate(never)["constraints"]["slew"]["not_satisfied"]
+    assert (share["count"], share["flights"], share["share"]) == (0, 0, None)
 
 
 def test_metrics_are_compared_where_both_were_completed(thousand: pa.Table, better: pa.Table) -> None:

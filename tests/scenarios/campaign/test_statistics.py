@@ -13,6 +13,7 @@ import pytest
 from scipy import stats
 
 from quadsim.errors import InputError, ParameterError
+from quadsim.flight.audit import Limit
 from scenarios.campaign.campaign_report import driver_sentence, driver_table, event_table, verdict_sentence
 from scenarios.campaign.paired import compare_pairs
 from scenarios.campaign.statistics import (
@@ -287,6 +288,29 @@ def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(smal
     assert not judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).holds
     with pytest.raises(InputError, match="no pair of flights of which both reached every required constraint"):
         compare_pairs(table, table, ("one", "other"))
+
+
+def test_of_tied_flights_the_first_is_the_worst(thousand: pa.Table) -> None:
+    """Margins that are equal but for rounding, as of a wind from either side."""
+    rng = np.random.default_rng(0)
+    limits = (Limit(name="roll", signal="roll", lower=-5.0, upper=5.0),)
+    table = with_column(thousand.slice(0, 6), "verdict", ["satisfied"] * 6)
+    table = with_column(with_column(table, "failed", [False] * 6), "flight", [5, 1, 4, 2, 3, 0])
+    for _ in range(20):
+        shares = np.array([0.9, 0.2, 0.2, 0.5, 0.2, 0.5]) + 3e-6 * rng.uniform(-1.0, 1.0, 6)
+        shaken = with_column(
+            with_column(table, "worst_margin", shares.tolist()), "margin.roll", (5.0 * shares).tolist()
+        )
+        assert np.array(shaken["flight"])[ranking(shaken)].tolist() == [1, 3, 4, 0, 2, 5]
+        assert worst_flight(shaken) == 1
+        roll = estimate(shaken, limits)["constraints"]["roll"]
+        assert roll["worst_flight"] == 1
+        assert roll["worst_margin"] == 5.0 * shares.min()
+        far = with_column(shaken, "worst_margin", [None] * 6)
+        for axis in "xyz":
+            errors = np.array([1.0, 3.0, 3.0, 2.0, 3.0, 2.0]) * (1.0 + 3e-6 * rng.uniform(-1.0, 1.0, 6))
+            far = with_column(far, f"rmse.{axis}", errors.tolist())
+        assert np.array(far["flight"])[ranking(far)].tolist() == [1, 3, 4, 0, 2, 5]
 
 
 def test_the_worst_flights_come_first(small: pa.Table) -> None:

@@ -19,7 +19,7 @@ from quadsim.flight.rundir import Run
 from quadsim.palette import ON_DARK, rgb
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
-from quadsim.report.film.frames import make_footage
+from quadsim.report.film.frames import make_footage, ranked_tracks
 from quadsim.report.film.video import (
     Estimate,
     frame_count,
@@ -244,8 +244,20 @@ def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many
 
     limits = (*wide, near, reported, low)
     tracks = make_footage(replace(short_run, limits=limits), np.array([6.0])).margins
-    shown, rest = margin_rows(sorted(tracks, key=lambda track: track.rank), 0)
+    shown, rest = margin_rows(ranked_tracks(tracks), 0)
     assert [track.limit.name for track in shown] == ["low", "reported", "near", "wide_0", "wide_1", "wide_2"]
     assert rest == "and 4 more"
     assert red(*wide, near) == 0
     assert red(*limits) > 0
+
+
+def test_limits_that_are_equally_near_stand_as_in_the_file(short_run: Run) -> None:
+    """Their bounds differ by rounding, as margins do from one processor to another."""
+    rng = np.random.default_rng(0)
+    names = ("zeta", "alpha", "mid")
+    for _ in range(5):
+        bounds = 100.0 * (1.0 + 3e-6 * rng.uniform(-1.0, 1.0, len(names)))
+        limits = [Limit(name=name, signal="z", upper=bound) for name, bound in zip(names, bounds, strict=True)]
+        limits.append(Limit(name="near", signal="z", upper=10.0))
+        tracks = make_footage(replace(short_run, limits=tuple(limits)), np.array([6.0])).margins
+        assert [track.limit.name for track in ranked_tracks(tracks)] == ["near", *names]
