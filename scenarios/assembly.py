@@ -69,7 +69,7 @@ from scenarios.limits import audit_notes, flyable, signal_limits, space_limits, 
 from scenarios.plugin import Plugin, import_plugin, make_force, reason_of
 from scenarios.schema.events import ControllerEvent, Event, SensorFaultEvent, SetpointEvent
 from scenarios.schema.problems import parse_table
-from scenarios.schema.scenario import Recorded, Scenario, VehicleTable
+from scenarios.schema.scenario import RecordedVehicle, Scenario, VehicleTable
 from scenarios.schema.settings import REPEATING
 from scenarios.schema.writing import plain
 
@@ -148,7 +148,7 @@ class Assembly:
         if scenario.recorded is None:
             tables = ((name, getattr(scenario, name)) for name in REPEATING)
             stated = [f"{table}.{name}" for table, numbers in tables for name in plain(numbers or {}) if name != "file"]
-            record = Recorded(file=scenario.vehicle.file, stated=tuple(stated))
+            record = RecordedVehicle(file=scenario.vehicle.file, stated=tuple(stated))
         else:
             record = scenario.recorded
         vehicle, autopilot = self._numbers

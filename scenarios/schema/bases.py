@@ -84,6 +84,8 @@ def _merged(
         raise FileError(path, f"must have at most {DEEPEST} bases above one another")
     inherited = read_merged(base, find, locate, chain)
     locate(inherited, base_file.parent)
+    if "controller" in data:
+        state_bounds(inherited, data["controller"])
     # Group and expected verdict are not inherited.
     merged = merge({key: value for key, value in inherited.items() if key not in ("group", "expect")}, data)
     if "description" not in data:
@@ -135,8 +137,6 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     only in an entry that states neither bounds nor tolerances.
     """
     merged = copy.deepcopy(dict(base))
-    if "controller" in over:
-        state_bounds(merged, over["controller"])
     for path, value in leaves(over):
         restate(merged, path, value)
     return _merge(merged, over)

@@ -73,7 +73,7 @@ else:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recorded:
+class RecordedVehicle:
     """Numbers of the vehicle file that [vehicle] and [autopilot] repeat, to fly alike without it; written by runs."""
 
     file: Annotated[str, doc("the vehicle file they are of, vehicle.file; with another one they are left out")]
@@ -178,7 +178,8 @@ class Scenario:
     vehicle: VehicleTable
     actual: ActualTable | None = None
     recorded: Annotated[
-        Recorded | None, doc("absent: [vehicle] and [autopilot] have only what replaces the vehicle file's numbers")
+        RecordedVehicle | None,
+        doc("absent: [vehicle] and [autopilot] have only what replaces the vehicle file's numbers"),
     ] = None
     initial: Initial = field(default_factory=Initial)
     plant: Simulation = Simulation()
@@ -297,10 +298,11 @@ class Scenario:
                 period = "have a period that is" if name == "log_rate" else "be"
                 raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {rate}") from error
         if self.recorded is not None and self.recorded.file != self.vehicle.file:
-            numbers = "remove [recorded], and the numbers of [vehicle] and [autopilot] that repeat it"
+            advice = (
+                "for another vehicle remove [recorded], and the numbers of [vehicle] and [autopilot] that repeat it"
+            )
             raise ValueError(
-                f"vehicle.file must be {self.recorded.file!r}, the file of [recorded]; got {self.vehicle.file!r} "
-                f"(for another vehicle {numbers})"
+                f"recorded.file must be vehicle.file = {self.vehicle.file!r}; got {self.recorded.file!r} ({advice})"
             )
         self._check_events()
         specs = [self.controller, *(spec for _, spec in self.controller_changes)]
