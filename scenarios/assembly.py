@@ -69,8 +69,6 @@ from scenarios.limits import audit_notes, flyable, signal_limits, space_limits, 
 from scenarios.plugin import Plugin, import_plugin, make_force, reason_of
 from scenarios.schema.events import ControllerEvent, Event, SensorFaultEvent, SetpointEvent
 from scenarios.schema.problems import parse_table
-from scenarios.schema.scenario import RecordedVehicle, Scenario, VehicleTable
-from scenarios.schema.settings import REPEATING
 from scenarios.schema.writing import plain
 
 if TYPE_CHECKING:
@@ -79,6 +77,7 @@ if TYPE_CHECKING:
     from quadsim.flight.audit import Limit, SpaceLimit
     from quadsim.motion import Motion
     from scenarios.schema.controllers import AnyController
+    from scenarios.schema.scenario import Scenario, VehicleTable
 
 _SIZES: Final = {
     "rotor_rise": ("rotors", "rise", RotorDynamics),
@@ -144,15 +143,7 @@ class Assembly:
 
         Effects continue to take their sizes from the vehicle.
         """
-        scenario = self.scenario
-        if scenario.recorded is None:
-            tables = ((name, getattr(scenario, name)) for name in REPEATING)
-            stated = [f"{table}.{name}" for table, numbers in tables for name in plain(numbers or {}) if name != "file"]
-            record = RecordedVehicle(file=scenario.vehicle.file, stated=tuple(stated))
-        else:
-            record = scenario.recorded
-        vehicle, autopilot = self._numbers
-        return self.of(scenario.altered(vehicle=vehicle, autopilot=autopilot, recorded=record))
+        return self.of(self.scenario.recording(*self._numbers))
 
     @property
     def _numbers(self) -> tuple[VehicleTable, AutopilotSettings | None]:

@@ -34,7 +34,7 @@ from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorF
 from scenarios.schema.initial import Initial
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.sensors import EstimatorSpec, Sensors, check_sensing
-from scenarios.schema.settings import REPEATING, separate, set_field
+from scenarios.schema.settings import REPEATING, RecordedVehicle, separate, set_field
 from scenarios.schema.writing import is_absent, plain, to_toml
 
 
@@ -70,18 +70,6 @@ else:
         "True parameters where they differ from the model: the plant uses them, the controller does not know them."
     )
     VehicleTable.__module__ = ActualTable.__module__ = __name__
-
-
-@dataclass(frozen=True, kw_only=True)
-class RecordedVehicle:
-    """Numbers of the vehicle file that [vehicle] and [autopilot] repeat, to fly alike without it; written by runs."""
-
-    file: Annotated[str, doc("the vehicle file they are of, vehicle.file; with another one they are left out")]
-    stated: Annotated[
-        tuple[str, ...],
-        MaxLen(MOST_ENTRIES),
-        doc("fields of [vehicle] and [autopilot] that are no repetition, as vehicle.mass"),
-    ] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,6 +266,15 @@ class Scenario:
         if "duration" in fields:
             vars(other).update(ends_with_course=False)
         return other
+
+    def recording(self, vehicle: VehicleTable, autopilot: AutopilotSettings | None) -> Scenario:
+        """Return the scenario with these tables, in which it repeats the numbers of its vehicle's file."""
+        record = self.recorded
+        if record is None:
+            tables = {name: plain(getattr(self, name) or {}) for name in REPEATING}
+            stated = [f"{table}.{name}" for table in tables for name in tables[table] if name != "file"]
+            record = RecordedVehicle(file=self.vehicle.file, stated=tuple(stated))
+        return self.altered(vehicle=vehicle, autopilot=autopilot, recorded=record)
 
     def require_consistent(self) -> None:
         """Refuse fields that are valid alone but inconsistent.

@@ -5,10 +5,14 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
+
+from annotated_types import MaxLen, doc
 
 from quadsim.assets import DEEPEST, parse_toml
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.input_limits import MOST_ENTRIES
 
 _CHANGED: Final = " (changed: "  # start of the list of changes at the end of a description
 NOT_DESCRIBED: Final = ("name", "description", "group", "expect", "seed")
@@ -17,6 +21,18 @@ RECORDED: Final = "recorded"
 REPEATING: Final = ("vehicle", "autopilot")
 """The table that says that a scenario repeats its vehicle's file, and the tables that do."""
 _LONGEST: Final = 60  # characters of a value that a description shows
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedVehicle:
+    """Numbers of the vehicle file that [vehicle] and [autopilot] repeat, to fly alike without it; written by runs."""
+
+    file: Annotated[str, doc("the vehicle file they are of, vehicle.file; with another one they are left out")]
+    stated: Annotated[
+        tuple[str, ...],
+        MaxLen(MOST_ENTRIES),
+        doc("fields of [vehicle] and [autopilot] that are no repetition, as vehicle.mass"),
+    ] = ()
 
 
 def apply_setting(data: dict[str, Any], setting: str, defaults: Mapping[str, Any] | None = None) -> None:
