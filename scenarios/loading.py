@@ -107,8 +107,8 @@ class ScenarioFile(Document):
 
     @property
     def scenario(self) -> Scenario:
-        """The parsed scenario."""
-        return parse_scenario(tomllib.loads(self.content))
+        """The parsed scenario, with the numbers of its vehicle's file recorded."""
+        return Assembly(parse_scenario(tomllib.loads(self.content))).recorded.scenario
 
     def to_json(self) -> Any:
         """Return its tables."""
