@@ -22,7 +22,7 @@ from scenarios.schema.scenario import Scenario
 def campaign(scenario: Scenario, solver: str, flights: int, workers: int) -> Record:
     """Fly one campaign; what its flights took, and what it added to them."""
     spec = CampaignFile(name="benchmark", scenario=scenario.name, flights=flights)
-    plan = Plan(spec, Assembly(scenario).with_vehicle)
+    plan = Plan(spec, Assembly(scenario).recorded.scenario)
     with tempfile.TemporaryDirectory() as scratch:
         directory = Path(scratch) / "campaign"
         result = fly_campaign(plan, directory, workers=workers, report=False)

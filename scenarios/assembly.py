@@ -58,13 +58,15 @@ from quadsim.vehicle import (
     altered,
     load_vehicle,
     missing_parameters,
+    overridden,
     vehicle_autopilot,
 )
 from scenarios.courses.course import Course, repeated
+from scenarios.courses.csv_course import Csv
 from scenarios.courses.followed import FollowedCourse
 from scenarios.courses.steps import Steps, switches
 from scenarios.limits import audit_notes, flyable, signal_limits, space_limits, sum_limits, with_law_bounds
-from scenarios.plugin import import_plugin, make_force, reason_of
+from scenarios.plugin import Plugin, import_plugin, make_force, reason_of
 from scenarios.schema.events import ControllerEvent, Event, SensorFaultEvent, SetpointEvent
 from scenarios.schema.problems import parse_table
 from scenarios.schema.writing import plain
@@ -75,7 +77,7 @@ if TYPE_CHECKING:
     from quadsim.flight.audit import Limit, SpaceLimit
     from quadsim.motion import Motion
     from scenarios.schema.controllers import AnyController
-    from scenarios.schema.scenario import Scenario
+    from scenarios.schema.scenario import Scenario, VehicleTable
 
 _SIZES: Final = {
     "rotor_rise": ("rotors", "rise", RotorDynamics),
@@ -129,23 +131,44 @@ class Assembly:
 
     @property
     def resolved(self) -> Assembly:
-        """The assembly of the scenario with all numbers of its vehicle: its file alone then defines the flight."""
+        """The assembly of the scenario with every derived value stated: numbers of its vehicle, sizes and solver."""
         controller, events = self._stated_laws()
-        return self.of(self.with_vehicle.altered(effects=self.effects, controller=controller, events=events))
+        vehicle, autopilot = self._numbers
+        fields = {"vehicle": vehicle, "autopilot": autopilot, "effects": self.effects}
+        return self.of(self.scenario.altered(**fields, controller=controller, events=events))
 
     @property
-    def with_vehicle(self) -> Scenario:
-        """The scenario with the numbers of its vehicle file; effects continue to take theirs from the vehicle."""
+    def recorded(self) -> Assembly:
+        """The assembly of the scenario with the numbers of its vehicle's file, which it then does not need.
+
+        Effects continue to take their sizes from the vehicle.
+        """
+        return self.of(self.scenario.recording(*self._numbers))
+
+    @property
+    def _numbers(self) -> tuple[VehicleTable, AutopilotSettings | None]:
+        """The tables `[vehicle]` and `[autopilot]` with the numbers of the vehicle's file."""
         numbers = {name: getattr(self.vehicle, name) for name in VEHICLE_UNITS}
-        table = replace(self.scenario.vehicle, **numbers)
-        return self.scenario.altered(vehicle=table, autopilot=self.autopilot)
+        return replace(self.scenario.vehicle, **numbers), self.autopilot
+
+    def to_toml(self) -> str:
+        """Return the scenario's file: what it states, defaults included; what is derived stands in comments."""
+        events = self.scenario.events
+        return self.scenario.written(self.resolved.scenario.altered(events=events))
+
+    def audited(self) -> Assembly:
+        """Return the assembly with the bounds of a user's controller, which builds it, as constraints."""
+        if not isinstance(self.scenario.controller, Plugin):
+            return self
+        return self.with_law_bounds(self.controller())
 
     # --- vehicle -----------------------------------------------------------------------------------------------------
 
     @cached_property
     def vehicle(self) -> Vehicle:
         """The modelled vehicle: its file with the scenario's overrides; a resolved scenario needs no file."""
-        file, overrides = self.scenario.vehicle.file, self.scenario.vehicle.overrides()
+        file = self.scenario.vehicle.file
+        overrides = self._overrides
         try:
             path = vehicle_path(file)
         except InputError:
@@ -153,6 +176,17 @@ class Assembly:
                 raise
             return Vehicle(name=Path(file).stem, **overrides)
         return load_vehicle(path, overrides)
+
+    @property
+    def _overrides(self) -> dict[str, Any]:
+        """The numbers of `[vehicle]`: those recorded from its file, under those stated."""
+        numbers = self.scenario.vehicle.overrides()
+        recorded = self.scenario.recorded
+        if recorded is None:
+            return numbers
+        stated = {name: value for name, value in numbers.items() if f"vehicle.{name}" in recorded.stated}
+        repeated = {name: value for name, value in numbers.items() if name not in stated}
+        return {name: value for name, value in overridden(repeated, stated).items() if value is not None}
 
     @cached_property
     def autopilot(self) -> AutopilotSettings | None:
@@ -254,6 +288,17 @@ class Assembly:
         if reference.repeat is None:
             return course
         return repeated(course, reference.repeat, until=self.scenario.duration)
+
+    @property
+    def course_cut(self) -> float | None:
+        """Time [s] at which the course ends, if the flight is over before; else None.
+
+        Courses without an end are never cut, nor is a function of time, which is sampled for the flight.
+        """
+        reference, end = self.scenario.reference, self.course.end
+        if isinstance(reference, Csv) and reference.content is not None:
+            return None
+        return round(end, 9) if self.scenario.duration < end - 1e-9 and math.isfinite(end) else None
 
     @property
     def initial_pose(self) -> Array:

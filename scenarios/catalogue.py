@@ -10,6 +10,7 @@ from typing import Any, Final, Literal, TypeAlias, get_args
 
 from quadsim.assets import read_toml, vehicle_names, vehicle_path
 from quadsim.errors import FileError, UnknownNameError
+from quadsim.outputs import SUMMARY_FILE
 from scenarios.results import Result, Shown
 
 _LIBRARY: Final = Path(__file__).resolve().parent / "library"
@@ -90,6 +91,14 @@ def variants() -> Mapping[str, Variant]:
 def scenario_names() -> list[str]:
     """Return the names of the library's scenarios, variants included, sorted."""
     return sorted([*_names(FLIGHTS), *variants()])
+
+
+def names_directory(target: str | Path) -> bool:
+    """Return whether a target means a directory: a run, or any that has not the name of a scenario."""
+    directory = Path(target)
+    if not directory.is_dir():
+        return False
+    return str(target) not in scenario_names() or (directory / SUMMARY_FILE).is_file()
 
 
 Source: TypeAlias = tuple[Path, Mapping[str, Any]]

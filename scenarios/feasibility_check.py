@@ -45,13 +45,18 @@ def report(assembly: Assembly) -> Feasibility:
     if until < course.end < math.inf and not _sampled(scenario):
         sentence += f" It lasts until {course.end:g} s, but the flight follows it for {until:g} s."
     advice = fitting(assembly) if required.problems else ""
-    return replace(required, sentence=sentence, advice=advice, notes=(*hover_notes(assembly), *course.notes))
+    return replace(required, sentence=sentence, advice=advice, notes=(*notes(assembly), *course.notes))
 
 
 def hover_speeds(assembly: Assembly) -> Array:
     """Return the rotor speeds (4,) [rad/s] at which the actual vehicle hovers, with its load at the start."""
     vehicle, load = assembly.actual, assembly.effects.load or Load()
     return vehicle.hover_speeds * math.sqrt(mass_properties(vehicle, load, load.payloads).mass / vehicle.mass)
+
+
+def notes(assembly: Assembly) -> tuple[str, ...]:
+    """Return what no controller can do, or what nobody can mean, as `run` says before it flies."""
+    return (*hover_notes(assembly), *floor_notes(assembly))
 
 
 def hover_notes(assembly: Assembly) -> tuple[str, ...]:
@@ -61,6 +66,30 @@ def hover_notes(assembly: Assembly) -> tuple[str, ...]:
         return ()
     bound, side = (upper, "") if hover.max() > upper else (lower, "at least ")
     return (f"hover needs {span(hover)} rad/s, the bound is {side}{bound:.4g}: no controller can hold altitude",)
+
+
+def floor_notes(assembly: Assembly) -> tuple[str, ...]:
+    """Return a note if the course is below the floor, unless it only lands; without a floor, if z is never above 0.
+
+    A landing asks for a height below the floor at a place, at the end: it does not move on there.
+    """
+    scenario = assembly.scenario
+    t = scenario.control_period * np.arange(scenario.periods + 1, dtype=np.float64)
+    x, y, z = assembly.course.sample(t)[:, :3].T
+    below = z < 0.0
+    ground = scenario.effects.ground
+    if ground is None:
+        is_meant = not below.all() or scenario.initial.position[2] >= 0.0
+        what = f"The course stays below z = 0, at {z.max():.3g} m and lower"
+    else:
+        moving = np.hypot(np.diff(x), np.diff(y)) > 1e-6
+        is_meant = not (moving & below[1:] & below[:-1]).any() and below.mean() < 0.5
+        what = f"The course is below the floor, by up to {-z.min():.3g} m"
+    if is_meant:
+        return ()
+    since = f", from {t[below][0]:.3g} s on" if not below[0] else ""
+    advice = "where z points down, as in PX4 and ArduPilot, the signs of y, z and yaw have to be turned"
+    return (f"{what}{since}: z points up here; {advice}.",)
 
 
 def _sampled(scenario: Scenario) -> bool:

@@ -19,6 +19,7 @@ from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
 from quadsim.outputs import reserving
 from quadsim.report.comparison import check_names, different_audits
 from quadsim.report.table import Cell, QuantityRow
+from scenarios.catalogue import names_directory
 from scenarios.flown import INTERRUPTED, Flight, add_films, require_film, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
@@ -275,7 +276,7 @@ def _check(target: Compared) -> None:
     """Reject targets that cannot be compared, before any flight."""
     if isinstance(target, Flight | Scenario):
         return
-    if Path(target).is_dir():
+    if names_directory(target):
         for note in reaudit(Path(target), products=False).notes:
             _log.info("%s: %s", target, note)
     else:
@@ -291,7 +292,7 @@ def _run_of(
             return target.run
         with reserving(beside / target.scenario.name, free=True) as place:
             return _saved(target, place, progress, products)
-    if not isinstance(target, Scenario) and Path(target).is_dir():
+    if not isinstance(target, Scenario) and names_directory(target):
         return stored_run(Path(target))
     scenario = target if isinstance(target, Scenario) else load_scenario(str(target))
     with reserving(beside / scenario.name, free=True) as place:

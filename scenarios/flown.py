@@ -127,8 +127,11 @@ class Flight(Result):
         return self.outcome == "satisfied"
 
     def __repr__(self) -> str:
-        flown = self.log.control.t.size * self.scenario.control_period
-        line = f"<Flight {self.scenario.name}: {self.outcome}, {flown:.2f} s by {self.controller}"
+        flown = f"{self.log.control.t.size * self.scenario.control_period:.2f} s"
+        end = self.assembly.course_cut if self.recorded is None else self.recorded.get("course", {}).get("cut_before")
+        if end is not None:
+            flown += f" of a course that ends at {end:g} s"
+        line = f"<Flight {self.scenario.name}: {self.outcome}, {flown} by {self.controller}"
         return f"{line}{f', {self.log.reason}' if self.log.reason else ''}{worst_margin(self.findings)}>"
 
     @property
@@ -351,7 +354,7 @@ class Flight(Result):
 
         def write(*, overwrite: bool) -> None:
             with writing(directory, overwrite=overwrite) as partial:
-                (partial / rundir.SCENARIO_FILE).write_text(self.scenario.to_toml(), encoding="utf-8")
+                (partial / rundir.SCENARIO_FILE).write_text(self.assembly.to_toml(), encoding="utf-8")
                 course = self.scenario.reference
                 if isinstance(course, Csv) and course.content is not None:
                     (partial / course.file).write_bytes(course.content)
@@ -522,6 +525,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
     samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
     estimation = {} if log.control.measured_perfectly else {**metrics.estimation(log.control), "samples": samples}
     steps = flight.assembly.course_steps
+    course_cut = flight.assembly.course_cut
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=steps)
     notes = implausible(flight.actual)
     notes += model_notes(flight.assembly) if flight.controller == scenario.controller.type else []
@@ -540,7 +544,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "as_expected": flight.outcome == scenario.expect,
         "duration": round(log.control.t.size * scenario.control_period, 9),
         "seed": scenario.seed,
-        "course": asdict(report(flight.assembly)),
+        "course": asdict(report(flight.assembly)) | ({} if course_cut is None else {"cut_before": course_cut}),
         **({"events": events} if (events := story(scenario, log.control.t.size * scenario.control_period)) else {}),
         "tracking": numbers["tracking"],
         "constraints": [limit_to_json(finding) for finding in flight.findings],

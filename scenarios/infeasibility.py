@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -31,6 +30,7 @@ from quadsim.vehicle import Vehicle
 from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field, set_field
+from scenarios.schema.writing import plain
 
 Settings = dict[str, Any]
 WIDER: Final = (1.0, 1.02, 1.1, 1.5)
@@ -71,18 +71,17 @@ def diagnose(
 
 def changed_scenario(scenario: Scenario, settings: Settings) -> Scenario | None:
     """Return the scenario with other fields of its file; None if that would be refused."""
-    table = tomllib.loads(scenario.to_toml())
+    table = scenario.tables
+    defaults = plain(scenario)
     for field, value in settings.items():
-        set_field(table, field, value, source="diagnosis")
+        set_field(table, field, value, source="diagnosis", defaults=defaults)
     if "controller.type" in settings:
         law = table["controller"]
         table["controller"] = {name: value for name, value in law.items() if name in fields_of(Robust)}
     try:
-        changed = Scenario.parse(table)
+        return scenario.derive(table)
     except InputError:
         return None
-    # A reference that was passed in as a function has its rows in memory.
-    return changed.altered(reference=scenario.reference) if changed.reference == scenario.reference else changed
 
 
 def _unconverged(
@@ -178,7 +177,7 @@ class _Case:
 
     def _widened(self, amounts: Mapping[str, tuple[set[Side], float]]) -> Settings | None:
         """Return fields with bounds moved outwards by at least these amounts, if that helps."""
-        table = tomllib.loads(self._scenario.to_toml())
+        table = plain(self._scenario)
         for more in WIDER:
             settings: Settings = {}
             for field, (sides, amount) in amounts.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,13 +11,14 @@ from typing import Any
 
 from quadsim.errors import FileError, InputError
 from scenarios.assembly import Assembly
-from scenarios.catalogue import scenario_source, source_label
+from scenarios.catalogue import scenario_names, scenario_source, source_label
 from scenarios.courses.csv_course import Csv
 from scenarios.results import Document
 from scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting
+from scenarios.schema.writing import plain
 
 
 def load_scenario(
@@ -45,7 +47,7 @@ def assemble(
         changes = {**changes, "seed": seed} if isinstance(changes, Mapping) else [*changes, f"seed={seed}"]
     if not isinstance(source, str | Path) and changes and not isinstance(changes, Mapping):
         raise InputError("changes of a Scenario are a mapping: {'controller.horizon': 30}")
-    if isinstance(source, str | Path) and Path(source).is_dir():
+    if isinstance(source, str | Path) and Path(source).is_dir() and str(source) not in scenario_names():
         raise InputError(f"{source} is a directory; give a scenario's name or its TOML file")
     try:
         scenario = source
@@ -60,13 +62,26 @@ def _read(name: str, settings: Sequence[str]) -> Scenario:
     data, (file, changes) = read_scenario(name), scenario_source(name)
     label = source_label((file, changes))
     unchanged = copy.deepcopy(data)
-    for setting in settings:
-        apply_setting(data, setting)
+    apply_settings(data, settings, file.parent)
     try:
         return parse_scenario(data, source=label, directory=file.parent)
     except ScenarioError as error:
         causes = _of_types(error.problems, name, unchanged, data)
         raise ScenarioError(label, [*error.problems, *causes]) from error
+
+
+def apply_settings(data: dict[str, Any], settings: Sequence[str], directory: Path) -> None:
+    """Apply `dotted.path=value` texts to a file's tables in place; paths are also looked up in `directory`.
+
+    Raises:
+        InputError: a text is malformed, or its path leads nowhere.
+    """
+    defaults = None
+    if settings:
+        with contextlib.suppress(InputError, OSError):  # a file may be complete with its settings alone
+            defaults = plain(parse_scenario(data, directory=directory))
+    for setting in settings:
+        apply_setting(data, setting, defaults)
 
 
 def _of_types(problems: Sequence[str], name: str, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
@@ -92,8 +107,8 @@ class ScenarioFile(Document):
 
     @property
     def scenario(self) -> Scenario:
-        """The parsed scenario."""
-        return parse_scenario(tomllib.loads(self.content))
+        """The parsed scenario, with the numbers of its vehicle's file recorded."""
+        return Assembly(parse_scenario(tomllib.loads(self.content))).recorded.scenario
 
     def to_json(self) -> Any:
         """Return its tables."""

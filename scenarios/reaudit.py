@@ -247,9 +247,8 @@ def _holds_commands(scenario: Scenario) -> bool:
     """Return whether the rotors turn at the commanded speeds throughout each period."""
     laws = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
     commands_held = all(spec.type in _HOLDING and spec.indi is None and spec.commands == ROTORS for spec in laws)
-    return (
-        commands_held and scenario.effects.rotors is None and not any(isinstance(e, LagChange) for e in scenario.events)
-    )
+    lagging = any(isinstance(event, LagChange) for event in scenario.events)
+    return commands_held and not lagging and Assembly(scenario).effects.rotors is None
 
 
 def _differences(

@@ -305,7 +305,7 @@ class Rollout:
         self.loop.quaternions = needs_quaternions(scenario)
         log = self.loop.log()
         return Flight(
-            assembly=self._events.assembly.of(scenario).resolved,
+            assembly=self._events.assembly.of(scenario).recorded,
             log=log,
             findings=audit(log, self.limits),
             controller=self._law[0],

@@ -63,7 +63,7 @@ def following(assembly: Assembly, reference: object) -> Assembly:
     samples = scenario.periods + max(spec.horizon for spec in specs) + 1
     t = scenario.control_period * np.arange(samples, dtype=np.float64)
     course = tabulated("reference.csv", t, np.array([_pose(reference, time) for time in t.tolist()]))
-    return Assembly(scenario.altered(reference=course, ends_with_course=False), assembly.vehicle).check()
+    return Assembly(scenario.altered(reference=course, duration=scenario.duration), assembly.vehicle).check()
 
 
 def _pose(reference: Callable[[float], Any], time: float) -> Array:

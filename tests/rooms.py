@@ -54,6 +54,7 @@ USING: Final = {
     "scenarios/test_api.py": EVERY,
     "scenarios/test_bounded_input.py": ("campaign", "identify"),
     "scenarios/test_cli.py": EVERY,
+    "scenarios/test_derived.py": ("campaign", "design"),
     "scenarios/test_help.py": EVERY,
     "scenarios/test_infeasibility.py": ("campaign",),
     "scenarios/test_initial.py": ("campaign", "gym"),

@@ -66,6 +66,7 @@ BESIDES = (
     ("controller={type='pid'}", "actual.mass=4.2", "keep_in={position=[0, 0, 1], size=[9, 9, 9]}"),
     ("controller={type='lqr', output_weights={z=1}, input_weights={speed=1}}", f"obstacles={OBSTACLES}"),
     ("controller={type='m:Law'}", "forces=[{type='m:force'}]"),
+    ("recorded={file='lopes2011'}",),
 )
 """Settings of `hover` for the tables that no file of the library has."""
 CAMPAIGN = """

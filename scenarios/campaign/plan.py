@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time as clock
-import tomllib
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -21,7 +20,7 @@ from scenarios.campaign.events import CountedEvent, parse_event
 from scenarios.campaign.rows import DRAW, TIMES, flown_row, make_schema
 from scenarios.catalogue import campaign_path, scenario_source
 from scenarios.flown import Flight
-from scenarios.loading import parse_scenario
+from scenarios.loading import apply_settings, parse_scenario
 from scenarios.machine import processor_name
 from scenarios.many import ERROR, MEMORY, Row, fly_many
 from scenarios.plugin import Plugin
@@ -31,17 +30,18 @@ from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import (
     NOT_DESCRIBED,
-    apply_setting,
+    RECORDED,
     differences,
     get_field,
     note_changes,
     separate,
     set_field,
 )
+from scenarios.schema.writing import plain
 
 FIRST: Final = 5  # flights of which one at least has to be possible
 DrawnChange = tuple[Varied, Value]
-Parse = Callable[[dict[str, Any]], Scenario]
+_OF_VEHICLE: Final = ("vehicle", "vehicle.file")  # fields that choose the vehicle
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Plan:
     """A campaign's file and the scenario that its flights differ from."""
 
     spec: CampaignFile  # the file
-    scenario: Scenario  # with the file's changes, and every number of its vehicle, in it
+    scenario: Scenario  # with the file's changes, and the numbers of its vehicle's file recorded
     one_seed: bool = False  # whether all flights have the scenario's own, as in a sweep
 
     @property
@@ -70,8 +70,8 @@ class Plan:
 
     @cached_property
     def limits(self) -> tuple[Limit, ...]:
-        """The limits of the audit; flights for which bounds are drawn have others."""
-        return Assembly(self.scenario).limits
+        """The limits of the audit, those of a user's controller too; flights for which bounds are drawn have others."""
+        return Assembly(self.scenario).audited().limits
 
     @property
     def flies_user_code(self) -> bool:
@@ -93,11 +93,6 @@ class Plan:
             return tuple(parse_event(text, self.columns) for text in self.spec.failure)
         except InputError as error:
             raise InputError(f"failure: {error}") from error
-
-    @cached_property
-    def data(self) -> dict[str, Any]:
-        """The scenario's tables."""
-        return tomllib.loads(self.scenario.to_toml())
 
     def of(self, flight: int) -> Scenario:
         """The scenario of one flight.
@@ -177,10 +172,11 @@ class Plan:
         return row | {"failed": any(event.holds(row) for event in self.failure)}
 
     def _varied(self, changes: Sequence[DrawnChange], *, name: str, seed: int) -> Scenario:
-        def parse(data: dict[str, Any]) -> Scenario:
-            return parse_scenario({**data, "name": name, "seed": seed}, source=name)
-
-        return changed(self.data, changes, parse, table=self._table)
+        scenario = self.scenario
+        vehicles = [change for change in changes if not {*_OF_VEHICLE}.isdisjoint(change[0].fields)]
+        if vehicles:  # shares of numbers are then of the vehicle at hand
+            scenario = Assembly(changed(scenario, vehicles, {}, table=self._table)).recorded.scenario
+        return changed(scenario, changes, {"name": name, "seed": seed}, table=self._table)
 
 
 def read_campaign(name: str) -> dict[str, Any]:
@@ -211,7 +207,7 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
 def make_plan(scenario: Scenario, data: Mapping[str, Any]) -> Plan:
     """Return a campaign of a given scenario, with its other fields as in a file."""
     spec = parse_campaign({"name": scenario.name, **data, "scenario": scenario.name}, source="campaign")
-    plan = Plan(spec, audited(Assembly(scenario)).with_vehicle)
+    plan = Plan(spec, Assembly(scenario).recorded.scenario)
     plan.check()
     return plan
 
@@ -233,22 +229,12 @@ def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ())
         if (field := setting.partition("=")[0].strip()) in owners:
             rule = f"of a field that flights do not have each of their own; {owners[field]}"
             raise ParameterError("", "--set", setting, rule)
-        apply_setting(data, setting)
     try:
+        apply_settings(data, settings, file.parent)
         scenario = parse_scenario(data, source=f"{path.name}, {Path(spec.scenario).name}", directory=file.parent)
     except OSError as error:
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
-    Assembly(scenario).check()
-    return audited(Assembly(scenario)).with_vehicle
-
-
-def audited(assembly: Assembly) -> Assembly:
-    """Return the assembly with the bounds of a user's controller as constraints: the table has a column for each."""
-    return (
-        assembly.with_law_bounds(assembly.controller())
-        if isinstance(assembly.scenario.controller, Plugin)
-        else assembly
-    )
+    return Assembly(scenario).check().recorded.scenario
 
 
 def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], ...]:
@@ -258,9 +244,8 @@ def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], .
     """
     tables, drawn = [], []
     for plan in (first, second):
-        scenario = {
-            key: value for key, value in tomllib.loads(plan.scenario.to_toml()).items() if key not in NOT_DESCRIBED
-        }
+        left_out = (*NOT_DESCRIBED, RECORDED)
+        scenario = {key: value for key, value in plain(plan.scenario).items() if key not in left_out}
         campaign = asdict(plan.spec)
         tables.append({**scenario, **{name: campaign[name] for name in ("seed", "sampling", "limits", "vary")}})
         drawn.append({field for entry in plan.spec.vary if not entry.relative for field in entry.fields})
@@ -292,29 +277,34 @@ def cell(value: Value) -> Value | str:
     return float(value) if isinstance(value, int | float) else str(value)
 
 
-def changed(data: Mapping[str, Any], changes: Sequence[DrawnChange], parse: Parse, *, table: str) -> Scenario:
-    """A scenario's tables with the fields of some entries replaced, parsed; `table` of the file has the entries.
+def changed(scenario: Scenario, changes: Sequence[DrawnChange], identity: Mapping[str, Any], *, table: str) -> Scenario:
+    """A scenario with the fields of some entries replaced; `table` of the file has the entries.
+
+    `identity` has its name and seed, which no description lists.
 
     Raises:
         InputError: what comes of it is no scenario.
     """
-    before, data = data, merge(data, {})
+    tables = scenario.tables
+    defaults = plain(scenario)
     for entry, _ in changes:  # a field of `[actual]` is as modelled until it is drawn
         for above, name, *_rest in (field.split(".") for field in entry.fields if "." in field):
-            if above == "actual" and name in before["vehicle"]:
-                data.setdefault("actual", {}).setdefault(name, before["vehicle"][name])
-    after = merge(data, {})
+            if above == "actual" and name in defaults["vehicle"]:
+                for data in (tables, defaults):
+                    data.setdefault("actual", {}).setdefault(name, defaults["vehicle"][name])
     for entry, value in changes:
         for field, single in separate({tuple(entry.fields): value}, source=table).items():
-            new = _scaled(data, entry, field, single, parse, table) if entry.relative else single
-            set_field(after, field, new, source=f"{table}.{entry.name}.fields")
-    return parse(after)
+            new = _scaled(scenario, defaults, entry, field, single, table) if entry.relative else single
+            set_field(tables, field, new, source=f"{table}.{entry.name}.fields", defaults=defaults)
+    return scenario.derive({**tables, **identity}, source=identity.get("name"))
 
 
-def _scaled(data: dict[str, Any], entry: Varied, field: str, value: Value, parse: Parse, table: str) -> Value:
-    modelled = get_field(data, field)
+def _scaled(
+    scenario: Scenario, defaults: Mapping[str, Any], entry: Varied, field: str, value: Value, table: str
+) -> Value:
+    modelled = get_field(merge(defaults, {}), field)
     if modelled is None:  # refused with its own message where there is no such field
-        changed(data, [(replace(entry, relative=False), value)], parse, table=table)
+        changed(scenario, [(replace(entry, relative=False), value)], {}, table=table)
     for what, number in ((f"the scenario has no number at {field}", modelled), ("what is drawn is no number", value)):
         if isinstance(number, bool) or not isinstance(number, int | float):
             raise ParameterError(f"{table}.{entry.name}", "relative", True, f"false where {what}")
@@ -343,8 +333,8 @@ def drawn_flights(scenario: Scenario, campaign: str) -> Plan:
     """The draws of a campaign, with its `[set]`, for a scenario that need not be its own."""
     data = read_campaign(campaign)
     if data.get("set"):
-        merged = merge(tomllib.loads(scenario.to_toml()), data["set"])
-        scenario = parse_scenario(merged, source=f"{scenario.name}, as {campaign} sets it")
+        merged = merge(scenario.tables, data["set"])
+        scenario = scenario.derive(merged, source=f"{scenario.name}, as {campaign} sets it")
     return make_plan(
         scenario, {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
     )

@@ -18,7 +18,7 @@ from quadsim.palette import COLOUR
 from quadsim.report.figure import Bound, Figure, Panel, Series
 from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import CampaignFile, GridValues
-from scenarios.campaign.plan import Plan, audited, cell
+from scenarios.campaign.plan import Plan, cell
 from scenarios.campaign.rows import DRAW, is_number, make_table, numbers
 from scenarios.flown import to_pandas
 from scenarios.progress import Progress, silent
@@ -42,6 +42,7 @@ class Sweep(Result):
     name: str  # of the scenario
     fields: tuple[str, ...]  # columns that were swept
     table: pa.Table
+    cut: int = 0  # flights that end before their course does
 
     def __getitem__(self, column: str) -> np.ndarray[Any, Any]:
         """Return a column (flights,) by name.
@@ -82,6 +83,8 @@ class Sweep(Result):
         head = (*map(self._brief, self.fields), *_SHOWN)
         title = f"sweep of {self.name}: {len(self)} flights, {verdicts}"
         yield console.table(title, head, lines, left=("verdict", "worst_constraint"))
+        if self.cut:
+            yield f"{self.cut} of {len(self)} flights end before their course does: the scenario states a duration"
 
     def _brief(self, field: str) -> str:
         """Return the last part of a field's path if it is unique."""
@@ -133,7 +136,7 @@ def fly_sweep(
         spec = CampaignFile(name=scenario.name, scenario=scenario.name, flights=count, vary=[*entries])
     except ValueError as error:
         raise InputError(f"sweep: {error}") from error
-    plan = Plan(spec, audited(Assembly(scenario)).with_vehicle, one_seed=True)
+    plan = Plan(spec, Assembly(scenario).recorded.scenario, one_seed=True)
     plan.check()
     progress("sweep", 0, count)
     rows = []
@@ -141,13 +144,22 @@ def fly_sweep(
         for row in flown:
             rows.append(row)
             progress("sweep", len(rows), count)
+    cut = sum(_is_cut(plan, flight) for flight in range(count))
     swept = _swept(entries)
     table = make_table(rows, plan.schema)
     dropped = ("flight", "seed", "failed", *(DRAW + entry.name for entry in entries))
     results = table.select([*_FIRST, *(name for name in table.column_names if name not in (*_FIRST, *dropped))])
     schema = pa.schema([*(pa.field(name, column.type) for name, column in swept.items()), *results.schema])
     columns = [*swept.values(), *results.columns]
-    return Sweep(scenario.name, tuple(swept), pa.Table.from_arrays(columns, schema=schema))
+    return Sweep(scenario.name, tuple(swept), pa.Table.from_arrays(columns, schema=schema), cut)
+
+
+def _is_cut(plan: Plan, flight: int) -> bool:
+    """Return whether a flight ends before its course does; one that cannot be flown does not."""
+    try:
+        return Assembly(plan.of(flight)).course_cut is not None
+    except InputError:
+        return False
 
 
 def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> GridValues:

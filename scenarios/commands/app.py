@@ -300,7 +300,7 @@ def run(
     """
     from quadsim.outputs import run_directory
     from scenarios import loading, user_code
-    from scenarios.feasibility_check import hover_notes
+    from scenarios.feasibility_check import notes
     from scenarios.flown import require_film, write_run
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
@@ -308,7 +308,7 @@ def run(
     require_film(video, fps)
     parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces, reference)
     products = {"video": video, "recording": recording, "figures": figures}
-    for note in hover_notes(parts[0]):
+    for note in notes(parts[0]):
         _log.info(note)
     with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory:
         with reporting(progress) as report:
@@ -435,13 +435,14 @@ def check(
         (True, ())
     """
     from scenarios import loading, reaudit
+    from scenarios.catalogue import names_directory
     from scenarios.commands.junit import junit_file, write_junit
     from scenarios.progress import reporting
     from scenarios.results import after
     from scenarios.rollout import Rollout
 
     file = None if junit is None else junit_file(junit)
-    if isinstance(target, str | Path) and Path(target).is_dir():
+    if isinstance(target, str | Path) and names_directory(target):
         if changes or seed is not None:
             option, value = ("--set", changes) if changes else ("--seed", seed)
             raise ParameterError("", option, value, "absent when a finished run is checked")

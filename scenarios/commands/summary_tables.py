@@ -34,7 +34,10 @@ _SPARE: Final = ("beyond", "sampled", "plant", "bounds")  # columns that a narro
 
 def summary_tables(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
     """Yield the tables and sentences of a summary: the verdict and its reasons, audit, tracking, timing, the rest."""
-    simulated = console.styled(f"  {summary['duration']:.2f} s flown")
+    flown = f"{summary['duration']:.2f} s flown"
+    if "cut_before" in summary.get("course", {}):
+        flown += f", of a course that ends at {summary['course']['cut_before']:g} s"
+    simulated = console.styled(f"  {flown}")
     yield console.styled((summary["scenario"], "bold"), "  ") + outcome_line(summary) + simulated
     if summary.get("description"):
         yield summary["description"]

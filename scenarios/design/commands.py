@@ -84,10 +84,11 @@ def scenario(
     if name is None:
         names = ", ".join(scenario_names())
         raise InputError(f"scenario needs a name or a TOML file, or --schema (there are: {names})")
-    whole = loading.assemble(name, changes, seed).resolved.scenario
-    if isinstance(whole.reference, Csv):  # so that you may replace the table
-        whole = whole.altered(reference=replace(whole.reference, sha256=None))
-    return loading.ScenarioFile(whole.to_toml())
+    assembly = loading.assemble(name, changes, seed)
+    table = assembly.scenario.reference
+    if isinstance(table, Csv):  # so that you may replace the file
+        assembly = assembly.of(assembly.scenario.altered(reference=replace(table, sha256=None)))
+    return loading.ScenarioFile(assembly.to_toml())
 
 
 def vehicle_report(

@@ -132,7 +132,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._flight: Rollout | None = None
         self._camera: Camera | None = None
         self._closed = False
-        self.scenario, self.limits = self._base, Assembly(self._base).limits
+        self.scenario = self._base
+        self.limits = self._assembly(self._base).limits
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
@@ -185,7 +186,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             self.actions = Actions(self._action, scenario, Assembly(scenario).vehicle)
         # events that change the controller need a real one
         law: Any = None if scenario.controller_changes else Agent(scenario.controller.horizon)
-        self._flight = Rollout(scenario, law)
+        self._flight = Rollout(self._assembly(scenario), law)
         self.limits = self._flight.limits
         self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
         self._seen, log = self._flight.observation, self._flight.loop.log()
@@ -299,6 +300,11 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             self._camera.close()
             self._camera = None
 
+    def _assembly(self, scenario: Scenario) -> Assembly:
+        """Return the parts of an episode, with the bounds of a user's controller where a campaign varies it."""
+        assembly = Assembly(scenario)
+        return assembly if self._plan is None else assembly.audited()
+
     def _drawn(self, seed: int | None, options: Mapping[str, Any]) -> Scenario:
         """The scenario of the episode that starts."""
         if self._plan is None:
@@ -386,15 +392,18 @@ def register_library() -> None:
         gymnasium.registry.setdefault(environment_id(name), _specification(scenario, scenario=name))
 
 
-def _specification(flown_scenario: Scenario, **kwargs: Any) -> EnvSpec:
+def _specification(flown_scenario: Scenario, vary: str | Path | None = None, **kwargs: Any) -> EnvSpec:
+    """Describe the environment; its time limit is the duration, which a campaign gives to each episode anew."""
     entry_point = f"{__name__}:{QuadrotorEnv.__name__}"
-    return EnvSpec(
-        environment_id(flown_scenario.name), entry_point, max_episode_steps=flown_scenario.periods, kwargs=kwargs
-    )
+    most = flown_scenario.periods if vary is None else None
+    return EnvSpec(environment_id(flown_scenario.name), entry_point, max_episode_steps=most, kwargs=kwargs)
 
 
 def make_env(scenario: Scenario | str | Path, **options: Any) -> gymnasium.Env[Any, Any]:
     """The environment of any scenario, with the wrappers of `gymnasium.make`: its time limit is the duration.
+
+    With `vary` each episode ends at its own duration; `gymnasium.make` of a registered id keeps the limit of the
+    scenario that ships, and takes another as `max_episode_steps`.
 
     Args:
         scenario: it, or its name or file.
@@ -412,7 +421,7 @@ def make_env(scenario: Scenario | str | Path, **options: Any) -> gymnasium.Env[A
         >>> env.close()
     """
     scenario = load_scenario(scenario)
-    return gymnasium.make(_specification(scenario, scenario=scenario), **options)
+    return gymnasium.make(_specification(scenario, options.get("vary"), scenario=scenario), **options)
 
 
 def make_vec(scenario: Scenario | str | Path, num_envs: int, **options: Any) -> VectorEnv:
@@ -436,4 +445,5 @@ def make_vec(scenario: Scenario | str | Path, num_envs: int, **options: Any) -> 
     if num_envs < 1:
         raise ParameterError("", "num_envs", num_envs, "at least 1")
     scenario = load_scenario(scenario)
-    return gymnasium.make_vec(_specification(scenario, scenario=scenario), num_envs, "async", **options)
+    specification = _specification(scenario, options.get("vary"), scenario=scenario)
+    return gymnasium.make_vec(specification, num_envs, "async", **options)

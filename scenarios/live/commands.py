@@ -51,11 +51,12 @@ def live(
         Traceback (most recent call last):
         quadsim.errors.ParameterError: --port must be from 1 to 65535, or 0 for any that is free; got 70000
     """
+    from scenarios.catalogue import names_directory
     from scenarios.live.serving import fly_live
     from scenarios.loading import load_scenario
     from scenarios.reaudit import reaudit, stored_scenario
 
-    onward = isinstance(scenario, str | Path) and Path(scenario).is_dir()
+    onward = isinstance(scenario, str | Path) and names_directory(scenario)
     if onward:
         if changes or seed is not None:
             raise ParameterError("", "--set" if changes else "--seed", "given", "absent when a run is continued")

@@ -11,14 +11,14 @@ from quadsim.assets import DEEPEST, read_toml
 from quadsim.errors import FileError, InputError, ParameterError
 from scenarios.catalogue import VARIANTS, Source, scenario_source, source_label
 from scenarios.plugin import located
-from scenarios.schema.settings import note_changes, set_field, state_bounds
+from scenarios.schema.settings import RECORDED, leaves, note_changes, restate, set_field, state_bounds
 
 _TOLERANCES: Final = ("tolerance", "tolerance_sampled")
 
 
 def locate_files(data: dict[str, Any], directory: Path) -> None:
     """Make paths that are relative to a file's folder independent of it, in place."""
-    for name, ending in (("vehicle", ".toml"), ("reference", "")):
+    for name, ending in (("vehicle", ".toml"), (RECORDED, ".toml"), ("reference", "")):
         file = data[name].get("file") if isinstance(data.get(name), dict) else None
         if isinstance(file, str) and file.endswith(ending) and (directory / file).is_file():
             data[name]["file"] = str((directory / file).resolve())
@@ -130,13 +130,20 @@ def read_whole(path: Path) -> dict[str, Any]:
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge one table over another, field by field.
+    """Merge a file's tables over another's, field by field; with what they replace goes what repeats it (`restate`).
 
     A table of another `type` replaces the base's; entries of a list that have names are merged by name, new ones come
     after them; every other value replaces the base's.  A base's tolerances belong to the base's bounds: they survive
     only in an entry that states neither bounds nor tolerances.
     """
-    merged = dict(copy.deepcopy(dict(base)))
+    merged = copy.deepcopy(dict(base))
+    for path, value in leaves(over):
+        restate(merged, path, value)
+    return _merge(merged, over)
+
+
+def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    merged = copy.deepcopy(dict(base))
     for key, value in over.items():
         before = merged.get(key)
         if (
@@ -144,11 +151,11 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
             and isinstance(value, dict)
             and value.get("type", before.get("type")) == before.get("type")
         ):
-            merged[key] = merge(before, value)
+            merged[key] = _merge(before, value)
         elif isinstance(before, list) and _named(before) and _named(value):
             entries = {entry["name"]: entry for entry in before}
             entries |= {
-                entry["name"]: merge(_restated(entries.get(entry["name"], {}), entry), entry) for entry in value
+                entry["name"]: _merge(_restated(entries.get(entry["name"], {}), entry), entry) for entry in value
             }
             merged[key] = list(entries.values())
         else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, get_args, get_type_hints
@@ -35,8 +34,8 @@ from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorF
 from scenarios.schema.initial import Initial
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.sensors import EstimatorSpec, Sensors, check_sensing
-from scenarios.schema.settings import separate, set_field
-from scenarios.schema.writing import to_toml
+from scenarios.schema.settings import REPEATING, RecordedVehicle, separate, set_field
+from scenarios.schema.writing import is_absent, plain, to_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,6 +163,10 @@ class Scenario:
     ] = 200.0
     vehicle: VehicleTable
     actual: ActualTable | None = None
+    recorded: Annotated[
+        RecordedVehicle | None,
+        doc("absent: [vehicle] and [autopilot] have only what replaces the vehicle file's numbers"),
+    ] = None
     initial: Initial = field(default_factory=Initial)
     plant: Simulation = Simulation()
     reference: ReferenceTable
@@ -232,11 +235,44 @@ class Scenario:
         """Whether the duration comes from the course rather than from the file."""
         return bool(vars(self).get("ends_with_course", False))
 
+    @property
+    def tables(self) -> dict[str, Any]:
+        """What was stated, as nested tables in file units, without defaults and derived values; a copy."""
+        stated: dict[str, Any] | None = vars(self).get("stated")
+        tables = copy.deepcopy(stated) if stated is not None else self._every_field()
+        for name in vars(self).get("restated", ()):
+            value = getattr(self, name)
+            if is_absent(value):
+                tables.pop(name, None)
+            else:
+                tables[name] = plain(value)
+        return tables
+
+    def _every_field(self) -> dict[str, Any]:
+        """Return every field with a value, defaults included, except the duration where the course gives it."""
+        tables: dict[str, Any] = plain(self)
+        if self.ends_with_course:
+            del tables["duration"]
+        return tables
+
     def altered(self, **fields: Any) -> Scenario:
         """Return a copy with other values of whole fields, without checking consistency; lists become tuples."""
         other = copy.copy(self)
         vars(other).update({name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})
+        restated = {*vars(self).get("restated", ()), *fields}
+        vars(other).update(restated=tuple(sorted(restated)))
+        if "duration" in fields:
+            vars(other).update(ends_with_course=False)
         return other
+
+    def recording(self, vehicle: VehicleTable, autopilot: AutopilotSettings | None) -> Scenario:
+        """Return the scenario with these tables, in which it repeats the numbers of its vehicle's file."""
+        record = self.recorded
+        if record is None:
+            tables = {name: plain(getattr(self, name) or {}) for name in REPEATING}
+            stated = [f"{table}.{name}" for table in tables for name in tables[table] if name != "file"]
+            record = RecordedVehicle(file=self.vehicle.file, stated=tuple(stated))
+        return self.altered(vehicle=vehicle, autopilot=autopilot, recorded=record)
 
     def require_consistent(self) -> None:
         """Refuse fields that are valid alone but inconsistent.
@@ -256,6 +292,13 @@ class Scenario:
                 rate = self.log_rate if name == "log_rate" else value
                 period = "have a period that is" if name == "log_rate" else "be"
                 raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {rate}") from error
+        if self.recorded is not None and self.recorded.file != self.vehicle.file:
+            advice = (
+                "for another vehicle remove [recorded], and the numbers of [vehicle] and [autopilot] that repeat it"
+            )
+            raise ValueError(
+                f"recorded.file must be vehicle.file = {self.vehicle.file!r}; got {self.recorded.file!r} ({advice})"
+            )
         self._check_events()
         specs = [self.controller, *(spec for _, spec in self.controller_changes)]
         for spec in specs:
@@ -370,11 +413,23 @@ class Scenario:
         if isinstance(data.get("controller"), str):
             data = {**data, "controller": {"type": data["controller"]}}
         try:
-            return parse_table(cls, data, source)
+            scenario = parse_table(cls, data, source)
         except ScenarioError:
             raise
         except ValueError as error:
             raise InputError(f"a scenario must be one that can be written: {error}") from error
+        vars(scenario).update(stated=copy.deepcopy(dict(data)))
+        return scenario
+
+    def derive(self, tables: Mapping[str, Any], *, source: str | None = None) -> Scenario:
+        """Return the scenario of other tables, made from `tables`, checked as a file is and called `source`.
+
+        Raises:
+            ScenarioError: the message names every invalid field.
+        """
+        other = Scenario.parse(tables, source=self.name if source is None else source)
+        # A reference that was passed in as a function has its rows in memory.
+        return other.altered(reference=self.reference) if other.reference == self.reference else other
 
     def replace(self, changes: Mapping[Any, Any]) -> Scenario:
         """Return a scenario with other values of some fields; this one is unchanged.
@@ -397,22 +452,31 @@ class Scenario:
             >>> scenario.replace({both: [-2.0, 2.0]}).controller.output_bounds
             {'roll': (-2.0, 2.0), 'pitch': (-2.0, 2.0)}
         """
-        data = tomllib.loads(self.to_toml())
-        if self.ends_with_course:
-            del data["duration"]
+        tables = self.tables
+        defaults = plain(self)
         for path, value in separate(changes, source="replace").items():
-            set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, source="replace")
-        other = Scenario.parse(data, source=self.name)
-        # A reference that was passed in as a function has its rows in memory.
-        return other.altered(reference=self.reference) if other.reference == self.reference else other
+            number = value.tolist() if hasattr(value, "tolist") else value
+            set_field(tables, path, number, source="replace", defaults=defaults)
+        return self.derive(tables)
 
     def fly(self, **options: Any) -> quadsim.Flight:
         """Fly the scenario; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
         return quadsim.fly(self, **options)
 
     def to_toml(self) -> str:
-        """Return the resolved file: every field, defaults included, with comments; parsing it gives this scenario."""
-        return to_toml(self)
+        """Return the file: every field, defaults included, with comments; parsing it gives this scenario.
+
+        A derived duration stands in a comment.
+        """
+        return self.written(self)
+
+    def written(self, resolved: Scenario) -> str:
+        """Return the file as `to_toml`, with values of `resolved` that this scenario does not state in comments."""
+        repeated: dict[str, str] = {}
+        if self.recorded is not None:
+            paths = {f"{table}.{name}" for table in REPEATING for name in plain(getattr(self, table) or {})}
+            repeated = dict.fromkeys(paths - {"vehicle.file", *self.recorded.stated}, self.recorded.file)
+        return to_toml(resolved, self._every_field(), repeated)
 
 
 _FOR_USERS: Final = {*Scenario.__dataclass_fields__, "replace", "fly", "to_toml"}

@@ -5,19 +5,38 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
+
+from annotated_types import MaxLen, doc
 
 from quadsim.assets import DEEPEST, parse_toml
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.input_limits import MOST_ENTRIES
 
 _CHANGED: Final = " (changed: "  # start of the list of changes at the end of a description
 NOT_DESCRIBED: Final = ("name", "description", "group", "expect", "seed")
 """Fields whose changes a description does not list."""
+RECORDED: Final = "recorded"
+REPEATING: Final = ("vehicle", "autopilot")
+"""The table that says that a scenario repeats its vehicle's file, and the tables that do."""
 _LONGEST: Final = 60  # characters of a value that a description shows
 
 
-def apply_setting(data: dict[str, Any], setting: str) -> None:
-    """Apply one `dotted.path=value` to a scenario's tables; see `set_field`.
+@dataclass(frozen=True, kw_only=True)
+class RecordedVehicle:
+    """Numbers of the vehicle file that [vehicle] and [autopilot] repeat, to fly alike without it; written by runs."""
+
+    file: Annotated[str, doc("the vehicle file they are of, vehicle.file; with another one they are left out")]
+    stated: Annotated[
+        tuple[str, ...],
+        MaxLen(MOST_ENTRIES),
+        doc("fields of [vehicle] and [autopilot] that are no repetition, as vehicle.mass"),
+    ] = ()
+
+
+def apply_setting(data: dict[str, Any], setting: str, defaults: Mapping[str, Any] | None = None) -> None:
+    """Apply one `dotted.path=value` to a scenario's tables, with their `defaults`; see `set_field`.
 
     Raises:
         ParameterError: the text is not of that form, or the path leads through something that is not a table.
@@ -35,15 +54,30 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
     except InputError:
         rule = f"of at most {DEEPEST} tables and lists within one another"
         raise ParameterError("", "--set", setting[:100], rule) from None
-    set_field(data, path.strip(), value, source="--set", given=setting)
+    set_field(data, path.strip(), value, source="--set", given=setting, defaults=defaults)
 
 
-def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given: str | None = None) -> None:
+def set_field(
+    data: dict[str, Any],
+    path: str,
+    value: Any,
+    *,
+    source: str,
+    given: str | None = None,
+    defaults: Mapping[str, Any] | None = None,
+) -> None:
     """Replace or add a field, and say so in the scenario's description; missing tables on the path are added.
 
     An entry of a list of tables is addressed by its name, as in `constraints.roll.upper`, or, where it has none, by its
     index, as in `events.0.at`; a number of a list by its index, as in `initial.euler.2`.
-    None removes the field.  `source` and `given`, the request as written, are for the message.
+
+    Args:
+        data: what was stated, changed in place.
+        path: dotted path of the field.
+        value: its new value; None removes the field.
+        source: who asks, for the message.
+        given: the request as written, for the message; the path by default.
+        defaults: the same tables with every default, which have the lists that `data` leaves to them.
 
     Raises:
         ParameterError: the path leads through something that is not a table.
@@ -51,8 +85,9 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
     """
     if path in ("controller", "controller.type"):
         state_bounds(data, value if path == "controller" else {"type": value})
+    restate(data, path, value)
     *through, last = path.split(".")
-    holder = _holder(data, through, source=source, given=given or path)
+    holder = _holder(data, through, source=source, given=given or path, defaults=defaults)
     if isinstance(holder, dict) and value is None:
         holder.pop(last, None)
     elif isinstance(holder, dict):
@@ -61,6 +96,32 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
         _require_numbers(holder, path, source=source, given=given or path)
         holder[_index(holder, ".".join(through), last)] = value
     note_change(data, path, value)
+
+
+def restate(data: dict[str, Any], path: str, value: Any) -> None:
+    """Before a field gets a value, drop what repeats a file that `path` replaces, and note what is stated from now on.
+
+    With another vehicle file go the values recorded from the file before, and with another course file its hash.  A
+    recorded value that is replaced is stated.
+    """
+    table, _, field = path.partition(".")
+    reference, vehicle, recorded = (data.get(name) for name in ("reference", "vehicle", RECORDED))
+    if path == "reference.file" and isinstance(reference, dict) and reference.get("file") != value:
+        reference.pop("sha256", None)
+    if not (isinstance(recorded, dict) and isinstance(vehicle, dict)):
+        return
+    stated = recorded.get("stated", [])
+    if path == "vehicle" or (path == "vehicle.file" and vehicle.get("file") != value):
+        for name in REPEATING:
+            kept = {key: number for key, number in _table(data, name).items() if f"{name}.{key}" in stated}
+            data[name] = kept
+        del data[RECORDED]
+        if not data["autopilot"]:
+            del data["autopilot"]
+    elif table in REPEATING and field != "file":
+        names = [field.partition(".")[0]] if field else [*_table({table: value}, table)]
+        new = [f"{table}.{name}" for name in names if f"{table}.{name}" not in stated]
+        data[RECORDED] = {**recorded, "stated": [*stated, *new]}
 
 
 def separate(changes: Mapping[Any, Any], *, source: str) -> dict[str, Any]:
@@ -169,16 +230,28 @@ def get_field(data: dict[str, Any], path: str) -> Any:
     return holder[_index(holder, ".".join(through), last)]
 
 
-def _holder(data: dict[str, Any], through: list[str], *, source: str, given: str) -> dict[str, Any] | list[Any]:
-    """Return the table or list at the end of a path."""
+def _holder(
+    data: dict[str, Any],
+    through: list[str],
+    *,
+    source: str,
+    given: str,
+    defaults: Mapping[str, Any] | None = None,
+) -> dict[str, Any] | list[Any]:
+    """Return the table or list at the end of a path; `defaults` has the lists that `data` leaves to them."""
     holder: Any = data
+    default: Any = defaults
     for depth, key in enumerate(through):
         if isinstance(holder, list):
-            holder = holder[_index(holder, ".".join(through[:depth]), key)]
+            i = _index(holder, ".".join(through[:depth]), key)
+            default = default[i] if isinstance(default, list) and i < len(default) else None
+            holder = holder[i]
         else:
             if key == "controller" and isinstance(holder.get(key), str):  # its name alone
                 holder[key] = {"type": holder[key]}
-            holder = holder.setdefault(key, {})
+            alike = isinstance(default, Mapping) and holder.get("type", default.get("type")) == default.get("type")
+            default = default.get(key) if alike else None
+            holder = holder.setdefault(key, copy.deepcopy(default) if isinstance(default, list) else {})
         if not isinstance(holder, dict | list) or holder == []:
             raise ParameterError("", source, given, f"a path to a field; {key} has none")
     return holder

@@ -1,7 +1,8 @@
 """A scenario as commented TOML: every field with its unit and meaning, the descriptions of `scenarios.schema`.
 
-What is written parses to the same scenario, and equal scenarios give equal texts.  A field that may be absent, and is,
-stands there commented out.  A field is explained where its kind of table first occurs.
+What is written parses to the same scenario, and equal scenarios give equal texts.  What is not stated stands in
+comments: a field that may be absent, and is, an absent table with its defaults, and a derived value with the word
+`derived`.  A field is explained where its kind of table first occurs.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any, Final, Literal, get_args, get_origin
 
 import tomlkit
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
 
 from scenarios.schema.base import fields_of, is_table
 
@@ -47,12 +49,22 @@ def plain(value: Any) -> Any:
     return [plain(entry) for entry in value] if isinstance(value, list | tuple) else value
 
 
-def to_toml(model: Any) -> str:
-    """Return a table as a TOML document."""
-    return "\n".join(_lines(model, "", set())) + "\n"
+def to_toml(model: Any, stated: Mapping[str, Any] | None = None, recorded: Mapping[str, str] | None = None) -> str:
+    """Return a table as a TOML document.
+
+    Args:
+        model: the table.
+        stated: as of `plain`, the fields that the document states; the others are derived and stand in comments.  By
+            default all of `model`.
+        recorded: by dotted path, the file that a field repeats; its comment names it.
+    """
+    lines = _lines(model, "", set(), plain(model) if stated is None else stated, recorded or {})
+    return "\n".join(lines) + "\n"
 
 
-def _lines(model: Any, path: str, explained: set[object]) -> Iterator[str]:
+def _lines(
+    model: Any, path: str, explained: set[object], stated: Mapping[str, Any], recorded: Mapping[str, str]
+) -> Iterator[str]:
     """Yield the lines of a table: numbers, texts and small lists, then its subtables, in order of declaration."""
     below: list[tuple[str, Any, str]] = []
     for name, field in sorted(fields_of(type(model)).items(), key=_type_first):
@@ -64,27 +76,72 @@ def _lines(model: Any, path: str, explained: set[object]) -> Iterator[str]:
             below.append((name, value, comment or headline(type(value)) if is_new else ""))
         elif isinstance(value, Mapping) or (value and kinds and not path):
             below.append((name, value, comment))
+        elif is_absent(value) and kinds:
+            if is_new:
+                below.append((name, None, comment or "; ".join(map(headline, kinds))))
         elif is_absent(value):
-            text = f"# [{path}{name}]" if kinds else f"# {name} ="
-            yield from _commented(text, comment or "; ".join(map(headline, kinds))) if is_new else ()
+            yield from _commented(f"# {name} =", comment) if is_new else ()
+        elif name not in stated:
+            yield from _commented(_unstated(_pair(name, value)), _labelled_as("derived", comment))
         else:
             yield from _about_entries(kinds) if kinds not in explained else ()
             explained.add(kinds)
-            yield from _commented(_pair(name, value), comment)
+            source = recorded.get(f"{path}{name}")
+            yield from _commented(_pair(name, value), _labelled_as(f"of {source}", comment) if source else comment)
     for name, value, comment in below:
-        if isinstance(value, list | tuple):
+        if value is None:
+            field = fields_of(type(model))[name]
+            yield from _absent(f"{path}{name}", tables_in(field.annotation), comment, explained)
+        elif isinstance(value, list | tuple):
             yield from ["", *_wrapped(comment)]
             several = len({type(entry) for entry in value}) > 1
             for entry in value:
                 about = headline(type(entry)) if (several or not comment) and type(entry) not in explained else ""
                 explained.add(type(entry))
-                yield from ["", *_commented(f"[[{name}]]", about), *_lines(entry, f"{name}.", explained)]
-        else:
+                lines = _lines(entry, f"{name}.", explained, plain(entry), recorded)
+                yield from ["", *_commented(f"[[{name}]]", about), *lines]
+        elif isinstance(value, Mapping):
             yield from ["", *_commented(f"[{path}{name}]", comment)]
-            if isinstance(value, Mapping):
-                yield from (_pair(key, entry) for key, entry in value.items())
-            else:
-                yield from _lines(value, f"{path}{name}.", explained)
+            yield from (_pair(key, entry) for key, entry in value.items())
+        elif name in stated:
+            yield from ["", *_commented(f"[{path}{name}]", comment)]
+            yield from _lines(value, f"{path}{name}.", explained, stated[name], recorded)
+        else:
+            yield from ["", *_commented(f"# [{path}{name}]", _labelled_as("derived", comment))]
+            yield from _lines(value, f"{path}{name}.", explained, {}, recorded)
+
+
+def _absent(path: str, kinds: Sequence[type[Any]], comment: str, explained: set[object]) -> Iterator[str]:
+    """Yield an absent table in comments: its fields with their defaults, then its subtables."""
+    yield from ["", *_commented(f"# [{path}]", comment)]
+    if len(kinds) > 1:
+        yield from _about_entries(kinds)
+        return
+    (kind,) = kinds
+    below: list[tuple[str, tuple[type[Any], ...], str]] = []
+    for name, field in sorted(fields_of(kind).items(), key=_type_first):
+        is_new = (kind, name) not in explained
+        explained.add((kind, name))
+        about = " ".join((field.description or "").split()) if is_new else ""
+        default = field.get_default(call_default_factory=True)
+        tables = tables_in(field.annotation)
+        if tables and not isinstance(default, list | tuple):
+            below.append((name, tables, about or "; ".join(map(headline, tables)) if is_new else ""))
+        elif default is PydanticUndefined or is_absent(default):
+            yield from _commented(f"# {name} =", about)
+        else:
+            yield from _commented(_unstated(_pair(name, plain(default))), about)
+    for name, tables, about in below:
+        yield from _absent(f"{path}.{name}", tables, about, explained)
+
+
+def _unstated(text: str) -> str:
+    """Return lines of TOML as comments."""
+    return "\n".join(f"# {line}" for line in text.split("\n"))
+
+
+def _labelled_as(label: str, comment: str) -> str:
+    return f"{label}; {comment}" if comment else label
 
 
 def _about_entries(kinds: Sequence[type[Any]]) -> Iterator[str]:

@@ -399,7 +399,7 @@ def flown_with(flight: Flight, settings: dict[str, Any], until: float) -> Flight
     """Fly a change without the code under test: a robust law has no field `solver`."""
     data = tomllib.loads(flight.scenario.to_toml())
     if "controller.type" in settings:
-        del data["controller"]["solver"]
+        data["controller"].pop("solver", None)
     for path, value in settings.items():
         *tables, name = path.split(".")
         place = data

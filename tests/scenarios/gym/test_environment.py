@@ -223,6 +223,21 @@ def test_a_campaigns_duration_truncates(tmp_path: Path) -> None:
     assert [env.step(HOVER)[2:4] for _ in range(2)] == [(False, False), (False, True)]
 
 
+def test_a_drawn_course_is_flown_to_its_end(tmp_path: Path) -> None:
+    settings = ["constraints=[]", "reference.period=2.0", "reference.ramp=0.5", "lost.tilt=180.0"]
+    eight = quadsim.load("hummingbird-figure-eight", [*settings, "reference.length=0.1", "reference.turns=0.5"])
+    eight = eight.replace({"duration": None})
+    entry = '[[vary]]\nname = "turns"\nfields = ["reference.turns"]\ndistribution = "grid"\nvalues = [1.5]\n'
+    campaign = tmp_path / "turns.toml"
+    campaign.write_text(f'name = "turns"\nscenario = "hover"\nflights = 1\n{entry}')
+    env = quadsim.gym.make_env(eight, vary=str(campaign), action="deviations")
+    assert env.spec is not None
+    assert env.spec.max_episode_steps is None
+    drawn = eight.replace({"reference.turns": 1.5})
+    assert drawn.periods == eight.periods + 40
+    assert len(flown(env)) == drawn.periods + 1
+
+
 SLOW = quadsim.load("hover").replace({"controller.input_bounds.speed": [0.0, 150.0]})
 
 

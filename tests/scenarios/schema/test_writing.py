@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
+from collections.abc import Iterator
+from typing import Any, get_origin
 
 import pytest
 from support import scenario_table
@@ -10,17 +13,68 @@ from support import scenario_table
 from scenarios.assembly import Assembly
 from scenarios.catalogue import scenario_names
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.schema.writing import plain
+from scenarios.schema.base import fields_of, is_table
+from scenarios.schema.scenario import Scenario
+from scenarios.schema.writing import plain, tables_in
 
 
 @pytest.mark.parametrize("name", scenario_names())
 def test_what_is_written_is_read_again_and_written_the_same(name: str) -> None:
-    scenario = Assembly(load_scenario(name)).resolved.scenario
-    text = scenario.to_toml()
-    again = parse_scenario(tomllib.loads(text))
-    assert again == scenario
-    assert again.to_toml() == text
-    assert tomllib.loads(text) == plain(scenario)
+    stated = Assembly(load_scenario(name))
+    for assembly in (stated, stated.recorded):
+        text = assembly.to_toml()
+        again = parse_scenario(tomllib.loads(text))
+        assert again == assembly.scenario
+        assert again.ends_with_course == assembly.scenario.ends_with_course
+        assert Assembly(again).to_toml() == text
+        assert Assembly(again).recorded.to_toml() == stated.recorded.to_toml()
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_comments_have_every_derived_value(name: str) -> None:
+    assembly = Assembly(load_scenario(name))
+    lines = assembly.to_toml().splitlines()
+    marks = [i for i, line in enumerate(lines) if "# derived" in line]
+    assert marks
+    for i in marks:
+        value_above = lines[i].startswith("# derived")
+        j = next(j for j in range(i, len(lines)) if not value_above or " = " in lines[j] or lines[j].startswith("# ["))
+        lines[j] = lines[j].removeprefix("# ")
+    resolved = plain(assembly.resolved.scenario)
+    resolved["events"] = plain(assembly.scenario)["events"]
+    assert tomllib.loads("\n".join(lines)) == resolved
+
+
+def fields_below(value: object, kind: type[Any], path: str) -> Iterator[tuple[type[Any], str, str]]:
+    """Yield kind of table, its path and name of every field of a table and of those in it, present or absent."""
+    for name, field in fields_of(kind).items():
+        yield kind, path, name
+        below = getattr(value, name, None)
+        kinds = (type(below),) if is_table(type(below)) else tables_in(field.annotation)
+        if (
+            len(kinds) == 1
+            and not isinstance(below, list | tuple)
+            and get_origin(field.annotation) not in (list, tuple)
+        ):
+            yield from fields_below(below, kinds[0], f"{path}.{name}".removeprefix("."))
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_every_field_is_printed_also_of_absent_tables(name: str) -> None:
+    """An absent one where its kind of table first occurs."""
+    assembly = Assembly(load_scenario(name))
+    printed, table = set(), ""
+    for line in assembly.to_toml().splitlines():
+        if heading := re.match(r"(?:# )?\[\[?([\w.]+)\]\]?(?:  #|$)", line):
+            table = heading.group(1)
+            printed.add((table.rpartition(".")[0], table.rpartition(".")[2]))
+        elif field := re.match(r"(?:# )?(\w+) =", line):
+            printed.add((table, field.group(1)))
+    declared = [*fields_below(assembly.scenario, Scenario, "")]
+    there = {(kind, field) for kind, path, field in declared if (path, field) in printed}
+    missing = {(path, field) for kind, path, field in declared if (kind, field) not in there}
+    assert len(declared) > 100
+    assert not missing
 
 
 def test_whole_numbers_may_stand_for_numbers() -> None:
