@@ -248,6 +248,7 @@ class Command:
             the last command, if it continues for one that missed its deadline.
         stats: how it was computed.
         inner: inner loop that flies commands from now on; None: the rotors hold `speeds`.
+        iterations_by: whose iterations `stats` counts, also if that answer was rejected; empty: `answered_by`.
 
     Examples:
         >>> import numpy as np
@@ -264,6 +265,7 @@ class Command:
     fallback: int = 0
     stats: Statistics = NO_STATISTICS
     inner: InnerLoop | None = None
+    iterations_by: str = ""
 
 
 GROUNDED: Final = frozenset({Phase.LANDED, Phase.CRASHED})
@@ -292,6 +294,16 @@ class Solving(Protocol):
     @property
     def solver(self) -> str:
         """Name of the QP solver; empty for a closed form."""
+        ...
+
+
+@runtime_checkable
+class Iterating(Protocol):
+    """A law whose answers take iterations."""
+
+    @property
+    def iterates(self) -> frozenset[str]:
+        """Names of all that may count them, as in `Command.iterations_by`."""
         ...
 
 

@@ -108,6 +108,7 @@ class NonlinearMPC:
     """
 
     name: Final = "nonlinear"
+    iterates: Final = frozenset({name})
 
     def __init__(
         self,
@@ -378,19 +379,19 @@ class NonlinearMPC:
         last_plan = self._sqp.plan
         answer, found = self._iterate(now.time)
         status = STATUSES[found]
-        answer, reason = self._check(self.problem, None, answer, None if status in ACCEPTED else status)
+        answer, reason = self._checked(answer, None if status in ACCEPTED else status)
         first = self.infeasible_period
         if reason is not None:
             if reason != INVALID_DATA and (first is None or first.converges is not None):
                 self.infeasible_period = self._kept_period(now.time, reason)
-            return refused(self._acting, self.horizon, reason, answer)
+            return replace(refused(self._acting, self.horizon, reason, answer), iterations_by=self.name)
         if status == NOT_CONVERGED and first is None:
             start = _Start(last_plan, self._law.world.numbers.copy(), now.time, self._law.query)
             converges = partial(_converges, self._again, self.settings, start)
             self.infeasible_period = replace(self._kept_period(now.time, status), converges=converges)
         speeds = self._law.plan.copy()
         self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
-        return command_of(speeds[0], speeds, status, answer)
+        return replace(command_of(speeds[0], speeds, status, answer), iterations_by=self.name)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the latest disturbance estimate, without rotor lag."""
@@ -418,7 +419,7 @@ class NonlinearMPC:
         return Trim(speeds=np.array(trim.commands), lift=np.array(trim.lift)) if self._targets else None
 
     def _iterate(self, time: float) -> tuple[Answer, int]:
-        """Take SQP steps from the stored plan; return the answer and its status in the core."""
+        """Take SQP steps from the stored plan; return the last program's optimum and the plan's status in the core."""
         sqp, started = self._sqp, clock.perf_counter()
         status = sqp.step() if self._space is None else self._among(self._space, time)
         found = self._law.end(status)
@@ -431,13 +432,12 @@ class NonlinearMPC:
         stats = Statistics(
             iterations=sqp.iterations,
             active=active,
-            infeasibility=sqp.violation,
             sqp_defect=sqp.defect,
             sqp_step=sqp.moved,
             solve_s=spent_s,
         )
         answer = Answer(
-            sqp.planned_inputs if status is SQPStatus.UNCONVERGED else sqp.inputs,
+            sqp.inputs,
             sqp.slacks(self._groups),
             UNCONSTRAINED if free else SOLVED,
             GAIN if free else CORE,
@@ -446,6 +446,12 @@ class NonlinearMPC:
             certificate=self._certificate,
         )
         return answer, found
+
+    def _checked(self, answer: Answer, refused: str | None) -> tuple[Answer, str | None]:
+        """Check the last program's optimum; see `mpc.answer.AnswerCheck`."""
+        if answer.certificate is None:
+            return answer, refused
+        return self._check(self._rows(), self._query(), answer, refused)
 
     def _among(self, space: Space, time: float) -> SQPStatus:
         """Take SQP steps among half-spaces: those of a program follow its optimum, a few times at most."""

@@ -168,8 +168,9 @@ def test_computation_takes_its_times_and_stalls() -> None:
     assert result is not None
     assert [(each.at, each.duration) for each in result.stalls] == [(1.0, 0.2)]
     assert replace(result, stalls=()) == Computation(plan=False)
-    loaded, _ = scenario("computation={delay=0.01, per_iteration=1e-4, jitter=0.002}")
-    assert Assembly(loaded).computation() == Computation(delay=0.01, per_iteration=1e-4, plan=False, jitter=0.002)
+    loaded, _ = scenario("computation={delay=0.01, per_iteration={piqp=1e-4}, jitter=0.002}")
+    expected = Computation(delay=0.01, per_iteration={"piqp-multistage": 1e-4}, plan=False, jitter=0.002)
+    assert Assembly(loaded).computation() == expected
 
 
 @pytest.mark.parametrize(
