@@ -42,7 +42,7 @@ from mpc.nonlinear.rigidbody import (
     thrust_axis,
 )
 from mpc.nonlinear.settings import Nonlinear
-from mpc.nonlinear.sqp import SQP, SQPStatus, slack_groups
+from mpc.nonlinear.sqp import OWN_NAMES, SQP, SQPStatus, slack_groups
 from mpc.observer import DisturbanceObserver, disturbance_of
 from mpc.obstacles import HALF_SPACE_ROUNDING, SETTLED, Space, distances
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
@@ -306,7 +306,16 @@ class NonlinearMPC:
     def _of_states(self, constraint: Constraint, n: int) -> Constraint:
         """Convert rows over the 12 states and rotor speeds to the model's; refuse those not linear in its states."""
         C, D = (np.zeros((constraint.lower.shape[-1], size)) for size in (n, N_ROTORS))
+        if constraint.name in OWN_NAMES:
+            rule = f"named otherwise than {', '.join(OWN_NAMES)}, the law's own bounds"
+            raise ParameterError("controller", constraint.name, "further rows of that name", rule)
+        if constraint.E is not None and constraint.E.any():
+            rule = "without steps of rotor speeds, which input_bounds.slew bounds"
+            raise ParameterError("controller", constraint.name, "of those", rule)
         if constraint.C is not None:
+            if constraint.C.ndim == 3:
+                rule = "with the same rows at all steps: only the half-spaces of obstacles differ from step to step"
+                raise ParameterError("controller", constraint.name, "of others", rule)
             if constraint.C[:, [*EULER, *EULER_RATE]].any():
                 rule = "without Euler angles and their rates; tilt and body_rate bound the attitude"
                 raise ParameterError("controller", constraint.name, "of those", rule)

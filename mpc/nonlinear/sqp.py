@@ -29,6 +29,8 @@ _CURVATURE: Final = 1e-5
 _OWN_SLACKS: Final = {"tilt": 0, "body_rates": 1, "space": 2}
 """Slacks of a node by the constraints that have them; those of all others follow."""
 _TILT_SIDES: Final = 12
+OWN_NAMES: Final = ("inputs", "tilt", "body_rates")
+"""Constraints whose rows the core has by themselves."""
 
 
 class SQPStatus(IntEnum):
@@ -437,18 +439,14 @@ def _stated(
         the rows, and the place in `prices` of each of the problem's slacks that they have.
 
     Raises:
-        ParameterError: coefficients, or bounds that the core has once, differ from step to step.
+        ParameterError: bounds that the core has once differ from step to step.
     """
     stated: list[_StatedRow] = []
-    rows, own = problem.rows, ("inputs", "tilt", "body_rates")
+    rows = problem.rows
     states = {at: places + k for k, at in enumerate([*range(P.start, P.stop), *range(V.start, V.stop)])}
     groups: dict[int, int] = {}
-    if rows.C.ndim == 3:
-        parts = [part.name for part in problem.every_constraint if part.C is not None and part.C.ndim == 3]
-        rule = "with the same rows at all steps: only half-spaces of `space` differ from step to step"
-        raise ParameterError("controller", ", ".join(parts), "rows that differ from step to step", rule)
     for i, name in enumerate(rows.names):
-        if name in own:
+        if name in OWN_NAMES:
             _require_alike(name, rows.lower[:, i], rows.upper[:, i])
             continue
         lag = 0 if rows.of_states[i] else 1

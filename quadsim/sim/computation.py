@@ -109,5 +109,5 @@ class Computation(ComputationTime):
 
 def not_measured(missing: Collection[str], measured: Collection[str]) -> ParameterError:
     """Return the error of a law whose iterations are not those that were measured."""
-    rule = f"by the solvers that may answer for this controller, so also of {', '.join(sorted(missing))}"
-    return ParameterError("computation", "per_iteration", f"of {', '.join(sorted(measured))}", rule)
+    rule = f"given for every solver that may answer for this controller, so also for {', '.join(sorted(missing))}"
+    return ParameterError("computation", "per_iteration", sorted(measured), rule)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from quadsim.controller import GROUNDED, MISSED, Command, Phase, Statistics, StepInputs, stopped
+from quadsim.errors import ParameterError
 from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import computation, estimation, ground
 from quadsim.flight.phase import PhaseMonitor
@@ -350,6 +351,20 @@ def delay(computation: Computation, time: float = 0.0) -> float:
 def test_fixed_part_and_iterations_add_up() -> None:
     assert delay(Computation()) == 0.0
     assert delay(Computation(delay=0.01, per_iteration={"law": 0.002})) == pytest.approx(0.034)
+
+
+def test_iterations_take_the_time_of_whoever_counted_them() -> None:
+    computation = Computation(per_iteration={"core": 1e-3, "piqp-multistage": 0.01})
+    for answered_by, iterations_by, expected in (
+        ("core", "", 0.002),
+        ("piqp-multistage", "piqp-multistage", 0.02),
+        ("fallback", "core", 0.002),
+    ):
+        stats = Statistics(iterations=2)
+        command = replace(COMMAND, answered_by=answered_by, iterations_by=iterations_by, stats=stats)
+        assert computation.taken(0.0, command, np.random.default_rng(0)) == pytest.approx(expected)
+    with pytest.raises(ParameterError, match=r"per_iteration must be given .* also for daqp; got \['core'"):
+        computation.taken(0.0, replace(COMMAND, iterations_by="daqp"), np.random.default_rng(0))
 
 
 def test_jitter_is_exponential() -> None:
