@@ -200,7 +200,7 @@ class Statistics(NamedTuple):
         slack: largest softening of an output bound [rad]; 0 while all bounds are hard.
         reported_primal: largest constraint violation that the QP solver reports [in its scaling].
         reported_dual: largest gradient of the Lagrangian that the QP solver reports [in its scaling].
-        infeasibility: largest violation of the problem's rows by the plan, soft rows less their slack [row's unit].
+        infeasibility: largest violation of the problem's normalised rows by the plan, soft rows less their slack.
         kkt_stationarity: largest entry of the Lagrangian's gradient, computed from the QP.
         kkt_complementarity: largest product of a multiplier and the distance to its bound, computed from the QP.
         kkt_dual: largest multiplier with the wrong sign, computed from the QP.
