@@ -214,7 +214,7 @@ class Rows:
         return self.soft[np.unique(self.slack[self.soft], return_index=True)[1]]
 
 
-ROW_ROUNDING: Final = 1e-9
+SCALE_ROUNDING: Final = 1e-9
 """Share by which the largest coefficient of a row may exceed 1 through rounding, as that of a unit normal may."""
 LARGEST_EXPONENT: Final = 1000
 """Largest magnitude of the exponent of a row's scale, with which all scales are finite."""
@@ -226,7 +226,7 @@ def row_scale(largest: Array) -> Array:
     A power of two keeps all digits.  Bounds on single states and inputs, unit normals and sums of terms with factors of
     1 keep their scale of 1.
     """
-    _, exponent = np.frexp(largest * (1.0 - ROW_ROUNDING))
+    _, exponent = np.frexp(largest * (1.0 - SCALE_ROUNDING))
     exponent = np.minimum(np.maximum(exponent, -LARGEST_EXPONENT), LARGEST_EXPONENT)
     return np.asarray(np.where(largest > 0.0, np.ldexp(1.0, -exponent), 1.0))
 
