@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 BOUND_TOLERANCE: Final = 1e-6
 """Tolerance of the bounds [rad/s]: an answer outside by no more is moved onto its bounds and accepted."""
 INFEASIBLE: Final = 1e-3
-"""Largest violation of a row [its unit] that an accepted plan may have."""
+"""Largest violation of a normalised row (`mpc.constraints.Rows`) that an accepted plan may have."""
 INFEASIBLE_ANSWER: Final = "infeasible_answer"
 """Status of an answer whose plan violates a row by more than `INFEASIBLE`."""
 LARGEST_MAP: Final = 2**20
@@ -135,16 +135,16 @@ class AnswerCheck:
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a failed solver may return any number
     def __call__(
-        self, problem: Problem, query: Query | None, answer: Answer, refused: str | None
+        self, problem: Problem, query: Query, answer: Answer, refused: str | None
     ) -> tuple[Answer, str | None]:
         """Return the answer with its violation of rows and, when due, KKT residuals; and the reason to reject it.
 
-        A reason in `refused` takes precedence.  Without a query, the answer's own violation counts.
+        A reason in `refused` takes precedence.
         """
         due, self._periods = self._periods % self._every == 0, self._periods + 1
         if answer.certificate is None:
             return answer, refused
-        violation = answer.stats.infeasibility if query is None else self._infeasibility(problem, query, answer)
+        violation = self._infeasibility(problem, query, answer)
         if refused is None and not violation <= INFEASIBLE:
             refused = INFEASIBLE_ANSWER
         if due or refused is not None:
@@ -174,7 +174,7 @@ class AnswerCheck:
             values += np.where(rows.of_states, *((rows.C @ x[:, :, None])[:, :, 0] for x in (states, before)))
         beyond = np.maximum(values - rows.upper, rows.lower - values)
         if rows.soft.size:
-            beyond[:, rows.soft] -= answer.slacks[:, rows.slack[rows.soft]]
+            beyond[:, rows.soft] -= (answer.slacks * rows.slack_scale)[:, rows.slack[rows.soft]]
         return max(float(beyond.flat[beyond.argmax()]), 0.0)
 
 
@@ -205,6 +205,7 @@ def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallb
         answered_by=answer.answered_by if accepted else FALLBACK,
         fallback=fallback,
         stats=stats,
+        iterations_by=answer.answered_by,
     )
 
 

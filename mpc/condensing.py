@@ -205,8 +205,8 @@ class Condensed:
         return x[: self._inputs].reshape(self._problem.horizon, -1)
 
     def slacks(self, x: Array) -> Array:
-        """Return (N, m_s) the slacks of a primal point."""
-        return x[self._inputs :].reshape(self._problem.horizon, -1)
+        """Return (N, m_s) the slacks of a primal point, in the constraints' units."""
+        return x[self._inputs :].reshape(self._problem.horizon, -1) / self._problem.rows.slack_scale
 
     def multipliers(self, solution: Solution) -> Array:
         """Return (N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
@@ -220,7 +220,9 @@ class Condensed:
         (z, z_box), x, rows = self._rows.split(multipliers), plan.ravel(), self._problem.rows
         if rows.soft.size:
             l1, l2 = rows.l1[rows.slacks], rows.l2[rows.slacks]
-            prices = np.abs(multipliers[:, rows.soft]) @ (rows.slack[rows.soft][:, None] == np.arange(l1.size))
+            slacks = slacks * rows.slack_scale
+            normalised = multipliers[:, rows.soft] / rows.scale[rows.soft]
+            prices = np.abs(normalised) @ (rows.slack[rows.soft][:, None] == np.arange(l1.size))
             # Stationarity of a slack: l1 + 2 l2 e - sum |z| + z_box = 0.
             z_slacks = np.minimum(prices - l1 - 2.0 * l2 * slacks, 0.0)
             x, z_box = np.concatenate((x, slacks.ravel())), np.concatenate((z_box, z_slacks.ravel()))

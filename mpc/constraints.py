@@ -172,21 +172,31 @@ def origin_of_state(index: int) -> Origin:
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """The m rows of all constraints that have a finite bound, in the constraints' order."""
+    """The m normalised rows of all constraints that have a finite bound, in the constraints' order.
 
+    A row is the constraint's times its `scale`, so that its unit does not affect any solver.  Penalties are those of
+    normalised rows too.  Formulations return slacks and multipliers in the constraints' units.
+    """
+
+    scale: Array  # (m,) of `row_scale`; the same for rows that share a slack
     C: Array  # (m, n), or (N, m, n) if rows differ from step to step
     D: Array  # (m, nu)
     E: Array  # (m, nu)
     lower: Array  # (N, m)
     upper: Array  # same
-    l1: Array  # (m,) linear penalty of a row; infinite for hard rows
-    l2: Array  # (m,) quadratic penalty
+    l1: Array  # (m,) linear penalty of a normalised row; infinite for hard rows
+    l2: Array  # (m,) quadratic penalty of a normalised row
     slack: Indices  # (m,) index of a soft row's slack within its step; -1 for hard rows
     # (m,) whether a row is on the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i)
     of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
     input: Indices  # (m,) the input that a hard row bounds alone; -1 otherwise
     step: Indices  # (m,) the input whose step a hard row bounds alone; -1 otherwise
     names: tuple[str, ...]  # (m,) names of their constraints
+
+    @cached_property
+    def slack_scale(self) -> Array:
+        """Return (n_s,) the scale of each slack of a step."""
+        return self.scale[self.slacks]
 
     @cached_property
     def on_states(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -202,6 +212,23 @@ class Rows:
     def slacks(self) -> Indices:
         """Return (m_s,) the first row of each slack; all soft rows if none share a slack."""
         return self.soft[np.unique(self.slack[self.soft], return_index=True)[1]]
+
+
+SCALE_ROUNDING: Final = 1e-9
+"""Share by which the largest coefficient of a row may exceed 1 through rounding, as that of a unit normal may."""
+LARGEST_EXPONENT: Final = 1000
+"""Largest magnitude of the exponent of a row's scale, with which all scales are finite."""
+
+
+def row_scale(largest: Array) -> Array:
+    """Return the powers of two (m,) that bring rows' `largest` coefficients (m,) into (1/2, 1]; 1 for rows of zeros.
+
+    A power of two keeps all digits.  Bounds on single states and inputs, unit normals and sums of terms with factors of
+    1 keep their scale of 1.
+    """
+    _, exponent = np.frexp(largest * (1.0 - SCALE_ROUNDING))
+    exponent = np.minimum(np.maximum(exponent, -LARGEST_EXPONENT), LARGEST_EXPONENT)
+    return np.asarray(np.where(largest > 0.0, np.ldexp(1.0, -exponent), 1.0))
 
 
 def renumbered(slack: Indices) -> Indices:

@@ -224,15 +224,13 @@ def _relaxed(
     rows = tuple(replace(one, penalty=slack if side in elastic else None) for side, one in sides.items())
     form = Staged(replace(problem, bounds=None, constraints=rows))
     qp = form.assemble(query).qp
-    named, columns = (
-        [side for side in sides if side in elastic],
-        form.slacks(np.arange(qp.c.size, dtype=float)).astype(int),
-    )
+    named = [side for side in sides if side in elastic]
+    columns, scale = form.slack_columns, form.slack_scale
     basis, cost, box = sparse.identity(qp.c.size, format="csc"), np.zeros(qp.c.size), np.stack([qp.x_l, qp.x_u], 1)
-    cost[columns] = 1.0
+    cost[columns] = 1.0 / scale
     if together is not None:
         weights = np.zeros(qp.c.size)
-        weights[columns] = [1.0 / together[side] for side in named]
+        weights[columns] = scale / np.array([together[side] for side in named])
         others = np.setdiff1d(np.arange(qp.c.size), columns)
         basis = sparse.hstack([basis[:, others], sparse.csc_matrix(weights[:, None])], format="csc")
         cost, box = np.append(np.zeros(others.size), 1.0), np.vstack([box[others], [0.0, math.inf]])

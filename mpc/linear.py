@@ -9,6 +9,7 @@ import numpy as np
 from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection, resized, shifted
 from mpc.equilibrium import Trim
 from mpc.observer import disturbance_of
+from mpc.obstacles import SOLVER as SPACE_SOLVER
 from mpc.obstacles import ObstacleQP, Space
 from mpc.ocp import InfeasiblePeriod, Problem, Query
 from mpc.paper import rollout
@@ -187,6 +188,11 @@ class LinearMPC:
         if law is not None and law._plan is not None and self._holds:
             self._plan, self._held = resized(law._plan, self.horizon), law._held
         self.preparation.adopt(None if law is None else law.preparation.memory, disturbance_of(previous))
+
+    @property
+    def iterates(self) -> frozenset[str]:
+        """See `quadsim.controller.Iterating`."""
+        return self._solver.iterates | frozenset({SPACE_SOLVER} if self._obstacles is not None else ())
 
     @property
     def trim(self) -> Trim | None:

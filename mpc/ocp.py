@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 import mpc
-from mpc.constraints import Bounds, Constraint, Rows, renumbered
+from mpc.constraints import Bounds, Constraint, Rows, renumbered, row_scale
 from mpc.model import LinearModel
 from mpc.regulator import stabilising
 from quadsim.errors import ParameterError
@@ -156,7 +156,8 @@ class Problem:
         """The condensed QP of one period, as new numpy arrays for any solver.  Eqs. (27)-(29).
 
         The variables x are the inputs u(k), ..., u(k+N-1) [rad/s], so x[:4] is the command, and then the slacks of
-        soft rows.  Tightened bounds are in `lower` and `upper`.
+        soft rows.  Tightened bounds are in `lower` and `upper`.  Rows and slacks are those of the constraints times
+        `rows.scale`, a power of two that is 1 for bounds on single states.
 
         Args:
             state: (12,) x(k) [m, m/s, rad, rad/s].  A model with rotor lag has the rotor speeds [rad/s] as well, (16,);
@@ -180,7 +181,7 @@ class Problem:
 
     @cached_property
     def rows(self) -> Rows:
-        """The rows of all constraints."""
+        """The rows of all constraints, normalised."""
         constraints = self.every_constraint
         if not constraints:
             raise ValueError("a constrained MPC needs a problem with bounds")
@@ -205,6 +206,13 @@ class Problem:
                 for (part, m), k in zip(parts, first, strict=False)
             ]
         )
+        scale = row_scale(_largest_coefficients(C, D, E))
+        for first_row in np.unique(slack[slack >= 0]):
+            shared = slack == first_row
+            scale[shared] = scale[shared].min()
+        C, D, E = C * scale[:, None], D * scale[:, None], E * scale[:, None]
+        lower, upper = lower * scale, upper * scale
+        l1, l2 = l1 / scale, l2 / scale**2
         of_states = C.any(axis=-1) if C.ndim == 2 else C.any(axis=(0, 2))
 
         def alone(of: Array, other: Array) -> Indices:
@@ -215,6 +223,7 @@ class Problem:
 
         bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
         return Rows(
+            scale=scale[bounded],
             C=C[..., bounded, :],
             D=D[bounded],
             E=E[bounded],
@@ -228,6 +237,15 @@ class Problem:
             step=alone(E, D)[bounded],
             names=tuple(names[i] for i in bounded),
         )
+
+
+def _largest_coefficients(C: Array, D: Array, E: Array) -> Array:
+    """Return (m,) the largest magnitude of a row's coefficients in C (m, n) or (N, m, n), D and E (m, nu)."""
+    of_states = np.abs(C).max(axis=-1, initial=0.0)
+    if C.ndim == 3:
+        of_states = of_states.max(axis=0)
+    of_inputs = np.maximum(np.abs(D).max(axis=1, initial=0.0), np.abs(E).max(axis=1, initial=0.0))
+    return np.asarray(np.maximum(of_states, of_inputs))
 
 
 class Query(NamedTuple):

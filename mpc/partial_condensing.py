@@ -326,8 +326,8 @@ class PartiallyCondensed:
         return x[self._at.inputs]
 
     def slacks(self, x: Array) -> Array:
-        """Return (N, m_s) the slacks of a primal point."""
-        return x[self._at.slacks]
+        """Return (N, m_s) the slacks of a primal point, in the constraints' units."""
+        return x[self._at.slacks] / self._problem.rows.slack_scale
 
     def _states(self, matrices: Matrices, c: Array, state: Array, x: Array) -> Array:
         """Return (N, n) the predicted states of a primal point."""

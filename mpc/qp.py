@@ -42,6 +42,7 @@ class QPRows:
 
     Attributes:
         C, D, E: (K, n), or (N, K, n) if rows differ from step to step, (K, nu), (K, nu).
+        origin: (K,) index of each row among the problem's.
         slack: (K, m_s) slack coefficients.
         lower, upper: (N, K).
         of_states: (K,) see `mpc.constraints.Rows`.
@@ -54,7 +55,7 @@ class QPRows:
         hard = np.flatnonzero((rows.input < 0) & np.isinf(rows.l1))
         above = rows.soft[np.isfinite(rows.upper[:, rows.soft]).any(axis=0)]
         below = rows.soft[np.isfinite(rows.lower[:, rows.soft]).any(axis=0)]
-        self._origin = origin = np.concatenate([hard, above, below])
+        self.origin = origin = np.concatenate([hard, above, below])
         of_rows = (rows.slack[:, None] == np.arange(rows.slacks.size)).astype(float)
         self.slack = np.concatenate([np.zeros((hard.size, rows.slacks.size)), 0.0 - of_rows[above], of_rows[below]])
         self.C, self.D, self.E = rows.C[..., origin, :], rows.D[origin], rows.E[origin]
@@ -73,10 +74,10 @@ class QPRows:
         self._of_box[self._boxed, rows.input[self._boxed]] = 1.0
 
     def multipliers(self, z: Array, z_inputs: Array) -> Array:
-        """(N, m) multipliers of the problem's rows, from those of the QP's rows (N K,) and inputs (N nu,)."""
+        """(N, m) multipliers of the constraints' rows, from those of the QP's rows (N K,) and inputs (N nu,)."""
         N = len(self.lower)
         multipliers = np.zeros((N, len(self._whole.D)))
-        for column, row in zip(z.reshape(N, -1).T, self._origin, strict=True):
+        for column, row in zip(z.reshape(N, -1).T, self.origin, strict=True):
             multipliers[:, row] += column
         left = z_inputs.reshape(N, -1).copy()
         for row in self._boxed:  # the first of several rows at the same bound takes the whole multiplier
@@ -85,11 +86,12 @@ class QPRows:
             active_side = np.where(left[:, j] > 0.0, upper, lower)
             multipliers[active_side, row] = left[active_side, j]
             left[active_side, j] = 0.0
-        return multipliers
+        return multipliers * self._whole.scale
 
     def split(self, multipliers: Array) -> tuple[Array, Array]:
         """The inverse: multipliers of the QP's rows (N K,) and of inputs (N nu,)."""
-        z = np.minimum(np.maximum(multipliers[:, self._origin], self._least), self._most)
+        multipliers = multipliers / self._whole.scale
+        z = np.minimum(np.maximum(multipliers[:, self.origin], self._least), self._most)
         return z.ravel(), np.dot(multipliers, self._of_box).ravel()
 
 

@@ -94,8 +94,18 @@ class Staged:
         return x[self._u]
 
     def slacks(self, x: Array) -> Array:
-        """Return (N, m_s) the slacks of a primal point."""
-        return x[self._e]
+        """Return (N, m_s) the slacks of a primal point, in the constraints' units."""
+        return x[self._e] / self.slack_scale
+
+    @property
+    def slack_scale(self) -> Array:
+        """(m_s,) what a slack variable is per unit of the constraint's."""
+        return self._problem.rows.slack_scale
+
+    @property
+    def slack_columns(self) -> Indices:
+        """(N, m_s) indices of the slacks among the variables."""
+        return self._e
 
     def multipliers(self, solution: Solution) -> Array:
         """Return (N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
@@ -107,7 +117,8 @@ class Staged:
         States follow the plan, and their multipliers are those for which the Lagrangian is stationary in them.
         """
         x, z_box = np.zeros(self._size), np.zeros(self._size)
-        x[self._u], x[self._e], x[self._x] = plan, slacks, predicted(self._problem, query, plan)
+        x[self._u], x[self._x] = plan, predicted(self._problem, query, plan)
+        x[self._e] = slacks * self.slack_scale
         z, z_inputs = self._rows.split(multipliers)
         z_box[self._u] = z_inputs.reshape(plan.shape)
         gradient = qp.P @ x + qp.c + qp.G.T @ z

@@ -200,7 +200,7 @@ class Statistics(NamedTuple):
         slack: largest softening of an output bound [rad]; 0 while all bounds are hard.
         reported_primal: largest constraint violation that the QP solver reports [in its scaling].
         reported_dual: largest gradient of the Lagrangian that the QP solver reports [in its scaling].
-        infeasibility: largest violation of the problem's rows by the plan, soft rows less their slack [row's unit].
+        infeasibility: largest violation of the problem's normalised rows by the plan, soft rows less their slack.
         kkt_stationarity: largest entry of the Lagrangian's gradient, computed from the QP.
         kkt_complementarity: largest product of a multiplier and the distance to its bound, computed from the QP.
         kkt_dual: largest multiplier with the wrong sign, computed from the QP.
@@ -248,6 +248,7 @@ class Command:
             the last command, if it continues for one that missed its deadline.
         stats: how it was computed.
         inner: inner loop that flies commands from now on; None: the rotors hold `speeds`.
+        iterations_by: whose iterations `stats` counts, also if that answer was rejected; empty: `answered_by`.
 
     Examples:
         >>> import numpy as np
@@ -264,6 +265,7 @@ class Command:
     fallback: int = 0
     stats: Statistics = NO_STATISTICS
     inner: InnerLoop | None = None
+    iterations_by: str = ""
 
 
 GROUNDED: Final = frozenset({Phase.LANDED, Phase.CRASHED})
@@ -292,6 +294,16 @@ class Solving(Protocol):
     @property
     def solver(self) -> str:
         """Name of the QP solver; empty for a closed form."""
+        ...
+
+
+@runtime_checkable
+class Iterating(Protocol):
+    """A law whose answers take iterations."""
+
+    @property
+    def iterates(self) -> frozenset[str]:
+        """Names of all that may count them, as in `Command.iterations_by`."""
         ...
 
 

@@ -20,9 +20,10 @@ from mpc.builders import build, stated
 from mpc.flatness import motion_along
 from mpc.nonlinear.settings import Nonlinear
 from mpc.pilot import Pilot
+from mpc.solvers import ALIASES
 from quadsim.assets import vehicle_path
 from quadsim.border import user_code
-from quadsim.controller import CORE, ROTORS
+from quadsim.controller import CORE, ROTORS, Iterating
 from quadsim.errors import InputError, ParameterError, QuadsimError
 from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
@@ -30,7 +31,7 @@ from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance, touch
 from quadsim.rotation import body_to_euler_rates
 from quadsim.sim.airframe import outline
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings, built_in_lags, identify_lags
-from quadsim.sim.computation import Computation, ComputationTime, Stall
+from quadsim.sim.computation import Computation, ComputationTime, Stall, not_measured
 from quadsim.sim.effects import Change, Effects, Force, Push, PushChange
 from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics, RotorLoss
@@ -378,7 +379,27 @@ class Assembly:
         if isinstance(spec, Nonlinear | Geometric) and spec.commands != ROTORS and spec.inner_lag is None:
             spec = replace(spec, inner_lag=self.inner_lag)
         shapes = (*self.scenario.obstacles, *self.regions)
-        return self.with_autopilot(build(spec, self.vehicle, self.scenario.control_period, shapes))
+        pilot = build(spec, self.vehicle, self.scenario.control_period, shapes)
+        self.require_measured(pilot.law)
+        return self.with_autopilot(pilot)
+
+    def require_measured(self, law: object) -> None:
+        """Reject times per iteration of other solvers than those that may answer for a law.
+
+        Raises:
+            ParameterError: a solver that may answer is not named in `computation.per_iteration`, or none iterates.
+        """
+        settings = self.scenario.computation
+        if settings is None or not settings.per_iteration:
+            return
+        law = law.law if isinstance(law, Pilot) else law
+        named = frozenset(ALIASES.get(name, name) for name in settings.per_iteration)
+        iterates = law.iterates if isinstance(law, Iterating) else frozenset()
+        if not iterates:
+            rule = "absent with a controller that counts no iterations"
+            raise ParameterError("computation", "per_iteration", settings.per_iteration, rule)
+        if not iterates <= named:
+            raise not_measured(iterates - named, named)
 
     def _stated_laws(self) -> tuple[AnyController, tuple[Event, ...]]:
         """Return controller and events with `compiled` and `solver` of each law stated, to fly as without."""
@@ -491,7 +512,9 @@ class Assembly:
             return None
         fallback = (self.scenario.controller if spec is None else spec).fallback
         guarded = fallback is not None and fallback.enabled  # within the fallback contract
-        return Computation(**vars(filled(settings or ComputationTime(), plan=guarded)), stalls=stalls)
+        stated = filled(settings or ComputationTime(), plan=guarded)
+        per_iteration = {ALIASES.get(name, name): seconds for name, seconds in stated.per_iteration.items()}
+        return Computation(**vars(replace(stated, per_iteration=per_iteration)), stalls=stalls)
 
     # --- plant -------------------------------------------------------------------------------------------------------
 

@@ -30,6 +30,7 @@ from mpc.obstacles import Shape
 from quadsim import border
 from quadsim.border import numbers_of, user_code
 from quadsim.controller import (
+    LAW,
     NO_STATISTICS,
     ROTORS,
     TARGET_SIZES,
@@ -150,6 +151,8 @@ class PluginController:
         law: the user's object.
     """
 
+    iterates: Final = frozenset({LAW})
+
     def __init__(self, law: Any, horizon: int) -> None:
         self.law, self.horizon, kind = law, horizon, type(law).__name__
         with user_code(lambda error: InputError(f"controller: {kind} cannot be used: {reason_of(error)}")):
@@ -206,6 +209,7 @@ class PluginController:
                 answer = Command(speeds=answer, plan=np.tile(_numbers(answer, (self._size,), "it"), (self.horizon, 1)))
             parts: dict[str, Any] = {"fallback": operator.index(answer.fallback), "stats": _checked(answer.stats)}
             parts |= {name: printable(getattr(answer, name))[:200] for name in ("status", "answered_by")}
+            parts["iterations_by"] = LAW
             parts["speeds"] = _numbers(answer.speeds, (self._size,), "its speeds")
             parts["plan"] = _numbers(answer.plan, (self.horizon, self._size), "its plan")
             if self._size > N_ROTORS:

@@ -135,6 +135,7 @@ class Rollout:
         if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
             raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
         controller = assembly.controller() if law is None else law
+        assembly.require_measured(controller)
         assembly = assembly.with_law_bounds(controller)
         self.vehicle, self.actual, self.limits = assembly.vehicle, assembly.actual, assembly.limits
         self._started = scenario = assembly.scenario

@@ -13,7 +13,7 @@ import numpy as np
 
 from mpc.condensing import Condensed
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
-from mpc.core.solver import PROBLEMS, Key, Optimum, Work, core_library, core_problem
+from mpc.core.solver import PROBLEMS, Core, Key, Optimum, Work, core_library, core_problem
 from mpc.core.tables import with_constraints
 from mpc.equilibrium import Trim
 from mpc.fallback.structs import STATUSES, GuardStruct, TrimStruct
@@ -276,6 +276,7 @@ class CompiledSolver:
     """Reads the answer to the query that a preparation in C made last; see `mpc.solvers.Solver`."""
 
     name: Final = "compiled"
+    iterates: Final = Core.iterates
 
     def __init__(self, preparation: CompiledPreparation) -> None:
         self._preparation = preparation

@@ -16,7 +16,7 @@ from mpc.condensing import Condensed
 from mpc.core.tables import members, tables
 from mpc.ocp import Problem, Query
 from mpc.qp import QP, Solution
-from mpc.solvers import Answer, Method, QPSolver
+from mpc.solvers import CORES_SECOND, Answer, Method, QPSolver
 from quadsim.controller import CORE, GAIN, SOLVED, UNCONSTRAINED, Statistics
 from quadsim.core.library import check_sizes, load_library
 from quadsim.state import N_STATES, Array, read_only
@@ -164,6 +164,7 @@ class Optimum:
         self._piqp: QPSolver | None = None
         rows = problem.rows
         self._upper, self._lower, self._soft = rows.upper, rows.lower, rows.soft
+        self._scale, self._slack_scale = rows.scale, rows.slack_scale
         self._no_slacks, self._no_multipliers = (
             read_only(np.zeros((problem.horizon, count))) for count in (rows.soft.size, len(rows.D))
         )
@@ -190,11 +191,11 @@ class Optimum:
         method = Method(found)
         plan, slacks, multipliers, active = self._plan.copy(), self._no_slacks, self._no_multipliers, 0
         if method is not Method.FREE:
-            multipliers, active = self._multiplier.copy(), int(np.count_nonzero(self._side))
+            multipliers, active = self._multiplier * self._scale, int(np.count_nonzero(self._side))
             if slacks.size and np.count_nonzero(violated := np.abs(self._side) == 2):
                 values = self._value + self._shift
                 beyond = np.maximum(np.maximum(values - self._upper, self._lower - values), 0.0)
-                slacks = (violated * beyond)[:, self._soft]
+                slacks = (violated * beyond)[:, self._soft] / self._slack_scale
         return Answer(
             plan,
             slacks,
@@ -212,7 +213,7 @@ class Optimum:
 
     def _by_piqp(self, query: Query, started: float) -> Answer:
         if self._piqp is None:
-            self._piqp = QPSolver("piqp-multistage", self._problem)
+            self._piqp = QPSolver(CORES_SECOND, self._problem)
         spent_s = clock.perf_counter() - started
         answer = self._piqp.solve(query)
         return answer._replace(stats=answer.stats._replace(solve_s=spent_s + answer.stats.solve_s))
@@ -230,6 +231,7 @@ class Core:
     """
 
     name: Final = CORE
+    iterates: Final = frozenset({CORE, CORES_SECOND})
 
     def __init__(self, problem: Problem) -> None:
         self._library, self._shared = core_library(), core_problem(problem)

@@ -24,7 +24,7 @@ class ProblemStruct(ctypes.Structure):
         *struct_members(
             INT, "horizon actuators targets speeds moments substeps difference shifts moves tilts turns places"
         ),
-        *struct_members(INT, "rows faces slacks room changes iterations corrections"),
+        *struct_members(INT, "rows bound_nodes faces slacks room changes iterations corrections"),
         *struct_members(REAL, "tolerance step gravity largest effect:16 gyration:3 moment:6 inflow:6 damping:9 lead:4"),
         *struct_members(AT, "left"),
         *struct_members(REAL, "weight:21 effort:4 move"),

@@ -42,7 +42,7 @@ from mpc.nonlinear.rigidbody import (
     thrust_axis,
 )
 from mpc.nonlinear.settings import Nonlinear
-from mpc.nonlinear.sqp import SQP, SQPStatus, slack_groups
+from mpc.nonlinear.sqp import OWN_NAMES, SQP, SQPStatus, slack_groups
 from mpc.observer import DisturbanceObserver, disturbance_of
 from mpc.obstacles import HALF_SPACE_ROUNDING, SETTLED, Space, distances
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
@@ -113,6 +113,7 @@ class NonlinearMPC:
     """
 
     name: Final = "nonlinear"
+    iterates: Final = frozenset({name})
 
     def __init__(
         self,
@@ -310,7 +311,16 @@ class NonlinearMPC:
     def _of_states(self, constraint: Constraint, n: int) -> Constraint:
         """Convert rows over the 12 states and rotor speeds to the model's; refuse those not linear in its states."""
         C, D = (np.zeros((constraint.lower.shape[-1], size)) for size in (n, N_ROTORS))
+        if constraint.name in OWN_NAMES:
+            rule = f"named otherwise than {', '.join(OWN_NAMES)}, the law's own bounds"
+            raise ParameterError("controller", constraint.name, "further rows of that name", rule)
+        if constraint.E is not None and constraint.E.any():
+            rule = "without steps of rotor speeds, which input_bounds.slew bounds"
+            raise ParameterError("controller", constraint.name, "of those", rule)
         if constraint.C is not None:
+            if constraint.C.ndim == 3:
+                rule = "with the same rows at all steps: only the half-spaces of obstacles differ from step to step"
+                raise ParameterError("controller", constraint.name, "of others", rule)
             if constraint.C[:, [*EULER, *EULER_RATE]].any():
                 rule = "without Euler angles and their rates; tilt and body_rate bound the attitude"
                 raise ParameterError("controller", constraint.name, "of those", rule)
@@ -383,19 +393,19 @@ class NonlinearMPC:
         last_plan = self._sqp.plan
         answer, found = self._iterate(now.time)
         status = STATUSES[found]
-        answer, reason = self._check(self.problem, None, answer, None if status in ACCEPTED else status)
+        answer, reason = self._checked(answer, None if status in ACCEPTED else status)
         first = self.infeasible_period
         if reason is not None:
             if reason != INVALID_DATA and (first is None or first.converges is not None):
                 self.infeasible_period = self._kept_period(now.time, reason)
-            return refused(self._acting, self.horizon, reason, answer)
+            return replace(refused(self._acting, self.horizon, reason, answer), iterations_by=self.name)
         if status == NOT_CONVERGED and first is None:
             start = _Start(last_plan, self._law.world.numbers.copy(), now.time, self._law.query)
             converges = partial(_converges, self._again, self.settings, start)
             self.infeasible_period = replace(self._kept_period(now.time, status), converges=converges)
         speeds = self._law.plan.copy()
         self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
-        return command_of(speeds[0], speeds, status, answer)
+        return replace(command_of(speeds[0], speeds, status, answer), iterations_by=self.name)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the latest disturbance estimate, without rotor lag."""
@@ -423,7 +433,7 @@ class NonlinearMPC:
         return Trim(speeds=np.array(trim.commands), lift=np.array(trim.lift)) if self._targets else None
 
     def _iterate(self, time: float) -> tuple[Answer, int]:
-        """Take SQP steps from the stored plan; return the answer and its status in the core."""
+        """Take SQP steps from the stored plan; return the last program's optimum and the plan's status in the core."""
         sqp, started = self._sqp, clock.perf_counter()
         status = sqp.step() if self._space is None else self._among(self._space, time)
         found = self._law.end(status)
@@ -436,13 +446,12 @@ class NonlinearMPC:
         stats = Statistics(
             iterations=sqp.iterations,
             active=active,
-            infeasibility=sqp.violation,
             sqp_defect=sqp.defect,
             sqp_step=sqp.moved,
             solve_s=spent_s,
         )
         answer = Answer(
-            sqp.planned_inputs if status is SQPStatus.UNCONVERGED else sqp.inputs,
+            sqp.inputs,
             sqp.slacks(self._groups),
             UNCONSTRAINED if free else SOLVED,
             GAIN if free else CORE,
@@ -451,6 +460,12 @@ class NonlinearMPC:
             certificate=self._certificate,
         )
         return answer, found
+
+    def _checked(self, answer: Answer, refused: str | None) -> tuple[Answer, str | None]:
+        """Check the last program's optimum; see `mpc.answer.AnswerCheck`."""
+        if answer.certificate is None:
+            return answer, refused
+        return self._check(self._rows(), self._query(), answer, refused)
 
     def _among(self, space: Space, time: float) -> SQPStatus:
         """Take SQP steps among half-spaces: those of a program follow its optimum, a few times at most."""

@@ -17,6 +17,7 @@ from mpc.nonlinear.body import STATES_ROOM, ProblemStruct, World, body_numbers, 
 from mpc.nonlinear.rigidbody import N_BODY, P, RigidBody, V
 from mpc.ocp import Problem
 from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, set_arrays, struct_members
+from quadsim.errors import ParameterError
 from quadsim.state import Array, Indices
 from quadsim.vehicle import N_ROTORS
 
@@ -28,6 +29,8 @@ _CURVATURE: Final = 1e-5
 _OWN_SLACKS: Final = {"tilt": 0, "body_rates": 1, "space": 2}
 """Slacks of a node by the constraints that have them; those of all others follow."""
 _TILT_SIDES: Final = 12
+OWN_NAMES: Final = ("inputs", "tilt", "body_rates")
+"""Constraints whose rows the core has by themselves."""
 
 
 class SQPStatus(IntEnum):
@@ -79,8 +82,7 @@ class _StatedRow(NamedTuple):
     """A row that the caller states, as the upper bound of a sum of terms."""
 
     terms: list[tuple[float, int, int]]  # coefficient, entry, lag
-    first: float  # bound in the first node
-    bound: float  # in all others
+    bounds: Array  # (N,) of each node
     slack: int
     of: tuple[int, int]  # index among the problem's rows, and side: 1 upper, -1 lower
 
@@ -133,8 +135,12 @@ class SQP:
         tilt, rates = parts.get("tilt"), parts.get("body_rates")
         prices = [_price(tilt), _price(rates), (_HARD, 1.0) if price is None else _halved(*price)]
         places = N_ROTORS + 2 * (tilt is not None) + 3 * (rates is not None)
-        rows = _stated(problem, places, prices)
-        self._rows, self._numbers = rows, _numbers(problem)
+        rows, groups = _stated(problem, places, prices)
+        self._rows, self._numbers, self._scale = rows, _numbers(problem), problem.rows.scale
+        self._slack_scale = np.ones(len(prices))
+        for slack, group in groups.items():
+            self._slack_scale[group] = problem.rows.slack_scale[slack]
+        bounds = _bounds(rows, self.horizon)
         self.most_rows = self.horizon * (
             N_ROTORS + 3 * (tilt is not None) + 3 * (rates is not None) + len(rows) // 2 + faces
         )
@@ -147,6 +153,7 @@ class SQP:
             turns=rates is not None,
             places=bool(faces) or any(entry >= places for row in rows for _, entry, _ in row.terms),
             rows=len(rows),
+            bound_nodes=len(bounds),
             faces=faces,
             slacks=len(prices),
             room=min(self.most_rows, 6 * self.horizon) + 1,
@@ -170,7 +177,6 @@ class SQP:
             set_arrays(p, turn=np.minimum(rates.upper, _HARD))
         terms = [term for row in rows for term in row.terms]
         first = np.cumsum([0, *(len(row.terms) for row in rows)])
-        bounds = [[row.first for row in rows], [row.bound for row in rows]]
         linear, quadratic = np.array(prices).T
         self._prices = linear, np.where(quadratic > 0.0, quadratic, _CURVATURE * linear)
         self.pointed["left"], p.terminal = body_numbers(model, p), self._array("terminal", terminal)
@@ -316,11 +322,6 @@ class SQP:
         return np.array(self._s[1:, P])
 
     @property
-    def planned_inputs(self) -> Array:
-        """(N, 4) inputs of the stored plan."""
-        return np.array(self._u)
-
-    @property
     def inputs(self) -> Array:
         """(N, 4) inputs of the last optimum."""
         return np.array(self._v)
@@ -356,11 +357,6 @@ class SQP:
         return int(self._work.changes + self._work.rounds + self._work.inner)
 
     @property
-    def violation(self) -> float:
-        """Largest violation of a row by the last optimum, less its slack."""
-        return float(self._work.violation)
-
-    @property
     def defect(self) -> float:
         """By how much the plan misses the dynamics."""
         return float(self._work.defect)
@@ -371,9 +367,10 @@ class SQP:
         return float(self._work.moved)
 
     def slacks(self, groups: Indices) -> Array:
-        """(N, m) slacks of the last optimum, of chosen groups."""
+        """(N, m) slacks of the last optimum, of chosen groups, in the constraints' units."""
         linear, quadratic = self._prices
-        return np.array((self._free * (self._origin + (self._price - linear) / quadratic))[:, groups])
+        normalised = self._free * (self._origin + (self._price - linear) / quadratic)
+        return np.array((normalised / self._slack_scale)[:, groups])
 
     def multipliers(self, rows: int, faces_from: int | None = None) -> Array:
         """(N, rows) multipliers of the problem's rows at the last optimum, as `mpc.qp.Solution` has their signs.
@@ -395,7 +392,7 @@ class SQP:
                 found[node, starts["body_rates"] + turn % 3] += by if turn < 3 else -by
             elif kind < stated + p.rows:
                 index, side = self._rows[kind - stated].of
-                found[node, index] += side * by
+                found[node, index] += side * by * self._scale[index]
             elif kind < stated + p.rows + p.faces and faces_from is not None:
                 found[node, faces_from + kind - stated - p.rows] -= by
         at = starts["inputs"]
@@ -433,14 +430,24 @@ def _numbers(problem: Problem) -> dict[str, int]:
     return {name: names.index(name) for name in dict.fromkeys(names)}
 
 
-def _stated(problem: Problem, places: int, prices: list[tuple[float, float]]) -> list[_StatedRow]:
-    """Return all rows but the bounds of inputs, tilt and body rates, and append their prices."""
+def _stated(
+    problem: Problem, places: int, prices: list[tuple[float, float]]
+) -> tuple[list[_StatedRow], dict[int, int]]:
+    """Return all rows but the bounds of inputs, tilt and body rates, and append their prices.
+
+    Returns:
+        the rows, and the place in `prices` of each of the problem's slacks that they have.
+
+    Raises:
+        ParameterError: bounds that the core has once differ from step to step.
+    """
     stated: list[_StatedRow] = []
-    rows, own = problem.rows, ("inputs", "tilt", "body_rates")
+    rows = problem.rows
     states = {at: places + k for k, at in enumerate([*range(P.start, P.stop), *range(V.start, V.stop)])}
     groups: dict[int, int] = {}
     for i, name in enumerate(rows.names):
-        if name in own:
+        if name in OWN_NAMES:
+            _require_alike(name, rows.lower[:, i], rows.upper[:, i])
             continue
         lag = 0 if rows.of_states[i] else 1
         terms = [(float(rows.C[i, k]), states[int(k)], lag) for k in np.flatnonzero(rows.C[i])]
@@ -451,11 +458,28 @@ def _stated(problem: Problem, places: int, prices: list[tuple[float, float]]) ->
             groups[slack] = len(prices)
             prices.append(_halved(float(rows.l1[i]), float(rows.l2[i])))
         for side, bounds in ((1, rows.upper[:, i]), (-1, rows.lower[:, i])):
-            if np.isfinite(bounds[-1]):
+            if np.isfinite(bounds).any():
                 signed = [(side * by, entry, lag) for by, entry, lag in terms]
                 of = (i, side)
-                stated.append(_StatedRow(signed, side * bounds[0], side * bounds[-1], groups.get(slack, -1), of))
-    return stated
+                stated.append(_StatedRow(signed, side * bounds, groups.get(slack, -1), of))
+    return stated, groups
+
+
+def _require_alike(name: str, lower: Array, upper: Array) -> None:
+    """Reject bounds (N,) that differ from step to step, where the core has one number for all."""
+    for side in (lower, upper):
+        if (side != side[0]).any():
+            raise ParameterError("controller", name, side.tolist(), "the same at all steps of the nonlinear law")
+
+
+def _bounds(rows: list[_StatedRow], horizon: int) -> Array:
+    """Return the upper bounds of rows in the first nodes (nodes, rows), of which the last holds in all that follow."""
+    bounds = np.full((horizon, len(rows)), _HARD)
+    for k, row in enumerate(rows):
+        bounds[:, k] = np.minimum(row.bounds, _HARD)
+    differing = np.flatnonzero((bounds != bounds[-1]).any(axis=1))
+    last = differing[-1] + 1 if differing.size else 0
+    return bounds[: last + 1]
 
 
 def slack_groups(problem: Problem, *, faces: bool = False) -> Indices:

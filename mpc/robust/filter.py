@@ -23,12 +23,12 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
-from mpc.answer import ActuatorBounds, command_of, refused, rejection
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection
 from mpc.constraints import Constraint, Penalty
 from mpc.equilibrium import Trim
 from mpc.ocp import Objective, Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
-from mpc.qp import QPRows
+from mpc.qp import KKT_EVERY, QPRows
 from mpc.regulator import observed
 from mpc.robust.controller import RobustPreparation
 from mpc.robust.settings import Robust
@@ -47,7 +47,7 @@ TERMINAL_TOLERANCE: Final = 1e-4
 """Largest change per period of the steady part of the state at the plan's end [unit of the state]."""
 LOOSE: Final = 1e4
 """Stands for an infinite bound that changes or is on both sides of a row, which PIQP does not take."""
-END: Final = "standing"
+END: Final = "terminal condition"  # with a space, as no polytope is named
 """Name of the terminal constraint."""
 PASS_TOLERANCE: Final = 1e-2
 """Difference from the request [rad/s] attributed to rounding of the QP: the request is then passed unchanged."""
@@ -66,6 +66,7 @@ class SafetyFilter:
 
     name: Final = "safety-filter"
     solver: Final = "piqp-multistage"
+    iterates: Final = frozenset({solver})
 
     def __init__(self, preparation: RobustPreparation) -> None:
         self._preparation, self.horizon = preparation, preparation.problem.horizon
@@ -75,7 +76,7 @@ class SafetyFilter:
         # The same with soft constraints on states, except for the terminal one.
         parts = self.problem.constraints
         soft = replace(self.problem, constraints=tuple(p if p.C is None or p.name == END else _soft(p) for p in parts))
-        self._nearest, self._softened = _Nearest(self.problem, steady_rows), _Nearest(soft, steady_rows)
+        self._nearest, self._softened = _Nearest(self.problem), _Nearest(soft)
         self._acting = self.requested = self.problem.model.u_bar.copy()
 
     @property
@@ -99,17 +100,22 @@ class SafetyFilter:
         query = self._preparation.prepare(now, state, reference, self._acting)
         if query is None:
             return refused(self._acting, self.horizon, INVALID_DATA)
-        answer = self._nearest.solve(query, self.requested)
+        answer, reason = self._checked(self._nearest, query)
         if answer.status not in ACCEPTED:
-            answer = self._softened.solve(query, self.requested)
+            answer, reason = self._checked(self._softened, query)
+        if reason is not None:
+            return refused(query.u_before, self.horizon, reason, answer)
         plan, status = answer.plan, answer.status
-        problem = rejection(status, plan[0], plan, self._actuators, query.u_before)
-        if problem is not None:
-            return refused(query.u_before, self.horizon, problem, answer)
         plan = plan.copy()
         passed = np.abs(plan[0] - self.requested).max() <= PASS_TOLERANCE
         plan[0] = self._actuators.clip(self.requested if passed else plan[0], query.u_before)
         return command_of(plan[0], plan, UNCONSTRAINED if passed else status, answer)
+
+    def _checked(self, nearest: _Nearest, query: Query) -> tuple[Answer, str | None]:
+        """Return the answer of one QP and the reason to reject it, None for none; see `mpc.answer.AnswerCheck`."""
+        answer = nearest.solve(query, self.requested)
+        reason = rejection(answer.status, answer.plan[0], answer.plan, self._actuators, query.u_before)
+        return nearest.check(nearest.problem_at(query), query, answer, reason)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
@@ -131,16 +137,30 @@ def safety_filter(table: Robust, vehicle: Vehicle, period: float) -> SafetyFilte
 class _Nearest:
     """The QP of a problem whose first input should be close to a request."""
 
-    def __init__(self, problem: Problem, steady_rows: Array) -> None:
-        self._form = form = PartiallyCondensed(problem)
-        self._horizon, self._steady_rows = problem.horizon, steady_rows
+    def __init__(self, problem: Problem) -> None:
+        self._problem, self._form = problem, PartiallyCondensed(problem)
+        self.check, form = AnswerCheck(problem, KKT_EVERY), self._form
         self._first = form.inputs(np.arange(form.qp.c.size, dtype=np.float64))[0].astype(np.intp)
         self._P = form.qp.P.copy()
         self._P[self._first, self._first] += 2.0
         self._backend = Piqp()
         self._backend.setup(replace(form.qp, P=self._P))
-        upper = QPRows(problem).upper
-        self._ends = (upper[0] == LOOSE) & (upper[-1] < LOOSE)  # the terminal constraint's rows
+        rows = problem.rows
+        origin = QPRows(problem).origin
+        self._ends = np.array([rows.names[row] == END for row in origin], bool)  # the terminal constraint's rows
+        self._steady_rows = rows.C[origin[self._ends]]
+
+    def problem_at(self, query: Query) -> Problem:
+        """Return the problem with the terminal constraint about the equilibrium of a query."""
+        if query.equilibrium is None:
+            return self._problem
+        constraints = []
+        for part in self._problem.constraints:
+            if part.name == END and part.C is not None:
+                moved = part.C @ query.equilibrium.x
+                part = replace(part, lower=part.lower + moved, upper=part.upper + moved)
+            constraints.append(part)
+        return replace(self._problem, constraints=tuple(constraints))
 
     def solve(self, query: Query, requested: Array) -> Answer:
         """Return the plan whose first input is closest to `requested` (4,) [rad/s]."""
@@ -148,7 +168,7 @@ class _Nearest:
         qp.c[self._first] -= 2.0 * requested
         if query.equilibrium is not None:  # a state of predicted rotors is far from zero there, so all rows move
             for side in (qp.h_l, qp.h_u):
-                side.reshape(self._horizon, -1)[:, self._ends] += self._steady_rows @ query.equilibrium.x
+                side.reshape(self._problem.horizon, -1)[:, self._ends] += self._steady_rows @ query.equilibrium.x
         return Answer.of(self._form, qp, self._backend.solve(qp), SafetyFilter.solver)
 
 

@@ -73,6 +73,9 @@ COMPILED: Final = SolverEntry(
     package="mpc.core",
 )
 
+CORES_SECOND: Final = "piqp-multistage"
+"""What answers the problems that the core gives up."""
+
 ALIASES: Final = {"piqp": "piqp-multistage"}
 
 INVALID_DATA: Final = "invalid_data"
@@ -171,6 +174,10 @@ class Solver(Protocol):
         """Name of the QP solver; see `find_solver`."""
 
     @property
+    def iterates(self) -> frozenset[str]:
+        """Names of the solvers whose iterations its answers count."""
+
+    @property
     def formulation(self) -> Formulation:
         """The QP to which its solutions refer."""
 
@@ -196,6 +203,11 @@ class QPSolver:
             form = self.formulation if isinstance(self.formulation, Condensed) else Condensed(problem)
             self._free = FreeOptimum(form)
         self.reset()
+
+    @property
+    def iterates(self) -> frozenset[str]:
+        """See `Solver`; qpsolvers does not tell iterations."""
+        return frozenset({self.name} & set(SOLVERS))
 
     def reset(self) -> None:
         """See `Solver.reset`: back ends that start from their last answer restart from scratch."""

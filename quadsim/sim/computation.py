@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, doc
 
 from quadsim.controller import Command
+from quadsim.errors import ParameterError
 from quadsim.fields import Instant, Seconds
 
 
@@ -45,7 +47,13 @@ class ComputationTime:
         ComputationSeconds,
         doc("[s] fixed part; longer than a control period: several commands are under way at a time"),
     ] = 0.0
-    per_iteration: Annotated[ComputationSeconds, doc("[s] for each iteration of the solver")] = 0.0
+    per_iteration: Annotated[
+        dict[str, ComputationSeconds],
+        doc(
+            "[s] for each iteration, by the solver that it was measured for: its name in `quadsim list`, nonlinear for "
+            "that law's own, law for a controller of yours; refused without a solver that may answer; absent: no time"
+        ),
+    ] = field(default_factory=dict)
     plan: Annotated[
         bool | None,
         doc(
@@ -77,11 +85,29 @@ class Computation(ComputationTime):
         return max(physics_steps(self.delay, timestep) - 1, 0) // steps
 
     def taken(self, time: float, command: Command, rng: np.random.Generator) -> float:
-        """Return the time from the measurement at `time` [s] to the command [s]."""
-        taken = self.delay + self.per_iteration * command.stats.iterations
+        """Return the time from the measurement at `time` [s] to the command [s].
+
+        Raises:
+            ParameterError: the solver that answered has no time per iteration, though others have one.
+        """
+        taken = self.delay
+        if self.per_iteration and command.stats.iterations:
+            taken += self._per_iteration_of(command.iterations_by or command.answered_by) * command.stats.iterations
         if self.jitter:
             taken += rng.exponential(self.jitter)
         for stall in sorted(self.stalls, key=lambda stall: stall.at):
             if time < stall.at + stall.duration and time + taken >= stall.at:
                 taken = max(taken, stall.at + stall.duration - time)
         return taken
+
+    def _per_iteration_of(self, solver: str) -> float:
+        """Return the time that an iteration of a solver takes [s]."""
+        if solver not in self.per_iteration:
+            raise not_measured({solver}, self.per_iteration)
+        return self.per_iteration[solver]
+
+
+def not_measured(missing: Collection[str], measured: Collection[str]) -> ParameterError:
+    """Return the error of a law whose iterations are not those that were measured."""
+    rule = f"given for every solver that may answer for this controller, so also for {', '.join(sorted(missing))}"
+    return ParameterError("computation", "per_iteration", sorted(measured), rule)

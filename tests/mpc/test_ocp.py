@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support import paper_problem, random_problem
 
-from mpc.constraints import Constraint, Origin, Penalty, tightened
+from mpc.constraints import Constraint, Origin, Penalty, row_scale, tightened
 from mpc.ocp import Objective, Problem
 from quadsim.errors import ParameterError
 from quadsim.state import Array
@@ -104,14 +104,44 @@ def test_rows_are_all_that_bound_anything_in_the_constraints_order() -> None:
     assert rows.names == ("outputs", "outputs", "slews", "inputs", "inputs", "late")
     np.testing.assert_array_equal(rows.of_states, [True, True, False, False, False, False])
     np.testing.assert_array_equal(rows.input, [-1, -1, -1, 0, 1, -1])
-    np.testing.assert_array_equal(rows.l1, [1.0, 2.0, *[np.inf] * 4])
-    np.testing.assert_array_equal(rows.l2, [3.0, 4.0, *[0.0] * 4])
+    np.testing.assert_array_equal(rows.scale[2:], [1.0, 1.0, 1.0, 0.5])
+    np.testing.assert_array_equal(rows.l1 * rows.scale, [1.0, 2.0, *[np.inf] * 4])
+    np.testing.assert_array_equal(rows.l2 * rows.scale**2, [3.0, 4.0, *[0.0] * 4])
     np.testing.assert_array_equal(rows.soft, [0, 1])
-    np.testing.assert_array_equal(rows.upper[:, -1:], late)
+    np.testing.assert_array_equal(rows.upper[:, -1:], 0.5 * late)
     np.testing.assert_array_equal(rows.lower, np.broadcast_to(rows.lower, (3, 6)))
-    np.testing.assert_array_equal(rows.C[:2], bounds.C_c)
-    np.testing.assert_array_equal(rows.C[-1], np.ones(3))
-    np.testing.assert_array_equal(rows.D[3:], [[1.0, 0.0], [0.0, 1.0], [2.0, 0.0]])
+    np.testing.assert_array_equal(rows.C[:2], bounds.C_c * rows.scale[:2, None])
+    np.testing.assert_array_equal(rows.C[-1], np.full(3, 0.5))
+    np.testing.assert_array_equal(rows.D[3:], [[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("largest", "scale"),
+    [
+        (0.0, 1.0),
+        (1.0, 1.0),
+        (np.nextafter(1.0, 2.0), 1.0),  # a unit normal with rounding
+        (3.0**-0.5, 1.0),  # the least that a unit normal's largest component can be
+        (0.5, 2.0),
+        (2.0, 0.5),
+        (57.3, 2.0**-6),
+        (1e-8, 2.0**26),
+        (1e-320, 2.0**1000),
+    ],
+)
+def test_rows_are_scaled_by_powers_of_two(largest: float, scale: float) -> None:
+    assert row_scale(np.array([largest])) == scale
+
+
+def test_rows_that_share_a_slack_share_a_scale() -> None:
+    penalty = Penalty(l1=np.full(2, 8.0), l2=np.full(2, 8.0), largest=True)
+    C = np.array([[1.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
+    shared = Constraint(name="shared", lower=np.full(2, -1.0), upper=np.ones(2), C=C, penalty=penalty)
+    rows = replace(random_problem(np.random.default_rng(0), horizon=3), bounds=None, constraints=(shared,)).rows
+    np.testing.assert_array_equal(rows.scale, [0.25, 0.25])
+    np.testing.assert_array_equal(rows.l1, [32.0, 32.0])
+    np.testing.assert_array_equal(rows.l2, [128.0, 128.0])
+    np.testing.assert_array_equal(rows.slack_scale, [0.25])
 
 
 def test_margins_tighten_both_bounds_of_each_step() -> None:

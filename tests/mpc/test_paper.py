@@ -10,6 +10,7 @@ from mpc.condensing import Condensed
 from mpc.model import hover_model
 from mpc.ocp import Problem, Query
 from mpc.paper import cost, prediction, rollout, slew_matrix
+from mpc.qp import QPRows
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -133,7 +134,8 @@ def test_rows_are_the_printed_inequalities(horizon: int) -> None:
         np.tile(bounds.delta_max, horizon) - slews,
         slews - np.tile(bounds.delta_min, horizon),
     ]
+    scale = np.tile(problem.rows.scale[QPRows(problem).origin], horizon)
     values = qp.G @ plan.ravel()
-    ours = np.concatenate([qp.h_u - values, values - qp.h_l])
+    ours = np.concatenate([qp.h_u - values, values - qp.h_l]) / np.tile(scale, 2)
     ours, printed = np.sort(ours[np.isfinite(ours)]), np.sort(np.concatenate(slack))
     np.testing.assert_allclose(ours, printed, atol=1e-12)

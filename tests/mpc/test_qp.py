@@ -123,5 +123,7 @@ def test_a_slack_has_the_multiplier_that_makes_its_gradient_zero() -> None:
     form = Condensed(replace(problem, bounds=replace(problem.bounds, penalty=penalty)))
     multipliers, slacks = np.zeros((4, len(problem.rows.D))), np.array([[0.0], [1.0], [1.0], [1.0]])
     multipliers[:, 0] = [-2.0, 0.0, 5.0, 7.0]
-    z_slacks = form.solution(np.zeros((4, 2)), slacks, multipliers).z_box[8:]
-    np.testing.assert_allclose(z_slacks, [-1.0, -7.0, -2.0, 0.0])
+    solution = form.solution(np.zeros((4, 2)), slacks, multipliers)
+    scale = form.qp.c[8:] / 3.0  # l1 per unit of the QP's slack over that per unit of the row
+    np.testing.assert_allclose(solution.z_box[8:] / scale, [-1.0, -7.0, -2.0, 0.0])
+    np.testing.assert_allclose(form.slacks(solution.x), slacks)

@@ -161,12 +161,14 @@ def tables(draw: st.DrawFn) -> dict[str, Any]:
         controller["input_bounds"] = {"speed": [0.0, fastest], "slew": [-2.0 * step, step]}
     if kind == "robust":
         controller |= draw(ROBUST)
+    computation = {"delay": number(0.0, 0.1), "jitter": number(0.0, 0.1)}
+    if kind in ("constrained", "robust"):
+        time = number(0.0, 0.01)
+        computation["per_iteration"] = st.fixed_dictionaries({"piqp": time, "core": time})
     optional = {
         "effects": EFFECTS,
         "events": EVENTS,
-        "computation": some(
-            {"delay": number(0.0, 0.1), "per_iteration": number(0.0, 0.01), "jitter": number(0.0, 0.1)}
-        ),
+        "computation": some(computation),
     }
     table = {
         "name": "any",

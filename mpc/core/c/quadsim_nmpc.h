@@ -50,7 +50,9 @@ typedef struct quadsim_nmpc_problem {
     int shifts;                 /* whether the plan moves on by a node from call to call */
     int moves;                  /* whether steps of inputs have a weight */
     int tilts, turns, places;   /* which entries there are */
-    int rows, faces;            /* rows that the caller states, and at most so many half-spaces of positions, per node */
+    int rows;                   /* that the caller states, per node */
+    int bound_nodes;            /* nodes whose bounds are stated; those of the last hold in all that follow */
+    int faces;                  /* at most so many half-spaces of positions, per node */
     int slacks;                 /* of a node: of tilt, body rates and half-spaces, then those of rows */
     int room;                   /* active rows that there is room for */
     int changes;                /* of the active set in a search, after which it is given up */
@@ -71,7 +73,7 @@ typedef struct quadsim_nmpc_problem {
     quadsim_real tilt, turn[3];           /* of the thrust axis along a side of the polygon, [rad/s] */
     const quadsim_nmpc_term *terms;       /* of all rows */
     const int *first;                     /* [rows + 1] the first term of each row */
-    const quadsim_real *bounds;           /* [2][rows] upper ones: of the first node, and of all others */
+    const quadsim_real *bounds;           /* [bound_nodes][rows] upper ones; 1e30: none */
     const int *slack;                     /* [rows] which slack a row has; -1: it is hard */
     const quadsim_real *linear, *quadratic; /* [slacks] leaving a bound by e costs l e + q e^2 / 2, not both
                                              * 0; l >= 1e30: hard */

@@ -389,11 +389,12 @@ static real bound(const quadsim_nmpc_work *work, int row)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int node = row / kinds_of(p), kind = row % kinds_of(p);
+    const int stated = node < p->bound_nodes ? node : p->bound_nodes - 1;
     return kind < NU              ? p->upper[kind]
            : kind < TILT          ? -p->lower[kind - NU]
            : kind < SPIN          ? p->tilt
            : kind < STATED        ? p->turn[(kind - SPIN) % 3]
-           : kind < faces_from(p) ? p->bounds[(node > 0 ? p->rows : 0) + kind - STATED]
+           : kind < faces_from(p) ? p->bounds[stated * p->rows + kind - STATED]
            : kind < slacks_from(p) ? work->beyond[node * p->faces + kind - faces_from(p)]
                                    : R(0.0);
 }

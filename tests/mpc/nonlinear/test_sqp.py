@@ -14,18 +14,21 @@ from ocp_peer import Period, dense_qp
 
 from mpc.answer import ActuatorBounds
 from mpc.bounded import Polytope, Soft
+from mpc.constraints import Constraint
 from mpc.fallback.structs import STATUSES
 from mpc.nonlinear.controller import NonlinearMPC
 from mpc.nonlinear.rigidbody import N_BODY, P, Q, V, W
 from mpc.nonlinear.settings import Nonlinear, Weights
+from mpc.nonlinear.sqp import OWN_NAMES, SQP
 from mpc.obstacles import AvoidanceSettings, Space
 from mpc.ocp import Query
 from mpc.qp import kkt_residuals
 from mpc.solvers.daqp import DaqpDense
 from quadsim.assets import vehicle_path
 from quadsim.controller import ACCEPTED, OPTIMAL, SOLVED, UNCONSTRAINED, Command, StepInputs
+from quadsim.errors import ParameterError
 from quadsim.space import Sphere
-from quadsim.state import N_STATES, POSITIONS, VELOCITIES, Array
+from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import load_vehicle
 
 VEHICLE = replace(
@@ -174,6 +177,70 @@ def test_half_spaces_are_rows_of_the_program() -> None:
         assert (command.stats.slack > 0.0) == (penalty is not None and inside.min() < -1e-9)
 
 
+def ceiling(upper: Array, **parts: Any) -> Constraint:
+    """A bound (N, 1) on height."""
+    C = np.zeros((1, N_STATES))
+    C[0, INDEX["z"]] = 1.0
+    return Constraint(name="ceiling", lower=np.full_like(upper, -math.inf), upper=upper, **({"C": C} | parts))
+
+
+def below(row: Constraint) -> NonlinearMPC:
+    return NonlinearMPC(VEHICLE, period=0.05, settings=Nonlinear(horizon=20), constraints=(row,), kkt_every=1)
+
+
+@pytest.mark.parametrize("case", ["tighter in the middle", "at all steps but the last", "at the first steps", "alike"])
+def test_bounds_that_differ_from_step_to_step_hold(case: str) -> None:
+    upper = np.full((20, 1), 0.2)
+    if case == "tighter in the middle":
+        upper[:5] = upper[15:] = 10.0
+    elif case == "at all steps but the last":
+        upper[-1] = math.inf
+    elif case == "at the first steps":
+        upper[3:] = math.inf
+    controller, reference = below(ceiling(upper)), np.zeros((20, 4))
+    reference[:, 2] = 1.0
+    for k in range(6):
+        command = call(controller, at_rest(), 0.05 * k, reference)
+        assert command.status == SOLVED
+        heights = controller._sqp.positions[:, 2]
+        assert (heights <= upper[:, 0] + 1e-8).all()
+        assert command.stats.infeasibility < 1e-8
+        assert command.stats.kkt_stationarity < 1e-6
+    assert (heights.max() > 0.3) == (case in ("at the first steps", "tighter in the middle"))
+
+
+def test_rows_that_differ_from_step_to_step_are_refused() -> None:
+    with pytest.raises(ParameterError, match=r"controller\.ceiling .*with the same rows at all steps"):
+        below(ceiling(np.full((20, 1), 0.2), C=np.ones((20, 1, N_STATES)) * (np.arange(N_STATES) == INDEX["z"])))
+
+
+@pytest.mark.parametrize("name", OWN_NAMES)
+def test_a_row_with_the_name_of_a_bound_of_the_law_is_refused(name: str) -> None:
+    """It would be taken for that bound, and not kept."""
+    with pytest.raises(ParameterError, match=rf"controller\.{name} must be named otherwise than .*tilt"):
+        below(replace(ceiling(np.full((20, 1), 0.2)), name=name))
+
+
+def test_steps_of_rotor_speeds_are_refused_beside_the_slew() -> None:
+    row = Constraint(name="steps", lower=np.full(4, -1.0), upper=np.ones(4), E=np.eye(4))
+    with pytest.raises(ParameterError, match=r"controller\.steps must be without steps of rotor speeds"):
+        below(row)
+
+
+def test_a_wrong_answer_of_the_core_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check takes no word of what made the answer."""
+    reference = np.zeros((20, 4))
+    reference[:, 2] = 1.0
+    controller = below(ceiling(np.full((20, 1), 0.2)))
+    assert call(controller, at_rest(), 0.0, reference).status == SOLVED
+    right = SQP.inputs.fget
+    assert right is not None
+    monkeypatch.setattr(SQP, "inputs", property(lambda sqp: right(sqp) + 0.05))
+    command = call(controller, at_rest(), 0.05, reference)
+    assert command.status == "infeasible_answer"
+    assert command.stats.infeasibility > 1e-2
+
+
 def test_an_infeasible_program_is_refused_and_stated() -> None:
     """A hard bound on body rates, broken beyond what the rotors can do in a node."""
     controller, spinning = law(body_rate=30.0), at_rest()
@@ -246,4 +313,4 @@ def test_ten_thousand_thrown_states_have_typed_answers(count: int) -> None:
             assert np.isfinite(command.plan).all(), case
             assert command.status in {*ACCEPTED, *STATUSES}, case
             if command.status in {SOLVED, UNCONSTRAINED}:
-                assert controller._sqp.violation < 1e-6, case
+                assert command.stats.infeasibility < 1e-6, case

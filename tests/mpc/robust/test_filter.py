@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from support import paper_problem, robust_table
 
-from mpc.bounded import InputBounds
+from mpc.bounded import InputBounds, Polytope
 from mpc.condensing import Condensed
 from mpc.constraints import Bounds
 from mpc.ocp import Objective, Query
 from mpc.robust.controller import RobustPreparation
-from mpc.robust.filter import TERMINAL_TOLERANCE, SafetyFilter
-from mpc.solvers import make_backend
+from mpc.robust.filter import TERMINAL_TOLERANCE, SafetyFilter, _Nearest
+from mpc.solvers import Answer, make_backend
 from quadsim.controller import UNCONSTRAINED, Command, StepInputs
 from quadsim.state import INDEX, Array
 from scenarios.assembly import Assembly
@@ -120,3 +120,36 @@ def test_numbers_out_of_hand_are_refused() -> None:
     command = filtered(make_filter(), state, HOVER)
     assert command.status == "invalid_data"
     assert np.array_equal(command.speeds, HOVER)
+
+
+def test_a_wrong_answer_of_the_solver_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plan that its bounds on rotors allow, but those on attitude do not."""
+    solve = _Nearest.solve
+
+    def wrong(nearest: _Nearest, query: Query, requested: Array) -> Answer:
+        answer = solve(nearest, query, requested)
+        plan = answer.plan.copy()
+        plan[1:] += np.array([0.0, 20.0, 0.0, -20.0])
+        return answer._replace(plan=plan)
+
+    monkeypatch.setattr(_Nearest, "solve", wrong)
+    assert filtered(make_filter(), np.zeros(12), HOVER).status == "infeasible_answer"
+
+
+def test_a_polytope_of_any_name_is_no_terminal_condition() -> None:
+    """A row times a factor leaves the filter's answer, and its terminal condition, as they are."""
+    plans = []
+    for factor in (1.0, 1e-4, 64.0):
+        rows, upper = ((factor, 0.5 * factor),), (0.3 * factor,)
+        table = robust_table(
+            horizon=HORIZON,
+            input_bounds=InputBounds(speed=(0.0, 250.0), slew=(-10.0, 10.0)),
+            polytopes=(Polytope(name="standing", of=("z", "vz"), rows=rows, upper=upper),),
+        )
+        filter_ = SafetyFilter(RobustPreparation(VEHICLE, table.problem(VEHICLE, PERIOD), table))
+        command = filtered(filter_, np.zeros(12), HOVER + 10.0)
+        assert command.stats.infeasibility < 1e-6
+        plans.append(command.plan)
+    assert np.abs(plans[0][:, 0] - HOVER[0]).max() > 1.0
+    for plan in plans[1:]:
+        np.testing.assert_allclose(plan, plans[0], atol=1e-3)

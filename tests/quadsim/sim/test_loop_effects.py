@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from quadsim.controller import GROUNDED, MISSED, Command, Phase, Statistics, StepInputs, stopped
+from quadsim.errors import ParameterError
 from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import computation, estimation, ground
 from quadsim.flight.phase import PhaseMonitor
@@ -157,7 +158,7 @@ def test_a_deadline_follows_the_commands_under_way(vehicle: Vehicle, speeds: Arr
                 speeds=command.speeds, plan=command.speeds + np.arange(4.0)[:, None], stats=Statistics(iterations=slow)
             )
 
-    late = Computation(delay=0.12, per_iteration=0.01, plan=plan)
+    late = Computation(delay=0.12, per_iteration={"law": 0.01}, plan=plan)
     with Plant(vehicle) as plant:
         log = fly_scripted(plant, Planner(speeds, horizon=4), computation=late)
     assert [status == MISSED for status in log.control.status] == [k == 3 for k in range(8)]
@@ -172,7 +173,7 @@ def test_a_deadline_follows_the_commands_under_way(vehicle: Vehicle, speeds: Arr
 
 def test_iterations_cost_simulated_time(vehicle: Vehicle, speeds: Array) -> None:
     with Plant(vehicle) as plant:
-        log = fly_scripted(plant, Scripted(speeds), computation=Computation(per_iteration=0.004))
+        log = fly_scripted(plant, Scripted(speeds), computation=Computation(per_iteration={"law": 0.004}))
     np.testing.assert_allclose(log.control.delay, 0.004 * np.arange(8))
 
 
@@ -349,7 +350,21 @@ def delay(computation: Computation, time: float = 0.0) -> float:
 
 def test_fixed_part_and_iterations_add_up() -> None:
     assert delay(Computation()) == 0.0
-    assert delay(Computation(delay=0.01, per_iteration=0.002)) == pytest.approx(0.034)
+    assert delay(Computation(delay=0.01, per_iteration={"law": 0.002})) == pytest.approx(0.034)
+
+
+def test_iterations_take_the_time_of_whoever_counted_them() -> None:
+    computation = Computation(per_iteration={"core": 1e-3, "piqp-multistage": 0.01})
+    for answered_by, iterations_by, expected in (
+        ("core", "", 0.002),
+        ("piqp-multistage", "piqp-multistage", 0.02),
+        ("fallback", "core", 0.002),
+    ):
+        stats = Statistics(iterations=2)
+        command = replace(COMMAND, answered_by=answered_by, iterations_by=iterations_by, stats=stats)
+        assert computation.taken(0.0, command, np.random.default_rng(0)) == pytest.approx(expected)
+    with pytest.raises(ParameterError, match=r"per_iteration must be given .* also for daqp; got \['core'"):
+        computation.taken(0.0, replace(COMMAND, iterations_by="daqp"), np.random.default_rng(0))
 
 
 def test_jitter_is_exponential() -> None:
@@ -402,7 +417,7 @@ def test_the_latest_arrival_of_a_command_is_not_forgotten_with_an_earlier_one(ve
             initial_state=make_state(position=(0.0, 0.0, 10.0)),
             initial_speeds=plant.vehicle.hover_speeds,
             steps_per_period=STEPS,
-            computation=Computation(per_iteration=0.01),
+            computation=Computation(per_iteration={"law": 0.01}),
         )
         answered = [(loop.step(), loop.answered)[1] for _ in range(3)]
     assert answered == pytest.approx([0.12, 0.12, 0.14])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from quadsim.errors import InputError, ParameterError
 from quadsim.sim.computation import Computation
 from quadsim.sim.effects import Disturbance, Effects, Ground
 from quadsim.sim.effects.battery import Battery
@@ -168,8 +169,45 @@ def test_computation_takes_its_times_and_stalls() -> None:
     assert result is not None
     assert [(each.at, each.duration) for each in result.stalls] == [(1.0, 0.2)]
     assert replace(result, stalls=()) == Computation(plan=False)
-    loaded, _ = scenario("computation={delay=0.01, per_iteration=1e-4, jitter=0.002}")
-    assert Assembly(loaded).computation() == Computation(delay=0.01, per_iteration=1e-4, plan=False, jitter=0.002)
+    loaded, _ = scenario("computation={delay=0.01, per_iteration={piqp=1e-4}, jitter=0.002}")
+    expected = Computation(delay=0.01, per_iteration={"piqp-multistage": 1e-4}, plan=False, jitter=0.002)
+    assert Assembly(loaded).computation() == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("robust", ["computation.per_iteration.piqp=1e-3"], "also for core"),
+        ("robust", ["computation.per_iteration.core=1e-5"], "also for piqp-multistage"),
+        ("robust", ["computation.per_iteration={core=1e-5, piqp=1e-3}"], None),
+        ("robust", ["controller.solver=piqp", "computation.per_iteration.piqp=1e-3"], None),
+        ("robust", ["controller.solver=daqp", "computation.per_iteration.core=1e-5"], "also for daqp"),
+        ("robust", ["controller.solver=daqp", "computation.per_iteration.daqp=1e-5"], None),
+        ("paper-constrained", ["computation.per_iteration.core=1e-5"], "also for piqp-multistage"),
+        (
+            "paper-constrained",
+            ["controller.solver=clarabel", "computation.per_iteration.clarabel=1e-5"],
+            "no iterations",
+        ),
+        ("paper-unconstrained", ["computation.per_iteration.piqp=1e-3"], "no iterations"),
+        ("nonlinear", ["computation.per_iteration.core=1e-5"], "also for nonlinear"),
+        ("nonlinear", ["computation.per_iteration.nonlinear=1e-5"], None),
+    ],
+)
+def test_times_of_iterations_are_those_of_the_solver_that_answers(
+    name: str, settings: list[str], message: str | None
+) -> None:
+    assembly = Assembly(load_scenario(name, settings))
+    if message is None:
+        assembly.controller()
+        return
+    with pytest.raises(ParameterError, match=rf"computation\.per_iteration must be .*{message}"):
+        assembly.controller()
+
+
+def test_a_time_of_iterations_without_a_solver_is_refused() -> None:
+    with pytest.raises(InputError, match=r"computation\.per_iteration must be a table"):
+        load_scenario("robust", ["computation.per_iteration=1e-3"])
 
 
 @pytest.mark.parametrize(
