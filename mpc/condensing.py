@@ -180,7 +180,7 @@ class Condensed:
         check_shape("state", state, (n,))
         check_shape("reference", reference, (problem.horizon, len(REFERENCE_STATES)))
         hover = Equilibrium(np.concatenate([np.zeros(N_STATES), u_bar])[:n], u_bar)
-        query = Query(state, problem.objective.desired(reference), u_before, equilibrium or hover)
+        query = Query(state, problem.desired(reference), u_before, equilibrium or hover)
         qp = self.assemble(query).qp
         return CondensedQP(*map(np.array, (qp.P, qp.c, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)))
 
