@@ -35,6 +35,7 @@ from quadsim.state import (
     INDEX,
     N_STATES,
     POSITION,
+    REFERENCE_RATES,
     STATE_NAMES,
     STATE_UNITS,
     Array,
@@ -356,8 +357,18 @@ class Weighted(ControllerTable):
     output_weights: Annotated[
         dict[str, Weight],
         Len(1),
-        doc("diagonal of Q_y [1/unit of the state^2, rad for angles]; the states named here are C_r"),
+        doc(
+            "diagonal of Q_y [1/unit of the state^2, rad for angles]; the states named here are C_r; desired are the "
+            "filtered reference's position, yaw, velocity and yaw rate, and 0 for roll, pitch and their rates"
+        ),
     ]
+    desired_rates: Annotated[
+        Literal["reference", "zero"],
+        doc(
+            "desired velocities and yaw rate where output_weights name them: the filtered reference's, by differences "
+            "over the horizon, or zero, which brakes what moves"
+        ),
+    ] = "reference"
     input_weights: InputWeights
     terminal: Annotated[
         Literal["lqr"] | None,
@@ -373,6 +384,12 @@ class Weighted(ControllerTable):
 
     def __post_init__(self) -> None:
         require_states(self.output_weights, "output_weights")
+        rates = [STATE_NAMES[i] for i in REFERENCE_RATES if STATE_NAMES[i] in self.output_weights]
+        if self.horizon < 2 and rates and self.desired_rates == "reference":
+            raise ValueError(
+                f"horizon must be at least 2 where output_weights have {', '.join(rates)}, whose desired values are "
+                f"differences of the reference; got {self.horizon}"
+            )
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
         """Return the optimal control problem of each period.
@@ -380,10 +397,15 @@ class Weighted(ControllerTable):
         Raises:
             InputError: no problem can be built from these numbers.
         """
-        model, objective = hover_model(vehicle, period), objective_of(self.output_weights, self.input_weights)
+        model, objective = hover_model(vehicle, period), self.objective()
         if self.terminal == "lqr":
             objective = replace(objective, P=lqr_terminal_weight(model, objective))
         return Problem(model=model, horizon=self.horizon, objective=objective)
+
+    def objective(self) -> Objective:
+        """Return the weights, on the 12 states and without one on the last state."""
+        weights = objective_of(self.output_weights, self.input_weights)
+        return replace(weights, follows_rates=self.desired_rates == "reference")
 
 
 @dataclass(frozen=True, kw_only=True)

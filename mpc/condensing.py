@@ -18,7 +18,7 @@ from mpc.constraints import Bounds
 from mpc.ocp import Equilibrium, Problem, Query, check_shape, predicted
 from mpc.paper import Prediction, cost, prediction, slew_matrix
 from mpc.qp import QP, PeriodQP, QPRows, Solution
-from quadsim.controller import UNCONSTRAINED
+from quadsim.controller import UNCONSTRAINED, Statistics
 from quadsim.state import N_STATES, REFERENCE_STATES, Array
 
 RowFlags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
@@ -182,7 +182,7 @@ class Condensed:
         check_shape("state", state, (n,))
         check_shape("reference", reference, (problem.horizon, len(REFERENCE_STATES)))
         hover = Equilibrium(np.concatenate([np.zeros(N_STATES), u_bar])[:n], u_bar)
-        query = Query(state, problem.objective.desired(reference), u_before, equilibrium or hover)
+        query = Query(state, problem.desired(reference), u_before, equilibrium or hover)
         qp = self.assemble(query).qp
         return CondensedQP(*map(np.array, (qp.P, qp.c, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)))
 
@@ -259,4 +259,5 @@ class FreeOptimum:
         if failed or not ((lower <= values) & (values <= upper)).all():
             return None
         z_box = np.concatenate([np.zeros(m), -qp.c[m:]])
-        return Solution(x, np.zeros(0), np.zeros(qp.h_l.size), z_box, status=UNCONSTRAINED)
+        no_solver = Statistics(solve_s=0.0)
+        return Solution(x, np.zeros(0), np.zeros(qp.h_l.size), z_box, status=UNCONSTRAINED, stats=no_solver)

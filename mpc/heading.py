@@ -89,12 +89,17 @@ def with_limited_yaw(reference: Array, yaw: float, largest: float) -> Array:
     return turned
 
 
-def seen_from(reference: Array, yaw: float) -> Array:
-    """The reference (N, 4) in axes turned by a yaw [rad]."""
+def turned_axes(rows: Array, yaw: float) -> Array:
+    """Rows (N, 4), of which the first two are along world x and y, in axes turned by a yaw [rad]."""
     turned = np.eye(len(REFERENCE_STATES))
     turned[0, 0] = turned[1, 1] = math.cos(yaw)
     turned[1, 0] = sine = math.sin(yaw)
     turned[0, 1] = -sine
-    seen = np.dot(reference, turned)
+    return np.dot(rows, turned)
+
+
+def seen_from(reference: Array, yaw: float) -> Array:
+    """The reference (N, 4) in axes turned by a yaw [rad]."""
+    seen = turned_axes(reference, yaw)
     seen[:, 3] -= yaw
     return seen

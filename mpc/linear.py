@@ -116,7 +116,7 @@ class NominalPreparation:
     def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query:
         """See `Preparation.prepare`; solvers refuse numbers that are not finite."""
         reference = self._turns.follow(reference, float(state[INDEX["yaw"]]))
-        return Query(state, self.problem.objective.desired(reference), acting)
+        return Query(state, self.problem.desired(reference), acting)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""

@@ -23,7 +23,7 @@ from mpc.constraints import Bounds, Constraint, Rows, renumbered, row_scale
 from mpc.model import LinearModel
 from mpc.regulator import stabilising
 from quadsim.errors import ParameterError
-from quadsim.state import REFERENCE_STATES, Array, Indices
+from quadsim.state import REFERENCE_RATES, REFERENCE_STATES, Array, Indices
 
 
 class Equilibrium(NamedTuple):
@@ -45,6 +45,7 @@ class Objective:
     # (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), replaces Q_y there; symmetric
     # positive semidefinite; None for none
     P: Array | None = None
+    follows_rates: bool = True  # whether desired velocities and yaw rate are the reference's; otherwise they are 0
 
     def __post_init__(self) -> None:
         for name in ("Q_y", "Q_u"):
@@ -55,9 +56,28 @@ class Objective:
         if self.C_r.ndim != 2 or self.Q_y.shape[0] != self.C_r.shape[0]:
             raise ParameterError("controller", "C_r", self.C_r.shape, f"of shape ({self.Q_y.shape[0]}, n)")
 
-    def desired(self, reference: Array) -> Array:
-        """Return the desired outputs y_r^d (..., n_r) for a reference (..., 4) of x, y, z, yaw; 0 for other states."""
-        return np.dot(reference, self.C_r[:, REFERENCE_STATES].T)
+    @cached_property
+    def needs_rates(self) -> bool:
+        """Whether a desired output of a linear model depends on the reference's velocities or its yaw rate."""
+        return self.follows_rates and bool(self.C_r[:, REFERENCE_RATES].any())
+
+    def desired(self, reference: Array, rates: Array | None = None) -> Array:
+        """Return the desired outputs y_r^d (N, n_r) of a linear model; roll, pitch and their rates are desired at 0.
+
+        Args:
+            reference: (N, 4) x, y, z [m], yaw [rad].
+            rates: (N, 4) their rates of change (`reference_rates`); None where it `needs_rates` not.
+
+        Raises:
+            ParameterError: an output depends on the rates, which are absent.
+        """
+        desired: Array = np.dot(reference, self.C_r[:, REFERENCE_STATES].T)
+        if not self.needs_rates:
+            return desired
+        if rates is None:
+            rule = "given where a velocity or the yaw rate has a weight: Problem.desired computes them"
+            raise ParameterError("controller", "rates", None, rule)
+        return np.asarray(desired + np.dot(rates, self.C_r[:, REFERENCE_RATES].T))
 
     @cached_property
     def weights(self) -> tuple[Array, Array]:
@@ -74,6 +94,31 @@ class Objective:
     def move_weight(self) -> Array:
         """Q_d (nu, nu), zeros if there is none."""
         return np.zeros_like(self.Q_u) if self.Q_d is None else self.Q_d
+
+
+def reference_rates(reference: Array, period: float) -> Array:
+    """Return the velocities [m/s] and the yaw rate [rad/s] (N, 4) of a reference (N, 4), from its steps.
+
+    They are the mean of the steps before and after a row, and at both ends those of the parabola through three rows:
+    exact where the acceleration is constant.  Of two rows they are the one step.
+
+    Args:
+        reference: x, y, z [m], yaw [rad], the yaw without jumps of a turn (`quadsim.state.ReferenceTurns`).
+        period: time from row to row [s].
+
+    Raises:
+        ParameterError: there is only one row.
+    """
+    if len(reference) < 2:
+        rule = "at least 2 where a velocity or the yaw rate has a weight: it is desired as the reference changes"
+        raise ParameterError("controller", "horizon", len(reference), rule)
+    steps = (reference[1:] - reference[:-1]) / period
+    rates = np.empty_like(reference)
+    rates[1:-1] = 0.5 * (steps[:-1] + steps[1:])
+    second = min(1, len(steps) - 1)
+    rates[0] = 1.5 * steps[0] - 0.5 * steps[second]
+    rates[-1] = 1.5 * steps[-1] - 0.5 * steps[-1 - second]
+    return rates
 
 
 def lqr_terminal_weight(model: LinearModel, objective: Objective, states: Sequence[str] | None = None) -> Array:
@@ -130,6 +175,14 @@ class Problem:
     def every_constraint(self) -> tuple[Constraint, ...]:
         """The paper's constraints, in the order of `Bounds.constraints`, then the others."""
         return (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
+
+    def rates(self, reference: Array) -> Array | None:
+        """Return the `reference_rates` of a preview (N, 4); None if no desired output depends on them."""
+        return reference_rates(reference, self.model.period) if self.objective.needs_rates else None
+
+    def desired(self, reference: Array) -> Array:
+        """Return the desired outputs (N, n_r) of a preview (N, 4) x, y, z [m], yaw [rad], and of its rates."""
+        return self.objective.desired(reference, self.rates(reference))
 
     def condensed(self) -> mpc.Condensed:
         """The QP in the inputs alone: its parts that are the same in all periods.

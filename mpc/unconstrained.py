@@ -67,7 +67,7 @@ class UnconstrainedMPC:
         if now.phase in GROUNDED:
             return stopped(np.zeros(self.problem.model.nu), self.horizon, now.phase)
         started = clock.perf_counter()
-        desired = self.problem.objective.desired(self._turns.follow(reference, float(state[INDEX["yaw"]])))
+        desired = self.problem.desired(self._turns.follow(reference, float(state[INDEX["yaw"]])))
         sequence = self.gains.K @ state + self.gains.G @ desired.ravel() + self._offset
         plan = sequence.reshape(self.horizon, -1)
         spent_s = clock.perf_counter() - started

@@ -32,7 +32,9 @@ CORE: Final = "core"  # the exact optimum of `mpc.core`, compiled
 LAW: Final = "law"  # a law without a solver
 FALLBACK: Final = "fallback"  # an earlier plan or command, or the fallback contract
 STOPPED: Final = "stopped"  # no source: the rotors are off
-NO_SOLVER: Final = frozenset({GAIN, CORE, LAW, FALLBACK, STOPPED})
+NO_OPTIMUM: Final = frozenset({LAW, FALLBACK, STOPPED})
+"""Sources of a command without an optimum, whose active constraints and computing time nobody reports."""
+NO_SOLVER: Final = frozenset({GAIN, CORE}) | NO_OPTIMUM
 """Sources of a command other than QP solvers, which are recorded by name (`mpc.solvers.find_solver`)."""
 LAW_NAMES: Final = {
     "unconstrained": "unconstrained MPC",
@@ -207,7 +209,7 @@ class Statistics(NamedTuple):
         sqp_defect: largest |x_{i+1} - f(x_i, u_i)| of a plan by sequential quadratic programming, over its nodes and
             the states' components [m, m/s, rad/s, shares]; a solved QP does not imply that it is small.
         sqp_step: largest change of a state or an input in the last iteration, in the same units.
-        solve_s: wall time inside the solver [s].
+        solve_s: wall time of the optimum alone, however it was found [s].
 
     Examples:
         >>> import quadsim
@@ -227,7 +229,7 @@ class Statistics(NamedTuple):
     kkt_dual: float = math.nan
     sqp_defect: float = math.nan
     sqp_step: float = math.nan
-    solve_s: float = 0.0
+    solve_s: float = math.nan
 
 
 NO_STATISTICS: Final = Statistics()

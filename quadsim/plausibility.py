@@ -32,6 +32,9 @@ LARGEST_SAMPLES: Final = {
     "voltage": 1e5,
 }
 """Largest magnitude of a logged quantity, in the unit of a table: far above what a vehicle does."""
+EDGE: Final = 0.05
+"""Share of a range at either end, on a logarithmic scale, where no unit is guessed: a factor of 100 takes most numbers
+that are a little too large to within a range of nearly that width."""
 UNKNOWN_RADIUS: Final = 0.5  # radius of a propeller whose file states none, in arm lengths
 
 
@@ -53,6 +56,18 @@ class Ratio:
         if value <= 0.0:
             return math.inf if self.low > 0.0 else 0.0
         return max(math.log(value / self.high), math.log(self.low / value) if self.low > 0.0 else 0.0, 0.0)
+
+    def is_usual(self, vehicle: Vehicle) -> bool:
+        """Return whether a vehicle is within the range, and not at its edge, or states nothing."""
+        value = self.value(vehicle)
+        if value is None:
+            return True
+        if self.misfit(vehicle) > 0.0:
+            return False
+        if self.low <= 0.0:
+            return True
+        edge = EDGE * math.log(self.high / self.low)
+        return min(math.log(self.high / value), math.log(value / self.low)) >= edge
 
 
 def _radius(vehicle: Vehicle) -> float:
@@ -142,7 +157,7 @@ RATIOS: Final = (
         of=("drag_to_thrust", "rotor_radius", "arm_length"),
         text="drag_to_thrust over rotor_radius",
         value=lambda v: v.drag_to_thrust / _radius(v),
-        low=0.01,
+        low=0.03,
         high=0.6,
     ),
     Ratio(
@@ -254,11 +269,17 @@ def _line(ratio: Ratio, vehicle: Vehicle) -> str:
 
 
 def _explanation(vehicle: Vehicle) -> str | None:
-    """Return which one parameter in another unit would make the vehicle plausible; None if none would."""
+    """Return which one parameter in another unit would make the vehicle plausible; None if none would.
+
+    Every ratio that was off and that the unit changes must then be usual.
+    """
     before, best = _misfit(vehicle), None
+    off = [ratio for ratio in RATIOS if ratio.misfit(vehicle) > 0.0]
     for name, unit, other in _converted(vehicle):
         misfit = _misfit(other)
-        if misfit < 0.2 * before and (best is None or misfit < best[0] - 1e-9):
+        changed = [ratio for ratio in off if ratio.value(other) != ratio.value(vehicle)]
+        usual = all(ratio.is_usual(other) for ratio in changed)
+        if usual and misfit < 0.2 * before and (best is None or misfit < best[0] - 1e-9):
             given, fits = _shown(getattr(vehicle, name)), _shown(getattr(other, name))
             best = misfit, f"is {name} = {given} given in {unit}? {fits} {VEHICLE_UNITS[name]} would fit"
     return None if best is None else best[1]

@@ -44,6 +44,8 @@ _SHOWN: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degr
 REFERENCE_NAMES: Final = ("x", "y", "z", "yaw")
 REFERENCE_UNITS: Final = ("m", "m", "m", "rad")
 REFERENCE_STATES: Final = tuple(INDEX[name] for name in REFERENCE_NAMES)
+REFERENCE_RATES: Final = (*VELOCITY, INDEX["yaw_rate"])
+"""The states that are the rates of change of `REFERENCE_STATES`."""
 
 
 def shown_unit(unit: str) -> tuple[str, float]:

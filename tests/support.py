@@ -263,7 +263,7 @@ def flight_queries(flight: Flight, problem: Problem, stride: int) -> list[Query]
     reference = paper_reference(log.t.size + N)
     before = np.vstack([log.speeds_before, log.speeds[:-1]])
     return [
-        Query(log.state[k], problem.objective.desired(reference[k + 1 : k + 1 + N]), before[k])
+        Query(log.state[k], problem.desired(reference[k + 1 : k + 1 + N]), before[k])
         for k in range(0, log.t.size, stride)
     ]
 

@@ -357,6 +357,8 @@ MISTAKES = {
     "got 3.0",
     "constraints=[{name='a', signal='x', lower=1, upper=0}]": "constraints.a.lower must be below upper = 0.0; got 1.0",
     "constraints=[{name='a', signal='x'}, {name='a', signal='y'}]": "constraints must have distinct names@",
+    "controller={type='unconstrained', horizon=1, output_weights={x=1, vx=1}, input_weights={speed=1}}": "controller."
+    "horizon must be at least 2 where output_weights have vx, whose desired values are @",
     "controller.output_weights={q=1}": "controller.output_weights.q is not a state (there are: x, vx, @",
     "controller.polytopes=[{name='p', of=['x'], rows=[[1]], upper=[]}]": "controller.polytopes.p.upper must have one "
     "number per row, 1; got []",

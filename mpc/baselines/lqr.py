@@ -21,7 +21,7 @@ from mpc.regulator import stabilising
 from quadsim.controller import Command, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
-from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, STATE_NAMES, VELOCITY, Array, read_only
+from quadsim.state import INDEX, N_STATES, REFERENCE_RATES, REFERENCE_STATES, STATE_NAMES, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 LARGEST_DEVIATIONS: Final = {
@@ -132,7 +132,7 @@ class LQR(FeedbackLaw):
         rates = rate + period * np.arange(self.horizon)[:, None] * acceleration
         targets = np.zeros((self.horizon, N_STATES))
         targets[:, REFERENCE_STATES] = poses
-        targets[:, [*VELOCITY, INDEX["yaw_rate"]]] = rates
+        targets[:, REFERENCE_RATES] = rates
         return targets
 
     def _limited(self, error: Array) -> Array:
@@ -163,8 +163,9 @@ class LQRTable(Baseline):
     output_weights: Annotated[
         Annotated[dict[str, Weight], Len(1)] | None,
         doc(
-            "diagonal of Q_y [1/unit of the state^2, rad for angles], by state name; absent: Bryson's rule "
-            "for all twelve and the inputs"
+            "diagonal of Q_y [1/unit of the state^2, rad for angles], by state name; desired are the filtered "
+            "reference's position, yaw, velocity and yaw rate, and 0 for roll, pitch and their rates; absent: "
+            "Bryson's rule for all twelve and the inputs"
         ),
     ] = None
     input_weights: Annotated[

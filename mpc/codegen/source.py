@@ -238,7 +238,7 @@ def _controller(text: CText, law: Exportable, bounds: ActuatorBounds | None, tab
     members = fallback_numbers(model, bounds, law.fallback, problem.horizon)
     fallback = {name: text.value(value) for name, value in members.items()}
     blocks = [
-        text.array("C_r", numbers.pop("C_r")),
+        text.array("C_r", problem.objective.C_r),
         text.struct("quadsim_fallback", f"{text.prefix}fallback", **fallback),
     ]
     if law.settings is not None:

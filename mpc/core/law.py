@@ -64,6 +64,8 @@ class _Controller(ctypes.Structure):
     _fields_ = [
         *((name, _AT) for name in ("problem", "robust", "fallback", "C_r")),
         *_arrays(hover=4),
+        ("follows_rates", _INT),
+        ("period", _REAL),
     ]
 
 
@@ -105,7 +107,7 @@ class _Shared:
         self.nominal = hover_model(law.vehicle, law.problem.model.period)
         self.problem = core_problem(law.problem)
         numbers, robust = controller_numbers(law), None
-        self._C_r = np.ascontiguousarray(numbers.pop("C_r"))
+        self._C_r = np.ascontiguousarray(law.problem.objective.C_r)
         if law.settings is not None:
             members = robust_numbers(law, self.problem.tables.modes)
             robust = _Robust(**{name: _plain(value) for name, value in members.items()})
@@ -249,7 +251,7 @@ class CompiledPreparation:
             self._mpc.known = 0
         objective = self.problem.objective
         if self.found == INVALID:
-            return None if self._robust is not None else Query(state, objective.desired(reference), acting)
+            return None if self._robust is not None else Query(state, self.problem.desired(reference), acting)
         x, x_s, u_s = self._x.copy(), self._x_s.copy(), self._u_s.copy()
         if x.size > N_STATES:  # C has the modes of rotor speeds here
             x[N_STATES:], x_s[N_STATES:] = self._turning, u_s

@@ -70,9 +70,10 @@ def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequenc
     )
 
 
-def controller_numbers(law: Exportable) -> dict[str, Array]:
-    """Return the members of a `quadsim_controller`."""
-    return {"C_r": law.problem.objective.C_r, "hover": law.problem.model.u_bar}
+def controller_numbers(law: Exportable) -> dict[str, float | Array]:
+    """Return the members of a `quadsim_controller` that are numbers; it also points to C_r."""
+    model, objective = law.problem.model, law.problem.objective
+    return {"hover": model.u_bar, "follows_rates": int(objective.needs_rates), "period": model.period}
 
 
 def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:

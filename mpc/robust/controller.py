@@ -23,7 +23,7 @@ import numpy as np
 from mpc.bounded import resolved_lag
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE
-from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, with_limited_yaw
+from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, turned_axes, with_limited_yaw
 from mpc.linear import Remembered
 from mpc.model import hover_model
 from mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
@@ -138,10 +138,10 @@ class RobustPreparation:
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, so its motion shows no disturbance
             self._ahead = following
         reference = self._turns.follow(reference, float(state[_YAW]))
-        if self.delay:  # the reference at the predicted instants, later by the delay
-            reference = np.concatenate([reference[len(under_way) :], np.repeat(reference[-1:], len(under_way), axis=0)])
-            later = np.concatenate([reference[1:], reference[-1:]])
-            reference = reference + self._late / self._period * (later - reference)
+        rates = self.problem.rates(reference)
+        if self.delay:
+            reference = self._at_prediction(reference, len(under_way))
+            rates = None if rates is None else self._at_prediction(rates, len(under_way))
         x0 = np.concatenate([x0, self._turning])[: self._model.n]
         if self._heading:
             reference = with_limited_yaw(reference, self.yaw, self._largest_turn)
@@ -150,7 +150,9 @@ class RobustPreparation:
         u_s = self._balanced()
         x_s = self.trim.state(self.yaw, self._model.n)
         x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
-        desired = self.problem.objective.desired(seen_from(reference, self.yaw))
+        seen = seen_from(reference, self.yaw)
+        seen_rates = None if rates is None else turned_axes(rates, self.yaw)
+        desired = self.problem.objective.desired(seen, seen_rates)
         return Query(x0, desired, acting, Equilibrium(x_s, u_s))
 
     def predict(self, states: Array, plans: Array) -> Array:
@@ -179,6 +181,13 @@ class RobustPreparation:
             turning.append(spun(self._model, turning[-1], command, self._period))
         self._ahead, self._called_at, self._turning = None, time, turning[-1]
         return in_force, under_way, rotors, turning
+
+    def _at_prediction(self, preview: Array, under_way: int) -> Array:
+        """Return the rows (N, 4) of a preview at the predicted instants, later by the delay; the last one is held."""
+        held = np.repeat(preview[-1:], under_way, axis=0)
+        preview = np.concatenate([preview[under_way:], held])
+        later = np.concatenate([preview[1:], preview[-1:]])
+        return np.asarray(preview + self._late / self._period * (later - preview))
 
     def _forget(self) -> None:
         """Assume no disturbance."""

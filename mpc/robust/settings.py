@@ -14,7 +14,6 @@ from mpc.bounded import (
     Lag,
     LagSeconds,
     Soft,
-    objective_of,
     require_lag,
     resolved_lag,
 )
@@ -101,7 +100,7 @@ class Robust(Bounded):
             raise ParameterError("controller", "delay", self.delay, rule)
         A, B = discretise(*continuous_model(vehicle, resolved_lag(self.rotor_lag, vehicle)), period)
         model = LinearModel(A=A, B=B, u_bar=hover_model(vehicle, period).u_bar, period=period)
-        objective, bounds, n = objective_of(self.output_weights, self.input_weights), self.bounds(), model.n
+        objective, bounds, n = self.objective(), self.bounds(), model.n
         moves = None if self.move_weight is None else self.move_weight * np.eye(N_ROTORS)
         objective = replace(objective, C_r=_widened(objective.C_r, n), Q_d=moves)
         if self.terminal == "lqr":

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.controller import ACCEPTED, MISSED, NO_SOLVER, Phase
+from quadsim.controller import ACCEPTED, MISSED, NO_OPTIMUM, NO_SOLVER, Phase
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, TimingLog
 from quadsim.flight.phase import AIRBORNE, TAKEOFF_RISE, Outline, clearance, takeoff_time, touchdown
 from quadsim.state import (
@@ -123,10 +123,13 @@ def control(log: ControlLog) -> dict[str, float]:
     }
 
 
-def percentiles(values: Array) -> dict[str, float]:
-    """Return the median, 95th and 99th percentile and maximum."""
-    p50, p95, p99 = np.percentile(values, [50, 95, 99])
-    return {"p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(values.max())}
+def percentiles(values: Array) -> dict[str, Any]:
+    """Return the median, 95th and 99th percentile and maximum of the values that there are, not NaN; None for none."""
+    known = values[~np.isnan(values)]
+    if not known.size:
+        return dict.fromkeys(("p50", "p95", "p99", "max"))
+    p50, p95, p99 = np.percentile(known, [50, 95, 99])
+    return {"p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(known.max())}
 
 
 def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[str, Any]:
@@ -134,7 +137,8 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
 
     `iterations` covers the periods that the QP solver answered, None if there are none, or several solvers;
     `iterations_by` lists every answerer that iterates.  Each residual has its largest value among accepted answers, and
-    the number of these periods in which it was computed.
+    the number of these periods in which it was computed.  What a law does not report, the time of its optimum and the
+    active constraints there, is None.
     """
     accepted = np.array([status in ACCEPTED for status in log.status])
     answerers = np.array(log.answered_by)
@@ -145,6 +149,7 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
         if counts.any() or by not in NO_SOLVER
     }
     solvers = set(iterations) - NO_SOLVER
+    optimises = bool(set(iterations) - NO_OPTIMUM) or bool(log.active.any())
     return {
         "statuses": dict(sorted(Counter(log.status).items())),
         "fallbacks": {str(level): count for level, count in sorted(Counter(log.fallback.tolist()).items())},
@@ -153,8 +158,8 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
         "answered_by": dict(sorted(Counter(log.answered_by).items())),
         "iterations": by_answerer.get(solvers.pop()) if len(solvers) == 1 else None,
         "iterations_by": by_answerer,
-        "active_max": int(log.active.max()),
-        "active_periods": int(np.count_nonzero(log.active)),
+        "active_max": int(log.active.max()) if optimises else None,
+        "active_periods": int(np.count_nonzero(log.active)) if optimises else None,
         "residuals": {name: _largest(getattr(log, name)[accepted]) for name in RESIDUALS},
         "solve_ms": percentiles(timing.solve_ms),
         "step_ms": percentiles(timing.step_ms),

@@ -12,6 +12,7 @@ import numpy as np
 
 from quadsim.errors import InputError, UnknownNameError
 from quadsim.flight.audit import SIGNALS, TERM_SIGNALS, SpaceLimit, margins_at
+from quadsim.flight.metrics import percentiles
 from quadsim.flight.rundir import Run
 from quadsim.palette import COLOUR, CYCLE, line_colour
 from quadsim.report.comparison import distinct_courses, run_names
@@ -189,7 +190,8 @@ def targets(run: Run) -> list[Figure]:
 
 def times(runs: Sequence[Run]) -> Figure:
     """Plot computation times against the deadline, iterations and active constraints."""
-    panels = [_clock(runs, key) for key in _CLOCKS]
+    reported = [key for key in _CLOCKS if any(np.isfinite(getattr(run.log.timing, key)).any() for run in runs)]
+    panels = [_clock(runs, key) for key in reported]
     for title, key in (("solver iterations", "iterations"), ("active constraints", "active")):
         counts = tuple(
             _of_run(i, label, run.log.control.t, getattr(run.log.control, key).astype(float), style="steps")
@@ -208,8 +210,8 @@ def _clock(runs: Sequence[Run], key: str) -> Panel:
         shown = np.where(values > 0.0, values, np.nan)
         curves.append(_of_run(i, label, run.log.timing.t, shown, style="points", width=2.0))
         if len(runs) == 1:
-            p50, p99 = np.percentile(values, [50, 99])
-            title = f"{title}: median {p50:.3g}, p99 {p99:.3g}, max {values.max():.3g}"
+            spent = percentiles(values)
+            title = f"{title}: median {spent['p50']:.3g}, p99 {spent['p99']:.3g}, max {spent['max']:.3g}"
     deadlines = (
         {float(run.summary["controller"]["deadline_ms"]) for _, _, run in _flown(runs)} if key == "step_ms" else ()
     )

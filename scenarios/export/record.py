@@ -151,6 +151,6 @@ def _found(law: LinearMPC | NonlinearMPC | GeometricController, command: Command
 
 def _free_commands(law: UnconstrainedMPC, asked: list[_Asked]) -> Array:
     """(K, 4) from the core: the one gain of Eq. (24) has lost half its digits at N = 100."""
-    core, desired = Core(with_constraints(law.problem)), law.problem.objective.desired
+    core, desired = Core(with_constraints(law.problem)), law.problem.desired
     queries = (Query(state, desired(path), acting) for state, acting, path, _ in asked)
     return np.array([core.solve(query).plan[0] for query in queries])

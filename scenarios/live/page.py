@@ -36,6 +36,7 @@ from scenarios.flown import Flight
 from scenarios.live import readout
 from scenarios.live.controls import ControllerTab, Steering, Widgets, disturb
 from scenarios.live.guard import Guard
+from scenarios.live.incoming import Incoming
 from scenarios.live.look import dressed
 from scenarios.live.pace import Pace
 from scenarios.live.session import Frame, Session
@@ -102,8 +103,9 @@ class Page:
             raise ParameterError("", "--port", port, "a port that is free")
         for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel that any client may open
             self._server._websock_server.unregister_handler(message)
-        self.address = f"http://{_reachable(host)}:{listening}/?token={guard.token}"
         self._driver: int | None = None
+        Incoming(self._server, self._drives)
+        self.address = f"http://{_reachable(host)}:{listening}/?token={guard.token}"
         self._takes: dict[int, list[Any]] = {}  # of each client, what a watcher sees
         self._aims: dict[int, Any] = {}  # where each client looks, from the vehicle [m]
         self._history: deque[tuple[float, ...]] = deque(maxlen=round(SECONDS / session.period))
@@ -120,7 +122,7 @@ class Page:
         self._away = self.stage.unit * VIEW
         start, camera = np.asarray(session.flights[0].loop.course.row(0)[:3]), self._server.initial_camera
         camera.position, camera.look_at, camera.fov = start + self._away, start, FIELD
-        self._widgets = Widgets(self._server.gui, session, lambda client: client == self._driver)
+        self._widgets = Widgets(self._server.gui, session, self._drives)
         self._build(others)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._left)
@@ -305,6 +307,9 @@ class Page:
         _send(event.client, f"{self._session.scenario.name}.html", page)
 
     # Who drives
+
+    def _drives(self, client: int) -> bool:
+        return client == self._driver
 
     async def _connected(self, client: Any) -> None:
         if self._driver is None:

@@ -71,12 +71,15 @@ def fly_live(
                     refused = session.play(inputs, report)
                 for reason in refused:
                     console.show(f"quadsim: refused: {script}: {reason}".split("\n"), console.stderr())
-        except KeyboardInterrupt:  # what was flown is saved
+        except KeyboardInterrupt:
             print(file=sys.stderr)
+        finally:  # what was flown is saved, whatever ended it
+            flight = None
+            if session.k:
+                flight = session.flight()
+                save(flight)
         text, seconds = "", session.k * session.period
-        if session.k:
-            flight = session.flight()
-            save(flight)
+        if flight is not None:
             flight = replace(flight, directory=directory)
             text = "".join(f"{line}\n" for line in (next(iter(flight.shown())), *flight.outputs()))
         status = EXIT_DONE if session.reason is None and not refused else EXIT_FAILED

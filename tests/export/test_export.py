@@ -211,7 +211,7 @@ def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None
     problem = Assembly(scenario).problem()
     result, rng = tables(problem), np.random.default_rng(0)
     state, reference = rng.normal(size=12), rng.normal(size=(problem.horizon, 4))
-    query = Query(1e-6 * state, problem.objective.desired(1e-6 * reference), problem.model.u_bar)
+    query = Query(1e-6 * state, problem.desired(1e-6 * reference), problem.model.u_bar)
     answer = Core(problem).solve(query)
     assert answer.method is Method.FREE
     desired = result.T_inverse @ (answer.plan[0] - problem.model.u_bar) / 1e-6

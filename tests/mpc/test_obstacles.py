@@ -49,7 +49,7 @@ def query(problem: Problem, *, goal: float = 2.0, speed: float = 0.8) -> Query:
     state, reference = np.zeros(12), np.zeros((N, 4))
     state[INDEX["vx"]] = speed
     reference[:, 0] = goal
-    return Query(state, problem.objective.desired(reference), problem.model.u_bar)
+    return Query(state, problem.desired(reference), problem.model.u_bar)
 
 
 def clearing(problem: Problem, among: Space, calls: list[Answer] | None = None) -> ObstacleQP:

@@ -11,9 +11,9 @@ import pytest
 from support import paper_problem, random_problem
 
 from mpc.constraints import Constraint, Origin, Penalty, row_scale, tightened
-from mpc.ocp import Objective, Problem
+from mpc.ocp import Objective, Problem, reference_rates
 from quadsim.errors import ParameterError
-from quadsim.state import Array
+from quadsim.state import REFERENCE_RATES, REFERENCE_STATES, Array
 
 
 @pytest.mark.parametrize(
@@ -42,6 +42,33 @@ def test_desired_outputs_are_the_reference_and_zero_elsewhere() -> None:
     np.testing.assert_array_equal(paper_problem().objective.desired(reference), reference)
     full = paper_problem("paper-unconstrained").objective.desired(reference)
     np.testing.assert_array_equal(full, [[1, 0, 2, 0, 3, 0, 0, 0, 0, 0, 0.5, 0]])
+
+
+def test_desired_velocities_and_yaw_rate_are_the_differences_of_the_reference() -> None:
+    """Against NumPy's differences, which are exact for a parabola at the ends too."""
+    full = replace(paper_problem("paper-unconstrained"), horizon=30)
+    problem = replace(full, objective=replace(full.objective, follows_rates=True))
+    period = problem.model.period
+    t = period * np.arange(1, 31)[:, None]
+    reference = np.array([1.0, 2.0, 3.0, 4.0]) + t * [0.5, -1.0, 2.0, 0.3] + t**2 * [1.0, 0.2, -0.4, 0.6]
+    desired = problem.desired(reference)
+    np.testing.assert_array_equal(desired[:, REFERENCE_STATES], reference)
+    np.testing.assert_allclose(desired[:, REFERENCE_RATES], [0.5, -1.0, 2.0, 0.3] + 2 * t * [1.0, 0.2, -0.4, 0.6])
+    np.testing.assert_array_equal(desired[:, [6, 7, 8, 9]], 0.0)
+    wild = np.random.default_rng(1).normal(size=(30, 4))
+    np.testing.assert_allclose(
+        problem.desired(wild)[:, REFERENCE_RATES], np.gradient(wild, period, axis=0, edge_order=2), atol=1e-10
+    )
+    np.testing.assert_allclose(reference_rates(wild[:2], 0.1), np.tile(10.0 * (wild[1] - wild[0]), (2, 1)))
+
+
+def test_desired_velocities_are_never_silently_zero() -> None:
+    full = paper_problem("paper-unconstrained")
+    problem = replace(full, objective=replace(full.objective, follows_rates=True))
+    with pytest.raises(ParameterError, match=r"rates must be given where a velocity or the yaw rate has a weight"):
+        problem.objective.desired(np.zeros((100, 4)))
+    with pytest.raises(ParameterError, match=r"horizon must be at least 2 where a velocity .*; got 1"):
+        reference_rates(np.zeros((1, 4)), 0.05)
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def test_every_stage_length_gives_the_condensed_optimum(steps: int) -> None:
     problem = paper_problem("paper-constrained", "controller.horizon=17")
     state = np.zeros(12)
     state[10] = np.pi / 6
-    query = state, problem.objective.desired(paper_reference(18)[1:]), problem.model.u_bar, problem.equilibrium
+    query = state, problem.desired(paper_reference(18)[1:]), problem.model.u_bar, problem.equilibrium
     plan, _, residual = exact(PartiallyCondensed(problem, steps_per_stage=steps), query)
     other, _, _ = exact(Condensed(problem), query)
     assert residual < 1e-8
@@ -252,7 +252,7 @@ def test_slack_is_the_smallest_where_hard_bounds_are_infeasible() -> None:
     assert bounds is not None
     tilted = np.zeros(12)
     tilted[[6, 7, 9]] = np.radians([12.0, 20.0, 15.0])
-    desired, u_bar = problem.objective.desired(np.zeros((50, 4))), problem.model.u_bar
+    desired, u_bar = problem.desired(np.zeros((50, 4))), problem.model.u_bar
     now = ocp_peer.period(problem, tilted, desired, u_bar)
     assert Changing(problem).solve(now).status != SOLVED
     lenient = softened(problem, [1e6, 1e6], [0.0, 0.0])

@@ -56,7 +56,7 @@ def at(solution: Solution, **parts: Array) -> Solution:
 def test_kkt_residuals_see_every_kind_of_fault() -> None:
     problem = paper_problem()
     formulation, backend = Condensed(problem), Piqp(dense=True)
-    query = (STATE, problem.objective.desired(paper_reference(60)[1:51]), problem.model.u_bar)
+    query = (STATE, problem.desired(paper_reference(60)[1:51]), problem.model.u_bar)
     qp, solution = solved(formulation, backend, query)
     assert kkt_residuals(qp, solution).worst < 1e-3
     assert kkt_residuals(qp, at(solution, x=solution.x + 1.0)).stationarity > 0.1
@@ -70,7 +70,7 @@ def test_kkt_residuals_see_every_kind_of_fault() -> None:
 def test_answers_are_copies_that_the_next_solve_leaves_alone() -> None:
     problem = paper_problem()
     solver = QPSolver("piqp-multistage", problem)
-    desired = problem.objective.desired(paper_reference(60)[1:51])
+    desired = problem.desired(paper_reference(60)[1:51])
     first = solver.solve(Query(STATE, desired, problem.model.u_bar))
     before = first.plan.copy(), first.certificate()[1].x.copy(), first.certificate()[1].y.copy()
     solver.solve(Query(-STATE, -desired, problem.model.u_bar))
@@ -101,7 +101,7 @@ def test_multipliers_of_rows_are_those_of_the_qp_and_back() -> None:
     again = Constraint(name="again", D=np.eye(4), lower=np.zeros(4), upper=np.full(4, 250.0))
     tighter = Constraint(name="late", D=np.eye(4), lower=np.full((15, 4), -1.0), upper=late)
     problem = replace(problem, constraints=(again, tighter))
-    desired = problem.objective.desired(np.tile([0.0, 0.0, 30.0, 0.0], (15, 1)))
+    desired = problem.desired(np.tile([0.0, 0.0, 30.0, 0.0], (15, 1)))
     form, backend = Condensed(problem), Piqp(dense=True)
     qp, solution = solved(form, backend, (np.zeros(12), desired, problem.model.u_bar))
     optimum = polish(qp, solution)

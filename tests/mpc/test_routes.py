@@ -67,7 +67,7 @@ def coupled(problem: Problem, given: Period, *, soft: bool, share: float = 0.5, 
 def paper(*, soft: bool) -> tuple[Problem, Period, Constraint, Optimum]:
     """The paper's problem from hover, 3 m to go, with the coupled rows and their peer's optimum."""
     problem = paper_problem("paper-constrained", f"controller.horizon={N}")
-    desired = problem.objective.desired(np.tile([3.0, -2.0, 2.0, 0.3], (N, 1)))
+    desired = problem.desired(np.tile([3.0, -2.0, 2.0, 0.3], (N, 1)))
     given = ocp_peer.period(problem, np.zeros(12), desired, problem.model.u_bar)
     row = coupled(problem, given, soft=soft)
     problem = replace(problem, constraints=(row,))
@@ -260,7 +260,7 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
     x0 = np.concatenate([state, hover])[: base.model.n]
     rest = Equilibrium(np.zeros(base.model.n), hover)
     rest.x[12:] = hover[: base.model.n - 12]
-    given = ocp_peer.period(base, x0, base.objective.desired(reference), hover, rest)
+    given = ocp_peer.period(base, x0, base.desired(reference), hover, rest)
     row = coupled(base, given, soft=kind == "soft", share=0.7)
     row = replace(row, C=None if row.C is None else row.C[:, :12])
     if kind == "tightened":

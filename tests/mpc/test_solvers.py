@@ -37,7 +37,7 @@ def infeasible(name: str) -> Answer:
     problem = paper_problem()
     tilted = np.zeros(12)
     tilted[6], tilted[7] = np.radians(30.0), 5.0
-    desired = problem.objective.desired(np.zeros((50, 4)))
+    desired = problem.desired(np.zeros((50, 4)))
     return QPSolver(name, problem).solve(Query(tilted, desired, problem.model.u_bar))
 
 
@@ -50,7 +50,7 @@ def test_an_infeasible_problem_is_not_called_solved(name: str) -> None:
 def test_a_failure_leaves_the_next_solve_alone(name: str) -> None:
     problem = paper_problem()
     solver = QPSolver(name, problem)
-    desired = problem.objective.desired(np.zeros((50, 4)))
+    desired = problem.desired(np.zeros((50, 4)))
     tilted = np.zeros(12)
     tilted[6], tilted[7] = np.radians(30.0), 5.0
     assert solver.solve(Query(tilted, desired, problem.model.u_bar)).status in {"primal_infeasible", "unsolved"}
@@ -62,7 +62,7 @@ def test_a_failure_leaves_the_next_solve_alone(name: str) -> None:
 @pytest.mark.parametrize(("place", "corrupted"), [(0, np.nan), (1, np.nan), (2, np.nan), (2, np.inf), (2, -np.inf)])
 def test_data_that_is_not_finite_reaches_no_back_end(place: int, corrupted: float) -> None:
     problem = paper_problem()
-    query = [np.zeros(12), problem.objective.desired(np.zeros((50, 4))), problem.model.u_bar.copy()]
+    query = [np.zeros(12), problem.desired(np.zeros((50, 4))), problem.model.u_bar.copy()]
     query[place].flat[0] = corrupted
     solver = QPSolver("piqp-multistage", problem)
     answer = solver.solve(Query(*query))

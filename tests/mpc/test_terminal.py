@@ -88,7 +88,7 @@ def test_the_papers_vehicle_flies_to_a_set_point_as_by_the_infinite_horizons_law
     tilted[[6, 8]] = 0.05, -0.03
     for rest in (problem.equilibrium, Equilibrium(tilted, u_bar + 1.0)):
         expected = rest.u - K @ (state - rest.x - goal)
-        desired = problem.objective.desired(np.tile(reference, (horizon, 1)))
+        desired = problem.desired(np.tile(reference, (horizon, 1)))
         for name, result in first_inputs(problem, (state, desired, u_bar, rest)).items():
             np.testing.assert_allclose(result, expected, rtol=1e-8, err_msg=name)
 

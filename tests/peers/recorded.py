@@ -39,7 +39,7 @@ def record() -> tuple[Problem, tuple[Query, ...]]:
     log = flight.log.control
     problem = Assembly(flight.scenario).problem()
     reference = Assembly(flight.scenario).reference(log.t.size + problem.horizon)
-    desired = problem.objective.desired(reference)
+    desired = problem.desired(reference)
     before = np.vstack([log.speeds_before, log.speeds[:-1]])
     queries = tuple(
         Query(

@@ -22,7 +22,7 @@ def test_an_infeasible_qp_is_reported_and_harms_no_later_one(name: str, capfd: p
     solver = QPSolver(name, problem)
     tilted = np.zeros(12)
     tilted[6], tilted[7] = np.radians(30.0), 5.0
-    hovering = problem.objective.desired(np.zeros((50, 4)))
+    hovering = problem.desired(np.zeros((50, 4)))
     assert solver.solve(Query(tilted, hovering, problem.model.u_bar)).status in {"primal_infeasible", UNSOLVED}
     hover = solver.solve(Query(np.zeros(12), hovering, problem.model.u_bar))
     assert hover.status == SOLVED
@@ -35,7 +35,7 @@ def test_nothing_in_a_first_solve_is_printed(name: str, capfd: pytest.CaptureFix
     problem = paper_problem()
     formulation, backend = find_solver(name).formulate(problem), make_backend(name)
     backend.setup(formulation.qp)
-    desired = problem.objective.desired(paper_reference(51)[1:])
+    desired = problem.desired(paper_reference(51)[1:])
     solution = backend.solve(formulation.assemble(Query(np.zeros(12), desired, problem.model.u_bar)).qp)
     assert solution.status in {SOLVED, UNSOLVED}
     assert solution.stats.solve_s > 0.0

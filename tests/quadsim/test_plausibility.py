@@ -57,6 +57,18 @@ def test_a_number_in_another_unit_is_named_with_that_unit(name: str, factor: flo
     assert unit is None or f"given in {unit}?" in notes
 
 
+def test_no_unit_is_guessed_that_leaves_a_number_at_the_edge_of_what_is_usual() -> None:
+    """A Crazyflie's d/b as some simulators have it is too large for its propellers, but it is not in centimetres."""
+    crazyflie = load_vehicle(vehicle_path("crazyflie2"))
+    (note,) = implausible(replace(crazyflie, drag_to_thrust=0.02513))
+    assert "given in" not in note
+    assert note.startswith("vehicle: drag_to_thrust over rotor_radius is 1.12")
+    assert note.endswith("check drag_to_thrust, rotor_radius, arm_length")
+    in_cm = 100.0 * crazyflie.drag_to_thrust
+    assert "drag_to_thrust = 0.596" in " ".join(implausible(replace(crazyflie, drag_to_thrust=in_cm)))
+    assert "given in cm?" in " ".join(implausible(replace(crazyflie, drag_to_thrust=in_cm)))
+
+
 def test_an_extent_within_the_propellers_does_not_shrink_the_vehicle() -> None:
     vehicle = replace(template(), extent=0.001)
     assert vehicle.enclosing_radius == pytest.approx(vehicle.arm_length + (vehicle.rotor_radius or 0.0))

@@ -20,7 +20,7 @@ static void want_rest(quadsim_mpc *mpc, const real *rest)
     }
 }
 
-/* wanted [n_r] += y_d of a row of the reference; states besides these four are wanted at 0. */
+/* wanted [n_r] += y_d of a row of the reference. */
 static void want(const quadsim_controller *c, const real row[4], real *wanted)
 {
     const int n = c->problem->states;
@@ -28,6 +28,50 @@ static void want(const quadsim_controller *c, const real row[4], real *wanted)
     for (r = 0; r < c->problem->regulated; r++) {
         const real *C = c->C_r + r * n;
         wanted[r] += C[X] * row[0] + C[Y] * row[1] + C[Z] * row[2] + C[YAW] * row[3];
+    }
+}
+
+/* wanted [n_r] += y_d of the velocities and the yaw rate of a row; roll, pitch and their rates are wanted at 0. */
+static void want_rates(const quadsim_controller *c, const real rates[4], real *wanted)
+{
+    const int n = c->problem->states;
+    int r;
+    for (r = 0; r < c->problem->regulated; r++) {
+        const real *C = c->C_r + r * n;
+        wanted[r] += C[VX] * rates[0] + C[VY] * rates[1] + C[VZ] * rates[2] + C[YAW + 1] * rates[3];
+    }
+}
+
+/* The reference's step from row i to the next, in yaw the shorter way round. */
+static void step_from(const real *reference, int i, real step[4])
+{
+    int j;
+    for (j = 0; j < 4; j++) {
+        step[j] = reference[(i + 1) * 4 + j] - reference[i * 4 + j];
+    }
+    step[3] -= TURN * whole_turns(step[3]);
+}
+
+/* Velocities and yaw rate of the reference at row i: the mean of the steps before and after it, and at both ends those
+ * of the parabola through three rows.  There are at least two rows. */
+static void rates_at(const quadsim_controller *c, const real *reference, int i, real rates[4])
+{
+    const int last = c->problem->horizon - 2; /* the last step */
+    const int second = last > 0 ? 1 : 0;
+    int near = i, other = i - 1, j;
+    real share = R(0.5), near_step[4], other_step[4];
+    if (i == 0) {
+        share = R(1.5);
+        other = second;
+    } else if (i > last) {
+        share = R(1.5);
+        near = last;
+        other = last - second;
+    }
+    step_from(reference, near, near_step);
+    step_from(reference, other, other_step);
+    for (j = 0; j < 4; j++) {
+        rates[j] = (share * near_step[j] + (R(1.0) - share) * other_step[j]) / c->period;
     }
 }
 
@@ -226,13 +270,34 @@ static void later_row(const quadsim_controller *c, const real *reference, int i,
     row[3] = heading + c->robust->delayed_share * (ahead - heading);
 }
 
+/* The reference's rates at the instant that the prediction of row i is for, likewise. */
+static void later_rates(const quadsim_controller *c, const real *reference, int i, real rates[4])
+{
+    const int next = i == c->problem->horizon - 1 ? i : i + 1;
+    real ahead[4];
+    int j;
+    rates_at(c, reference, i, rates);
+    rates_at(c, reference, next, ahead);
+    for (j = 0; j < 4; j++) {
+        rates[j] += c->robust->delayed_share * (ahead[j] - rates[j]);
+    }
+}
+
+/* The first two numbers, along world x and y, in axes turned by an angle. */
+static void turn_axes(real row[4], real sine, real cosine)
+{
+    const real x = row[0], y = row[1];
+    row[0] = cosine * x + sine * y;
+    row[1] = cosine * y - sine * x;
+}
+
 /* wanted of the reference [N][4] as the prediction is given it: later by the delay, and where the model is turned by
  * the heading, yaw without jumps, seen from axes turned by it. */
 static void want_seen(quadsim_mpc *mpc, const real *reference, real turns, real yaw, real sine, real cosine)
 {
     const quadsim_controller *c = mpc->controller;
     const int end = c->problem->horizon - 1, under_way = c->robust->under_way;
-    real row[4], last = yaw, turned = yaw;
+    real row[4], rates[4], last = yaw, turned = yaw;
     int i;
     for (i = 0; i < under_way && i <= end; i++) { /* rows that are past when the command acts */
         turns = next_turns(reference, i, turns);
@@ -244,14 +309,20 @@ static void want_seen(quadsim_mpc *mpc, const real *reference, real turns, real 
         }
         later_row(c, reference, at, turns, row);
         if (c->robust->heading) {
-            const real x = row[0], y = row[1], step = row[3] - last;
+            const real step = row[3] - last;
             last = row[3];
             turned += clipped(step, -c->robust->largest_turn, c->robust->largest_turn);
-            row[0] = cosine * x + sine * y;
-            row[1] = cosine * y - sine * x;
+            turn_axes(row, sine, cosine);
             row[3] = turned - yaw;
         }
         want(c, row, mpc->wanted + i * c->problem->regulated);
+        if (c->follows_rates) {
+            later_rates(c, reference, at, rates);
+            if (c->robust->heading) {
+                turn_axes(rates, sine, cosine);
+            }
+            want_rates(c, rates, mpc->wanted + i * c->problem->regulated);
+        }
     }
 }
 
@@ -399,7 +470,7 @@ static int is_usable(const quadsim_controller *c, const real *state, const real 
 static enum quadsim_status solve_paper(quadsim_mpc *mpc, const real *state, const real *reference, const real *acting)
 {
     const quadsim_controller *c = mpc->controller;
-    real row[4], turns = first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]);
+    real row[4], rates[4], turns = first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]);
     int i;
     memcpy(mpc->state, state, 12 * sizeof(real));
     memcpy(mpc->resting, c->hover, sizeof(mpc->resting));
@@ -410,6 +481,10 @@ static enum quadsim_status solve_paper(quadsim_mpc *mpc, const real *state, cons
         memcpy(row, reference + i * 4, sizeof(row));
         row[3] -= TURN * turns;
         want(c, row, mpc->wanted + i * c->problem->regulated);
+        if (c->follows_rates) {
+            rates_at(c, reference, i, rates);
+            want_rates(c, rates, mpc->wanted + i * c->problem->regulated);
+        }
     }
     return optimise(mpc, acting);
 }

@@ -53,6 +53,8 @@ typedef struct quadsim_controller {
     const quadsim_fallback *fallback; /* NULL where quadsim guards the law: quadsim_mpc_step is not for it */
     const quadsim_real *C_r;                                 /* [n_r][n] regulated outputs, C_r x */
     quadsim_real hover[4];                                   /* [rad/s] */
+    int follows_rates; /* whether a desired output is a velocity or the yaw rate of the reference */
+    quadsim_real period;                                     /* [s] */
 } quadsim_controller;
 
 /* A controller.  Read guard.level, work.changes and work.plan, the last optimum [N][4] in rad/s; the rest is its own. */

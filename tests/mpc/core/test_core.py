@@ -42,7 +42,7 @@ def drawn_query(rng: np.random.Generator, problem: Problem) -> Query:
     size = rng.choice([0.1, 0.5, 2.0])
     state = np.zeros(n)
     state[:12] = size * rng.normal(size=12) * np.tile([1.0, 0.5, 1.0, 0.5, 1.0, 0.5, 0.03, 0.1, 0.03, 0.1, 0.3, 0.3], 1)
-    desired = np.tile(problem.objective.desired(size * rng.normal(size=(1, 4)) * [3.0, 3.0, 2.0, 0.5]), (N, 1))
+    desired = np.tile(problem.desired(size * rng.normal(size=(1, 4)) * [3.0, 3.0, 2.0, 0.5]), (N, 1))
     return Query(state, desired, u_bar + rng.uniform(-5.0, 5.0, 4), problem.equilibrium)
 
 

@@ -17,7 +17,7 @@ from mpc.linear import LinearMPC
 from mpc.robust.controller import RobustPreparation
 from quadsim.controller import CORE, FALLBACK, GAIN, Command, Phase, StepInputs
 from quadsim.errors import ExportError, InputError
-from quadsim.state import INDEX, N_STATES, Array
+from quadsim.state import INDEX, N_STATES, Array, wrapped
 from scenarios.assembly import Assembly
 from scenarios.export.exporter import exported_law
 from scenarios.flown import Flight
@@ -178,10 +178,22 @@ def test_a_compiled_law_predicts_through_the_commands_under_way(delay: float) ->
     assert mpc._memory.size == CController(law=law, asked=mpc._shared.problem.struct.room - 1).reals
 
 
-def test_both_preparations_pose_the_same_queries_and_remember_the_same() -> None:
+MOVING = {"x": 10.0, "y": 10.0, "z": 100.0, "yaw": 100.0, "vx": 5.0, "vy": 6.0, "vz": 7.0, "yaw_rate": 8.0}
+WEIGHTED = {
+    "places": {},
+    "velocities": {"controller.output_weights": MOVING},
+    "velocities, along the heading": {"controller.output_weights": MOVING, "controller.heading": True},
+    "velocities over two periods": {"controller.output_weights": MOVING, "controller.horizon": 2, "delay": 0.08},
+}
+
+
+@pytest.mark.parametrize("weighted", WEIGHTED)
+def test_both_preparations_pose_the_same_queries_and_remember_the_same(weighted: str) -> None:
     """In the air, on the ground and up again, through commands under way, a pause and states that are predicted."""
-    late = {"controller.delay": 0.12, "computation.delay": 0.12}
-    scenario = quadsim.load("robust-lag50", late)
+    changes = dict(WEIGHTED[weighted])
+    delay = changes.pop("delay", 0.12)
+    late = {"controller.delay": delay, "computation.delay": delay}
+    scenario = quadsim.load("robust-lag50", late | changes)
     law = exported_law(scenario)
     assert law.settings is not None
     twins = RobustPreparation(law.vehicle, law.problem, law.settings), CompiledPreparation(law)
@@ -198,6 +210,7 @@ def test_both_preparations_pose_the_same_queries_and_remember_the_same() -> None
         now = StepInputs(time=time, phase=phase, unseen=unseen if k in (20, 21) else None)
         state, acting = 0.1 * rng.standard_normal(N_STATES), hover + rng.uniform(-5.0, 5.0, 4)
         reference = np.cumsum(0.05 * rng.standard_normal((law.problem.horizon, 4)), axis=0)
+        reference[:, 3] = wrapped(reference[:, 3] + 3.1)  # across the half turn
         if phase is Phase.LANDED:
             for twin in twins:
                 twin.stand(now, acting)

@@ -186,3 +186,15 @@ def test_no_take_off_counts_three_seconds_after_it_was_told(phases: list[Phase],
 def test_a_flight_of_no_period_has_no_numbers() -> None:
     assert metrics.flight_numbers(small_log(0), 50.0) == {"tracking": {}, "control": {}, "controller": {}}
     assert all(metrics.flight_numbers(small_log(1), 50.0).values())
+
+
+def test_what_a_law_does_not_report_is_absent() -> None:
+    """A PID controller has no optimum: neither its time nor its active constraints are 0."""
+    log = replace(small_log(3).control, status=("commanded",) * 3, answered_by=("law",) * 3, active=np.zeros(3, int))
+    timing = TimingLog(t=log.t, solve_ms=np.full(3, math.nan), step_ms=np.array([1.0, 2.0, 3.0]))
+    numbers = metrics.controller(log, timing, deadline_ms=50.0)
+    assert numbers["solve_ms"] == {"p50": None, "p95": None, "p99": None, "max": None}
+    assert (numbers["active_max"], numbers["active_periods"]) == (None, None)
+    assert numbers["step_ms"]["p50"] == 2.0
+    some = replace(timing, solve_ms=np.array([math.nan, 3.0, 1.0]))
+    assert metrics.controller(log, some, deadline_ms=50.0)["solve_ms"]["p50"] == 2.0

@@ -160,6 +160,15 @@ def test_the_best_of_completed_flights_is_marked_where_they_differ(
     assert marks(comparison_rows([aborted_run, worse_run]), "RMS error, x") == [Mark.NONE] * 2
 
 
+def test_what_a_law_does_not_report_is_absent_and_never_the_best(short_run: Run, worse_run: Run) -> None:
+    unreported = {"solve_ms": dict.fromkeys(("p50", "p95", "p99", "max")), "active_max": None}
+    silent = having(short_run, "silent", controller=short_run.summary["controller"] | unreported)
+    rows = comparison_rows([silent, worse_run, short_run])
+    label = "optimum alone, by any answerer, median"
+    assert texts(rows, label)[0] == texts(rows, "active constraints, most")[0] == "-"
+    assert marks(rows, label)[0] is Mark.NONE
+
+
 def test_constraints_carry_their_tolerances_and_what_is_required(short_run: Run, worse_run: Run) -> None:
     free = having(short_run, "free", constraints=[])
     rows = comparison_rows([short_run, worse_run, free])

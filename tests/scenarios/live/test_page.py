@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import re
 import shutil
 import signal
@@ -19,6 +20,7 @@ from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
+import msgspec
 import numpy as np
 import pytest
 import viser
@@ -31,6 +33,7 @@ from scenarios.commands.cli import main
 from scenarios.flown import Flight
 from scenarios.live import serving
 from scenarios.live.guard import Guard
+from scenarios.live.incoming import offers
 from scenarios.live.pace import Pace
 from scenarios.live.page import Page
 from scenarios.live.session import Frame, Session
@@ -215,6 +218,138 @@ def test_an_interrupt_keeps_what_was_flown(
     for thread in {*threading.enumerate()} - threads:
         thread.join(0.0 if thread.daemon else PATIENCE)
         assert thread.daemon or not thread.is_alive()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_fault_of_the_page_loses_no_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(page: Page, frame: Frame, factor: float) -> None:
+        if frame.k == 4:
+            raise ZeroDivisionError("a page")
+
+    monkeypatch.setattr(Page, "show", fails)
+    monkeypatch.setattr(serving, "Pace", lambda waiting: Pace())
+    saved = tmp_path / "saved"
+    with pytest.raises(ZeroDivisionError):
+        serving.fly_live(
+            load_scenario("hover", ["controller.horizon=5"]),
+            None,
+            None,
+            onward=False,
+            out=saved,
+            overwrite=False,
+            video=False,
+            host="127.0.0.1",
+            port=0,
+            browser=False,
+        )
+    assert load_scenario(str(saved / "scenario.toml")).duration == pytest.approx(0.25)
+
+
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [3.0, 3.0, 3.0],
+    "fov": 0.8,
+    "near": 0.01,
+    "far": 1000.0,
+    "image_height": 800,
+    "image_width": 1200,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+}
+HOSTILE: tuple[Any, ...] = (
+    *(math.nan, math.inf, -1, -math.inf, 1e308, 2**62, "x", "0", "nan", None, [], {"a": 1}, b"x", True),
+    *([1e308, math.nan], [math.nan] * 3, [1.0] * 7),
+)
+
+
+@pytest.fixture
+def flying() -> Iterator[Served]:
+    """A session that flies, whatever is sent to its page."""
+    session, pace = Session(load_scenario("playground", ["controller.horizon=5"])), Pace()
+    page = Page(session, pace, save=lambda flight: "", others={})
+    thread = threading.Thread(target=pace.drive, args=(session, page))
+    thread.start()
+    served = Served(session, pace, page, threading.Event())
+    yield served
+    alive = thread.is_alive()
+    pace.stop()
+    thread.join()
+    page.close()
+    session.close()
+    assert alive
+
+
+def joined(served: Served, stack: ExitStack) -> Callable[..., None]:
+    """Open a page by hand; a function that sends a message from it."""
+    address = urlsplit(served.page.address)
+    cookie = {"Cookie": f"quadsim-{address.port}={address.query.partition('=')[2]}"}
+    clients = len(served.page._server.get_clients())
+    page = stack.enter_context(
+        connect(
+            f"ws://{address.netloc}/",
+            subprotocols=[PROTOCOL],
+            additional_headers=cookie,
+            max_size=None,
+            close_timeout=0.2,
+        )
+    )
+
+    def send(kind: str, **fields: Any) -> None:
+        page.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    send(**{"kind" if key == "type" else key: value for key, value in CAMERA.items()})
+    served.wait(lambda: len(served.page._server.get_clients()) > clients)
+    return send
+
+
+def test_hostile_values_change_nothing_and_end_nothing(flying: Served) -> None:
+    widgets = flying.page._server.gui._gui_input_handle_from_uuid
+    with ExitStack() as stack:
+        send = joined(flying, stack)
+        buttons = {uuid for uuid, widget in widgets.items() if widget._impl.is_button}
+        start = {uuid: widget.value for uuid, widget in widgets.items() if uuid not in buttons}
+        for uuid, value in start.items():
+            for hostile in HOSTILE:
+                if not offers(widgets[uuid], hostile):
+                    send("GuiUpdateMessage", uuid=uuid, updates={"value": hostile})
+            send("GuiUpdateMessage", uuid=uuid, updates={"value": value, "visible": False})
+            send("GuiUpdateMessage", uuid=uuid, updates={"_impl": None})
+        for name, value in {"position": [math.nan] * 3, "fov": math.inf, "look_at": [1e308] * 3}.items():
+            send(**{"kind" if key == "type" else key: entry for key, entry in (CAMERA | {name: value}).items()})
+        send("TransformControlsUpdateMessage", name="/target", wxyz=[1.0, 0.0, 0.0, 0.0], position=[math.nan] * 3)
+        speed = next(uuid for uuid, widget in widgets.items() if getattr(widget, "label", "") == "Speed")
+        send("GuiUpdateMessage", uuid=speed, updates={"value": "0"})
+        send("GuiUpdateMessage", uuid=speed, updates={"value": "2"})
+        flying.wait(lambda: flying.pace.speed == 2.0)
+        k = flying.session.k
+        flying.wait(lambda: flying.session.k > k + 5)
+    assert {uuid: widgets[uuid].value for uuid in start if uuid != speed} == {
+        uuid: value for uuid, value in start.items() if uuid != speed
+    }
+    assert widgets[speed].value == "2"
+
+
+def test_a_watching_page_changes_nothing_that_the_driver_gives(flying: Served) -> None:
+    widgets = flying.page._server.gui._gui_input_handle_from_uuid
+    by_label = {getattr(widget, "label", ""): uuid for uuid, widget in widgets.items()}
+    payload, take = by_label["Payload [kg]"], by_label["Take payload"]
+    before = widgets[payload].value
+    with ExitStack() as stack:
+        drive, watch = joined(flying, stack), joined(flying, stack)
+        watch("GuiUpdateMessage", uuid=payload, updates={"value": 0.5 * before})
+        watch("GuiUpdateMessage", uuid=by_label["Speed"], updates={"value": "4"})
+        watch("GuiUpdateMessage", uuid=take, updates={"value": True})
+        watch("GuiUpdateMessage", uuid=by_label["Camera follows"], updates={"value": False})
+        drive("GuiUpdateMessage", uuid=by_label["Speed"], updates={"value": "2"})
+        flying.wait(lambda: flying.pace.speed == 2.0)
+        k = flying.session.k
+        flying.wait(lambda: flying.session.k > k + 5)
+        assert not flying.events("payload_pickup")
+        drive("GuiUpdateMessage", uuid=take, updates={"value": True})
+        flying.wait(lambda: bool(flying.events("payload_pickup")))
+    assert [event.mass for event in flying.events("payload_pickup")] == [before]
+    assert widgets[by_label["Camera follows"]].value is True
 
 
 @pytest.fixture

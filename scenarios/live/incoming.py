@@ -1,0 +1,170 @@
+"""What the clients of a live session's page may send: every message is checked before anything acts on it.
+
+A message of a kind that this page has no use for, with a number that is not finite, or of another form is dropped.
+What is no message of viser's at all ends that client's connection, and no other.
+
+All pages share the widgets, so that what a watcher gives would be the driver's next value: only the driver changes a
+widget, and only to a value that the widget itself offers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, Final
+
+from viser import _messages
+
+Handler = Callable[[int, Any], Awaitable[None]]
+_LONGEST: Final = 1000  # characters of a text, or entries of a list
+_LARGEST: Final = 1e9  # magnitude of a number
+
+_NUMBER: Final = (int, float)
+_FORMS: Final[dict[type, dict[str, Any]]] = {
+    _messages.ViewerCameraMessage: {
+        "wxyz": 4,
+        "position": 3,
+        "fov": _NUMBER,
+        "near": _NUMBER,
+        "far": _NUMBER,
+        "image_height": _NUMBER,
+        "image_width": _NUMBER,
+        "look_at": 3,
+        "up_direction": 3,
+    },
+    _messages.SceneNodeClickMessage: {"name": str, "ray_origin": 3, "ray_direction": 3, "screen_pos": 2},
+    _messages.SceneNodeDragMessage: {"name": str, "start_position": 3, "end_position": 3},
+    _messages.ScenePointerMessage: {"event_type": str, "ray_origin": 3, "ray_direction": 3},
+    _messages.TransformControlsUpdateMessage: {"name": str, "wxyz": 4, "position": 3},
+    _messages.TransformControlsDragStartMessage: {"name": str},
+    _messages.TransformControlsDragEndMessage: {"name": str},
+    _messages.CommandTriggerMessage: {"uuid": str},
+    _messages.GuiUpdateMessage: {"uuid": str, "updates": dict},
+}
+"""The messages that this page's clients send; of their fields the type, or how many numbers they have."""
+_OF_THE_DRIVER: Final = (
+    _messages.TransformControlsUpdateMessage,
+    _messages.TransformControlsDragStartMessage,
+    _messages.TransformControlsDragEndMessage,
+)
+"""Messages by which viser moves what all pages share before it calls anybody."""
+
+
+class Incoming:
+    """Checks the messages of a viser server's clients.
+
+    Args:
+        server: viser's.
+        drives: whether a client, by its number, has the controls.
+    """
+
+    def __init__(self, server: Any, drives: Callable[[int], bool]) -> None:
+        self._server, self._drives = server, drives
+        connection = server._websock_server
+        self._guard(connection, self._check_shared)
+        connection.on_client_connect(lambda client: self._guard(client, lambda number, message: True))
+
+    def _guard(self, connection: Any, check: Callable[[int, Any], bool]) -> None:
+        """Let a connection handle only messages of the right form that pass a check of its own."""
+        handle: Handler = connection._handle_incoming_message
+
+        async def checked(client: int, message: Any) -> None:
+            if is_well_formed(message) and check(client, message):
+                await handle(client, message)
+
+        connection._handle_incoming_message = checked
+
+    def _check_shared(self, client: int, message: Any) -> bool:
+        """Return whether a message may act on what all pages share."""
+        if isinstance(message, _OF_THE_DRIVER):
+            return self._drives(client)
+        if not isinstance(message, _messages.GuiUpdateMessage):
+            return True  # these change nothing by themselves: `Widgets.on` knows who drives
+        widget = self._server.gui._gui_input_handle_from_uuid.get(message.uuid)
+        if widget is None:
+            return True  # of one client alone
+        if not self._drives(client):
+            self._turn_away(client, widget)
+            return False
+        return set(message.updates) == {"value"} and offers(widget, message.updates["value"])
+
+    def _turn_away(self, client: int, widget: Any) -> None:
+        """Tell a watching page that it watches, and show it the value that is in force."""
+        page = self._server.get_clients().get(client)
+        if page is None:
+            return
+        page.add_notification("You watch", "Another page has the controls: Take the controls changes that.")
+        if not widget._impl.is_button:
+            in_force = _messages.GuiUpdateMessage(widget._impl.uuid, {"value": widget.value})
+            page._websock_connection.queue_message(in_force)
+
+
+def is_well_formed(message: Any) -> bool:
+    """Return whether a message is one that a page sends, with finite numbers and fields of the right form."""
+    form = _FORMS.get(type(message))
+    if form is None or not _is_plain(vars(message)):
+        return False
+    for name, kind in form.items():
+        value = getattr(message, name, None)
+        if isinstance(kind, int):
+            right = isinstance(value, list | tuple) and len(value) == kind and all(map(_is_number, value))
+        elif kind is _NUMBER:
+            right = _is_number(value)
+        else:
+            right = isinstance(value, kind)
+        if not right:
+            return False
+    return True
+
+
+def offers(widget: Any, value: Any) -> bool:
+    """Return whether a widget of viser's can be set to a value on its page: of its type and within its limits."""
+    state = widget._impl
+    props = state.props
+    if getattr(props, "disabled", False):
+        return False
+    options = getattr(props, "options", None)
+    if options is not None:
+        return isinstance(value, str) and value in options
+    present = state.value
+    if state.is_button or isinstance(present, bool):
+        return isinstance(value, bool)
+    if isinstance(present, str):
+        return isinstance(value, str)
+    low, high = getattr(props, "min", None), getattr(props, "max", None)
+    if isinstance(present, tuple):
+        if not isinstance(value, list | tuple) or len(value) != len(present):
+            return False
+        lows = [None] * len(present) if low is None else low
+        highs = [None] * len(present) if high is None else high
+        return all(map(_is_within, value, lows, highs))
+    whole = isinstance(present, int)
+    return _is_within(value, low, high) and (not whole or float(value).is_integer())
+
+
+def _is_within(value: Any, low: float | None, high: float | None) -> bool:
+    """Return whether a value is a number within limits."""
+    if not _is_number(value):
+        return False
+    return (low is None or value >= low) and (high is None or value <= high)
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return math.isfinite(value) and abs(value) <= _LARGEST
+
+
+def _is_plain(value: Any) -> bool:
+    """Return whether all numbers within a value are finite, and nothing is too long."""
+    if value is None or isinstance(value, bool):
+        return True
+    if isinstance(value, int | float):
+        return _is_number(value)
+    if isinstance(value, str):
+        return len(value) <= _LONGEST
+    if isinstance(value, dict):
+        return _is_plain(list(value)) and _is_plain(list(value.values()))
+    if isinstance(value, Sequence) and not isinstance(value, bytes):
+        return len(value) <= _LONGEST and all(map(_is_plain, value))
+    return False
