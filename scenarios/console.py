@@ -107,8 +107,10 @@ def say(text: str) -> None:
 
 
 def written_to(path: Path) -> Text:
-    """Return the line with the path of an output."""
-    return styled("written to ", (short_path(path), "bold"))
+    """Return the line with the path of an output, which may have spaces."""
+    line = styled("written to ", (short_path(path), "bold"))
+    line.no_wrap = True
+    return line
 
 
 def to_open(path: Path, program: str = "open") -> Text:

@@ -64,6 +64,11 @@ _fly = Rollout.fly
 """Whatever stands in for it in a test."""
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """No test may need another one before it."""
+    parser.addoption("--reversed", action="store_true", help="run the tests in reversed order")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Give modules to the workers in the order of `pytest_collection_modifyitems`, not by their number of tests."""
     if hasattr(config.option, "loadscopereorder"):
@@ -72,11 +77,13 @@ def pytest_configure(config: pytest.Config) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long modules first, so that no worker is left alone with one in the end."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Long modules first, so that no worker is left alone with one in the end; or all the other way round."""
     here = Path(__file__).parent
     rank = {here / name: i for i, name in enumerate(LONG)}
     items.sort(key=lambda item: rank.get(item.path, len(rank)))
+    if config.getoption("--reversed"):
+        items.reverse()
 
 
 def pytest_collection_finish() -> None:

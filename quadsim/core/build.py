@@ -36,9 +36,8 @@ ZIG: Final = "ziglang==0.17.1"
 PLATFORM: Final = "QUADSIM_PLATFORM"
 """Environment variable with the platform tag of a wheel to publish, of `TARGETS`; unset for this machine's."""
 TARGETS: Final = {
-    "manylinux_2_17_x86_64": "x86_64-linux-gnu.2.17",
-    "manylinux_2_17_aarch64": "aarch64-linux-gnu.2.17",
-    "macosx_11_0_x86_64": "x86_64-macos.11.0",
+    "manylinux_2_28_x86_64": "x86_64-linux-gnu.2.28",
+    "manylinux_2_28_aarch64": "aarch64-linux-gnu.2.28",
     "macosx_11_0_arm64": "aarch64-macos.11.0",
 }
 """zig's targets by platform tag, each for every processor and system that pip installs the tag on."""

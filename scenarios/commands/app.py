@@ -69,8 +69,8 @@ def _version() -> str:
 app: Final = App(
     name="quadsim",
     help="Fly model predictive controllers of quadrotors in MuJoCo; record, film and audit every flight.",
-    help_epilogue="exit status: 0 done; 1 a required constraint is violated, or the flight was aborted or "
-    "interrupted; 2 wrong input",
+    help_epilogue="exit status: 0 done; 1 a required constraint is violated, or the flight was aborted; 2 wrong input; "
+    "130 interrupted by Ctrl-C, 143 by SIGTERM",
     help_format="plaintext",
     default_parameter=Parameter(show_default=False, negative_iterable=(), allow_repeating=True),
     version=_version,

@@ -1,6 +1,7 @@
 """The `quadsim` command: it parses the line, calls a function of `scenarios.commands.app`, and shows the result.
 
-Exit status: 0 done; 1 a required constraint is violated, or the flight was aborted or interrupted; 2 invalid input.
+Exit status: 0 done; 1 a required constraint is violated, or the flight was aborted; 2 invalid input.  That of an
+interrupted command is `scenarios.commands.entry`'s.
 """
 
 from __future__ import annotations
@@ -116,10 +117,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return EXIT_FAILED
         print(f"quadsim: code that was loaded asks Python to exit (status {error.code!r:.80})", file=sys.stderr)
         return EXIT_WRONG_INPUT
-    except KeyboardInterrupt as stop:
-        left = str(stop) or "nothing half written was left behind"
-        print(f"quadsim: interrupted (Ctrl-C); {left}", file=sys.stderr)
-        return EXIT_FAILED
     except BrokenPipeError:  # the reader of our output went away, e.g. `quadsim check RUN | head`: no verdict was read
         _silence_stdout()
         return EXIT_FAILED

@@ -1,7 +1,7 @@
 """The process of the `quadsim` command: its environment, set before any other import, its signals and streams.
 
 Ctrl-C, SIGTERM and SIGHUP all raise `KeyboardInterrupt`, unless the process was started with them ignored, as by
-`nohup`.
+`nohup`.  A command that heard one of them ends with 128 and its number, as a shell expects, whatever it has kept.
 """
 
 from __future__ import annotations
@@ -21,41 +21,86 @@ _RENDERERS: Final = ("", "egl", "osmesa", "glfw", "disable")
 
 def main() -> int:
     """Run the command line of this process; returns the exit status."""
-    heard = [stop for stop in _STOPS if signal.getsignal(stop) is not signal.SIG_IGN]
-    stopped = False
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        nonlocal stopped
-        stopped = True
-        raise KeyboardInterrupt
-
+    _open_what_is_closed()
+    stops = _Stops()
+    status = 0
+    left = "what was finished is kept, and nothing is half written"
     try:
-        for stop in heard:
-            signal.signal(stop, interrupt)
-        _open_what_is_closed()
-        problem = _set_environment()
-        if sys.stdout is None:
-            problem = "stdout is closed; to do without what is printed: >/dev/null"
-        if problem is not None:
-            print(f"quadsim: {problem}", file=sys.stderr)
-            return 2
-        if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors in ("strict", "surrogateescape"):
-            sys.stdout.reconfigure(errors="backslashreplace")  # a terminal may lack characters
-        from scenarios.commands.cli import main as run
-
-        status = run()
-        if "--json" in sys.argv:
-            os.dup2(2, 1)  # user code may print at exit too
-        return status
-    except (KeyboardInterrupt, ImportError, SystemError):  # a compiled module may turn the first into others
-        if not stopped:
+        try:
+            stops.hear()
+            status = _work()
+        finally:
+            stops.working = False
+    except BaseException as error:  # compiled modules and user code may turn `KeyboardInterrupt` into others
+        stops.working = False
+        if stops.first is None:
             raise
-        with contextlib.suppress(OSError):  # the terminal may be gone
-            print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
-        return 1
+        if isinstance(error, KeyboardInterrupt):
+            left = str(error) or left
     finally:
-        for stop in heard:  # the work is done, and the status reports how
-            signal.signal(stop, signal.SIG_IGN)
+        stops.release()
+    if stops.first is None:
+        return status
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        print(f"quadsim: interrupted ({stops.name}); {left}", file=sys.stderr)
+    return 128 + stops.first
+
+
+class _Stops:
+    """The signals that stop this process.
+
+    The first one is remembered, because the exception that it raises may be caught by whatever code runs then, where a
+    flight is kept, or get lost in a destructor or a compiled module.
+    """
+
+    first: signal.Signals | None = None
+    working = True
+    """Whether a signal raises `KeyboardInterrupt`; afterwards it is remembered only."""
+
+    def __init__(self) -> None:
+        self._heard = [stop for stop in _STOPS if signal.getsignal(stop) is not signal.SIG_IGN]
+
+    def hear(self) -> None:
+        for stop in self._heard:
+            signal.signal(stop, self._interrupt)
+
+    def release(self) -> None:
+        """Leave the process to its signals: one that arrives while Python shuts down kills it."""
+        signal.pthread_sigmask(signal.SIG_BLOCK, self._heard)
+        for stop in self._heard:
+            signal.signal(stop, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, self._heard)
+
+    @property
+    def name(self) -> str:
+        """What a user calls the first one."""
+        if self.first is None:
+            return ""
+        return "Ctrl-C" if self.first == signal.SIGINT else self.first.name
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self.first is None:
+            self.first = signal.Signals(number)
+        if self.working:
+            raise KeyboardInterrupt
+
+
+def _work() -> int:
+    """Set the environment and run the command; returns its exit status."""
+    problem = _set_environment()
+    if sys.stdout is None:
+        problem = "stdout is closed; to do without what is printed: >/dev/null"
+    if problem is not None:
+        print(f"quadsim: {problem}", file=sys.stderr)
+        return 2
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors in ("strict", "surrogateescape"):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a terminal may lack characters
+    from scenarios.commands.cli import main as run
+
+    status = run()
+    if "--json" in sys.argv:
+        os.dup2(2, 1)  # user code may print at exit too
+    return status
 
 
 def _set_environment() -> str | None:

@@ -62,7 +62,7 @@ def test_what_fails_leaves_nothing_and_takes_its_new_parents_along(tmp_path: Pat
 
 
 def test_an_error_names_the_place_and_not_where_it_was_built(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"cannot write \S+/run/flight\.mp4: no"), writing(tmp_path / "run") as work:
+    with pytest.raises(OutputError, match=r"cannot write .+/run/flight\.mp4: no"), writing(tmp_path / "run") as work:
         raise OutputError(work / "flight.mp4", "no")
 
 
@@ -135,11 +135,11 @@ def test_what_comes_in_while_it_is_made_stays_and_so_does_what_was_made(output: 
             (work / "new").write_text("new")
             (output / "mine").write_text("mine")
 
-    with pytest.raises(OutputError, match=r"does not list mine; .*; what was made is in (\S+)") as caught:
+    with pytest.raises(OutputError, match=r"does not list mine; .*; what was made is in ") as caught:
         others_come_in()
     assert (output / "mine").read_text() == "mine"
     assert (output / "table").read_text() == "one"
-    assert (Path(caught.value.problem.rpartition(" ")[2]) / "new").read_text() == "new"
+    assert (Path(caught.value.problem.partition("what was made is in ")[2]) / "new").read_text() == "new"
 
 
 def test_what_is_added_is_listed_and_nothing_is_where_it_fails(output: Path) -> None:
@@ -293,7 +293,8 @@ def test_a_place_that_cannot_be_read_is_refused_and_nothing_is_left_beside_it() 
             for overwrite in (False, True):
                 with pytest.raises(OutputError, match="closed: Permission denied"):
                     write(place / "closed", overwrite=overwrite)
-            (place / "entered").mkdir(mode=0o555)
+            (place / "entered").mkdir()
+            (place / "entered").chmod(0o555)
             write(place / "entered")
             assert (place / "entered").stat().st_mode & 0o777 == 0o555
             assert {path.name for path in place.iterdir()} == {"closed", "entered"}

@@ -31,15 +31,20 @@ class OwnError(Exception):
         raise RuntimeError("no text")
 
 
-RAISED = [
-    asyncio.CancelledError("task"),
-    GeneratorExit("closed"),
-    BaseException("bare"),
-    SystemExit(3),
-    StopIteration(1),
-    OwnError(),
-]
-names = pytest.mark.parametrize("raised", RAISED, ids=lambda error: type(error).__name__)
+RAISED: dict[type[BaseException], object] = {
+    asyncio.CancelledError: "task",
+    GeneratorExit: "closed",
+    BaseException: "bare",
+    SystemExit: 3,
+    StopIteration: 1,
+    OwnError: None,
+}
+
+
+@pytest.fixture(params=RAISED, ids=lambda kind: kind.__name__)
+def raised(request: pytest.FixtureRequest) -> BaseException:
+    """One of this test alone: each time that an exception is raised its traceback grows."""
+    return request.param(RAISED[request.param])
 
 
 def raising(error: BaseException, start: float = 0.0, size: int = 4) -> Callable[..., Any]:
@@ -56,7 +61,6 @@ def scenario() -> quadsim.Scenario:
     return quadsim.load("hover", {"duration": 0.3, "constraints": []})
 
 
-@names
 def test_whatever_a_controller_raises_ends_its_flight_as_aborted(
     scenario: quadsim.Scenario, raised: BaseException
 ) -> None:
@@ -67,7 +71,6 @@ def test_whatever_a_controller_raises_ends_its_flight_as_aborted(
     assert not any("quadsim/sim/loop.py" in line for line in flown.log.traceback)
 
 
-@names
 def test_whatever_a_force_or_a_reference_raises_is_told_as_theirs(
     scenario: quadsim.Scenario, raised: BaseException
 ) -> None:
@@ -80,7 +83,6 @@ def test_whatever_a_force_or_a_reference_raises_is_told_as_theirs(
         quadsim.fly(scenario, reference=raising(raised), progress=False)
 
 
-@names
 @pytest.mark.parametrize("part", ["__init__", "reset", "name", "step"])
 def test_whatever_is_raised_before_the_flight_is_one_message(
     scenario: quadsim.Scenario, raised: BaseException, part: str
@@ -94,7 +96,6 @@ def test_whatever_is_raised_before_the_flight_is_one_message(
         quadsim.fly(scenario, controller=type("Law", (), {**parts, part: value}), progress=False)
 
 
-@names
 def test_an_autopilot_that_raises_ends_the_flight_or_is_refused(raised: BaseException) -> None:
     class Pilot:
         rate, takes_targets, calls = 500.0, True, 0

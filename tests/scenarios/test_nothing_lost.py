@@ -161,5 +161,5 @@ def test_ctrl_c_while_a_film_is_made_keeps_what_was_flown(tmp_path: Path) -> Non
         process.communicate(timeout=120)
     result = summary_of(summary.parent)
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["hover"]
-    assert (process.returncode, result["verdict"]) == (0, "unaudited")
+    assert (process.returncode, result["verdict"]) == (130, "unaudited")
     assert result["products"]["flight.mp4"].startswith(("interrupted (Ctrl-C)", "failed: "))

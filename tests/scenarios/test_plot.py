@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -135,7 +136,7 @@ def test_the_command_writes_the_file_or_says_that_there_is_no_display(
     file = tmp_path / "fig.pdf"
     words = ["plot", *saved, "--signals", "z", "margin.roll", "--labels", "mpc", "pid", "--width", "3.5"]
     assert main([*words, "--out", str(file)]) == EXIT_DONE
-    assert capsys.readouterr().out.splitlines() == [f"written to {file}", f"open {file}"]
+    assert capsys.readouterr().out.splitlines() == [f"written to {file}", f"open {shlex.quote(str(file))}"]
     assert file.read_bytes().startswith(b"%PDF")
     assert main(words) == EXIT_WRONG_INPUT
     assert "no display to show the plot on; write it to a file: --out plot.pdf" in capsys.readouterr().err

@@ -22,6 +22,9 @@ pytestmark = pytest.mark.slow("process")
 ROOT = Path(__file__).resolve().parents[2]
 TABLES = ("--no-video", "--no-recording", "--no-figures")
 SHORT = ("--set", "duration=0.5")
+MOMENTS = 12
+TERMINATED = 143
+"""Exit status, as of a shell: 128 and the number of the signal."""
 
 
 def environment() -> dict[str, str]:
@@ -135,7 +138,8 @@ def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path) -> N
         clock.sleep(0.02)
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (EXIT_FAILED, "")
+    assert process.returncode == TERMINATED
+    assert err == "quadsim: interrupted (SIGTERM); what was finished is kept, and nothing is half written\n"
     assert "interrupted (Ctrl-C)" in out
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     run = rundir.load_run(tmp_path / "run")
@@ -145,6 +149,102 @@ def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path) -> N
     assert run.log.control.t.size * 0.05 == pytest.approx(run.summary["duration"])
     assert run.log.plant.t[-1] == pytest.approx(run.summary["duration"])
     assert rundir.damaged_files(run.directory, run.summary) == []
+
+
+STOPPING = """
+import atexit, importlib, os, signal, sys
+place, caught, number = sys.argv.pop(1), sys.argv.pop(1) == "caught", int(sys.argv.pop(1))
+module_name, name = place.rsplit(".", 1)
+module = importlib.import_module(module_name)
+whole = getattr(module, name)
+def stopped(*arguments, **options):
+    setattr(module, name, whole)
+    try:
+        os.kill(os.getpid(), number)
+    except BaseException:
+        if not caught:
+            raise
+    return whole(*arguments, **options)
+setattr(module, name, stopped)
+if name == "shutdown":
+    atexit.register(stopped)
+from scenarios.commands.entry import main
+sys.exit(main())
+"""
+"""A command line that gets a signal where a function is called first."""
+
+
+@pytest.mark.parametrize(
+    ("place", "caught"),
+    [
+        ("scenarios.flown.write_log", ""),
+        ("quadsim.report.recording.write_recording", ""),
+        ("quadsim.report.flight_figures.write_figures", ""),
+        pytest.param("quadsim.report.flight_figures.write_figures", "caught", marks=pytest.mark.witness("process")),
+        ("scenarios.flown.amend", ""),
+        ("scenarios.console.show", ""),
+        ("logging.shutdown", ""),
+    ],
+)
+def test_a_command_that_is_stopped_never_ends_with_0_and_keeps_what_is_finished(
+    tmp_path: Path, place: str, caught: str
+) -> None:
+    number = signal.SIGTERM if caught else signal.SIGINT
+    command = [sys.executable, "-c", STOPPING, place, caught, str(int(number))]
+    done = subprocess.run(
+        [*command, "run", "hover", "--no-video", *SHORT, "--out", "run"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        preexec_fn=listening,
+    )
+    assert "Traceback" not in done.stderr
+    if place == "logging.shutdown":  # all was said and done
+        assert done.returncode == -number
+    else:
+        assert done.returncode == 128 + number
+        said = "quadsim: interrupted (SIGTERM); " if caught else "quadsim: interrupted (Ctrl-C); "
+        assert done.stderr.splitlines()[-1].startswith(said)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    run = rundir.load_run(tmp_path / "run")
+    assert rundir.damaged_files(run.directory, run.summary) == []
+    assert (run.summary["status"], run.log.control.t.size) == ("completed", 10)
+
+
+def test_a_run_that_is_stopped_at_any_moment_ends_with_another_status_than_0(tmp_path: Path) -> None:
+    def started(place: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "scenarios.commands.entry", "run", "hover", "--no-video", *SHORT]
+        (tmp_path / place).mkdir()
+        return subprocess.Popen(
+            [*command, "--out", "run"],
+            cwd=tmp_path / place,
+            env=environment(),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            preexec_fn=listening,
+        )
+
+    begun = clock.monotonic()
+    assert started("whole").wait(timeout=120) == EXIT_DONE
+    whole = clock.monotonic() - begun
+    for moment in range(MOMENTS):
+        process = started(str(moment))
+        try:
+            process.wait(timeout=whole * (moment + 0.5) / MOMENTS)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGTERM if moment % 2 else signal.SIGINT)
+        status = process.wait(timeout=120)
+        folder = tmp_path / str(moment)
+        assert [path.name for path in folder.iterdir() if path.name != "run"] == []
+        if (folder / "run").exists():
+            summary = rundir.read_summary(folder / "run")
+            assert rundir.damaged_files(folder / "run", summary) == []
+        if status == EXIT_DONE:  # it was done before the signal
+            assert set(summary["products"].values()) == {"made"}
+            assert summary["status"] == "completed"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full to write to")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ def test_a_run_of_another_version_says_how_to_fly_it_again(
         assert main([command, str(other)]) == 2
         message = capsys.readouterr().err
         assert "was made by another version of quadsim" in message
-        assert f"fly it again: quadsim run {other / 'scenario.toml'}" in " ".join(message.split())
+        assert f"fly it again: quadsim run {shlex.quote(str(other / 'scenario.toml'))}" in " ".join(message.split())
 
 
 def test_a_campaign_of_another_version_says_how_to_fly_it_again(tmp_path: Path) -> None:

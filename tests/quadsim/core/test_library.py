@@ -87,7 +87,7 @@ def test_zig_compiles_what_is_published(platform: str, no_compiler: Path, monkey
     [
         ("", rf"no C compiler \(cc, gcc, clang\), nor {ZIG}"),
         ("macosx_11_0_arm64", f"QUADSIM_PLATFORM needs the package {ZIG}"),
-        ("win_amd64", r"QUADSIM_PLATFORM must be one of manylinux_2_17_x86_64, .*; got 'win_amd64'"),
+        ("win_amd64", r"QUADSIM_PLATFORM must be one of manylinux_2_28_x86_64, .*; got 'win_amd64'"),
     ],
 )
 @pytest.mark.usefixtures("no_compiler")

@@ -188,7 +188,7 @@ def test_ctrl_c_keeps_what_was_flown(file: Path) -> None:
             clock.sleep(0.1)
         campaign.send_signal(signal.SIGINT)
         _, output = campaign.communicate(timeout=30.0)
-        assert campaign.returncode == EXIT_FAILED
+        assert campaign.returncode == 130
     assert "/c has the flights so far, --resume continues it" in output
     assert "Traceback" not in output
     manifest = json.loads((file.parent / "c" / "manifest.json").read_text())

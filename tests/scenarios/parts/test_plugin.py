@@ -211,6 +211,7 @@ def test_a_prediction_of_another_shape_is_refused(given: Any) -> None:
 
 # --- what is wrong -------------------------------------------------------------------------------------------------
 
+MEANT = ". Did you mean 'offset'?" if sys.version_info >= (3, 13) else ""
 CALLED = "controller: mine:Hover cannot be called with vehicle, period, horizon"
 WITH = '[controller]\ntype = "{module}:Hover"\nsettings = '
 WRONG = {
@@ -239,7 +240,7 @@ WRONG = {
     "unknown": (
         HOVER,
         WITH + "{ ofset = 1 }",
-        f"{CALLED}, ofset: TypeError: Hover.__init__() got an unexpected keyword argument 'ofset'",
+        f"{CALLED}, ofset: TypeError: Hover.__init__() got an unexpected keyword argument 'ofset'{MEANT}",
     ),
 }
 
