@@ -58,7 +58,7 @@ test: setup $(VENV)/.browser  ## all tests but the slow groups, of which it runs
 test-all: setup $(VENV)/.browser  ## run every test but those of make peers and make firmware
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
-rooms: setup  ## take each feature room away, in a copy, and see the rest pass (OPTIONS=live for one)
+rooms: setup  ## take each feature away, in a copy, and see the rest pass (OPTIONS=live for one)
 	@$(PY) tests/rooms.py $(OPTIONS)
 
 peers: setup $(VENV)/.peers  ## install the peers and every solver, and hold quadsim against them
@@ -89,7 +89,7 @@ build: setup  ## source archive and wheel in dist/; the wheel is installed alone
 	@ls dist
 
 docs: setup $(VENV)/.docs  ## build the documentation into site/, with films; a broken link or a missing docstring fails
-	@$(PY) -m ruff check --quiet --select D1 --ignore D105,D107 quadsim mpc scenarios
+	@$(PY) -m ruff check --quiet --select D1 --ignore D105,D107 quadsim
 	@$(PY) docs/tools/notebook.py
 	@$(PY) docs/tools/gallery.py films
 	@$(VENV)/bin/zensical build --clean

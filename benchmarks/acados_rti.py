@@ -20,8 +20,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from mpc.nonlinear.rigidbody import N_BODY, RigidBody
-from mpc.ocp import Problem
+from quadsim.mpc.nonlinear.rigidbody import N_BODY, RigidBody
+from quadsim.mpc.ocp import Problem
 from quadsim.state import Array
 
 FOLDER: Final = Path(sys.prefix) / "acados"

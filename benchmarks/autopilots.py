@@ -18,8 +18,8 @@ import numpy as np
 from timing import Record, options, run
 
 import quadsim
+from quadsim.console.progress import Progress
 from quadsim.flight.audit import worst_finding
-from scenarios.progress import Progress
 
 EXAMPLE: Final = Path(__file__).resolve().parent.parent / "examples" / "betaflight.py"
 AGREEMENT: Final = 0.3  # cm

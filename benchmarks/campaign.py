@@ -8,15 +8,15 @@ from pathlib import Path
 
 from timing import Record, options, run
 
-from scenarios.assembly import Assembly
-from scenarios.campaign.campaign import fly_campaign
-from scenarios.campaign.campaign_file import CampaignFile
-from scenarios.campaign.plan import Plan
-from scenarios.campaign.rows import read_table
-from scenarios.campaign.store import FLIGHTS_FILE, TIMES_FILE
-from scenarios.commands.app import load
-from scenarios.progress import Progress
-from scenarios.schema.scenario import Scenario
+from quadsim.commands.app import load
+from quadsim.console.progress import Progress
+from quadsim.features.campaign.campaign import fly_campaign
+from quadsim.features.campaign.campaign_file import CampaignFile
+from quadsim.features.campaign.plan import Plan
+from quadsim.features.campaign.rows import read_table
+from quadsim.features.campaign.store import FLIGHTS_FILE, TIMES_FILE
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.schema.scenario import Scenario
 
 
 def campaign(scenario: Scenario, solver: str, flights: int, workers: int) -> Record:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from timing import Record, Stopwatch, options, run
 
+from quadsim.commands.app import load
+from quadsim.console.progress import Progress
 from quadsim.report.film.video import render_video, rendering_backend, worker_count
-from scenarios.commands.app import load
-from scenarios.progress import Progress
-from scenarios.rollout import Rollout
+from quadsim.rollout.rollout import Rollout
 
 FPS = 30
 

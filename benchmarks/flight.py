@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 from timing import Record, flown, options, run, undisturbed
 
+from quadsim.commands.app import load
+from quadsim.console.progress import Progress
 from quadsim.core.structs import SAMPLE, TrackStruct, plant_library
-from scenarios.assembly import Assembly
-from scenarios.commands.app import load
-from scenarios.progress import Progress
+from quadsim.scenarios.assembly import Assembly
 
 SHORT: Final = 10.0  # [s] that is flown of a longer flight
 GUSTY: Final = {

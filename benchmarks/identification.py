@@ -21,17 +21,17 @@ import numpy as np
 from timing import Record, options, run
 
 import quadsim
+from quadsim.console.progress import Progress
 from quadsim.errors import InputError, QuadsimError
+from quadsim.features.campaign.statistics import proportion
+from quadsim.features.design.plausible_vehicles import plausible_vehicles
+from quadsim.features.identify.report import IdentifiedVehicle
 from quadsim.flight.metrics import tracking
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.many import fly_many
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import parse_scenario
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.campaign.statistics import proportion
-from scenarios.design.plausible_vehicles import plausible_vehicles
-from scenarios.flown import Flight
-from scenarios.identify.report import IdentifiedVehicle
-from scenarios.loading import parse_scenario
-from scenarios.many import fly_many
-from scenarios.progress import Progress
-from scenarios.rollout import Rollout
 
 Table = dict[str, Any]
 MODELS: Final = ("start", "identified", "true")

@@ -20,15 +20,15 @@ from scipy.special import stdtrit
 from timing import Record, Stopwatch, options, run, step_quantiles
 
 from quadsim.assets import read_toml
+from quadsim.console.progress import Progress
 from quadsim.controller import ACCEPTED, NOT_CONVERGED
 from quadsim.errors import QuadsimError
+from quadsim.features.campaign.statistics import proportion
+from quadsim.rollout.many import fly_many
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import parse_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import POSITION
-from scenarios.campaign.statistics import proportion
-from scenarios.loading import parse_scenario
-from scenarios.many import fly_many
-from scenarios.progress import Progress
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
 
 Table = dict[str, Any]
 Row = tuple[str, str]  # vehicle and controller

@@ -19,20 +19,20 @@ from interfaces import merged
 from timing import Record, options, run
 
 import quadsim
+from quadsim.console.progress import Progress
 from quadsim.errors import QuadsimError
+from quadsim.features.design.first_scenario import first_scenario
+from quadsim.features.identify.estimate import VECTORS
+from quadsim.features.identify.fit import identify_records
+from quadsim.features.identify.record import Record as Log
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.many import fly_many
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
+from quadsim.scenarios.loading import parse_scenario
 from quadsim.sim.airframe import munk_moment
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.design.first_scenario import first_scenario
-from scenarios.flown import Flight
-from scenarios.identify.estimate import VECTORS
-from scenarios.identify.fit import identify_records
-from scenarios.identify.record import Record as Log
-from scenarios.loading import parse_scenario
-from scenarios.many import fly_many
-from scenarios.progress import Progress
 
 Table = dict[str, Any]
 VEHICLES: Final = 20

@@ -15,15 +15,15 @@ import numpy as np
 from timing import Record, options, run
 
 from quadsim.assets import read_toml
+from quadsim.commands.app import load
+from quadsim.console.progress import Progress
 from quadsim.errors import QuadsimError
 from quadsim.flight import metrics
+from quadsim.rollout.many import fly_many
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.schema.bases import read_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import INDEX, POSITION
-from scenarios.commands.app import load
-from scenarios.many import fly_many
-from scenarios.progress import Progress
-from scenarios.rollout import Rollout
-from scenarios.schema.bases import read_scenario
-from scenarios.schema.scenario import Scenario
 
 SCENARIO: Final = "paper-constrained"
 TILT: Final = 5.0

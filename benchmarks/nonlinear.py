@@ -22,16 +22,16 @@ import numpy as np
 from timing import Record, flown, options, run, undisturbed
 
 import quadsim
-from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.settings import Nonlinear
-from mpc.nonlinear.sqp import SQP, SQPStatus
-from mpc.pilot import Pilot
+from quadsim.commands.app import load
+from quadsim.console.progress import Progress
 from quadsim.errors import FlightError
+from quadsim.mpc.nonlinear.controller import NonlinearMPC
+from quadsim.mpc.nonlinear.settings import Nonlinear
+from quadsim.mpc.nonlinear.sqp import SQP, SQPStatus
+from quadsim.mpc.pilot import Pilot
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
-from scenarios.commands.app import load
-from scenarios.progress import Progress
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
 
 LONGEST: Final = 10.0  # [s] that is flown of a longer flight
 SHORT: Final = 1.0  # [s], with --quick

@@ -15,18 +15,18 @@ from pathlib import Path
 import numpy as np
 from timing import Record, options, run, step_quantiles, time_in_turns
 
-from mpc.constrained import Constrained
-from mpc.robust.settings import Robust
+from quadsim.commands.app import load
+from quadsim.console.progress import Progress
 from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import FlightError, InputError, MissingPackageError
 from quadsim.flight.log import ControlLog
+from quadsim.mpc.constrained import Constrained
+from quadsim.mpc.robust.settings import Robust
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import read_catalogue
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array, make_state
-from scenarios.assembly import Assembly
-from scenarios.catalogue import read_catalogue
-from scenarios.commands.app import load
-from scenarios.progress import Progress
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
 
 SEGMENT = 20
 """Consecutive periods that a solver answers before it is the next one's turn."""

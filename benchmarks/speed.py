@@ -1,8 +1,8 @@
 """Where linear control ends: how well each controller follows agile courses, flown ever faster.
 
 A flight is judged by its mean position error, and by how long roll or pitch is beyond a bound within which the course
-can be flown.  Weights of the MPCs that are linearised at hover come from `scenarios.design.first_scenario`; those of
-all other controllers are their defaults.
+can be flown.  Weights of the MPCs that are linearised at hover come from `quadsim.features.design.first_scenario`;
+those of all other controllers are their defaults.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from scipy.special import stdtrit
 from timing import Record, options, run
 
 from quadsim.assets import vehicle_path
+from quadsim.console.progress import Progress
 from quadsim.errors import QuadsimError
+from quadsim.features.design.first_scenario import first_scenario
 from quadsim.flight import metrics
+from quadsim.rollout.many import fly_many
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.feasibility_check import report
+from quadsim.scenarios.loading import parse_scenario
 from quadsim.state import INDEX, tilt
 from quadsim.vehicle import Vehicle, load_vehicle
-from scenarios.assembly import Assembly
-from scenarios.design.first_scenario import first_scenario
-from scenarios.feasibility_check import report
-from scenarios.loading import parse_scenario
-from scenarios.many import fly_many
-from scenarios.progress import Progress
-from scenarios.rollout import Rollout
 
 Table = dict[str, Any]
 

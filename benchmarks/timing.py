@@ -17,13 +17,13 @@ from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
+from quadsim.console.progress import Progress, reporting, silent
 from quadsim.errors import FlightError, QuadsimError
 from quadsim.flight.metrics import percentiles
+from quadsim.rollout.machine import machine, versions
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
-from scenarios.machine import machine, versions
-from scenarios.progress import Progress, reporting, silent
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
 
 Record = dict[str, Any]
 

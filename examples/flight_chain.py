@@ -19,8 +19,8 @@ import numpy as np
 from betaflight import BINARY, Betaflight
 
 import quadsim
+from quadsim.scenarios.loading import assemble
 from quadsim.vehicle import VEHICLE_UNITS
-from scenarios.loading import assemble
 
 TARGET = "cortex-m7"
 PROGRAMS = ("make", "arm-none-eabi-gcc", "qemu-system-arm")

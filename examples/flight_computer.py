@@ -17,8 +17,8 @@ import tty
 from pathlib import Path
 
 import quadsim
+from quadsim.features.export.in_the_loop import Frames, SerialMPC
 from quadsim.state import Array
-from scenarios.export.in_the_loop import Frames, SerialMPC
 
 
 class Terminal:

@@ -31,6 +31,15 @@ def own_packages() -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(filter(None, folders))}
 
 
+def library_dir() -> Path:
+    """Return the folder of the shipped flights, campaigns and papers: `scenarios` of a checkout, else in the wheel."""
+    package = Path(__file__).resolve().parent
+    for candidate in (package / "library", package.parent / "scenarios"):
+        if (candidate / "variants.toml").is_file():
+            return candidate
+    raise FileError(package / "library", "variants.toml is missing: the installation is incomplete, reinstall quadsim")
+
+
 def vehicle_names() -> list[str]:
     """Return the names of the shipped vehicles, sorted."""
     return sorted(path.stem for path in models_dir().glob("*.toml"))

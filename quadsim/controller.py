@@ -28,14 +28,14 @@ ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}  # statuses whose command is applied
 MISSED: Final = "missed"
 """Status: the command arrived after the start of the next period, so the one before stayed in force."""
 GAIN: Final = "gain"  # source of a command: the unconstrained optimum, a product with constant gains
-CORE: Final = "core"  # the exact optimum of `mpc.core`, compiled
+CORE: Final = "core"  # the exact optimum of `quadsim.mpc.core`, compiled
 LAW: Final = "law"  # a law without a solver
 FALLBACK: Final = "fallback"  # an earlier plan or command, or the fallback contract
 STOPPED: Final = "stopped"  # no source: the rotors are off
 NO_OPTIMUM: Final = frozenset({LAW, FALLBACK, STOPPED})
 """Sources of a command without an optimum, whose active constraints and computing time nobody reports."""
 NO_SOLVER: Final = frozenset({GAIN, CORE}) | NO_OPTIMUM
-"""Sources of a command other than QP solvers, which are recorded by name (`mpc.solvers.find_solver`)."""
+"""Sources of a command other than QP solvers, which are recorded by name (`quadsim.mpc.solvers.find_solver`)."""
 LAW_NAMES: Final = {
     "unconstrained": "unconstrained MPC",
     "constrained": "constrained MPC",
@@ -338,7 +338,7 @@ class Controller(Named, Solving, Resetting, Stepping, Protocol):
     """A feedback law run once per control period.
 
     These are the parts that every controller has.  Those that it may have are the protocols below: a controller has
-    one by having its member.  A user's law need only be `Stepping`; `scenarios.plugin` makes it a controller.
+    one by having its member.  A user's law need only be `Stepping`; `quadsim.scenarios.plugin` makes it a controller.
     """
 
     @property
@@ -383,7 +383,7 @@ class Diagnosable(Protocol):
 
     @property
     def infeasible_period(self) -> object:
-        """An `mpc.InfeasiblePeriod`, of the first such period since `reset`; None if there is none."""
+        """An `quadsim.mpc.InfeasiblePeriod`, of the first such period since `reset`; None if there is none."""
         ...
 
 

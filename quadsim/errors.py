@@ -18,7 +18,7 @@ from typing import Final
 _TRACEBACK_LINES: Final = 20  # lines kept of the traceback that ended a flight
 _LONGEST: Final = 500  # characters kept of its message
 _LONGEST_LIST: Final = 150  # characters of a list of names
-OUR_FOLDERS: Final = tuple(f"{Path(__file__).parents[1] / name}{os.sep}" for name in ("quadsim", "mpc", "scenarios"))
+OUR_FOLDERS: Final = (f"{Path(__file__).parent}{os.sep}",)
 _HIDDEN: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 """Unicode categories that control a terminal or are invisible: controls, formats such as direction, surrogates."""
 

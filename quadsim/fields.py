@@ -1,8 +1,8 @@
 """The types of settings fields, in Python and in files: numbers with their limits.
 
 A settings dataclass is the only declaration of its fields: type and limits by `annotated_types`, unit and meaning by
-`annotated_types.doc`, default value.  `scenarios.schema` reads tables of scenario files into these dataclasses, and
-derives messages, the JSON Schema and commented files from them.  Numbers are therefore in file units, angles in
+`annotated_types.doc`, default value.  `quadsim.scenarios.schema` reads tables of scenario files into these dataclasses,
+and derives messages, the JSON Schema and commented files from them.  Numbers are therefore in file units, angles in
 degrees; the code that computes with them converts them.
 """
 

@@ -17,16 +17,16 @@ from typing import TYPE_CHECKING
 from quadsim.errors import MissingPackageError
 
 if TYPE_CHECKING:
-    from scenarios.gym.environment import QuadrotorEnv as QuadrotorEnv
-    from scenarios.gym.environment import environment_id as environment_id
-    from scenarios.gym.environment import make_env as make_env
-    from scenarios.gym.environment import make_vec as make_vec
-    from scenarios.gym.safety import MPCSafetyFilter as MPCSafetyFilter
+    from quadsim.features.gym.environment import QuadrotorEnv as QuadrotorEnv
+    from quadsim.features.gym.environment import environment_id as environment_id
+    from quadsim.features.gym.environment import make_env as make_env
+    from quadsim.features.gym.environment import make_vec as make_vec
+    from quadsim.features.gym.safety import MPCSafetyFilter as MPCSafetyFilter
 
 __all__ = ["MPCSafetyFilter", "QuadrotorEnv", "environment_id", "make_env", "make_vec"]
 
 if find_spec("gymnasium") is None:
     raise MissingPackageError("quadsim.gym", "gymnasium", extra="gym")
-_environment, _safety = (importlib.import_module(f"scenarios.gym.{part}") for part in ("environment", "safety"))
+_environment, _safety = (importlib.import_module(f"quadsim.features.gym.{part}") for part in ("environment", "safety"))
 globals().update({name: getattr(_environment, name, None) or getattr(_safety, name) for name in __all__})
 _environment.register_library()

@@ -16,16 +16,16 @@ from hypothesis import settings
 from rooms import USING
 from support import NO_PRODUCTS, draw_nothing, fly_here
 
+from quadsim.console.progress import Progress, silent
+from quadsim.features.entries import FEATURES
 from quadsim.flight import rundir
 from quadsim.flight.rundir import Run
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import scenario_names
+from quadsim.scenarios.loading import load_scenario
 from quadsim.vehicle import Vehicle
-from scenarios.assembly import Assembly
-from scenarios.catalogue import scenario_names
-from scenarios.commands.rooms import ROOMS
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.progress import Progress, silent
-from scenarios.rollout import Rollout
 
 # Compiled code is cached, whatever the environment sets: the workers, and all processes that tests
 # start, would compile the same modules again.  `make clean` removes it.
@@ -38,28 +38,28 @@ settings.register_profile("quick", settings.get_profile("thorough"), max_example
 settings.load_profile("thorough")
 
 LONG = (
-    *("test_benchmarks.py", "test_commands.py", "quadsim/report/test_comparison_page.py"),
-    "scenarios/campaign/test_campaign_report.py",
-    *("scenarios/gym/test_environment.py", "scenarios/gym/test_learning.py"),
-    *("scenarios/test_library.py", "scenarios/test_many.py", "scenarios/campaign/test_campaign.py"),
-    *("scenarios/design/test_first_flights.py", "scenarios/test_api.py", "scenarios/test_infeasibility.py"),
-    *("quadsim/report/film/test_video.py", "test_documents.py", "scenarios/test_process.py", "test_refusals.py"),
-    *("scenarios/test_nothing_lost.py", "mpc/robust/test_robust.py", "scenarios/papers/test_reproduction.py"),
-    *("scenarios/test_any_scenario.py", "mpc/test_partial_condensing.py"),
-    *("scenarios/test_run.py", "scenarios/test_cli.py", "scenarios/test_reaudit.py", "test_packaging.py"),
+    *("test_benchmarks.py", "test_commands.py", "report/test_comparison_page.py"),
+    "features/campaign/test_campaign_report.py",
+    *("features/gym/test_environment.py", "features/gym/test_learning.py"),
+    *("scenarios/test_library.py", "rollout/test_many.py", "features/campaign/test_campaign.py"),
+    *("features/design/test_first_flights.py", "commands/test_api.py", "rollout/test_infeasibility.py"),
+    *("report/film/test_video.py", "test_documents.py", "commands/test_process.py", "test_refusals.py"),
+    *("rollout/test_nothing_lost.py", "mpc/robust/test_robust.py", "features/papers/test_reproduction.py"),
+    *("rollout/test_any_scenario.py", "mpc/test_partial_condensing.py"),
+    *("rollout/test_run.py", "commands/test_cli.py", "rollout/test_reaudit.py", "test_packaging.py"),
     *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/core/test_core.py", "mpc/nonlinear/test_rates.py"),
-    *("test_spine.py", "test_rooms.py", "quadsim/sim/test_autopilot.py", "quadsim/sim/estimation/test_estimator.py"),
+    *("test_spine.py", "test_rooms.py", "sim/test_autopilot.py", "sim/estimation/test_estimator.py"),
     *(
-        "scenarios/test_piloted.py",
-        "scenarios/test_take_off.py",
-        "scenarios/test_space.py",
-        "scenarios/test_verdicts.py",
+        "rollout/test_piloted.py",
+        "rollout/test_take_off.py",
+        "rollout/test_space.py",
+        "rollout/test_verdicts.py",
     ),
-    *("scenarios/identify/test_identify_fit.py", "scenarios/papers/test_beyond.py"),
+    *("features/identify/test_identify_fit.py", "features/papers/test_beyond.py"),
 )
 """Modules that take longest."""
-collect_ignore = [module for module, used in USING.items() if not {*used} <= {*ROOMS}]
-"""Tests of rooms that have been taken away."""
+collect_ignore = [module for module, used in USING.items() if not {*used} <= {*FEATURES}]
+"""Tests of features that have been taken away."""
 _fly = Rollout.fly
 """Whatever stands in for it in a test."""
 

@@ -14,15 +14,15 @@ from dataclasses import is_dataclass
 from types import FrameType
 
 import quadsim
+from quadsim.rollout.rollout import Rollout
 from quadsim.sim.physics import one_period
-from scenarios.rollout import Rollout
 
 SCENARIO = "paper-constrained"
 SETTLED, WATCHED = 150, 20
 """Periods flown before any is watched, so that what is made once has been made; and then, so that one of them checks
 its KKT residuals."""
 SECONDS = 10.0  # of the whole flight; by then constraints have been active
-PACKAGES = ("quadsim.", "mpc.", "scenarios.")
+PACKAGES = ("quadsim.",)
 
 
 def method_of(frame: FrameType) -> tuple[type, str] | None:

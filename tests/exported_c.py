@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mpc.codegen.ctext import Precision
 from quadsim.controller import Phase
+from quadsim.features.export.exporter import c_controller
+from quadsim.features.export.record import Recording
+from quadsim.mpc.codegen.ctext import Precision
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
-from scenarios.export.exporter import c_controller
-from scenarios.export.record import Recording
-from scenarios.schema.scenario import Scenario
 
 HOST = Path(__file__).parent / "firmware" / "host.c"
 PHASES = (Phase.FLYING, Phase.ARMED, Phase.LANDED)  # by `enum quadsim_phase`

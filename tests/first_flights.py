@@ -1,4 +1,4 @@
-"""First flights, made and flown in memory: what the tests and docs/own-vehicle.md judge `scenarios.design` by.
+"""First flights, made and flown in memory: what the tests and docs/own-vehicle.md judge `quadsim.features.design` by.
 
 `python tests/first_flights.py` flies every vehicle on every course by every law, and prints JSON.
 """
@@ -13,12 +13,12 @@ from itertools import product
 from typing import Final
 
 from quadsim.assets import vehicle_names, vehicle_path
+from quadsim.features.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
+from quadsim.features.design.plausible_vehicles import plausible_vehicles
 from quadsim.flight.metrics import peak_tilt, tracking
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import parse_scenario
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
-from scenarios.design.plausible_vehicles import plausible_vehicles
-from scenarios.loading import parse_scenario
-from scenarios.rollout import Rollout
 
 REQUIREMENTS: Final = {
     "tracking": ("hold_x", "hold_y", "hold_z"),

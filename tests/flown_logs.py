@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 import quadsim
+from quadsim.rollout.flown import Flight
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES
-from scenarios.flown import Flight
 
 COLUMNS = "t,x,y,z,vx,vy,vz,qw,qx,qy,qz,wx,wy,wz,u1,u2,u3,u4"
 NOISE = (0.0, *3 * [1e-3], *3 * [1e-2], *4 * [0.0], *3 * [1e-2], *4 * [0.0])

@@ -17,10 +17,10 @@ import numpy as np
 from quadsim.controller import ACCEPTED, SOLVED
 from quadsim.flight.audit import worst_finding
 from quadsim.flight.metrics import peak_tilt, tracking
-from scenarios.catalogue import scenario_names
-from scenarios.flown import Flight, summarise
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
+from quadsim.rollout.flown import Flight, summarise
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.catalogue import scenario_names
+from quadsim.scenarios.loading import load_scenario
 
 GOLDEN: Final = Path(__file__).resolve().parent / "golden"
 PAPER: Final = ("paper-unconstrained", "paper-unconstrained-clipped", "paper-constrained")

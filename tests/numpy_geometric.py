@@ -7,9 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured
-from mpc.baselines.bandwidths import YAW_SHARE
-from mpc.baselines.geometric import (
+from quadsim.controller import ROTORS
+from quadsim.motion import Motion
+from quadsim.mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured
+from quadsim.mpc.baselines.bandwidths import YAW_SHARE
+from quadsim.mpc.baselines.geometric import (
     NO_LAG,
     UNDISTURBED,
     DesiredAttitude,
@@ -18,10 +20,8 @@ from mpc.baselines.geometric import (
     Integrals,
     geometric_gains,
 )
-from mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, Target, differentiator
-from mpc.nonlinear.rigidbody import rotation
-from quadsim.controller import ROTORS
-from quadsim.motion import Motion
+from quadsim.mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, Target, differentiator
+from quadsim.mpc.nonlinear.rigidbody import rotation
 from quadsim.rotation import multiply
 from quadsim.state import Array, wrapped
 from quadsim.vehicle import Vehicle
@@ -149,7 +149,7 @@ def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
 
 
 class NumpyGeometric:
-    """The equations of `mpc.baselines.geometric.GeometricController`."""
+    """The equations of `quadsim.mpc.baselines.geometric.GeometricController`."""
 
     def __init__(self, vehicle: Vehicle, period: float, settings: Geometric) -> None:
         self.commands, self._vehicle, self._period = settings.commands, vehicle, period

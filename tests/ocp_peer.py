@@ -1,8 +1,8 @@
 """The optimum of an optimal control problem from its definition alone: rolled out, probed, and solved as a dense QP.
 
-Nothing of `mpc.qp`, `mpc.partial_condensing` or `mpc.paper` that builds matrices is used: states by recursion, and
-every matrix by what unit inputs do.  A plan may have axes in front of its own two: many plans are then rolled out at
-once.
+Nothing of `quadsim.mpc.qp`, `quadsim.mpc.partial_condensing` or `quadsim.mpc.paper` that builds matrices is used:
+states by recursion, and every matrix by what unit inputs do.  A plan may have axes in front of its own two: many plans
+are then rolled out at once.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import scipy.linalg
 from polish import polish
 from scipy.optimize import linprog
 
-from mpc.constraints import Constraint
-from mpc.ocp import Equilibrium, Problem, Query
-from mpc.qp import QP, Solution, kkt_residuals
-from mpc.solvers.daqp import DaqpDense
+from quadsim.mpc.constraints import Constraint
+from quadsim.mpc.ocp import Equilibrium, Problem, Query
+from quadsim.mpc.qp import QP, Solution, kkt_residuals
+from quadsim.mpc.solvers.daqp import DaqpDense
 from quadsim.state import Array
 
 

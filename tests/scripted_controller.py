@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from support import paper_problem
 
-from mpc.answer import ActuatorBounds
-from mpc.equilibrium import Trim
-from mpc.fallback.contract import Guard
-from mpc.heading import advance as advance_from
-from mpc.heading import turn
-from mpc.model import LinearModel
-from mpc.ocp import Problem
-from mpc.pilot import Pilot
 from quadsim.controller import SOLVED, Command, Statistics, StepInputs
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.equilibrium import Trim
+from quadsim.mpc.fallback.contract import Guard
+from quadsim.mpc.heading import advance as advance_from
+from quadsim.mpc.heading import turn
+from quadsim.mpc.model import LinearModel
+from quadsim.mpc.ocp import Problem
+from quadsim.mpc.pilot import Pilot
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario
 
 PERIOD = 0.05
 

@@ -17,34 +17,34 @@ from hypothesis import settings
 from ocp_peer import Period
 from scipy.linalg import block_diag
 
-from mpc.constrained import Constrained
-from mpc.constraints import Bounds, Constraint, Penalty
-from mpc.linear import LinearMPC, NominalPreparation
-from mpc.model import LinearModel
-from mpc.nonlinear.body import Body
-from mpc.nonlinear.model import NonlinearModel, next_state
-from mpc.nonlinear.rigidbody import RigidBody
-from mpc.ocp import Equilibrium, Objective, Problem, Query
-from mpc.robust.controller import RobustPreparation
-from mpc.robust.settings import Robust
-from mpc.solvers import Solver
-from mpc.solvers.by_name import make_solver
 from quadsim.controller import Controller
 from quadsim.errors import described
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.mpc.constrained import Constrained
+from quadsim.mpc.constraints import Bounds, Constraint, Penalty
+from quadsim.mpc.linear import LinearMPC, NominalPreparation
+from quadsim.mpc.model import LinearModel
+from quadsim.mpc.nonlinear.body import Body
+from quadsim.mpc.nonlinear.model import NonlinearModel, next_state
+from quadsim.mpc.nonlinear.rigidbody import RigidBody
+from quadsim.mpc.ocp import Equilibrium, Objective, Problem, Query
+from quadsim.mpc.robust.controller import RobustPreparation
+from quadsim.mpc.robust.settings import Robust
+from quadsim.mpc.solvers import Solver
+from quadsim.mpc.solvers.by_name import make_solver
+from quadsim.rollout import many
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.many import Row
+from quadsim.rollout.rollout import closed_loop
 from quadsim.rotation import conjugate, multiply
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.loop import complete
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios import many
-from scenarios.assembly import Assembly
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.many import Row
-from scenarios.rollout import closed_loop
-from scenarios.schema.scenario import Scenario
 
 NO_PRODUCTS = {"video": False, "recording": False, "figures": False}
 """Of a flight that is saved."""
@@ -65,7 +65,7 @@ def fly_here(patch: pytest.MonkeyPatch) -> None:
             except Exception as error:
                 yield place, {"verdict": many.ERROR, "reason": described(error)}
 
-    for user in ("scenarios.many", "scenarios.campaign.plan"):
+    for user in ("quadsim.rollout.many", "quadsim.features.campaign.plan"):
         patch.setattr(f"{user}.fly_many", fly_many)
 
 
@@ -229,7 +229,7 @@ def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
 
 
 def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
-    """See `mpc.nonlinear.body.Body.linearise`."""
+    """See `quadsim.mpc.nonlinear.body.Body.linearise`."""
     return Body(model).linearise(x, u, frames)
 
 

@@ -18,13 +18,16 @@ from typing import TypeGuard
 import pytest
 
 from quadsim.core.build import sources
-from scenarios.commands.rooms import ROOMS
+from quadsim.features.entries import FEATURES
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("quadsim", "mpc", "scenarios")
+PACKAGES = ("quadsim",)
+PAGE = ROOT / "docs" / "architecture.md"
+USERS_IMPORT = ("quadsim", "quadsim.gym")
 MPC_MAY_IMPORT = {
     f"quadsim.{name}" for name in ("vehicle", "state", "rotation", "errors", "fields", "controller", "motion", "space",
-                                      "ties", "input_limits", "core.library", "core.structs", "core.inner")
+                                      "ties", "input_limits",
+                                      "shorthands", "core.library", "core.structs", "core.inner")
 }  # fmt: skip
 RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it may import at its top what is heavy."""
@@ -39,18 +42,18 @@ OF_ONE_PLACE = {
     "jinja2": "quadsim.report.page",
     "matplotlib": "quadsim.report.to_matplotlib",
     "plotly": "quadsim.report.to_plotly",
-    "distributed": "scenarios.many",
-    "gymnasium": "scenarios.gym",
-    **dict.fromkeys(LOGS, "scenarios.identify"),
+    "distributed": "quadsim.rollout.many",
+    "gymnasium": "quadsim.features.gym",
+    **dict.fromkeys(LOGS, "quadsim.features.identify"),
 }
 """What only some outputs need, and where alone it is imported."""
-OF_ROOMS = {"gymnasium": "gym", **dict.fromkeys(LOGS, "identify"), "trimesh": "live", "viser": "live"}
-ABSENT = {library for library, room in OF_ROOMS.items() if room not in ROOMS}
-"""Libraries that a room alone uses, and those of rooms that have been taken away."""
+OF_FEATURES = {"gymnasium": "gym", **dict.fromkeys(LOGS, "identify"), "trimesh": "live", "viser": "live"}
+ABSENT = {library for library, feature in OF_FEATURES.items() if feature not in FEATURES}
+"""Libraries that a feature alone uses, and those of features that have been taken away."""
 IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
 """Distributions whose import name is not their own."""
-HANDING_OUT = ("quadsim", "mpc")
-"""Packages with a table of public names, each imported on first use; `quadsim` also starts the command."""
+HANDING_OUT = ("quadsim", "quadsim.mpc", "quadsim.gym")
+"""Modules with a table of public names, each imported on first use; `quadsim` also starts the command."""
 MOST_DEFINED_TWICE = 20
 """Public names that several modules define: they may only get fewer."""
 MOST_FORMULAS_TWICE = 2
@@ -113,8 +116,10 @@ def imports() -> list[Import]:
 
 
 def loaded_by(code: str) -> set[str]:
-    """Top-level names of all modules that a fresh interpreter has loaded after some code."""
-    report = "import sys\nprint(*{name.partition('.')[0] for name in sys.modules}, file=sys.stderr)"
+    """Top-level names of all modules that a fresh interpreter has loaded after some code; two levels of ours."""
+    first = "{name.partition('.')[0] for name in sys.modules}"
+    ours = "{'.'.join(name.split('.')[:2]) for name in sys.modules if name.startswith('quadsim.')}"
+    report = f"import sys\nprint(*{first}, *{ours}, file=sys.stderr)"
     command = [sys.executable, "-c", f"{code}\n{report}"]
     return set(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stderr.split())
 
@@ -127,24 +132,64 @@ def declared() -> set[str]:
     return {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
 
 
-def test_the_testbed_imports_nothing_of_ours(imports: list[Import]) -> None:
-    """But for `import quadsim` and `import quadsim.gym`, which hand out what users call, late."""
-    result = [i for i in imports if i.importer.startswith("quadsim") and i.library in {"mpc", "scenarios", "piqp"}]
-    assert {i.importer for i in result} == {"quadsim", *(["quadsim.gym"] if "gym" in ROOMS else [])}
-    assert not [i for i in result if i.at_start]
+def floors() -> list[str]:
+    """The folders in the table of floors of docs/architecture.md, from the lowest on."""
+    table = PAGE.read_text(encoding="utf-8").partition("## Floors")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `([\w.]+)/?`.* \|.*\|$", table, re.MULTILINE)
+    assert rows[0] == "__init__.py"
+    return rows[:0:-1]
+
+
+def floor_of(module: str) -> int:
+    """The height of a module: 0 of `core` and of what is in no folder, the highest of what users import."""
+    heights = floors()
+    if module in USERS_IMPORT:
+        return len(heights)
+    folder = module.split(".")[1]
+    if folder in heights:
+        return heights.index(folder)
+    assert (ROOT / "quadsim" / f"{folder}.py").is_file(), f"{PAGE.name} has no floor for quadsim/{folder}"
+    return 0
+
+
+def upwards(imports: list[Import]) -> list[str]:
+    """Imports of what is on a higher floor, in functions and for typing too."""
+    ours = modules()
+    heights = {name: floor_of(name) for name in ours}
+    return [
+        f"{item.importer} imports {item.imported}"
+        for item in imports
+        if item.imported in ours and heights[item.importer] < heights[item.imported]
+    ]
+
+
+def test_every_floor_imports_those_below_alone(imports: list[Import]) -> None:
+    assert {floor_of(name) for name in modules()} == {*range(len(floors()) + 1)}
+    assert upwards(imports) == []
+
+
+def test_an_import_of_a_higher_floor_is_seen_even_if_it_is_late_or_for_types_alone() -> None:
+    source = "if TYPE_CHECKING:\n    from quadsim.sim.plant import Plant\ndef f():\n    from quadsim.mpc import ocp"
+    found = [*imports_of("quadsim.mpc.qp", source, {*modules()})]
+    assert upwards(found) == ["quadsim.mpc.qp imports quadsim.sim.plant"]
+    assert upwards([*imports_of("quadsim.state", "import quadsim", {*modules()})]) == ["quadsim.state imports quadsim"]
 
 
 def test_controllers_know_vehicle_state_errors_and_protocol_alone(imports: list[Import]) -> None:
-    named = {i.imported for i in imports if i.importer.startswith("mpc")}
-    assert {name for name in named if name.startswith(("quadsim", "scenarios"))} <= MPC_MAY_IMPORT
+    named = {i.imported for i in imports if f"{i.importer}.".startswith("quadsim.mpc.")}
+    others = {name for name in named if name.startswith("quadsim") and not name.startswith("quadsim.mpc")}
+    assert others <= MPC_MAY_IMPORT
     assert "mujoco" not in {name.partition(".")[0] for name in named}
 
 
 def test_controllers_run_without_a_simulator() -> None:
-    optional = {"mpc.solvers.daqp": "daqp", "mpc.solvers.qpsolvers": "qpsolvers"}
-    loaded = loaded_by("import " + ", ".join(name for name in set(modules()) - set(optional) if name.startswith("mpc")))
-    assert {"mpc", "quadsim", "piqp"} <= loaded
-    assert not loaded & {"mujoco", "scenarios", "pydantic", *OF_ONE_PLACE, *optional.values()}
+    optional = {"quadsim.mpc.solvers.daqp": "daqp", "quadsim.mpc.solvers.qpsolvers": "qpsolvers"}
+    loaded = loaded_by(
+        "import " + ", ".join(name for name in set(modules()) - set(optional) if name.startswith("quadsim.mpc"))
+    )
+    above = {f"quadsim.{folder}" for folder in floors()[floors().index("mpc") + 1 :]}
+    assert {"quadsim.mpc", "quadsim", "piqp"} <= loaded
+    assert not loaded & {"mujoco", "pydantic", *above, *OF_ONE_PLACE, *optional.values()}
 
 
 @pytest.mark.parametrize("library", OF_ONE_PLACE)
@@ -184,11 +229,12 @@ def test_no_module_and_no_folder_imports_what_imports_it(imports: list[Import]) 
 def circles(imports: list[Import]) -> list[list[str]]:
     """Groups of modules that import one another, directly or through others, whether at start, late or for types.
 
-    What a package hands out by name is left out (`HANDING_OUT`), and so is that importing a module runs its packages.
+    What hands out public names (`HANDING_OUT`) counts as any module; that importing a module runs its packages does
+    not.
     """
     ours, graph = modules(), dict[str, set[str]]()
     for item in imports:
-        if item.imported in ours and item.importer not in HANDING_OUT and item.imported != item.importer:
+        if item.imported in ours and item.imported != item.importer:
             graph.setdefault(item.importer, set()).add(item.imported)
 
     def reached(start: str) -> set[str]:
@@ -205,24 +251,31 @@ def circles(imports: list[Import]) -> list[list[str]]:
 
 def test_a_circle_is_seen_even_if_it_closes_late_or_for_types_alone() -> None:
     sources = {
-        "mpc.qp": "if TYPE_CHECKING:\n    from mpc.paper import Prediction",
-        "mpc.paper": "def cost():\n    from mpc import ocp",
-        "mpc.ocp": "import mpc.qp\nimport mpc.model",
-        "mpc.model": "import mpc.model",
+        "quadsim.mpc.qp": "if TYPE_CHECKING:\n    from quadsim.mpc.paper import Prediction",
+        "quadsim.mpc.paper": "def cost():\n    from quadsim.mpc import ocp",
+        "quadsim.mpc.ocp": "import quadsim.mpc.qp\nimport quadsim.mpc.model",
+        "quadsim.mpc.model": "import quadsim.mpc.model",
     }
     ours = {*modules()}
     found = [item for name, source in sources.items() for item in imports_of(name, source, ours)]
-    assert circles(found) == [["mpc.ocp", "mpc.paper", "mpc.qp"]]
+    assert circles(found) == [["quadsim.mpc.ocp", "quadsim.mpc.paper", "quadsim.mpc.qp"]]
 
 
 def test_no_modules_import_in_a_circle(imports: list[Import]) -> None:
     assert circles(imports) == []
 
 
-def test_two_values_alone_use_what_their_package_hands_out(imports: list[Import]) -> None:
-    """`Scenario.fly` is `quadsim.fly`, and `Problem.condensed` is `mpc.Condensed`: shorthands for users."""
-    users = {item.importer for item in imports if item.imported in HANDING_OUT and item.importer not in HANDING_OUT}
-    assert users == {"scenarios.schema.scenario", "mpc.ocp"}
+def test_what_hands_out_public_names_is_part_of_a_circle_if_a_module_below_imports_it() -> None:
+    sources = {"quadsim": "def f():\n    from quadsim.vehicle import Vehicle", "quadsim.vehicle": "import quadsim"}
+    ours = {*modules()}
+    found = [item for name, source in sources.items() for item in imports_of(name, source, ours)]
+    assert circles(found) == [["quadsim", "quadsim.vehicle"]]
+
+
+def test_nothing_imports_what_hands_out_public_names(imports: list[Import]) -> None:
+    """But one of these another: `quadsim.mpc` is one of the names that `quadsim` has."""
+    users = {item.importer for item in imports if item.imported in HANDING_OUT}
+    assert users - {*HANDING_OUT} == set()
 
 
 def public_names(source: str) -> set[str]:
@@ -302,10 +355,10 @@ def test_what_is_imported_is_what_is_declared(imports: list[Import]) -> None:
 
 
 def test_help_loads_little_and_list_no_simulator() -> None:
-    loaded = loaded_by("import scenarios.commands.cli\nscenarios.commands.cli.main(['--help'])")
-    assert "scenarios" in loaded
+    loaded = loaded_by("import quadsim.commands.cli\nquadsim.commands.cli.main(['--help'])")
+    assert "quadsim.commands" in loaded
     assert loaded & declared() == {"cyclopts", "rich"}
-    loaded = loaded_by("import scenarios.commands.cli\nscenarios.commands.cli.main(['list'])")
+    loaded = loaded_by("import quadsim.commands.cli\nquadsim.commands.cli.main(['list'])")
     assert not loaded & {"mujoco", "pydantic", "pyarrow", "pandas"}
 
 
@@ -317,7 +370,7 @@ def unwritten(source: str) -> Iterator[str]:
     """Attributes asked for by a literal name of what may lack them: an optional part of a protocol written nowhere.
 
     It counts `getattr` and `hasattr` on `OF_CONTROLLERS`.  Optional parts are protocols of `quadsim.controller` and its
-    like in `mpc`, asked for by `isinstance`, and class attributes of `mpc.bounded.ControllerTable`.
+    like in `mpc`, asked for by `isinstance`, and class attributes of `quadsim.mpc.bounded.ControllerTable`.
     """
     for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "hasattr"):

@@ -175,7 +175,7 @@ def law(now, state, reference):
 def test_stdout_has_the_result_alone_as_json_whatever_user_code_prints(tmp_path: Path) -> None:
     (tmp_path / "printing.py").write_text(PRINTING)
     (tmp_path / "s.toml").write_text(SCENARIO.format(module="printing"))
-    command = [sys.executable, "-m", "scenarios.commands.entry", "check", "s.toml", "--json"]
+    command = [sys.executable, "-m", "quadsim.commands.entry", "check", "s.toml", "--json"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert json.loads(done.stdout)["scenario"] == "own", done.stderr
     for printed in ("by Python", "by the stream", "by the system", "by C", "by a child", "at exit"):

@@ -13,14 +13,14 @@ from flown_logs import fly_eight, write_log
 from support import NO_PRODUCTS, fly_here
 
 import quadsim
+from quadsim.commands.app import app
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED
 from quadsim.errors import RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
-from scenarios.commands.app import app
-from scenarios.commands.cli import main
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.results import EXIT_DONE, EXIT_FAILED
-from scenarios.rollout import Rollout
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMPAIGN = ("--set", "duration=1.0", "--set", "constraints=[]", "--flights", "2", "--no-report")
@@ -96,7 +96,7 @@ def workplace(
     for name in ("paper-unconstrained", "paper-constrained"):
         shutil.copytree(flown, tmp_path / "runs" / name)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("scenarios.rollout.Rollout.fly", fly_known)
+    monkeypatch.setattr("quadsim.rollout.rollout.Rollout.fly", fly_known)
 
 
 @pytest.fixture(scope="session")

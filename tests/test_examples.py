@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenarios.commands.cli import main
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
+from quadsim.commands.cli import main
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "examples"

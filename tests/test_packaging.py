@@ -23,7 +23,6 @@ from quadsim.core.build import LIBRARY, platform_tag, requirements
 pytestmark = pytest.mark.slow("packages")
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("quadsim", "mpc", "scenarios")
 DATA = (
     "*.py",
     "py.typed",
@@ -76,15 +75,18 @@ def run_alone(command: list[str | Path], directory: Path) -> str:
 
 
 def test_wheel_holds_every_file_of_the_packages(dist: Path) -> None:
-    files = {path for package in PACKAGES for pattern in DATA for path in (ROOT / package).rglob(pattern)}
+    files = {path for pattern in DATA for path in (ROOT / "quadsim").rglob(pattern)}
     expected = {path.relative_to(ROOT).as_posix() for path in files}
     expected |= {f"quadsim/models/{path.name}" for path in (ROOT / "models").iterdir()} | {LIBRARY}
+    library = [path for path in (ROOT / "scenarios").rglob("*") if path.suffix in (".toml", ".csv")]
+    expected |= {f"quadsim/library/{path.relative_to(ROOT / 'scenarios').as_posix()}" for path in library}
     (file,) = dist.glob("*.whl")
     with zipfile.ZipFile(file) as wheel:
         held = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert held == expected
-    assert {"quadsim/models/quadrotor.xml", "quadsim/py.typed", "scenarios/library/flights/hover.toml"} <= held
-    assert "scenarios/library/variants.toml" in held
+    assert {"quadsim/models/quadrotor.xml", "quadsim/py.typed", "quadsim/library/flights/hover.toml"} <= held
+    assert {name.partition("/")[0] for name in held} == {"quadsim"}, "one name"
+    assert "quadsim/library/variants.toml" in held
     assert any(name.startswith("quadsim/report/templates/") for name in held)
 
 
@@ -104,12 +106,12 @@ def test_wheel_flies_alone(installed: Path, tmp_path: Path) -> None:
     flight = ["run", "hover", "--set", "duration=1.0", "--no-video", "--no-recording", "--no-figures"]
     comparison = ["compare", "runs/hover", "--out", "page"]
     code = (
-        "import sys, quadsim, mpc, scenarios; from scenarios.commands.cli import main; "
-        "print(quadsim.__file__, mpc.__file__, scenarios.__file__); "
+        "import sys, quadsim.mpc; from quadsim.commands.cli import main; "
+        "print(quadsim.__file__, quadsim.mpc.__file__); "
         f"sys.exit(main({flight}) or main({comparison}))"
     )
     result = run_alone([installed / "python", "-c", code], tmp_path).partition("\n")[0].split()
-    assert len(result) == 3
+    assert len(result) == 2
     assert all(Path(place).is_relative_to(installed.parent) for place in result), result
     summary = json.loads((tmp_path / "runs" / "hover" / "summary.json").read_text())
     assert summary["status"] == "completed"
@@ -120,7 +122,7 @@ def test_wheel_flies_alone(installed: Path, tmp_path: Path) -> None:
 
 def test_version_is_the_same_everywhere(dist: Path) -> None:
     printed = subprocess.run(
-        [sys.executable, "-m", "scenarios.commands.entry", "--version"], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-m", "quadsim.commands.entry", "--version"], cwd=ROOT, capture_output=True, text=True
     )
     changes = re.search(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     citation = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)

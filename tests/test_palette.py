@@ -13,27 +13,27 @@ import pytest
 
 from quadsim.palette import COLOUR, CYCLE, ON_DARK, ON_LIGHT, css, line_colour, on_dark, rgb, rgba
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 READ = (
-    *("quadsim/**/*.py", "mpc/**/*.py", "scenarios/**/*.py", "docs/tools/*.py", "docs/fly/*", "docs/assets/*.css"),
+    *("quadsim/**/*.py", "docs/tools/*.py", "docs/fly/*", "docs/assets/*.css"),
     *("quadsim/report/templates/*", "docs/assets/gallery/*.svg", "docs/assets/*.svg"),
 )
 GREYEST = 40
 """Ink, paper, floor and shade: a colour whose red, green and blue differ by no more than this has no meaning."""
 MATERIALS = {
-    ("scenarios/live/look.py", "#f56b14"): "icon: the vehicle's front, as in models/quadrotor.xml",
-    ("scenarios/live/look.py", "#1b7fc4"): "icon",
-    ("scenarios/live/look.py", "#839dc0"): "sky",
-    ("scenarios/live/look.py", "#31435a"): "sky",
+    ("quadsim/features/live/look.py", "#f56b14"): "icon: the vehicle's front, as in models/quadrotor.xml",
+    ("quadsim/features/live/look.py", "#1b7fc4"): "icon",
+    ("quadsim/features/live/look.py", "#839dc0"): "sky",
+    ("quadsim/features/live/look.py", "#31435a"): "sky",
     ("quadsim/report/templates/page.css", "#0b5cad"): "link",
     ("quadsim/report/templates/page.css", "#7cb8ff"): "link",
     ("quadsim/report/to_plotly.py", "(210, 34, 46)"): "no colour: lengths in pixels",
     ("docs/tools/gallery.py", "(160, 90, 8)"): "no colour: lengths in pixels",
-    ("scenarios/live/look.py", "(128, 128, 3)"): "no colour: shape of an array",
+    ("quadsim/features/live/look.py", "(128, 128, 3)"): "no colour: shape of an array",
     ("docs/fly/fly.js", "#596b85"): "rotor disc, as in models/quadrotor.xml",
 }
 """Colours of things, which say nothing of a flight, and what they are."""
-DRAWING = ("quadsim/report", "quadsim/sim/airframe.py", "scenarios/live", "docs")
+DRAWING = ("quadsim/report", "quadsim/sim/airframe.py", "quadsim/features/live", "docs")
 """Where a tuple of numbers may be a colour."""
 PAGE, DARK_PAGE = "#ffffff", "#14171a"
 BLINDNESS = {

@@ -12,10 +12,10 @@ import pytest
 import quadsim
 from quadsim.assets import vehicle_names, vehicle_path
 from quadsim.errors import ParameterError
+from quadsim.features.design.plausible_vehicles import plausible_vehicles
 from quadsim.plausibility import implausible
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.design.plausible_vehicles import plausible_vehicles
-from scenarios.schema.scenario import Scenario
 
 FACTORS = (1e3, 1e-3, math.degrees(1.0), 2.0 * math.pi)
 SHIPPED = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]

@@ -22,21 +22,21 @@ import tomlkit
 from jsonschema import Draft202012Validator
 
 from quadsim.assets import vehicle_path
+from quadsim.commands.cli import main
 from quadsim.errors import InputError
+from quadsim.features.campaign.campaign_file import CampaignFile
+from quadsim.features.campaign.plan import load_plan, parse_campaign, read_campaign
 from quadsim.fields import floor_of
+from quadsim.scenarios.catalogue import campaign_names, scenario_names
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.base import fields_of
+from quadsim.scenarios.schema.bases import read_scenario
+from quadsim.scenarios.schema.json_schema import scenario_schema
+from quadsim.scenarios.schema.problems import adapter, kinds_of
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.settings import apply_setting
+from quadsim.scenarios.schema.writing import tables_in
 from quadsim.vehicle import VEHICLE_UNITS, load_vehicle
-from scenarios.campaign.campaign_file import CampaignFile
-from scenarios.campaign.plan import load_plan, parse_campaign, read_campaign
-from scenarios.catalogue import campaign_names, scenario_names
-from scenarios.commands.cli import main
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.schema.base import fields_of
-from scenarios.schema.bases import read_scenario
-from scenarios.schema.json_schema import scenario_schema
-from scenarios.schema.problems import adapter, kinds_of
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import apply_setting
-from scenarios.schema.writing import tables_in
 
 FILE = "mine.toml"
 WORDS = ("default", "description", "title")
@@ -513,9 +513,9 @@ def test_every_command_reports_it_once_and_writes_nothing(
     ("limit", "most", "expected"),
     [
         ("quadsim.assets.LARGEST_TOML", 20, "@x.toml: must be of 20 or fewer bytes; got 30"),
-        ("scenarios.courses.csv_course.LARGEST_CSV", 30, "@x.csv: must be of 30 or fewer bytes; got 48"),
+        ("quadsim.scenarios.courses.csv_course.LARGEST_CSV", 30, "@x.csv: must be of 30 or fewer bytes; got 48"),
         ("quadsim.assets.MOST_ASSIGNMENTS", 1, "@x.toml: must assign at most 1 values; it has 2 equals signs"),
-        ("scenarios.courses.csv_course.MOST_ROWS", 1, "@x.csv: must have 1 or fewer rows below its header"),
+        ("quadsim.scenarios.courses.csv_course.MOST_ROWS", 1, "@x.csv: must have 1 or fewer rows below its header"),
     ],
 )
 def test_a_file_that_is_too_large_is_not_read(

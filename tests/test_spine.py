@@ -25,11 +25,11 @@ MOST_DATA_TYPES, MOST_CLASSES = 16, 75  # may only fall
 pytestmark = pytest.mark.slow("spine")
 
 COUNTED = "import runpy; runpy.run_path('tests/count_types.py', run_name='__main__')"
-HELP = "import scenarios.commands.cli; scenarios.commands.cli.main(['--help'])"
+HELP = "import quadsim.commands.cli; quadsim.commands.cli.main(['--help'])"
 WATCHED = """
 import json, os, sys
 from collections import Counter
-PACKAGES = ("quadsim", "mpc", "scenarios")
+PACKAGES = ("quadsim",)
 FOLDERS = tuple(os.path.join(os.getcwd(), package, "") for package in PACKAGES)
 entered, loaded, calls, frames, importing = set(), set(), Counter(), [], 0
 
@@ -51,7 +51,7 @@ def watch(frame, event, _):  # a call
     if importing:
         return
     calls[f"{name}.{code.co_qualname}"] += 1
-    if code.co_name == "step" and name.startswith("mpc.") and not frames:
+    if code.co_name == "step" and name.startswith("quadsim.mpc.") and not frames:
         while frame is not None:
             frames.extend([f"{ours(frame)}.{frame.f_code.co_qualname}"] if ours(frame) else [])
             frame = frame.f_back
@@ -63,7 +63,7 @@ def leave(frame, event, _):
 
 sys.argv = ["quadsim", *sys.argv[1:]]
 sys.settrace(watch)
-from scenarios.commands.entry import main
+from quadsim.commands.entry import main
 status = main()
 sys.settrace(None)
 print(json.dumps([status, sorted(entered), sorted(loaded | entered), calls, frames]), file=sys.stderr)
@@ -91,7 +91,9 @@ def test_one_flight_enters_few_files(watched: Any) -> None:
 def test_a_vehicle_is_loaded_once_and_a_course_is_built_once(watched: Any) -> None:
     _, _, calls, _ = watched
     assert calls["quadsim.vehicle.load_vehicle"] == 1
-    assert [count for name, count in calls.items() if re.fullmatch(r"scenarios\.courses\..*\.build", name)] == [1]
+    assert [
+        count for name, count in calls.items() if re.fullmatch(r"quadsim\.scenarios\.courses\..*\.build", name)
+    ] == [1]
 
 
 def test_the_controller_s_first_step_is_few_calls_deep(watched: Any) -> None:
@@ -166,7 +168,7 @@ def test_the_longest_chain_of_imports_is_short() -> None:
 
 @pytest.mark.witness("spine")
 @pytest.mark.parametrize(
-    ("code", "most"), [("import quadsim", 0.1), ("import scenarios.commands.cli as c; c.main(['-h'])", 0.3)]
+    ("code", "most"), [("import quadsim", 0.1), ("import quadsim.commands.cli as c; c.main(['-h'])", 0.3)]
 )
 def test_what_answers_at_once_does(code: str, most: float) -> None:
     """Processor time of the fastest of three, without the interpreter's own; twice that on a busy machine."""

@@ -13,11 +13,14 @@ from support import NO_PRODUCTS
 from uneven import FILES, published, uneven
 
 import quadsim
-from mpc.allocation import allocate, make_allocation
-from mpc.model import continuous_model
 from quadsim.assets import vehicle_path
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_WRONG_INPUT
 from quadsim.errors import FileError, ParameterError
+from quadsim.mpc.allocation import allocate, make_allocation
+from quadsim.mpc.model import continuous_model
 from quadsim.plausibility import implausible
+from quadsim.scenarios.assembly import Assembly
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.battery import Battery
@@ -25,9 +28,6 @@ from quadsim.sim.physics import Integrator
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES
 from quadsim.vehicle import Vehicle, altered, load_vehicle
-from scenarios.assembly import Assembly
-from scenarios.commands.cli import main
-from scenarios.results import EXIT_WRONG_INPUT
 
 HUMMINGBIRD = load_vehicle(vehicle_path("hummingbird"))
 TOP = HUMMINGBIRD.thrust_coefficient * HUMMINGBIRD.speed_max**2  # N, of one rotor

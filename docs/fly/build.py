@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from quadsim.assets import models_dir
+from quadsim.features.export.exporter import c_controller
 from quadsim.palette import css
-from scenarios.assembly import Assembly
-from scenarios.courses.steps import Steps
-from scenarios.export.exporter import c_controller
-from scenarios.loading import load_scenario
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.courses.steps import Steps
+from quadsim.scenarios.loading import load_scenario
 
 HERE = Path(__file__).resolve().parent
 SITE = HERE.parents[1] / "site"

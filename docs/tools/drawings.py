@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 from quadsim import load_vehicle
@@ -87,7 +88,36 @@ def frames() -> str:
     return svg(880, 415, parts)
 
 
-DRAWINGS = {"frames.svg": frames}
+def floors() -> str:
+    """The floors of quadsim in docs/architecture.md, each above those that it imports, and the data beside them."""
+    page = (ASSETS.parent / "architecture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`.*`|`.*) \| ([^:;|]*).*\|$", page.partition("## Floors")[2], re.MULTILINE)
+    height, left, width = 34, 30, 520
+    parts = []
+    for i, (folders, has) in enumerate(rows):
+        y = 10 + i * (height + 6)
+        parts.append(box(left, y, width, height, FORWARD if i == 0 else INK))
+        parts.append(text(left + 12, y + 22, folders.replace("`", ""), "start", FORWARD))
+        parts.append(text(left + 180, y + 22, has.strip(" |"), "start"))
+    bottom = 10 + len(rows) * (height + 6)
+    parts.append(arrow(14, 14, 14, bottom - 8))
+    parts.append(f'<g transform="rotate(-90 8 {bottom / 2:.1f})">{text(8, bottom / 2 + 1, "imports")}</g>')
+    for i, (folder, has) in enumerate((("scenarios/", "files that you edit"), ("models/", "vehicles, MJCF"))):
+        y = 10 + (4 + 5 * i) * (height + 6)
+        parts.append(box(left + width + 50, y, 190, 2 * height + 6, TURN))
+        parts.append(text(left + width + 145, y + 32, folder, colour=TURN))
+        parts.append(text(left + width + 145, y + 54, has))
+        parts.append(arrow(left + width + 48, y + height, left + width + 6, y + height, "turn"))
+    return svg(800, bottom, parts)
+
+
+def box(x: float, y: float, width: float, height: float, colour: str) -> str:
+    """A frame."""
+    size = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="4"'
+    return f'<rect {size} fill="none" stroke="{colour}" stroke-width="1.5"/>'
+
+
+DRAWINGS = {"frames.svg": frames, "floors.svg": floors}
 
 if __name__ == "__main__":
     for name, draw in DRAWINGS.items():

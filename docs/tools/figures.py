@@ -17,6 +17,7 @@ import numpy as np
 
 import quadsim
 import quadsim.gym
+from quadsim.features.identify.identification_figures import trace_figure
 from quadsim.flight.audit import SIGNALS
 from quadsim.palette import COLOUR, CYCLE
 from quadsim.report import flight_figures
@@ -25,7 +26,6 @@ from quadsim.report.to_matplotlib import STYLE, draw
 from quadsim.report.vehicle_drawing import vehicle_figure
 from quadsim.sim.effects.battery import LIPO
 from quadsim.state import POSITION, Array
-from scenarios.identify.identification_figures import trace_figure
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 ASSETS: Final = ROOT / "docs" / "assets" / "figures"

@@ -95,7 +95,7 @@ def film_flight(name: str) -> None:
 
 def texts() -> dict[str, str]:
     """What the name of each scenario opens: its file, or its row in the table of variants, with comments."""
-    from scenarios.catalogue import FLIGHTS, VARIANTS
+    from quadsim.scenarios.catalogue import FLIGHTS, VARIANTS
 
     files = {path.stem: path.read_text(encoding="utf-8") for path in FLIGHTS.glob("*.toml")}
     table = re.sub(r"^# ---- .*\n", "", VARIANTS.read_text(encoding="utf-8"), flags=re.MULTILINE)  # without headings
@@ -105,9 +105,9 @@ def texts() -> dict[str, str]:
 
 def main() -> None:
     """Make what is named; without off-screen OpenGL the page keeps its pictures and says so."""
-    from scenarios.catalogue import scenario_names
-    from scenarios.machine import usable_cores
-    from scenarios.progress import reporting
+    from quadsim.console.progress import reporting
+    from quadsim.rollout.machine import usable_cores
+    from quadsim.scenarios.catalogue import scenario_names
 
     for folder in (FILMS, FILES):
         folder.mkdir(exist_ok=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from html import escape
 from typing import Final
 
-from scenarios.catalogue import read_catalogue
+from quadsim.scenarios.catalogue import read_catalogue
 
 PLACE: Final = "<!-- library: docs/tools/library.py -->"
 TOPICS: Final = {

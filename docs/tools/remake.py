@@ -25,9 +25,9 @@ from typing import Any, Final
 
 from PIL import Image
 
-from scenarios.campaign.statistics import interval
-from scenarios.papers.reproduction import NUMBER_KINDS
-from scenarios.progress import reporting
+from quadsim.console.progress import reporting
+from quadsim.features.campaign.statistics import interval
+from quadsim.features.papers.reproduction import NUMBER_KINDS
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 MADE: Final = ROOT / "runs" / "numbers"
@@ -92,7 +92,7 @@ def make(name: str) -> None:
             (MADE / f"{name}.json").write_text(done.stdout, encoding="utf-8")
     git = ("git", "-C", str(ROOT))
     commit = subprocess.run([*git, "rev-parse", "--short=8", "HEAD"], check=True, text=True, capture_output=True)
-    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "models", "quadsim", "mpc", "scenarios"])
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "models", "quadsim", "scenarios"])
     origin = {
         "commit": commit.stdout.strip() + (" with changes" if changed.returncode else ""),
         "date": datetime.now(UTC).date().isoformat(),

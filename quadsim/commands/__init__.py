@@ -1,1 +1,1 @@
-"""The command line: `quadsim` and the commands of the core; a room's are in its own `commands.py`."""
+"""The command line: `quadsim` and the commands of the core; a feature's are in its own `commands.py`."""

@@ -1,7 +1,7 @@
 """The functions of quadsim: the API of `import quadsim` and the commands of the command line.
 
-A function under `@app.command` is both.  Only `scenarios.commands.cli` prints; it shows the results
-(`scenarios.results`).  Heavy imports are inside the functions, so that importing this module is fast.
+A function under `@app.command` is both.  Only `quadsim.commands.cli` prints; it shows the results
+(`quadsim.console.results`).  Heavy imports are inside the functions, so that importing this module is fast.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from cyclopts import App, Parameter
 
 from quadsim.errors import FileError, InputError, ParameterError
-from scenarios.commands.arguments import (
+from quadsim.features.arguments import (
     Changes,
     ComparedName,
     File,
@@ -35,21 +35,21 @@ from scenarios.commands.arguments import (
     Watched,
     Whole,
 )
-from scenarios.commands.rooms import ROOMS, owner_of
+from quadsim.features.entries import FEATURES, owner_of
 
 if TYPE_CHECKING:
-    from mpc.ocp import Problem
-    from mpc.pilot import Pilot
+    from quadsim.console.results import Listing, Result
     from quadsim.controller import AutopilotLoop
     from quadsim.flight.feasibility import Feasibility
+    from quadsim.mpc.ocp import Problem
+    from quadsim.mpc.pilot import Pilot
+    from quadsim.rollout.flight_plot import Overlay
+    from quadsim.rollout.flown import Flight
+    from quadsim.rollout.reaudit import Reaudit
+    from quadsim.rollout.rollout import Rollout
+    from quadsim.scenarios.catalogue import Catalogue
+    from quadsim.scenarios.schema.scenario import Scenario
     from quadsim.vehicle import Vehicle
-    from scenarios.catalogue import Catalogue
-    from scenarios.flight_plot import Overlay
-    from scenarios.flown import Flight
-    from scenarios.reaudit import Reaudit
-    from scenarios.results import Listing, Result
-    from scenarios.rollout import Rollout
-    from scenarios.schema.scenario import Scenario
 else:
     Catalogue = Flight = Listing = Overlay = Reaudit = Result = Any
 
@@ -75,10 +75,10 @@ app: Final = App(
     default_parameter=Parameter(show_default=False, negative_iterable=(), allow_repeating=True),
     version=_version,
 )
-for _room, _content in ROOMS.items():
+for _feature, _content in FEATURES.items():
     for _word, _command in _content.commands.items():
         app.command(
-            f"scenarios.{_room}.commands:{_command.function}",
+            f"quadsim.features.{_feature}.commands:{_command.function}",
             name=_word,
             help=_command.help,
             help_epilogue=_examples(*_command.examples),
@@ -105,7 +105,7 @@ def load(name: str | Path, changes: Changes = ()) -> Scenario:
         >>> scenario.controller.horizon, scenario.duration
         (30, 60.0)
     """
-    from scenarios.loading import load_scenario
+    from quadsim.scenarios.loading import load_scenario
 
     return load_scenario(name, changes)
 
@@ -130,7 +130,7 @@ def feasibility(scenario: ScenarioName) -> Feasibility:
         >>> quadsim.feasibility(fast).problems[0]
         'roll up to 40.43 deg (bound 5)'
     """
-    from scenarios import feasibility_check, loading
+    from quadsim.scenarios import feasibility_check, loading
 
     return feasibility_check.report(loading.assemble(scenario))
 
@@ -152,7 +152,7 @@ def make_controller(scenario: ScenarioName) -> Pilot:
         >>> command.speeds.shape, command.plan.shape
         ((4,), (50, 4))
     """
-    from scenarios.loading import assemble
+    from quadsim.scenarios.loading import assemble
 
     return assemble(scenario).controller()
 
@@ -178,7 +178,7 @@ def problem(scenario: ScenarioName) -> Problem:
         >>> problem.rows.names[0], problem.rows.upper.shape
         ('outputs', (50, 10))
     """
-    from scenarios.loading import assemble
+    from quadsim.scenarios.loading import assemble
 
     return assemble(scenario).problem()
 
@@ -235,7 +235,7 @@ def fly(
         >>> quadsim.fly(scenario, controller=full_throttle).state["vz"][-1].round()
         np.float64(13.0)
     """
-    from scenarios.progress import reporting
+    from quadsim.console.progress import reporting
 
     with reporting(progress) as report:
         begun = start(scenario, controller=controller, forces=forces, reference=reference, autopilot=autopilot)
@@ -298,12 +298,12 @@ def run(
         ...     flight.outcome, flight.directory.name
         ('satisfied', 'run')
     """
+    from quadsim.console.progress import reporting
     from quadsim.outputs import run_directory
-    from scenarios import loading, user_code
-    from scenarios.feasibility_check import notes
-    from scenarios.flown import require_film, write_run
-    from scenarios.progress import reporting
-    from scenarios.rollout import Rollout
+    from quadsim.rollout.flown import require_film, write_run
+    from quadsim.rollout.rollout import Rollout
+    from quadsim.scenarios import loading, user_code
+    from quadsim.scenarios.feasibility_check import notes
 
     require_film(video, fps)
     parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces, reference)
@@ -350,8 +350,8 @@ def start(
         ...     started.flight().outcome
         'satisfied'
     """
-    from scenarios import loading, user_code
-    from scenarios.rollout import Rollout
+    from quadsim.rollout.rollout import Rollout
+    from quadsim.scenarios import loading, user_code
 
     parts = user_code.set_up(loading.assemble(scenario), controller, forces, reference, autopilot)
     return Rollout(*parts, live=live, recorded=recorded)
@@ -375,10 +375,10 @@ def read(directory: str | Path) -> Flight:
         (True, 'satisfied')
     """
     from quadsim.flight.rundir import findings_of
+    from quadsim.rollout.flown import Flight
+    from quadsim.rollout.reaudit import stored_run, stored_scenario
+    from quadsim.scenarios.assembly import Assembly
     from quadsim.vehicle import Vehicle
-    from scenarios.assembly import Assembly
-    from scenarios.flown import Flight
-    from scenarios.reaudit import stored_run, stored_scenario
 
     directory = Path(directory)
     run = stored_run(directory)
@@ -434,12 +434,13 @@ def check(
         >>> audited.satisfied, audited.notes
         (True, ())
     """
-    from scenarios import loading, reaudit
-    from scenarios.catalogue import names_directory
-    from scenarios.commands.junit import junit_file, write_junit
-    from scenarios.progress import reporting
-    from scenarios.results import after
-    from scenarios.rollout import Rollout
+    from quadsim.console.junit import junit_file, write_junit
+    from quadsim.console.progress import reporting
+    from quadsim.console.results import after
+    from quadsim.rollout import reaudit
+    from quadsim.rollout.rollout import Rollout
+    from quadsim.scenarios import loading
+    from quadsim.scenarios.catalogue import names_directory
 
     file = None if junit is None else junit_file(junit)
     if isinstance(target, str | Path) and names_directory(target):
@@ -515,10 +516,10 @@ def compare(
         >>> quadsim.compare(quadsim.fly(hover), quadsim.fly(pid)).to_markdown().count("|") > 10
         True
     """
+    from quadsim.console.progress import reporting
+    from quadsim.console.results import Document
     from quadsim.outputs import absolute
-    from scenarios.flight_comparison import compare_flights
-    from scenarios.progress import reporting
-    from scenarios.results import Document
+    from quadsim.rollout.flight_comparison import compare_flights
 
     if not targets:
         raise InputError("compare needs runs, scenarios, or two campaigns")
@@ -586,9 +587,9 @@ def plot(
         >>> axes[0].get_ylabel(), len(axes)
         ('z [m]', 2)
     """
-    from scenarios.flight_plot import plot_runs
-    from scenarios.flown import Flight
-    from scenarios.reaudit import stored_run
+    from quadsim.rollout.flight_plot import plot_runs
+    from quadsim.rollout.flown import Flight
+    from quadsim.rollout.reaudit import stored_run
 
     each = [flights] if isinstance(flights, Flight | str | Path) else flights
     runs = [flight.undiagnosed_run if isinstance(flight, Flight) else stored_run(Path(flight)) for flight in each]
@@ -637,11 +638,11 @@ def film(
         ...     file.name, file.stat().st_size > 1000
         ('flight.mp4', True)
     """
+    from quadsim.console.progress import reporting
     from quadsim.flight import rundir
     from quadsim.outputs import absolute, adding
     from quadsim.report.film.video import Estimate, render_gif, render_video
-    from scenarios.progress import reporting
-    from scenarios.reaudit import reaudit
+    from quadsim.rollout.reaudit import reaudit
 
     reaudit(Path(directory), products=False)
     directory = absolute(directory)
@@ -748,7 +749,7 @@ def catalogue() -> Catalogue:
         >>> catalogue.controllers["lqr"]
         "infinite-horizon LQR on the hover model, following the reference's velocity"
     """
-    from scenarios.catalogue import read_catalogue
+    from quadsim.scenarios.catalogue import read_catalogue
 
     return read_catalogue()
 
@@ -768,7 +769,7 @@ def doctor() -> Listing:
         >>> sorted(checks)
         ['machine', 'packages', 'rendering', 'solvers', 'viewer']
     """
-    from scenarios.commands.doctor import capabilities
-    from scenarios.results import Listing
+    from quadsim.commands.doctor import capabilities
+    from quadsim.console.results import Listing
 
     return Listing(capabilities())

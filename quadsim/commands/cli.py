@@ -1,7 +1,7 @@
-"""The `quadsim` command: it parses the line, calls a function of `scenarios.commands.app`, and shows the result.
+"""The `quadsim` command: it parses the line, calls a function of `quadsim.commands.app`, and shows the result.
 
 Exit status: 0 done; 1 a required constraint is violated, or the flight was aborted; 2 invalid input.  That of an
-interrupted command is `scenarios.commands.entry`'s.
+interrupted command is `quadsim.commands.entry`'s.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Annotated, Any, Final
 
 from cyclopts import CycloptsError, Parameter
 
+from quadsim.commands.app import app
+from quadsim.console.results import EXIT_FAILED, EXIT_WRONG_INPUT, Document, Result
 from quadsim.errors import QuadsimError, printable
-from scenarios.commands.app import app
-from scenarios.results import EXIT_FAILED, EXIT_WRONG_INPUT, Document, Result
 
 _MOST_LINES, _LONGEST_LINE = 21, 1000  # of a message: one with many problems has a line for each
 _HOME: Final = re.compile(r"(--[\w-]+=)?(~.*)", re.DOTALL)
@@ -50,7 +50,7 @@ class _Verdict:
     shown = False
 
     def __call__(self, result: Result) -> None:
-        from scenarios import console
+        from quadsim.console import console
 
         self.shown = True
         console.show(result.shown())
@@ -68,7 +68,7 @@ def _stdout_for(json: bool) -> contextlib.AbstractContextManager[None]:
 def _show(result: object, json: bool, *, judged: bool) -> int:
     """Print a result, or what is left of it after the verdict; returns its exit status."""
     if isinstance(result, Path):
-        from scenarios.console import short_path
+        from quadsim.console.console import short_path
 
         result = Document(f"written to {printable(short_path(result))}\n", str(result))
     if not isinstance(result, Result):
@@ -76,7 +76,7 @@ def _show(result: object, json: bool, *, judged: bool) -> int:
     if json:
         print(serialising.dumps(result.to_json(), indent=2))
     elif judged:
-        from scenarios import console
+        from quadsim.console import console
 
         console.show(result.outputs())
     else:
@@ -134,7 +134,7 @@ def _at_home(word: str) -> str:
 
 def _complain(error: Exception) -> None:
     """Print some twenty lines of a message."""
-    from scenarios import console
+    from quadsim.console import console
 
     lines = printable(f"quadsim: {error}", keep="\n").split("\n")
     shown = [line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]} ..." for line in lines[:_MOST_LINES]]
@@ -151,7 +151,7 @@ class _Notices(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler.emit`."""
-        from scenarios import console
+        from quadsim.console import console
 
         message = record.getMessage()
         if message not in self._shown:

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from functools import partial
 
 from quadsim.errors import FlightError, QuadsimError
-from scenarios.loading import assemble
-from scenarios.machine import machine, usable_cores, versions
+from quadsim.rollout.machine import machine, usable_cores, versions
+from quadsim.scenarios.loading import assemble
 
 
 def capabilities() -> dict[str, dict[str, str]]:
     """Return this machine's capabilities by section; every installed QP solver solves one constrained step."""
-    from mpc.solvers import solver_entries
+    from quadsim.mpc.solvers import solver_entries
     from quadsim.report.recording import viewer_problem
 
     here = machine()

@@ -95,7 +95,7 @@ def _work() -> int:
         return 2
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors in ("strict", "surrogateescape"):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal may lack characters
-    from scenarios.commands.cli import main as run
+    from quadsim.commands.cli import main as run
 
     status = run()
     if "--json" in sys.argv:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from scenarios.console import PlainConsole
+    from quadsim.console.console import PlainConsole
 
 Progress = Callable[[str, int, int], None]  # called with (activity, done, total) during long work
 
@@ -33,7 +33,7 @@ def reporting(progress: Progress | bool, *, bars: bool = True) -> Iterator[Progr
     if callable(progress):
         yield progress
         return
-    from scenarios.console import stderr
+    from quadsim.console.console import stderr
 
     if not progress:
         yield silent
@@ -60,7 +60,7 @@ def reporting(progress: Progress | bool, *, bars: bool = True) -> Iterator[Progr
 @contextlib.contextmanager
 def lines(screen: PlainConsole) -> Iterator[Callable[[str], None]]:
     """Yield a function that takes what is done now; the latest is printed every `LINE_EVERY`, also while it lasts."""
-    from scenarios import console
+    from quadsim.console import console
 
     now, started, over = "starting", clock.monotonic(), threading.Event()
 

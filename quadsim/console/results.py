@@ -22,7 +22,7 @@ EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
 
 
 class Result:
-    """A result of the functions of `scenarios.commands.app` that users and programs read."""
+    """A result of the functions of `quadsim.commands.app` that users and programs read."""
 
     @property
     def exit_status(self) -> int:
@@ -43,13 +43,13 @@ class Result:
 
     def show(self) -> None:
         """Print the result."""
-        from scenarios import console
+        from quadsim.console import console
 
         console.show([*self.shown(), *self.outputs()])
 
     def text(self) -> str:
         """Return the output of `show` without colours."""
-        from scenarios import console
+        from quadsim.console import console
 
         return console.to_text([*self.shown(), *self.outputs()])
 
@@ -64,7 +64,7 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Return its tables and its plot for a notebook."""
-        from scenarios import console
+        from quadsim.console import console
 
         return console.to_html([*self.shown(), *self.outputs()]) + plot_html(self.small_plot())
 
@@ -131,7 +131,7 @@ class Listing(dict[str, Mapping[str, str]], Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios import console
+        from quadsim.console import console
 
         return console.listing(self)
 

@@ -10,6 +10,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from quadsim.console import console
 from quadsim.controller import OPTIMAL, Phase, counts, law_name
 from quadsim.flight.audit import VERDICT_TEXT, Finding
 from quadsim.flight.rundir import findings_of
@@ -26,7 +27,6 @@ from quadsim.report.comparison import (
     violated_unrequired,
 )
 from quadsim.report.table import ABSENT, short_number
-from scenarios import console
 
 _NAMED: Final = 3  # violated constraints named in the first line
 _SPARE: Final = ("beyond", "sampled", "plant", "bounds")  # columns that a narrow console does without, in this order

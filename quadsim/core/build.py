@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Final
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-"""The folder of the packages: a checkout, or `site-packages`."""
-FOLDERS: Final = ("quadsim/core", "mpc/core/c")
+"""The folder of the package: a checkout, or `site-packages`."""
+FOLDERS: Final = ("quadsim/core", "quadsim/mpc/core/c")
 """Every C file in them is compiled into the library."""
 LIBRARY: Final = "quadsim/core/_core.so"  # the suffix is free for ctypes; macOS takes .so as well
 FLAGS: Final = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")

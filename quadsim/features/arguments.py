@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 from cyclopts import Parameter
 
 from quadsim.assets import vehicle_names
-from scenarios.catalogue import scenario_names
+from quadsim.scenarios.catalogue import scenario_names
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from scenarios.flown import Flight
-    from scenarios.progress import Progress
-    from scenarios.schema.scenario import Scenario
+    from quadsim.console.progress import Progress
+    from quadsim.rollout.flown import Flight
+    from quadsim.scenarios.schema.scenario import Scenario
 
     File: TypeAlias = str | Path
     Files: TypeAlias = Sequence[File]

@@ -183,7 +183,7 @@ class Limit:
     """Bounds on a signal of the flight.
 
     `slew` is the command's step per period; `speed` and `slew` apply to every rotor.  An infinite bound means no bound.
-    An entry without bounds takes the controller's, which `scenarios.limits` fills in.
+    An entry without bounds takes the controller's, which `quadsim.scenarios.limits` fills in.
     """
 
     name: Annotated[str, doc("name in reports")] = field(metadata={"pattern": "^[A-Za-z0-9_.-]+$"})

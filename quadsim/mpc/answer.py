@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from mpc.condensing import states_rows
-from mpc.ocp import Problem, Query, predicted
-from mpc.paper import prediction
-from mpc.qp import kkt_residuals
 from quadsim.controller import ACCEPTED, FALLBACK, Command
 from quadsim.errors import ParameterError
+from quadsim.mpc.condensing import states_rows
+from quadsim.mpc.ocp import Problem, Query, predicted
+from quadsim.mpc.paper import prediction
+from quadsim.mpc.qp import kkt_residuals
 from quadsim.state import Array, Indices, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 if TYPE_CHECKING:
-    from mpc.solvers import Answer
+    from quadsim.mpc.solvers import Answer
 
 BOUND_TOLERANCE: Final = 1e-6
 """Tolerance of the bounds [rad/s]: an answer outside by no more is moved onto its bounds and accepted."""
 INFEASIBLE: Final = 1e-3
-"""Largest violation of a normalised row (`mpc.constraints.Rows`) that an accepted plan may have."""
+"""Largest violation of a normalised row (`quadsim.mpc.constraints.Rows`) that an accepted plan may have."""
 INFEASIBLE_ANSWER: Final = "infeasible_answer"
 """Status of an answer whose plan violates a row by more than `INFEASIBLE`."""
 LARGEST_MAP: Final = 2**20

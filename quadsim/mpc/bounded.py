@@ -16,21 +16,21 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 import numpy as np
 from annotated_types import Ge, Le, Len, MaxLen, doc
 
-from mpc.allocation import thrust_to_command
-from mpc.answer import ActuatorBounds
-from mpc.constraints import Bounds, Constraint, Origin, Penalty
-from mpc.fallback.settings import FallbackSettings
-from mpc.indi import INDISettings, TorqueIncrement
-from mpc.model import SHORTEST_LAG, hover_model
-from mpc.obstacles import AvoidanceSettings, Shape, Space
-from mpc.ocp import Objective, Problem, lqr_terminal_weight
-from mpc.qp import KKT_EVERY
-from mpc.solvers import ALIASES, SOLVERS, Solver, find_solver
-from mpc.solvers.by_name import make_solver
 from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number, Pair, Positive, Weight
 from quadsim.input_limits import MOST_ENTRIES
+from quadsim.mpc.allocation import thrust_to_command
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.constraints import Bounds, Constraint, Origin, Penalty
+from quadsim.mpc.fallback.settings import FallbackSettings
+from quadsim.mpc.indi import INDISettings, TorqueIncrement
+from quadsim.mpc.model import SHORTEST_LAG, hover_model
+from quadsim.mpc.obstacles import AvoidanceSettings, Shape, Space
+from quadsim.mpc.ocp import Objective, Problem, lqr_terminal_weight
+from quadsim.mpc.qp import KKT_EVERY
+from quadsim.mpc.solvers import ALIASES, SOLVERS, Solver, find_solver
+from quadsim.mpc.solvers.by_name import make_solver
 from quadsim.state import (
     INDEX,
     N_STATES,
@@ -93,7 +93,7 @@ class ControllerTable:
 
 @singledispatch
 def law_of(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    """Return the law of a table, in Python; see `mpc.builders.build`.  Each table's builder registers itself here."""
+    """Return the law of a table, in Python; see `builders.build`.  Each table's builder registers itself here."""
     raise NotImplementedError(type(table).__name__)
 
 
@@ -332,7 +332,7 @@ class Avoidance(AvoidanceSettings):
         positions: Sequence[int] = POSITION,
         largest: bool = False,
     ) -> Space | None:
-        """Return the half-spaces of obstacles and regions (`mpc.obstacles.Space`); None without any."""
+        """Return the half-spaces of obstacles and regions (`quadsim.mpc.obstacles.Space`); None without any."""
         if not shapes:
             return None
         return Space(

@@ -12,23 +12,23 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from mpc.bounded import USUAL_SOLVER, Bounded, ControllerTable, Weighted, law_of, require_lags
-from mpc.constrained import Constrained
-from mpc.fallback.contract import Guard
-from mpc.model import hover_model, target_model
-from mpc.nonlinear.settings import Nonlinear
-from mpc.obstacles import Shape
-from mpc.pilot import Pilot
-from mpc.robust.settings import Robust
 from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ExportError, InputError, ParameterError
+from quadsim.mpc.bounded import USUAL_SOLVER, Bounded, ControllerTable, Weighted, law_of, require_lags
+from quadsim.mpc.constrained import Constrained
+from quadsim.mpc.fallback.contract import Guard
+from quadsim.mpc.model import hover_model, target_model
+from quadsim.mpc.nonlinear.settings import Nonlinear
+from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.robust.settings import Robust
 from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from mpc.core.law import CompiledPreparation
-    from mpc.linear import LinearMPC, Preparation
-    from mpc.obstacles import Space
-    from mpc.solvers import Solver
+    from quadsim.mpc.core.law import CompiledPreparation
+    from quadsim.mpc.linear import LinearMPC, Preparation
+    from quadsim.mpc.obstacles import Space
+    from quadsim.mpc.solvers import Solver
 
 
 AnyTable = TypeVar("AnyTable", bound=ControllerTable)
@@ -97,8 +97,8 @@ def _in_c(
         return None
     if table.compiled is None and not (isinstance(table, Robust) and table.solver in (None, CORE)):
         return None
-    from mpc.core.law import CompiledPreparation
-    from mpc.core.numbers import exportable
+    from quadsim.mpc.core.law import CompiledPreparation
+    from quadsim.mpc.core.numbers import exportable
 
     try:
         return CompiledPreparation(exportable(table, vehicle, period, shapes))
@@ -110,7 +110,7 @@ def _in_c(
 
 def _compiled(table: ControllerTable, preparation: CompiledPreparation) -> Controller:
     """Return the law in C."""
-    from mpc.core.law import CompiledGain, CompiledSolver
+    from quadsim.mpc.core.law import CompiledGain, CompiledSolver
 
     if not isinstance(table, Bounded):
         return CompiledGain(preparation)
@@ -118,7 +118,7 @@ def _compiled(table: ControllerTable, preparation: CompiledPreparation) -> Contr
 
 
 def _linear(table: Bounded, preparation: Preparation, solver: Solver, space: Space | None = None) -> LinearMPC:
-    from mpc.linear import LinearMPC
+    from quadsim.mpc.linear import LinearMPC
 
     return LinearMPC(
         preparation,
@@ -133,12 +133,12 @@ def _linear(table: Bounded, preparation: Preparation, solver: Solver, space: Spa
 @law_of.register(Constrained)
 @law_of.register(Robust)
 def _in_python(table: Bounded, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    from mpc.linear import NominalPreparation
+    from quadsim.mpc.linear import NominalPreparation
 
     problem, space = table.problem(vehicle, period), table.space(shapes, vehicle, period)
     preparation: Preparation = NominalPreparation(problem)
     if isinstance(table, Robust):
-        from mpc.robust.controller import RobustPreparation
+        from quadsim.mpc.robust.controller import RobustPreparation
 
         preparation = RobustPreparation(vehicle, problem, table)
     return _linear(table, preparation, table.make_solver(problem, space), space)
@@ -146,7 +146,7 @@ def _in_python(table: Bounded, vehicle: Vehicle, period: float, shapes: Sequence
 
 @law_of.register(Nonlinear)
 def _nonlinear(table: Nonlinear, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    from mpc.nonlinear.controller import NonlinearMPC
+    from quadsim.mpc.nonlinear.controller import NonlinearMPC
 
     if table.commands != ROTORS:
         require_lags(table.inner_lag)

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 import scipy.linalg
 from scipy.linalg import lapack
 
-from mpc.constraints import Bounds
-from mpc.ocp import Equilibrium, Problem, Query, check_shape, predicted
-from mpc.paper import Prediction, cost, prediction, slew_matrix
-from mpc.qp import QP, PeriodQP, QPRows, Solution
 from quadsim.controller import UNCONSTRAINED, Statistics
+from quadsim.mpc.constraints import Bounds
+from quadsim.mpc.ocp import CondensedQP, Equilibrium, Problem, Query, check_shape, predicted
+from quadsim.mpc.paper import Prediction, cost, prediction, slew_matrix
+from quadsim.mpc.qp import QP, PeriodQP, QPRows, Solution
 from quadsim.state import N_STATES, REFERENCE_STATES, Array
 
 RowFlags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
@@ -59,18 +59,6 @@ def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
         H, F_x, F_y = H + 2.0 * last.T @ (Q_end - Q) @ last, F_x + 2.0 * last.T @ (Q_end - Q) @ free, F_y.copy()
         F_y[:, -W.shape[1] :] -= 2.0 * last.T @ (W_end - W)
     return CondensedCost(H=0.5 * (H + H.T), F_x=F_x, F_y=F_y, F_d=F_d)
-
-
-class CondensedQP(NamedTuple):
-    """min 1/2 x' H x + f' x  subject to  lower <= A x <= upper,  x_min <= x <= x_max; see `mpc.ocp.Problem.qp`."""
-
-    H: Array
-    f: Array
-    A: Array
-    lower: Array  # may be -inf
-    upper: Array  # may be inf
-    x_min: Array  # likewise
-    x_max: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +156,7 @@ class Condensed:
     def period(
         self, state: Array, reference: Array, u_before: Array, equilibrium: Equilibrium | None = None
     ) -> CondensedQP:
-        """Return the QP of one period as new arrays; see `mpc.ocp.Problem.qp`.
+        """Return the QP of one period as new arrays; see `quadsim.mpc.ocp.Problem.qp`.
 
         Raises:
             ParameterError: an array has another shape.
@@ -209,7 +197,7 @@ class Condensed:
         return x[self._inputs :].reshape(self._problem.horizon, -1) / self._problem.rows.slack_scale
 
     def multipliers(self, solution: Solution) -> Array:
-        """Return (N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
+        """Return (N, m) the multipliers of the problem's rows (`constraints.Rows`), signed as in `Solution`."""
         return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
 
     def solution(self, plan: Array, slacks: Array, multipliers: Array) -> Solution:

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from annotated_types import doc
 
-from mpc.bounded import Bounded
-from mpc.fallback.settings import FallbackSettings
+from quadsim.mpc.bounded import Bounded
+from quadsim.mpc.fallback.settings import FallbackSettings
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,13 +24,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from scipy import sparse
 
-from mpc.constraints import Constraint, Penalty
-from mpc.ocp import InfeasiblePeriod, Problem, Query
-from mpc.qp import Solution
-from mpc.solvers import QPSolver
-from mpc.solvers.piqp import Piqp
-from mpc.staged import Staged, steps_of
 from quadsim.controller import SOLVED
+from quadsim.mpc.constraints import Constraint, Penalty
+from quadsim.mpc.ocp import InfeasiblePeriod, Problem, Query
+from quadsim.mpc.qp import Solution
+from quadsim.mpc.solvers import QPSolver
+from quadsim.mpc.solvers.piqp import Piqp
+from quadsim.mpc.staged import Staged, steps_of
 from quadsim.state import Array
 
 DIAGNOSIS_SOLVER: Final = "piqp-multistage"
@@ -44,7 +44,7 @@ PRICED: Final = 1e-9
 class Side(NamedTuple):
     """One of the two bounds of a row."""
 
-    place: int  # index of its constraint (`mpc.ocp.Problem.every_constraint`)
+    place: int  # index of its constraint (`quadsim.mpc.ocp.Problem.every_constraint`)
     row: int  # row within the constraint
     upper: bool  # whether it is the upper bound
 

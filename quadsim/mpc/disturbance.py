@@ -7,8 +7,8 @@ The mean acceleration over a period that the model misses,
 The mean angular acceleration is defined in the same way.  Two states follow each of them, the disturbance and its rate
 of change, with both poles of the error at exp(-bandwidth tau_s): the critically damped g-h filter (Morrison,
 "Introduction to Sequential Smoothing and Prediction", 1969).  It tracks a disturbance that changes at a constant rate
-without lag; drag on a curved path nearly does so.  The estimate of a constant disturbance in `mpc.observer` lags by its
-time constant.
+without lag; drag on a curved path nearly does so.  The estimate of a constant disturbance in `quadsim.mpc.observer`
+lags by its time constant.
 
 A vehicle with rotor lag has rotor inertia: the torque that accelerates the rotors acts on the body, and their momentum
 turns with it.  On a Hummingbird at a period of 25 ms, a change of commands turns the body more through this torque than

@@ -20,7 +20,7 @@ from quadsim.state import INDEX, N_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
-    from mpc.nonlinear.model import NonlinearModel
+    from quadsim.mpc.nonlinear.model import NonlinearModel
 
 LEAST_LIFT: Final = 0.1  # least thrust at rest as a share of the weight, so that no equilibrium is upside down
 _ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]

@@ -1,6 +1,6 @@
 """The heading frame: axes turned by the yaw, in which the hover model at zero yaw holds for any yaw.
 
-The model is linearised at the equilibrium (x_s, u_s) of `mpc.equilibrium`: in axes turned by the yaw
+The model is linearised at the equilibrium (x_s, u_s) of `quadsim.mpc.equilibrium`: in axes turned by the yaw
 
     x(k+1) = x_s + A (x(k) - x_s) + B (u(k) - u_s).
 """
@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from mpc.equilibrium import Trim
-from mpc.model import LinearModel
-from mpc.paper import rollout
+from quadsim.mpc.equilibrium import Trim
+from quadsim.mpc.model import LinearModel
+from quadsim.mpc.paper import rollout
 from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, Array
 
 _YAW: Final = INDEX["yaw"]

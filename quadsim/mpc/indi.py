@@ -24,15 +24,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from annotated_types import doc
 
-from mpc.allocation import allocation_struct, make_allocation
 from quadsim.core.inner import CompiledLoop
 from quadsim.core.structs import LoopKind, fill
 from quadsim.fields import Hertz
+from quadsim.mpc.allocation import allocation_struct, make_allocation
 from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from mpc.answer import ActuatorBounds
-    from mpc.disturbance import RampSettings
+    from quadsim.mpc.answer import ActuatorBounds
+    from quadsim.mpc.disturbance import RampSettings
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,17 +6,17 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection, resized, shifted
-from mpc.equilibrium import Trim
-from mpc.observer import disturbance_of
-from mpc.obstacles import SOLVER as SPACE_SOLVER
-from mpc.obstacles import ObstacleQP, Space
-from mpc.ocp import InfeasiblePeriod, Problem, Query
-from mpc.paper import rollout
-from mpc.qp import KKT_EVERY
-from mpc.solvers import INVALID_DATA, Answer, Solver
 from quadsim.controller import GROUNDED, Command, StepInputs, stopped
 from quadsim.errors import PlanExhaustedError
+from quadsim.mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection, resized, shifted
+from quadsim.mpc.equilibrium import Trim
+from quadsim.mpc.observer import disturbance_of
+from quadsim.mpc.obstacles import SOLVER as SPACE_SOLVER
+from quadsim.mpc.obstacles import ObstacleQP, Space
+from quadsim.mpc.ocp import InfeasiblePeriod, Problem, Query
+from quadsim.mpc.paper import rollout
+from quadsim.mpc.qp import KKT_EVERY
+from quadsim.mpc.solvers import INVALID_DATA, Answer, Solver
 from quadsim.state import INDEX, Array, ReferenceTurns
 
 
@@ -30,7 +30,7 @@ class Remembered(NamedTuple):
     ahead: Array | None  # (12,) state there; None if it is not known
     called_at: float  # [s] time of the last call
     measured: float  # [s] and of the last measured state
-    estimate: Array | None  # (6,) of `mpc.observer.DisturbanceObserver`; None without one
+    estimate: Array | None  # (6,) of `quadsim.mpc.observer.DisturbanceObserver`; None without one
 
 
 class Preparation(Protocol):
@@ -128,9 +128,9 @@ class LinearMPC:
 
     If the unconstrained optimum satisfies every constraint, it is the solution and no QP is solved; the status is then
     `unconstrained`.  The controller uses an answer only if it is solved and finite, its first input is within the hard
-    bounds, and its plan satisfies the problem's rows (`mpc.answer.AnswerCheck`).  Otherwise it reports the status with
-    the command in force, for a fallback to act on; or, if it `holds` plans, it flies the previous one, shifted by one
-    step (fallback level 1), for as long as that lasts, and then ends the flight.
+    bounds, and its plan satisfies the problem's rows (`quadsim.mpc.answer.AnswerCheck`).  Otherwise it reports the
+    status with the command in force, for a fallback to act on; or, if it `holds` plans, it flies the previous one,
+    shifted by one step (fallback level 1), for as long as that lasts, and then ends the flight.
 
     States, units and frames: `docs/conventions.md`.
 
@@ -157,7 +157,7 @@ class LinearMPC:
 
         Args:
             preparation: makes the query of each period.
-            solver: the problem's (`mpc.solvers.make_solver`).
+            solver: the problem's (`quadsim.mpc.solvers.make_solver`).
             name: of the law, in summaries.
             holds: whether the last plan is held where a QP has no answer.
             space: the obstacles to avoid; None for none.

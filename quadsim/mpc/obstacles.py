@@ -26,13 +26,13 @@ from typing import Annotated, Final, TypeAlias
 import numpy as np
 from annotated_types import Ge, Le, doc
 
-from mpc.constraints import Constraint, Origin, Penalty
-from mpc.ocp import Problem, Query, predicted
-from mpc.partial_condensing import PartiallyCondensed
-from mpc.solvers import Answer, Solver
-from mpc.solvers.piqp import Piqp
 from quadsim.controller import ACCEPTED
 from quadsim.fields import NonNegative
+from quadsim.mpc.constraints import Constraint, Origin, Penalty
+from quadsim.mpc.ocp import Problem, Query, predicted
+from quadsim.mpc.partial_condensing import PartiallyCondensed
+from quadsim.mpc.solvers import Answer, Solver
+from quadsim.mpc.solvers.piqp import Piqp
 from quadsim.space import AnyObstacle, Corridor, Fence, Obstacle, Solids
 from quadsim.state import POSITION, Array
 
@@ -42,7 +42,7 @@ SWITCHED_OFF: Final = 1e3
 """Bound [m] of a half-space that is switched off."""
 SOLVER: Final = "piqp-multistage"  # solves QPs with half-spaces; the problem's own solver solves the others
 SOFT_SPACE: Final = "controller.avoidance.soft"
-"""Table of a scenario file that makes half-spaces soft (`mpc.constraints.Origin.soft`)."""
+"""Table of a scenario file that makes half-spaces soft (`quadsim.mpc.constraints.Origin.soft`)."""
 HALF_SPACE_ROUNDING: Final = 1e-6
 """Violation of a half-space [m] attributed to rounding."""
 SETTLED: Final = 1e-2

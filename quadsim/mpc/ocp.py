@@ -14,15 +14,15 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-import mpc
-from mpc.constraints import Bounds, Constraint, Rows, renumbered, row_scale
-from mpc.model import LinearModel
-from mpc.regulator import stabilising
+from quadsim import shorthands
 from quadsim.errors import ParameterError
+from quadsim.mpc.constraints import Bounds, Constraint, Rows, renumbered, row_scale
+from quadsim.mpc.model import LinearModel
+from quadsim.mpc.regulator import stabilising
 from quadsim.state import REFERENCE_RATES, REFERENCE_STATES, Array, Indices
 
 
@@ -138,6 +138,18 @@ def lqr_terminal_weight(model: LinearModel, objective: Objective, states: Sequen
     return np.asarray(0.5 * (P + P.T))
 
 
+class CondensedQP(NamedTuple):
+    """min 1/2 x' H x + f' x  subject to  lower <= A x <= upper,  x_min <= x <= x_max; see `Problem.qp`."""
+
+    H: Array
+    f: Array
+    A: Array
+    lower: Array  # may be -inf
+    upper: Array  # may be inf
+    x_min: Array  # likewise
+    x_max: Array
+
+
 @dataclass(frozen=True, kw_only=True)
 class Problem:
     """A complete definition of a controller, apart from how its optimum is computed."""
@@ -184,12 +196,13 @@ class Problem:
         """Return the desired outputs (N, n_r) of a preview (N, 4) x, y, z [m], yaw [rad], and of its rates."""
         return self.objective.desired(reference, self.rates(reference))
 
-    def condensed(self) -> mpc.Condensed:
+    def condensed(self) -> Any:
         """The QP in the inputs alone: its parts that are the same in all periods.
 
         Returns:
-            `cost` has H (N nu, N nu) of Eq. (7), F_x (N nu, n) of Eq. (8) and F_y (N nu, N n_r) of Eq. (9); `qp.G` has
-            the rows, time by time; `inputs(x)` takes a solution to the plan (N, nu) [rad/s].
+            A `quadsim.mpc.Condensed`: `cost` has H (N nu, N nu) of Eq. (7), F_x (N nu, n) of Eq. (8) and F_y (N nu, N
+            n_r) of Eq. (9); `qp.G` has the rows, time by time; `inputs(x)` takes a solution to the plan (N, nu)
+            [rad/s].
 
         Examples:
             >>> import quadsim
@@ -200,12 +213,12 @@ class Problem:
         return self._condensed
 
     @cached_property
-    def _condensed(self) -> mpc.Condensed:
-        return mpc.Condensed.of(self)
+    def _condensed(self) -> Any:
+        return shorthands.condensed_form(self)
 
     def qp(
         self, state: Array, reference: Array, u_before: Array, equilibrium: Equilibrium | None = None
-    ) -> mpc.CondensedQP:
+    ) -> CondensedQP:
         """The condensed QP of one period, as new numpy arrays for any solver.  Eqs. (27)-(29).
 
         The variables x are the inputs u(k), ..., u(k+N-1) [rad/s], so x[:4] is the command, and then the slacks of

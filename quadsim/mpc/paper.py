@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpc.model import LinearModel
-from mpc.ocp import Objective
+from quadsim.mpc.model import LinearModel
+from quadsim.mpc.ocp import Objective
 from quadsim.state import Array
 
 

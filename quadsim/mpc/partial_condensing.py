@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from mpc.ocp import Problem, Query
-from mpc.qp import QP, PeriodQP, QPRows, Solution
+from quadsim.mpc.ocp import Problem, Query
+from quadsim.mpc.qp import QP, PeriodQP, QPRows, Solution
 from quadsim.state import Array, Indices
 
 BLOCK_ROUNDING: Final = 1e-14
@@ -338,7 +338,7 @@ class PartiallyCondensed:
         return np.concatenate([first, later.reshape(-1, at.n), x[at.starts[-1:]]])
 
     def multipliers(self, solution: Solution) -> Array:
-        """Return (N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
+        """Return (N, m) the multipliers of the problem's rows (`constraints.Rows`), signed as in `Solution`."""
         return self._rows.multipliers(solution.z, solution.z_box[self._at.inputs].ravel())
 
     def _offsets(self, matrices: Matrices, c: Array, state: Array) -> tuple[Array, Array]:

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpc.fallback.contract import Guard
-from mpc.indi import TorqueIncrement
 from quadsim.controller import (
     GROUNDED,
     ROTORS,
@@ -25,6 +23,8 @@ from quadsim.controller import (
 )
 from quadsim.core.inner import CompiledLoop
 from quadsim.core.structs import InnerStruct
+from quadsim.mpc.fallback.contract import Guard
+from quadsim.mpc.indi import TorqueIncrement
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -32,10 +32,11 @@ from quadsim.vehicle import Vehicle
 class Pilot:
     """A law, with or without the fallback contract around it, and with or without an inner loop.
 
-    An inner loop corrects the rotor speeds that the law commands (`mpc.indi.TorqueIncrement`), or is an autopilot. The
-    law then commands targets: `speeds` a row, thrust [N] and body rates [rad/s] (4,), perhaps with an attitude (8,),
-    `plan` such rows; `now.acting` and `reset` give it the target in force. To the flight the pilot is the inner loop
-    then: it passes calls on to the autopilot, and so knows the target in force whenever commands come late.
+    An inner loop corrects the rotor speeds that the law commands (`quadsim.mpc.indi.TorqueIncrement`), or is an
+    autopilot. The law then commands targets: `speeds` a row, thrust [N] and body rates [rad/s] (4,), perhaps with an
+    attitude (8,), `plan` such rows; `now.acting` and `reset` give it the target in force. To the flight the pilot is
+    the inner loop then: it passes calls on to the autopilot, and so knows the target in force whenever commands come
+    late.
 
     Attributes:
         law: the law.

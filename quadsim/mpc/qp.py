@@ -9,8 +9,8 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 import numpy as np
 from scipy.sparse import csc_matrix
 
-from mpc.ocp import Problem
 from quadsim.controller import NO_STATISTICS, SOLVED, Statistics
+from quadsim.mpc.ocp import Problem
 from quadsim.state import Array
 
 Matrix: TypeAlias = Array | csc_matrix
@@ -45,7 +45,7 @@ class QPRows:
         origin: (K,) index of each row among the problem's.
         slack: (K, m_s) slack coefficients.
         lower, upper: (N, K).
-        of_states: (K,) see `mpc.constraints.Rows`.
+        of_states: (K,) see `quadsim.mpc.constraints.Rows`.
         u_min, u_max: (N, nu) the box.
     """
 

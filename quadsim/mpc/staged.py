@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
 
-from mpc.ocp import Problem, Query, predicted
-from mpc.qp import QP, PeriodQP, QPRows, Solution
+from quadsim.mpc.ocp import Problem, Query, predicted
+from quadsim.mpc.qp import QP, PeriodQP, QPRows, Solution
 from quadsim.state import Array, Indices
 
 
@@ -108,7 +108,7 @@ class Staged:
         return self._e
 
     def multipliers(self, solution: Solution) -> Array:
-        """Return (N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
+        """Return (N, m) the multipliers of the problem's rows (`constraints.Rows`), signed as in `Solution`."""
         return self._rows.multipliers(solution.z, solution.z_box[self._u].ravel())
 
     def solution(self, query: Query, qp: QP, plan: Array, slacks: Array, multipliers: Array) -> Solution:

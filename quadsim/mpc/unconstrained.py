@@ -11,12 +11,12 @@ import numpy as np
 import scipy.linalg
 from annotated_types import doc
 
-from mpc.bounded import Weighted, law_of
-from mpc.condensing import condensed_cost
-from mpc.obstacles import Shape
-from mpc.ocp import Problem
-from mpc.paper import prediction, rollout
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Statistics, StepInputs, stopped
+from quadsim.mpc.bounded import Weighted, law_of
+from quadsim.mpc.condensing import condensed_cost
+from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.ocp import Problem
+from quadsim.mpc.paper import prediction, rollout
 from quadsim.state import INDEX, Array, ReferenceTurns
 from quadsim.vehicle import Vehicle
 

@@ -13,20 +13,20 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from quadsim.assets import read_toml
+from quadsim.console.progress import Progress, silent
+from quadsim.console.results import Result, Shown, after
 from quadsim.errors import OutputError, ParameterError
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
 from quadsim.outputs import reserving
 from quadsim.report.comparison import check_names, different_audits
 from quadsim.report.table import Cell, QuantityRow
-from scenarios.catalogue import names_directory
-from scenarios.flown import INTERRUPTED, Flight, add_films, require_film, worst_margin
-from scenarios.loading import load_scenario
-from scenarios.progress import Progress, silent
-from scenarios.reaudit import reaudit, stored_run
-from scenarios.results import Result, Shown, after
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
+from quadsim.rollout.flown import INTERRUPTED, Flight, add_films, require_film, worst_margin
+from quadsim.rollout.reaudit import reaudit, stored_run
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.catalogue import names_directory
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
     from quadsim.report.figure import Figure
@@ -80,7 +80,7 @@ class FlightComparison(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios import console
+        from quadsim.console import console
 
         yield from self.notes
         yield console.styled_cell(self.conclusion)
@@ -96,7 +96,7 @@ class FlightComparison(Result):
 
     def outputs(self) -> Shown:
         """See `Result.outputs`."""
-        from scenarios import console
+        from quadsim.console import console
 
         if self.page is not None:
             yield "every number, plots and films:"
@@ -139,9 +139,9 @@ def compare_flights(
         OutputError: the directory, or a film that is requested, cannot be written.
         RenderingUnavailableError: a video is requested but cannot be rendered; nothing was flown.
     """
+    from quadsim.console.console import short_path
     from quadsim.report.comparison import comparison_rows, run_names
     from quadsim.report.comparison_page import write_comparison
-    from scenarios.console import short_path
 
     whose = None if constraints is None else place_of(constraints, targets)
     check_names(names, len(targets))

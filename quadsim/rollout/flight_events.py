@@ -15,9 +15,20 @@ from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, get_args
 
-from mpc.ocp import InfeasiblePeriod
 from quadsim.controller import Controller, Diagnosable
 from quadsim.errors import InputError, ParameterError, printable
+from quadsim.mpc.ocp import InfeasiblePeriod
+from quadsim.scenarios.schema.controllers import AnyController, changed_controller
+from quadsim.scenarios.schema.events import (
+    MOST_EVENTS,
+    ControllerEvent,
+    Event,
+    SensorFaultEvent,
+    SensorText,
+    SetpointEvent,
+    first_period,
+)
+from quadsim.scenarios.schema.problems import parse_table
 from quadsim.sim.computation import Stall
 from quadsim.sim.effects import LOADING, Push
 from quadsim.sim.effects.load import Load, MassChange, PayloadDrop, PayloadPickup
@@ -27,22 +38,11 @@ from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing import SensorName
 from quadsim.state import REFERENCE_NAMES
-from scenarios.schema.controllers import AnyController, changed_controller
-from scenarios.schema.events import (
-    MOST_EVENTS,
-    ControllerEvent,
-    Event,
-    SensorFaultEvent,
-    SensorText,
-    SetpointEvent,
-    first_period,
-)
-from scenarios.schema.problems import parse_table
 
 if TYPE_CHECKING:
-    from scenarios.assembly import Assembly
-    from scenarios.courses.followed import FollowedCourse
-    from scenarios.schema.scenario import Scenario
+    from quadsim.scenarios.assembly import Assembly
+    from quadsim.scenarios.courses.followed import FollowedCourse
+    from quadsim.scenarios.schema.scenario import Scenario
 
 _DEPENDENT: Final = (ControllerEvent, PayloadDrop, PayloadPickup, SensorFaultEvent)
 """The events that depend on other parts of the scenario."""
@@ -106,7 +106,7 @@ class FlightEvents:
         return self.assembly.scenario
 
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
-        """See `scenarios.rollout.Rollout.apply`."""
+        """See `quadsim.rollout.rollout.Rollout.apply`."""
         event = self._stamped(event)
         scenario = self._with(event)
         assembly = self.assembly.of(scenario)
@@ -137,7 +137,7 @@ class FlightEvents:
         return event
 
     def successor(self, fields: Mapping[str, Any]) -> Successor:
-        """See `scenarios.rollout.Rollout.successor`."""
+        """See `quadsim.rollout.rollout.Rollout.successor`."""
         return self._built(changed_controller(self._spec, fields))
 
     def leave_course(self) -> None:

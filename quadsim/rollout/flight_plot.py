@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from quadsim.console.results import Result, Shown
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import check_names
 from quadsim.report.flight_figures import signals as draw_signals
 from quadsim.report.to_matplotlib import draw, figure_file, show_window, write_figure
-from scenarios.results import Result, Shown
 
 PAGE_WIDTH: Final = 7.16  # of a figure across both columns of a journal's page [in]; 3.5 is one column
 _WIDTHS: Final = (2.0, 20.0)  # smallest and largest [in]
@@ -37,7 +37,7 @@ class Overlay(list[Any], Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios import console
+        from quadsim.console import console
 
         if self.path is not None:
             yield console.written_to(self.path)
@@ -58,7 +58,7 @@ def plot_runs(
     out: Path | str | None = None,
     overwrite: bool = False,
 ) -> Overlay:
-    """Overlay runs; arguments and errors as `scenarios.commands.app.plot`."""
+    """Overlay runs; arguments and errors as `quadsim.commands.app.plot`."""
     if not runs:
         raise InputError("plot needs one or more flights")
     check_names(labels, len(runs), "labels")

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from quadsim.console.progress import Progress, reporting, silent
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown, plot_html
 from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import MissingPackageError, OutputError, UnknownNameError, failure_line
 from quadsim.flight import metrics, rundir
@@ -32,29 +34,27 @@ from quadsim.flight.parquet import FORMAT, log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
 from quadsim.outputs import absolute, adding, amend, to_json, writing
 from quadsim.plausibility import implausible
+from quadsim.rollout.flight_events import story
+from quadsim.rollout.machine import machine, versions
+from quadsim.scenarios.courses.csv_course import Csv
+from quadsim.scenarios.feasibility_check import report
+from quadsim.scenarios.mismatch import model_notes
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.settings import leaves
 from quadsim.sim.airframe import outline
 from quadsim.sim.estimator import Tally
 from quadsim.sim.sensing import SensorName
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
-from scenarios.courses.csv_course import Csv
-from scenarios.feasibility_check import report
-from scenarios.flight_events import story
-from scenarios.machine import machine, versions
-from scenarios.mismatch import model_notes
-from scenarios.progress import Progress, reporting, silent
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown, plot_html
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import leaves
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from mpc.ocp import InfeasiblePeriod
     from quadsim.flight.audit import FlightVerdict  # only here: Jedi completes no object with a property of a Literal
+    from quadsim.mpc.ocp import InfeasiblePeriod
     from quadsim.report.figure import Figure
-    from scenarios.assembly import Assembly
-    from scenarios.flight_plot import Overlay
+    from quadsim.rollout.flight_plot import Overlay
+    from quadsim.scenarios.assembly import Assembly
 
 _log: Final = logging.getLogger("quadsim")
 _PRODUCTS: Final = {rundir.RECORDING_FILE: "recording", rundir.FIGURES_DIR: "figures", rundir.VIDEO_FILE: "video"}
@@ -81,7 +81,7 @@ class Flight(Result):
         recorded: `summary.json` of a flight that was read; None for a new flight.
         infeasible_period: the first period whose QP had no answer; None if there is none, or the flight was read.
         own_code: whether a controller, force or autopilot flew that was passed in, which the scenario cannot repeat.
-        try_remedies: flies what the explanation of a failure suggests, see `scenarios.remedies.tried`; None for a
+        try_remedies: flies what the explanation of a failure suggests, see `quadsim.rollout.remedies.tried`; None for a
             flight that was read.
 
     Examples:
@@ -149,7 +149,7 @@ class Flight(Result):
         """Why the first QP without an answer had none, and what helps; None if all QPs had one.
 
         If all had one and a constraint does not hold, it explains the first SQP that did not converge, if any.  What is
-        advised has been flown, in `scenarios.remedies.MOST_FLOWN` flights at most; this takes seconds, once.
+        advised has been flown, in `quadsim.rollout.remedies.MOST_FLOWN` flights at most; this takes seconds, once.
 
         `sentence` and `advice` are for users; `docs/audit.md` explains the other entries.
         """
@@ -165,7 +165,7 @@ class Flight(Result):
             return self.recorded.get("diagnosis")
         if self.infeasible_period is None or (self.infeasible_period.status == NOT_CONVERGED and self.satisfied):
             return None
-        from scenarios.infeasibility import diagnose
+        from quadsim.rollout.infeasibility import diagnose
 
         spec = self.scenario.controller_at(self.infeasible_period.time)
         scenario = self.scenario.altered(controller=spec, events=())
@@ -301,7 +301,7 @@ class Flight(Result):
         Raises:
             InputError: as in `quadsim.plot`.
         """
-        from scenarios.flight_plot import plot_runs
+        from quadsim.rollout.flight_plot import plot_runs
 
         return plot_runs([self.undiagnosed_run], signals, **options)
 
@@ -402,13 +402,13 @@ class Flight(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios.commands.summary_tables import summary_tables
+        from quadsim.console.summary_tables import summary_tables
 
         return summary_tables(self.to_json())
 
     def outputs(self) -> Shown:
         """See `Result.outputs`."""
-        from scenarios import console
+        from quadsim.console import console
 
         if self.directory is None:
             return
@@ -597,7 +597,7 @@ def _add_products(
             progress("figures", 1, 1)
     interrupted = flight.log.interrupted or INTERRUPTED in failed.values()
     if requested["video"] is not False and has_periods and not interrupted:
-        from scenarios.console import short_path
+        from quadsim.console.console import short_path
 
         failed |= add_films([run], note=f"all else is in {short_path(directory)}", progress=progress, fps=fps)
     demanded = {name: requested[product] for name, product in _PRODUCTS.items()}

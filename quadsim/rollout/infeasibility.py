@@ -1,7 +1,7 @@
 """Explain why a flight's QP had no answer, in the terms and units of the scenario file, and suggest remedies.
 
 Each suggestion is a change of the file that was tried: the problem is rebuilt from the changed file and solved for the
-same period.  `scenarios.remedies` flies them.
+same period.  `quadsim.rollout.remedies` flies them.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from typing import Any, Final
 
 import numpy as np
 
-from mpc.bounded import Bounded
-from mpc.builders import build
-from mpc.constrained import Constrained
-from mpc.constraints import Origin
-from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
-from mpc.obstacles import SOFT_SPACE
-from mpc.ocp import InfeasiblePeriod
-from mpc.robust.settings import Robust
 from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import InputError
+from quadsim.mpc.bounded import Bounded
+from quadsim.mpc.builders import build
+from quadsim.mpc.constrained import Constrained
+from quadsim.mpc.constraints import Origin
+from quadsim.mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
+from quadsim.mpc.obstacles import SOFT_SPACE
+from quadsim.mpc.ocp import InfeasiblePeriod
+from quadsim.mpc.robust.settings import Robust
+from quadsim.scenarios.schema.base import fields_of
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.settings import get_field, set_field
+from quadsim.scenarios.schema.writing import plain
 from quadsim.state import N_STATES, REFERENCE_STATES
 from quadsim.ties import in_order
 from quadsim.vehicle import Vehicle
-from scenarios.schema.base import fields_of
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import get_field, set_field
-from scenarios.schema.writing import plain
 
 Settings = dict[str, Any]
 WIDER: Final = (1.0, 1.02, 1.1, 1.5)

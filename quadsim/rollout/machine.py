@@ -11,10 +11,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from quadsim.assets import models_dir
+from quadsim.assets import library_dir, models_dir
 
 PACKAGES: Final = ("mujoco", "numpy", "scipy", "piqp", "rerun-sdk", "imageio", "pyarrow", "matplotlib")
-_ROOT: Final = Path(__file__).resolve().parents[1]
+_PACKAGE: Final = Path(__file__).resolve().parents[1]
 
 
 def versions() -> dict[str, str]:
@@ -51,7 +51,7 @@ def usable_cores() -> int:
 @cache
 def code_digest() -> str:
     """Return the SHA-256 of all quadsim files that affect numbers: code, models, scenarios."""
-    return digest_below([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
+    return digest_below([_PACKAGE, library_dir(), models_dir()])
 
 
 def digest_below(roots: Iterable[Path]) -> str:

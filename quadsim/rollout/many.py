@@ -26,7 +26,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from quadsim.errors import MissingPackageError, ParameterError, QuadsimError, described
-from scenarios.machine import code_digest, usable_cores, versions
+from quadsim.rollout.machine import code_digest, usable_cores, versions
 
 Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
 FlownRows = Generator[tuple[int, Row]]
@@ -36,10 +36,10 @@ ERROR, TIMEOUT, MEMORY, DIED = "error", "timeout", "memory", "died"
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _PRELOAD: Final = (
     "quadsim",
-    "scenarios.campaign.plan",
-    "mpc.constrained",
-    "mpc.robust.controller",
-    "mpc.unconstrained",
+    "quadsim.features.campaign.plan",
+    "quadsim.mpc.constrained",
+    "quadsim.mpc.robust.controller",
+    "quadsim.mpc.unconstrained",
 )
 """Preloaded by the server that workers are forked from; the first one finds the others by their place."""
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads

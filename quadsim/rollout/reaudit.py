@@ -18,6 +18,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from quadsim.console.junit import Cases, flight_verdicts
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from quadsim.controller import MISSED, ROTORS
 from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import metrics, rundir
@@ -26,19 +28,17 @@ from quadsim.flight.log import ControlLog, FlightLog, PlantLog, columns_of
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import finding_from_json, limit_to_json
 from quadsim.report.comparison import comparison_rows
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.courses.csv_course import Csv
+from quadsim.scenarios.loading import parse_scenario
+from quadsim.scenarios.plugin import is_plugin
+from quadsim.scenarios.schema.bases import read_whole
+from quadsim.scenarios.schema.controllers import LAWS
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.settings import leaves
 from quadsim.sim.computation import physics_steps
 from quadsim.sim.effects.rotors import LagChange
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array, wrapped
-from scenarios.assembly import Assembly
-from scenarios.commands.junit import Cases, flight_verdicts
-from scenarios.courses.csv_course import Csv
-from scenarios.loading import parse_scenario
-from scenarios.plugin import is_plugin
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.schema.bases import read_whole
-from scenarios.schema.controllers import LAWS
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import leaves
 
 TABLE_FILES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
 OURS: Final = {*TABLE_FILES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
@@ -70,12 +70,12 @@ class Reaudit(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios.commands.summary_tables import summary_tables
+        from quadsim.console.summary_tables import summary_tables
 
         return summary_tables(self.to_json())
 
     def verdicts(self) -> tuple[str, Cases]:
-        """See `scenarios.commands.junit.Judged`."""
+        """See `quadsim.console.junit.Judged`."""
         return flight_verdicts(self.summary)
 
     def to_json(self) -> dict[str, Any]:
@@ -128,7 +128,7 @@ def stored_run(directory: Path) -> rundir.Run:
     Raises:
         FileError: a file is missing or damaged.
     """
-    from scenarios.commands.summary_tables import summary_tables
+    from quadsim.console.summary_tables import summary_tables
 
     run = rundir.load_run(directory)
     try:

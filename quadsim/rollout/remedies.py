@@ -12,17 +12,17 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from mpc.constrained import Constrained
-from mpc.model import SHORTEST_LAG
-from mpc.robust.settings import Robust
 from quadsim.errors import InputError
 from quadsim.flight.metrics import unrecovered
+from quadsim.mpc.constrained import Constrained
+from quadsim.mpc.model import SHORTEST_LAG
+from quadsim.mpc.robust.settings import Robust
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.infeasibility import Settings, change_text, changed_scenario
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.feasibility_check import hover_notes, hover_speeds
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
-from scenarios.assembly import Assembly
-from scenarios.feasibility_check import hover_notes, hover_speeds
-from scenarios.flown import Flight
-from scenarios.infeasibility import Settings, change_text, changed_scenario
-from scenarios.schema.scenario import Scenario
 
 FlyUntil: TypeAlias = Callable[[Assembly, float], Flight]
 
@@ -47,7 +47,7 @@ def tried(explanation: Mapping[str, Any], flight: Flight, fly: FlyUntil) -> dict
     changed the controller, or the failure is late, the advice says that it was not flown.
 
     Args:
-        explanation: of `scenarios.infeasibility.diagnose`.
+        explanation: of `quadsim.rollout.infeasibility.diagnose`.
         flight: the flight.
         fly: flies an assembly until a time [s].
     """

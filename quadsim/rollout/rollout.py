@@ -14,22 +14,22 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from quadsim.border import numbers_of
+from quadsim.console.progress import Progress, silent
 from quadsim.controller import Command, Controller, takes_targets
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import audit, smallest_margins
 from quadsim.input_limits import MOST_STEPS
+from quadsim.rollout.flight_events import FlightEvents, Successor, prepared
+from quadsim.rollout.flown import Flight
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.schema.events import ControllerEvent, Event
+from quadsim.scenarios.schema.scenario import LONGEST_FLIGHT, Scenario
 from quadsim.sim.effects import Force
 from quadsim.sim.loop import ClosedLoop, Reference, complete
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import Observation, Period, one_period
 from quadsim.sim.plant import Plant
 from quadsim.state import Array
-from scenarios.assembly import Assembly
-from scenarios.flight_events import FlightEvents, Successor, prepared
-from scenarios.flown import Flight
-from scenarios.progress import Progress, silent
-from scenarios.schema.events import ControllerEvent, Event
-from scenarios.schema.scenario import LONGEST_FLIGHT, Scenario
 
 
 def closed_loop(
@@ -122,8 +122,8 @@ class Rollout:
             scenario: the scenario to fly, or its assembly.
             law: replaces the scenario's controller.
             forces: replace the scenario's forces.
-            live: see `scenarios.commands.app.start`.
-            recorded: see `scenarios.commands.app.start`.
+            live: see `quadsim.commands.app.start`.
+            recorded: see `quadsim.commands.app.start`.
 
         Raises:
             InputError: something cannot be built.
@@ -320,7 +320,7 @@ class Rollout:
 
 
 def _try_remedies(explanation: Mapping[str, Any], flight: Flight) -> dict[str, Any]:
-    """See `scenarios.remedies.tried`."""
-    from scenarios import remedies  # late: few flights need it
+    """See `quadsim.rollout.remedies.tried`."""
+    from quadsim.rollout import remedies  # late: few flights need it
 
     return remedies.tried(explanation, flight, lambda assembly, until: Rollout(assembly).fly(until=until))

@@ -14,13 +14,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from mpc.baselines.geometric import Geometric
-from mpc.bounded import Bounded, Weighted
-from mpc.builders import build, stated
-from mpc.flatness import motion_along
-from mpc.nonlinear.settings import Nonlinear
-from mpc.pilot import Pilot
-from mpc.solvers import ALIASES
 from quadsim.assets import vehicle_path
 from quadsim.border import user_code
 from quadsim.controller import CORE, ROTORS, Iterating
@@ -28,7 +21,23 @@ from quadsim.errors import InputError, ParameterError, QuadsimError
 from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
 from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance, touching_speed
+from quadsim.mpc.baselines.geometric import Geometric
+from quadsim.mpc.bounded import Bounded, Weighted
+from quadsim.mpc.builders import build, stated
+from quadsim.mpc.flatness import motion_along
+from quadsim.mpc.nonlinear.settings import Nonlinear
+from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.solvers import ALIASES
 from quadsim.rotation import body_to_euler_rates
+from quadsim.scenarios.courses.course import Course, repeated
+from quadsim.scenarios.courses.csv_course import Csv
+from quadsim.scenarios.courses.followed import FollowedCourse
+from quadsim.scenarios.courses.steps import Steps, switches
+from quadsim.scenarios.limits import audit_notes, flyable, signal_limits, space_limits, sum_limits, with_law_bounds
+from quadsim.scenarios.plugin import Plugin, import_plugin, make_force, reason_of
+from quadsim.scenarios.schema.events import ControllerEvent, Event, SensorFaultEvent, SetpointEvent
+from quadsim.scenarios.schema.problems import parse_table
+from quadsim.scenarios.schema.writing import plain
 from quadsim.sim.airframe import outline
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings, built_in_lags, identify_lags
 from quadsim.sim.computation import Computation, ComputationTime, Stall, not_measured
@@ -62,23 +71,14 @@ from quadsim.vehicle import (
     overridden,
     vehicle_autopilot,
 )
-from scenarios.courses.course import Course, repeated
-from scenarios.courses.csv_course import Csv
-from scenarios.courses.followed import FollowedCourse
-from scenarios.courses.steps import Steps, switches
-from scenarios.limits import audit_notes, flyable, signal_limits, space_limits, sum_limits, with_law_bounds
-from scenarios.plugin import Plugin, import_plugin, make_force, reason_of
-from scenarios.schema.events import ControllerEvent, Event, SensorFaultEvent, SetpointEvent
-from scenarios.schema.problems import parse_table
-from scenarios.schema.writing import plain
 
 if TYPE_CHECKING:
-    from mpc.ocp import Problem
     from quadsim.controller import AutopilotLoop, Controller
     from quadsim.flight.audit import Limit, SpaceLimit
     from quadsim.motion import Motion
-    from scenarios.schema.controllers import AnyController
-    from scenarios.schema.scenario import Scenario, VehicleTable
+    from quadsim.mpc.ocp import Problem
+    from quadsim.scenarios.schema.controllers import AnyController
+    from quadsim.scenarios.schema.scenario import Scenario, VehicleTable
 
 _SIZES: Final = {
     "rotor_rise": ("rotors", "rise", RotorDynamics),
@@ -421,7 +421,7 @@ class Assembly:
         return controller, tuple(changed.get(id(event), event) for event in self.scenario.events)
 
     def _stated_law(self, spec: AnyController) -> AnyController:
-        """See `mpc.builders.stated`."""
+        """See `quadsim.mpc.builders.stated`."""
         shapes = (*self.scenario.obstacles, *self.regions)
         return stated(spec, self.vehicle, self.scenario.control_period, shapes)
 
@@ -461,7 +461,7 @@ class Assembly:
         """
         spec = self.scenario.controller
         if not isinstance(spec, Weighted):
-            from scenarios.schema.controllers import TABLES
+            from quadsim.scenarios.schema.controllers import TABLES
 
             linear = [name for name, table in TABLES.items() if issubclass(table, Weighted)]
             rule = f"one that solves a linear problem over a horizon: {', '.join(linear)}"
@@ -470,7 +470,7 @@ class Assembly:
 
     @cached_property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """The controller's bounds on signals of the audit, see `mpc.bounded.ControllerTable.audited`."""
+        """The controller's bounds on signals of the audit, see `quadsim.mpc.bounded.ControllerTable.audited`."""
         return self.scenario.controller.audited(self.vehicle)
 
     @cached_property
@@ -501,7 +501,7 @@ class Assembly:
 
     @property
     def audit_notes(self) -> list[str]:
-        """Notes on the audit, see `scenarios.limits.audit_notes`."""
+        """Notes on the audit, see `quadsim.scenarios.limits.audit_notes`."""
         return audit_notes(self.scenario, self.vehicle, self._flyable, audited=bool(self.limits))
 
     def computation(self, spec: AnyController | None = None) -> Computation | None:

@@ -8,12 +8,12 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias, get_args
 
-from quadsim.assets import read_toml, vehicle_names, vehicle_path
+from quadsim.assets import library_dir, read_toml, vehicle_names, vehicle_path
+from quadsim.console.results import Result, Shown
 from quadsim.errors import FileError, UnknownNameError
 from quadsim.outputs import SUMMARY_FILE
-from scenarios.results import Result, Shown
 
-_LIBRARY: Final = Path(__file__).resolve().parent / "library"
+_LIBRARY: Final = library_dir()
 FLIGHTS, CAMPAIGNS, PAPERS = (_LIBRARY / name for name in ("flights", "campaigns", "papers"))
 VARIANTS: Final = _LIBRARY / "variants.toml"
 
@@ -155,7 +155,7 @@ class Catalogue(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`; a variant stands below its base, indented."""
-        from scenarios import console
+        from quadsim.console import console
 
         groups: dict[str, dict[str, str]] = {f"scenarios: {group}": {} for group in get_args(Group)}
         bases = {name: entry.variant.base for name, entry in self.scenarios.items() if entry.variant is not None}
@@ -183,7 +183,7 @@ class Catalogue(Result):
 
 def read_catalogue() -> Catalogue:
     """Read everything shipped, without checking the files."""
-    from mpc.solvers import solver_entries
+    from quadsim.mpc.solvers import solver_entries
     from quadsim.vehicle import load_vehicle
 
     scenarios = {}

@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mpc.bounded import Bounded
-from mpc.robust.settings import Robust
 from quadsim.errors import ParameterError
 from quadsim.flight.audit import Mask
 from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
+from quadsim.mpc.bounded import Bounded
+from quadsim.mpc.robust.settings import Robust
+from quadsim.scenarios.courses.course import Course
+from quadsim.scenarios.courses.csv_course import Csv
+from quadsim.scenarios.courses.smoothing import within_rounding
+from quadsim.scenarios.schema.events import SetpointEvent, first_period
 from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import Vehicle, span
-from scenarios.courses.course import Course
-from scenarios.courses.csv_course import Csv
-from scenarios.courses.smoothing import within_rounding
-from scenarios.schema.events import SetpointEvent, first_period
 
 if TYPE_CHECKING:
-    from scenarios.assembly import Assembly
-    from scenarios.schema.scenario import Scenario
+    from quadsim.scenarios.assembly import Assembly
+    from quadsim.scenarios.schema.scenario import Scenario
 
 
 def report(assembly: Assembly) -> Feasibility:

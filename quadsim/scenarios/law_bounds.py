@@ -9,13 +9,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from mpc.constraints import Bounds, Constraint
-from mpc.ocp import Problem
 from quadsim.errors import InputError
 from quadsim.flight.audit import SUM, TERM_SIGNALS, Limit
+from quadsim.mpc.constraints import Bounds, Constraint
+from quadsim.mpc.ocp import Problem
+from quadsim.scenarios.schema.problems import parse_table
 from quadsim.state import N_STATES, STATE_NAMES, STATE_UNITS, Array, shown_unit
 from quadsim.vehicle import N_ROTORS
-from scenarios.schema.problems import parse_table
 
 _SOURCES: Final = ("problem", "bounds", "constraints")
 _SPEEDS: Final = tuple(f"speed_{j + 1}" for j in range(N_ROTORS))
@@ -26,8 +26,9 @@ def law_limits(law: object, taken: Iterable[str] = ()) -> list[Limit]:
     """Return what a user's controller says of its bounds, as limits with distinct names.
 
     Args:
-        law: has none, one or more of `problem`, an `mpc.Problem`; `bounds`, an `mpc.Bounds` or pairs by signal, in the
-            units of the audit; `constraints`, a list of `mpc.Constraint` or of entries as in `[[constraints]]`.
+        law: has none, one or more of `problem`, a `quadsim.mpc.Problem`; `bounds`, a `quadsim.mpc.Bounds` or pairs by
+            signal, in the units of the audit; `constraints`, a list of `quadsim.mpc.Constraint` or of entries as in
+            `[[constraints]]`.
         taken: names that are not free.
     """
     names, limits = set(taken), dict[tuple[Any, ...], Limit]()

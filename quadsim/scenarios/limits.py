@@ -12,18 +12,18 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from mpc.bounded import Range
-from mpc.pilot import Pilot
 from quadsim.controller import Controller
 from quadsim.flight.audit import SUM, UNAUDITED_ADVICE, Limit, SpaceLimit
+from quadsim.mpc.bounded import Range
+from quadsim.mpc.pilot import Pilot
 from quadsim.report.table import format_number
+from quadsim.scenarios.law_bounds import law_limits
+from quadsim.scenarios.plugin import PluginController
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.vehicle import Vehicle
-from scenarios.law_bounds import law_limits
-from scenarios.plugin import PluginController
 
 if TYPE_CHECKING:
-    from scenarios.schema.scenario import Scenario
+    from quadsim.scenarios.schema.scenario import Scenario
 
 
 def signal_limits(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit]:

@@ -9,22 +9,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from quadsim.console.results import Document
 from quadsim.errors import FileError, InputError
-from scenarios.assembly import Assembly
-from scenarios.catalogue import scenario_names, scenario_source, source_label
-from scenarios.courses.csv_course import Csv
-from scenarios.results import Document
-from scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
-from scenarios.schema.problems import ScenarioError
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import apply_setting
-from scenarios.schema.writing import plain
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import scenario_names, scenario_source, source_label
+from quadsim.scenarios.courses.csv_course import Csv
+from quadsim.scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
+from quadsim.scenarios.schema.problems import ScenarioError
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.settings import apply_setting
+from quadsim.scenarios.schema.writing import plain
 
 
 def load_scenario(
     source: Scenario | str | Path, changes: Mapping[str, Any] | Sequence[str] = (), seed: int | None = None
 ) -> Scenario:
-    """Return the scenario of `assemble`; see `scenarios.commands.app.load`."""
+    """Return the scenario of `assemble`; see `quadsim.commands.app.load`."""
     return assemble(source, changes, seed).scenario
 
 

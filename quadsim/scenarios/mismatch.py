@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from mpc.bounded import Weighted, resolved_lag
-from mpc.model import SHORTEST_LAG
-from mpc.nonlinear.settings import Nonlinear
-from mpc.robust.settings import Robust
 from quadsim.controller import ROTORS
+from quadsim.mpc.bounded import Weighted, resolved_lag
+from quadsim.mpc.model import SHORTEST_LAG
+from quadsim.mpc.nonlinear.settings import Nonlinear
+from quadsim.mpc.robust.settings import Robust
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.schema.controllers import AnyController
 from quadsim.sim.effects.rotors import RotorDynamics
-from scenarios.assembly import Assembly
-from scenarios.schema.controllers import AnyController
 
 
 def model_notes(assembly: Assembly) -> list[str]:

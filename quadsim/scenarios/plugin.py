@@ -25,8 +25,6 @@ from typing import Annotated, Any, Final
 import numpy as np
 from annotated_types import doc
 
-from mpc.bounded import ControllerTable, Horizon, law_of
-from mpc.obstacles import Shape
 from quadsim import border
 from quadsim.border import numbers_of, user_code
 from quadsim.controller import (
@@ -53,11 +51,13 @@ from quadsim.errors import (
     printable,
 )
 from quadsim.fields import is_plain
+from quadsim.mpc.bounded import ControllerTable, Horizon, law_of
+from quadsim.mpc.obstacles import Shape
 from quadsim.outputs import digest_of
+from quadsim.scenarios.catalogue import CONTROLLERS
 from quadsim.sim.effects import Force
 from quadsim.state import Array, State
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.catalogue import CONTROLLERS
 
 FORM: Final = "package.module:Class"  # form of a controller's name
 ENTRY_POINTS: Final = "quadsim.controllers"
@@ -166,7 +166,7 @@ class PluginController:
 
     @property
     def infeasible_period(self) -> object:
-        """The first problem without an answer, an `mpc.InfeasiblePeriod`, if the law keeps one."""
+        """The first problem without an answer, a `quadsim.mpc.InfeasiblePeriod`, if the law keeps one."""
         try:
             with user_code(lambda error: InputError(reason_of(error))):
                 return _optional(lambda: self.law.infeasible_period, None)

@@ -6,12 +6,12 @@ from html import escape
 
 import numpy as np
 
+from quadsim.console.results import plot_html
 from quadsim.errors import InputError
 from quadsim.palette import COLOUR
 from quadsim.report.figure import Figure, Panel, Series
-from scenarios.loading import assemble
-from scenarios.results import plot_html
-from scenarios.schema.scenario import Scenario
+from quadsim.scenarios.loading import assemble
+from quadsim.scenarios.schema.scenario import Scenario
 
 
 def scenario_html(scenario: Scenario) -> str:

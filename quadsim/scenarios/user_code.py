@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from mpc.pilot import Pilot
 from quadsim.border import numbers_of, user_code
 from quadsim.controller import AutopilotLoop, Controller
 from quadsim.errors import InputError, ParameterError
+from quadsim.mpc.pilot import Pilot
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.courses.csv_course import LARGEST_NUMBER, tabulated
+from quadsim.scenarios.plugin import import_plugin, make_force, make_law, reason_of, refer_to, require_importable
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.writing import plain
 from quadsim.sim.effects import Force
 from quadsim.state import Array
-from scenarios.assembly import Assembly
-from scenarios.courses.csv_course import LARGEST_NUMBER, tabulated
-from scenarios.plugin import import_plugin, make_force, make_law, reason_of, refer_to, require_importable
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.writing import plain
 
 
 def named(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:

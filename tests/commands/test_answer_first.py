@@ -11,9 +11,9 @@ import tomlkit
 from flown_logs import fly_eight, write_log
 
 import quadsim
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE, EXIT_WRONG_INPUT
 from quadsim.errors import OutputError
-from scenarios.commands.cli import main
-from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
 
 SHORT = ("--set", "duration=0.5", "--set", "constraints=[]")
 MASS = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "grid", "values": [3.9, 4.0, 4.1]}
@@ -51,7 +51,7 @@ def test_a_campaign_whose_figure_fails_has_its_summary_its_page_and_a_line(
 def test_a_campaign_whose_report_fails_is_complete_all_the_same(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("scenarios.campaign.campaign_report.render_page", fail)
+    monkeypatch.setattr("quadsim.features.campaign.campaign_report.render_page", fail)
     (here / "c.toml").write_text(tomlkit.dumps(CAMPAIGN), encoding="utf-8")
     assert main(["campaign", "c.toml", "--out", "c", "--workers", "1"]) == EXIT_DONE
     assert "quadsim: the report failed: ValueError: no LaTeX" in capsys.readouterr().err.splitlines()
@@ -73,7 +73,7 @@ def test_runs_and_their_comparison_stand_without_figures(here: Path, capsys: pyt
 @pytest.mark.parametrize(
     ("command", "broken", "shown"),
     [
-        (("check", "hover", *SHORT, "--junit", "v.xml"), "scenarios.commands.junit.write_junit", "verdict"),
+        (("check", "hover", *SHORT, "--junit", "v.xml"), "quadsim.console.junit.write_junit", "verdict"),
         (("compare", "r", "r", "--out", "pair"), "quadsim.report.comparison_page.render_page", "outcome"),
         (("vehicle", "hummingbird", "--out", "v.png"), "quadsim.report.vehicle_drawing.write_figure", "hummingbird"),
     ],
@@ -99,7 +99,7 @@ def test_an_output_that_was_asked_for_and_fails_comes_after_the_result_and_decid
 @pytest.mark.slow("identification")
 def test_an_identified_vehicle_is_written_before_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_log(fly_eight("hummingbird"), tmp_path / "eight.csv")
-    monkeypatch.setattr("scenarios.identify.report._render", fail)
+    monkeypatch.setattr("quadsim.features.identify.report._render", fail)
     files = {"out": tmp_path / "mine.toml", "page": tmp_path / "mine.html"}
     with pytest.raises(OutputError, match=r"mine\.html: failed: ValueError: no LaTeX") as caught:
         quadsim.identify(tmp_path / "eight.csv", vehicle="hummingbird", **files)

@@ -17,17 +17,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mpc
 import quadsim
 import quadsim.gym
+from quadsim import mpc
 from quadsim.controller import StepInputs
 from quadsim.errors import InputError, OutputError, ParameterError, RenderingUnavailableError, UnknownNameError
 from quadsim.flight import rundir
 from quadsim.report.film.video import rendering_backend
+from quadsim.rollout.flown import Flight
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.flown import Flight
-from scenarios.schema.scenario import Scenario
 
 Fly = Callable[..., Flight]
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -79,7 +79,7 @@ def test_every_docstring_has_an_example_that_runs(
         except RenderingUnavailableError as error:
             pytest.skip(str(error))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("scenarios.rollout.Rollout.fly", fly_known)
+    monkeypatch.setattr("quadsim.rollout.rollout.Rollout.fly", fly_known)
     public = functools.reduce(getattr, name.split("."), quadsim)
     runner = doctest.DocTestRunner(verbose=False)
     for example in doctest.DocTestFinder().find(public, name, module=sys.modules[public.__module__]):
@@ -90,7 +90,7 @@ def test_every_docstring_has_an_example_that_runs(
 
 def test_the_pages_of_the_api_have_every_name() -> None:
     page = "".join(path.read_text(encoding="utf-8") for path in (EXAMPLES.parent / "docs").glob("api*.md"))
-    named = set(re.findall(r"^::: ((?:quadsim|quadsim\.gym|mpc)\.\w+)$", page, re.MULTILINE))
+    named = set(re.findall(r"^::: ((?:quadsim|quadsim\.gym|quadsim\.mpc)\.\w+)$", page, re.MULTILINE))
     subpackages = {name for name in mpc.__all__ if isinstance(getattr(mpc, name), ModuleType)}
     handed_out = {quadsim: {*quadsim.__all__}, quadsim.gym: {*quadsim.gym.__all__}, mpc: {*mpc.__all__} - subpackages}
     assert named == {f"{package.__name__}.{name}" for package, names in handed_out.items() for name in names}

@@ -14,22 +14,22 @@ from xml.etree import ElementTree
 import pytest
 
 import quadsim
-from mpc.core import solver
-from mpc.solvers import SOLVERS, solver_entries
 from quadsim import __version__
 from quadsim.assets import vehicle_names
+from quadsim.commands.app import app
+from quadsim.commands.cli import main
+from quadsim.commands.doctor import capabilities
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from quadsim.core import library
 from quadsim.core.build import LIBRARY
 from quadsim.errors import OutputError, RenderingUnavailableError
+from quadsim.features.campaign.plan import read_campaign
 from quadsim.flight import rundir
-from scenarios import flown
-from scenarios.campaign.plan import read_campaign
-from scenarios.catalogue import campaign_names, scenario_names, variants
-from scenarios.commands.app import app
-from scenarios.commands.cli import main
-from scenarios.commands.doctor import capabilities
-from scenarios.loading import load_scenario
-from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
+from quadsim.mpc.core import solver
+from quadsim.mpc.solvers import SOLVERS, solver_entries
+from quadsim.rollout import flown
+from quadsim.scenarios.catalogue import campaign_names, scenario_names, variants
+from quadsim.scenarios.loading import load_scenario
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
 SHORT = ("--set", "duration=0.5")
@@ -178,8 +178,8 @@ def test_doctor_reports_a_package_that_does_not_work_and_the_rest(monkeypatch: p
     def broken(self: object, qp: object) -> None:
         raise RuntimeError("libdaqp.so is of another machine")
 
-    monkeypatch.setattr("mpc.solvers.daqp.DaqpDense.setup", broken)
-    monkeypatch.setattr("scenarios.commands.doctor._rendering", lambda: 1 / 0)
+    monkeypatch.setattr("quadsim.mpc.solvers.daqp.DaqpDense.setup", broken)
+    monkeypatch.setattr("quadsim.commands.doctor._rendering", lambda: 1 / 0)
     checks = capabilities()
     assert checks["solvers"]["daqp"] == "fails: RuntimeError: libdaqp.so is of another machine"
     assert checks["rendering"]["video"] == "fails: ZeroDivisionError: division by zero"
@@ -443,7 +443,7 @@ def test_a_film_asked_for_by_name_is_refused_before_anything_is_flown_where_noth
 
     monkeypatch.setattr("quadsim.report.film.video.rendering_backend", nothing_renders)
     with monkeypatch.context() as grounded:
-        grounded.setattr("scenarios.rollout.Rollout.fly", flown)
+        grounded.setattr("quadsim.rollout.rollout.Rollout.fly", flown)
         assert main(["run", "hover", "--video"]) == EXIT_WRONG_INPUT
     printed = capsys.readouterr()
     assert printed.err.startswith(

@@ -7,8 +7,8 @@ import shlex
 
 import pytest
 
-from scenarios.commands.app import app
-from scenarios.commands.cli import main
+from quadsim.commands.app import app
+from quadsim.commands.cli import main
 
 COMMANDS = [
     "campaign",

@@ -14,8 +14,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from quadsim.flight import rundir
-from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 pytestmark = pytest.mark.slow("process")
 
@@ -34,7 +34,7 @@ def environment() -> dict[str, str]:
 @pytest.mark.witness("process")
 def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0() -> None:
     """`quadsim list | true`."""
-    command = [sys.executable, "-m", "scenarios.commands.entry", "list"]
+    command = [sys.executable, "-m", "quadsim.commands.entry", "list"]
     process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stderr is not None
@@ -50,7 +50,7 @@ HELD = "import numpy as np\ndef held(now, state, reference):\n    import random\
 @pytest.fixture
 def trapped(tmp_path: Path) -> Path:
     """A folder with a file of the name of every module there is, which notes that it was executed."""
-    modules = {*sys.stdlib_module_names, *metadata.packages_distributions(), "quadsim", "mpc", "scenarios"}
+    modules = {*sys.stdlib_module_names, *metadata.packages_distributions(), "quadsim"}
     for name in modules - {"__main__"}:
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'a').write(__name__ + '\\n')\n")
     return tmp_path
@@ -91,7 +91,7 @@ def listening() -> None:
 @pytest.mark.parametrize("closed", [(1,), (0, 2)])
 def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "scenarios.commands.entry", "run", "hover", *TABLES, *SHORT, "--out", "run"],
+        [sys.executable, "-m", "quadsim.commands.entry", "run", "hover", *TABLES, *SHORT, "--out", "run"],
         cwd=tmp_path,
         env=environment(),
         capture_output=True,
@@ -112,7 +112,7 @@ def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path) -> N
         [
             sys.executable,
             "-m",
-            "scenarios.commands.entry",
+            "quadsim.commands.entry",
             "run",
             "hover",
             *TABLES,
@@ -168,7 +168,7 @@ def stopped(*arguments, **options):
 setattr(module, name, stopped)
 if name == "shutdown":
     atexit.register(stopped)
-from scenarios.commands.entry import main
+from quadsim.commands.entry import main
 sys.exit(main())
 """
 """A command line that gets a signal where a function is called first."""
@@ -177,12 +177,12 @@ sys.exit(main())
 @pytest.mark.parametrize(
     ("place", "caught"),
     [
-        ("scenarios.flown.write_log", ""),
+        ("quadsim.rollout.flown.write_log", ""),
         ("quadsim.report.recording.write_recording", ""),
         ("quadsim.report.flight_figures.write_figures", ""),
         pytest.param("quadsim.report.flight_figures.write_figures", "caught", marks=pytest.mark.witness("process")),
-        ("scenarios.flown.amend", ""),
-        ("scenarios.console.show", ""),
+        ("quadsim.rollout.flown.amend", ""),
+        ("quadsim.console.console.show", ""),
         ("logging.shutdown", ""),
     ],
 )
@@ -215,7 +215,7 @@ def test_a_command_that_is_stopped_never_ends_with_0_and_keeps_what_is_finished(
 
 def test_a_run_that_is_stopped_at_any_moment_ends_with_another_status_than_0(tmp_path: Path) -> None:
     def started(place: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "scenarios.commands.entry", "run", "hover", "--no-video", *SHORT]
+        command = [sys.executable, "-m", "quadsim.commands.entry", "run", "hover", "--no-video", *SHORT]
         (tmp_path / place).mkdir()
         return subprocess.Popen(
             [*command, "--out", "run"],
@@ -250,7 +250,7 @@ def test_a_run_that_is_stopped_at_any_moment_ends_with_another_status_than_0(tmp
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full to write to")
 def test_output_that_cannot_be_written_is_reported() -> None:
     with Path("/dev/full").open("w") as full:
-        command = [sys.executable, "-m", "scenarios.commands.entry", "list", "--json"]
+        command = [sys.executable, "-m", "quadsim.commands.entry", "list", "--json"]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     assert done.stderr == "quadsim: cannot write the output: No space left on device\n"
     assert done.returncode == EXIT_WRONG_INPUT

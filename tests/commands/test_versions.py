@@ -14,10 +14,10 @@ import pytest
 from support import NO_PRODUCTS
 
 import quadsim
+from quadsim.commands.cli import main
 from quadsim.errors import FileError
 from quadsim.flight.parquet import FORMAT
-from scenarios.commands.cli import main
-from scenarios.reaudit import reaudit
+from quadsim.rollout.reaudit import reaudit
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,12 @@ import pytest
 from rich.console import RenderableType
 from rich.text import Text
 
+from quadsim.console import console
+from quadsim.console.junit import write_cases
+from quadsim.console.summary_tables import audit_table, summary_tables
 from quadsim.errors import printable
 from quadsim.flight.rundir import findings_of
 from quadsim.report.table import Cell, Grid, Mark, QuantityRow, short_number, to_markdown
-from scenarios import console
-from scenarios.commands.junit import write_cases
-from scenarios.commands.summary_tables import audit_table, summary_tables
 
 NASTY = ("[/bold]", "[link=file:///decoy]x[/link]", "\x1b[2J\x1b]0;title\x07", "a\r\nquadsim: all is well", "\ud800")
 

@@ -8,17 +8,17 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from scenarios import console
-from scenarios.campaign.campaign import CampaignProgress
-from scenarios.campaign.watching import watching
-from scenarios.console import PlainConsole
-from scenarios.progress import reporting
+from quadsim.console import console
+from quadsim.console.console import PlainConsole
+from quadsim.console.progress import reporting
+from quadsim.features.campaign.campaign import CampaignProgress
+from quadsim.features.campaign.watching import watching
 
 
 @pytest.fixture
 def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], list[str]]]:
     """Has a line come often, and returns the lines once two more have come."""
-    monkeypatch.setattr("scenarios.progress.LINE_EVERY", 0.02)
+    monkeypatch.setattr("quadsim.console.progress.LINE_EVERY", 0.02)
     shown = io.StringIO()
     monkeypatch.setattr(console, "stderr", lambda: PlainConsole(stderr=True, file=shown))
 
@@ -44,7 +44,7 @@ def test_elsewhere_lines_say_what_is_done_however_long_it_takes(lines: Callable[
 
 
 def test_no_progress_is_silent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("scenarios.progress.LINE_EVERY", 0.01)
+    monkeypatch.setattr("quadsim.console.progress.LINE_EVERY", 0.01)
     with reporting(False) as report:
         report("flight", 1, 2)
         clock.sleep(0.1)

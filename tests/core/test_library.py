@@ -15,7 +15,7 @@ from quadsim.core.build import LIBRARY, PLATFORM, TARGETS, ZIG, CompilationError
 from quadsim.core.library import load_from, load_library
 from quadsim.errors import FileError
 
-ANSWER = "mpc/core/c/answer.c"
+ANSWER = "quadsim/mpc/core/c/answer.c"
 
 
 @pytest.fixture
@@ -211,4 +211,4 @@ def test_the_script_prints_the_library_or_all_that_the_compiler_says(tree: Path)
 def test_this_library_is_of_these_sources() -> None:
     assert load_library() is load_library()
     assert build.is_current()
-    assert library.ROOT == build.ROOT == Path(__file__).parents[3]
+    assert library.ROOT == build.ROOT == Path(__file__).parents[2]

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from mpc.codegen.ctext import Precision
-from mpc.codegen.targets import TARGETS
-from scenarios.export.exporter import export
-from scenarios.loading import load_scenario
+from quadsim.features.export.exporter import export
+from quadsim.mpc.codegen.ctext import Precision
+from quadsim.mpc.codegen.targets import TARGETS
+from quadsim.scenarios.loading import load_scenario
 
 Answer = tuple[str, ...]
 """Number, status, changes, four commands, ticks, as main.c prints them."""

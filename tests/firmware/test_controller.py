@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from exported_c import HOST, Host, Reply, replay
 
-from mpc.codegen.ctext import Precision
-from mpc.fallback.structs import STATUSES
+from quadsim.features.export.exporter import c_controller
+from quadsim.features.export.record import REFUSED, Recording, record
+from quadsim.mpc.codegen.ctext import Precision
+from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import Array
-from scenarios.export.exporter import c_controller
-from scenarios.export.record import REFUSED, Recording, record
-from scenarios.loading import load_scenario
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 

@@ -11,9 +11,9 @@ import pytest
 from exported_c import Host, replay
 from fly.build import CONTROLLERS, build, missing
 
-from scenarios.export.record import record
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
+from quadsim.features.export.record import record
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
 
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PHONE = {"width": 390, "height": 844}

@@ -16,16 +16,16 @@ from firmware.test_fuzz import HANGS, HERE, SANITIZERS
 from firmware.test_static import ALLOWED, CPPCHECK, EXPORTS, TIDY, WARNINGS, undefined
 
 import quadsim
-from mpc.codegen.ctext import Precision
-from mpc.codegen.geometric import CGeometric
-from mpc.codegen.targets import TARGETS
-from mpc.fallback.structs import STATUSES
 from quadsim.errors import ExportError, ParameterError
+from quadsim.features.export.exporter import c_controller, export
+from quadsim.features.export.in_the_loop import fly_exported
+from quadsim.mpc.codegen.ctext import Precision
+from quadsim.mpc.codegen.geometric import CGeometric
+from quadsim.mpc.codegen.targets import TARGETS
+from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import make_state
-from scenarios.assembly import Assembly
-from scenarios.export.exporter import c_controller, export
-from scenarios.export.in_the_loop import fly_exported
-from scenarios.schema.scenario import Scenario
 
 FED_FORWARD = {"feedforward": True, "disturbance": {}, "drag": [0.3, 0.2, 0.1], "integral": True}
 """With the autopilot scenario's motion as its reference."""

@@ -14,25 +14,25 @@ import numpy as np
 import pytest
 from exported_c import PHASES, Host
 
-from mpc.answer import ActuatorBounds
-from mpc.builders import guard_of
-from mpc.codegen import source
-from mpc.equilibrium import Trim
-from mpc.fallback.structs import STATUSES
-from mpc.heading import advance
-from mpc.linear import LinearMPC
-from mpc.model import LinearModel
-from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.settings import Nonlinear
 from quadsim.controller import Command, StepInputs
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.builders import guard_of
+from quadsim.mpc.codegen import source
+from quadsim.mpc.equilibrium import Trim
+from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.mpc.heading import advance
+from quadsim.mpc.linear import LinearMPC
+from quadsim.mpc.model import LinearModel
+from quadsim.mpc.nonlinear.controller import NonlinearMPC
+from quadsim.mpc.nonlinear.settings import Nonlinear
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario
-from scenarios.schema.scenario import Scenario
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
-HEADER = Path(__file__).parents[2] / "mpc" / "core" / "c" / "quadsim_guard.h"
+HEADER = Path(__file__).parents[2] / "quadsim" / "mpc" / "core" / "c" / "quadsim_guard.h"
 TOLD = ("max_iterations", "no_room")
 """Failures of the C alone: in Python PIQP answers instead."""
 SHORT = {"controller.fallback": {"unseen": 0.4, "hover": 0.5, "plan_age": 0.5}}

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import quadsim
-from mpc.codegen.targets import TARGETS
+from quadsim.commands.cli import main
 from quadsim.errors import FlightError, MissingProgramError
+from quadsim.features.export.in_the_loop import Frames, Program, SerialMPC, fly_exported, require_programs
+from quadsim.mpc.codegen.targets import TARGETS
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings
-from scenarios.commands.cli import main
-from scenarios.export.in_the_loop import Frames, Program, SerialMPC, fly_exported, require_programs
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
 
 CASES = {
     "double": ("cortex-m7", "double", "paper-constrained", 1e-6),

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from firmware.conftest import Answers, Export, Run
 
-from mpc.fallback.structs import STATUSES
 from quadsim.assets import vehicle_path
+from quadsim.features.export.in_the_loop import Frames, QueryKind, Reply, SerialMPC, make_program
+from quadsim.features.export.record import Recording, record
+from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import Array
 from quadsim.vehicle import load_vehicle
-from scenarios.export.in_the_loop import Frames, QueryKind, Reply, SerialMPC, make_program
-from scenarios.export.record import Recording, record
-from scenarios.loading import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "examples"))

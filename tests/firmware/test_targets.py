@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from firmware.conftest import Answer, Answers, Export, Measured, Run, defines_of, sources_of
 
-from mpc.codegen.targets import INSTRUCTIONS_PER_TICK, TARGETS
-from scenarios.export.in_the_loop import make_program
+from quadsim.features.export.in_the_loop import make_program
+from quadsim.mpc.codegen.targets import INSTRUCTIONS_PER_TICK, TARGETS
 
 HERE = Path(__file__).parent
 BOARDS = [name for name, target in TARGETS.items() if target.board]

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 from uneven import uneven
 
-from mpc.allocation import Allocation, allocate, make_allocation, thrust_to_command
 from quadsim.assets import vehicle_path
+from quadsim.mpc.allocation import Allocation, allocate, make_allocation, thrust_to_command
 from quadsim.vehicle import load_vehicle
 
 VEHICLES = {name: load_vehicle(vehicle_path(name)) for name in ("lopes2011", "hummingbird", "crazyflie2")}

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import paper_problem
 
-from mpc.answer import BOUND_TOLERANCE, ActuatorBounds, rejection, shifted
-from mpc.constraints import Constraint, Penalty
-from mpc.ocp import Problem
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.errors import ParameterError
+from quadsim.mpc.answer import BOUND_TOLERANCE, ActuatorBounds, rejection, shifted
+from quadsim.mpc.constraints import Constraint, Penalty
+from quadsim.mpc.ocp import Problem
 from quadsim.state import Array
 
 HOVER = np.full(4, 190.0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support import paper_problem, random_axes, random_problem
 
-from mpc.core.axes import Axis, axes
-from mpc.ocp import Problem
+from quadsim.mpc.core.axes import Axis, axes
+from quadsim.mpc.ocp import Problem
 from quadsim.state import STATE_NAMES, Array
 
 QUADROTOR = {("x", "vx", "pitch", "pitch_rate"), ("y", "vy", "roll", "roll_rate")}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from support import constrained_mpc, paper_problem, paper_reference
 
-from mpc.ocp import Query
-from mpc.solvers import INVALID_DATA, Answer, QPSolver
 from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import PlanExhaustedError
+from quadsim.mpc.ocp import Query
+from quadsim.mpc.solvers import INVALID_DATA, Answer, QPSolver
 
 STATE = np.zeros(12)
 STATE[10] = np.pi / 6

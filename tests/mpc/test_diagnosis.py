@@ -11,10 +11,10 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from support import changing_period, fewer, random_problem, with_terms
 
-from mpc.constraints import Constraint, Penalty
-from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
-from mpc.model import LinearModel
-from mpc.ocp import InfeasiblePeriod, Objective, Problem, Query
+from quadsim.mpc.constraints import Constraint, Penalty
+from quadsim.mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
+from quadsim.mpc.model import LinearModel
+from quadsim.mpc.ocp import InfeasiblePeriod, Objective, Problem, Query
 
 TERMS = ((), ("constraints",), ("margins", "constraints"), ("soft",), ("soft", "margins", "constraints", "P", "Q_d"))
 NEAR = 1e-4

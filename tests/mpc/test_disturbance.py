@@ -11,8 +11,8 @@ from numpy_ramp import NumpyRamp
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import hat
-from mpc.disturbance import RampObserver, RampSettings
+from quadsim.mpc.baselines.attitude import hat
+from quadsim.mpc.disturbance import RampObserver, RampSettings
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from support import derivative
 
-from mpc.equilibrium import LEAST_LIFT, equilibrium, twisted
-from mpc.heading import turn_horizontally
-from mpc.nonlinear.model import nonlinear_model
+from quadsim.mpc.equilibrium import LEAST_LIFT, equilibrium, twisted
+from quadsim.mpc.heading import turn_horizontally
+from quadsim.mpc.nonlinear.model import nonlinear_model
 from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle
 

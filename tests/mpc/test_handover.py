@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from quadsim.flight.log import FlightLog
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import Array
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
 
 DISTURBED = ["effects.disturbance={force=[0.4, -0.3, 0.0], torque=[0.0, 0.0, 0.01]}", "effects.load.mass_factor=1.1"]
 LAWS: dict[str, tuple[str, list[str], dict[str, Any]]] = {
@@ -54,7 +54,7 @@ def test_the_same_numbers_make_no_bump(law: str) -> None:
 
 def test_without_what_was_learnt_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """The test above if nothing were handed over: the observer restarts."""
-    monkeypatch.setattr("mpc.pilot.Pilot.adopt", lambda self, previous: None)
+    monkeypatch.setattr("quadsim.mpc.pilot.Pilot.adopt", lambda self, previous: None)
     name, changes, fields = LAWS["robust"]
     assert jump(flown(name, fields, changes), unchanged("robust"))[40:].max() > 0.5
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from support import linearised
 
-from mpc.equilibrium import equilibrium, twisted
-from mpc.heading import advance, anchored, predict_in_heading_frame, turn, turn_horizontally
-from mpc.model import hover_model
-from mpc.nonlinear.model import nonlinear_model
-from mpc.paper import rollout
+from quadsim.mpc.equilibrium import equilibrium, twisted
+from quadsim.mpc.heading import advance, anchored, predict_in_heading_frame, turn, turn_horizontally
+from quadsim.mpc.model import hover_model
+from quadsim.mpc.nonlinear.model import nonlinear_model
+from quadsim.mpc.paper import rollout
 from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle
 

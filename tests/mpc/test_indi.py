@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from mpc.allocation import allocate, make_allocation
-from mpc.answer import ActuatorBounds
-from mpc.baselines.geometric import Geometric, GeometricController
-from mpc.indi import INDISettings, TorqueIncrement
-from mpc.pilot import Pilot
 from quadsim.controller import Phase, StepInputs
 from quadsim.errors import CommandError
 from quadsim.flight.log import FlightLog
+from quadsim.mpc.allocation import allocate, make_allocation
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.baselines.geometric import Geometric, GeometricController
+from quadsim.mpc.indi import INDISettings, TorqueIncrement
+from quadsim.mpc.pilot import Pilot
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.loop import fly

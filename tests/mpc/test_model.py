@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mpc.model import continuous_model, discretise, hover_model
+from quadsim.mpc.model import continuous_model, discretise, hover_model
 from quadsim.sim.airframe import compile_model
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mpc.observer import DisturbanceObserver, ObserverSettings, observer_gain, thrust_axis
+from quadsim.mpc.observer import DisturbanceObserver, ObserverSettings, observer_gain, thrust_axis
 from quadsim.rotation import body_to_euler_rates, body_to_world
 from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, make_state
 

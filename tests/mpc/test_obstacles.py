@@ -10,17 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import paper_problem
 
-from mpc.condensing import Condensed
-from mpc.obstacles import AvoidanceSettings, ObstacleQP, Shape, Space
-from mpc.ocp import Problem, Query, predicted
-from mpc.paper import prediction
-from mpc.qp import kkt_residuals
-from mpc.robust.tightening import TighteningSettings, position_margins
-from mpc.solvers import Answer, QPSolver
-from mpc.solvers.by_name import make_solver
-from mpc.solvers.piqp import Piqp
 from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.obstacles import AvoidanceSettings, ObstacleQP, Shape, Space
+from quadsim.mpc.ocp import Problem, Query, predicted
+from quadsim.mpc.paper import prediction
+from quadsim.mpc.qp import kkt_residuals
+from quadsim.mpc.robust.tightening import TighteningSettings, position_margins
+from quadsim.mpc.solvers import Answer, QPSolver
+from quadsim.mpc.solvers.by_name import make_solver
+from quadsim.mpc.solvers.piqp import Piqp
 from quadsim.space import Capsule, Corridor, Cylinder, Fence, Sphere
 from quadsim.state import INDEX, POSITION, Array
 from quadsim.vehicle import Vehicle

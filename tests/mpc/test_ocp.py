@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from support import paper_problem, random_problem
 
-from mpc.constraints import Constraint, Origin, Penalty, row_scale, tightened
-from mpc.ocp import Objective, Problem, reference_rates
 from quadsim.errors import ParameterError
+from quadsim.mpc.constraints import Constraint, Origin, Penalty, row_scale, tightened
+from quadsim.mpc.ocp import Objective, Problem, reference_rates
 from quadsim.state import REFERENCE_RATES, REFERENCE_STATES, Array
 
 

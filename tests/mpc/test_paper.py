@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from support import paper_problem, random_problem
 
-from mpc.condensing import Condensed
-from mpc.model import hover_model
-from mpc.ocp import Problem, Query
-from mpc.paper import cost, prediction, rollout, slew_matrix
-from mpc.qp import QPRows
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.model import hover_model
+from quadsim.mpc.ocp import Problem, Query
+from quadsim.mpc.paper import cost, prediction, rollout, slew_matrix
+from quadsim.mpc.qp import QPRows
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle

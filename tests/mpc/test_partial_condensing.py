@@ -24,19 +24,19 @@ from support import (
     with_terms,
 )
 
-from mpc.condensing import Condensed
-from mpc.constraints import Penalty
-from mpc.nonlinear.model import nonlinear_model
-from mpc.ocp import Equilibrium, Problem, Query
-from mpc.partial_condensing import PartiallyCondensed
-from mpc.qp import QP, Solution, kkt_residuals
-from mpc.solvers import Formulation
-from mpc.solvers.piqp import Piqp
-from mpc.staged import Staged
 from quadsim.controller import SOLVED
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.constraints import Penalty
+from quadsim.mpc.nonlinear.model import nonlinear_model
+from quadsim.mpc.ocp import Equilibrium, Problem, Query
+from quadsim.mpc.partial_condensing import PartiallyCondensed
+from quadsim.mpc.qp import QP, Solution, kkt_residuals
+from quadsim.mpc.solvers import Formulation
+from quadsim.mpc.solvers.piqp import Piqp
+from quadsim.mpc.staged import Staged
+from quadsim.rollout.flown import Flight
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.flown import Flight
 
 LAG = 0.05
 

@@ -9,16 +9,16 @@ import pytest
 from polish import polish
 from support import flight_queries, paper_problem, paper_reference, random_problem
 
-from mpc.condensing import Condensed
-from mpc.constraints import Constraint, Penalty
-from mpc.ocp import Query
-from mpc.partial_condensing import PartiallyCondensed
-from mpc.qp import QP, Backend, Solution, kkt_residuals
-from mpc.solvers import SOLVERS, Formulation, QPSolver, make_backend
-from mpc.solvers.piqp import Piqp
 from quadsim.controller import SOLVED
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.constraints import Constraint, Penalty
+from quadsim.mpc.ocp import Query
+from quadsim.mpc.partial_condensing import PartiallyCondensed
+from quadsim.mpc.qp import QP, Backend, Solution, kkt_residuals
+from quadsim.mpc.solvers import SOLVERS, Formulation, QPSolver, make_backend
+from quadsim.mpc.solvers.piqp import Piqp
+from quadsim.rollout.flown import Flight
 from quadsim.state import Array
-from scenarios.flown import Flight
 
 STATE = np.zeros(12)
 STATE[10] = np.pi / 6

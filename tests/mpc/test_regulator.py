@@ -10,11 +10,11 @@ import pytest
 import scipy.linalg
 from support import paper_problem
 
-from mpc.baselines.lqr import lqr_gain
-from mpc.condensing import LARGEST_CONDITION, Condensed, FreeOptimum
-from mpc.ocp import Problem, lqr_terminal_weight
-from mpc.regulator import stabilising, undetected
 from quadsim.errors import ParameterError
+from quadsim.mpc.baselines.lqr import lqr_gain
+from quadsim.mpc.condensing import LARGEST_CONDITION, Condensed, FreeOptimum
+from quadsim.mpc.ocp import Problem, lqr_terminal_weight
+from quadsim.mpc.regulator import stabilising, undetected
 from quadsim.state import STATE_NAMES, Array
 
 

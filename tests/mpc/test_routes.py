@@ -16,14 +16,14 @@ import pytest
 from ocp_peer import Optimum, Period
 from support import paper_problem, random_problem, random_rows, robust_mpc, robust_table
 
-from mpc.bounded import Soft
-from mpc.constraints import Constraint, Penalty, tightened
-from mpc.model import LinearModel, continuous_model, discretise
-from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
-from mpc.robust.settings import Robust
-from mpc.solvers import SOLVERS, Method, QPSolver, find_solver, solver_entries
-from mpc.solvers.by_name import make_solver
 from quadsim.controller import CORE, SOLVED, UNCONSTRAINED, StepInputs
+from quadsim.mpc.bounded import Soft
+from quadsim.mpc.constraints import Constraint, Penalty, tightened
+from quadsim.mpc.model import LinearModel, continuous_model, discretise
+from quadsim.mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
+from quadsim.mpc.robust.settings import Robust
+from quadsim.mpc.solvers import SOLVERS, Method, QPSolver, find_solver, solver_entries
+from quadsim.mpc.solvers.by_name import make_solver
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 

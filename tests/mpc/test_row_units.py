@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from support import paper_problem
 
-from mpc.answer import AnswerCheck
-from mpc.constraints import Constraint, Penalty
-from mpc.diagnosis import Side, smallest_widening
-from mpc.ocp import InfeasiblePeriod, Problem, Query
-from mpc.solvers import Answer
-from mpc.solvers.by_name import make_solver
 from quadsim.controller import SOLVED
+from quadsim.mpc.answer import AnswerCheck
+from quadsim.mpc.constraints import Constraint, Penalty
+from quadsim.mpc.diagnosis import Side, smallest_widening
+from quadsim.mpc.ocp import InfeasiblePeriod, Problem, Query
+from quadsim.mpc.solvers import Answer
+from quadsim.mpc.solvers.by_name import make_solver
 from quadsim.state import INDEX, Array
 
 SOLVERS = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "clarabel", "core")

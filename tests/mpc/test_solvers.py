@@ -13,20 +13,20 @@ import qpsolvers
 from scipy.sparse import csc_matrix
 from support import constrained_mpc, flight_queries, paper_problem, paper_reference, random_problem
 
-from mpc.condensing import Condensed
-from mpc.constraints import Penalty
-from mpc.ocp import Query
-from mpc.partial_condensing import PartiallyCondensed
-from mpc.qp import QP, kkt_residuals
-from mpc.solvers import SOLVERS, Answer, QPSolver, find_solver, make_backend, solver_entries
-from mpc.solvers.by_name import make_solver
-from mpc.solvers.daqp import DaqpDense
-from mpc.solvers.piqp import Piqp
 from quadsim.controller import CORE, GAIN, SOLVED, StepInputs
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.constraints import Penalty
+from quadsim.mpc.ocp import Query
+from quadsim.mpc.partial_condensing import PartiallyCondensed
+from quadsim.mpc.qp import QP, kkt_residuals
+from quadsim.mpc.solvers import SOLVERS, Answer, QPSolver, find_solver, make_backend, solver_entries
+from quadsim.mpc.solvers.by_name import make_solver
+from quadsim.mpc.solvers.daqp import DaqpDense
+from quadsim.mpc.solvers.piqp import Piqp
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
 
 ALWAYS = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "clarabel")
 """What `make setup` installs."""

@@ -10,13 +10,13 @@ import scipy.linalg
 from polish import polish
 from support import paper_problem, random_problem
 
-from mpc.condensing import Condensed
-from mpc.core.axes import axes
-from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
-from mpc.partial_condensing import PartiallyCondensed
-from mpc.solvers import Formulation, Method, QPSolver
-from mpc.solvers.piqp import Piqp
 from quadsim.errors import ParameterError
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.core.axes import axes
+from quadsim.mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
+from quadsim.mpc.partial_condensing import PartiallyCondensed
+from quadsim.mpc.solvers import Formulation, Method, QPSolver
+from quadsim.mpc.solvers.piqp import Piqp
 from quadsim.state import Array
 
 

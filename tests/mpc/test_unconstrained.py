@@ -8,8 +8,8 @@ import numpy as np
 import scipy.linalg
 from support import paper_problem, paper_reference
 
-from mpc.unconstrained import UnconstrainedMPC, sequence_gains
 from quadsim.controller import StepInputs
+from quadsim.mpc.unconstrained import UnconstrainedMPC, sequence_gains
 from quadsim.state import Array
 
 

@@ -11,11 +11,11 @@ from peers.checks import Check
 from peers.qpoases import Qpoases
 from peers.recorded import Query
 
-from mpc.condensing import Condensed
-from mpc.ocp import Problem
-from mpc.qp import KKTResiduals, kkt_residuals
-from mpc.solvers import SOLVERS, find_solver, make_backend
 from quadsim.controller import SOLVED
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.ocp import Problem
+from quadsim.mpc.qp import KKTResiduals, kkt_residuals
+from quadsim.mpc.solvers import SOLVERS, find_solver, make_backend
 from quadsim.state import Array
 
 QPOASES: Final = "qpoases"

@@ -12,11 +12,11 @@ from peers.rotorpy_plant import RotorPyPlant
 from quadsim.flight.audit import audit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import tracking
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.loop import fly
 from quadsim.sim.plant import Plant
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario
-from scenarios.schema.scenario import Scenario
 
 SCENARIO: Final = "paper-constrained"
 

@@ -25,9 +25,9 @@ from peers.checks import Check
 from peers.recorded import Query
 from qpmpc import MPCProblem, Plan, solve_mpc
 
-from mpc.ocp import Problem
-from mpc.solvers import QPSolver
 from quadsim.errors import ParameterError
+from quadsim.mpc.ocp import Problem
+from quadsim.mpc.solvers import QPSolver
 from quadsim.state import Array
 
 SOLVER: Final = "quadprog"

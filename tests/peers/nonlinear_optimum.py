@@ -12,15 +12,15 @@ from peers.casadi_ocp import Case, Found, Peer
 from peers.checks import Check
 from peers.do_mpc_ocp import DoMPC
 
-from mpc.answer import ActuatorBounds
-from mpc.bounded import Soft
-from mpc.nonlinear.controller import STEP_TOLERANCE, NonlinearMPC
-from mpc.nonlinear.settings import Nonlinear, Weights
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.motion import Motion
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.bounded import Soft
+from quadsim.mpc.nonlinear.controller import STEP_TOLERANCE, NonlinearMPC
+from quadsim.mpc.nonlinear.settings import Nonlinear, Weights
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import N_STATES, POSITIONS, VELOCITIES, Array
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario
 
 COURSE: Final = "torrente-loop8-drag"
 """Whose reference motion and vehicle these are; the plant is not flown."""

@@ -7,12 +7,12 @@ from typing import Final
 
 import numpy as np
 
-from mpc import ocp
-from mpc.ocp import Problem
+from quadsim.mpc import ocp
+from quadsim.mpc.ocp import Problem
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import Array
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
 
 SCENARIO: Final = "paper-constrained"
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from support import paper_problem, paper_reference
 
-from mpc.ocp import Query
-from mpc.solvers import SOLVERS, QPSolver, find_solver, make_backend
-from mpc.solvers.qpsolvers import UNSOLVED
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE
 from quadsim.controller import SOLVED
-from scenarios.commands.cli import main
-from scenarios.results import EXIT_DONE
+from quadsim.mpc.ocp import Query
+from quadsim.mpc.solvers import SOLVERS, QPSolver, find_solver, make_backend
+from quadsim.mpc.solvers.qpsolvers import UNSOLVED
 
 NAMES = (*SOLVERS, "clarabel", "osqp", "proxqp", "quadprog")
 

@@ -10,8 +10,8 @@ import casadi as cs
 import numpy as np
 import pytest
 
-import mpc
 import quadsim
+from quadsim import mpc
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SCENARIO = str(EXAMPLES / "casadi_mpc.toml")

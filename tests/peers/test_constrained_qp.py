@@ -10,9 +10,9 @@ from peers.checks import Check
 from peers.constrained_qp import OURS, ConstrainedQP, QpmpcController
 from peers.recorded import Query
 
-from mpc.ocp import Problem
-from mpc.solvers import QPSolver
 from quadsim.controller import UNCONSTRAINED
+from quadsim.mpc.ocp import Problem
+from quadsim.mpc.solvers import QPSolver
 
 
 def test_first_inputs_are_the_same(against_qpmpc: ConstrainedQP, hold: Callable[[Check], None]) -> None:

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 
 from quadsim.flight.rundir import Run, load_run
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
 
 
 @pytest.fixture(scope="session")

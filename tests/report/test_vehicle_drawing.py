@@ -19,7 +19,7 @@ from quadsim.report.vehicle_drawing import vehicle_figure
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle, load_vehicle
 
-FILES = Path(__file__).resolve().parents[2] / "vehicles"
+FILES = Path(__file__).resolve().parents[1] / "vehicles"
 VEHICLES = [load_vehicle(path) for path in (*map(vehicle_path, vehicle_names()), *sorted(FILES.glob("*.toml")))]
 EVERY = pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda vehicle: vehicle.name)
 

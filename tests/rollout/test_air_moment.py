@@ -13,18 +13,18 @@ from scipy.spatial.transform import Rotation
 from uneven import published
 
 import quadsim
-from mpc.baselines.attitude import motion_of
-from mpc.baselines.geometric import Geometric, GeometricController, Integrals
-from mpc.baselines.preview import Target
-from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.settings import Nonlinear
 from quadsim.errors import InputError
 from quadsim.flight.log import FlightLog
+from quadsim.mpc.baselines.attitude import motion_of
+from quadsim.mpc.baselines.geometric import Geometric, GeometricController, Integrals
+from quadsim.mpc.baselines.preview import Target
+from quadsim.mpc.nonlinear.controller import NonlinearMPC
+from quadsim.mpc.nonlinear.settings import Nonlinear
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
 from quadsim.rotation import euler_to_body_rates
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import ANGLE_RATES, ANGLES
-from scenarios.flown import Flight
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
 
 MOMENT, DAMPING = 1e-5, 5e-3
 VEHICLE = {"vehicle.rotor_moment": [MOMENT, MOMENT], "vehicle.rate_damping": [DAMPING] * 3}

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from support import paper_problem
 
-from mpc.answer import INFEASIBLE, AnswerCheck
-from mpc.ocp import Query, predicted
-from mpc.qp import KKT_EVERY
-from mpc.solvers import QPSolver
-from mpc.solvers.piqp import Piqp
-from scenarios.assembly import preferring_core
-from scenarios.flown import summarise
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
+from quadsim.mpc.answer import INFEASIBLE, AnswerCheck
+from quadsim.mpc.ocp import Query, predicted
+from quadsim.mpc.qp import KKT_EVERY
+from quadsim.mpc.solvers import QPSolver
+from quadsim.mpc.solvers.piqp import Piqp
+from quadsim.rollout.flown import summarise
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import preferring_core
+from quadsim.scenarios.loading import load_scenario
 
 
 @pytest.mark.slow("core")

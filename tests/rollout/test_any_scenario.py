@@ -21,11 +21,11 @@ from hypothesis import strategies as st
 from quadsim.errors import InputError
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import write_log
-from scenarios.assembly import Assembly
-from scenarios.flown import summarise
-from scenarios.loading import parse_scenario
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
+from quadsim.rollout.flown import summarise
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import parse_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 
 
 def vector(size: float, length: int = 3) -> st.SearchStrategy[list[float]]:

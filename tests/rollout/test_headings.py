@@ -12,11 +12,11 @@ import pytest
 
 import quadsim
 from quadsim.controller import StepInputs
+from quadsim.rollout.flown import Flight
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.courses.csv_course import tabulated
+from quadsim.scenarios.feasibility_check import report
 from quadsim.state import INDEX, REFERENCE_NAMES, TURN, Array, make_state
-from scenarios.assembly import Assembly
-from scenarios.courses.csv_course import tabulated
-from scenarios.feasibility_check import report
-from scenarios.flown import Flight
 
 YAW: Final = REFERENCE_NAMES.index("yaw")
 CONTROLLERS: Final[dict[str, tuple[str, dict[str, Any]]]] = {

@@ -17,24 +17,24 @@ import numpy as np
 import pytest
 from support import constrained_mpc, fly_here
 
-import mpc
 import quadsim
-from mpc.builders import law_of
-from mpc.nonlinear.controller import CONVERGED
-from mpc.ocp import InfeasiblePeriod
+from quadsim import mpc
 from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import PlanExhaustedError
+from quadsim.mpc.builders import law_of
+from quadsim.mpc.nonlinear.controller import CONVERGED
+from quadsim.mpc.ocp import InfeasiblePeriod
+from quadsim.rollout import infeasibility, remedies
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.infeasibility import diagnose
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import FLIGHTS
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.settings import get_field
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios import infeasibility, remedies
-from scenarios.assembly import Assembly
-from scenarios.catalogue import FLIGHTS
-from scenarios.flown import Flight
-from scenarios.infeasibility import diagnose
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import get_field
 
 pytestmark = pytest.mark.slow("diagnosis")
 

@@ -11,9 +11,9 @@ import pytest
 import quadsim
 from quadsim.flight.rundir import load_run
 from quadsim.report.figure import commanded_speeds
-from scenarios.flown import Flight
-from scenarios.reaudit import reaudit
-from scenarios.schema.scenario import Scenario
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.reaudit import reaudit
+from quadsim.scenarios.schema.scenario import Scenario
 
 pytestmark = pytest.mark.slow("latency")
 

@@ -14,8 +14,8 @@ from support import NO_PRODUCTS
 import quadsim
 from quadsim.controller import StepInputs
 from quadsim.flight.log import COLUMNS
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array, State
-from scenarios.schema.scenario import Scenario
 
 
 class Logging:

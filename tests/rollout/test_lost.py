@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from quadsim.commands import cli
 from quadsim.flight import rundir
-from scenarios.commands import cli
-from scenarios.flown import summarise
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
+from quadsim.rollout.flown import summarise
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
 
 UNSTABLE = '''
 import numpy as np

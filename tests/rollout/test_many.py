@@ -19,8 +19,8 @@ import pytest
 from toy_flights import Toy, below, fly, fly_slowly, living, report, until
 
 from quadsim.errors import MissingPackageError, ParameterError
-from scenarios import many
-from scenarios.many import ClusterError, fly_many
+from quadsim.rollout import many
+from quadsim.rollout.many import ClusterError, fly_many
 
 pytestmark = pytest.mark.slow("workers")
 
@@ -133,7 +133,7 @@ def test_workers_that_cannot_be_are_refused_at_once(options: dict[str, Any], mes
 PARENT = """
 import sys
 from pathlib import Path
-from scenarios.many import fly_many
+from quadsim.rollout.many import fly_many
 from toy_flights import fly_and_note
 print("started", flush=True)
 kinds = sys.argv[2:]

@@ -37,7 +37,7 @@ OWN = ("--set", "duration=1.0", "--set", "constraints=[]", "--set", 'controller=
 
 
 def quadsim_command(*arguments: str, here: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "scenarios.commands.entry", *arguments]
+    command = [sys.executable, "-m", "quadsim.commands.entry", *arguments]
     env = {**os.environ, **environment}
     return subprocess.run(command, cwd=here, env=env, capture_output=True, text=True, timeout=300, check=False)
 
@@ -150,7 +150,7 @@ def test_a_product_that_fails_is_named_and_decides_the_status_only_if_asked_for(
 def test_ctrl_c_while_a_film_is_made_keeps_what_was_flown(tmp_path: Path) -> None:
     (tmp_path / "late.py").write_text(LAW.format(late="pass"))
     options = ("--set", "duration=20.0", "--no-recording", "--no-figures")
-    command = [sys.executable, "-m", "scenarios.commands.entry", "run", "hover", *OWN, *options]
+    command = [sys.executable, "-m", "quadsim.commands.entry", "run", "hover", *OWN, *options]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         summary, started = tmp_path / "runs" / "hover" / "summary.json", clock.monotonic()
         while clock.monotonic() - started < 120.0 and not summary.exists():

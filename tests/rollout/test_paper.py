@@ -9,7 +9,7 @@ import pytest
 
 from quadsim.controller import ACCEPTED
 from quadsim.flight.audit import Finding
-from scenarios.flown import Flight, summarise
+from quadsim.rollout.flown import Flight, summarise
 
 SAMPLED, PLANT = 0.01, 0.05
 """How far beyond 5 deg roll and pitch may go [deg]: at the control samples, and at the physics rate."""

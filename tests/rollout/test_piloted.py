@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 import quadsim
-from mpc.pilot import Pilot
 from quadsim.assets import vehicle_path
 from quadsim.controller import StepInputs
 from quadsim.errors import InputError
+from quadsim.mpc.pilot import Pilot
+from quadsim.rollout.reaudit import reaudit
 from quadsim.rotation import conjugate, multiply
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.plugin import Plugin, make_law
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from quadsim.state import Array, State
 from quadsim.vehicle import Vehicle
-from scenarios.assembly import Assembly
-from scenarios.plugin import Plugin, make_law
-from scenarios.reaudit import reaudit
 
 START = {
     "vehicle.file": "hummingbird",

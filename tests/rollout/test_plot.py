@@ -12,13 +12,13 @@ import pytest
 from matplotlib.image import imread
 
 import quadsim
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE, EXIT_WRONG_INPUT
 from quadsim.errors import InputError, OutputError, ParameterError, UnknownNameError
 from quadsim.palette import COLOUR, CYCLE, line_colour
 from quadsim.report.flight_figures import signals
 from quadsim.report.to_matplotlib import draw
-from scenarios.commands.cli import main
-from scenarios.flown import Flight
-from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
+from quadsim.rollout.flown import Flight
 
 mpl.use("Agg")
 

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpc.fallback.completion import completed_inputs
-from mpc.nonlinear.rigidbody import thrust_axis
 from quadsim.controller import Command, StepInputs
 from quadsim.flight.parquet import read_log, write_log
+from quadsim.mpc.fallback.completion import completed_inputs
+from quadsim.mpc.nonlinear.rigidbody import thrust_axis
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion, quaternion_to_euler
+from quadsim.scenarios.loading import load_scenario
 from quadsim.sim.physics import physics_to_state
 from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, Array, YawTurns, tilt
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
 
 
 @pytest.fixture(scope="module")

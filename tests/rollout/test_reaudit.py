@@ -17,14 +17,14 @@ import pyarrow.parquet as pq
 import pytest
 
 import quadsim
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from quadsim.errors import FileError
 from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
-from scenarios.assembly import Assembly
-from scenarios.commands.cli import main
-from scenarios.flown import Flight
-from scenarios.reaudit import _in_force, reaudit
-from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.reaudit import _in_force, reaudit
+from quadsim.scenarios.assembly import Assembly
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
 SHORT = ("--set", "duration=0.5")
@@ -235,7 +235,9 @@ def test_what_a_run_records_is_what_its_tables_give(
     """
     flight = fly_once(name)
     scenario = flight.scenario.altered(log_rate=rate)
-    monkeypatch.setattr("scenarios.rollout.Rollout.fly", lambda *_, **__: replace(flight, assembly=Assembly(scenario)))
+    monkeypatch.setattr(
+        "quadsim.rollout.rollout.Rollout.fly", lambda *_, **__: replace(flight, assembly=Assembly(scenario))
+    )
     out = str(tmp_path / "run")
     status = main(["run", name, "--set", f"log_rate={rate}", *TABLES, "--json", "--out", out])
     assert main(["check", out]) == status

@@ -19,10 +19,10 @@ from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import Run
+from quadsim.rollout.machine import PACKAGES
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.sim import loop
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.machine import PACKAGES
-from scenarios.rollout import Rollout
 
 SHORT = "duration=0.5"
 UPSIDE = "initial.euler=[60.0, 0.0, 0.0]"

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support import NO_PRODUCTS
 
+from quadsim.console.summary_tables import outcome_line
 from quadsim.controller import Phase
 from quadsim.errors import FileError
 from quadsim.flight.audit import Finding, SpaceLimit
@@ -18,14 +19,13 @@ from quadsim.flight.rundir import load_run
 from quadsim.report.figure import Scene, has_space, obstacles_in, outlines, region_edges
 from quadsim.report.flight_figures import page_figures, write_figures
 from quadsim.report.recording import write_recording
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.reaudit import reaudit
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.writing import plain
 from quadsim.space import Cylinder
-from scenarios.commands.summary_tables import outcome_line
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.reaudit import reaudit
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.writing import plain
 
 PILLAR = {"type": "cylinder", "name": "pillar", "position": [1.0, 0.0, 1.0], "radius": 0.1, "height": 3.0}
 BALL = {

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quadsim.errors import CommandError, FlightError, InputError
-from scenarios.assembly import Assembly
-from scenarios.flight_events import prepared
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
+from quadsim.rollout.flight_events import prepared
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 
 PERIODS = 12
 SCENARIOS = {

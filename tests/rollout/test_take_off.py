@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import quadsim
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_FAILED
 from quadsim.controller import Phase
 from quadsim.flight.metrics import never_took_off
 from quadsim.flight.phase import AIRBORNE, LARGEST_LEAD
+from quadsim.rollout.reaudit import reaudit
 from quadsim.sim.loop import TAKEOFF_LEAD
 from quadsim.state import INDEX
-from scenarios.commands.cli import main
-from scenarios.reaudit import reaudit
-from scenarios.results import EXIT_FAILED
 
 pytestmark = pytest.mark.slow("take-off")
 

@@ -10,8 +10,8 @@ import pytest
 from exported_c import Host, replay
 
 import quadsim
-from scenarios.export.record import record
-from scenarios.schema.scenario import Scenario
+from quadsim.features.export.record import record
+from quadsim.scenarios.schema.scenario import Scenario
 
 WEIGHTS = {"x": 10.0, "vx": 50.0, "y": 10.0, "vy": 50.0, "z": 100.0, "yaw": 100.0}
 INPUTS = {"input_weights": {"speed": 0.01}}

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mpc
 import quadsim
+from quadsim import mpc
+from quadsim.commands.cli import main
 from quadsim.errors import InputError
 from quadsim.flight.audit import (
     COMMAND_TOLERANCE,
@@ -23,11 +24,10 @@ from quadsim.flight.audit import (
     worst_finding,
 )
 from quadsim.flight.rundir import findings_of
-from scenarios.commands.cli import main
-from scenarios.flown import Flight
-from scenarios.law_bounds import law_limits
-from scenarios.schema.bases import merge
-from scenarios.schema.scenario import Scenario
+from quadsim.rollout.flown import Flight
+from quadsim.scenarios.law_bounds import law_limits
+from quadsim.scenarios.schema.bases import merge
+from quadsim.scenarios.schema.scenario import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 STATED = {"roll": (-5.0, 5.0), "pitch": (-5.0, 5.0), "speed": (0.0, 250.0), "slew": (-10.0, 5.0)}
@@ -98,9 +98,7 @@ def test_a_bases_tolerance_survives_only_in_an_entry_that_states_neither_bounds_
 def test_no_other_module_compares_a_margin_with_a_tolerance() -> None:
     """In Python: `margin < -tolerance` and its like have one owner."""
     pattern = re.compile(r"[<>]=?\s*-\s*(\w+\.)*tolerance|\.tolerance(_sampled)?\s*[<>]|\+\s*(\w+\.)*tolerance")
-    files = [
-        path for folder in ("quadsim", "scenarios", "docs", "benchmarks") for path in (ROOT / folder).rglob("*.py")
-    ]
+    files = [path for folder in ("quadsim", "docs", "benchmarks") for path in (ROOT / folder).rglob("*.py")]
     offenders = {
         str(path.relative_to(ROOT))
         for path in files

@@ -14,18 +14,18 @@ import pytest
 from support import NO_PRODUCTS
 
 import quadsim
-from mpc.ocp import Problem
 from quadsim.controller import StepInputs
 from quadsim.flight import rundir
+from quadsim.mpc.ocp import Problem
 from quadsim.report.comparison import comparison_rows
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.reaudit import reaudit
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.assembly import Assembly
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.reaudit import reaudit
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
 
 BASE = [
     "initial.position=[0.0, 0.0, 0.2]",

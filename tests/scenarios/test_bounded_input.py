@@ -11,16 +11,16 @@ import pyarrow.parquet as pq
 import pytest
 
 from quadsim.errors import FileError, InputError
+from quadsim.features.campaign.plan import load_plan
+from quadsim.features.campaign.rows import read_table
+from quadsim.features.identify.record import read_record
 from quadsim.flight import parquet
 from quadsim.flight.parquet import read_parquet
 from quadsim.input_limits import MOST_ENTRIES, MOST_ROWS
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.problems import ScenarioError
+from quadsim.scenarios.schema.writing import plain
 from quadsim.vehicle import load_vehicle
-from scenarios.campaign.plan import load_plan
-from scenarios.campaign.rows import read_table
-from scenarios.identify.record import read_record
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.schema.problems import ScenarioError
-from scenarios.schema.writing import plain
 
 CONSTRAINT = '[[constraints]]\nname = "c{i}"\nsignal = "z"\nupper = {i}.0\n'
 SPHERE = '[[obstacles]]\ntype = "sphere"\nname = "o{i}"\nposition = [{i}.0, 5.0, 1.0]\nradius = 0.1\n'

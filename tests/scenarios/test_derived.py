@@ -11,16 +11,16 @@ import pytest
 from support import NO_PRODUCTS, fly_here
 
 import quadsim
+from quadsim.commands.app import run
 from quadsim.errors import InputError
-from scenarios.assembly import Assembly
-from scenarios.campaign.plan import drawn_flights, make_plan
-from scenarios.catalogue import scenario_names
-from scenarios.commands.app import run
-from scenarios.feasibility_check import floor_notes
-from scenarios.loading import assemble, load_scenario, parse_scenario
-from scenarios.schema.bases import read_whole
-from scenarios.schema.problems import ScenarioError
-from scenarios.schema.scenario import Scenario
+from quadsim.features.campaign.plan import drawn_flights, make_plan
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import scenario_names
+from quadsim.scenarios.feasibility_check import floor_notes
+from quadsim.scenarios.loading import assemble, load_scenario, parse_scenario
+from quadsim.scenarios.schema.bases import read_whole
+from quadsim.scenarios.schema.problems import ScenarioError
+from quadsim.scenarios.schema.scenario import Scenario
 
 TURNS = "reference.turns"
 OTHER_VEHICLE = "hummingbird"

@@ -12,15 +12,15 @@ import pytest
 from support import scenario_table
 
 import quadsim
+from quadsim.console.console import PlainConsole, show
 from quadsim.flight.feasibility import Feasibility
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import scenario_names
+from quadsim.scenarios.feasibility_check import fitting, report
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.assembly import Assembly
-from scenarios.catalogue import scenario_names
-from scenarios.console import PlainConsole, show
-from scenarios.feasibility_check import fitting, report
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.schema.scenario import Scenario
 
 
 def scenario(reference: dict[str, Any], *, duration: float = 20.0, **fields: Any) -> Scenario:

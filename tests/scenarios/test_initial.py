@@ -14,13 +14,13 @@ import quadsim
 import quadsim.gym
 from quadsim.controller import StepInputs
 from quadsim.errors import InputError
+from quadsim.features.campaign.plan import make_plan
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.bases import read_whole
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import INDEX, Array
-from scenarios.campaign.plan import make_plan
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.rollout import Rollout
-from scenarios.schema.bases import read_whole
-from scenarios.schema.scenario import Scenario
 
 STOPPED = [0.0] * 4
 VELOCITY = (2.0, -1.0, 6.0)

@@ -14,19 +14,19 @@ import pytest
 from _pytest.mark.structures import ParameterSet
 from golden_numbers import library_entry, read
 
-from mpc.answer import INFEASIBLE
 from quadsim.controller import FALLBACK, LAW, MISSED, STOPPED
+from quadsim.features.campaign.rows import flown_row
 from quadsim.flight.audit import COMMAND_TOLERANCE, audit, worst_finding, worst_share
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
+from quadsim.mpc.answer import INFEASIBLE
 from quadsim.report.comparison import comparison_rows
-from scenarios.campaign.rows import flown_row
-from scenarios.catalogue import CONTROLLERS, scenario_names, scenario_source
-from scenarios.flown import Flight, summarise
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.rollout import Rollout
-from scenarios.schema.base import fields_of
-from scenarios.schema.controllers import LAWS
-from scenarios.schema.scenario import Lost, Scenario
+from quadsim.rollout.flown import Flight, summarise
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.catalogue import CONTROLLERS, scenario_names, scenario_source
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.base import fields_of
+from quadsim.scenarios.schema.controllers import LAWS
+from quadsim.scenarios.schema.scenario import Lost, Scenario
 
 SHARED = (
     *("paper-constrained", "paper-constrained-lag20", "paper-unconstrained", "paper-unconstrained-clipped"),

@@ -10,15 +10,15 @@ from xml.etree import ElementTree
 import pytest
 
 import quadsim
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED
+from quadsim.features.live.session import Session
 from quadsim.flight.audit import UNAUDITED_ADVICE, Limit
-from scenarios.assembly import Assembly
-from scenarios.commands.cli import main
-from scenarios.limits import flyable
-from scenarios.live.session import Session
-from scenarios.loading import load_scenario
-from scenarios.reaudit import reaudit
-from scenarios.results import EXIT_DONE, EXIT_FAILED
-from scenarios.schema.scenario import Scenario
+from quadsim.rollout.reaudit import reaudit
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.limits import flyable
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 
 
 def audited(scenario: Scenario) -> dict[str, Limit]:

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 import quadsim
-from scenarios.assembly import Assembly
-from scenarios.commands.cli import main
-from scenarios.loading import load_scenario
-from scenarios.mismatch import model_notes
+from quadsim.commands.cli import main
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.mismatch import model_notes
 
 LAG = {"effects.rotors": {"rise": 0.02, "fall": 0.02}}
 REMEDY = 'controller.rotor_lag = "vehicle"'

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import quadsim
-from scenarios.schema.settings import get_field
+from quadsim.scenarios.schema.settings import get_field
 
 FENCE = {"of": ["x", "y"], "rows": [[1.0, 1.0], [1.0, -1.0]], "lower": [-20.0, -21.0], "upper": [22.0, 23.0]}
 TURNING = {"of": ["roll_rate", "speed_2"], "rows": [[1.0, 0.0], [0.0, 1.0], [1.0, 0.1]], "upper": [90.0, 240.0, 150.0]}

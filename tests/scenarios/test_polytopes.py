@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mpc.ocp import Problem
 from quadsim.flight.audit import SUM, audit
 from quadsim.flight.rundir import limit_from_json, limit_to_json
+from quadsim.mpc.ocp import Problem
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.state import INDEX
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario, parse_scenario
 from tests.support import scenario_table, small_log
 
 MIXED: dict[str, Any] = {

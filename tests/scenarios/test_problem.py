@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import quadsim
-from mpc.condensing import CondensedQP
 from quadsim.controller import StepInputs
 from quadsim.errors import InputError, ParameterError
+from quadsim.mpc.ocp import CondensedQP
 from quadsim.state import REFERENCE_NAMES, Array
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from quadsim.errors import FileError, InputError
-from scenarios import catalogue
-from scenarios.catalogue import FLIGHTS, VARIANTS, read_variants, scenario_names, variants
-from scenarios.loading import load_scenario
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import get_field
+from quadsim.scenarios import catalogue
+from quadsim.scenarios.catalogue import FLIGHTS, VARIANTS, read_variants, scenario_names, variants
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.settings import get_field
 
 FILES = {path.stem for path in FLIGHTS.glob("*.toml")}
 

@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError
+from quadsim.features.campaign.events import HARMLESS, INCOMPLETE, CountedEvent
+from quadsim.features.campaign.rows import MARGIN, SAMPLED, SATISFIED, TIME_VIOLATED, flags, null, numbers, texts
 from quadsim.flight.audit import Limit, limit_differences
-from scenarios.campaign.events import HARMLESS, INCOMPLETE, CountedEvent
-from scenarios.campaign.rows import MARGIN, SAMPLED, SATISFIED, TIME_VIOLATED, flags, null, numbers, texts
 
 
 def judged_by(

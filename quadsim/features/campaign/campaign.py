@@ -19,16 +19,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from quadsim.console.junit import Cases
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.flight.rundir import SCENARIO_FILE
-from quadsim.outputs import Growing, digest_of, growing, optional
-from quadsim.report.figure import Figure
-from scenarios.campaign import store as records
-from scenarios.campaign.campaign_report import campaign_overview, write_report
-from scenarios.campaign.plan import Plan
-from scenarios.campaign.rows import make_table, read_table
-from scenarios.campaign.statistics import Judgement, estimate, proportion, worst_flight
-from scenarios.campaign.store import (
+from quadsim.features.campaign import store as records
+from quadsim.features.campaign.campaign_report import campaign_overview, write_report
+from quadsim.features.campaign.plan import Plan
+from quadsim.features.campaign.rows import make_table, read_table
+from quadsim.features.campaign.statistics import Judgement, estimate, proportion, worst_flight
+from quadsim.features.campaign.store import (
     FLIGHTS_FILE,
     TIMES_FILE,
     Store,
@@ -37,12 +36,13 @@ from scenarios.campaign.store import (
     read_manifest,
     stored_plan,
 )
-from scenarios.commands.junit import Cases
-from scenarios.flown import Flight, to_pandas
-from scenarios.machine import code_digest
-from scenarios.many import MEMORY, TIMEOUT, count_workers
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.schema.scenario import Scenario
+from quadsim.flight.rundir import SCENARIO_FILE
+from quadsim.outputs import Growing, digest_of, growing, optional
+from quadsim.report.figure import Figure
+from quadsim.rollout.flown import Flight, to_pandas
+from quadsim.rollout.machine import code_digest
+from quadsim.rollout.many import MEMORY, TIMEOUT, count_workers
+from quadsim.scenarios.schema.scenario import Scenario
 
 REPORT_FILES: Final = ("index.html", "campaign.png")
 _JUDGED: Final = 5  # requirements that a repr has
@@ -79,12 +79,12 @@ class CampaignResult(Result):
         return EXIT_DONE if all(judgement.holds for judgement in self.judgements) else EXIT_FAILED
 
     def verdicts(self) -> tuple[str, Cases]:
-        """See `scenarios.commands.junit.Judged`."""
+        """See `quadsim.console.junit.Judged`."""
         cases = [(entry.requirement.text, entry.holds, entry.sentence) for entry in self.judgements]
         return self.summary["campaign"], cases
 
     def __repr__(self) -> str:
-        from scenarios.campaign.campaign_report import verdict_sentence
+        from quadsim.features.campaign.campaign_report import verdict_sentence
 
         lines = [f"<CampaignResult {self.summary['campaign']}: {verdict_sentence(self.summary)}"]
         for flight in self.summary["worst"][:1]:
@@ -102,7 +102,7 @@ class CampaignResult(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios.campaign.campaign_report import campaign_lines
+        from quadsim.features.campaign.campaign_report import campaign_lines
 
         return campaign_lines(self.summary, self.judgements, self.directory)
 
@@ -299,7 +299,7 @@ class Replay(Result):
 
     def outputs(self) -> Shown:
         """See `Result.outputs`; before them, whether the numbers are the campaign's."""
-        from scenarios import console
+        from quadsim.console import console
 
         number, count = self.recorded.number, len(self.recorded.row)
         if self.differing:

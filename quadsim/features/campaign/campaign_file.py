@@ -19,12 +19,12 @@ from annotated_types import Ge, Le, MaxLen, MinLen, doc
 from pydantic import Field
 
 from quadsim.errors import InputError
+from quadsim.features.campaign.events import parse_event
 from quadsim.fields import Number, Positive, Seconds
 from quadsim.input_limits import MOST_ENTRIES
+from quadsim.scenarios.schema.base import LARGEST_SEED
+from quadsim.scenarios.schema.writing import to_toml
 from quadsim.state import Array
-from scenarios.campaign.events import parse_event
-from scenarios.schema.base import LARGEST_SEED
-from scenarios.schema.writing import to_toml
 
 WholeNumber = Annotated[int, Ge(-LARGEST_SEED), Le(LARGEST_SEED)]
 Seed = Annotated[int, Ge(0), Le(LARGEST_SEED)]

@@ -11,16 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 
-from quadsim.outputs import SUMMARY_FILE, optional
-from quadsim.report.figure import Bound, Figure, Panel, Series
-from quadsim.report.page import PAGE_FILE, Section, render_page
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
-from quadsim.report.to_matplotlib import write_pngs
-from quadsim.report.to_plotly import Plot, to_plot
-from quadsim.state import Array
-from scenarios.campaign.campaign_file import CampaignFile
-from scenarios.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, parse_event
-from scenarios.campaign.rows import (
+from quadsim.features.campaign.campaign_file import CampaignFile
+from quadsim.features.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, parse_event
+from quadsim.features.campaign.rows import (
     DRAW,
     MARGIN,
     CampaignSummary,
@@ -31,7 +24,14 @@ from scenarios.campaign.rows import (
     unit_of,
     verdicts,
 )
-from scenarios.campaign.statistics import ALPHA, Judgement, count_of, drivers, interval, label, p_value, percent
+from quadsim.features.campaign.statistics import ALPHA, Judgement, count_of, drivers, interval, label, p_value, percent
+from quadsim.outputs import SUMMARY_FILE, optional
+from quadsim.report.figure import Bound, Figure, Panel, Series
+from quadsim.report.page import PAGE_FILE, Section, render_page
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
+from quadsim.report.to_matplotlib import write_pngs
+from quadsim.report.to_plotly import Plot, to_plot
+from quadsim.state import Array
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -52,7 +52,7 @@ def campaign_lines(
     summary: CampaignSummary, judgements: Sequence[Judgement], directory: Path
 ) -> Iterator[RenderableType]:
     """Return the report for a console."""
-    from scenarios import console
+    from quadsim.console import console
 
     where = console.short_path(directory)
     yield console.styled((summary["campaign"], "bold"), f": {verdict_sentence(summary)}")

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 from cyclopts import Parameter
 
 from quadsim.errors import InputError, ParameterError
-from scenarios.catalogue import campaign_names
-from scenarios.commands.arguments import (
+from quadsim.features.arguments import (
     Changes,
     ComparedName,
     Fields,
@@ -26,18 +25,19 @@ from scenarios.commands.arguments import (
     Watched,
     Whole,
 )
+from quadsim.scenarios.catalogue import campaign_names
 
 if TYPE_CHECKING:
-    from scenarios.campaign.campaign import CampaignResult, Replay
-    from scenarios.campaign.paired import PairedComparison
-    from scenarios.campaign.plan import Plan
-    from scenarios.campaign.sweep import Sweep
-    from scenarios.schema.scenario import Scenario
+    from quadsim.features.campaign.campaign import CampaignResult, Replay
+    from quadsim.features.campaign.paired import PairedComparison
+    from quadsim.features.campaign.plan import Plan
+    from quadsim.features.campaign.sweep import Sweep
+    from quadsim.scenarios.schema.scenario import Scenario
 
     CampaignName: TypeAlias = ScenarioName
     Draws: TypeAlias = Sequence[Mapping[str, Any]]
 else:
-    from scenarios.commands.arguments import one_of
+    from quadsim.features.arguments import one_of
 
     CampaignResult = PairedComparison = Replay = Any
     CampaignName = one_of(campaign_names)
@@ -83,10 +83,10 @@ def sweep(
         >>> tilt["controller.output_bounds.pitch.1"].tolist(), tilt["margin.roll"].round(3).tolist()
         ([2.0, 5.0], [2.0, 5.0])
     """
-    from scenarios.campaign.sweep import fly_sweep
-    from scenarios.loading import load_scenario
-    from scenarios.progress import reporting
-    from scenarios.user_code import importable
+    from quadsim.console.progress import reporting
+    from quadsim.features.campaign.sweep import fly_sweep
+    from quadsim.scenarios.loading import load_scenario
+    from quadsim.scenarios.user_code import importable
 
     with reporting(progress) as report:
         return fly_sweep(importable(load_scenario(scenario), controller, forces), values, workers, report)
@@ -154,14 +154,14 @@ def campaign(
         >>> result.table["verdict"].to_pylist()
         ['satisfied', 'satisfied', 'satisfied']
     """
-    from scenarios.campaign.campaign import fly_campaign
-    from scenarios.campaign.events import parse_event
-    from scenarios.campaign.plan import load_plan, make_plan
-    from scenarios.campaign.statistics import judge, parse_requirement
-    from scenarios.commands.junit import junit_file, write_junit
-    from scenarios.results import after
-    from scenarios.schema.scenario import Scenario
-    from scenarios.user_code import importable
+    from quadsim.console.junit import junit_file, write_junit
+    from quadsim.console.results import after
+    from quadsim.features.campaign.campaign import fly_campaign
+    from quadsim.features.campaign.events import parse_event
+    from quadsim.features.campaign.plan import load_plan, make_plan
+    from quadsim.features.campaign.statistics import judge, parse_requirement
+    from quadsim.scenarios.schema.scenario import Scenario
+    from quadsim.scenarios.user_code import importable
 
     if junit is not None and not require:
         raise ParameterError("", "--junit", junit, "given with --require, whose verdicts it writes")
@@ -230,11 +230,11 @@ def replay(
         Traceback (most recent call last):
         quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
     """
+    from quadsim.console.progress import reporting
+    from quadsim.features.campaign.campaign import compare_replay, recorded_flight
     from quadsim.outputs import run_directory
-    from scenarios.campaign.campaign import compare_replay, recorded_flight
-    from scenarios.flown import require_film, write_run
-    from scenarios.progress import reporting
-    from scenarios.rollout import Rollout
+    from quadsim.rollout.flown import require_film, write_run
+    from quadsim.rollout.rollout import Rollout
 
     require_film(video)
 
@@ -254,8 +254,8 @@ def replay(
 @contextmanager
 def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) -> Iterator[dict[str, Any]]:
     """Yield the options of a command that adds flights to a directory; Ctrl-C says how to continue."""
+    from quadsim.features.campaign.watching import watching
     from quadsim.outputs import absolute
-    from scenarios.campaign.watching import watching
 
     if resume and overwrite:
         raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
@@ -269,14 +269,14 @@ def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) 
 
 def owns(directory: Path) -> bool:
     """Whether a directory is a campaign's."""
-    from scenarios.campaign.store import is_campaign
+    from quadsim.features.campaign.store import is_campaign
 
     return is_campaign(directory)
 
 
 def drawn_flights(scenario: Scenario, campaign: str) -> Plan:
-    """Draw a campaign's flights for a scenario that need not be its own; see `scenarios.campaign.plan`."""
-    from scenarios.campaign.plan import drawn_flights as draw
+    """Draw a campaign's flights for a scenario that need not be its own; see `quadsim.features.campaign.plan`."""
+    from quadsim.features.campaign.plan import drawn_flights as draw
 
     return draw(scenario, campaign)
 
@@ -306,14 +306,14 @@ def compare_directories(
             other bounds.
         OutputError: the directory cannot be written.
     """
+    from quadsim.console.results import after
+    from quadsim.features.campaign.again import judged_by
+    from quadsim.features.campaign.paired import compare_pairs
+    from quadsim.features.campaign.plan import plan_differences
+    from quadsim.features.campaign.store import FLIGHTS_FILE, read_flights, stored_plan
     from quadsim.flight.audit import limit_differences
     from quadsim.report.comparison import check_names
-    from scenarios.campaign.again import judged_by
-    from scenarios.campaign.paired import compare_pairs
-    from scenarios.campaign.plan import plan_differences
-    from scenarios.campaign.store import FLIGHTS_FILE, read_flights, stored_plan
-    from scenarios.flight_comparison import place_of
-    from scenarios.results import after
+    from quadsim.rollout.flight_comparison import place_of
 
     if len(directories) != 2:
         raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")

@@ -16,7 +16,7 @@ import numpy as np
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.palette import COLOUR, CYCLE
-from scenarios.many import DIED, ERROR, MEMORY, TIMEOUT
+from quadsim.rollout.many import DIED, ERROR, MEMORY, TIMEOUT
 
 if TYPE_CHECKING:
     import pyarrow as pa

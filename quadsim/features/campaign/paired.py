@@ -14,14 +14,10 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
+from quadsim.console.results import Result, Shown
 from quadsim.errors import InputError
-from quadsim.outputs import to_json, writing
-from quadsim.report.comparison import different_audits
-from quadsim.report.comparison_page import TABLE_FILE
-from quadsim.report.page import PAGE_FILE, Section, render_page
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
-from scenarios.campaign.events import EVENT_NAMES, INCOMPLETE, UNAUDITED, FlightFlags, parse_event
-from scenarios.campaign.rows import (
+from quadsim.features.campaign.events import EVENT_NAMES, INCOMPLETE, UNAUDITED, FlightFlags, parse_event
+from quadsim.features.campaign.rows import (
     DRAW,
     MARGIN,
     SAMPLED,
@@ -38,7 +34,7 @@ from scenarios.campaign.rows import (
     texts,
     unit_of,
 )
-from scenarios.campaign.statistics import (
+from quadsim.features.campaign.statistics import (
     ALPHA,
     CONFIDENCE,
     FAILURE,
@@ -50,8 +46,12 @@ from scenarios.campaign.statistics import (
     paired_difference,
     percent,
 )
-from scenarios.results import Result, Shown
-from scenarios.schema.settings import field_text
+from quadsim.outputs import to_json, writing
+from quadsim.report.comparison import different_audits
+from quadsim.report.comparison_page import TABLE_FILE
+from quadsim.report.page import PAGE_FILE, Section, render_page
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
+from quadsim.scenarios.schema.settings import field_text
 
 COMPARISON_FILE: Final = "comparison.json"
 COMPARED: Final = (
@@ -170,7 +170,7 @@ class PairedComparison(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios import console
+        from quadsim.console import console
 
         if self.audits:
             yield different_audits(*self.names, self.audits)
@@ -243,7 +243,7 @@ def compare_pairs(
         table_b: of the second.
         names: of the first and the second; where they are the same, the comparison distinguishes them as such.
         failures: the events that each counts as failure; None where they are known to be the same.
-        differences: see `scenarios.campaign.plan.plan_differences`; None where not known.
+        differences: see `quadsim.features.campaign.plan.plan_differences`; None where not known.
         audits: in what their constraints or tolerances differ: then margins are compared, and neither violations nor
             failures that count them.
 

@@ -13,22 +13,22 @@ from typing import Any, Final
 import pyarrow as pa
 
 from quadsim.errors import FileError, InputError, ParameterError, QuadsimError
+from quadsim.features.campaign.campaign_file import CampaignFile, Draws, Value, Varied
+from quadsim.features.campaign.events import CountedEvent, parse_event
+from quadsim.features.campaign.rows import DRAW, TIMES, flown_row, make_schema
 from quadsim.flight.audit import Limit
-from scenarios.assembly import Assembly
-from scenarios.campaign.campaign_file import CampaignFile, Draws, Value, Varied
-from scenarios.campaign.events import CountedEvent, parse_event
-from scenarios.campaign.rows import DRAW, TIMES, flown_row, make_schema
-from scenarios.catalogue import campaign_path, scenario_source
-from scenarios.flown import Flight
-from scenarios.loading import apply_settings, parse_scenario
-from scenarios.machine import processor_name
-from scenarios.many import ERROR, MEMORY, Row, fly_many
-from scenarios.plugin import Plugin
-from scenarios.rollout import Rollout
-from scenarios.schema.bases import locate_files, merge, read_merged, read_scenario
-from scenarios.schema.problems import ScenarioError, parse_table
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import (
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.machine import processor_name
+from quadsim.rollout.many import ERROR, MEMORY, Row, fly_many
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import campaign_path, scenario_source
+from quadsim.scenarios.loading import apply_settings, parse_scenario
+from quadsim.scenarios.plugin import Plugin
+from quadsim.scenarios.schema.bases import locate_files, merge, read_merged, read_scenario
+from quadsim.scenarios.schema.problems import ScenarioError, parse_table
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.settings import (
     NOT_DESCRIBED,
     RECORDED,
     differences,
@@ -37,7 +37,7 @@ from scenarios.schema.settings import (
     separate,
     set_field,
 )
-from scenarios.schema.writing import plain
+from quadsim.scenarios.schema.writing import plain
 
 FIRST: Final = 5  # flights of which one at least has to be possible
 DrawnChange = tuple[Varied, Value]
@@ -148,7 +148,7 @@ class Plan:
     def fly_all(
         self, flights: Sequence[int], *, workers: int | None = None, cluster: str | None = None
     ) -> Generator[Row]:
-        """The rows of flights, each once, in whatever order they come; see `scenarios.many.fly_many`."""
+        """The rows of flights, each once, in whatever order they come; see `quadsim.rollout.many.fly_many`."""
         limits = {"timeout": self.spec.limits.flight, "memory": self.spec.limits.memory}
         many = fly_many(flights, self.fly, workers=workers, cluster=cluster, isolate=self.flies_user_code, **limits)
         with closing(many) as rows:

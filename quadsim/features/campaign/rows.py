@@ -16,13 +16,13 @@ import pyarrow as pa
 
 from quadsim.controller import ACCEPTED, NO_SOLVER, Phase
 from quadsim.errors import FileError
+from quadsim.features.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, CountedEvent, FlightFlags
 from quadsim.flight import metrics
 from quadsim.flight.audit import Finding, Limit, worst_finding, worst_share
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FORMAT, read_parquet
+from quadsim.rollout.many import Row
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
-from scenarios.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, CountedEvent, FlightFlags
-from scenarios.many import Row
 
 DRAW: Final = "draw."  # how the columns of drawn values begin
 VIOLATION: Final = "violation"  # the event

@@ -20,11 +20,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from quadsim.errors import InputError, ParameterError
-from quadsim.flight.audit import UNAUDITED_ADVICE, Limit
-from quadsim.report.table import ABSENT
-from quadsim.state import Array, Indices
-from quadsim.ties import TIE_SHARE, first_smallest, in_order
-from scenarios.campaign.events import (
+from quadsim.features.campaign.events import (
     EVENT_NAMES,
     OPERATIONS,
     VERDICTS,
@@ -32,7 +28,7 @@ from scenarios.campaign.events import (
     FlightFlags,
     parse_event,
 )
-from scenarios.campaign.rows import (
+from quadsim.features.campaign.rows import (
     DRAW,
     MARGIN,
     CampaignSummary,
@@ -50,6 +46,10 @@ from scenarios.campaign.rows import (
     unit_of,
     verdicts,
 )
+from quadsim.flight.audit import UNAUDITED_ADVICE, Limit
+from quadsim.report.table import ABSENT
+from quadsim.state import Array, Indices
+from quadsim.ties import TIE_SHARE, first_smallest, in_order
 
 
 def percent(share: float | None, digits: int = 2) -> str:

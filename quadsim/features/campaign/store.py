@@ -22,16 +22,16 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from quadsim.errors import FileError, InputError
+from quadsim.features.campaign.campaign_file import CampaignFile
+from quadsim.features.campaign.plan import Plan, load_plan
+from quadsim.features.campaign.rows import TIMES, make_table, read_table, split_times
 from quadsim.flight.parquet import FORMAT, format_of, require_format
 from quadsim.flight.rundir import SCENARIO_FILE, read_json, require_inside
 from quadsim.outputs import SUMMARY_FILE, Growing, digest_of, to_json
 from quadsim.report.page import PAGE_FILE
-from scenarios.campaign.campaign_file import CampaignFile
-from scenarios.campaign.plan import Plan, load_plan
-from scenarios.campaign.rows import TIMES, make_table, read_table, split_times
-from scenarios.machine import code_digest, digest_below, machine, versions
-from scenarios.many import Row
-from scenarios.plugin import Plugin, PluginForce, import_plugin
+from quadsim.rollout.machine import code_digest, digest_below, machine, versions
+from quadsim.rollout.many import Row
+from quadsim.scenarios.plugin import Plugin, PluginForce, import_plugin
 
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
@@ -66,7 +66,7 @@ def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
 
 
 class Store:
-    """The rows of a campaign on disk, in the columns of `scenarios.campaign.rows.make_schema`."""
+    """The rows of a campaign on disk, in the columns of `quadsim.features.campaign.rows.make_schema`."""
 
     def __init__(self, files: Growing, schema: pa.Schema) -> None:
         self._files, self._directory, self._schema = files, files.path, schema

@@ -13,18 +13,18 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
+from quadsim.console.progress import Progress, silent
+from quadsim.console.results import Result, Shown
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.features.campaign.campaign_file import CampaignFile, GridValues
+from quadsim.features.campaign.plan import Plan, cell
+from quadsim.features.campaign.rows import DRAW, is_number, make_table, numbers
 from quadsim.palette import COLOUR
 from quadsim.report.figure import Bound, Figure, Panel, Series
-from scenarios.assembly import Assembly
-from scenarios.campaign.campaign_file import CampaignFile, GridValues
-from scenarios.campaign.plan import Plan, cell
-from scenarios.campaign.rows import DRAW, is_number, make_table, numbers
-from scenarios.flown import to_pandas
-from scenarios.progress import Progress, silent
-from scenarios.results import Result, Shown
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import leaves, separate
+from quadsim.rollout.flown import to_pandas
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.settings import leaves, separate
 
 _FIRST: Final = ("verdict", "worst_margin", "worst_constraint", "reason")  # columns after those of the swept fields
 _SHOWN: Final = ("verdict", "rmse.x", "rmse.y", "rmse.z", "worst_margin", "worst_constraint")
@@ -76,7 +76,7 @@ class Sweep(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios import console
+        from quadsim.console import console
 
         verdicts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(self["verdict"].tolist()).items())
         lines = [[_text(row[name]) for name in (*self.fields, *_SHOWN)] for row in self.table.to_pylist()]

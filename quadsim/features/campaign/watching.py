@@ -6,15 +6,15 @@ import contextlib
 import datetime
 from collections.abc import Iterator
 
-from scenarios.campaign.campaign import CampaignProgress, Watch
-from scenarios.campaign.statistics import interval, proportion
-from scenarios.progress import lines
+from quadsim.console.progress import lines
+from quadsim.features.campaign.campaign import CampaignProgress, Watch
+from quadsim.features.campaign.statistics import interval, proportion
 
 
 @contextlib.contextmanager
 def watching(progress: bool) -> Iterator[Watch]:
     """Yield the function that shows a campaign's progress: a bar on a terminal, elsewhere a line at intervals."""
-    from scenarios.console import stderr
+    from quadsim.console.console import stderr
 
     screen = stderr()
     if not progress:

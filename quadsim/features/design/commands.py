@@ -10,13 +10,13 @@ from cyclopts import Parameter
 
 from quadsim.assets import vehicle_names
 from quadsim.errors import InputError, ParameterError
-from scenarios.catalogue import scenario_names
-from scenarios.commands.arguments import Changes, File, Flag, ScenarioName, VehicleName, Whole
+from quadsim.features.arguments import Changes, File, Flag, ScenarioName, VehicleName, Whole
+from quadsim.scenarios.catalogue import scenario_names
 
 if TYPE_CHECKING:
-    from scenarios.design.vehicle_report import VehicleReport
-    from scenarios.loading import ScenarioFile
-    from scenarios.results import Document
+    from quadsim.console.results import Document
+    from quadsim.features.design.vehicle_report import VehicleReport
+    from quadsim.scenarios.loading import ScenarioFile
 else:
     Document = ScenarioFile = VehicleReport = Any
 
@@ -62,11 +62,11 @@ def scenario(
     import json
 
     from quadsim.assets import vehicle_path
+    from quadsim.features.design.first_scenario import first_scenario
+    from quadsim.scenarios import loading
+    from quadsim.scenarios.courses.csv_course import Csv
+    from quadsim.scenarios.schema.json_schema import scenario_schema
     from quadsim.vehicle import load_vehicle
-    from scenarios import loading
-    from scenarios.courses.csv_course import Csv
-    from scenarios.design.first_scenario import first_scenario
-    from scenarios.schema.json_schema import scenario_schema
 
     if schema:
         return loading.ScenarioFile(json.dumps(scenario_schema(), indent=2) + "\n", scenario_schema())
@@ -129,12 +129,13 @@ def vehicle_report(
         'controller.input_bounds.speed: hover is 453.2 rad/s, the scenario allows 250'
     """
     from quadsim.assets import vehicle_path
+    from quadsim.console import results
+    from quadsim.features.design import shortfalls, vehicle_report
     from quadsim.report import vehicle_drawing
+    from quadsim.scenarios import loading
+    from quadsim.scenarios.assembly import stated_autopilot
     from quadsim.sim.autopilot import AutopilotSettings
     from quadsim.vehicle import load_vehicle, vehicle_sources
-    from scenarios import loading, results
-    from scenarios.assembly import stated_autopilot
-    from scenarios.design import shortfalls, vehicle_report
 
     blank = Path(__file__).with_name("vehicle_template.toml")
     if thrust_stand is not None:
@@ -144,7 +145,7 @@ def vehicle_report(
         start = blank if name is None else vehicle_path(str(name))
         if name is not None:
             load_vehicle(start)
-        from scenarios.design.thrust_stand import stand_vehicle_text
+        from quadsim.features.design.thrust_stand import stand_vehicle_text
 
         return results.Document(*stand_vehicle_text(Path(thrust_stand), start.read_text(encoding="utf-8-sig")))
     if template:

@@ -11,11 +11,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from mpc.baselines.bandwidths import lag_to_allow_for
-from mpc.model import SHORTEST_LAG
 from quadsim.errors import UnknownNameError, printable
-from quadsim.vehicle import Vehicle, span
-from scenarios.design.rules import (
+from quadsim.features.design.rules import (
     HEADING_RATIO,
     HEADING_STEP,
     HEIGHT_RATIO,
@@ -29,9 +26,12 @@ from scenarios.design.rules import (
     delay_margin,
     design_for,
 )
+from quadsim.mpc.baselines.bandwidths import lag_to_allow_for
+from quadsim.mpc.model import SHORTEST_LAG
+from quadsim.vehicle import Vehicle, span
 
 if TYPE_CHECKING:
-    from scenarios.schema.scenario import Scenario
+    from quadsim.scenarios.schema.scenario import Scenario
 
 COURSES: Final = ("hover", "step", "figure-eight")
 DESIGNED_LAWS: Final = ("robust", "lqr", "pid", "geometric", "rates")
@@ -85,7 +85,7 @@ class FirstScenario:
     @property
     def scenario(self) -> Scenario:
         """The parsed scenario."""
-        from scenarios.loading import parse_scenario
+        from quadsim.scenarios.loading import parse_scenario
 
         return parse_scenario(self.to_data())
 
@@ -154,7 +154,7 @@ def _notes(vehicle: Vehicle, tuning: Design, course: str, law: str) -> str:
     option, what = "", "The loop's bandwidth for x and y"
     then = (
         f"Without bounds it tolerates {1e3 * delay_margin(vehicle, tuning):.3g} ms more delay than it knows of.\n"
-        "# Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: scenarios/design/rules.py."
+        "# Weights by Bryson's rule, 1 / (largest accepted deviation)^2; sources: quadsim/features/design/rules.py."
     )
     if law != "robust":
         option, what = f" --controller {law}", "The course is made for a robust MPC, whose bandwidth for x and y"

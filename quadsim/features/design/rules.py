@@ -31,12 +31,12 @@ from typing import Final, Literal
 import numpy as np
 import scipy.linalg
 
-from mpc.model import continuous_model, discretise
 from quadsim.errors import ParameterError
+from quadsim.features.design.authority import Authority, authority
+from quadsim.mpc.model import continuous_model, discretise
 from quadsim.state import INDEX, Array
 from quadsim.ties import TIE_SHARE, first_smallest
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.design.authority import Authority, authority
 
 PERIODS: Final = (0.05, 0.04, 0.025, 0.02, 0.01)
 """Control periods to choose from [s], whole multiples of the physics step."""

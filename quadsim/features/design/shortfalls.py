@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from mpc.baselines.law import Baseline
-from mpc.bounded import Bounded, InputBounds
-from mpc.robust.settings import Robust
+from quadsim.features.design.authority import Authority, authority
+from quadsim.mpc.baselines.law import Baseline
+from quadsim.mpc.bounded import Bounded, InputBounds
+from quadsim.mpc.robust.settings import Robust
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.feasibility_check import report
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.vehicle import Vehicle, span
-from scenarios.assembly import Assembly
-from scenarios.design.authority import Authority, authority
-from scenarios.feasibility_check import report
-from scenarios.schema.scenario import Scenario
 
 SLOWEST_ANSWER: Final = 1.0
 """Time [s] within which steps of the command, as they are bounded, should come from hover to the highest speed."""

@@ -10,8 +10,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from mpc.model import continuous_model, discretise
+from quadsim.console.results import Result, Shown
 from quadsim.errors import ParameterError, QuadsimError
+from quadsim.features.design.authority import TorqueRange, authority, torque_ranges
+from quadsim.features.design.rules import delay_margin, design_for
+from quadsim.mpc.model import continuous_model, discretise
 from quadsim.plausibility import implausible
 from quadsim.report import vehicle_drawing
 from quadsim.report.figure import Figure
@@ -19,9 +22,6 @@ from quadsim.report.table import Cell, Grid, format_number
 from quadsim.sim.autopilot import AutopilotSettings, built_in_lags
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
-from scenarios.design.authority import TorqueRange, authority, torque_ranges
-from scenarios.design.rules import delay_margin, design_for
-from scenarios.results import Result, Shown
 
 SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
 TIMESTEP: Final = 1e-3  # of the physics behind the autopilot's lags [s]
@@ -31,7 +31,7 @@ _RPM: Final = 60.0 / (2.0 * math.pi)
 
 @dataclass(frozen=True, kw_only=True)
 class Designed:
-    """Performance of a controller designed for a vehicle; see `scenarios.design.rules`."""
+    """Performance of a controller designed for a vehicle; see `quadsim.features.design.rules`."""
 
     time_constants: dict[str, float]  # one over the bandwidth of each axis [s]
     limited_by: str  # what the bandwidth of x and y is the limit of: lag, torque or period
@@ -96,7 +96,7 @@ class VehicleReport(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios import console
+        from quadsim.console import console
 
         yield from console.grids(vehicle_tables(self), left=("unit", "source", "what and why"))
         yield from implausible(self.vehicle)
@@ -209,7 +209,7 @@ def vehicle_tables(report: VehicleReport) -> list[Grid]:
             "what a controller made for it can do",
             ("", "value", "unit"),
             _abilities(sheet),
-            note="quadsim scenario --for VEHICLE makes it; the rules: scenarios/design/rules.py",
+            note="quadsim scenario --for VEHICLE makes it; the rules: quadsim/features/design/rules.py",
         ),
         _grid(
             "its autopilot, for controllers of thrust and body rates",

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Any, Final
 
-from scenarios.commands.arguments import Changes, File, Flag, ScenarioName, Watched, Whole
+from quadsim.features.arguments import Changes, File, Flag, ScenarioName, Watched, Whole
 
 if TYPE_CHECKING:
-    from scenarios.flown import Flight
-    from scenarios.results import Document
+    from quadsim.console.results import Document
+    from quadsim.rollout.flown import Flight
 else:
     Document = Flight = Any
 
@@ -47,10 +47,11 @@ def export(
     import json
     import shlex
 
+    from quadsim.console import results
+    from quadsim.console.progress import reporting
+    from quadsim.features.export import exporter, in_the_loop
     from quadsim.outputs import run_directory
-    from scenarios import loading, results
-    from scenarios.export import exporter, in_the_loop
-    from scenarios.progress import reporting
+    from quadsim.scenarios import loading
 
     flown, options = loading.load_scenario(scenario, changes, seed), {"precision": precision, "target": target}
     with reporting(progress) as report:

@@ -11,27 +11,27 @@ from typing import Any, Final, get_args
 
 import numpy as np
 
-from mpc.baselines.geometric import Geometric
-from mpc.bounded import Weighted
-from mpc.codegen.ctext import CText, Precision
-from mpc.codegen.geometric import CGeometric
-from mpc.codegen.nonlinear import CNonlinear
-from mpc.codegen.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
-from mpc.codegen.targets import TARGETS, Machine
-from mpc.core.numbers import AVOIDS, Exportable, exportable
-from mpc.core.solver import CoreProblem, Work, core_library
-from mpc.nonlinear.rigidbody import N_BODY, P, V
-from mpc.nonlinear.settings import Nonlinear
-from mpc.nonlinear.sqp import SQPStatus
-from mpc.solvers import Method
 from quadsim.controller import ROTORS
 from quadsim.errors import ExportError, ParameterError
+from quadsim.features.export.record import Recording, record
+from quadsim.mpc.baselines.geometric import Geometric
+from quadsim.mpc.bounded import Weighted
+from quadsim.mpc.codegen.ctext import CText, Precision
+from quadsim.mpc.codegen.geometric import CGeometric
+from quadsim.mpc.codegen.nonlinear import CNonlinear
+from quadsim.mpc.codegen.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
+from quadsim.mpc.codegen.targets import TARGETS, Machine
+from quadsim.mpc.core.numbers import AVOIDS, Exportable, exportable
+from quadsim.mpc.core.solver import CoreProblem, Work, core_library
+from quadsim.mpc.nonlinear.rigidbody import N_BODY, P, V
+from quadsim.mpc.nonlinear.settings import Nonlinear
+from quadsim.mpc.nonlinear.sqp import SQPStatus
+from quadsim.mpc.solvers import Method
 from quadsim.outputs import absolute, reserving, writing
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import N_STATES, POSITION, VELOCITY, Array
-from scenarios.assembly import Assembly
-from scenarios.export.record import Recording, record
-from scenarios.loading import load_scenario
-from scenarios.schema.scenario import Scenario
 
 DISTANCES: Final = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Per axis [m], and speeds per axis [m/s]."""

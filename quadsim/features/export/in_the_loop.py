@@ -1,7 +1,7 @@
 """Processor in the loop: a flight whose controller is an exported one, on its target or in the target's emulator.
 
 The programs of an export are built with its Makefile and run; questions and answers pass the serial line of
-`mpc/codegen/c/serial.c`.
+`quadsim/mpc/codegen/c/serial.c`.
 """
 
 from __future__ import annotations
@@ -23,12 +23,7 @@ from typing import Final, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from mpc.codegen.ctext import Precision
-from mpc.codegen.source import CSource
-from mpc.codegen.targets import EMULATOR, TARGETS, Machine
-from mpc.fallback.structs import STATUSES
-from mpc.nonlinear.law import measured_state, reference_rows
-from mpc.pilot import Pilot
+from quadsim.console.progress import Progress, reporting
 from quadsim.controller import (
     COMMANDED,
     CORE,
@@ -46,17 +41,22 @@ from quadsim.controller import (
     stopped,
 )
 from quadsim.errors import FlightError, MissingProgramError, QuadsimError
+from quadsim.features.export.exporter import c_controller, programs
 from quadsim.flight.audit import COMMAND_SIGNALS, Limit
+from quadsim.mpc.codegen.ctext import Precision
+from quadsim.mpc.codegen.source import CSource
+from quadsim.mpc.codegen.targets import EMULATOR, TARGETS, Machine
+from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.mpc.nonlinear.law import measured_state, reference_rows
+from quadsim.mpc.pilot import Pilot
 from quadsim.outputs import reserving
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import N_STATES, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.assembly import Assembly
-from scenarios.export.exporter import c_controller, programs
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.progress import Progress, reporting
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
 
 ANSWERERS: Final = {UNCONSTRAINED: GAIN, SOLVED: CORE, NOT_CONVERGED: CORE, COMMANDED: LAW}
 """`answered_by` of a command that is flown as it is, by its status."""

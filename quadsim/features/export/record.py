@@ -9,23 +9,23 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mpc.baselines.geometric import GeometricController
-from mpc.bounded import Bounded, Weighted
-from mpc.core.solver import Core
-from mpc.core.tables import with_constraints
-from mpc.fallback.structs import STATUSES
-from mpc.linear import LinearMPC
-from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.law import measured_state, reference_rows
-from mpc.ocp import Query
-from mpc.solvers import Method
-from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import ACCEPTED, CORE, GAIN, ROTORS, SOLVED, Command, Phase, StepInputs
 from quadsim.errors import ExportError, PlanExhaustedError
+from quadsim.mpc.baselines.geometric import GeometricController
+from quadsim.mpc.bounded import Bounded, Weighted
+from quadsim.mpc.core.solver import Core
+from quadsim.mpc.core.tables import with_constraints
+from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.mpc.linear import LinearMPC
+from quadsim.mpc.nonlinear.controller import NonlinearMPC
+from quadsim.mpc.nonlinear.law import measured_state, reference_rows
+from quadsim.mpc.ocp import Query
+from quadsim.mpc.solvers import Method
+from quadsim.mpc.unconstrained import UnconstrainedMPC
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
-from scenarios.assembly import Assembly
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
 
 RecordedLaw = LinearMPC | UnconstrainedMPC | NonlinearMPC | GeometricController
 QUATERNIONS: Final = (NonlinearMPC, GeometricController)

@@ -16,21 +16,21 @@ from gymnasium.vector import VectorEnv
 
 from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import FlightError, ParameterError
+from quadsim.features.entries import commands_of
+from quadsim.features.gym.spaces import USUAL, Action, Actions, Observations
 from quadsim.flight.audit import Limit
 from quadsim.flight.log import FlightLog, PeriodLog
 from quadsim.report.film.camera import Camera
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly, preferring_core
+from quadsim.scenarios.catalogue import scenario_names
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.base import LARGEST_SEED
+from quadsim.scenarios.schema.bases import read_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.physics import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array, wrapped
-from scenarios.assembly import Assembly, preferring_core
-from scenarios.catalogue import scenario_names
-from scenarios.commands.rooms import commands_of
-from scenarios.flown import Flight
-from scenarios.gym.spaces import USUAL, Action, Actions, Observations
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
-from scenarios.schema.base import LARGEST_SEED
-from scenarios.schema.bases import read_scenario
-from scenarios.schema.scenario import Scenario
 
 Reward = Callable[[Array, Array, Array], float]
 """Function of the true state (12,) after a step, the reference (4,) and the commanded rotor speeds (4,) [rad/s]."""
@@ -48,9 +48,9 @@ def nearness(state: Array, reference: Array, speeds: Array) -> float:
 class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     """A scenario, one step per control period.
 
-    For observations and actions see `scenarios.gym.spaces`.  An episode is terminated when the vehicle is lost by a
-    criterion of `[lost]`, has crashed, or has diverged, and truncated at the scenario's duration, which a campaign's
-    `[set]` may change.
+    For observations and actions see `quadsim.features.gym.spaces`.  An episode is terminated when the vehicle is lost
+    by a criterion of `[lost]`, has crashed, or has diverged, and truncated at the scenario's duration, which a
+    campaign's `[set]` may change.
 
     A pickled or copied environment is without its episode, whose plant is native memory: reset it first.
 

@@ -9,19 +9,19 @@ import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from mpc.builders import guard_of
-from mpc.pilot import Pilot
-from mpc.robust.filter import safety_filter
-from mpc.robust.settings import Robust
 from quadsim.controller import UNCONSTRAINED
 from quadsim.errors import ParameterError
+from quadsim.features.gym.environment import QuadrotorEnv
+from quadsim.features.gym.spaces import Action
+from quadsim.mpc.builders import guard_of
+from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.robust.filter import safety_filter
+from quadsim.mpc.robust.settings import Robust
 from quadsim.vehicle import Vehicle
-from scenarios.gym.environment import QuadrotorEnv
-from scenarios.gym.spaces import Action
 
 
 class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
-    """Passes an action, or the nearest one after which the constraints can be satisfied; see `mpc.robust.filter`.
+    """Passes an action, or the nearest one after which the constraints can be satisfied; see `robust.filter`.
 
     An action that is not finite is never flown: the fallback's command is, until the next one.
 

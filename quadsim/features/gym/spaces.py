@@ -10,15 +10,15 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from mpc.answer import ActuatorBounds
-from mpc.bounded import Bounded
 from quadsim.controller import Command
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.flight.log import ControlLog, columns_of
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.bounded import Bounded
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle, span
-from scenarios.schema.scenario import Scenario
 
 Action = NDArray[np.floating]
 

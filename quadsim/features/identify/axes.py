@@ -14,11 +14,11 @@ from typing import Final
 import numpy as np
 
 from quadsim.errors import InputError
+from quadsim.features.identify.correlation import Pairs, aligned, correlations, moments, pairs_of, shifts, stride
+from quadsim.features.identify.record import Record, driver
+from quadsim.features.identify.windows import body_z, mean, rate_over_window, to_world, turn_rate
 from quadsim.rotation import conjugate
 from quadsim.state import Array
-from scenarios.identify.correlation import Pairs, aligned, correlations, moments, pairs_of, shifts, stride
-from scenarios.identify.record import Record, driver
-from scenarios.identify.windows import body_z, mean, rate_over_window, to_world, turn_rate
 
 WINDOW: Final = 0.1  # [s] over which rates and thrust are compared
 SLOW_WINDOW: Final = 0.2  # [s] for lateral accelerations

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError, InputError
-from scenarios.identify.quantities import LoggedColumns, NamedQuantity
-from scenarios.identify.series import Column, on_one_clock
+from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity
+from quadsim.features.identify.series import Column, on_one_clock
 
 _STEP: Final = re.compile(r"\.?([A-Za-z_]\w*)|\[(\d+)\]")
 

@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError
-from scenarios.identify.border import between, stated_number
-from scenarios.identify.quantities import RPM, LoggedColumns, NamedQuantity, logged_as
-from scenarios.identify.series import Column, on_one_clock
+from quadsim.features.identify.border import between, stated_number
+from quadsim.features.identify.quantities import RPM, LoggedColumns, NamedQuantity, logged_as
+from quadsim.features.identify.series import Column, on_one_clock
 
 _ADVICE: Final = (
     "in Betaflight, set blackbox_disable_attitude, _acc, _rpm and _gyro to OFF, blackbox_sample_rate to 1/8"

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects, label, maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from quadsim.errors import InputError
+from quadsim.features.identify.axes import check_axes
+from quadsim.features.identify.clocks import check_clocks
+from quadsim.features.identify.quantities import RPM
+from quadsim.features.identify.record import INPUTS, SLOWEST_COMMANDS, Record, driver
+from quadsim.features.identify.rotor_order import check_rotor_order
+from quadsim.features.identify.scales import check_scales
+from quadsim.features.identify.windows import body_z, rate_over_window
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.identify.axes import check_axes
-from scenarios.identify.clocks import check_clocks
-from scenarios.identify.quantities import RPM
-from scenarios.identify.record import INPUTS, SLOWEST_COMMANDS, Record, driver
-from scenarios.identify.rotor_order import check_rotor_order
-from scenarios.identify.scales import check_scales
-from scenarios.identify.windows import body_z, rate_over_window
 
 SHORTEST_SPAN: Final = 2.0  # [s] of a span that is used
 LEAST: Final = 4.0  # [s] that the longest must have

@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 
 from quadsim.errors import InputError
+from quadsim.features.identify.axes import lateral_motion, tilt_fit, turning_pairs
+from quadsim.features.identify.correlation import likeness, shifts, stride
+from quadsim.features.identify.record import Record
 from quadsim.state import Array
-from scenarios.identify.axes import lateral_motion, tilt_fit, turning_pairs
-from scenarios.identify.correlation import likeness, shifts, stride
-from scenarios.identify.record import Record
 
 REFUSED_SHIFT: Final = {"rates are": 0.015, "velocity is": 0.05}
 """Shift [s] that is refused: drag and yaw reaction would be wrong, and their intervals with them."""

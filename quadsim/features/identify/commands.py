@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadsim.errors import InputError, ParameterError
-from scenarios.commands.arguments import File, Files, Flag, VehicleName, Whole
+from quadsim.features.arguments import File, Files, Flag, VehicleName, Whole
 
 if TYPE_CHECKING:
-    from scenarios.identify.report import IdentifiedVehicle
+    from quadsim.features.identify.report import IdentifiedVehicle
 else:
     IdentifiedVehicle = Any
 
@@ -56,9 +56,9 @@ def identify(
         quadsim.errors.FileError: not-logged-yet.csv: is missing, or not a file
     """
     from quadsim.assets import vehicle_path
-    from scenarios.identify.quantities import read_map
-    from scenarios.identify.report import NEEDED_PARAMETERS, identify_logs
-    from scenarios.identify.ulog import stated_rotors
+    from quadsim.features.identify.quantities import read_map
+    from quadsim.features.identify.report import NEEDED_PARAMETERS, identify_logs
+    from quadsim.features.identify.ulog import stated_rotors
 
     if not logs:
         raise InputError("identify needs a flight log: CSV, Parquet, an autopilot's, or a run directory")

@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
+from quadsim.features.identify.record import Record
 from quadsim.state import Array
-from scenarios.identify.record import Record
 
 TICK: Final = 0.01  # [s] between samples that are compared, or the log's period if that is longer
 LONGEST_SHIFT: Final = 0.3  # [s] between clocks that is looked for

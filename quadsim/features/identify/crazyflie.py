@@ -15,8 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from scenarios.identify.quantities import LoggedColumns, NamedQuantity, logged_as
-from scenarios.identify.series import Column, on_one_clock
+from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, logged_as
+from quadsim.features.identify.series import Column, on_one_clock
 
 FIRST_BYTES: Final = (b"\xbc\x01\x00", b"\xbc\x02\x00")
 _STAMPS: Final = {1: (struct.Struct("<HI"), 1e-3), 2: (struct.Struct("<HQ"), 1e-6)}

@@ -12,10 +12,10 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError
+from quadsim.features.identify.border import between, stated_number
+from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, logged_as
+from quadsim.features.identify.series import Column, on_one_clock
 from quadsim.vehicle import N_ROTORS
-from scenarios.identify.border import between, stated_number
-from scenarios.identify.quantities import LoggedColumns, NamedQuantity, logged_as
-from scenarios.identify.series import Column, on_one_clock
 
 _NAMES: Final = (
     logged_as("rates", "IMU.GyrX IMU.GyrY IMU.GyrZ", down=True),

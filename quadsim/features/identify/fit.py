@@ -15,13 +15,20 @@ import numpy as np
 from scipy.stats import t as student
 
 from quadsim.errors import InputError
+from quadsim.features.identify.estimate import (
+    VECTORS,
+    FlightNumbers,
+    Identification,
+    ParameterEstimate,
+    field_of,
+    number_in,
+)
+from quadsim.features.identify.model import INCREMENTS, stretch
+from quadsim.features.identify.record import Record
+from quadsim.features.identify.rotor_response import rotor_response
+from quadsim.features.identify.search import LEVEL_PLATE, PLATE, Search
 from quadsim.state import Array
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.identify.estimate import VECTORS, FlightNumbers, Identification, ParameterEstimate, field_of, number_in
-from scenarios.identify.model import INCREMENTS, stretch
-from scenarios.identify.record import Record
-from scenarios.identify.rotor_response import rotor_response
-from scenarios.identify.search import LEVEL_PLATE, PLATE, Search
 
 INTERVAL_SHARE: Final = 0.95
 WIDEST: Final = 0.25

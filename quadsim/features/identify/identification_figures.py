@@ -7,11 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.palette import COLOUR, CYCLE
-from quadsim.report.figure import Figure, Panel, Series
-from quadsim.state import shown_unit
-from scenarios.identify.estimate import ParameterEstimate
-from scenarios.identify.prediction import (
+from quadsim.features.identify.estimate import ParameterEstimate
+from quadsim.features.identify.prediction import (
     HORIZONS,
     IDENTIFIED,
     QUANTITIES,
@@ -21,6 +18,9 @@ from scenarios.identify.prediction import (
     PredictionErrors,
     Trace,
 )
+from quadsim.palette import COLOUR, CYCLE
+from quadsim.report.figure import Figure, Panel, Series
+from quadsim.state import shown_unit
 
 _COLOURS: Final = dict(zip((IDENTIFIED, THRUST_ONLY, START), CYCLE, strict=False))
 _TRACED: Final = tuple(

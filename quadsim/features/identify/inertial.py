@@ -8,9 +8,9 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from quadsim.errors import InputError
+from quadsim.features.identify.windows import to_world
 from quadsim.rotation import euler_to_quaternion, exponential, multiply, normalise
 from quadsim.state import Array
-from scenarios.identify.windows import to_world
 
 _GRAVITY: Final = 9.81  # [m/s^2] of what an accelerometer shows at rest
 _UP: Final = 0.07  # by which the mean force may differ from the weight

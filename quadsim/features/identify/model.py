@@ -9,12 +9,12 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from quadsim.features.identify.record import Record
+from quadsim.features.identify.rotors import Turning, lagging, measured, smoothed
 from quadsim.rotation import exponential, multiply, normalise
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.identify.record import Record
-from scenarios.identify.rotors import Turning, lagging, measured, smoothed
 
 INCREMENTS: Final = ("roll", "pitch", "yaw", "vx", "vy", "vz")
 _SMOOTHING: Final = 0.1

@@ -17,13 +17,13 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from quadsim.errors import InputError
+from quadsim.features.identify.checks import SHORTEST_SPAN
+from quadsim.features.identify.estimate import Identification
+from quadsim.features.identify.model import MeanMotion, Parameters, predicted_increments, turning
+from quadsim.features.identify.record import Record
+from quadsim.features.identify.rotors import Turning
 from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
-from scenarios.identify.checks import SHORTEST_SPAN
-from scenarios.identify.estimate import Identification
-from scenarios.identify.model import MeanMotion, Parameters, predicted_increments, turning
-from scenarios.identify.record import Record
-from scenarios.identify.rotors import Turning
 
 PREDICTION_WINDOW: Final = 0.5  # longest horizon [s]; windows start every half of it
 HORIZONS: Final = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)  # at which errors are taken [s]

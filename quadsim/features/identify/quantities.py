@@ -21,10 +21,10 @@ import numpy as np
 
 from quadsim.assets import read_toml
 from quadsim.errors import FileError, InputError, ParameterError
+from quadsim.features.identify.series import Column
 from quadsim.plausibility import LARGEST_SAMPLES
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import Array
-from scenarios.identify.series import Column
 
 RPM: Final = math.tau / 60.0  # [rad/s]
 NO_ERPM: Final = 65535  # of 16 bits: no value, but a gap
@@ -151,7 +151,7 @@ def _named_in(path: Path, quantity: str, table: Any) -> NamedQuantity:
 def to_series(
     path: Path, log: LoggedColumns, given: Sequence[NamedQuantity] = (), poles: int | None = None
 ) -> dict[str, Column]:
-    """Return the series of a log by field of `scenarios.identify.record.Record`, in our units and frames.
+    """Return the series of a log by field of `quadsim.features.identify.record.Record`, in our units and frames.
 
     Args:
         path: of the log, for messages.

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadsim.errors import FileError, InputError
+from quadsim.features.identify import crazyflie, ulog
+from quadsim.features.identify.bags import read_bag
+from quadsim.features.identify.blackbox import read_blackbox
+from quadsim.features.identify.border import reading
+from quadsim.features.identify.dataflash import read_dataflash
+from quadsim.features.identify.inertial import filled_in, integrated_velocity, levelled_attitude
+from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, to_series
+from quadsim.features.identify.series import Column, held
+from quadsim.features.identify.tables import read_columns
 from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array
-from scenarios.identify import crazyflie, ulog
-from scenarios.identify.bags import read_bag
-from scenarios.identify.blackbox import read_blackbox
-from scenarios.identify.border import reading
-from scenarios.identify.dataflash import read_dataflash
-from scenarios.identify.inertial import filled_in, integrated_velocity, levelled_attitude
-from scenarios.identify.quantities import LoggedColumns, NamedQuantity, to_series
-from scenarios.identify.series import Column, held
-from scenarios.identify.tables import read_columns
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
@@ -57,7 +57,7 @@ FORMATS: Final = (
 class Record:
     """A flight as it was logged: N samples, uniform in time; world z up, body x forward, y left, z up.
 
-    Samples in gaps of the log are NaN; `scenarios.identify.checks.spans` leaves them out.
+    Samples in gaps of the log are NaN; `quadsim.features.identify.checks.spans` leaves them out.
     """
 
     name: str  # of the log, for messages and sources
@@ -94,7 +94,7 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
     Args:
         path: file or run directory.
         poles: magnets of each motor, for electrical speeds: eRPM / (poles / 2) = rpm.
-        columns: a map of its columns (`scenarios.identify.quantities.read_map`).
+        columns: a map of its columns (`quadsim.features.identify.quantities.read_map`).
 
     Raises:
         FileError: it is missing or damaged, or lacks a column; the message names what is allowed. Whatever else its

@@ -12,24 +12,19 @@ from typing import Any, Final
 
 import numpy as np
 
+from quadsim.console.results import Result, Shown, after
 from quadsim.errors import InputError, ParameterError
-from quadsim.outputs import require_file, writing_file
-from quadsim.report.page import Section, render_page
-from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
-from quadsim.report.to_plotly import to_plot
-from quadsim.state import shown_unit
-from quadsim.vehicle import Vehicle, load_vehicle
-from scenarios.identify.border import judging
-from scenarios.identify.checks import check_log, spans
-from scenarios.identify.estimate import Identification, ParameterEstimate
-from scenarios.identify.fit import identify_records
-from scenarios.identify.identification_figures import (
+from quadsim.features.identify.border import judging
+from quadsim.features.identify.checks import check_log, spans
+from quadsim.features.identify.estimate import Identification, ParameterEstimate
+from quadsim.features.identify.fit import identify_records
+from quadsim.features.identify.identification_figures import (
     horizon_figure,
     interval_figure,
     residual_figure,
     trace_figure,
 )
-from scenarios.identify.prediction import (
+from quadsim.features.identify.prediction import (
     HORIZONS,
     JUDGED,
     QUANTITIES,
@@ -39,10 +34,15 @@ from scenarios.identify.prediction import (
     hold_out,
     predict,
 )
-from scenarios.identify.quantities import NamedQuantity
-from scenarios.identify.record import read_record
-from scenarios.identify.vehicle_file import interval_text, rounded, vehicle_text, verdict
-from scenarios.results import Result, Shown, after
+from quadsim.features.identify.quantities import NamedQuantity
+from quadsim.features.identify.record import read_record
+from quadsim.features.identify.vehicle_file import interval_text, rounded, vehicle_text, verdict
+from quadsim.outputs import require_file, writing_file
+from quadsim.report.page import Section, render_page
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
+from quadsim.report.to_plotly import to_plot
+from quadsim.state import shown_unit
+from quadsim.vehicle import Vehicle, load_vehicle
 
 NEEDED_PARAMETERS: Final = "mass, gravity, arm_length, rotor_azimuths, rotor_spins, speed_min and speed_max"
 
@@ -129,7 +129,7 @@ class IdentifiedVehicle(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios import console
+        from quadsim.console import console
 
         yield console.styled((self.verdict.text, "bold"))
         yield self.counted
@@ -154,7 +154,7 @@ class IdentifiedVehicle(Result):
 
     def outputs(self) -> Shown:
         """See `Result.outputs`."""
-        from scenarios import console
+        from quadsim.console import console
 
         yield from (console.written_to(path) for path in (self.file, self.page) if path is not None)
         if self.page is not None:

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 from quadsim.errors import InputError
+from quadsim.features.identify.record import Record, driver
+from quadsim.features.identify.windows import mean, rate_over_window
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.identify.record import Record, driver
-from scenarios.identify.windows import mean, rate_over_window
 
 ACCELERATION_WINDOW: Final = 0.02  # [s] of an angular acceleration
 LAGS: Final = (0.0, 0.015, 0.03, 0.06, 0.1)  # [s] of rotors that are tried

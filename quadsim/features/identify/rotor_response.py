@@ -14,9 +14,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
+from quadsim.features.identify.model import Parameters, Stretch, commanded
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.identify.model import Parameters, Stretch, commanded
 
 CORNER: Final = 6.0  # [Hz], a tenth of the log's rate if that is less
 _EDGE: Final = 0.5  # [s] at the ends of a stretch that the filter disturbs

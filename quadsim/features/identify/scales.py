@@ -14,10 +14,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from quadsim.errors import InputError
+from quadsim.features.identify.correlation import Pairs, moments, pairs_of, stride
+from quadsim.features.identify.record import Record
+from quadsim.features.identify.windows import body_z, half_window, mean, rate_over_window, turn_rate
 from quadsim.state import Array
-from scenarios.identify.correlation import Pairs, moments, pairs_of, stride
-from scenarios.identify.record import Record
-from scenarios.identify.windows import body_z, half_window, mean, rate_over_window, turn_rate
 
 _TOLERANCE: Final = 0.07
 """By which three columns may differ together: state estimators differ by 5 % from what they were fed, axis by axis."""

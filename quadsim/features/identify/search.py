@@ -17,12 +17,12 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
+from quadsim.features.identify.estimate import VECTORS, field_of
+from quadsim.features.identify.model import INCREMENTS, Parameters, Stretch, predicted_increments, turning
+from quadsim.features.identify.rotors import Turning
 from quadsim.fields import floor_of
 from quadsim.state import Array, Indices
 from quadsim.vehicle import LARGEST, VEHICLE_UNITS, Vehicle
-from scenarios.identify.estimate import VECTORS, field_of
-from scenarios.identify.model import INCREMENTS, Parameters, Stretch, predicted_increments, turning
-from scenarios.identify.rotors import Turning
 
 TURN_ON: Final = 0.5  # time [s] after a stretch begins until the rotors have forgotten the speeds assumed there
 KNOT: Final = 0.5  # time between two instants of the wind [s], where `_MOST_KNOTS` allow

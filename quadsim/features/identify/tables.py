@@ -11,11 +11,11 @@ import pyarrow as pa
 import pyarrow.csv
 
 from quadsim.errors import FileError
+from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, listed, logged_as
+from quadsim.features.identify.series import Column
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, read_parquet
 from quadsim.rotation import euler_to_body_rates
 from quadsim.state import Array
-from scenarios.identify.quantities import LoggedColumns, NamedQuantity, listed, logged_as
-from scenarios.identify.series import Column
 
 _NAMES: Final = (
     *(logged_as("position", way) for way in ("x y z", "px py pz", "pos_x pos_y pos_z")),

@@ -11,11 +11,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from quadsim.features.identify.border import between, reading, stated_number
+from quadsim.features.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, logged_as
+from quadsim.features.identify.series import Column, held, on_one_clock
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.identify.border import between, reading, stated_number
-from scenarios.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, logged_as
-from scenarios.identify.series import Column, held, on_one_clock
 
 ULOGS: Final = (".ulg", ".ulog")
 _ROTORS: Final = range(N_ROTORS)

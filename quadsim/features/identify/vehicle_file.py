@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 import tomlkit
 
+from quadsim.features.identify.estimate import Identification, ParameterEstimate, field_of, number_in
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.identify.estimate import Identification, ParameterEstimate, field_of, number_in
 
 _DIGITS: Final = 100.0  # the last digit is no more than this part of an interval
 

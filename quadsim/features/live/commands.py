@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadsim.errors import ParameterError
-from scenarios.commands.arguments import Changes, File, Flag, ScenarioName, Whole
+from quadsim.features.arguments import Changes, File, Flag, ScenarioName, Whole
 
 if TYPE_CHECKING:
-    from scenarios.results import Document
+    from quadsim.console.results import Document
 else:
     Document = Any
 
@@ -51,10 +51,10 @@ def live(
         Traceback (most recent call last):
         quadsim.errors.ParameterError: --port must be from 1 to 65535, or 0 for any that is free; got 70000
     """
-    from scenarios.catalogue import names_directory
-    from scenarios.live.serving import fly_live
-    from scenarios.loading import load_scenario
-    from scenarios.reaudit import reaudit, stored_scenario
+    from quadsim.features.live.serving import fly_live
+    from quadsim.rollout.reaudit import reaudit, stored_scenario
+    from quadsim.scenarios.catalogue import names_directory
+    from quadsim.scenarios.loading import load_scenario
 
     onward = isinstance(scenario, str | Path) and names_directory(scenario)
     if onward:

@@ -15,14 +15,14 @@ from typing import Any, Final, get_args
 import numpy as np
 
 from quadsim.errors import InputError
+from quadsim.features.live import readout
+from quadsim.features.live.knobs import TURNED_FIELDS, Knob, KnobValue, knobs
+from quadsim.features.live.session import Disturbances, Session
+from quadsim.features.live.stage import Stage
+from quadsim.scenarios.schema.controllers import AnyController
+from quadsim.scenarios.schema.events import SensorText
+from quadsim.scenarios.schema.writing import plain
 from quadsim.vehicle import N_ROTORS
-from scenarios.live import readout
-from scenarios.live.knobs import TURNED_FIELDS, Knob, KnobValue, knobs
-from scenarios.live.session import Disturbances, Session
-from scenarios.live.stage import Stage
-from scenarios.schema.controllers import AnyController
-from scenarios.schema.events import SensorText
-from scenarios.schema.writing import plain
 
 _STEER: Final = {"W": ("+", "x"), "S": ("-", "x"), "A": ("+", "y"), "D": ("-", "y"), "R": ("+", "z"), "F": ("-", "z")}
 _STEER_STEP: Final = 0.5  # [m/s] by which each of these keys changes the set-point's velocity

@@ -10,7 +10,7 @@ from http import HTTPStatus
 from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
-from scenarios.live.look import ADMISSION
+from quadsim.features.live.look import ADMISSION
 
 _HOW_TO_OPEN: Final = "Open the whole address that quadsim live printed, with ?token= and what follows."
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})

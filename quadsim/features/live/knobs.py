@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from scenarios.schema.base import fields_of, is_table
-from scenarios.schema.controllers import AnyController
-from scenarios.schema.problems import Kind, kinds_of
+from quadsim.scenarios.schema.base import fields_of, is_table
+from quadsim.scenarios.schema.controllers import AnyController
+from quadsim.scenarios.schema.problems import Kind, kinds_of
 
 KnobValue = float | int | bool | str | tuple[float, ...]
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from quadsim.errors import QuadsimError
-from scenarios.live.session import Frame, Session
+from quadsim.features.live.session import Frame, Session
 
 LATE: Final = 0.25  # [s] beyond which lost time is given up: no period is dropped, the flight is behind real time
 POSES: Final = 2  # drawn in each period

@@ -27,21 +27,21 @@ from viser import _messages
 
 from quadsim.controller import law_name
 from quadsim.errors import InputError, OutputError, ParameterError
+from quadsim.features.live import readout
+from quadsim.features.live.controls import ControllerTab, Steering, Widgets, disturb
+from quadsim.features.live.guard import Guard
+from quadsim.features.live.incoming import Incoming
+from quadsim.features.live.look import dressed
+from quadsim.features.live.pace import Pace
+from quadsim.features.live.session import Frame, Session
+from quadsim.features.live.stage import FIELD, VIEW, Stage
 from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import least_range
+from quadsim.rollout.flown import Flight
 from quadsim.rotation import quaternion_to_euler
+from quadsim.scenarios.schema.controllers import AnyController
 from quadsim.sim.physics import Period
 from quadsim.state import POSITION, Array, wrapped
-from scenarios.flown import Flight
-from scenarios.live import readout
-from scenarios.live.controls import ControllerTab, Steering, Widgets, disturb
-from scenarios.live.guard import Guard
-from scenarios.live.incoming import Incoming
-from scenarios.live.look import dressed
-from scenarios.live.pace import Pace
-from scenarios.live.session import Frame, Session
-from scenarios.live.stage import FIELD, VIEW, Stage
-from scenarios.schema.controllers import AnyController
 
 SECONDS: Final = 20.0  # of the plots
 _EVERY: Final = 4

@@ -8,9 +8,9 @@ from html import escape
 from typing import Final
 
 from quadsim.controller import OPTIMAL
+from quadsim.features.live.session import Frame
 from quadsim.flight.audit import Limit
 from quadsim.palette import COLOUR, line_colour
-from scenarios.live.session import Frame
 
 NEAR: Final = 0.1  # share of a bound's half band within which the row is marked
 _SHOWN: Final = 1.2  # bounds to the right end of a bar: what is beyond the bound shows too

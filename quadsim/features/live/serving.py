@@ -14,20 +14,20 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from quadsim.console import console
+from quadsim.console.progress import reporting
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Document
 from quadsim.controller import law_name
 from quadsim.errors import MissingPackageError, ParameterError
+from quadsim.features.live.guard import LOOPBACK
+from quadsim.features.live.pace import Pace
+from quadsim.features.live.session import Session, read_script
 from quadsim.outputs import run_directory
-from scenarios import console
-from scenarios.catalogue import scenario_names
-from scenarios.flown import Flight
-from scenarios.live.guard import LOOPBACK
-from scenarios.live.pace import Pace
-from scenarios.live.session import Session, read_script
-from scenarios.loading import load_scenario
-from scenarios.progress import reporting
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Document
-from scenarios.schema.controllers import AnyController
-from scenarios.schema.scenario import Scenario
+from quadsim.rollout.flown import Flight
+from quadsim.scenarios.catalogue import scenario_names
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.controllers import AnyController
+from quadsim.scenarios.schema.scenario import Scenario
 
 
 def fly_live(
@@ -43,7 +43,8 @@ def fly_live(
 ) -> Document:
     """Fly a session and save it, whatever ended it; `onward`: from where the scenario, a finished run's, ended.
 
-    The other arguments are those of `scenarios.live.commands.live`; `place` is the port, the host and the browser.
+    The other arguments are those of `quadsim.features.live.commands.live`; `place` is the port, the host and the
+    browser.
     """
     inputs = None if script is None else read_script(script)
     if inputs is None:
@@ -104,7 +105,7 @@ def _require_server(host: str, port: int) -> None:
 
 def _serve(session: Session, save: Callable[[Flight], str], *, host: str, port: int, browser: bool) -> None:
     """Show the page and fly until Ctrl-C; controllers of the library for the same vehicle and period may take over."""
-    from scenarios.live.page import Page
+    from quadsim.features.live.page import Page
 
     if host not in LOOPBACK:
         console.say(

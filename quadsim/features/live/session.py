@@ -19,25 +19,25 @@ from annotated_types import Ge, Le, doc
 from pydantic import Field
 
 from quadsim.assets import read_toml
+from quadsim.console.progress import Progress, silent
 from quadsim.controller import Predicting
 from quadsim.errors import FlightError, InputError, ParameterError
 from quadsim.fields import FLOORS, Fraction, Vector
 from quadsim.flight.audit import COMMAND_SIGNALS, Limit
+from quadsim.rollout.flight_events import Successor
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly, preferring_core
+from quadsim.scenarios.schema.controllers import AnyController
+from quadsim.scenarios.schema.events import Event
+from quadsim.scenarios.schema.problems import parse_table
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.effects.load import Load, MassChange
 from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss
 from quadsim.sim.effects.wind import Air, WindChange
 from quadsim.sim.physics import Period
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 from quadsim.vehicle import span
-from scenarios.assembly import Assembly, preferring_core
-from scenarios.flight_events import Successor
-from scenarios.flown import Flight
-from scenarios.progress import Progress, silent
-from scenarios.rollout import Rollout
-from scenarios.schema.controllers import AnyController
-from scenarios.schema.events import Event
-from scenarios.schema.problems import parse_table
-from scenarios.schema.scenario import Scenario
 
 STIFFNESS: Final = 0.4  # of the spring that a person pulls by, in weights of the vehicle per metre
 STRONGEST: Final = 0.3  # largest pull in weights of the vehicle

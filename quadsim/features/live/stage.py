@@ -18,14 +18,14 @@ import viser
 from viser.infra._infra import WebsockMessageHandler
 
 from quadsim.controller import law_name
+from quadsim.features.live import look
+from quadsim.features.live.session import Frame, Session
 from quadsim.flight.audit import SpaceLimit
 from quadsim.palette import COLOUR, Rgb, line_colour, rgb
 from quadsim.report.film.frames import thin
 from quadsim.sim.airframe import FLOOR, compile_model
 from quadsim.space import Obstacle, Region
 from quadsim.state import Array
-from scenarios.live import look
-from scenarios.live.session import Frame, Session
 
 VIEW: Final = np.array([-5.5, -8.0, 4.5])  # from the first vehicle to a camera at the start, in arm lengths
 FLAT: Final = {"cast_shadow": False, "receive_shadow": False}

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from scenarios.catalogue import paper_names
-from scenarios.commands.arguments import File, Watched
+from quadsim.features.arguments import File, Watched
+from quadsim.scenarios.catalogue import paper_names
 
 if TYPE_CHECKING:
-    from scenarios.papers.reproduction import Reproductions
+    from quadsim.features.papers.reproduction import Reproductions
 
     PaperName: TypeAlias = File
 else:
-    from scenarios.commands.arguments import one_of
+    from quadsim.features.arguments import one_of
 
     Reproductions = Any
     PaperName = one_of(paper_names)
@@ -43,10 +43,10 @@ def reproduce(
         >>> paper.within, paper.numbers[2].spec.published, round(paper.numbers[2].ours, 3)
         (True, 250.0, 250.0)
     """
-    from scenarios.commands.junit import junit_file, write_junit
-    from scenarios.papers.reproduction import Reproductions, load_paper, reproduce_paper
-    from scenarios.progress import reporting
-    from scenarios.results import after
+    from quadsim.console.junit import junit_file, write_junit
+    from quadsim.console.progress import reporting
+    from quadsim.console.results import after
+    from quadsim.features.papers.reproduction import Reproductions, load_paper, reproduce_paper
 
     file = None if junit is None else junit_file(junit)
     papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]

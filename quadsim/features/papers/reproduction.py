@@ -17,21 +17,21 @@ from typing import Annotated, Any, Final, Literal
 from annotated_types import MaxLen, MinLen, doc
 
 from quadsim.assets import read_toml
+from quadsim.console.junit import Cases
+from quadsim.console.progress import Progress, silent
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from quadsim.errors import InputError
 from quadsim.fields import NonNegative, Number, Positive
 from quadsim.input_limits import MOST_ENTRIES
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
-from scenarios.assembly import Assembly
-from scenarios.catalogue import paper_path, scenario_source
-from scenarios.commands.junit import Cases
-from scenarios.loading import parse_scenario
-from scenarios.progress import Progress, silent
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.rollout import Rollout
-from scenarios.schema.base import PairList
-from scenarios.schema.bases import merge, read_scenario
-from scenarios.schema.problems import parse_table
-from scenarios.schema.scenario import Scenario
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import paper_path, scenario_source
+from quadsim.scenarios.loading import parse_scenario
+from quadsim.scenarios.schema.base import PairList
+from quadsim.scenarios.schema.bases import merge, read_scenario
+from quadsim.scenarios.schema.problems import parse_table
+from quadsim.scenarios.schema.scenario import Scenario
 
 NUMBER_KINDS: Final = {
     "published": "published",
@@ -315,13 +315,13 @@ class Reproductions(tuple[Reproduction, ...], Result):
         return EXIT_DONE if all(paper.within for paper in self) else EXIT_FAILED
 
     def verdicts(self) -> tuple[str, Cases]:
-        """See `scenarios.commands.junit.Judged`."""
+        """See `quadsim.console.junit.Judged`."""
         numbers = [(entry.paper.name, number) for entry in self for number in entry.numbers]
         return "reproduce", [(f"{paper}: {it.spec.name}", it.within, it.sentence) for paper, it in numbers]
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios import console
+        from quadsim.console import console
 
         return console.grids([paper.grid for paper in self], left=("number",))
 

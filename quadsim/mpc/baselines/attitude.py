@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from mpc.baselines.compiled import geometric_library
-from mpc.nonlinear.rigidbody import rotation
+from quadsim.mpc.baselines.compiled import geometric_library
+from quadsim.mpc.nonlinear.rigidbody import rotation
 from quadsim.rotation import body_to_world, euler_to_body_rates
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import ctypes
 from functools import cache
 
-from mpc.disturbance import RampState
-from mpc.fallback.structs import GuardStruct
 from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, struct_members
+from quadsim.mpc.disturbance import RampState
+from quadsim.mpc.fallback.structs import GuardStruct
 
 
 class GeometricNumbersStruct(ctypes.Structure):

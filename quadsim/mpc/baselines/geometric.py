@@ -15,11 +15,16 @@ from typing import Annotated, Any, Final, Literal, TypeAlias
 import numpy as np
 from annotated_types import Len, doc
 
-from mpc.allocation import allocate, make_allocation
-from mpc.answer import ActuatorBounds
-from mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured
-from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
-from mpc.baselines.compiled import (
+from quadsim.controller import ROTORS, TARGET_SIZES, Command, Phase, StepInputs
+from quadsim.core.library import set_arrays
+from quadsim.errors import ParameterError
+from quadsim.fields import NonNegative
+from quadsim.motion import Motion
+from quadsim.mpc.allocation import allocate, make_allocation
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured
+from quadsim.mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
+from quadsim.mpc.baselines.compiled import (
     AttitudeStruct,
     DisturbanceStruct,
     GeometricNumbersStruct,
@@ -28,19 +33,14 @@ from mpc.baselines.compiled import (
     TargetStruct,
     geometric_library,
 )
-from mpc.baselines.law import FeedbackLaw, Tuned
-from mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIEW_DEGREE, Target, differentiator
-from mpc.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, law_of, require_lags, require_space
-from mpc.disturbance import RampObserver, RampSettings
-from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
-from mpc.model import target_model
-from mpc.nonlinear.model import zero
-from mpc.obstacles import Shape
-from quadsim.controller import ROTORS, TARGET_SIZES, Command, Phase, StepInputs
-from quadsim.core.library import set_arrays
-from quadsim.errors import ParameterError
-from quadsim.fields import NonNegative
-from quadsim.motion import Motion
+from quadsim.mpc.baselines.law import FeedbackLaw, Tuned
+from quadsim.mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIEW_DEGREE, Target, differentiator
+from quadsim.mpc.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, law_of, require_lags, require_space
+from quadsim.mpc.disturbance import RampObserver, RampSettings
+from quadsim.mpc.indi import INDISettings, TorqueIncrement, require_one_scale
+from quadsim.mpc.model import target_model
+from quadsim.mpc.nonlinear.model import zero
+from quadsim.mpc.obstacles import Shape
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -429,15 +429,15 @@ class Geometric(Tuned):
             raise ParameterError("", "horizon", self.horizon, rule)
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
-        """See `mpc.bounded.ControllerTable.audited`."""
+        """See `quadsim.mpc.bounded.ControllerTable.audited`."""
         return super().audited(vehicle) if self.commands == "rotors" else self.target_bounds.audited(vehicle)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
-        """See `mpc.baselines.law.Baseline.actuators`; of targets where it commands these."""
+        """See `quadsim.mpc.baselines.law.Baseline.actuators`; of targets where it commands these."""
         return super().actuators(vehicle) if self.commands == ROTORS else self.target_bounds.actuators(vehicle)
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
-        """See `mpc.bounded.ControllerTable.inner_loop`."""
+        """See `quadsim.mpc.bounded.ControllerTable.inner_loop`."""
         return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
 
 

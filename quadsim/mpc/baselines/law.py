@@ -9,14 +9,14 @@ from typing import Annotated, Final
 import numpy as np
 from annotated_types import Ge, Le, doc
 
-from mpc.answer import ActuatorBounds
-from mpc.baselines.preview import SMALLEST_PREVIEW, differentiator
-from mpc.bounded import LARGEST_HORIZON, ControllerTable, InputBounds, Range
-from mpc.heading import predict_in_heading_frame
-from mpc.model import LinearModel, hover_model
 from quadsim.controller import GROUNDED, Command, StepInputs, stopped
 from quadsim.errors import CommandError
 from quadsim.fields import NonNegative
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.baselines.preview import SMALLEST_PREVIEW, differentiator
+from quadsim.mpc.bounded import LARGEST_HORIZON, ControllerTable, InputBounds, Range
+from quadsim.mpc.heading import predict_in_heading_frame
+from quadsim.mpc.model import LinearModel, hover_model
 from quadsim.state import INDEX, STATE_NAMES, Array, ReferenceTurns
 from quadsim.vehicle import Vehicle
 
@@ -92,7 +92,7 @@ class Baseline(ControllerTable):
     tilt: Annotated[float, Ge(0.1), Le(80.0), doc("[deg] largest tilt commanded")] = 45.0
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
-        """See `mpc.bounded.ControllerTable.audited`."""
+        """See `quadsim.mpc.bounded.ControllerTable.audited`."""
         return {} if self.input_bounds is None else self.input_bounds.audited(vehicle)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:

@@ -10,17 +10,17 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from annotated_types import Ge, Le, Len, doc
 
-from mpc.allocation import allocate, make_allocation
-from mpc.baselines.law import Baseline, FeedbackLaw
-from mpc.bounded import InputWeights, law_of, objective_of, require_states
-from mpc.heading import turn_horizontally
-from mpc.model import LinearModel, continuous_model, discretise, hover_model
-from mpc.obstacles import Shape
-from mpc.ocp import Objective
-from mpc.regulator import stabilising
 from quadsim.controller import Command, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
+from quadsim.mpc.allocation import allocate, make_allocation
+from quadsim.mpc.baselines.law import Baseline, FeedbackLaw
+from quadsim.mpc.bounded import InputWeights, law_of, objective_of, require_states
+from quadsim.mpc.heading import turn_horizontally
+from quadsim.mpc.model import LinearModel, continuous_model, discretise, hover_model
+from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.ocp import Objective
+from quadsim.mpc.regulator import stabilising
 from quadsim.state import INDEX, N_STATES, REFERENCE_RATES, REFERENCE_STATES, STATE_NAMES, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 

@@ -13,15 +13,22 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from annotated_types import doc
 
-from mpc.allocation import allocate, make_allocation, thrust_to_command
-from mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured, attitude_for, limit_force, motion_of, prioritised_error
-from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
-from mpc.baselines.law import FeedbackLaw, Tuned
-from mpc.baselines.preview import Target, target_of
-from mpc.bounded import law_of
-from mpc.obstacles import Shape
 from quadsim.controller import Command, Phase, StepInputs
 from quadsim.fields import Positive
+from quadsim.mpc.allocation import allocate, make_allocation, thrust_to_command
+from quadsim.mpc.baselines.attitude import (
+    LEAST_THRUST_SHARE,
+    Measured,
+    attitude_for,
+    limit_force,
+    motion_of,
+    prioritised_error,
+)
+from quadsim.mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
+from quadsim.mpc.baselines.law import FeedbackLaw, Tuned
+from quadsim.mpc.baselines.preview import Target, target_of
+from quadsim.mpc.bounded import law_of
+from quadsim.mpc.obstacles import Shape
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

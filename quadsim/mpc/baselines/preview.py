@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from mpc.nonlinear.model import zero
 from quadsim.errors import ParameterError
+from quadsim.mpc.nonlinear.model import zero
 from quadsim.state import Array, read_only
 
 SMALLEST_PREVIEW: Final = 3  # a parabola needs three samples

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from mpc.core.tables import NO_BOUND
+from quadsim.mpc.core.tables import NO_BOUND
 from quadsim.state import Array
 
 Precision = Literal["double", "float"]

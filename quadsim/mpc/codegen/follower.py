@@ -6,12 +6,12 @@ import abc
 from dataclasses import dataclass
 from typing import ClassVar
 
-from mpc.answer import ActuatorBounds
-from mpc.baselines.geometric import Geometric, GeometricController
-from mpc.codegen.source import CSource
-from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.law import WIDTH_OF_MOTION
-from mpc.nonlinear.settings import Nonlinear
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.baselines.geometric import Geometric, GeometricController
+from quadsim.mpc.codegen.source import CSource
+from quadsim.mpc.nonlinear.controller import NonlinearMPC
+from quadsim.mpc.nonlinear.law import WIDTH_OF_MOTION
+from quadsim.mpc.nonlinear.settings import Nonlinear
 from quadsim.state import N_STATES
 from quadsim.vehicle import Vehicle
 

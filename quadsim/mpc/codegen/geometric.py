@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from mpc.baselines.geometric import Geometric, GeometricController
-from mpc.codegen.ctext import CText
-from mpc.codegen.follower import CFollower
-from mpc.codegen.source import SHARED_FILES
-from mpc.core.numbers import fallback_numbers
-from mpc.fallback.settings import USUAL_FALLBACK
 from quadsim.errors import ExportError
+from quadsim.mpc.baselines.geometric import Geometric, GeometricController
+from quadsim.mpc.codegen.ctext import CText
+from quadsim.mpc.codegen.follower import CFollower
+from quadsim.mpc.codegen.source import SHARED_FILES
+from quadsim.mpc.core.numbers import fallback_numbers
+from quadsim.mpc.fallback.settings import USUAL_FALLBACK
 from quadsim.vehicle import N_ROTORS
 
 

@@ -9,25 +9,25 @@ from typing import Final
 
 import numpy as np
 
-from mpc.codegen.ctext import CText
-from mpc.codegen.follower import CFollower
-from mpc.codegen.source import CHANGES, SHARED_FILES
-from mpc.core.numbers import fallback_numbers
-from mpc.core.tables import NO_BOUND
-from mpc.model import LinearModel, hover_model, target_model
-from mpc.nonlinear.body import ProblemStruct
-from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.law import memory_of
-from mpc.nonlinear.settings import Nonlinear
 from quadsim.controller import ROTORS
 from quadsim.errors import ExportError
+from quadsim.mpc.codegen.ctext import CText
+from quadsim.mpc.codegen.follower import CFollower
+from quadsim.mpc.codegen.source import CHANGES, SHARED_FILES
+from quadsim.mpc.core.numbers import fallback_numbers
+from quadsim.mpc.core.tables import NO_BOUND
+from quadsim.mpc.model import LinearModel, hover_model, target_model
+from quadsim.mpc.nonlinear.body import ProblemStruct
+from quadsim.mpc.nonlinear.controller import NonlinearMPC
+from quadsim.mpc.nonlinear.law import memory_of
+from quadsim.mpc.nonlinear.settings import Nonlinear
 
 FILES: Final = (
     *SHARED_FILES,
     *("quadsim_ramp.h", "quadsim_ramp.c", "quadsim_nmpc.h", "quadsim_nmpc_math.h", "quadsim_nmpc.c"),
     *("quadsim_nmpc_model.c", "quadsim_nmpc_qp.c", "quadsim_nonlinear.h", "quadsim_nonlinear.c"),
 )
-"""Files of `mpc/core/c` to export verbatim."""
+"""Files of `quadsim/mpc/core/c` to export verbatim."""
 ROWS_PER_NODE: Final = 2.0
 """Capacity for active rows, per node."""
 FEWEST_ROWS: Final = 32

@@ -9,19 +9,19 @@ from functools import cached_property
 from importlib import resources
 from typing import ClassVar, Final
 
-from mpc.answer import ActuatorBounds
-from mpc.codegen.ctext import CText, Precision
-from mpc.core.numbers import Exportable, controller_numbers, fallback_numbers, robust_numbers
-from mpc.core.solver import core_problem
-from mpc.core.tables import Tables, members
-from mpc.model import hover_model
-from mpc.robust.settings import split_delay
 from quadsim.controller import ROTORS
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.codegen.ctext import CText, Precision
+from quadsim.mpc.core.numbers import Exportable, controller_numbers, fallback_numbers, robust_numbers
+from quadsim.mpc.core.solver import core_problem
+from quadsim.mpc.core.tables import Tables, members
+from quadsim.mpc.model import hover_model
+from quadsim.mpc.robust.settings import split_delay
 from quadsim.state import N_STATES, REFERENCE_STATES
 from quadsim.vehicle import N_ROTORS
 
 SHARED_FILES: Final = ("quadsim_core.h", "quadsim_math.h", "quadsim_guard.h", "quadsim_guard.c")
-"""Files of `mpc/core/c` that every law takes."""
+"""Files of `quadsim/mpc/core/c` that every law takes."""
 CORE_FILES: Final = (*SHARED_FILES, "quadsim_core.c", "quadsim_mpc.h", "quadsim_mpc.c")
 """Those of the linear laws."""
 BODY_FILES: Final = ("quadsim_rigid.h",)
@@ -35,7 +35,7 @@ ROWS_PER_STEP: Final = 2.56
 LEAST_ROWS: Final = 64
 
 
-def part(name: str, package: str = "mpc.codegen") -> str:
+def part(name: str, package: str = "quadsim.mpc.codegen") -> str:
     """Return a hand-written C source of a package."""
     return (resources.files(package) / "c" / name).read_text(encoding="utf-8")
 
@@ -51,7 +51,7 @@ class CSource(abc.ABC):
     law_name: ClassVar[str]
     """Header of its law, and first word of its functions."""
     law_files: ClassVar[tuple[str, ...]]
-    """Files of `mpc/core/c` to export verbatim."""
+    """Files of `quadsim/mpc/core/c` to export verbatim."""
     state: ClassVar[int] = N_STATES
     """Numbers of a measured state."""
     plan: ClassVar[str] = "law->work.plan"
@@ -125,7 +125,9 @@ class CSource(abc.ABC):
     def files(self) -> dict[str, str]:
         """Its C files, by name."""
         body = {name: (resources.files("quadsim.core") / name).read_text(encoding="utf-8") for name in BODY_FILES}
-        return {name: part(name, "mpc.core") for name in self.law_files} | body | {DATA: self.filled(part(DATA))}
+        return (
+            {name: part(name, "quadsim.mpc.core") for name in self.law_files} | body | {DATA: self.filled(part(DATA))}
+        )
 
     @property
     def defines(self) -> str:

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from mpc.model import LinearModel
-from mpc.ocp import Objective, Problem
+from quadsim.mpc.model import LinearModel
+from quadsim.mpc.ocp import Objective, Problem
 from quadsim.state import Array, Indices
 
 COUPLING_ROUNDING: Final = 1e-12
@@ -37,7 +37,7 @@ class Axis:
     problem: Problem  # in w (N, m), without constraints; u_bar = 0
     states: Indices  # (n_g,) indices of its states
     regulated: Indices  # indices of its rows of C_r
-    outputs: Indices  # indices of its rows (`mpc.constraints.Rows`)
+    outputs: Indices  # indices of its rows (`quadsim.mpc.constraints.Rows`)
     T: Array  # (nu, m) the axis's part of u - u_s is T w; columns of unit length
 
 

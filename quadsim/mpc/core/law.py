@@ -11,20 +11,6 @@ from typing import Final, NoReturn
 
 import numpy as np
 
-from mpc.condensing import Condensed
-from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
-from mpc.core.solver import PROBLEMS, Core, Key, Optimum, Work, core_library, core_problem
-from mpc.core.tables import with_constraints
-from mpc.equilibrium import Trim
-from mpc.fallback.structs import STATUSES, GuardStruct, TrimStruct
-from mpc.heading import predict_in_heading_frame
-from mpc.linear import Remembered
-from mpc.model import hover_model
-from mpc.nonlinear.model import SUBSTEPS
-from mpc.ocp import Equilibrium, Query
-from mpc.paper import rollout
-from mpc.robust.settings import LONGEST_SPAN
-from mpc.solvers import INVALID_DATA, Answer
 from quadsim.controller import (
     GAIN,
     GROUNDED,
@@ -36,6 +22,20 @@ from quadsim.controller import (
     stopped,
 )
 from quadsim.core.library import check_sizes
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.core.numbers import Exportable, controller_numbers, robust_numbers
+from quadsim.mpc.core.solver import PROBLEMS, Core, Key, Optimum, Work, core_library, core_problem
+from quadsim.mpc.core.tables import with_constraints
+from quadsim.mpc.equilibrium import Trim
+from quadsim.mpc.fallback.structs import STATUSES, GuardStruct, TrimStruct
+from quadsim.mpc.heading import predict_in_heading_frame
+from quadsim.mpc.linear import Remembered
+from quadsim.mpc.model import hover_model
+from quadsim.mpc.nonlinear.model import SUBSTEPS
+from quadsim.mpc.ocp import Equilibrium, Query
+from quadsim.mpc.paper import rollout
+from quadsim.mpc.robust.settings import LONGEST_SPAN
+from quadsim.mpc.solvers import INVALID_DATA, Answer
 from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -130,7 +130,7 @@ def _plain(value: float | Array) -> float | tuple[float, ...]:
 
 
 class CompiledPreparation:
-    """The preparation of a law in C, which solves each query as it makes it; see `mpc.linear.Preparation`.
+    """The preparation of a law in C, which solves each query as it makes it; see `quadsim.mpc.linear.Preparation`.
 
     `yaw` is not known here; only obstacles, which C does not have, would need it.
 
@@ -186,7 +186,7 @@ class CompiledPreparation:
         self._made: Trim | None = None  # of the estimate now, if it has been asked for
 
     def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
-        """See `mpc.linear.Preparation`."""
+        """See `quadsim.mpc.linear.Preparation`."""
         if self._robust is None:
             return
         if memory is not None:
@@ -204,7 +204,7 @@ class CompiledPreparation:
 
     @property
     def memory(self) -> Remembered | None:
-        """See `mpc.linear.Preparation`."""
+        """See `quadsim.mpc.linear.Preparation`."""
         if self._robust is None:
             return None
         return Remembered(
@@ -220,7 +220,7 @@ class CompiledPreparation:
 
     @property
     def trim(self) -> Trim | None:
-        """See `mpc.linear.Preparation`."""
+        """See `quadsim.mpc.linear.Preparation`."""
         if self._robust is None:
             return None
         if self._made is None:
@@ -229,19 +229,19 @@ class CompiledPreparation:
 
     @property
     def disturbance(self) -> Array | None:
-        """See `mpc.linear.Preparation`."""
+        """See `quadsim.mpc.linear.Preparation`."""
         if self._robust is None:
             return None
         x, y, up = self._lift.tolist()
         return np.array([-x, -y, self._robust.gravity - up, *(math.hypot(x, y, up) * self._twist)])
 
     def stand(self, now: StepInputs, acting: Array) -> None:
-        """See `mpc.linear.Preparation`."""
+        """See `quadsim.mpc.linear.Preparation`."""
         self._acting[:], self._called_at, self._made = acting, now.time, None
         self._library.quadsim_mpc_stand(self._at, self._acting.ctypes.data)
 
     def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query | None:
-        """See `mpc.linear.Preparation`."""
+        """See `quadsim.mpc.linear.Preparation`."""
         self._state[:], self._path[:], self._acting[:] = state, reference, acting
         if self._robust is not None and not self._may_learn(now):
             self._mpc.known = 0
@@ -275,7 +275,7 @@ class CompiledPreparation:
 
 
 class CompiledSolver:
-    """Reads the answer to the query that a preparation in C made last; see `mpc.solvers.Solver`."""
+    """Reads the answer to the query that a preparation in C made last; see `quadsim.mpc.solvers.Solver`."""
 
     name: Final = "compiled"
     iterates: Final = Core.iterates
@@ -285,21 +285,21 @@ class CompiledSolver:
 
     @property
     def formulation(self) -> Condensed:
-        """See `mpc.solvers.Solver`."""
+        """See `quadsim.mpc.solvers.Solver`."""
         return self._preparation.condensed
 
     def reset(self) -> None:
-        """See `mpc.solvers.Solver`."""
+        """See `quadsim.mpc.solvers.Solver`."""
         self._preparation.optimum.reset()
 
     def solve(self, query: Query) -> Answer:
-        """See `mpc.solvers.Solver`; the query is the last one prepared."""
+        """See `quadsim.mpc.solvers.Solver`; the query is the last one prepared."""
         preparation = self._preparation
         return preparation.optimum.answer(preparation.found, query, preparation.started)
 
 
 class CompiledGain:
-    """The paper's unconstrained law in C, as `mpc.unconstrained.UnconstrainedMPC` without constant gains."""
+    """The paper's unconstrained law in C, as `quadsim.mpc.unconstrained.UnconstrainedMPC` without constant gains."""
 
     name: Final = "unconstrained"
     solver: Final = CompiledSolver.name

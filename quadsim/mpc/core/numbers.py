@@ -9,11 +9,13 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds
-from mpc.bounded import Bounded, Weighted, resolved_lag
-from mpc.core.tables import NO_BOUND
-from mpc.equilibrium import LEAST_LIFT
-from mpc.fallback.completion import (
+from quadsim.controller import LARGEST_SPEED
+from quadsim.errors import ExportError
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.bounded import Bounded, Weighted, resolved_lag
+from quadsim.mpc.core.tables import NO_BOUND
+from quadsim.mpc.equilibrium import LEAST_LIFT
+from quadsim.mpc.fallback.completion import (
     NOISE,
     PLAUSIBLE,
     PLAUSIBLE_REFERENCE,
@@ -21,17 +23,15 @@ from mpc.fallback.completion import (
     UNMOVED,
     acceleration_noise,
 )
-from mpc.fallback.hover import LARGEST_CLIMB, LARGEST_TURN, HoverLaw
-from mpc.fallback.settings import USUAL_FALLBACK, FallbackSettings
-from mpc.heading import slope
-from mpc.model import LinearModel, hover_model
-from mpc.nonlinear.model import SUBSTEPS, nonlinear_model
-from mpc.observer import UPRIGHT, DisturbanceObserver
-from mpc.obstacles import Shape
-from mpc.ocp import Problem
-from mpc.robust.settings import LONGEST_SPAN, Robust, split_delay
-from quadsim.controller import LARGEST_SPEED
-from quadsim.errors import ExportError
+from quadsim.mpc.fallback.hover import LARGEST_CLIMB, LARGEST_TURN, HoverLaw
+from quadsim.mpc.fallback.settings import USUAL_FALLBACK, FallbackSettings
+from quadsim.mpc.heading import slope
+from quadsim.mpc.model import LinearModel, hover_model
+from quadsim.mpc.nonlinear.model import SUBSTEPS, nonlinear_model
+from quadsim.mpc.observer import UPRIGHT, DisturbanceObserver
+from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.ocp import Problem
+from quadsim.mpc.robust.settings import LONGEST_SPAN, Robust, split_delay
 from quadsim.state import EULER, POSITION, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -77,7 +77,7 @@ def controller_numbers(law: Exportable) -> dict[str, float | Array]:
 
 
 def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
-    """Return the members of a `quadsim_robust`; `modes` (4, 4) as in `mpc.core.tables.Tables`."""
+    """Return the members of a `quadsim_robust`; `modes` (4, 4) as in `quadsim.mpc.core.tables.Tables`."""
     settings, vehicle, period = law.settings, law.vehicle, law.problem.model.period
     assert settings is not None
     lag, (whole, late) = resolved_lag(settings.rotor_lag, vehicle), split_delay(settings.delay, period)
@@ -123,7 +123,7 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
 def fallback_numbers(
     model: LinearModel, bounds: ActuatorBounds | None, settings: FallbackSettings, horizon: int
 ) -> dict[str, int | float | Array]:
-    """Return the members of a `quadsim_fallback`; see `mpc.fallback.contract.Guard`, which compares times [s].
+    """Return the members of a `quadsim_fallback`; see `quadsim.mpc.fallback.contract.Guard`, which compares times [s].
 
     Args:
         model: of level hover.

@@ -12,13 +12,13 @@ from typing import Any, Final, Generic, NoReturn, TypeVar
 
 import numpy as np
 
-from mpc.condensing import Condensed
-from mpc.core.tables import members, tables
-from mpc.ocp import Problem, Query
-from mpc.qp import QP, Solution
-from mpc.solvers import CORES_SECOND, Answer, Method, QPSolver
 from quadsim.controller import CORE, GAIN, SOLVED, UNCONSTRAINED, Statistics
 from quadsim.core.library import check_sizes, load_library
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.core.tables import members, tables
+from quadsim.mpc.ocp import Problem, Query
+from quadsim.mpc.qp import QP, Solution
+from quadsim.mpc.solvers import CORES_SECOND, Answer, Method, QPSolver
 from quadsim.state import N_STATES, Array, read_only
 from quadsim.vehicle import N_ROTORS
 
@@ -220,7 +220,7 @@ class Optimum:
 
 
 class Core:
-    """Computes a problem's optimum with the compiled core; see `mpc.solvers.Solver`.
+    """Computes a problem's optimum with the compiled core; see `quadsim.mpc.solvers.Solver`.
 
     The search starts from the last optimum's active set, shifted by one step.  PIQP answers the problems that the core
     gives up or finds infeasible, and `answered_by` names it.
@@ -257,12 +257,12 @@ class Core:
         raise TypeError("a Core cannot be copied or pickled: make another from its problem")
 
     def reset(self) -> None:
-        """See `mpc.solvers.Solver.reset`."""
+        """See `quadsim.mpc.solvers.Solver.reset`."""
         self._library.quadsim_work_reset(self._at)
         self._optimum.reset()
 
     def solve(self, query: Query) -> Answer:
-        """See `mpc.solvers.Solver.solve`."""
+        """See `quadsim.mpc.solvers.Solver.solve`."""
         started, (state, desired, u_before, rest, _) = clock.perf_counter(), query
         x_s, u_s = self._equilibrium if rest is None else rest
         self._state[:], self._x_s[:], self._u_s[:], self._before[:] = state, x_s, u_s, u_before

@@ -1,6 +1,7 @@
 """Tables from which a problem's optimum is computed without a linear algebra library.
 
-Axis by axis (`mpc.core.axes`), the inputs u - u_s = T w separate into parts w without a common cost.  For each axis:
+Axis by axis (`quadsim.mpc.core.axes`), the inputs u - u_s = T w separate into parts w without a common cost.  For each
+axis:
 
 - without rows, the optimum of a linear-quadratic problem with any linear terms is one backward pass of dynamic
 programming, with gains K_i that do not depend on these terms, and one forward pass: O(N) numbers instead of the O(N^2)
@@ -21,12 +22,12 @@ from typing import Any, Final
 import numpy as np
 import scipy.linalg
 
-from mpc.condensing import condensed_cost, states_rows
-from mpc.constraints import Constraint, Rows
-from mpc.core.axes import Axis, axes, axis_of, symmetric
-from mpc.ocp import Problem
-from mpc.paper import prediction
 from quadsim.errors import ParameterError
+from quadsim.mpc.condensing import condensed_cost, states_rows
+from quadsim.mpc.constraints import Constraint, Rows
+from quadsim.mpc.core.axes import Axis, axes, axis_of, symmetric
+from quadsim.mpc.ocp import Problem
+from quadsim.mpc.paper import prediction
 from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 

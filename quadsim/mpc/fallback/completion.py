@@ -1,11 +1,11 @@
 """State completion: a whole state from one whose measured channels are partly missing.
 
 A channel is missing if it is not finite, implausibly large, or frozen.  It is replaced by its conditional mean given
-the available channels: the hover model, linearised about the estimated equilibrium (`mpc.equilibrium`), predicts the
-state under the command in force, and a Kalman filter corrects it with the available channels as its only measurements
-(Simon, "Optimal State Estimation", 2006, Sec.  5.1). The process noise is an acceleration, constant over a period and
-white from one to the next (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation",
-2001, Sec.  6.3.2). Available channels pass unchanged, so a complete measurement is not altered.
+the available channels: the hover model, linearised about the estimated equilibrium (`quadsim.mpc.equilibrium`),
+predicts the state under the command in force, and a Kalman filter corrects it with the available channels as its only
+measurements (Simon, "Optimal State Estimation", 2006, Sec.  5.1). The process noise is an acceleration, constant over a
+period and white from one to the next (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and
+Navigation", 2001, Sec.  6.3.2). Available channels pass unchanged, so a complete measurement is not altered.
 
 A group of three channels is frozen if it repeats the last period's numbers bit by bit although the prediction has moved
 away from them.  A sensor slower than the controller repeats its numbers between samples; they are predicted then.
@@ -20,10 +20,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mpc.equilibrium import Trim
-from mpc.heading import advance, turn
-from mpc.model import LinearModel
 from quadsim.controller import StepInputs
+from quadsim.mpc.equilibrium import Trim
+from quadsim.mpc.heading import advance, turn
+from quadsim.mpc.model import LinearModel
 from quadsim.rotation import body_rates_of
 from quadsim.state import (
     ANGLE_RATES,

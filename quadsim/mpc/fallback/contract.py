@@ -14,11 +14,11 @@ The law is called in every period with a known state, so it resumes automaticall
 that its slew bounds refer to the acting command, and the list of predicted channels
 (`StepInputs.unseen`).
 
-Exported laws have the same contract in C, `mpc/core/c/quadsim_guard.c`; `tests/firmware/test_guard.py` holds the two
-together.
+Exported laws have the same contract in C, `quadsim/mpc/core/c/quadsim_guard.c`; `tests/firmware/test_guard.py` holds
+the two together.
 
-A law that estimates disturbances is `mpc.equilibrium.Trimmed`.  Levels 1 to 3, and predictions of missing channels,
-start from its equilibrium; it is held while nothing is measured.
+A law that estimates disturbances is `quadsim.mpc.equilibrium.Trimmed`.  Levels 1 to 3, and predictions of missing
+channels, start from its equilibrium; it is held while nothing is measured.
 """
 
 from __future__ import annotations
@@ -31,13 +31,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, rejection, resized, shifted
-from mpc.equilibrium import Trim, Trimmed
-from mpc.fallback.completion import PLAUSIBLE_REFERENCE, StateCompletion, completed_inputs
-from mpc.fallback.hover import HoverLaw
-from mpc.fallback.settings import USUAL_FALLBACK, USUAL_TILT, FallbackSettings
-from mpc.heading import anchored, predict_in_heading_frame
-from mpc.model import LinearModel
 from quadsim.controller import (
     ACCEPTED,
     FALLBACK,
@@ -51,6 +44,13 @@ from quadsim.controller import (
     stopped,
 )
 from quadsim.errors import FlightError
+from quadsim.mpc.answer import ActuatorBounds, rejection, resized, shifted
+from quadsim.mpc.equilibrium import Trim, Trimmed
+from quadsim.mpc.fallback.completion import PLAUSIBLE_REFERENCE, StateCompletion, completed_inputs
+from quadsim.mpc.fallback.hover import HoverLaw
+from quadsim.mpc.fallback.settings import USUAL_FALLBACK, USUAL_TILT, FallbackSettings
+from quadsim.mpc.heading import anchored, predict_in_heading_frame
+from quadsim.mpc.model import LinearModel
 from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
 
@@ -60,7 +60,7 @@ _MISTAKES: Final = (NotImplementedError, RecursionError)  # subclasses of `Runti
 
 
 class Guard:
-    """The fallback contract around a law, which `mpc.pilot.Pilot` passes to it, whatever that law does.
+    """The fallback contract around a law, which `quadsim.mpc.pilot.Pilot` passes to it, whatever that law does.
 
     It never sends a command that is not finite or not within the bounds.  It passes the law's usable commands
     unchanged; a law may have its own fallback.

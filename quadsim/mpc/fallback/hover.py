@@ -7,7 +7,7 @@ the closed loop is then the same for every vehicle.
 
     acceleration = -K (xi - xi_target)    u = u_s + S^-1 acceleration
 
-u_s holds the vehicle at rest under the known disturbance; see `mpc.equilibrium.Trim`. S maps rotor speeds to
+u_s holds the vehicle at rest under the known disturbance; see `quadsim.mpc.equilibrium.Trim`. S maps rotor speeds to
 accelerations along z and about x, y, z.  K acts on horizontal errors through the tilt that it demands in addition to
 the tilt at rest, tilt* = -(k_p e_p + k_v e_v) / k_tilt.  That sum is bounded here: the law is exactly the LQR within
 the bound, and demands no more tilt beyond.
@@ -20,11 +20,11 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds
-from mpc.equilibrium import Trim
-from mpc.heading import anchored, slope, turn_horizontally
-from mpc.model import LinearModel
-from mpc.regulator import lqr
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.equilibrium import Trim
+from quadsim.mpc.heading import anchored, slope, turn_horizontally
+from quadsim.mpc.model import LinearModel
+from quadsim.mpc.regulator import lqr
 from quadsim.state import INDEX, POSITION, VELOCITY, Array, by_group, read_only
 from quadsim.vehicle import N_ROTORS
 

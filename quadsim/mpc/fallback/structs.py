@@ -1,14 +1,14 @@
-"""The fallback contract's types in C, `quadsim_guard.h`: in flight it is `mpc.fallback.contract.Guard`."""
+"""The fallback contract's types in C, `quadsim_guard.h`: in flight it is `quadsim.mpc.fallback.contract.Guard`."""
 
 from __future__ import annotations
 
 import ctypes
 from typing import Final
 
-from mpc.answer import INFEASIBLE_ANSWER
-from mpc.solvers import INVALID_DATA
 from quadsim.controller import COMMANDED, MISSED, NOT_CONVERGED, SOLVED, UNCONSTRAINED, Phase
 from quadsim.core.library import AT, INT, REAL, struct_members
+from quadsim.mpc.answer import INFEASIBLE_ANSWER
+from quadsim.mpc.solvers import INVALID_DATA
 
 STATUSES: Final = (
     *(UNCONSTRAINED, SOLVED, SOLVED, "primal_infeasible", "max_iterations", "no_room", INVALID_DATA, "not_finite"),

@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from mpc.nonlinear.rigidbody import N_BODY, Inputs, RigidBody
 from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, set_arrays, struct_members
+from quadsim.mpc.nonlinear.rigidbody import N_BODY, Inputs, RigidBody
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 

@@ -22,33 +22,6 @@ from typing import Final, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, resized
-from mpc.bounded import resolved_lag
-from mpc.constraints import Constraint, Penalty
-from mpc.disturbance import RampObserver
-from mpc.equilibrium import LEAST_LIFT, Trim
-from mpc.fallback.structs import STATUSES
-from mpc.model import LinearModel
-from mpc.nonlinear.body import Body
-from mpc.nonlinear.law import NonlinearLaw, NumbersStruct
-from mpc.nonlinear.rigidbody import (
-    N_BODY,
-    Inputs,
-    P,
-    Q,
-    V,
-    W,
-    rigid_body,
-    thrust_axis,
-)
-from mpc.nonlinear.settings import Nonlinear
-from mpc.nonlinear.sqp import OWN_NAMES, SQP, SQPStatus, slack_groups
-from mpc.observer import DisturbanceObserver, disturbance_of
-from mpc.obstacles import HALF_SPACE_ROUNDING, SETTLED, Space, distances
-from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
-from mpc.qp import KKT_EVERY, QP, Solution
-from mpc.solvers import INVALID_DATA, Answer, Method
-from mpc.staged import Staged
 from quadsim.controller import (
     ACCEPTED,
     CORE,
@@ -67,6 +40,33 @@ from quadsim.controller import (
 )
 from quadsim.core.library import set_arrays
 from quadsim.errors import ParameterError
+from quadsim.mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, resized
+from quadsim.mpc.bounded import resolved_lag
+from quadsim.mpc.constraints import Constraint, Penalty
+from quadsim.mpc.disturbance import RampObserver
+from quadsim.mpc.equilibrium import LEAST_LIFT, Trim
+from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.mpc.model import LinearModel
+from quadsim.mpc.nonlinear.body import Body
+from quadsim.mpc.nonlinear.law import NonlinearLaw, NumbersStruct
+from quadsim.mpc.nonlinear.rigidbody import (
+    N_BODY,
+    Inputs,
+    P,
+    Q,
+    V,
+    W,
+    rigid_body,
+    thrust_axis,
+)
+from quadsim.mpc.nonlinear.settings import Nonlinear
+from quadsim.mpc.nonlinear.sqp import OWN_NAMES, SQP, SQPStatus, slack_groups
+from quadsim.mpc.observer import DisturbanceObserver, disturbance_of
+from quadsim.mpc.obstacles import HALF_SPACE_ROUNDING, SETTLED, Space, distances
+from quadsim.mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
+from quadsim.mpc.qp import KKT_EVERY, QP, Solution
+from quadsim.mpc.solvers import INVALID_DATA, Answer, Method
+from quadsim.mpc.staged import Staged
 from quadsim.rotation import (
     body_to_euler_rates,
     euler_to_body_rates,
@@ -462,7 +462,7 @@ class NonlinearMPC:
         return answer, found
 
     def _checked(self, answer: Answer, refused: str | None) -> tuple[Answer, str | None]:
-        """Check the last program's optimum; see `mpc.answer.AnswerCheck`."""
+        """Check the last program's optimum; see `quadsim.mpc.answer.AnswerCheck`."""
         if answer.certificate is None:
             return answer, refused
         return self._check(self._rows(), self._query(), answer, refused)
@@ -540,9 +540,9 @@ class _Start(NamedTuple):
     """What a period's plan starts from: data alone, so that a flight can be pickled."""
 
     plan: tuple[Array, Array] | None
-    world: Array  # see `mpc.nonlinear.body.World`
+    world: Array  # see `quadsim.mpc.nonlinear.body.World`
     time: float
-    query: tuple[Array, ...]  # see `mpc.nonlinear.sqp.SQP.begin`
+    query: tuple[Array, ...]  # see `quadsim.mpc.nonlinear.sqp.SQP.begin`
 
 
 def _converges(make: Callable[..., NonlinearMPC], settings: Nonlinear, start: _Start, iterations: int) -> bool:

@@ -13,14 +13,14 @@ from typing import Final, NoReturn
 
 import numpy as np
 
-from mpc.disturbance import RampObserver, RampState
-from mpc.fallback.structs import GuardStruct, TrimStruct
-from mpc.nonlinear.body import STATES_ROOM, ProblemStruct, World, WorldStruct
-from mpc.nonlinear.rigidbody import N_BODY
-from mpc.nonlinear.sqp import SQP, SQPStatus, WorkStruct
 from quadsim.controller import StepInputs
 from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, struct_members
 from quadsim.motion import Motion
+from quadsim.mpc.disturbance import RampObserver, RampState
+from quadsim.mpc.fallback.structs import GuardStruct, TrimStruct
+from quadsim.mpc.nonlinear.body import STATES_ROOM, ProblemStruct, World, WorldStruct
+from quadsim.mpc.nonlinear.rigidbody import N_BODY
+from quadsim.mpc.nonlinear.sqp import SQP, SQPStatus, WorkStruct
 from quadsim.state import N_STATES, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -158,7 +158,7 @@ class NonlinearLaw:
 
     @property
     def query(self) -> tuple[Array, ...]:
-        """The query of the last `begin`, as of `mpc.nonlinear.sqp.SQP.begin`."""
+        """The query of the last `begin`, as of `quadsim.mpc.nonlinear.sqp.SQP.begin`."""
         return tuple(array.copy() for array in self._query)
 
     def ask(self, world: Array, query: tuple[Array, ...]) -> None:
@@ -168,7 +168,7 @@ class NonlinearLaw:
             array[:] = value
 
     def end(self, answer: SQPStatus) -> int:
-        """Return the period's status, of `mpc.fallback.structs.STATUSES`, and put its commands into `plan`."""
+        """Return the period's status, of `quadsim.mpc.fallback.structs.STATUSES`, and put its commands into `plan`."""
         return int(self._library.quadsim_nonlinear_end(self._at, answer))
 
     def adopt(self, other: NonlinearLaw, rotors: tuple[Array, Array] | None) -> None:

@@ -34,7 +34,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.nonlinear.model import zero
+from quadsim.mpc.nonlinear.model import zero
 from quadsim.state import Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 

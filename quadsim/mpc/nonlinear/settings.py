@@ -10,8 +10,12 @@ from typing import Annotated, ClassVar, Final, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 
-from mpc.answer import ActuatorBounds
-from mpc.bounded import (
+from quadsim.controller import ROTORS
+from quadsim.errors import ParameterError
+from quadsim.fields import NonNegative, Pair, Seconds, Weight
+from quadsim.input_limits import MOST_ENTRIES
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.bounded import (
     USUAL_TARGETS,
     Avoidance,
     ControllerTable,
@@ -32,18 +36,14 @@ from mpc.bounded import (
     rows_of,
     selection,
 )
-from mpc.constraints import Constraint, origin_of_state
-from mpc.disturbance import RampSettings
-from mpc.fallback.settings import USUAL_FALLBACK, FallbackSettings
-from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
-from mpc.nonlinear.rigidbody import RATE_SCALE
-from mpc.observer import ObserverSettings
-from mpc.obstacles import Shape, Space
-from mpc.qp import KKT_EVERY
-from quadsim.controller import ROTORS
-from quadsim.errors import ParameterError
-from quadsim.fields import NonNegative, Pair, Seconds, Weight
-from quadsim.input_limits import MOST_ENTRIES
+from quadsim.mpc.constraints import Constraint, origin_of_state
+from quadsim.mpc.disturbance import RampSettings
+from quadsim.mpc.fallback.settings import USUAL_FALLBACK, FallbackSettings
+from quadsim.mpc.indi import INDISettings, TorqueIncrement, require_one_scale
+from quadsim.mpc.nonlinear.rigidbody import RATE_SCALE
+from quadsim.mpc.observer import ObserverSettings
+from quadsim.mpc.obstacles import Shape, Space
+from quadsim.mpc.qp import KKT_EVERY
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
@@ -219,7 +219,7 @@ class Nonlinear(ControllerTable):
             )
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
-        """See `mpc.bounded.ControllerTable.audited`."""
+        """See `quadsim.mpc.bounded.ControllerTable.audited`."""
         bounds = ranges(self.output_bounds)
         if self.tilt is not None:
             bounds["tilt"] = (-math.inf, self.tilt)
@@ -241,7 +241,7 @@ class Nonlinear(ControllerTable):
         return self.avoidance.space(shapes, vehicle, period=step, horizon=nodes, positions=(0, 1, 2), largest=True)
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
-        """See `mpc.bounded.ControllerTable.inner_loop`."""
+        """See `quadsim.mpc.bounded.ControllerTable.inner_loop`."""
         return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:

@@ -12,12 +12,12 @@ from typing import Any, Final, NamedTuple, NoReturn
 
 import numpy as np
 
-from mpc.constraints import Constraint
-from mpc.nonlinear.body import STATES_ROOM, ProblemStruct, World, body_numbers, unpacked, width_of
-from mpc.nonlinear.rigidbody import N_BODY, P, RigidBody, V
-from mpc.ocp import Problem
 from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, set_arrays, struct_members
 from quadsim.errors import ParameterError
+from quadsim.mpc.constraints import Constraint
+from quadsim.mpc.nonlinear.body import STATES_ROOM, ProblemStruct, World, body_numbers, unpacked, width_of
+from quadsim.mpc.nonlinear.rigidbody import N_BODY, P, RigidBody, V
+from quadsim.mpc.ocp import Problem
 from quadsim.state import Array, Indices
 from quadsim.vehicle import N_ROTORS
 
@@ -373,7 +373,7 @@ class SQP:
         return np.array((normalised / self._slack_scale)[:, groups])
 
     def multipliers(self, rows: int, faces_from: int | None = None) -> Array:
-        """(N, rows) multipliers of the problem's rows at the last optimum, as `mpc.qp.Solution` has their signs.
+        """(N, rows) multipliers of the problem's rows at the last optimum, as `qp.Solution` has their signs.
 
         Those of half-spaces begin at column `faces_from`.
         """

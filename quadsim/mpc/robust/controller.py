@@ -3,7 +3,7 @@
 Each part has its own setting and is off by default; without any part it solves the paper's optimisation.
 
 The hover model is linearised at the vehicle's equilibrium under the estimated disturbance, (x_s, u_s) of
-`mpc.equilibrium`,
+`quadsim.mpc.equilibrium`,
 
     x(k+1) = x_s + A (x(k) - x_s) + B (u(k) - u_s),
 
@@ -20,17 +20,24 @@ from typing import Final
 
 import numpy as np
 
-from mpc.bounded import resolved_lag
-from mpc.equilibrium import Trim, equilibrium, twisted
-from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE
-from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, turned_axes, with_limited_yaw
-from mpc.linear import Remembered
-from mpc.model import hover_model
-from mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
-from mpc.observer import DisturbanceObserver, thrust_axis
-from mpc.ocp import Equilibrium, Problem, Query
-from mpc.robust.settings import LONGEST_SPAN, Robust, split_delay
 from quadsim.controller import Phase, StepInputs
+from quadsim.mpc.bounded import resolved_lag
+from quadsim.mpc.equilibrium import Trim, equilibrium, twisted
+from quadsim.mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE
+from quadsim.mpc.heading import (
+    predict_in_heading_frame,
+    seen_from,
+    slope,
+    turn_horizontally,
+    turned_axes,
+    with_limited_yaw,
+)
+from quadsim.mpc.linear import Remembered
+from quadsim.mpc.model import hover_model
+from quadsim.mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
+from quadsim.mpc.observer import DisturbanceObserver, thrust_axis
+from quadsim.mpc.ocp import Equilibrium, Problem, Query
+from quadsim.mpc.robust.settings import LONGEST_SPAN, Robust, split_delay
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, ReferenceTurns, all_true
 from quadsim.vehicle import Vehicle
 
@@ -40,7 +47,7 @@ _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 
 
 class RobustPreparation:
-    """The query of the robust MPC; see the module and `mpc.linear.Preparation`.
+    """The query of the robust MPC; see the module and `quadsim.mpc.linear.Preparation`.
 
     Attributes:
         problem: the optimal control problem, that of the table `settings` (`Robust.problem`).
@@ -76,7 +83,7 @@ class RobustPreparation:
 
     @property
     def memory(self) -> Remembered:
-        """See `mpc.linear.Preparation`."""
+        """See `quadsim.mpc.linear.Preparation`."""
         return Remembered(
             delay=self.delay,
             rotors=self._rotors.copy(),
@@ -110,12 +117,12 @@ class RobustPreparation:
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # values out of range are rejected, not warned of
     def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query | None:
-        """See `mpc.linear.Preparation.prepare`.
+        """See `quadsim.mpc.linear.Preparation.prepare`.
 
-        Numbers that are not finite, exceed `mpc.fallback.completion.PLAUSIBLE`, or lead to such numbers give None and
-        do not update the observer.  Nor does a state that is predicted in part (`StepInputs.unseen`), the first
-        measured state after more than `LONGEST_SPAN` of such states, or a state after a pause: `now.time` must be one
-        period later than last time.
+        Numbers that are not finite, exceed `quadsim.mpc.fallback.completion.PLAUSIBLE`, or lead to such numbers give
+        None and do not update the observer.  Nor does a state that is predicted in part (`StepInputs.unseen`), the
+        first measured state after more than `LONGEST_SPAN` of such states, or a state after a pause: `now.time` must be
+        one period later than last time.
         """
         ahead, before, called_at = self._ahead, self._rotors, self._called_at
         in_force, under_way, rotors, turning = self._advance_rotors(now.time, acting)

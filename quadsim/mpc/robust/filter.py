@@ -1,8 +1,8 @@
 """A predictive safety filter: it passes a requested command if the robust MPC's constraints can still hold after it.
 
 Wabersich and Zeilinger (2021), "A predictive safety filter for learning-based control of constrained nonlinear
-dynamical systems", with the model, the disturbance observer and the tightened bounds of `mpc.robust.controller`. It
-solves one QP per period,
+dynamical systems", with the model, the disturbance observer and the tightened bounds of
+`quadsim.mpc.robust.controller`. It solves one QP per period,
 
         min_u  |u(k) - u_requested|^2 + epsilon sum_i |u(k+i) - u_s|^2,    i = 0 .. N-1,
 
@@ -23,19 +23,19 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
-from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection
-from mpc.constraints import Constraint, Penalty
-from mpc.equilibrium import Trim
-from mpc.ocp import Objective, Problem, Query
-from mpc.partial_condensing import PartiallyCondensed
-from mpc.qp import KKT_EVERY, QPRows
-from mpc.regulator import observed
-from mpc.robust.controller import RobustPreparation
-from mpc.robust.settings import Robust
-from mpc.solvers import INVALID_DATA, Answer
-from mpc.solvers.piqp import Piqp
 from quadsim.controller import ACCEPTED, GROUNDED, UNCONSTRAINED, Command, StepInputs, stopped
 from quadsim.errors import ParameterError
+from quadsim.mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection
+from quadsim.mpc.constraints import Constraint, Penalty
+from quadsim.mpc.equilibrium import Trim
+from quadsim.mpc.ocp import Objective, Problem, Query
+from quadsim.mpc.partial_condensing import PartiallyCondensed
+from quadsim.mpc.qp import KKT_EVERY, QPRows
+from quadsim.mpc.regulator import observed
+from quadsim.mpc.robust.controller import RobustPreparation
+from quadsim.mpc.robust.settings import Robust
+from quadsim.mpc.solvers import INVALID_DATA, Answer
+from quadsim.mpc.solvers.piqp import Piqp
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -57,8 +57,8 @@ class SafetyFilter:
     """A controller that sends the requested command as far as it is safe; see the module.
 
     If the constraints cannot hold, for example after a disturbance larger than stated, the filter softens those on
-    states and solves the QP once more.  If that fails too, the status reports it, and `mpc.fallback.contract.Guard`
-    flies the last good plan.
+    states and solves the QP once more.  If that fails too, the status reports it, and
+    `quadsim.mpc.fallback.contract.Guard` flies the last good plan.
 
     The robust MPC's preparation provides model, observer and constraints.  Set `requested` (4,) to the command of the
     next period [rad/s].
@@ -112,7 +112,7 @@ class SafetyFilter:
         return command_of(plan[0], plan, UNCONSTRAINED if passed else status, answer)
 
     def _checked(self, nearest: _Nearest, query: Query) -> tuple[Answer, str | None]:
-        """Return the answer of one QP and the reason to reject it, None for none; see `mpc.answer.AnswerCheck`."""
+        """Return the answer of one QP and the reason to reject it, None for none; see `answer.AnswerCheck`."""
         answer = nearest.solve(query, self.requested)
         reason = rejection(answer.status, answer.plan[0], answer.plan, self._actuators, query.u_before)
         return nearest.check(nearest.problem_at(query), query, answer, reason)

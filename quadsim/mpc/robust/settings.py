@@ -9,7 +9,9 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from annotated_types import Gt, Le, doc
 
-from mpc.bounded import (
+from quadsim.errors import ParameterError
+from quadsim.fields import Weight
+from quadsim.mpc.bounded import (
     Bounded,
     Lag,
     LagSeconds,
@@ -17,13 +19,11 @@ from mpc.bounded import (
     require_lag,
     resolved_lag,
 )
-from mpc.fallback.settings import USUAL_FALLBACK, FallbackSettings
-from mpc.model import LinearModel, continuous_model, discretise, hover_model
-from mpc.observer import ObserverSettings
-from mpc.ocp import Problem, lqr_terminal_weight
-from mpc.robust.tightening import TighteningSettings, margins, position_margins
-from quadsim.errors import ParameterError
-from quadsim.fields import Weight
+from quadsim.mpc.fallback.settings import USUAL_FALLBACK, FallbackSettings
+from quadsim.mpc.model import LinearModel, continuous_model, discretise, hover_model
+from quadsim.mpc.observer import ObserverSettings
+from quadsim.mpc.ocp import Problem, lqr_terminal_weight
+from quadsim.mpc.robust.tightening import TighteningSettings, margins, position_margins
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -127,7 +127,7 @@ class Robust(Bounded):
         return margins(bounds=self.bounds(), **self._tightened(vehicle, period))
 
     def position_margins(self, vehicle: Vehicle, period: float) -> Array | None:
-        """See `mpc.bounded.Bounded.position_margins`."""
+        """See `quadsim.mpc.bounded.Bounded.position_margins`."""
         return None if self.tightening is None else position_margins(**self._tightened(vehicle, period))
 
     def _tightened(self, vehicle: Vehicle, period: float) -> dict[str, Any]:

@@ -32,11 +32,11 @@ import numpy as np
 import scipy.linalg
 from annotated_types import doc
 
-from mpc.constraints import Bounds
-from mpc.model import SHORTEST_LAG, continuous_model, discretise
-from mpc.regulator import lqr, observed
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
+from quadsim.mpc.constraints import Bounds
+from quadsim.mpc.model import SHORTEST_LAG, continuous_model, discretise
+from quadsim.mpc.regulator import lqr, observed
 from quadsim.state import INDEX, N_STATES, POSITION, Array, read_only
 from quadsim.ties import first_smallest
 from quadsim.vehicle import Vehicle

@@ -12,12 +12,12 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from mpc.condensing import Condensed, FreeOptimum
-from mpc.ocp import Problem, Query
-from mpc.partial_condensing import PartiallyCondensed
-from mpc.qp import QP, Backend, Solution
 from quadsim.controller import CORE, GAIN, NO_STATISTICS, Statistics
 from quadsim.errors import MissingPackageError, UnknownNameError
+from quadsim.mpc.condensing import Condensed, FreeOptimum
+from quadsim.mpc.ocp import Problem, Query
+from quadsim.mpc.partial_condensing import PartiallyCondensed
+from quadsim.mpc.qp import QP, Backend, Solution
 from quadsim.state import Array
 
 Formulation: TypeAlias = Condensed | PartiallyCondensed
@@ -70,7 +70,7 @@ SOLVERS: Final = {
 
 COMPILED: Final = SolverEntry(
     description="the compiled core: the exact optimum where matrices are fixed; PIQP answers what it gives up",
-    package="mpc.core",
+    package="quadsim.mpc.core",
 )
 
 CORES_SECOND: Final = "piqp-multistage"
@@ -120,16 +120,16 @@ def make_backend(name: str) -> Backend:
     if not entry.installed:
         raise MissingPackageError(f"the solver {name!r}", entry.package, extra=entry.extra)
     if entry.package == "piqp":
-        from mpc.solvers.piqp import Piqp
+        from quadsim.mpc.solvers.piqp import Piqp
 
         return Piqp(dense=entry.dense)
     if entry.package == "daqp":
-        from mpc.solvers.daqp import DaqpDense
+        from quadsim.mpc.solvers.daqp import DaqpDense
 
         return DaqpDense()
     if name in SOLVERS:
         raise UnknownNameError("QP solver", name, SOLVERS, "make_backend cannot make one")
-    from mpc.solvers.qpsolvers import AnyOfQpsolvers
+    from quadsim.mpc.solvers.qpsolvers import AnyOfQpsolvers
 
     return AnyOfQpsolvers(name)
 
@@ -149,7 +149,7 @@ class Answer(NamedTuple):
     slacks: Array  # (N, m_s) violations of soft rows
     status: str  # `solved`, `unconstrained`, or the reason of a failure
     answered_by: str  # `gain`, `core` or the QP solver's name; see `quadsim.controller.Command`
-    stats: Statistics = NO_STATISTICS  # of the solver that answered, completed by `mpc.answer.AnswerCheck`
+    stats: Statistics = NO_STATISTICS  # of the solver that answered, completed by `quadsim.mpc.answer.AnswerCheck`
     method: Method = Method.WHOLE  # the part of the QP that had to be solved
     certificate: Callable[[], tuple[QP, Solution]] | None = None  # the QP and its solution; None for invalid data
 

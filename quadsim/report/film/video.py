@@ -60,7 +60,7 @@ def rendering_backend() -> str:
     """
     preferred = (
         os.environ.get("QUADSIM_GL") or os.environ.get("MUJOCO_GL", "").strip().lower()
-    )  # see scenarios/commands/entry.py
+    )  # see quadsim/commands/entry.py
     tried: dict[str, str] = {}
     for backend in sorted(BACKENDS, key=lambda name: name != preferred):
         try:

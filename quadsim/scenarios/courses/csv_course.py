@@ -18,10 +18,10 @@ from pydantic import StringConstraints
 
 from quadsim.errors import FileError
 from quadsim.input_limits import LARGEST_CSV
+from quadsim.scenarios.courses.course import EXACT, Course, Path, Started, begin
+from quadsim.scenarios.courses.legs import polyline
 from quadsim.state import Array, unwrapped
 from quadsim.ties import TIE_SHARE, first_smallest
-from scenarios.courses.course import EXACT, Course, Path, Started, begin
-from scenarios.courses.legs import polyline
 
 POSE_HEADER: Final = ("t", "x", "y", "z", "yaw")
 VELOCITY_HEADER: Final = ("vx", "vy", "vz")

@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
+from quadsim.scenarios.courses.course import Course
+from quadsim.scenarios.courses.smoothing import smooth
 from quadsim.state import REFERENCE_NAMES, Array, nearest_turn, unwrapped
-from scenarios.courses.course import Course
-from scenarios.courses.smoothing import smooth
 
 _YAW: Final = REFERENCE_NAMES.index("yaw")
 _BLOCK: Final = 256  # rows that the course is sampled for, and filtered, at a time

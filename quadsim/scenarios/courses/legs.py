@@ -12,8 +12,7 @@ from annotated_types import Len, doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Number
-from quadsim.state import Array
-from scenarios.courses.course import (
+from quadsim.scenarios.courses.course import (
     MOST_POINTS,
     Course,
     Filtered,
@@ -25,6 +24,7 @@ from scenarios.courses.course import (
     poses_of,
     require_apart,
 )
+from quadsim.state import Array
 
 
 @dataclass(frozen=True, kw_only=True)

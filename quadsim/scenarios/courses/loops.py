@@ -12,8 +12,8 @@ from annotated_types import doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Metres, NonNegative, Number, Pair
+from quadsim.scenarios.courses.course import Path, Speed, Started, Time, require_one
 from quadsim.state import Array
-from scenarios.courses.course import Path, Speed, Started, Time, require_one
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,7 @@ import numpy as np
 from annotated_types import Len, doc
 
 from quadsim.errors import ParameterError
-from quadsim.state import Array
-from scenarios.courses.course import (
+from quadsim.scenarios.courses.course import (
     CLOSEST,
     MOST_POINTS,
     Path,
@@ -25,6 +24,7 @@ from scenarios.courses.course import (
     require_apart,
     require_one,
 )
+from quadsim.state import Array
 
 if TYPE_CHECKING:
     from scipy.interpolate import BPoly

@@ -14,12 +14,12 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from annotated_types import doc
 
-from mpc.flatness import attitudes
 from quadsim.errors import ParameterError
 from quadsim.fields import Metres
+from quadsim.mpc.flatness import attitudes
 from quadsim.rotation import quaternion_to_euler
+from quadsim.scenarios.courses.course import Path, Speed, Started, Time
 from quadsim.state import Array
-from scenarios.courses.course import Path, Speed, Started, Time
 
 MOST_SAMPLES: Final = 100_000  # of the phase: 2000 s at 50 Hz
 

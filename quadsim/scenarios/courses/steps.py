@@ -13,8 +13,8 @@ from annotated_types import MaxLen, doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Number
+from quadsim.scenarios.courses.course import Course, Filtered
 from quadsim.state import Array, nearest_turn
-from scenarios.courses.course import Course, Filtered
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,12 +6,12 @@ from typing import Annotated, Final
 
 from pydantic import Discriminator, Tag
 
-from scenarios.courses.csv_course import Csv
-from scenarios.courses.legs import Waypoints, YawTurns
-from scenarios.courses.loops import Circle, FigureEight, Helix
-from scenarios.courses.minimum_snap import MinimumSnap
-from scenarios.courses.ramped import RampedCircle, RampedLemniscate
-from scenarios.courses.steps import Steps
+from quadsim.scenarios.courses.csv_course import Csv
+from quadsim.scenarios.courses.legs import Waypoints, YawTurns
+from quadsim.scenarios.courses.loops import Circle, FigureEight, Helix
+from quadsim.scenarios.courses.minimum_snap import MinimumSnap
+from quadsim.scenarios.courses.ramped import RampedCircle, RampedLemniscate
+from quadsim.scenarios.courses.steps import Steps
 
 DEFAULT: Final = "steps"  # the type of a table that states none
 

@@ -9,9 +9,9 @@ from typing import Any, Final
 
 from quadsim.assets import DEEPEST, read_toml
 from quadsim.errors import FileError, InputError, ParameterError
-from scenarios.catalogue import VARIANTS, Source, scenario_source, source_label
-from scenarios.plugin import located
-from scenarios.schema.settings import RECORDED, leaves, note_changes, restate, set_field, state_bounds
+from quadsim.scenarios.catalogue import VARIANTS, Source, scenario_source, source_label
+from quadsim.scenarios.plugin import located
+from quadsim.scenarios.schema.settings import RECORDED, leaves, note_changes, restate, set_field, state_bounds
 
 _TOLERANCES: Final = ("tolerance", "tolerance_sampled")
 

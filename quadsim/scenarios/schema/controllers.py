@@ -8,18 +8,18 @@ from typing import Annotated, Any, Final, get_args
 
 from pydantic import Discriminator, Tag
 
-from mpc.baselines.geometric import Geometric
-from mpc.baselines.lqr import LQRTable
-from mpc.baselines.pid import PID
-from mpc.bounded import ControllerTable
-from mpc.constrained import Constrained
-from mpc.nonlinear.settings import Nonlinear
-from mpc.robust.settings import Robust
-from mpc.unconstrained import Unconstrained
-from scenarios.plugin import FORM, Plugin, is_plugin
-from scenarios.schema.problems import parse_table
-from scenarios.schema.settings import set_field
-from scenarios.schema.writing import plain
+from quadsim.mpc.baselines.geometric import Geometric
+from quadsim.mpc.baselines.lqr import LQRTable
+from quadsim.mpc.baselines.pid import PID
+from quadsim.mpc.bounded import ControllerTable
+from quadsim.mpc.constrained import Constrained
+from quadsim.mpc.nonlinear.settings import Nonlinear
+from quadsim.mpc.robust.settings import Robust
+from quadsim.mpc.unconstrained import Unconstrained
+from quadsim.scenarios.plugin import FORM, Plugin, is_plugin
+from quadsim.scenarios.schema.problems import parse_table
+from quadsim.scenarios.schema.settings import set_field
+from quadsim.scenarios.schema.writing import plain
 
 
 def _law(controller: object) -> str | None:

@@ -10,11 +10,11 @@ from typing import Any, Final
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
-from scenarios.courses.table import DEFAULT, ReferenceTable
-from scenarios.schema.base import fields_of
-from scenarios.schema.problems import adapter
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.writing import headline, is_absent, tables_in
+from quadsim.scenarios.courses.table import DEFAULT, ReferenceTable
+from quadsim.scenarios.schema.base import fields_of
+from quadsim.scenarios.schema.problems import adapter
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.writing import headline, is_absent, tables_in
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 BASE: Final = {

@@ -20,8 +20,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, core_schema
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.scenarios.schema.base import STRICT, fields_of, is_table
 from quadsim.vehicle import MEANT
-from scenarios.schema.base import STRICT, fields_of, is_table
 
 TableType = TypeVar("TableType")
 

@@ -11,12 +11,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, get
 from annotated_types import Ge, Gt, Le, MaxLen, doc
 from pydantic import BeforeValidator, Field
 
-import quadsim
-from mpc.bounded import Polytope
+from quadsim import shorthands
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import FLOORS, Metres, Positive
 from quadsim.flight.audit import FlightVerdict, Limit
 from quadsim.input_limits import MOST_ENTRIES, MOST_STEPS
+from quadsim.mpc.bounded import Polytope
+from quadsim.scenarios.catalogue import Group
+from quadsim.scenarios.courses.table import ReferenceTable
+from quadsim.scenarios.plugin import PluginForce
+from quadsim.scenarios.schema.base import LARGEST_SEED
+from quadsim.scenarios.schema.controllers import AnyController, changed_controller
+from quadsim.scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
+from quadsim.scenarios.schema.initial import Initial
+from quadsim.scenarios.schema.problems import ScenarioError, parse_table
+from quadsim.scenarios.schema.sensors import EstimatorSpec, Sensors, check_sensing
+from quadsim.scenarios.schema.settings import REPEATING, RecordedVehicle, separate, set_field
+from quadsim.scenarios.schema.writing import is_absent, plain, to_toml
 from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
@@ -25,17 +36,6 @@ from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.catalogue import Group
-from scenarios.courses.table import ReferenceTable
-from scenarios.plugin import PluginForce
-from scenarios.schema.base import LARGEST_SEED
-from scenarios.schema.controllers import AnyController, changed_controller
-from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
-from scenarios.schema.initial import Initial
-from scenarios.schema.problems import ScenarioError, parse_table
-from scenarios.schema.sensors import EstimatorSpec, Sensors, check_sensing
-from scenarios.schema.settings import REPEATING, RecordedVehicle, separate, set_field
-from scenarios.schema.writing import is_absent, plain, to_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +224,7 @@ class Scenario:
         return f"<Scenario {self.name}: {parts}\n {self.description}>"
 
     def _repr_html_(self) -> str:
-        return quadsim.scenario_html(self)
+        return shorthands.scenario_as_html(self)
 
     def __dir__(self) -> list[str]:
         """Return the fields and methods for users, for completion in an interactive session."""
@@ -459,9 +459,9 @@ class Scenario:
             set_field(tables, path, number, source="replace", defaults=defaults)
         return self.derive(tables)
 
-    def fly(self, **options: Any) -> quadsim.Flight:
-        """Fly the scenario; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
-        return quadsim.fly(self, **options)
+    def fly(self, **options: Any) -> Any:
+        """Return the `quadsim.Flight`; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
+        return shorthands.fly_scenario(self, **options)
 
     def to_toml(self) -> str:
         """Return the file: every field, defaults included, with comments; parsing it gives this scenario.

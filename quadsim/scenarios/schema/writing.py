@@ -1,4 +1,4 @@
-"""A scenario as commented TOML: every field with its unit and meaning, the descriptions of `scenarios.schema`.
+"""A scenario as commented TOML: every field with its unit and meaning, the descriptions of `quadsim.scenarios.schema`.
 
 What is written parses to the same scenario, and equal scenarios give equal texts.  What is not stated stands in
 comments: a field that may be absent, and is, an absent table with its defaults, and a derived value with the word
@@ -16,7 +16,7 @@ import tomlkit
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from scenarios.schema.base import fields_of, is_table
+from quadsim.scenarios.schema.base import fields_of, is_table
 
 WIDTH: Final = 120
 """Longest line with a comment; a comment that does not fit beside its field is written above it."""

@@ -1,4 +1,4 @@
-"""Campaigns without a flight: tables in the columns of `scenarios.campaign.rows`, filled from a known law."""
+"""Campaigns without a flight: tables in the columns of `quadsim.features.campaign.rows`, filled from a known law."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from quadsim.features.campaign.rows import make_schema, make_table, split_times
 from quadsim.flight.audit import Limit
-from scenarios.campaign.rows import make_schema, make_table, split_times
-from scenarios.many import Row
+from quadsim.rollout.many import Row
 
 LIMITS = (
     Limit(name="roll", signal="roll", lower=-5.0, upper=5.0, tolerance=0.05),

@@ -19,19 +19,19 @@ import pytest
 import tomlkit
 
 from quadsim.errors import InputError, OutputError
+from quadsim.features.campaign import campaign as module
+from quadsim.features.campaign import store as records
+from quadsim.features.campaign.campaign import CampaignProgress, compare_replay, recorded_flight
+from quadsim.features.campaign.campaign import CampaignResult as Result
+from quadsim.features.campaign.campaign_file import Choice
+from quadsim.features.campaign.events import parse_event
+from quadsim.features.campaign.plan import Plan, load_plan
+from quadsim.features.campaign.rows import read_table
+from quadsim.features.campaign.store import read_manifest
 from quadsim.outputs import SUMMARY_FILE, Growing, digest_of
-from scenarios.campaign import campaign as module
-from scenarios.campaign import store as records
-from scenarios.campaign.campaign import CampaignProgress, compare_replay, recorded_flight
-from scenarios.campaign.campaign import CampaignResult as Result
-from scenarios.campaign.campaign_file import Choice
-from scenarios.campaign.events import parse_event
-from scenarios.campaign.plan import Plan, load_plan
-from scenarios.campaign.rows import read_table
-from scenarios.campaign.store import read_manifest
-from scenarios.machine import processor_name
-from scenarios.many import Row
-from scenarios.rollout import Rollout
+from quadsim.rollout.machine import processor_name
+from quadsim.rollout.many import Row
+from quadsim.rollout.rollout import Rollout
 
 pytestmark = pytest.mark.slow("campaigns")
 
@@ -228,7 +228,8 @@ def test_code_of_the_user_is_known_wherever_a_campaign_names_it(tmp_path: Path) 
 
 def test_a_campaign_that_is_killed_resumes_to_the_same_bytes(tmp_path: Path) -> None:
     plan = plan_of_kinds(tmp_path, "sleeps", vary=[CAMPAIGN["vary"][0]], flights=16)
-    often = "from scenarios.campaign import store; store.FLUSH_S = 0.2; from scenarios.commands.cli import main; main()"
+    flushing = "from quadsim.features.campaign import store; store.FLUSH_S = 0.2"
+    often = f"{flushing}; from quadsim.commands.cli import main; main()"
     options = ("little.toml", "--out", "c", "--workers", "2", "--no-report", "--resume")
     command = [sys.executable, "-c", often, "campaign", *options]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}

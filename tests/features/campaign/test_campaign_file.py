@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from quadsim.errors import FileError, InputError, UnknownNameError
-from scenarios.campaign.campaign_file import CampaignFile, Draws
-from scenarios.campaign.plan import Plan, load_plan, parse_campaign, plan_differences
-from scenarios.catalogue import campaign_names, campaign_path
-from scenarios.loading import load_scenario
+from quadsim.features.campaign.campaign_file import CampaignFile, Draws
+from quadsim.features.campaign.plan import Plan, load_plan, parse_campaign, plan_differences
+from quadsim.scenarios.catalogue import campaign_names, campaign_path
+from quadsim.scenarios.loading import load_scenario
 
 MASS = {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.9, "high": 1.1}
 BASE: dict[str, Any] = {"name": "c", "scenario": "hover", "flights": 3, "vary": [MASS]}

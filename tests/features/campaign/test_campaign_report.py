@@ -12,10 +12,8 @@ import pyarrow as pa
 import pytest
 from browser import CLASHES, opened
 
-from quadsim.report.figure import Panel
-from quadsim.report.to_matplotlib import to_png
-from scenarios.campaign.campaign_file import CampaignFile
-from scenarios.campaign.campaign_report import (
+from quadsim.features.campaign.campaign_file import CampaignFile
+from quadsim.features.campaign.campaign_report import (
     campaign_overview,
     group_table,
     histograms,
@@ -24,8 +22,10 @@ from scenarios.campaign.campaign_report import (
     worst_table,
     write_report,
 )
-from scenarios.campaign.rows import CampaignSummary
-from scenarios.campaign.statistics import estimate, interval, percent
+from quadsim.features.campaign.rows import CampaignSummary
+from quadsim.features.campaign.statistics import estimate, interval, percent
+from quadsim.report.figure import Panel
+from quadsim.report.to_matplotlib import to_png
 
 pytestmark = pytest.mark.slow("campaigns")
 

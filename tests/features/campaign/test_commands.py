@@ -15,8 +15,8 @@ import pytest
 import tomlkit
 
 import quadsim
-from scenarios.commands.cli import main
-from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 MASS = {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
@@ -29,7 +29,7 @@ CAMPAIGN = {
     "vary": [MASS],
 }
 HASTY = (
-    "from scenarios.commands import entry; from scenarios.campaign import store; "
+    "from quadsim.commands import entry; from quadsim.features.campaign import store; "
     "store.FLUSH_S = 0.3; raise SystemExit(entry.main())"
 )
 """A command line whose campaigns write what is flown as soon as it is there."""

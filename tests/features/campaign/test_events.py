@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from scenarios.campaign.events import parse_event
-from scenarios.campaign.statistics import judge, least_flights, parse_requirement
+from quadsim.features.campaign.events import parse_event
+from quadsim.features.campaign.statistics import judge, least_flights, parse_requirement
 
 ROW = {
     **{"failed": False, "violated": True, "crashed": False, "verdict": "lost"},

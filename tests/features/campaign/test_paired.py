@@ -11,9 +11,9 @@ import pyarrow as pa
 import pytest
 
 from quadsim.errors import InputError, OutputError
-from scenarios.campaign.events import EVENT_NAMES
-from scenarios.campaign.paired import compare_pairs
-from scenarios.campaign.statistics import estimate, holm
+from quadsim.features.campaign.events import EVENT_NAMES
+from quadsim.features.campaign.paired import compare_pairs
+from quadsim.features.campaign.statistics import estimate, holm
 
 MakeCampaign = Callable[..., pa.Table]
 

@@ -13,10 +13,9 @@ import pytest
 from scipy import stats
 
 from quadsim.errors import InputError, ParameterError
-from quadsim.flight.audit import Limit
-from scenarios.campaign.campaign_report import driver_sentence, driver_table, event_table, verdict_sentence
-from scenarios.campaign.paired import compare_pairs
-from scenarios.campaign.statistics import (
+from quadsim.features.campaign.campaign_report import driver_sentence, driver_table, event_table, verdict_sentence
+from quadsim.features.campaign.paired import compare_pairs
+from quadsim.features.campaign.statistics import (
     Dependence,
     dependence,
     estimate,
@@ -32,6 +31,7 @@ from scenarios.campaign.statistics import (
     upper_bounds,
     worst_flight,
 )
+from quadsim.flight.audit import Limit
 
 
 @pytest.mark.parametrize(("count", "trials"), [(0, 1), (1, 1), (0, 20), (3, 20), (37, 1000), (999, 1000), (10, 10)])

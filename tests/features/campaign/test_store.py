@@ -16,12 +16,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from quadsim.errors import FileError, OutputError
-from quadsim.flight import rundir
-from quadsim.flight.audit import Finding, Limit, audit, worst_finding
-from quadsim.flight.rundir import Run
-from quadsim.outputs import Growing, growing
-from scenarios.campaign import store
-from scenarios.campaign.rows import (
+from quadsim.features.campaign import store
+from quadsim.features.campaign.rows import (
     flown_row,
     make_schema,
     make_table,
@@ -29,8 +25,12 @@ from scenarios.campaign.rows import (
     split_times,
     unit_of,
 )
-from scenarios.campaign.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store, read_flights
-from scenarios.many import Row
+from quadsim.features.campaign.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store, read_flights
+from quadsim.flight import rundir
+from quadsim.flight.audit import Finding, Limit, audit, worst_finding
+from quadsim.flight.rundir import Run
+from quadsim.outputs import Growing, growing
+from quadsim.rollout.many import Row
 
 FAILED: Row = {"status": "error", "verdict": "error", "reason": "x", "violated": True, "crashed": False}
 SCHEMA = make_schema({"mass": (pa.float64(), "kg")}, [])

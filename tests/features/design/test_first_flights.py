@@ -15,13 +15,9 @@ import tomlkit
 from first_flights import FirstFlight, fly_first, vehicles
 
 import quadsim
-from mpc.baselines.lqr import bryson_objective
-from mpc.robust.settings import Robust
 from quadsim.assets import vehicle_path
 from quadsim.errors import ParameterError
-from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.assembly import Assembly
-from scenarios.design.first_scenario import (
+from quadsim.features.design.first_scenario import (
     ALLOWED_SHARE,
     BASELINE_SHARE,
     COURSES,
@@ -29,7 +25,11 @@ from scenarios.design.first_scenario import (
     HEIGHT_OVER_ERROR,
     first_scenario,
 )
-from scenarios.loading import parse_scenario
+from quadsim.mpc.baselines.lqr import bryson_objective
+from quadsim.mpc.robust.settings import Robust
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import parse_scenario
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
 
 pytestmark = pytest.mark.slow("first flights")
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.commands.cli import main
-from scenarios.results import EXIT_DONE
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "own-vehicle.md").read_text(encoding="utf-8")
 

@@ -8,8 +8,8 @@ import pytest
 from first_flights import fly_first
 from uneven import FILES, PUBLISHED, published, uneven
 
-from scenarios.commands.cli import main
-from scenarios.results import EXIT_DONE
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE
 
 FIRST = [(name, course) for name in (*PUBLISHED, "uneven") for course in ("step", "figure-eight")]
 QUICK = (("iris", "step"), ("uneven", "figure-eight"))

@@ -9,15 +9,15 @@ import pytest
 
 import quadsim
 from quadsim.assets import vehicle_path
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE
 from quadsim.errors import ParameterError
+from quadsim.features.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
+from quadsim.features.design.shortfalls import shortfalls
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.base import fields_of
 from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.vehicle import ARMS, OPTIONAL_PARAMETERS, THRUST, VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.commands.cli import main
-from scenarios.design.first_scenario import COURSES, DESIGNED_LAWS, first_scenario
-from scenarios.design.shortfalls import shortfalls
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.results import EXIT_DONE
-from scenarios.schema.base import fields_of
 
 TEMPLATE = quadsim.vehicle_report(template=True).content
 HUMMINGBIRD, LOPES = (load_vehicle(vehicle_path(name)) for name in ("hummingbird", "lopes2011"))

@@ -12,8 +12,8 @@ from uneven import FILES
 
 import quadsim
 from quadsim.assets import vehicle_path
+from quadsim.commands.cli import main
 from quadsim.vehicle import load_vehicle, vehicle_sources
-from scenarios.commands.cli import main
 
 B, RATIO = 1.1e-5, 0.016
 SPEEDS = np.linspace(150.0, 800.0, 12)

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from first_flights import vehicles
 
-from mpc.builders import build
-from mpc.model import continuous_model, discretise
 from quadsim.controller import StepInputs
 from quadsim.errors import ParameterError
+from quadsim.features.design.authority import authority
+from quadsim.features.design.first_scenario import SHARE, first_scenario, largest_eight
+from quadsim.features.design.rules import FASTEST_LOOP, PERIOD_SHARE, delay_margin, design_for, gain, is_stable
+from quadsim.mpc.builders import build
+from quadsim.mpc.model import continuous_model, discretise
+from quadsim.scenarios.loading import parse_scenario
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.wind import Air
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES, make_state
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
-from scenarios.design.authority import authority
-from scenarios.design.first_scenario import SHARE, first_scenario, largest_eight
-from scenarios.design.rules import FASTEST_LOOP, PERIOD_SHARE, delay_margin, design_for, gain, is_stable
-from scenarios.loading import parse_scenario
 
 ALL = vehicles()
 EVERY = pytest.mark.parametrize("vehicle", ALL, ids=lambda vehicle: vehicle.name)

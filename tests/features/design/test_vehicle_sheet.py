@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 
 import quadsim
-from mpc.model import continuous_model, hover_model
 from quadsim.assets import vehicle_names, vehicle_path
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE, EXIT_WRONG_INPUT
 from quadsim.errors import InputError
+from quadsim.features.design.authority import torque_ranges
+from quadsim.features.design.vehicle_report import make_sheet
+from quadsim.mpc.model import continuous_model, hover_model
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.assembly import Assembly
-from scenarios.commands.cli import main
-from scenarios.design.authority import torque_ranges
-from scenarios.design.vehicle_report import make_sheet
-from scenarios.loading import load_scenario
-from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
 
 VEHICLES = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]
 HUMMINGBIRD, LOPES = (load_vehicle(vehicle_path(n)) for n in ("hummingbird", "lopes2011"))

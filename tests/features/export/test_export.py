@@ -11,23 +11,23 @@ import pytest
 import scipy.linalg
 
 import quadsim
-from mpc.codegen.ctext import CText
-from mpc.codegen.geometric import CGeometric
-from mpc.codegen.nonlinear import FILES as NONLINEAR_FILES
-from mpc.codegen.source import BODY_FILES, CORE_FILES, DATA
-from mpc.condensing import Condensed
-from mpc.core.solver import Core
-from mpc.core.tables import AxisTables, tables
-from mpc.ocp import Query
-from mpc.solvers import Method
+from quadsim.commands.cli import main
 from quadsim.errors import ExportError, OutputError, ParameterError
+from quadsim.features.export.exporter import FACTS, c_controller, export, exported_law, room_sentence
+from quadsim.features.export.record import record
+from quadsim.mpc.codegen.ctext import CText
+from quadsim.mpc.codegen.geometric import CGeometric
+from quadsim.mpc.codegen.nonlinear import FILES as NONLINEAR_FILES
+from quadsim.mpc.codegen.source import BODY_FILES, CORE_FILES, DATA
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.core.solver import Core
+from quadsim.mpc.core.tables import AxisTables, tables
+from quadsim.mpc.ocp import Query
+from quadsim.mpc.solvers import Method
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import read_catalogue
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import REFERENCE_STATES, Array
-from scenarios.assembly import Assembly
-from scenarios.catalogue import read_catalogue
-from scenarios.commands.cli import main
-from scenarios.export.exporter import FACTS, c_controller, export, exported_law, room_sentence
-from scenarios.export.record import record
-from scenarios.loading import load_scenario
 
 pytestmark = pytest.mark.slow("export")
 
@@ -71,8 +71,8 @@ def test_any_horizon_is_exported(horizon: int) -> None:
 
 def test_the_core_is_exported_byte_for_byte(tmp_path: Path) -> None:
     directory = quadsim.export(quadsim.load("hover", SHORT), tmp_path / "c")
-    root = Path(__file__).parents[2]
-    folder = root / "mpc" / "core" / "c"
+    root = Path(__file__).parents[3]
+    folder = root / "quadsim" / "mpc" / "core" / "c"
     laws = {*CORE_FILES, *NONLINEAR_FILES, *CGeometric.law_files}
     assert {path.name for path in folder.iterdir()} - {"sizes.c"} == laws
     for name in CORE_FILES:
@@ -138,8 +138,8 @@ def test_an_export_is_complete_and_replaces_an_earlier_one_on_request(tmp_path: 
 
 
 def test_the_licence_is_the_project_s() -> None:
-    root = Path(__file__).parent.parent.parent
-    assert (root / "mpc/codegen/c/LICENSE").read_text() == (root / "LICENSE").read_text()
+    root = Path(__file__).parents[3]
+    assert (root / "quadsim/mpc/codegen/c/LICENSE").read_text() == (root / "LICENSE").read_text()
 
 
 @pytest.mark.parametrize(

@@ -24,10 +24,10 @@ from support import decode
 import quadsim
 import quadsim.gym
 from quadsim.errors import InputError, ParameterError, RenderingUnavailableError
+from quadsim.features.campaign.plan import load_plan
 from quadsim.report.film.video import rendering_backend
+from quadsim.scenarios.catalogue import scenario_names
 from quadsim.state import INDEX
-from scenarios.campaign.plan import load_plan
-from scenarios.catalogue import scenario_names
 
 pytestmark = pytest.mark.slow("gym")
 

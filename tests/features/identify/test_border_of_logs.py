@@ -14,17 +14,17 @@ from flown_logs import COLUMNS, fly_eight, write_log
 import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.errors import FileError, InputError
+from quadsim.features.identify.border import between, judging, reading, stated_number
+from quadsim.features.identify.checks import spans
+from quadsim.features.identify.record import read_record
+from quadsim.features.identify.report import identify_logs
+from quadsim.features.identify.rotors import lagging
+from quadsim.features.identify.search import Sought
 from quadsim.flight.parquet import write_log as write_run
+from quadsim.rollout.flown import Flight
+from quadsim.scenarios.catalogue import scenario_names
 from quadsim.state import Array
 from quadsim.vehicle import load_vehicle
-from scenarios.catalogue import scenario_names
-from scenarios.flown import Flight
-from scenarios.identify.border import between, judging, reading, stated_number
-from scenarios.identify.checks import spans
-from scenarios.identify.record import read_record
-from scenarios.identify.report import identify_logs
-from scenarios.identify.rotors import lagging
-from scenarios.identify.search import Sought
 
 NAMES = COLUMNS.split(",")
 LONGEST = 6.0  # [s] of a flight of the library whose log is identified

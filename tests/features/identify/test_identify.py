@@ -16,13 +16,11 @@ from uneven import FILES, published
 
 import quadsim
 from quadsim.assets import vehicle_path
+from quadsim.commands.cli import main
 from quadsim.errors import InputError, ParameterError
-from quadsim.vehicle import altered, load_vehicle, vehicle_sources
-from scenarios.commands.cli import main
-from scenarios.flown import Flight
-from scenarios.identify.estimate import Identification, ParameterEstimate, number_in
-from scenarios.identify.model import Parameters, commanded, stretch
-from scenarios.identify.prediction import (
+from quadsim.features.identify.estimate import Identification, ParameterEstimate, number_in
+from quadsim.features.identify.model import Parameters, commanded, stretch
+from quadsim.features.identify.prediction import (
     HORIZONS,
     QUANTITIES,
     RESIDUAL_AFTER,
@@ -30,10 +28,12 @@ from scenarios.identify.prediction import (
     hold_out,
     predict,
 )
-from scenarios.identify.record import Record, read_record
-from scenarios.identify.report import IdentifiedVehicle
-from scenarios.identify.search import Search
-from scenarios.identify.vehicle_file import rounded, vehicle_text
+from quadsim.features.identify.record import Record, read_record
+from quadsim.features.identify.report import IdentifiedVehicle
+from quadsim.features.identify.search import Search
+from quadsim.features.identify.vehicle_file import rounded, vehicle_text
+from quadsim.rollout.flown import Flight
+from quadsim.vehicle import altered, load_vehicle, vehicle_sources
 
 pytestmark = pytest.mark.slow("identification")
 
@@ -282,7 +282,7 @@ def test_a_vehicle_that_predicts_worse_is_said_to_and_written_only_anyway(
         errors["identified"][:, 3] = 2.0 * errors["thrust only"][:, 3]
         return replace(found, errors=errors)
 
-    monkeypatch.setattr("scenarios.identify.report.predict", exchanged)
+    monkeypatch.setattr("quadsim.features.identify.report.predict", exchanged)
     words = ["identify", "eight.csv", "--vehicle", "start.toml", "--out", "mine.toml"]
     assert main(words) == 0
     text = " ".join(capsys.readouterr().out.split())
@@ -364,7 +364,7 @@ def test_a_vehicle_that_cannot_be_is_refused_with_what_to_check(here: Path, monk
     def refuse(*_: object, **__: object) -> Identification:
         raise ParameterError("vehicle", "inertia", (0.007, 0.007, 0.015), "such that no moment exceeds the others")
 
-    monkeypatch.setattr("scenarios.identify.report.identify_records", refuse)
+    monkeypatch.setattr("quadsim.features.identify.report.identify_records", refuse)
     with pytest.raises(
         InputError, match=r"the logs and start.toml give a vehicle that cannot be: vehicle.inertia must"
     ):

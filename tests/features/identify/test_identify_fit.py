@@ -12,19 +12,19 @@ from scipy.signal import lfilter
 
 import quadsim
 from quadsim.errors import InputError
+from quadsim.features.identify.estimate import Identification, ParameterEstimate
+from quadsim.features.identify.fit import MOST_COLOUR, identify_records
+from quadsim.features.identify.prediction import predict
+from quadsim.features.identify.record import Record, to_record
+from quadsim.features.identify.rotors import lagging
+from quadsim.features.identify.search import _polynomial
+from quadsim.features.identify.series import Column
+from quadsim.features.identify.windows import to_world
+from quadsim.rollout.flown import Flight
 from quadsim.rotation import conjugate, euler_to_body_rates, euler_to_quaternion
 from quadsim.sim.airframe import munk_moment
 from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import Vehicle
-from scenarios.flown import Flight
-from scenarios.identify.estimate import Identification, ParameterEstimate
-from scenarios.identify.fit import MOST_COLOUR, identify_records
-from scenarios.identify.prediction import predict
-from scenarios.identify.record import Record, to_record
-from scenarios.identify.rotors import lagging
-from scenarios.identify.search import _polynomial
-from scenarios.identify.series import Column
-from scenarios.identify.windows import to_world
 
 pytestmark = pytest.mark.slow("identification")
 

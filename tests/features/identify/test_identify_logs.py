@@ -15,17 +15,17 @@ import pytest
 from scipy.ndimage import uniform_filter1d
 
 import quadsim
+from quadsim.commands.cli import main
 from quadsim.errors import FileError, InputError, MissingPackageError, ParameterError
+from quadsim.features.identify.checks import check_log, spans
+from quadsim.features.identify.record import Record, read_record
+from quadsim.features.identify.ulog import stated_rotors
+from quadsim.features.identify.windows import to_world
 from quadsim.flight.parquet import write_log
+from quadsim.rollout.flown import Flight
 from quadsim.rotation import conjugate, quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.commands.cli import main
-from scenarios.flown import Flight
-from scenarios.identify.checks import check_log, spans
-from scenarios.identify.record import Record, read_record
-from scenarios.identify.ulog import stated_rotors
-from scenarios.identify.windows import to_world
 
 pytestmark = pytest.mark.slow("identification")
 

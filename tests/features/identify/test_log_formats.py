@@ -14,19 +14,19 @@ from flown_logs import fly_eight, write_log
 
 import quadsim
 from quadsim.assets import vehicle_path
+from quadsim.commands.cli import main
 from quadsim.errors import FileError, InputError
+from quadsim.features.identify.checks import check_log, spans
+from quadsim.features.identify.model import stretch
+from quadsim.features.identify.quantities import NamedQuantity, read_map
+from quadsim.features.identify.record import Record, read_record, to_record
+from quadsim.features.identify.rotor_response import rotor_response
+from quadsim.features.identify.rotors import lagging
+from quadsim.features.identify.series import Column
+from quadsim.features.identify.windows import to_world
 from quadsim.rotation import conjugate, quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import load_vehicle
-from scenarios.commands.cli import main
-from scenarios.identify.checks import check_log, spans
-from scenarios.identify.model import stretch
-from scenarios.identify.quantities import NamedQuantity, read_map
-from scenarios.identify.record import Record, read_record, to_record
-from scenarios.identify.rotor_response import rotor_response
-from scenarios.identify.rotors import lagging
-from scenarios.identify.series import Column
-from scenarios.identify.windows import to_world
 
 pytestmark = pytest.mark.slow("identification")
 

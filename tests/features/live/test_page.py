@@ -29,17 +29,17 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from scenarios.commands.cli import main
-from scenarios.flown import Flight
-from scenarios.live import serving
-from scenarios.live.guard import Guard
-from scenarios.live.incoming import offers
-from scenarios.live.pace import Pace
-from scenarios.live.page import Page
-from scenarios.live.session import Frame, Session
-from scenarios.loading import load_scenario
-from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
-from scenarios.rollout import Rollout
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE, EXIT_WRONG_INPUT
+from quadsim.features.live import serving
+from quadsim.features.live.guard import Guard
+from quadsim.features.live.incoming import offers
+from quadsim.features.live.pace import Pace
+from quadsim.features.live.page import Page
+from quadsim.features.live.session import Frame, Session
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
 
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE = 60.0

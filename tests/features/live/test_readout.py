@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 
+from quadsim.features.live.readout import Constraints, hints, readings
+from quadsim.features.live.session import Frame, Session
 from quadsim.flight.audit import Limit
 from quadsim.palette import COLOUR
-from scenarios.live.readout import Constraints, hints, readings
-from scenarios.live.session import Frame, Session
-from scenarios.loading import load_scenario
+from quadsim.scenarios.loading import load_scenario
 
 ROLL = Limit(name="roll", signal="roll", lower=-5.0, upper=5.0, tolerance=0.05)
 LATE = Limit(name="arrival_x", signal="x_error", lower=-0.1, upper=0.1, start=29.0)

@@ -15,18 +15,18 @@ from drawn_events import HAPPENING, kind, number, vector
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-import scenarios.flight_events
+import quadsim.rollout.flight_events
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from quadsim.errors import InputError
-from scenarios.commands.cli import main
-from scenarios.live.commands import live
-from scenarios.live.knobs import knobs
-from scenarios.live.pace import LATE, Pace
-from scenarios.live.session import STRONGEST, Frame, Session, looping, read_script
-from scenarios.loading import load_scenario
-from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
-from scenarios.rollout import Rollout
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.writing import plain
+from quadsim.features.live.commands import live
+from quadsim.features.live.knobs import knobs
+from quadsim.features.live.pace import LATE, Pace
+from quadsim.features.live.session import STRONGEST, Frame, Session, looping, read_script
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.writing import plain
 
 WINDY = load_scenario("steady-wind", ["controller.horizon=10"])
 ROBUST = load_scenario("robust", ["controller.horizon=10"]).controller
@@ -136,7 +136,7 @@ def test_what_is_refused_is_reported_and_changes_nothing(session: Session) -> No
 def test_what_cannot_be_held_any_more_is_released_and_reported_once(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scenarios.flight_events, "MOST_EVENTS", 20)
+    monkeypatch.setattr(quadsim.rollout.flight_events, "MOST_EVENTS", 20)
     session.submit({"type": "pull", "to": [0.3, 0.0, 1.0]})
     session.submit({"type": "wear", "rotor": 2, "loss": 0.02})
     (refusal,) = [refusal for frame in flown(session, 30) for refusal in frame.refused]

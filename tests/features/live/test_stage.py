@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 import zstandard
 
+from quadsim.features.live import look
+from quadsim.features.live.pace import Pace
+from quadsim.features.live.page import Page
+from quadsim.features.live.session import Frame, Session
+from quadsim.features.live.stage import _course
 from quadsim.palette import line_colour
-from scenarios.live import look
-from scenarios.live.pace import Pace
-from scenarios.live.page import Page
-from scenarios.live.session import Frame, Session
-from scenarios.live.stage import _course
-from scenarios.loading import load_scenario
-from tests.scenarios.live.test_page import PATIENCE, browser
+from quadsim.scenarios.loading import load_scenario
+from tests.features.live.test_page import PATIENCE, browser
 
 __all__ = ["browser"]  # a fixture
 

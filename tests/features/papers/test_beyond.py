@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from quadsim.rollout.flown import Flight
 from quadsim.state import VELOCITIES
-from scenarios.flown import Flight
 
 Fly = Callable[..., Flight]
 LEARNED = 0.020  # m, published of a learned model on the circle at 8 m/s, with noise

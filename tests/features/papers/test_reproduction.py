@@ -16,13 +16,10 @@ import numpy as np
 import pytest
 
 import quadsim
+from quadsim.commands.cli import main
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from quadsim.errors import FileError, UnknownNameError
-from quadsim.report.table import grid_to_markdown
-from scenarios.catalogue import paper_names, scenario_names
-from scenarios.commands.cli import main
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.papers.reproduction import (
+from quadsim.features.papers.reproduction import (
     COUNTED,
     NUMBER_KINDS,
     PaperNumber,
@@ -31,9 +28,12 @@ from scenarios.papers.reproduction import (
     load_paper,
     reproduce_paper,
 )
-from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
-from scenarios.rollout import Rollout
-from scenarios.schema.problems import ScenarioError
+from quadsim.report.table import grid_to_markdown
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.catalogue import paper_names, scenario_names
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.problems import ScenarioError
 
 pytestmark = pytest.mark.slow("papers")
 

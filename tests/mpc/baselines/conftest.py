@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from support import paper_reference
 
-from mpc.baselines.geometric import Geometric
-from mpc.baselines.lqr import LQRTable
-from mpc.baselines.pid import PID
-from mpc.builders import law_of
 from quadsim.assets import vehicle_path
 from quadsim.controller import Controller
 from quadsim.flight.log import FlightLog
+from quadsim.mpc.baselines.geometric import Geometric
+from quadsim.mpc.baselines.lqr import LQRTable
+from quadsim.mpc.baselines.pid import PID
+from quadsim.mpc.builders import law_of
 from quadsim.sim.effects import Effects
 from quadsim.sim.loop import fly
 from quadsim.sim.plant import Plant

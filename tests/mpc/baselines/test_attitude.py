@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy_geometric import attitude_error, quaternion_of, unit_derivatives, vee
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import attitude_for, hat, limit_force, prioritised_error
+from quadsim.mpc.baselines.attitude import attitude_for, hat, limit_force, prioritised_error
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from mpc.baselines.bandwidths import SEPARATION, Bandwidths, bandwidths, lag_to_allow_for
 from quadsim.errors import ParameterError
+from quadsim.mpc.baselines.bandwidths import SEPARATION, Bandwidths, bandwidths, lag_to_allow_for
 from quadsim.vehicle import Vehicle
 
 

@@ -11,13 +11,13 @@ from numpy_geometric import NumpyGeometric, target_of_motion
 from numpy_ramp import NumpyRamp
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import Measured, motion_of
-from mpc.baselines.geometric import Geometric, GeometricController, Integrals
-from mpc.baselines.preview import Target, differentiator, target_of
-from mpc.bounded import TargetBounds
-from mpc.disturbance import RampSettings
-from mpc.flatness import motion_along
 from quadsim.controller import Phase, StepInputs
+from quadsim.mpc.baselines.attitude import Measured, motion_of
+from quadsim.mpc.baselines.geometric import Geometric, GeometricController, Integrals
+from quadsim.mpc.baselines.preview import Target, differentiator, target_of
+from quadsim.mpc.bounded import TargetBounds
+from quadsim.mpc.disturbance import RampSettings
+from quadsim.mpc.flatness import motion_along
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import EULER, Array
 from quadsim.vehicle import Vehicle

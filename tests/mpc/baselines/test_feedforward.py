@@ -10,10 +10,10 @@ from numpy_geometric import desired_attitude
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import Measured, hat
-from mpc.baselines.geometric import DesiredAttitude, Geometric, GeometricController, Integrals
-from mpc.baselines.preview import Target
-from mpc.flatness import motion_along
+from quadsim.mpc.baselines.attitude import Measured, hat
+from quadsim.mpc.baselines.geometric import DesiredAttitude, Geometric, GeometricController, Integrals
+from quadsim.mpc.baselines.preview import Target
+from quadsim.mpc.flatness import motion_along
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

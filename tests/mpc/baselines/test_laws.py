@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mpc.bounded import InputBounds
 from quadsim.controller import Phase, StepInputs
 from quadsim.errors import CommandError
+from quadsim.mpc.bounded import InputBounds
 from quadsim.state import INDEX, make_state
 from quadsim.vehicle import Vehicle
 

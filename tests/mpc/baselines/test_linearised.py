@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from mpc.allocation import allocate
-from mpc.baselines.attitude import motion_of
-from mpc.baselines.geometric import GeometricController, Integrals
-from mpc.baselines.lqr import lqr_gain
-from mpc.baselines.pid import CascadedPID, Memory
-from mpc.baselines.preview import Target
-from mpc.model import continuous_model, discretise, hover_model
-from mpc.ocp import Objective
 from quadsim.errors import ParameterError
+from quadsim.mpc.allocation import allocate
+from quadsim.mpc.baselines.attitude import motion_of
+from quadsim.mpc.baselines.geometric import GeometricController, Integrals
+from quadsim.mpc.baselines.lqr import lqr_gain
+from quadsim.mpc.baselines.pid import CascadedPID, Memory
+from quadsim.mpc.baselines.preview import Target
+from quadsim.mpc.model import continuous_model, discretise, hover_model
+from quadsim.mpc.ocp import Objective
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mpc.baselines.pid import Memory, desired_velocity, force_within
-from mpc.baselines.preview import Target
 from quadsim.controller import StepInputs
 from quadsim.flight.log import FlightLog
+from quadsim.mpc.baselines.pid import Memory, desired_velocity, force_within
+from quadsim.mpc.baselines.preview import Target
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
 

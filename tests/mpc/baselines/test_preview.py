@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mpc.baselines.preview import differentiator, target_of
+from quadsim.mpc.baselines.preview import differentiator, target_of
 
 
 @pytest.mark.parametrize("samples", [3, 10, 25])

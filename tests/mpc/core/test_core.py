@@ -18,20 +18,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import flight_queries, paper_problem, random_axes, random_problem
 
-from mpc.constraints import Constraint, Penalty
-from mpc.core.axes import axes
-from mpc.core.solver import PROBLEMS, Core, core_problem
-from mpc.ocp import Equilibrium, Problem, Query, lqr_terminal_weight
-from mpc.qp import kkt_residuals
-from mpc.solvers import Answer, Method, QPSolver
-from mpc.solvers.by_name import make_solver
 from quadsim.controller import ACCEPTED, CORE, GAIN, SOLVED, UNCONSTRAINED
 from quadsim.errors import ParameterError
+from quadsim.mpc.constraints import Constraint, Penalty
+from quadsim.mpc.core.axes import axes
+from quadsim.mpc.core.solver import PROBLEMS, Core, core_problem
+from quadsim.mpc.ocp import Equilibrium, Problem, Query, lqr_terminal_weight
+from quadsim.mpc.qp import kkt_residuals
+from quadsim.mpc.solvers import Answer, Method, QPSolver
+from quadsim.mpc.solvers.by_name import make_solver
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import Array
-from scenarios.assembly import Assembly
-from scenarios.flown import Flight
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
 
 PIQP = "piqp-multistage"
 

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 import quadsim
-from mpc.codegen.source import CController
-from mpc.core.law import CompiledPreparation, CompiledSolver
-from mpc.core.numbers import robust_numbers
-from mpc.linear import LinearMPC
-from mpc.robust.controller import RobustPreparation
 from quadsim.controller import CORE, FALLBACK, GAIN, Command, Phase, StepInputs
 from quadsim.errors import ExportError, InputError
+from quadsim.features.export.exporter import exported_law
+from quadsim.mpc.codegen.source import CController
+from quadsim.mpc.core.law import CompiledPreparation, CompiledSolver
+from quadsim.mpc.core.numbers import robust_numbers
+from quadsim.mpc.linear import LinearMPC
+from quadsim.mpc.robust.controller import RobustPreparation
+from quadsim.rollout.flown import Flight
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import INDEX, N_STATES, Array, wrapped
-from scenarios.assembly import Assembly
-from scenarios.export.exporter import exported_law
-from scenarios.flown import Flight
-from scenarios.schema.scenario import Scenario
 
 COMPILED = {"controller.compiled": True}
 PYTHON = {"controller.compiled": False, "controller.solver": CORE}

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import block_diag
 from scripted_controller import PERIOD, advance, level, model, random_state
 
-from mpc.fallback.completion import ACCELERATION, PLAUSIBLE, StateCompletion
+from quadsim.mpc.fallback.completion import ACCELERATION, PLAUSIBLE, StateCompletion
 from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array
 
 

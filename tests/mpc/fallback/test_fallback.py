@@ -9,10 +9,10 @@ import piqp
 import pytest
 from scripted_controller import PERIOD, Scripted, advance, call, failing, following, guard, model, random_state
 
-from mpc.fallback.contract import FallbackSettings
-from mpc.solvers.piqp import STATUS
 from quadsim.controller import ACCEPTED, Phase, StepInputs
 from quadsim.errors import CommandError
+from quadsim.mpc.fallback.contract import FallbackSettings
+from quadsim.mpc.solvers.piqp import STATUS
 from quadsim.state import INDEX, VELOCITY, Array
 
 

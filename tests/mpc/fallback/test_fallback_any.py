@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scripted_controller import Scripted, bounds, guard, model
 
-from mpc.fallback.contract import FallbackSettings
 from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import CommandError
+from quadsim.mpc.fallback.contract import FallbackSettings
 from quadsim.state import Array
 
 NUMBERS = st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -1e300, 1e300, 1e5, 190.0, 250.0, 251.0])

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scripted_controller import Pressed, Scripted, advance, at_rest, call, failing, guard, model, pressed
 
-from mpc.answer import ActuatorBounds
-from mpc.fallback.hover import LARGEST_CLIMB, HoverLaw
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.fallback.hover import LARGEST_CLIMB, HoverLaw
 from quadsim.state import INDEX
 
 

@@ -10,14 +10,14 @@ import pytest
 from scripted_controller import PERIOD, bounds, model, problem
 from support import constrained_mpc, paper_reference
 
-from mpc.fallback.contract import FallbackSettings, Guard
-from mpc.ocp import Query
-from mpc.pilot import Pilot
-from mpc.solvers import Answer, QPSolver
-from mpc.solvers.piqp import STATUS
 from quadsim.controller import ACCEPTED
 from quadsim.flight.log import FlightLog
 from quadsim.flight.phase import PhaseMonitor, clearance
+from quadsim.mpc.fallback.contract import FallbackSettings, Guard
+from quadsim.mpc.ocp import Query
+from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.solvers import Answer, QPSolver
+from quadsim.mpc.solvers.piqp import STATUS
 from quadsim.sim.airframe import outline
 from quadsim.sim.computation import Computation, Stall
 from quadsim.sim.effects import Effects, Ground

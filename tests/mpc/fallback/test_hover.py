@@ -9,10 +9,10 @@ import pytest
 import scipy.linalg
 from scripted_controller import PERIOD, advance, bounds, level, model, random_state
 
-from mpc.fallback.hover import ACCEPTABLE, ACCEPTABLE_ACCELERATION, HoverLaw
-from mpc.heading import predict_in_heading_frame, turn
-from mpc.model import hover_model
 from quadsim.assets import vehicle_path
+from quadsim.mpc.fallback.hover import ACCEPTABLE, ACCEPTABLE_ACCELERATION, HoverLaw
+from quadsim.mpc.heading import predict_in_heading_frame, turn
+from quadsim.mpc.model import hover_model
 from quadsim.state import INDEX
 from quadsim.vehicle import load_vehicle
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from support import derivative, linearised
 
-from mpc.model import hover_model
-from mpc.nonlinear import model as module
-from mpc.nonlinear.model import NonlinearModel, nonlinear_model
+from quadsim.mpc.model import hover_model
+from quadsim.mpc.nonlinear import model as module
+from quadsim.mpc.nonlinear.model import NonlinearModel, nonlinear_model
 from quadsim.rotation import body_to_euler_rates, body_to_world, euler_to_body_rates
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics

@@ -11,18 +11,18 @@ import pytest
 from scipy.optimize import minimize
 from support import advance_nodes
 
-from mpc.answer import ActuatorBounds
-from mpc.constraints import Constraint
-from mpc.diagnosis import find_conflict
-from mpc.nonlinear.controller import CONVERGED, STEP_TOLERANCE, NonlinearMPC
-from mpc.nonlinear.law import WIDTH_OF_MOTION, put_motion
-from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, rigid_body, thrust_axis
-from mpc.nonlinear.settings import Nonlinear, Weights
-from mpc.observer import ObserverSettings
 from quadsim.assets import vehicle_path
 from quadsim.controller import ACCEPTED, NOT_CONVERGED, OPTIMAL, Command, Phase, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.constraints import Constraint
+from quadsim.mpc.diagnosis import find_conflict
+from quadsim.mpc.nonlinear.controller import CONVERGED, STEP_TOLERANCE, NonlinearMPC
+from quadsim.mpc.nonlinear.law import WIDTH_OF_MOTION, put_motion
+from quadsim.mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, rigid_body, thrust_axis
+from quadsim.mpc.nonlinear.settings import Nonlinear, Weights
+from quadsim.mpc.observer import ObserverSettings
 from quadsim.rotation import multiply, quaternion_to_euler
 from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import load_vehicle

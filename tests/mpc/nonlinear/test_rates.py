@@ -13,16 +13,19 @@ import pytest
 from scipy.integrate import solve_ivp
 from support import advance_nodes, frame, linearise_nodes
 
-from mpc.bounded import Avoidance, Polytope, Soft, TargetBounds
-from mpc.builders import build
-from mpc.constraints import Constraint
-from mpc.disturbance import RampSettings
-from mpc.fallback.contract import FallbackSettings
-from mpc.fallback.hover import HoverLaw
-from mpc.indi import INDISettings
-from mpc.model import target_model
-from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.rigidbody import (
+from quadsim.assets import vehicle_path
+from quadsim.controller import NOT_CONVERGED, Command, Controller, Phase, StepInputs
+from quadsim.errors import FlightError, ParameterError
+from quadsim.mpc.bounded import Avoidance, Polytope, Soft, TargetBounds
+from quadsim.mpc.builders import build
+from quadsim.mpc.constraints import Constraint
+from quadsim.mpc.disturbance import RampSettings
+from quadsim.mpc.fallback.contract import FallbackSettings
+from quadsim.mpc.fallback.hover import HoverLaw
+from quadsim.mpc.indi import INDISettings
+from quadsim.mpc.model import target_model
+from quadsim.mpc.nonlinear.controller import NonlinearMPC
+from quadsim.mpc.nonlinear.rigidbody import (
     N_BODY,
     RATE_SCALE,
     Inputs,
@@ -35,11 +38,8 @@ from mpc.nonlinear.rigidbody import (
     rotation,
     thrust_axis,
 )
-from mpc.nonlinear.settings import Nonlinear, Weights
-from mpc.observer import ObserverSettings
-from quadsim.assets import vehicle_path
-from quadsim.controller import NOT_CONVERGED, Command, Controller, Phase, StepInputs
-from quadsim.errors import FlightError, ParameterError
+from quadsim.mpc.nonlinear.settings import Nonlinear, Weights
+from quadsim.mpc.observer import ObserverSettings
 from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
 from quadsim.space import Sphere
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array

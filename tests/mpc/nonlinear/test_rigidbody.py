@@ -11,8 +11,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from support import advance_nodes, derivative, frame, linearise_nodes
 
-from mpc.nonlinear.model import nonlinear_model
-from mpc.nonlinear.rigidbody import (
+from quadsim.assets import vehicle_path
+from quadsim.mpc.nonlinear.model import nonlinear_model
+from quadsim.mpc.nonlinear.rigidbody import (
     N_BODY,
     Inputs,
     P,
@@ -24,7 +25,6 @@ from mpc.nonlinear.rigidbody import (
     rotation,
     thrust_axis,
 )
-from quadsim.assets import vehicle_path
 from quadsim.rotation import (
     body_to_euler_rates,
     body_to_world,

@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 from ocp_peer import Period, dense_qp
 
-from mpc.answer import ActuatorBounds
-from mpc.bounded import Polytope, Soft
-from mpc.constraints import Constraint
-from mpc.fallback.structs import STATUSES
-from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.rigidbody import N_BODY, P, Q, V, W
-from mpc.nonlinear.settings import Nonlinear, Weights
-from mpc.nonlinear.sqp import OWN_NAMES, SQP
-from mpc.obstacles import AvoidanceSettings, Space
-from mpc.ocp import Query
-from mpc.qp import kkt_residuals
-from mpc.solvers.daqp import DaqpDense
 from quadsim.assets import vehicle_path
 from quadsim.controller import ACCEPTED, OPTIMAL, SOLVED, UNCONSTRAINED, Command, StepInputs
 from quadsim.errors import ParameterError
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.bounded import Polytope, Soft
+from quadsim.mpc.constraints import Constraint
+from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.mpc.nonlinear.controller import NonlinearMPC
+from quadsim.mpc.nonlinear.rigidbody import N_BODY, P, Q, V, W
+from quadsim.mpc.nonlinear.settings import Nonlinear, Weights
+from quadsim.mpc.nonlinear.sqp import OWN_NAMES, SQP
+from quadsim.mpc.obstacles import AvoidanceSettings, Space
+from quadsim.mpc.ocp import Query
+from quadsim.mpc.qp import kkt_residuals
+from quadsim.mpc.solvers.daqp import DaqpDense
 from quadsim.space import Sphere
 from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import load_vehicle

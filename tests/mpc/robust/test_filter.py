@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from support import paper_problem, robust_table
 
-from mpc.bounded import InputBounds, Polytope
-from mpc.condensing import Condensed
-from mpc.constraints import Bounds
-from mpc.ocp import Objective, Query
-from mpc.robust.controller import RobustPreparation
-from mpc.robust.filter import TERMINAL_TOLERANCE, SafetyFilter, _Nearest
-from mpc.solvers import Answer, make_backend
 from quadsim.controller import UNCONSTRAINED, Command, StepInputs
+from quadsim.mpc.bounded import InputBounds, Polytope
+from quadsim.mpc.condensing import Condensed
+from quadsim.mpc.constraints import Bounds
+from quadsim.mpc.ocp import Objective, Query
+from quadsim.mpc.robust.controller import RobustPreparation
+from quadsim.mpc.robust.filter import TERMINAL_TOLERANCE, SafetyFilter, _Nearest
+from quadsim.mpc.solvers import Answer, make_backend
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import INDEX, Array
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario
 
 HORIZON, PERIOD = 40, 0.05
 VEHICLE = Assembly(load_scenario("paper-constrained")).vehicle

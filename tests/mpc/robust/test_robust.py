@@ -12,17 +12,17 @@ import pytest
 from numpy_laws import respond
 from support import constrained_mpc, derivative, paper_problem, paper_reference, robust_mpc, robust_table
 
-from mpc.bounded import InputWeights, Soft
-from mpc.heading import turn_horizontally
-from mpc.linear import LinearMPC
-from mpc.nonlinear.model import NonlinearModel, next_state, nonlinear_model
-from mpc.observer import ObserverSettings
-from mpc.robust.controller import RobustPreparation
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Phase, StepInputs
+from quadsim.mpc.bounded import InputWeights, Soft
+from quadsim.mpc.heading import turn_horizontally
+from quadsim.mpc.linear import LinearMPC
+from quadsim.mpc.nonlinear.model import NonlinearModel, next_state, nonlinear_model
+from quadsim.mpc.observer import ObserverSettings
+from quadsim.mpc.robust.controller import RobustPreparation
+from quadsim.rollout.flown import Flight
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios.flown import Flight
 
 PERIOD = 0.05
 SOFT = Soft(linear=2e5, quadratic=1e4)

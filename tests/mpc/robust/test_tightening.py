@@ -13,14 +13,16 @@ import pytest
 import scipy.linalg
 from support import derivative, fly_once, paper_problem, paper_reference, robust_mpc, robust_table
 
-from mpc.bounded import SHORTEST_LAG, InputWeights, Soft
-from mpc.constraints import Bounds
-from mpc.linear import LinearMPC
-from mpc.model import discretise
-from mpc.nonlinear.model import next_state, nonlinear_model
-from mpc.observer import ObserverSettings
-from mpc.regulator import observed
-from mpc.robust.tightening import (
+from quadsim.controller import ACCEPTED, StepInputs
+from quadsim.errors import ParameterError
+from quadsim.mpc.bounded import SHORTEST_LAG, InputWeights, Soft
+from quadsim.mpc.constraints import Bounds
+from quadsim.mpc.linear import LinearMPC
+from quadsim.mpc.model import discretise
+from quadsim.mpc.nonlinear.model import next_state, nonlinear_model
+from quadsim.mpc.observer import ObserverSettings
+from quadsim.mpc.regulator import observed
+from quadsim.mpc.robust.tightening import (
     ERROR_SHARE,
     SPEED_SHARE,
     TighteningSettings,
@@ -30,12 +32,10 @@ from mpc.robust.tightening import (
     growth,
     margins,
 )
-from quadsim.controller import ACCEPTED, StepInputs
-from quadsim.errors import ParameterError
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario
 
 ROOT = Path(__file__).resolve().parents[3]
 TILTS = [INDEX["roll"], INDEX["pitch"]]

@@ -29,10 +29,10 @@ from quadsim.report.film.video import (
     rendering_backend,
     write_poster,
 )
+from quadsim.rollout.rollout import Rollout
 from quadsim.rotation import body_to_world
+from quadsim.scenarios.loading import load_scenario
 from quadsim.state import EULER, INDEX, POSITION
-from scenarios.loading import load_scenario
-from scenarios.rollout import Rollout
 
 pytestmark = pytest.mark.slow("films")
 

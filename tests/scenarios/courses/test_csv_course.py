@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import quadsim
+from quadsim.console.console import to_text
 from quadsim.errors import FileError
+from quadsim.scenarios.catalogue import scenario_names
+from quadsim.scenarios.courses.csv_course import Csv, Table, read_course_table, through_rows
 from quadsim.state import Array
-from scenarios.catalogue import scenario_names
-from scenarios.console import to_text
-from scenarios.courses.csv_course import Csv, Table, read_course_table, through_rows
 
 ROWS = "0,0,0,1,0\n1,2,0,1,0.5\n3,2,4,2,1\n"
 

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.courses.followed import FollowedCourse
+from quadsim.scenarios.feasibility_check import report
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
-from scenarios.assembly import Assembly
-from scenarios.courses.followed import FollowedCourse
-from scenarios.feasibility_check import report
-from scenarios.loading import load_scenario
-from scenarios.schema.scenario import Scenario
 
 SAMPLES = 700
 

@@ -12,8 +12,8 @@ import pytest
 
 import quadsim
 from quadsim.errors import FileError, InputError
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import REFERENCE_NAMES
-from scenarios.schema.scenario import Scenario
 
 
 def helix(t: float) -> tuple[float, float, float, float]:

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from scenarios.courses.course import Path, begin
-from scenarios.courses.legs import Turn, Waypoint, Waypoints, YawTurns, polyline
+from quadsim.scenarios.courses.course import Path, begin
+from quadsim.scenarios.courses.legs import Turn, Waypoint, Waypoints, YawTurns, polyline
 
 START = np.array([1.0, 0.0, 2.0, 0.0])
 

@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from quadsim.scenarios.courses.course import Path, begin
+from quadsim.scenarios.courses.loops import Loop, circle, figure_eight, fly_round, ramped
 from quadsim.state import Array
-from scenarios.courses.course import Path, begin
-from scenarios.courses.loops import Loop, circle, figure_eight, fly_round, ramped
 
 CENTRE = np.array([1.0, -2.0, 3.0])
 THETA = np.linspace(0.0, 4.0 * math.pi, 801)

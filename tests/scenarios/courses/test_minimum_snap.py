@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import PPoly
 
+from quadsim.scenarios.courses.minimum_snap import ACCELERATION_ORDER, SNAP, minimum_snap, smoothest
 from quadsim.state import Array
-from scenarios.courses.minimum_snap import ACCELERATION_ORDER, SNAP, minimum_snap, smoothest
 
 TIMES = np.array([0.0, 1.5, 2.0, 5.0, 6.2])
 VALUES = np.array([[0.0, 1.0], [2.0, -1.0], [1.0, 0.5], [4.0, 3.0], [0.0, 0.0]])

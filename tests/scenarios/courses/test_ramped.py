@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mpc.flatness import attitudes, motion_along
 from quadsim.motion import Motion
+from quadsim.mpc.flatness import attitudes, motion_along
 from quadsim.rotation import quaternion_to_euler
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.problems import ScenarioError
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario
-from scenarios.schema.problems import ScenarioError
-from scenarios.schema.scenario import Scenario
 
 PERIOD = 0.02
 # Of the specification of the paper's simulation: sample, position, quaternion, velocity, body rates, thrusts over 20 N.

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from scenarios.assembly import Assembly
-from scenarios.courses.smoothing import smooth
-from scenarios.courses.steps import Window, steps, switches
-from scenarios.loading import load_scenario
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.courses.smoothing import smooth
+from quadsim.scenarios.courses.steps import Window, steps, switches
+from quadsim.scenarios.loading import load_scenario
 
 PERIOD = 0.05
 

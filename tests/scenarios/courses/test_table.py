@@ -12,11 +12,11 @@ import pytest
 from support import scenario_table
 
 from quadsim.errors import FileError
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.courses.smoothing import smooth
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
-from scenarios.assembly import Assembly
-from scenarios.courses.smoothing import smooth
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.schema.scenario import Scenario
 
 INITIAL = (1.0, -2.0, 3.0)
 POINTS = [{"position": [4.0, 2.0, 3.0], "yaw": 90.0}, {"position": [4.0, 2.0, 5.0]}]

@@ -13,25 +13,25 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from mpc.answer import ActuatorBounds
-from mpc.baselines.geometric import GeometricController
-from mpc.baselines.lqr import LQR, bryson_objective
-from mpc.baselines.pid import PID, CascadedPID
-from mpc.constraints import Bounds
-from mpc.linear import LinearMPC
-from mpc.nonlinear.controller import NonlinearMPC
-from mpc.nonlinear.settings import Weights
-from mpc.observer import DisturbanceObserver, ObserverSettings
-from mpc.ocp import Objective
-from mpc.pilot import Pilot
-from mpc.robust.controller import RobustPreparation
-from mpc.robust.tightening import TighteningSettings, margins
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.schema.json_schema import scenario_schema
-from scenarios.schema.scenario import Scenario
+from quadsim.mpc.answer import ActuatorBounds
+from quadsim.mpc.baselines.geometric import GeometricController
+from quadsim.mpc.baselines.lqr import LQR, bryson_objective
+from quadsim.mpc.baselines.pid import PID, CascadedPID
+from quadsim.mpc.constraints import Bounds
+from quadsim.mpc.linear import LinearMPC
+from quadsim.mpc.nonlinear.controller import NonlinearMPC
+from quadsim.mpc.nonlinear.settings import Weights
+from quadsim.mpc.observer import DisturbanceObserver, ObserverSettings
+from quadsim.mpc.ocp import Objective
+from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.robust.controller import RobustPreparation
+from quadsim.mpc.robust.tightening import TighteningSettings, margins
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.json_schema import scenario_schema
+from quadsim.scenarios.schema.scenario import Scenario
 
 ROBUST: dict[str, Any] = {
     "type": "robust",

@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 from quadsim.errors import InputError, ParameterError
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.computation import Computation
 from quadsim.sim.effects import Disturbance, Effects, Ground
 from quadsim.sim.effects.battery import Battery
@@ -16,9 +19,6 @@ from quadsim.sim.effects.load import Load, Payload, PayloadDrop, PayloadPickup
 from quadsim.sim.effects.rotors import RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air
 from quadsim.vehicle import Vehicle
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario
-from scenarios.schema.scenario import Scenario
 
 
 def scenario(*settings: str, vehicle: str = "lopes2011") -> tuple[Scenario, Vehicle]:

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 from support import scenario_table
 
+from quadsim.scenarios.assembly import Assembly, make_fault
+from quadsim.scenarios.loading import parse_scenario
+from quadsim.scenarios.schema.events import SensorFaultEvent
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.sensing import FaultKind, Outliers, SensorFault, SensorName, in_si
 from quadsim.vehicle import Vehicle
-from scenarios.assembly import Assembly, make_fault
-from scenarios.loading import parse_scenario
-from scenarios.schema.events import SensorFaultEvent
-from scenarios.schema.scenario import Scenario
 
 SENSORS: dict[str, Any] = {
     "position": {"rate": 20, "noise": [0.1, 0.1, 0.2], "delay": 0.11},

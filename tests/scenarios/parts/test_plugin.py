@@ -16,11 +16,11 @@ from support import NO_PRODUCTS
 
 from quadsim.controller import Command, Statistics, StepInputs
 from quadsim.errors import CommandError, InputError
+from quadsim.rollout.rollout import Rollout
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.plugin import PluginController
 from quadsim.state import Array
-from scenarios.assembly import Assembly
-from scenarios.loading import load_scenario
-from scenarios.plugin import PluginController
-from scenarios.rollout import Rollout
 
 HOVER = """
 import numpy as np

@@ -6,12 +6,12 @@ from typing import Any, get_args
 
 import pytest
 
-from scenarios.assembly import Assembly
-from scenarios.flight_events import prepared, story
-from scenarios.loading import load_scenario
-from scenarios.schema.base import fields_of
-from scenarios.schema.events import Event
-from scenarios.schema.scenario import Scenario
+from quadsim.rollout.flight_events import prepared, story
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.base import fields_of
+from quadsim.scenarios.schema.events import Event
+from quadsim.scenarios.schema.scenario import Scenario
 
 TEXTS = [
     ({"type": "rotor_loss", "rotor": 2, "loss": 0.2, "duration": 3.0}, "rotor 2 loses 20 % for 3 s"),

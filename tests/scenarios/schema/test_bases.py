@@ -9,9 +9,9 @@ import pytest
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import FileError
-from scenarios.loading import load_scenario
-from scenarios.schema.bases import merge
-from scenarios.schema.problems import ScenarioError
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.bases import merge
+from quadsim.scenarios.schema.problems import ScenarioError
 
 
 def write(directory: Path, name: str, text: str) -> str:

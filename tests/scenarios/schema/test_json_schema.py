@@ -9,9 +9,9 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from quadsim.assets import read_toml
-from scenarios.catalogue import scenario_names, scenario_source
-from scenarios.loading import load_scenario
-from scenarios.schema.json_schema import scenario_schema
+from quadsim.scenarios.catalogue import scenario_names, scenario_source
+from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.schema.json_schema import scenario_schema
 
 SCHEMA = scenario_schema()
 VALIDATOR = Draft202012Validator(SCHEMA)

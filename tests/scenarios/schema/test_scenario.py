@@ -11,11 +11,11 @@ from support import scenario_table
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import UnknownNameError
-from scenarios.assembly import Assembly
-from scenarios.catalogue import FLIGHTS
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.schema.problems import ScenarioError
-from scenarios.schema.scenario import Scenario
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import FLIGHTS
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.problems import ScenarioError
+from quadsim.scenarios.schema.scenario import Scenario
 
 
 def reread(scenario: Scenario) -> Scenario:

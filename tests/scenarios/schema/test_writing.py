@@ -10,12 +10,12 @@ from typing import Any, get_origin
 import pytest
 from support import scenario_table
 
-from scenarios.assembly import Assembly
-from scenarios.catalogue import scenario_names
-from scenarios.loading import load_scenario, parse_scenario
-from scenarios.schema.base import fields_of, is_table
-from scenarios.schema.scenario import Scenario
-from scenarios.schema.writing import plain, tables_in
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import scenario_names
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.base import fields_of, is_table
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.writing import plain, tables_in
 
 
 @pytest.mark.parametrize("name", scenario_names())

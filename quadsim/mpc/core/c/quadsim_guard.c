@@ -1,7 +1,7 @@
 /* The fallback contract around the law: what is flown when it has no usable answer, and the state that it is given.
  *
  * Each period flies the first of these that there is: the law's optimum; the last one's plan, shifted, with a correction
- * towards the states that it foresaw; level hover; descent.  Statement, sources and twin: mpc/fallback of quadsim. */
+ * towards the states that it foresaw; level hover; descent.  Statement, sources and twin: quadsim/mpc/fallback of quadsim. */
 #include "quadsim_guard.h"
 
 #include <string.h>

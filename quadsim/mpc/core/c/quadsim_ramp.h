@@ -1,4 +1,4 @@
-/* Estimates of unmodelled force and torque, and of the force's rate of change; equations and sources: mpc/disturbance.py
+/* Estimates of unmodelled force and torque, and of the force's rate of change; equations and sources: quadsim/mpc/disturbance.py
  * of quadsim.
  *
  * velocity [3]      world axes [m/s]

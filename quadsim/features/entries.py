@@ -1,6 +1,6 @@
-"""The rooms: folders of features beside the core, which names none of them but here.
+"""The features: folders beside the core, which names none of them but here.
 
-A room has its commands in its `commands.py`, imported when one is called, its tests in a folder of its name, and its
+A feature has its commands in its `commands.py`, imported when one is called, its tests in a folder of its name, and its
 pages.  `make rooms` takes each away, with its entry here, and sees the rest pass.
 """
 
@@ -16,36 +16,36 @@ from quadsim.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
-class RoomCommand:
-    """A command of a room, as the help of `quadsim` lists it before the room is imported."""
+class FeatureCommand:
+    """A command of a feature, as the help of `quadsim` lists it before the feature is imported."""
 
-    function: str  # of the room's `commands`
+    function: str  # of the feature's `commands`
     help: str  # the first line of its docstring
     examples: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Room:
-    """What the core knows of a room."""
+class Feature:
+    """What the core knows of a feature."""
 
-    commands: Mapping[str, RoomCommand] = field(default_factory=dict)  # by the word on the command line
+    commands: Mapping[str, FeatureCommand] = field(default_factory=dict)  # by the word on the command line
     owns_directories: bool = False
     """Whether its `commands` have `owns(directory)`, `check_advice(directory)` and `compare_directories(...)`."""
 
 
-ROOMS: Final[dict[str, Room]] = {
-    "live": Room(
+FEATURES: Final[dict[str, Feature]] = {
+    "live": Feature(
         commands={
-            "live": RoomCommand(
+            "live": FeatureCommand(
                 function="live",
                 help="Fly interactively in the browser: push, change every setting, save the flight as a scenario.",
                 examples=("quadsim live", "quadsim live robust --against paper-constrained"),
             )
         }
     ),
-    "campaign": Room(
+    "campaign": Feature(
         commands={
-            "campaign": RoomCommand(
+            "campaign": FeatureCommand(
                 function="campaign",
                 help="Fly a scenario many times with randomly drawn parameters.",
                 examples=(
@@ -53,7 +53,7 @@ ROOMS: Final[dict[str, Room]] = {
                     "quadsim campaign mine.toml --resume --require 'P(violation) < 0.01 @ 95%'",
                 ),
             ),
-            "replay": RoomCommand(
+            "replay": FeatureCommand(
                 function="replay",
                 help="Fly one flight of a finished campaign again, with all outputs.",
                 examples=(
@@ -64,18 +64,18 @@ ROOMS: Final[dict[str, Room]] = {
         },
         owns_directories=True,
     ),
-    "papers": Room(
+    "papers": Feature(
         commands={
-            "reproduce": RoomCommand(
+            "reproduce": FeatureCommand(
                 function="reproduce",
                 help="Reproduce papers' numbers: theirs, ours, difference; exit 1 if one is off.",
                 examples=("quadsim reproduce", "quadsim reproduce torrente2021 --junit numbers.xml"),
             )
         }
     ),
-    "export": Room(
+    "export": Feature(
         commands={
-            "export": RoomCommand(
+            "export": FeatureCommand(
                 function="export",
                 help="Export a scenario's controller as self-contained C99, with recorded periods to test it.",
                 examples=(
@@ -85,9 +85,9 @@ ROOMS: Final[dict[str, Room]] = {
             )
         }
     ),
-    "identify": Room(
+    "identify": Feature(
         commands={
-            "identify": RoomCommand(
+            "identify": FeatureCommand(
                 function="identify",
                 help="Identify a vehicle from flight logs: its file, with an interval for every number.",
                 examples=(
@@ -97,9 +97,9 @@ ROOMS: Final[dict[str, Room]] = {
             )
         }
     ),
-    "design": Room(
+    "design": Feature(
         commands={
-            "scenario": RoomCommand(
+            "scenario": FeatureCommand(
                 function="scenario",
                 help="Print a scenario with all defaults and comments, as a start for your own.",
                 examples=(
@@ -107,7 +107,7 @@ ROOMS: Final[dict[str, Room]] = {
                     "quadsim scenario --for hummingbird --course figure-eight > mine.toml",
                 ),
             ),
-            "vehicle": RoomCommand(
+            "vehicle": FeatureCommand(
                 function="vehicle_report",
                 help="Report a vehicle's limits and designed gains, and the sources of its parameters; draw it.",
                 examples=(
@@ -117,22 +117,22 @@ ROOMS: Final[dict[str, Room]] = {
             ),
         }
     ),
-    "gym": Room(),
+    "gym": Feature(),
 }
 
 
-def commands_of(room: str) -> Any:
-    """Import the commands of a room.
+def commands_of(feature: str) -> Any:
+    """Import the commands of a feature.
 
     Raises:
-        InputError: there is no such room.
+        InputError: there is no such feature.
     """
-    if room not in ROOMS:
-        raise InputError(f"this quadsim has been installed without its room {room!r}")
-    return importlib.import_module(f"scenarios.{room}.commands")
+    if feature not in FEATURES:
+        raise InputError(f"this quadsim has been installed without its feature {feature!r}")
+    return importlib.import_module(f"quadsim.features.{feature}.commands")
 
 
 def owner_of(directory: Path) -> Any:
-    """Import the commands of the room that made a directory; None for a run, or for what no room made."""
-    owning = (commands_of(name) for name, room in ROOMS.items() if room.owns_directories)
+    """Import the commands of the feature that made a directory; None for a run, or for what no feature made."""
+    owning = (commands_of(name) for name, feature in FEATURES.items() if feature.owns_directories)
     return next((commands for commands in owning if commands.owns(directory)), None)
