@@ -21,10 +21,10 @@ from quadsim.errors import InputError, ParameterError, QuadsimError
 from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
 from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance, touching_speed
-from quadsim.mpc.baselines.geometric import Geometric
 from quadsim.mpc.bounded import Bounded, Weighted
 from quadsim.mpc.builders import build, stated
 from quadsim.mpc.flatness import motion_along
+from quadsim.mpc.laws.geometric import Geometric
 from quadsim.mpc.nonlinear.settings import Nonlinear
 from quadsim.mpc.pilot import Pilot
 from quadsim.mpc.solvers import ALIASES
