@@ -76,7 +76,7 @@ class ControllerTable:
     horizon: int
     polytopes: tuple[Polytope, ...] = ()
     commands: str = ROTORS
-    inner_lag: tuple[float, ...] | None = None
+    inner_lag: tuple[float, ...] | None = None  # of what an autopilot flies: a field of each table with `commands`
     indi: INDISettings | None = None
     fallback: FallbackSettings | None = None
     iterations: int = 1
