@@ -36,16 +36,6 @@ NO_OPTIMUM: Final = frozenset({LAW, FALLBACK, STOPPED})
 """Sources of a command without an optimum, whose active constraints and computing time nobody reports."""
 NO_SOLVER: Final = frozenset({GAIN, CORE}) | NO_OPTIMUM
 """Sources of a command other than QP solvers, which are recorded by name (`quadsim.mpc.solvers.find_solver`)."""
-LAW_NAMES: Final = {
-    "unconstrained": "unconstrained MPC",
-    "constrained": "constrained MPC",
-    "robust": "robust MPC",
-    "nonlinear": "nonlinear MPC",
-    "lqr": "LQR",
-    "pid": "PID",
-    "geometric": "geometric control",
-}
-"""Display names of the built-in controllers, by recorded name; others are shown by their recorded name."""
 ROTORS: Final = "rotors"
 """Commands of rotor speeds; others are targets of an autopilot: `rates` (4,), `attitude` (8,)."""
 TARGET_SIZES: Final = {ROTORS: 4, "rates": 4, "attitude": 8}
@@ -408,11 +398,6 @@ def check_command(speeds: Array) -> str | None:
     if not np.all(np.isfinite(speeds)):
         return f"the command is not finite: {np.asarray(speeds).tolist()}"
     return f"the command is beyond any rotor's speed: {np.asarray(speeds).tolist()}"
-
-
-def law_name(recorded: str) -> str:
-    """Return the display name of a controller from the name in a run's summary."""
-    return LAW_NAMES.get(recorded, recorded)
 
 
 def counts(answered_by: Mapping[str, int]) -> str:

@@ -11,7 +11,8 @@ from quadsim.controller import ROTORS
 from quadsim.motion import Motion
 from quadsim.mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured
 from quadsim.mpc.baselines.bandwidths import YAW_SHARE
-from quadsim.mpc.baselines.geometric import (
+from quadsim.mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, Target, differentiator
+from quadsim.mpc.laws.geometric import (
     NO_LAG,
     UNDISTURBED,
     DesiredAttitude,
@@ -20,7 +21,6 @@ from quadsim.mpc.baselines.geometric import (
     Integrals,
     geometric_gains,
 )
-from quadsim.mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, Target, differentiator
 from quadsim.mpc.nonlinear.rigidbody import rotation
 from quadsim.rotation import multiply
 from quadsim.state import Array, wrapped
@@ -149,7 +149,7 @@ def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
 
 
 class NumpyGeometric:
-    """The equations of `quadsim.mpc.baselines.geometric.GeometricController`."""
+    """The equations of `quadsim.mpc.laws.geometric.GeometricController`."""
 
     def __init__(self, vehicle: Vehicle, period: float, settings: Geometric) -> None:
         self.commands, self._vehicle, self._period = settings.commands, vehicle, period

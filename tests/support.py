@@ -20,8 +20,8 @@ from scipy.linalg import block_diag
 from quadsim.controller import Controller
 from quadsim.errors import described
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
-from quadsim.mpc.constrained import Constrained
 from quadsim.mpc.constraints import Bounds, Constraint, Penalty
+from quadsim.mpc.laws.constrained import Constrained
 from quadsim.mpc.linear import LinearMPC, NominalPreparation
 from quadsim.mpc.model import LinearModel
 from quadsim.mpc.nonlinear.body import Body

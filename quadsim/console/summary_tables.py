@@ -11,9 +11,10 @@ from rich.table import Table
 from rich.text import Text
 
 from quadsim.console import console
-from quadsim.controller import OPTIMAL, Phase, counts, law_name
+from quadsim.controller import OPTIMAL, Phase, counts
 from quadsim.flight.audit import VERDICT_TEXT, Finding
 from quadsim.flight.rundir import findings_of
+from quadsim.mpc.laws import law_name
 from quadsim.report.comparison import (
     NOT_REQUIRED,
     crash,

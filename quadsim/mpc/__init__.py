@@ -15,13 +15,14 @@ if __name__ == "mpc":  # through the link at the root of a checkout
 from quadsim import shorthands
 
 if TYPE_CHECKING:
-    from quadsim.mpc.baselines.geometric import GeometricController as GeometricController
-    from quadsim.mpc.baselines.lqr import LQR as LQR
-    from quadsim.mpc.baselines.pid import CascadedPID as CascadedPID
     from quadsim.mpc.condensing import Condensed as Condensed
     from quadsim.mpc.constraints import Bounds as Bounds
     from quadsim.mpc.constraints import Constraint as Constraint
     from quadsim.mpc.constraints import Penalty as Penalty
+    from quadsim.mpc.laws.geometric import GeometricController as GeometricController
+    from quadsim.mpc.laws.lqr import LQR as LQR
+    from quadsim.mpc.laws.pid import CascadedPID as CascadedPID
+    from quadsim.mpc.laws.unconstrained import UnconstrainedMPC as UnconstrainedMPC
     from quadsim.mpc.linear import LinearMPC as LinearMPC
     from quadsim.mpc.linear import NominalPreparation as NominalPreparation
     from quadsim.mpc.model import LinearModel as LinearModel
@@ -37,12 +38,11 @@ if TYPE_CHECKING:
     from quadsim.mpc.robust.controller import RobustPreparation as RobustPreparation
     from quadsim.mpc.robust.settings import Robust as Robust
     from quadsim.mpc.solvers import QPSolver as QPSolver
-    from quadsim.mpc.unconstrained import UnconstrainedMPC as UnconstrainedMPC
 
 _MODULES = {
-    "quadsim.mpc.baselines.geometric": ("GeometricController",),
-    "quadsim.mpc.baselines.lqr": ("LQR",),
-    "quadsim.mpc.baselines.pid": ("CascadedPID",),
+    "quadsim.mpc.laws.geometric": ("GeometricController",),
+    "quadsim.mpc.laws.lqr": ("LQR",),
+    "quadsim.mpc.laws.pid": ("CascadedPID",),
     "quadsim.mpc.condensing": ("Condensed",),
     "quadsim.mpc.constraints": ("Bounds", "Constraint", "Penalty"),
     "quadsim.mpc.linear": ("LinearMPC", "NominalPreparation"),
@@ -54,10 +54,10 @@ _MODULES = {
     "quadsim.mpc.robust.controller": ("RobustPreparation",),
     "quadsim.mpc.robust.settings": ("Robust",),
     "quadsim.mpc.solvers": ("QPSolver",),
-    "quadsim.mpc.unconstrained": ("UnconstrainedMPC",),
+    "quadsim.mpc.laws.unconstrained": ("UnconstrainedMPC",),
 }
 _PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
-_SUBPACKAGES = ("baselines", "core", "fallback", "nonlinear", "paper", "robust", "solvers")
+_SUBPACKAGES = ("baselines", "core", "fallback", "laws", "nonlinear", "paper", "robust", "solvers")
 __all__ = [*_PUBLIC, *_SUBPACKAGES]
 
 

@@ -9,14 +9,13 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import singledispatch
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, Len, MaxLen, doc
 
-from quadsim.controller import CORE, ROTORS, Controller
+from quadsim.controller import CORE, ROTORS
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number, Pair, Positive, Weight
 from quadsim.input_limits import MOST_ENTRIES
@@ -74,13 +73,22 @@ class ControllerTable:
 
     any_attitude: ClassVar = False  # whether the controller reads attitudes as quaternions
     type: str
+    horizon: int
     polytopes: tuple[Polytope, ...] = ()
     commands: str = ROTORS
-    inner_lag: tuple[float, ...] | None = None
+    inner_lag: tuple[float, ...] | None = None  # of what an autopilot flies: a field of each table with `commands`
     indi: INDISettings | None = None
     fallback: FallbackSettings | None = None
     iterations: int = 1
     output_bounds: Mapping[str, Sequence[float]] = MappingProxyType({})
+
+    @property
+    def holds_speeds(self) -> bool:
+        """Whether rotors turn at each command for a whole period, as the audit of a saved run then checks.
+
+        Not behind an autopilot, nor where an inner loop of the law corrects the speeds.
+        """
+        return self.commands == ROTORS and self.indi is None
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """Return its hard and soft bounds on audited signals, in file units."""
@@ -89,12 +97,6 @@ class ControllerTable:
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
         """Return the inner loop that corrects the rotor speeds it commands; None without one."""
         return None
-
-
-@singledispatch
-def law_of(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    """Return the law of a table, in Python; see `builders.build`.  Each table's builder registers itself here."""
-    raise NotImplementedError(type(table).__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -411,6 +413,8 @@ class Weighted(ControllerTable):
 @dataclass(frozen=True, kw_only=True)
 class Bounded(Weighted):
     """An MPC with bounds."""
+
+    holds_plans: ClassVar = False  # whether the last plan is held where a QP has no answer
 
     output_bounds: Annotated[
         dict[str, Pair], doc("[deg, deg/s, m, m/s] y_c_min, y_c_max; the states named here are C_c")

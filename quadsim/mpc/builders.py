@@ -1,8 +1,4 @@
-"""From the tables `[controller]` to what flies.
-
-A law in one file with its table registers its builder there; those here are imported when one is built: most flights
-need one of them.
-"""
+"""From the tables `[controller]` to what flies: a law in Python (`quadsim.mpc.laws`) or C, its guard and inner loop."""
 
 from __future__ import annotations
 
@@ -14,9 +10,9 @@ import numpy as np
 
 from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ExportError, InputError, ParameterError
-from quadsim.mpc.bounded import USUAL_SOLVER, Bounded, ControllerTable, Weighted, law_of, require_lags
-from quadsim.mpc.constrained import Constrained
+from quadsim.mpc.bounded import USUAL_SOLVER, Bounded, ControllerTable, Weighted, require_lags
 from quadsim.mpc.fallback.contract import Guard
+from quadsim.mpc.laws import law_of
 from quadsim.mpc.model import hover_model, target_model
 from quadsim.mpc.nonlinear.settings import Nonlinear
 from quadsim.mpc.obstacles import Shape
@@ -26,10 +22,6 @@ from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadsim.mpc.core.law import CompiledPreparation
-    from quadsim.mpc.linear import LinearMPC, Preparation
-    from quadsim.mpc.obstacles import Space
-    from quadsim.mpc.solvers import Solver
-
 
 AnyTable = TypeVar("AnyTable", bound=ControllerTable)
 
@@ -111,51 +103,8 @@ def _in_c(
 def _compiled(table: ControllerTable, preparation: CompiledPreparation) -> Controller:
     """Return the law in C."""
     from quadsim.mpc.core.law import CompiledGain, CompiledSolver
+    from quadsim.mpc.linear import linear_law
 
     if not isinstance(table, Bounded):
         return CompiledGain(preparation)
-    return _linear(table, preparation, CompiledSolver(preparation))
-
-
-def _linear(table: Bounded, preparation: Preparation, solver: Solver, space: Space | None = None) -> LinearMPC:
-    from quadsim.mpc.linear import LinearMPC
-
-    return LinearMPC(
-        preparation,
-        solver,
-        name=table.type,
-        holds=isinstance(table, Constrained),
-        space=space,
-        kkt_every=table.kkt_every,
-    )
-
-
-@law_of.register(Constrained)
-@law_of.register(Robust)
-def _in_python(table: Bounded, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    from quadsim.mpc.linear import NominalPreparation
-
-    problem, space = table.problem(vehicle, period), table.space(shapes, vehicle, period)
-    preparation: Preparation = NominalPreparation(problem)
-    if isinstance(table, Robust):
-        from quadsim.mpc.robust.controller import RobustPreparation
-
-        preparation = RobustPreparation(vehicle, problem, table)
-    return _linear(table, preparation, table.make_solver(problem, space), space)
-
-
-@law_of.register(Nonlinear)
-def _nonlinear(table: Nonlinear, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    from quadsim.mpc.nonlinear.controller import NonlinearMPC
-
-    if table.commands != ROTORS:
-        require_lags(table.inner_lag)
-    return NonlinearMPC(
-        vehicle,
-        period=period,
-        settings=table,
-        bounds=table.actuators(vehicle),
-        constraints=table.constraints(),
-        space=table.space(shapes, vehicle, period),
-        kkt_every=table.kkt_every,
-    )
+    return linear_law(table, preparation, CompiledSolver(preparation))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from quadsim.mpc.paper import rollout
 from quadsim.mpc.qp import KKT_EVERY
 from quadsim.mpc.solvers import INVALID_DATA, Answer, Solver
 from quadsim.state import INDEX, Array, ReferenceTurns
+
+if TYPE_CHECKING:
+    from quadsim.mpc.bounded import Bounded
 
 
 class Remembered(NamedTuple):
@@ -253,3 +256,15 @@ class LinearMPC:
         if self._obstacles is None:
             return self._solver.solve(query), self.problem
         return self._obstacles.solve(time, query, self.preparation.yaw)
+
+
+def linear_law(table: Bounded, preparation: Preparation, solver: Solver, space: Space | None = None) -> LinearMPC:
+    """Return the law of a table with the parts that it is made of; see `LinearMPC`."""
+    return LinearMPC(
+        preparation,
+        solver,
+        name=table.type,
+        holds=table.holds_plans,
+        space=space,
+        kkt_every=table.kkt_every,
+    )

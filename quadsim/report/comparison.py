@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from quadsim.controller import Phase, law_name
+from quadsim.controller import Phase
 from quadsim.errors import ParameterError, printable
 from quadsim.flight.audit import VERDICT_TEXT, Finding, Limit, SpaceLimit, limit_differences, worst_finding
 from quadsim.flight.rundir import findings_of
+from quadsim.mpc.laws import law_name
 from quadsim.report.table import ABSENT, Cell, Mark, QuantityRow, format_number, short_number
 from quadsim.space import Obstacle
 from quadsim.state import VELOCITY

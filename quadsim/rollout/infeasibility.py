@@ -18,9 +18,9 @@ from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import InputError
 from quadsim.mpc.bounded import Bounded
 from quadsim.mpc.builders import build
-from quadsim.mpc.constrained import Constrained
 from quadsim.mpc.constraints import Origin
 from quadsim.mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
+from quadsim.mpc.laws.constrained import Constrained
 from quadsim.mpc.obstacles import SOFT_SPACE
 from quadsim.mpc.ocp import InfeasiblePeriod
 from quadsim.mpc.robust.settings import Robust

@@ -37,9 +37,9 @@ _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREAD
 _PRELOAD: Final = (
     "quadsim",
     "quadsim.features.campaign.plan",
-    "quadsim.mpc.constrained",
+    "quadsim.mpc.laws.constrained",
     "quadsim.mpc.robust.controller",
-    "quadsim.mpc.unconstrained",
+    "quadsim.mpc.laws.unconstrained",
 )
 """Preloaded by the server that workers are forked from; the first one finds the others by their place."""
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from quadsim.console.junit import Cases, flight_verdicts
 from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from quadsim.controller import MISSED, ROTORS
+from quadsim.controller import MISSED
 from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, FlightVerdict, audit, flight_verdict, margins_at
@@ -47,8 +47,6 @@ ARITHMETIC_TOLERANCE: Final = 1e-9
 """Tolerance for another machine's arithmetic, relative to 1 or to the larger number."""
 ROUNDING_TILT: Final = 1e-6  # the same for the tilt: near level, an arc cosine has half of a number's digits
 MOST_REPORTED: Final = 6  # differences that one message names
-_HOLDING: Final = ("unconstrained", "constrained", "robust", "nonlinear", "lqr", "pid", "geometric")
-"""Laws that command rotor speeds for a whole period, unless INDI modifies them."""
 _COMMANDED: Final = tuple(columns_of(ControlLog)["speeds"].units)
 _TURNING: Final = tuple(columns_of(PlantLog)["speeds"].units)
 
@@ -246,7 +244,7 @@ def _in_force(
 def _holds_commands(scenario: Scenario) -> bool:
     """Return whether the rotors turn at the commanded speeds throughout each period."""
     laws = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
-    commands_held = all(spec.type in _HOLDING and spec.indi is None and spec.commands == ROTORS for spec in laws)
+    commands_held = all(spec.holds_speeds for spec in laws)
     lagging = any(isinstance(event, LagChange) for event in scenario.events)
     return commands_held and not lagging and Assembly(scenario).effects.rotors is None
 

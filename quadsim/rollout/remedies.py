@@ -14,7 +14,7 @@ import numpy as np
 
 from quadsim.errors import InputError
 from quadsim.flight.metrics import unrecovered
-from quadsim.mpc.constrained import Constrained
+from quadsim.mpc.laws.constrained import Constrained
 from quadsim.mpc.model import SHORTEST_LAG
 from quadsim.mpc.robust.settings import Robust
 from quadsim.rollout.flown import Flight

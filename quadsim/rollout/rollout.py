@@ -24,6 +24,7 @@ from quadsim.rollout.flown import Flight
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.schema.events import ControllerEvent, Event
 from quadsim.scenarios.schema.scenario import LONGEST_FLIGHT, Scenario
+from quadsim.sim.computation import check_measured
 from quadsim.sim.effects import Force
 from quadsim.sim.loop import ClosedLoop, Reference, complete
 from quadsim.sim.navigation import Navigation
@@ -135,7 +136,7 @@ class Rollout:
         if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
             raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
         controller = assembly.controller() if law is None else law
-        assembly.require_measured(controller)
+        check_measured(scenario.computation, controller)
         assembly = assembly.with_law_bounds(controller)
         self.vehicle, self.actual, self.limits = assembly.vehicle, assembly.actual, assembly.limits
         self._started = scenario = assembly.scenario

@@ -4,35 +4,33 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from functools import cached_property
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from quadsim.assets import vehicle_path
 from quadsim.border import user_code
-from quadsim.controller import CORE, ROTORS, Iterating
+from quadsim.controller import CORE, ROTORS
 from quadsim.errors import InputError, ParameterError, QuadsimError
 from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
-from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance, touching_speed
-from quadsim.mpc.baselines.geometric import Geometric
+from quadsim.flight.phase import PhaseMonitor
 from quadsim.mpc.bounded import Bounded, Weighted
 from quadsim.mpc.builders import build, stated
 from quadsim.mpc.flatness import motion_along
-from quadsim.mpc.nonlinear.settings import Nonlinear
 from quadsim.mpc.pilot import Pilot
 from quadsim.mpc.solvers import ALIASES
 from quadsim.rotation import body_to_euler_rates
 from quadsim.scenarios.courses.course import Course, repeated
 from quadsim.scenarios.courses.csv_course import Csv
 from quadsim.scenarios.courses.followed import FollowedCourse
-from quadsim.scenarios.courses.steps import Steps, switches
+from quadsim.scenarios.courses.steps import Steps
 from quadsim.scenarios.limits import audit_notes, flyable, signal_limits, space_limits, sum_limits, with_law_bounds
 from quadsim.scenarios.plugin import Plugin, import_plugin, make_force, reason_of
 from quadsim.scenarios.schema.events import ControllerEvent, Event, SensorFaultEvent, SetpointEvent
@@ -40,21 +38,18 @@ from quadsim.scenarios.schema.problems import parse_table
 from quadsim.scenarios.schema.writing import plain
 from quadsim.sim.airframe import outline
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings, built_in_lags, identify_lags
-from quadsim.sim.computation import Computation, ComputationTime, Stall, not_measured
-from quadsim.sim.effects import Change, Effects, Force, Push, PushChange
-from quadsim.sim.effects.load import Load, mass_properties
-from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics, RotorLoss
+from quadsim.sim.computation import Computation, ComputationTime, Stall, check_measured
+from quadsim.sim.effects import Change, Effects, Force, Push, push_changes
+from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss, efficiency_changes
 from quadsim.sim.effects.wind import Air, Gust, WindChange, WindField
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import physics_to_state
-from quadsim.sim.plant import Plant, check_free
-from quadsim.sim.sensing import AXES, FaultKind, Sensor, SensorFault, SensorName, in_si
-from quadsim.space import Corridor, Fence, Region
+from quadsim.sim.plant import Plant
+from quadsim.sim.sensing import Sensor, SensorFault, SensorName
+from quadsim.space import Corridor, Fence
 from quadsim.state import (
     ANGLE_RATES,
     ANGLES,
-    POSITION,
-    REFERENCE_NAMES,
     VELOCITIES,
     Array,
     make_state,
@@ -92,7 +87,6 @@ _SIZES: Final = {
     "rotor_radius": ("ground", "rotor_radius", None),
 }
 """Vehicle parameters that act in an effect: its table, the field that also states it, and the switch of the effect."""
-_RESTING: Final = 1e-9  # vertical speed attributed to rounding [m/s]
 _OF_ALL_EVENTS: Final = ("vehicle", "autopilot", "user_autopilot", "inner_lag", "actual", "effects", "course")
 """Parts that do not depend on events, controller or duration."""
 
@@ -351,21 +345,14 @@ class Assembly:
 
         Only courses made of windows have steps whose settling is measured, and only on axes without a set-point.
         """
-        scenario, initial = self.scenario, self.initial_pose
+        scenario = self.scenario
         if not isinstance(scenario.reference, Steps):
             return ()
-        taken = {name for event in scenario.events if isinstance(event, SetpointEvent) for name in event.values}
+        set_points = [event for event in scenario.events if isinstance(event, SetpointEvent)]
+        taken = {name for event in set_points for name in event.values}
         preview = scenario.controller.horizon * scenario.control_period
-        steps = []
-        channels = scenario.reference.channels(initial)
-        for name, (windows, elsewhere), start in zip(REFERENCE_NAMES, channels, initial.tolist(), strict=True):
-            if name in taken:
-                continue
-            reached = [step for step in switches(windows, elsewhere, initial=start) if step[0] < scenario.duration]
-            ends = [*(time - preview for time, _, _ in reached[1:]), scenario.duration]
-            for (time, before, after), until in zip(reached, ends, strict=False):
-                steps.append(CourseStep(channel=name, time=time, before=before, after=after, until=until))
-        return tuple(steps)
+        steps = scenario.reference.course_steps(self.initial_pose, duration=scenario.duration, preview=preview)
+        return tuple(step for step in steps if step.channel not in taken)
 
     # --- controller --------------------------------------------------------------------------------------------------
 
@@ -376,30 +363,12 @@ class Assembly:
             InputError: it cannot be built from these numbers, or its code cannot be found or called.
         """
         spec = self.scenario.controller if spec is None else spec
-        if isinstance(spec, Nonlinear | Geometric) and spec.commands != ROTORS and spec.inner_lag is None:
+        if spec.commands != ROTORS and spec.inner_lag is None and is_dataclass(spec):
             spec = replace(spec, inner_lag=self.inner_lag)
         shapes = (*self.scenario.obstacles, *self.regions)
         pilot = build(spec, self.vehicle, self.scenario.control_period, shapes)
-        self.require_measured(pilot.law)
+        check_measured(self.scenario.computation, pilot)
         return self.with_autopilot(pilot)
-
-    def require_measured(self, law: object) -> None:
-        """Reject times per iteration of other solvers than those that may answer for a law.
-
-        Raises:
-            ParameterError: a solver that may answer is not named in `computation.per_iteration`, or none iterates.
-        """
-        settings = self.scenario.computation
-        if settings is None or not settings.per_iteration:
-            return
-        law = law.law if isinstance(law, Pilot) else law
-        named = frozenset(ALIASES.get(name, name) for name in settings.per_iteration)
-        iterates = law.iterates if isinstance(law, Iterating) else frozenset()
-        if not iterates:
-            rule = "absent with a controller that counts no iterations"
-            raise ParameterError("computation", "per_iteration", settings.per_iteration, rule)
-        if not iterates <= named:
-            raise not_measured(iterates - named, named)
 
     def _stated_laws(self) -> tuple[AnyController, tuple[Event, ...]]:
         """Return controller and events with `compiled` and `solver` of each law stated, to fly as without."""
@@ -476,14 +445,15 @@ class Assembly:
     @cached_property
     def limits(self) -> tuple[Limit, ...]:
         """The limits of the audit: constraints, controller bounds, polytopes, obstacles and regions."""
-        return (*signal_limits(self.scenario, self._flyable), *sum_limits(self.scenario), *self._space_limits)
+        return (*signal_limits(self.scenario, self._flyable), *sum_limits(self.scenario), *self.space_limits)
 
     @property
     def _flyable(self) -> dict[str, tuple[float, float]]:
         return flyable(self.bounds, self.actual)
 
     @property
-    def _space_limits(self) -> tuple[SpaceLimit, ...]:
+    def space_limits(self) -> tuple[SpaceLimit, ...]:
+        """Those of obstacles and regions alone."""
         scenario, regions = self.scenario, self.regions
         if not scenario.obstacles and not regions:
             return ()
@@ -564,10 +534,7 @@ class Assembly:
         blown = any(isinstance(event, Gust | WindChange) for event in self.scenario.events)
         if not (any(air.wind) or air.turbulence is not None or blown):
             return None
-        if not air.drags:
-            name = self.vehicle.name
-            rule = f"positive, or body_drag given, for the wind to push: the vehicle {name!r} states no drag"
-            raise ParameterError("effects.air", "rotor_drag", air.rotor_drag or 0.0, rule)
+        air.require_drag(self.vehicle)
         return air
 
     def wind(self) -> WindField | None:
@@ -598,24 +565,17 @@ class Assembly:
             ParameterError: rotors with inertia would change their speed at once.
         """
         events = self.scenario.events if events is None else events
-        pushes = _in_force([event for event in events if isinstance(event, Push)])
         rotors = self.effects.rotors or RotorDynamics()
         for event in events:
             if isinstance(event, LagChange):
                 rotors.lagging(event)
+        losses = [event for event in events if isinstance(event, RotorLoss)]
+        pushes = [event for event in events if isinstance(event, Push)]
         return (
-            *self._losses([event for event in events if isinstance(event, RotorLoss)]),
-            *(PushChange(at=time, pushes=tuple(in_force)) for time, in_force in pushes),
+            *efficiency_changes(losses, rotors.efficiency),
+            *push_changes(pushes),
             *(event for event in events if isinstance(event, Change)),
         )
-
-    def _losses(self, losses: Sequence[RotorLoss]) -> Iterator[RotorChange]:
-        """Yield each rotor's efficiency whenever a loss starts or ends: the product over the losses in force."""
-        rotors = self.scenario.effects.rotors or RotorDynamics()
-        for rotor, worn in enumerate(rotors.efficiency, start=1):
-            for time, in_force in _in_force([loss for loss in losses if loss.rotor == rotor]):
-                left = math.prod(1.0 - loss.loss for loss in in_force)
-                yield RotorChange(at=time, rotor=rotor, efficiency=worn * left)
 
     # --- sensors -----------------------------------------------------------------------------------------------------
 
@@ -639,63 +599,7 @@ class Assembly:
     @property
     def faults(self) -> tuple[SensorFault, ...]:
         """The faults of the sensors."""
-        return tuple(make_fault(event) for event in self.scenario.events if isinstance(event, SensorFaultEvent))
-
-    # --- what goes together ------------------------------------------------------------------------------------------
-
-    def check(self) -> Assembly:
-        """Reject, before the flight, parts that do not fit together.
-
-        Raises:
-            InputError: the vehicle does not exist or cannot hover, an effect is impossible with it or with the
-                integrator, the course cannot be built or lacks the motion on which the flight starts, or the flight
-                starts below the floor, into it, in the air with `cold` rotors, or with rotors beyond their range.
-        """
-        scenario, load = self.scenario, self.effects.load or Load()
-        mass_properties(self.actual, load, load.payloads)
-        _ = self.moving_air
-        changes = self.changes()
-        if scenario.plant.integrator == "rk4":
-            check_free(self.effects, changes, scenario.obstacles)
-        course = self.course
-        if scenario.initial.on_reference and course.derivatives is None:
-            rule = f"false where the course states positions alone, as one of type {scenario.reference.type} does"
-            raise ParameterError("initial", "on_reference", True, rule)
-        speeds, fastest = self.initial_speeds, self.actual.speed_max
-        if scenario.initial.rotor_speeds is not None and speeds.max() > fastest:
-            rule = f"at most {fastest:g} rad/s each, the speed_max of {self.actual.name}"
-            raise ParameterError("initial", "rotor_speeds", speeds.tolist(), rule)
-        ground = scenario.effects.ground
-        if ground is not None and (ground.contact or ground.effect):
-            self._check_floor()
-        if limits := self._space_limits:
-            start = self.initial_state(self.motion)[None, list(POSITION)]
-            for limit in limits:
-                clear = float(limit.shape.clearance(np.zeros(1), start)[0]) - limit.radius
-                if limit.start <= 0.0 and limit.violated(clear):
-                    side = "inside" if isinstance(limit.shape, Region) else "clear of"
-                    ball = f"the radius of {limit.radius:.3g} m of the ball that represents the vehicle"
-                    raise ParameterError("initial", "position", start[0].tolist(), f"{side} {limit.name}, by {ball}")
-        return self
-
-    def _check_floor(self) -> None:
-        """Reject a start below the floor or into it, or one in the air with rotors at rest."""
-        initial, shape, state = self.scenario.initial, outline(self.actual), self.initial_state()[None, :]
-        feet = float(clearance(state, shape.feet, shape.foot_radius, shape.floor)[0])
-        hull = float(clearance(state, shape.hull, 0.0, shape.floor)[0])
-        lowest, position = min(feet, hull), list(initial.position)
-        if lowest < -TOUCH:
-            tilt = f"roll {initial.euler[0]:g} and pitch {initial.euler[1]:g} deg"
-            rule = f"{-lowest:.3g} m higher, at {tilt}, for feet and hull to clear the floor"
-            raise ParameterError("initial", "position", position, rule)
-        if initial.cold and feet > AIRBORNE:
-            rule = f"on the floor where initial.cold is true, or it would fall: its feet are {feet:.3g} m above it"
-            raise ParameterError("initial", "position", position, rule)
-        sinking = -touching_speed(state, np.radians(initial.body_rates), shape)
-        if sinking > _RESTING and self.scenario.effects.ground is not None and self.scenario.effects.ground.contact:
-            name = "velocity" if initial.velocity[2] < 0.0 else "body_rates"
-            rule = f"such that no part on the floor moves into it: one does, at {sinking:.3g} m/s"
-            raise ParameterError("initial", name, list(getattr(initial, name)), rule)
+        return tuple(event.in_si() for event in self.scenario.events if isinstance(event, SensorFaultEvent))
 
 
 def stated_autopilot(path: Path, stated: AutopilotSettings | None = None) -> AutopilotSettings | None:
@@ -722,32 +626,3 @@ def preferring_core(scenario: Scenario) -> Scenario:
     except ParameterError:
         return scenario
     return preferred
-
-
-def make_fault(event: SensorFaultEvent) -> SensorFault:
-    """A sensor's fault in SI units."""
-    name = SensorName(event.sensor)
-    return SensorFault(
-        sensor=name,
-        kind=FaultKind(event.fault),
-        start=event.at,
-        stop=event.at + event.duration,
-        axes=AXES if event.axes is None else tuple(sorted({"xyz".index(axis) for axis in event.axes})),
-        offset=in_si(name, event.offset or 0.0),
-    )
-
-
-_Lasting = TypeVar("_Lasting", RotorLoss, Push)
-
-
-def _in_force(events: Sequence[_Lasting]) -> Iterator[tuple[float, list[_Lasting]]]:
-    """Yield the instants [s] at which events start or end, with the events in force from then on, in their order."""
-    turns: dict[float, tuple[set[int], set[int]]] = {}
-    for i, event in enumerate(events):
-        turns.setdefault(event.at, (set(), set()))[0].add(i)
-        if event.duration is not None:
-            turns.setdefault(event.at + event.duration, (set(), set()))[1].add(i)
-    in_force: set[int] = set()
-    for time, (begun, ended) in sorted(turns.items(), key=itemgetter(0)):
-        in_force = (in_force | begun) - ended
-        yield time, [events[i] for i in sorted(in_force)]

@@ -19,16 +19,6 @@ VARIANTS: Final = _LIBRARY / "variants.toml"
 
 Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
 
-CONTROLLERS: Final = {
-    "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
-    "constrained": "the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
-    "robust": "constrained, with soft bounds, rotor lag, delay, disturbances, heading and more, each switched on alone",
-    "nonlinear": "nonlinear MPC at any attitude: a quaternion model, sequential quadratic programming",
-    "lqr": "infinite-horizon LQR on the hover model, following the reference's velocity",
-    "pid": "cascaded PID, as autopilots fly it",
-    "geometric": "geometric tracking control on SE(3)",
-}
-"""Repeated here, so that `quadsim list` need not import them."""
 _MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
 """Marks scenarios that are meant to defeat their controller."""
 
@@ -183,6 +173,7 @@ class Catalogue(Result):
 
 def read_catalogue() -> Catalogue:
     """Read everything shipped, without checking the files."""
+    from quadsim.mpc.laws import laws
     from quadsim.mpc.solvers import solver_entries
     from quadsim.vehicle import load_vehicle
 
@@ -197,7 +188,7 @@ def read_catalogue() -> Catalogue:
         scenarios=scenarios,
         campaigns={name: read_toml(campaign_path(name))["description"] for name in campaign_names()},
         vehicles={name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
-        controllers=CONTROLLERS,
+        controllers={name: law.description for name, law in laws().items()},
         papers={name: read_toml(paper_path(name))["title"] for name in paper_names()},
         solvers={name: entry.line for name, entry in solver_entries().items()},
     )

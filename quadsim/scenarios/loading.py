@@ -14,6 +14,7 @@ from quadsim.errors import FileError, InputError
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import scenario_names, scenario_source, source_label
 from quadsim.scenarios.courses.csv_course import Csv
+from quadsim.scenarios.preflight import checked
 from quadsim.scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
 from quadsim.scenarios.schema.problems import ScenarioError
 from quadsim.scenarios.schema.scenario import Scenario
@@ -53,7 +54,9 @@ def assemble(
         scenario = source
         if isinstance(scenario, str | Path):
             scenario = _read(str(scenario), () if isinstance(changes, Mapping) else changes)
-        return Assembly(scenario.replace(changes) if isinstance(changes, Mapping) and changes else scenario).check()
+        if isinstance(changes, Mapping) and changes:
+            scenario = scenario.replace(changes)
+        return checked(Assembly(scenario))
     except OSError as error:  # of looking whether a file is there, e.g. under a name longer than the system takes
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
 

@@ -51,10 +51,10 @@ from quadsim.errors import (
     printable,
 )
 from quadsim.fields import is_plain
-from quadsim.mpc.bounded import ControllerTable, Horizon, law_of
+from quadsim.mpc.bounded import ControllerTable, Horizon
+from quadsim.mpc.laws import law_of, laws
 from quadsim.mpc.obstacles import Shape
 from quadsim.outputs import digest_of
-from quadsim.scenarios.catalogue import CONTROLLERS
 from quadsim.sim.effects import Force
 from quadsim.state import Array, State
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -86,8 +86,13 @@ class Plugin(ControllerTable, _Code):
     type: Annotated[
         str,
         doc("its code, as package.module:Class, or its name among the entry points quadsim.controllers"),
-    ] = field(metadata={"json_schema_extra": {"not": {"enum": [*CONTROLLERS]}}})
+    ] = field(metadata={"json_schema_extra": {"not": {"enum": [*laws()]}}})
     horizon: Annotated[Horizon, doc("[periods] N, samples of the reference passed to a step")] = 50
+
+    @property
+    def holds_speeds(self) -> bool:
+        """Not known: any of its commands may bring an inner loop."""
+        return False
 
     def __post_init__(self) -> None:
         _check_code(self.type, self.settings, ("vehicle", "period", "horizon"))

@@ -17,6 +17,7 @@ from quadsim.mpc.pilot import Pilot
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.courses.csv_course import LARGEST_NUMBER, tabulated
 from quadsim.scenarios.plugin import import_plugin, make_force, make_law, reason_of, refer_to, require_importable
+from quadsim.scenarios.preflight import checked
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.scenarios.schema.writing import plain
 from quadsim.sim.effects import Force
@@ -63,7 +64,7 @@ def following(assembly: Assembly, reference: object) -> Assembly:
     samples = scenario.periods + max(spec.horizon for spec in specs) + 1
     t = scenario.control_period * np.arange(samples, dtype=np.float64)
     course = tabulated("reference.csv", t, np.array([_pose(reference, time) for time in t.tolist()]))
-    return Assembly(scenario.altered(reference=course, duration=scenario.duration), assembly.vehicle).check()
+    return checked(Assembly(scenario.altered(reference=course, duration=scenario.duration), assembly.vehicle))
 
 
 def _pose(reference: Callable[[float], Any], time: float) -> Array:

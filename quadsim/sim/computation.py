@@ -10,9 +10,11 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Le, doc
 
-from quadsim.controller import Command
+from quadsim.controller import Command, Iterating
 from quadsim.errors import ParameterError
 from quadsim.fields import Instant, Seconds
+from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.solvers import ALIASES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,3 +113,21 @@ def not_measured(missing: Collection[str], measured: Collection[str]) -> Paramet
     """Return the error of a law whose iterations are not those that were measured."""
     rule = f"given for every solver that may answer for this controller, so also for {', '.join(sorted(missing))}"
     return ParameterError("computation", "per_iteration", sorted(measured), rule)
+
+
+def check_measured(settings: ComputationTime | None, controller: object) -> None:
+    """Reject times per iteration of other solvers than those that may answer for a controller.
+
+    Raises:
+        ParameterError: a solver that may answer is not named in `computation.per_iteration`, or none iterates.
+    """
+    if settings is None or not settings.per_iteration:
+        return
+    law = controller.law if isinstance(controller, Pilot) else controller
+    named = frozenset(ALIASES.get(name, name) for name in settings.per_iteration)
+    iterates = law.iterates if isinstance(law, Iterating) else frozenset()
+    if not iterates:
+        rule = "absent with a controller that counts no iterations"
+        raise ParameterError("computation", "per_iteration", settings.per_iteration, rule)
+    if not iterates <= named:
+        raise not_measured(iterates - named, named)

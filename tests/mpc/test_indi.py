@@ -12,8 +12,8 @@ from quadsim.errors import CommandError
 from quadsim.flight.log import FlightLog
 from quadsim.mpc.allocation import allocate, make_allocation
 from quadsim.mpc.answer import ActuatorBounds
-from quadsim.mpc.baselines.geometric import Geometric, GeometricController
 from quadsim.mpc.indi import INDISettings, TorqueIncrement
+from quadsim.mpc.laws.geometric import Geometric, GeometricController
 from quadsim.mpc.pilot import Pilot
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics

@@ -11,8 +11,8 @@ import scipy.linalg
 from support import paper_problem
 
 from quadsim.errors import ParameterError
-from quadsim.mpc.baselines.lqr import lqr_gain
 from quadsim.mpc.condensing import LARGEST_CONDITION, Condensed, FreeOptimum
+from quadsim.mpc.laws.lqr import lqr_gain
 from quadsim.mpc.ocp import Problem, lqr_terminal_weight
 from quadsim.mpc.regulator import stabilising, undetected
 from quadsim.state import STATE_NAMES, Array

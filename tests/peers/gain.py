@@ -16,8 +16,8 @@ import numpy as np
 import scipy.linalg
 from peers.checks import Check
 
+from quadsim.mpc.laws.unconstrained import sequence_gains
 from quadsim.mpc.ocp import Problem
-from quadsim.mpc.unconstrained import sequence_gains
 from quadsim.state import Array
 
 SCENARIO: Final = "paper-unconstrained"

@@ -16,8 +16,8 @@ import quadsim
 from quadsim.errors import InputError
 from quadsim.flight.log import FlightLog
 from quadsim.mpc.baselines.attitude import motion_of
-from quadsim.mpc.baselines.geometric import Geometric, GeometricController, Integrals
 from quadsim.mpc.baselines.preview import Target
+from quadsim.mpc.laws.geometric import Geometric, GeometricController, Integrals
 from quadsim.mpc.nonlinear.controller import NonlinearMPC
 from quadsim.mpc.nonlinear.settings import Nonlinear
 from quadsim.rollout.flown import Flight

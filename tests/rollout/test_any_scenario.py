@@ -25,6 +25,7 @@ from quadsim.rollout.flown import summarise
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import parse_scenario
+from quadsim.scenarios.preflight import checked
 from quadsim.scenarios.schema.scenario import Scenario
 
 
@@ -208,7 +209,7 @@ def accepted(table: dict[str, Any]) -> Scenario | None:
     """The scenario, or None where it is refused by a typed error."""
     try:
         scenario = parse_scenario(table)
-        Assembly(scenario).check()
+        checked(Assembly(scenario))
     except InputError:
         return None
     return scenario

@@ -22,10 +22,9 @@ from quadsim.mpc.answer import INFEASIBLE
 from quadsim.report.comparison import comparison_rows
 from quadsim.rollout.flown import Flight, summarise
 from quadsim.rollout.rollout import Rollout
-from quadsim.scenarios.catalogue import CONTROLLERS, scenario_names, scenario_source
+from quadsim.scenarios.catalogue import scenario_names, scenario_source
 from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.scenarios.schema.base import fields_of
-from quadsim.scenarios.schema.controllers import LAWS
 from quadsim.scenarios.schema.scenario import Lost, Scenario
 
 SHARED = (
@@ -264,7 +263,3 @@ def test_the_page_states_every_loss_criterion_and_its_default() -> None:
     text = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
     for name, info in fields_of(Lost).items():
         assert f"- `lost.{name} = {info.default:g}`: {info.description}\n" in text
-
-
-def test_the_list_has_every_controller() -> None:
-    assert {*CONTROLLERS} == {*LAWS}

@@ -25,6 +25,7 @@ from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import campaign_path, scenario_source
 from quadsim.scenarios.loading import apply_settings, parse_scenario
 from quadsim.scenarios.plugin import Plugin
+from quadsim.scenarios.preflight import checked
 from quadsim.scenarios.schema.bases import locate_files, merge, read_merged, read_scenario
 from quadsim.scenarios.schema.problems import ScenarioError, parse_table
 from quadsim.scenarios.schema.scenario import Scenario
@@ -120,13 +121,13 @@ class Plan:
         _ = self.failure
         check_ends(
             self.spec.vary,
-            lambda entry, value: Assembly(self._varied([(entry, value)], name=self.scenario.name, seed=0)).check(),
+            lambda entry, value: checked(Assembly(self._varied([(entry, value)], name=self.scenario.name, seed=0))),
             table=self._table,
         )
         refusals = []
         for flight in range(min(FIRST, self.spec.flights)):
             try:
-                Assembly(self.of(flight)).check()
+                checked(Assembly(self.of(flight)))
                 return
             except InputError as error:
                 refusals.append(error)
@@ -234,7 +235,7 @@ def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ())
         scenario = parse_scenario(data, source=f"{path.name}, {Path(spec.scenario).name}", directory=file.parent)
     except OSError as error:
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
-    return Assembly(scenario).check().recorded.scenario
+    return checked(Assembly(scenario)).recorded.scenario
 
 
 def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], ...]:

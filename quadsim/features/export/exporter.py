@@ -14,7 +14,6 @@ import numpy as np
 from quadsim.controller import ROTORS
 from quadsim.errors import ExportError, ParameterError
 from quadsim.features.export.record import Recording, record
-from quadsim.mpc.baselines.geometric import Geometric
 from quadsim.mpc.bounded import Weighted
 from quadsim.mpc.codegen.ctext import CText, Precision
 from quadsim.mpc.codegen.geometric import CGeometric
@@ -23,6 +22,7 @@ from quadsim.mpc.codegen.source import BODY_FILES, CHANGES, DATA, CController, C
 from quadsim.mpc.codegen.targets import TARGETS, Machine
 from quadsim.mpc.core.numbers import AVOIDS, Exportable, exportable
 from quadsim.mpc.core.solver import CoreProblem, Work, core_library
+from quadsim.mpc.laws.geometric import Geometric
 from quadsim.mpc.nonlinear.rigidbody import N_BODY, P, V
 from quadsim.mpc.nonlinear.settings import Nonlinear
 from quadsim.mpc.nonlinear.sqp import SQPStatus

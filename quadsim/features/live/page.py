@@ -25,7 +25,6 @@ import numpy as np
 import viser
 from viser import _messages
 
-from quadsim.controller import law_name
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.features.live import readout
 from quadsim.features.live.controls import ControllerTab, Steering, Widgets, disturb
@@ -35,6 +34,7 @@ from quadsim.features.live.look import dressed
 from quadsim.features.live.pace import Pace
 from quadsim.features.live.session import Frame, Session
 from quadsim.features.live.stage import FIELD, VIEW, Stage
+from quadsim.mpc.laws import law_name
 from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import least_range
 from quadsim.rollout.flown import Flight

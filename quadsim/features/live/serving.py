@@ -17,11 +17,11 @@ from typing import Any
 from quadsim.console import console
 from quadsim.console.progress import reporting
 from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Document
-from quadsim.controller import law_name
 from quadsim.errors import MissingPackageError, ParameterError
 from quadsim.features.live.guard import LOOPBACK
 from quadsim.features.live.pace import Pace
 from quadsim.features.live.session import Session, read_script
+from quadsim.mpc.laws import law_name
 from quadsim.outputs import run_directory
 from quadsim.rollout.flown import Flight
 from quadsim.scenarios.catalogue import scenario_names

@@ -17,10 +17,10 @@ import numpy as np
 import viser
 from viser.infra._infra import WebsockMessageHandler
 
-from quadsim.controller import law_name
 from quadsim.features.live import look
 from quadsim.features.live.session import Frame, Session
 from quadsim.flight.audit import SpaceLimit
+from quadsim.mpc.laws import law_name
 from quadsim.palette import COLOUR, Rgb, line_colour, rgb
 from quadsim.report.film.frames import thin
 from quadsim.sim.airframe import FLOOR, compile_model

@@ -28,6 +28,7 @@ from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import paper_path, scenario_source
 from quadsim.scenarios.loading import parse_scenario
+from quadsim.scenarios.preflight import checked
 from quadsim.scenarios.schema.base import PairList
 from quadsim.scenarios.schema.bases import merge, read_scenario
 from quadsim.scenarios.schema.problems import parse_table
@@ -157,7 +158,7 @@ class Paper(PaperFile):
         name = str(beside) if own_file else number.scenario
         data, (file, _) = merge(read_scenario(name), number.set), scenario_source(name)
         scenario = parse_scenario(data, source=f"{number.name}: {number.scenario}", directory=file.parent)
-        Assembly(scenario).check()
+        checked(Assembly(scenario))
         return scenario
 
 

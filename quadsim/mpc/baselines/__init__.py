@@ -1,1 +1,1 @@
-"""Feedback laws to compare with MPC: LQR, cascaded PID, geometric control on SE(3)."""
+"""What feedback laws share, to compare with MPC: a period of a law, attitudes, bandwidths, previews."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from quadsim.mpc.answer import ActuatorBounds
-from quadsim.mpc.baselines.geometric import Geometric, GeometricController
 from quadsim.mpc.codegen.source import CSource
+from quadsim.mpc.laws.geometric import Geometric, GeometricController
 from quadsim.mpc.nonlinear.controller import NonlinearMPC
 from quadsim.mpc.nonlinear.law import WIDTH_OF_MOTION
 from quadsim.mpc.nonlinear.settings import Nonlinear

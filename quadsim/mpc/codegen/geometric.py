@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from quadsim.errors import ExportError
-from quadsim.mpc.baselines.geometric import Geometric, GeometricController
 from quadsim.mpc.codegen.ctext import CText
 from quadsim.mpc.codegen.follower import CFollower
 from quadsim.mpc.codegen.source import SHARED_FILES
 from quadsim.mpc.core.numbers import fallback_numbers
 from quadsim.mpc.fallback.settings import USUAL_FALLBACK
+from quadsim.mpc.laws.geometric import Geometric, GeometricController
 from quadsim.vehicle import N_ROTORS
 
 

@@ -299,7 +299,7 @@ class CompiledSolver:
 
 
 class CompiledGain:
-    """The paper's unconstrained law in C, as `quadsim.mpc.unconstrained.UnconstrainedMPC` without constant gains."""
+    """The paper's unconstrained law in C: `quadsim.mpc.laws.unconstrained.UnconstrainedMPC` without constant gains."""
 
     name: Final = "unconstrained"
     solver: Final = CompiledSolver.name

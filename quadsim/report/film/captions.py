@@ -10,9 +10,10 @@ from typing import Final
 import numpy as np
 from PIL import Image
 
-from quadsim.controller import LAW, OPTIMAL, STOPPED, Phase, law_name
+from quadsim.controller import LAW, OPTIMAL, STOPPED, Phase
 from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
+from quadsim.mpc.laws import law_name
 from quadsim.palette import ON_DARK
 from quadsim.report.comparison import failure_sentences
 from quadsim.report.film import painter as ink

@@ -13,8 +13,9 @@ from annotated_types import MaxLen, doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Number
+from quadsim.flight.metrics import CourseStep
 from quadsim.scenarios.courses.course import Course, Filtered
-from quadsim.state import Array, nearest_turn
+from quadsim.state import REFERENCE_NAMES, Array, nearest_turn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +60,24 @@ class Steps(Filtered):
         yaw = [replace(window, value=math.radians(1.0) * nearest_turn(window.value, turn=360.0)) for window in self.yaw]
         x, y, z = initial[:3].tolist()
         return [(self.x, x), (self.y, y), (self.z, z), (yaw, 0.0)]
+
+    def course_steps(self, initial: Array, *, duration: float, preview: float) -> list[CourseStep]:
+        """Return the steps of each channel before the end of a flight; a start away from the course is a step at 0.
+
+        Args:
+            initial: (4,) x, y, z [m] and yaw [rad] at the start.
+            duration: of the flight [s].
+            preview: time [s] by which the controller knows the next step, so that it ends the one before.
+        """
+        result = []
+        for name, (windows, elsewhere), start in zip(
+            REFERENCE_NAMES, self.channels(initial), initial.tolist(), strict=True
+        ):
+            reached = [step for step in switches(windows, elsewhere, initial=start) if step[0] < duration]
+            ends = [*(time - preview for time, _, _ in reached[1:]), duration]
+            for (time, before, after), until in zip(reached, ends, strict=False):
+                result.append(CourseStep(channel=name, time=time, before=before, after=after, until=until))
+        return result
 
 
 def steps(t: Array, windows: Sequence[Window], elsewhere: float) -> Array:

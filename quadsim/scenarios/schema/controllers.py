@@ -1,21 +1,15 @@
-"""`[controller]`: the table of the law named by its type; add a new law to the union here."""
+"""`[controller]`: the table of the law named by its type, one of `quadsim.mpc.laws` or a user's."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias, Union
 
 from pydantic import Discriminator, Tag
 
-from quadsim.mpc.baselines.geometric import Geometric
-from quadsim.mpc.baselines.lqr import LQRTable
-from quadsim.mpc.baselines.pid import PID
 from quadsim.mpc.bounded import ControllerTable
-from quadsim.mpc.constrained import Constrained
-from quadsim.mpc.nonlinear.settings import Nonlinear
-from quadsim.mpc.robust.settings import Robust
-from quadsim.mpc.unconstrained import Unconstrained
+from quadsim.mpc.laws import laws
 from quadsim.scenarios.plugin import FORM, Plugin, is_plugin
 from quadsim.scenarios.schema.problems import parse_table
 from quadsim.scenarios.schema.settings import set_field
@@ -39,22 +33,19 @@ class _OrName:
         return {"anyOf": [handler(schema), {"type": "string"}]}
 
 
-_Table = Annotated[
-    Annotated[Unconstrained, Tag("unconstrained")]
-    | Annotated[Constrained, Tag("constrained")]
-    | Annotated[Robust, Tag("robust")]
-    | Annotated[Nonlinear, Tag("nonlinear")]
-    | Annotated[LQRTable, Tag("lqr")]
-    | Annotated[PID, Tag("pid")]
-    | Annotated[Geometric, Tag("geometric")]
-    | Annotated[Plugin, Tag(FORM)],
-    Discriminator(_law),
-]
-TABLES: Final = {tag.tag: table for table, tag in map(get_args, get_args(get_args(_Table)[0]))}
-"""Their tables, by name."""
-LAWS: Final = tuple(name for name in TABLES if name != FORM)
+LAWS: Final = tuple(laws())
 """The names of built-in controllers."""
-AnyController = Annotated[_Table, _OrName()]
+TABLES: Final[Mapping[str, type[ControllerTable]]] = {
+    **{name: law.table for name, law in laws().items()},
+    FORM: Plugin,
+}
+"""The tables of all controllers by name; that of users' controllers by the form of their names."""
+
+if TYPE_CHECKING:
+    AnyController: TypeAlias = ControllerTable
+else:
+    _Tagged = Union[*(Annotated[table, Tag(name)] for name, table in TABLES.items())]
+    AnyController = Annotated[Annotated[_Tagged, Discriminator(_law)], _OrName()]
 """Any law, distinguished by its type; a law whose fields all have defaults may be given by name only."""
 
 

@@ -16,6 +16,7 @@ from quadsim.sim.effects import Push
 from quadsim.sim.effects.load import MassChange, PayloadDrop, PayloadPickup
 from quadsim.sim.effects.rotors import LagChange, RotorLoss
 from quadsim.sim.effects.wind import Gust, WindChange
+from quadsim.sim.sensing import AXES, FaultKind, SensorFault, SensorName, in_si
 from quadsim.state import REFERENCE_NAMES
 
 MOST_EVENTS: Final = 20_000  # of one flight: a person's hand for a quarter of an hour, 20 times a second
@@ -113,6 +114,21 @@ class SensorFaultEvent:
     def text(self) -> str:
         """Return the event in words."""
         return f"the {self.sensor} sensor {_FAULTS[self.fault]}"
+
+    def in_si(self) -> SensorFault:
+        """Return the fault in SI units."""
+        name = SensorName(self.sensor)
+        axes: tuple[int, ...] = AXES
+        if self.axes is not None:
+            axes = tuple(sorted("xyz".index(axis) for axis in self.axes))
+        return SensorFault(
+            sensor=name,
+            kind=FaultKind(self.fault),
+            start=self.at,
+            stop=self.at + self.duration,
+            axes=axes,
+            offset=in_si(name, self.offset or 0.0),
+        )
 
 
 Event = Annotated[

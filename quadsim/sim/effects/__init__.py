@@ -39,6 +39,7 @@ stage.  The quadratic drag of `Air.body_drag` is MuJoCo's own; see `quadsim.sim.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, Protocol
 
@@ -48,6 +49,7 @@ from annotated_types import doc
 from quadsim.errors import ParameterError
 from quadsim.fields import Instant, Metres, NonNegative, Seconds, Vector, filled
 from quadsim.sim.effects.battery import Battery
+from quadsim.sim.effects.lasting import in_force
 from quadsim.sim.effects.load import Load, MassChange, PayloadDrop, PayloadPickup
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air
@@ -134,6 +136,12 @@ class PushChange:
 
     at: float
     pushes: tuple[Push, ...]
+
+
+def push_changes(pushes: Sequence[Push]) -> Iterator[PushChange]:
+    """Yield the pushes that act, whenever one starts or ends."""
+    for time, pushes_in_force in in_force(pushes):
+        yield PushChange(at=time, pushes=tuple(pushes_in_force))
 
 
 Change = RotorChange | PayloadPickup | PayloadDrop | MassChange | LagChange | PushChange

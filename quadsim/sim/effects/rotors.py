@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
@@ -9,6 +11,7 @@ from annotated_types import Ge, Gt, Le, Len, doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Fraction, Instant, NonNegative, Positive, Seconds, filled, require_floor
+from quadsim.sim.effects.lasting import in_force
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 
@@ -102,6 +105,20 @@ class RotorChange:
     at: float
     rotor: int
     efficiency: float
+
+
+def efficiency_changes(losses: Sequence[RotorLoss], worn: Sequence[float]) -> Iterator[RotorChange]:
+    """Yield each rotor's efficiency whenever a loss starts or ends: the product over the losses in force.
+
+    Args:
+        losses: of any rotors.
+        worn: (4,) the rotors' efficiencies without a loss.
+    """
+    for rotor, efficiency in enumerate(worn, start=1):
+        of_rotor = [loss for loss in losses if loss.rotor == rotor]
+        for time, losses_in_force in in_force(of_rotor):
+            left = math.prod(1.0 - loss.loss for loss in losses_in_force)
+            yield RotorChange(at=time, rotor=rotor, efficiency=efficiency * left)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from annotated_types import Len, doc
 
-from quadsim.errors import InputError
+from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Instant, NonNegative, Pair, Positive, Seconds, Vector, filled
 from quadsim.sim.effects.turbulence import FASTEST_AIRSPEED, SLOWEST_AIRSPEED, Dryden, Turbulence
 from quadsim.state import Array
@@ -79,6 +79,17 @@ class Air:
         """Whether anything drags, once resolved: without it, wind pushes nothing."""
         turns = any(self.rotor_moment or ()) or any(self.inflow_moment or ())
         return bool(self.rotor_drag) or self.body_drag is not None or self.axis_drag or turns
+
+    def require_drag(self, vehicle: Vehicle) -> None:
+        """Reject wind on a vehicle that nothing drags, once resolved.
+
+        Raises:
+            ParameterError: the wind would push nothing.
+        """
+        if not self.drags:
+            name = vehicle.name
+            rule = f"positive, or body_drag given, for the wind to push: the vehicle {name!r} states no drag"
+            raise ParameterError("effects.air", "rotor_drag", self.rotor_drag or 0.0, rule)
 
     def resolved(self, vehicle: Vehicle) -> Air:
         """With the sizes that are left to the vehicle, and to the mean wind."""

@@ -25,7 +25,7 @@ from quadsim.features.design.first_scenario import (
     HEIGHT_OVER_ERROR,
     first_scenario,
 )
-from quadsim.mpc.baselines.lqr import bryson_objective
+from quadsim.mpc.laws.lqr import bryson_objective
 from quadsim.mpc.robust.settings import Robust
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import parse_scenario

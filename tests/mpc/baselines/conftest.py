@@ -12,10 +12,10 @@ from support import paper_reference
 from quadsim.assets import vehicle_path
 from quadsim.controller import Controller
 from quadsim.flight.log import FlightLog
-from quadsim.mpc.baselines.geometric import Geometric
-from quadsim.mpc.baselines.lqr import LQRTable
-from quadsim.mpc.baselines.pid import PID
 from quadsim.mpc.builders import law_of
+from quadsim.mpc.laws.geometric import Geometric
+from quadsim.mpc.laws.lqr import LQRTable
+from quadsim.mpc.laws.pid import PID
 from quadsim.sim.effects import Effects
 from quadsim.sim.loop import fly
 from quadsim.sim.plant import Plant

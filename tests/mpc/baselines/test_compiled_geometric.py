@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from quadsim.controller import Phase, StepInputs
 from quadsim.mpc.baselines.attitude import Measured, motion_of
-from quadsim.mpc.baselines.geometric import Geometric, GeometricController, Integrals
 from quadsim.mpc.baselines.preview import Target, differentiator, target_of
 from quadsim.mpc.bounded import TargetBounds
 from quadsim.mpc.disturbance import RampSettings
 from quadsim.mpc.flatness import motion_along
+from quadsim.mpc.laws.geometric import Geometric, GeometricController, Integrals
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import EULER, Array
 from quadsim.vehicle import Vehicle

@@ -11,9 +11,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from quadsim.mpc.baselines.attitude import Measured, hat
-from quadsim.mpc.baselines.geometric import DesiredAttitude, Geometric, GeometricController, Integrals
 from quadsim.mpc.baselines.preview import Target
 from quadsim.mpc.flatness import motion_along
+from quadsim.mpc.laws.geometric import DesiredAttitude, Geometric, GeometricController, Integrals
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

@@ -16,8 +16,8 @@ from quadsim.assets import vehicle_path
 from quadsim.controller import StepInputs
 from quadsim.flight.log import FlightLog
 from quadsim.mpc.baselines.attitude import Measured, motion_of
-from quadsim.mpc.baselines.geometric import DesiredAttitude, GeometricController, Integrals
 from quadsim.mpc.baselines.preview import Target
+from quadsim.mpc.laws.geometric import DesiredAttitude, GeometricController, Integrals
 from quadsim.state import make_state, tilt
 from quadsim.vehicle import Vehicle, load_vehicle
 

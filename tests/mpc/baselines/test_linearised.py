@@ -13,10 +13,10 @@ import scipy.linalg
 from quadsim.errors import ParameterError
 from quadsim.mpc.allocation import allocate
 from quadsim.mpc.baselines.attitude import motion_of
-from quadsim.mpc.baselines.geometric import GeometricController, Integrals
-from quadsim.mpc.baselines.lqr import lqr_gain
-from quadsim.mpc.baselines.pid import CascadedPID, Memory
 from quadsim.mpc.baselines.preview import Target
+from quadsim.mpc.laws.geometric import GeometricController, Integrals
+from quadsim.mpc.laws.lqr import lqr_gain
+from quadsim.mpc.laws.pid import CascadedPID, Memory
 from quadsim.mpc.model import continuous_model, discretise, hover_model
 from quadsim.mpc.ocp import Objective
 from quadsim.state import Array

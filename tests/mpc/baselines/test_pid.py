@@ -12,8 +12,8 @@ import pytest
 
 from quadsim.controller import StepInputs
 from quadsim.flight.log import FlightLog
-from quadsim.mpc.baselines.pid import Memory, desired_velocity, force_within
 from quadsim.mpc.baselines.preview import Target
+from quadsim.mpc.laws.pid import Memory, desired_velocity, force_within
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
 

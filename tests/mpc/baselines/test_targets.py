@@ -16,11 +16,11 @@ from quadsim.controller import Phase, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.flight.log import FlightLog
 from quadsim.mpc.baselines.attitude import motion_of
-from quadsim.mpc.baselines.geometric import Geometric, GeometricController, Integrals
 from quadsim.mpc.baselines.preview import Target
 from quadsim.mpc.bounded import TargetBounds
 from quadsim.mpc.builders import build, law_of
 from quadsim.mpc.disturbance import RampSettings
+from quadsim.mpc.laws.geometric import Geometric, GeometricController, Integrals
 from quadsim.mpc.model import continuous_model
 from quadsim.rotation import body_to_euler_rates
 from quadsim.state import EULER_RATE, INDEX, VELOCITY, Array, make_state

@@ -16,10 +16,10 @@ from jsonschema import Draft202012Validator
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
 from quadsim.mpc.answer import ActuatorBounds
-from quadsim.mpc.baselines.geometric import GeometricController
-from quadsim.mpc.baselines.lqr import LQR, bryson_objective
-from quadsim.mpc.baselines.pid import PID, CascadedPID
 from quadsim.mpc.constraints import Bounds
+from quadsim.mpc.laws.geometric import GeometricController
+from quadsim.mpc.laws.lqr import LQR, bryson_objective
+from quadsim.mpc.laws.pid import PID, CascadedPID
 from quadsim.mpc.linear import LinearMPC
 from quadsim.mpc.nonlinear.controller import NonlinearMPC
 from quadsim.mpc.nonlinear.settings import Weights

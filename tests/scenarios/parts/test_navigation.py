@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from support import scenario_table
 
-from quadsim.scenarios.assembly import Assembly, make_fault
+from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import parse_scenario
 from quadsim.scenarios.schema.events import SensorFaultEvent
 from quadsim.scenarios.schema.scenario import Scenario
@@ -54,7 +54,7 @@ def test_the_estimator_flies_by_its_table(vehicle: Vehicle) -> None:
 
 def test_faults_are_in_si_units() -> None:
     event = SensorFaultEvent(at=2.0, sensor="rates", fault="bias", duration=1.5, offset=(180.0, 0.0, 0.0))
-    assert make_fault(event) == SensorFault(
+    assert event.in_si() == SensorFault(
         sensor=SensorName.RATES, kind=FaultKind.BIAS, start=2.0, stop=3.5, offset=(math.pi, 0.0, 0.0)
     )
 

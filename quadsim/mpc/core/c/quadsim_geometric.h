@@ -1,4 +1,4 @@
-/* Geometric tracking control on SE(3); equations and sources: quadsim/mpc/baselines/geometric.py of quadsim.
+/* Geometric tracking control on SE(3); equations and sources: quadsim/mpc/laws/geometric.py of quadsim.
  *
  * Once every period, call quadsim_geometric_step with what is measured now; hold the command until the next call.
  *

@@ -27,7 +27,7 @@ from quadsim.mpc.baselines.attitude import (
 from quadsim.mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from quadsim.mpc.baselines.law import FeedbackLaw, Tuned
 from quadsim.mpc.baselines.preview import Target, target_of
-from quadsim.mpc.bounded import law_of
+from quadsim.mpc.laws import register
 from quadsim.mpc.obstacles import Shape
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -194,6 +194,11 @@ class PID(Tuned):
     velocity: Annotated[Positive, doc("[m/s] largest velocity commanded")] = 12.0
 
 
-@law_of.register(PID)
+@register(
+    PID,
+    title="PID",
+    description="cascaded PID, as autopilots fly it",
+    place=6,
+)
 def _law(table: PID, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> CascadedPID:
     return CascadedPID(vehicle, period, table)

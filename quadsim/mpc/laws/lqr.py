@@ -15,8 +15,9 @@ from quadsim.errors import ParameterError
 from quadsim.fields import Weight
 from quadsim.mpc.allocation import allocate, make_allocation
 from quadsim.mpc.baselines.law import Baseline, FeedbackLaw
-from quadsim.mpc.bounded import InputWeights, law_of, objective_of, require_states
+from quadsim.mpc.bounded import InputWeights, objective_of, require_states
 from quadsim.mpc.heading import turn_horizontally
+from quadsim.mpc.laws import register
 from quadsim.mpc.model import LinearModel, continuous_model, discretise, hover_model
 from quadsim.mpc.obstacles import Shape
 from quadsim.mpc.ocp import Objective
@@ -186,6 +187,11 @@ class LQRTable(Baseline):
         return objective_of(self.output_weights, self.input_weights)
 
 
-@law_of.register(LQRTable)
+@register(
+    LQRTable,
+    title="LQR",
+    description="infinite-horizon LQR on the hover model, following the reference's velocity",
+    place=5,
+)
 def _law(table: LQRTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LQR:
     return LQR(vehicle, period, table)

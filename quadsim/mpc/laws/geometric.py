@@ -35,9 +35,10 @@ from quadsim.mpc.baselines.compiled import (
 )
 from quadsim.mpc.baselines.law import FeedbackLaw, Tuned
 from quadsim.mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIEW_DEGREE, Target, differentiator
-from quadsim.mpc.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, law_of, require_lags, require_space
+from quadsim.mpc.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, require_lags, require_space
 from quadsim.mpc.disturbance import RampObserver, RampSettings
 from quadsim.mpc.indi import INDISettings, TorqueIncrement, require_one_scale
+from quadsim.mpc.laws import register
 from quadsim.mpc.model import target_model
 from quadsim.mpc.nonlinear.model import zero
 from quadsim.mpc.obstacles import Shape
@@ -441,6 +442,11 @@ class Geometric(Tuned):
         return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
 
 
-@law_of.register(Geometric)
+@register(
+    Geometric,
+    title="geometric control",
+    description="geometric tracking control on SE(3)",
+    place=7,
+)
 def _law(table: Geometric, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> GeometricController:
     return GeometricController(vehicle, period, table)

@@ -12,8 +12,9 @@ import scipy.linalg
 from annotated_types import doc
 
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Statistics, StepInputs, stopped
-from quadsim.mpc.bounded import Weighted, law_of
+from quadsim.mpc.bounded import Weighted
 from quadsim.mpc.condensing import condensed_cost
+from quadsim.mpc.laws import register
 from quadsim.mpc.obstacles import Shape
 from quadsim.mpc.ocp import Problem
 from quadsim.mpc.paper import prediction, rollout
@@ -86,6 +87,11 @@ class Unconstrained(Weighted):
     type: Annotated[Literal["unconstrained"], doc("the control law, by its name in `quadsim list`")] = "unconstrained"
 
 
-@law_of.register(Unconstrained)
+@register(
+    Unconstrained,
+    title="unconstrained MPC",
+    description="the paper's Sec. 4: a constant gain from the unconstrained optimum",
+    place=1,
+)
 def _law(table: Unconstrained, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> UnconstrainedMPC:
     return UnconstrainedMPC(table.problem(vehicle, period))

@@ -9,7 +9,7 @@ import scipy.linalg
 from support import paper_problem, paper_reference
 
 from quadsim.controller import StepInputs
-from quadsim.mpc.unconstrained import UnconstrainedMPC, sequence_gains
+from quadsim.mpc.laws.unconstrained import UnconstrainedMPC, sequence_gains
 from quadsim.state import Array
 
 

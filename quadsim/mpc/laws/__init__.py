@@ -1,0 +1,89 @@
+"""The control laws by name: a file each, with the law, its table `[controller]` and its builder.
+
+`register` says what else is known of a law; a module of this folder needs no line elsewhere.  The laws `robust` and
+`nonlinear` have folders of their own, and here only their registration.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, singledispatch
+from types import MappingProxyType
+from typing import Final, TypeVar
+
+from quadsim.controller import Controller
+from quadsim.mpc.bounded import ControllerTable
+from quadsim.mpc.obstacles import Shape
+from quadsim.vehicle import Vehicle
+
+AnyBuilder = TypeVar("AnyBuilder", bound=Callable[..., Controller])
+"""A function of a table, a vehicle, a control period [s], and obstacles and regions; see `law_of`."""
+_LAST: Final = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class LawEntry:
+    """What is known of a control law without building it."""
+
+    table: type[ControllerTable]  # a dataclass, whose field `type` is the law's name
+    title: str  # its display name
+    description: str  # its line in `quadsim list`
+    place: int  # in lists; laws of one place are in the order of their names
+
+    @property
+    def name(self) -> str:
+        """Its name, as files state and flights record it."""
+        return self.table.type
+
+
+_registered: Final[dict[str, LawEntry]] = {}
+
+
+def register(
+    table: type[ControllerTable], *, title: str, description: str, place: int = _LAST
+) -> Callable[[AnyBuilder], AnyBuilder]:
+    """Register a law by its builder, which this decorates; the arguments are the fields of `LawEntry`.
+
+    Raises:
+        ValueError: another table has that name.
+    """
+    law = LawEntry(table=table, title=title, description=description, place=place)
+    known = _registered.setdefault(law.name, law)
+    if known.table is not table:
+        raise ValueError(f"two laws have the name {law.name!r}: {known.table.__module__} and {table.__module__}")
+
+    def registered(builder: AnyBuilder) -> AnyBuilder:
+        law_of.register(table)(builder)
+        return builder
+
+    return registered
+
+
+@cache
+def laws() -> Mapping[str, LawEntry]:
+    """Return the laws by name; the first call imports every module of this folder."""
+    for module in pkgutil.iter_modules(__path__):
+        importlib.import_module(f"{__name__}.{module.name}")
+    ordered = sorted(_registered.values(), key=lambda law: (law.place, law.name))
+    return MappingProxyType({law.name: law for law in ordered})
+
+
+def law_name(recorded: str) -> str:
+    """Return the display name of a controller from the name in a run's summary; a user's is shown by that name."""
+    law = laws().get(recorded)
+    if law is None:
+        return recorded
+    return law.title
+
+
+@singledispatch
+def law_of(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+    """Return the law of a table, in Python, for a control `period` [s]; see `quadsim.mpc.builders.build`."""
+    laws()  # the builder of this table has not been imported yet
+    builder = law_of.dispatch(type(table))
+    if builder is law_of.dispatch(object):
+        raise NotImplementedError(f"no law is registered for the table {type(table).__name__}")
+    return builder(table, vehicle, period, shapes)

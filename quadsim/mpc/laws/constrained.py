@@ -1,0 +1,46 @@
+"""`[controller] type = "constrained"`: the MPC of Eqs. (27)-(29)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from annotated_types import doc
+
+from quadsim.mpc.bounded import Bounded
+from quadsim.mpc.fallback.settings import FallbackSettings
+from quadsim.mpc.laws import register
+from quadsim.mpc.obstacles import Shape
+from quadsim.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from quadsim.mpc.linear import LinearMPC
+
+
+@dataclass(frozen=True, kw_only=True)
+class Constrained(Bounded):
+    """The paper's constrained MPC, the optimum of a QP in every period (Sec. 5)."""
+
+    holds_plans: ClassVar = True
+
+    type: Annotated[Literal["constrained"], doc("the control law, by its name in `quadsim list`")] = "constrained"
+    fallback: Annotated[
+        FallbackSettings | None,
+        doc("absent: the last plan is held, shifted, and then the flight ends"),
+    ] = None
+
+
+@register(
+    Constrained,
+    title="constrained MPC",
+    description="the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
+    place=2,
+)
+def _law(table: Constrained, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
+    from quadsim.mpc.linear import NominalPreparation, linear_law
+
+    problem = table.problem(vehicle, period)
+    space = table.space(shapes, vehicle, period)
+    solver = table.make_solver(problem, space)
+    return linear_law(table, NominalPreparation(problem), solver, space)
