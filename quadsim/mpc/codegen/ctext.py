@@ -10,6 +10,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from quadsim.core.mirror import Struct
 from quadsim.mpc.core.tables import NO_BOUND
 from quadsim.state import Array
 
@@ -53,9 +54,7 @@ class CText:
         lines = [wrap.fill(f".{member} = {value},") for member, value in members.items()]
         return "\n".join([f"static const {kind} {name} = {{", *lines, "};\n"])
 
-    def mirrored(
-        self, struct: ctypes.Structure, pointers: Mapping[str, str] | None = None, **others: int
-    ) -> dict[str, str]:
+    def mirrored(self, struct: Struct, pointers: Mapping[str, str] | None = None, **others: int) -> dict[str, str]:
         """Return the initialisers of a struct that Python mirrors.
 
         Args:
@@ -75,7 +74,7 @@ class CText:
                 initialisers[name] = self.value(value)
         return initialisers
 
-    def structs(self, kind: str, name: str, structs: Iterable[ctypes.Structure]) -> str:
+    def structs(self, kind: str, name: str, structs: Iterable[Struct]) -> str:
         """Return a constant array of structs without pointers, that Python mirrors."""
         lines = ["{" + ", ".join(self.mirrored(struct).values()) + "}," for struct in structs]
         return self._array(kind, name, len(lines), lines or ["{0}"])
