@@ -32,6 +32,7 @@ NUMBERS: Final = frozenset(
 
 _COMMENT: Final = re.compile(r"/\*.*?\*/", re.DOTALL)
 _SPACE: Final = re.compile(r"\s*")
+_DIRECTIVE: Final = re.compile(r"^[ \t]*#(?:.*\\\n)*.*", re.MULTILINE)
 _STATIC: Final = re.compile(r"static\b[^;{]*")
 _BRACE: Final = re.compile(r"[{};]")
 _ENUM: Final = re.compile(r"enum\b\s*\w*\s*\{([^{}]*)\}\s*;")
@@ -134,6 +135,7 @@ class _Reader:
         self.functions: dict[str, Function] = {}
         self.with_structs: list[str] = []
         self._types: dict[str, str] = {}  # what a typedef stands for
+        self._known: dict[str, str] = {}  # what `type_of` has found
         self._macros: set[str] = set()
         self._read: set[str] = set()
 
@@ -148,31 +150,38 @@ class _Reader:
 
     def _compiled(self, path: Path, text: str) -> str:
         """Return the code that the preprocessor leaves, on the same lines; read what is included."""
-        lines = []
-        # Of each #if around a line: whether it holds; None where that is not known.
+        parts: list[str] = []
+        # Of each #if around some code: whether it holds; None where that is not known.
         holds: list[bool | None] = []
-        continued = False
-        for number, line in enumerate(text.split("\n"), 1):
-            directive = continued or line.lstrip().startswith("#")
-            if not directive:
-                used = False not in holds
-                if used and None in holds and line.strip():
-                    raise HeaderError(path, number, "a declaration under #if: use #ifdef, #ifndef or #else")
-                lines.append(line if used else "")
-                continue
-            if not continued:
-                self._directive(path, number, line, holds)
-            continued = line.endswith("\\")
-            lines.append("")
-        return "\n".join(lines)
+        end = 0
+        for found in _DIRECTIVE.finditer(text):
+            parts.append(self._used(path, text, end, found.start(), holds))
+            line = text.count("\n", 0, found.start()) + 1
+            self._directive(path, line, found[0], holds)
+            parts.append("\n" * found[0].count("\n"))
+            end = found.end()
+        parts.append(self._used(path, text, end, len(text), holds))
+        return "".join(parts)
+
+    def _used(self, path: Path, text: str, start: int, end: int, holds: list[bool | None]) -> str:
+        """Return the code between two places if it is compiled, else its line ends."""
+        code = text[start:end]
+        if False in holds:
+            return "\n" * code.count("\n")
+        if None in holds and code.strip():
+            line = text.count("\n", 0, end - len(code.lstrip())) + 1
+            raise HeaderError(path, line, "a declaration under #if: use #ifdef, #ifndef or #else")
+        return code
 
     def _directive(self, path: Path, number: int, line: str, holds: list[bool | None]) -> None:
-        word, _, rest = line.strip().removeprefix("#").strip().partition(" ")
-        rest = rest.strip()
+        word, *others = line.strip().removeprefix("#").split(None, 1)
+        rest = others[0].strip() if others else ""
         if word in ("ifdef", "ifndef"):
             holds.append((rest in self._macros) == (word == "ifdef"))
         elif word == "if":
             holds.append(None)
+        elif word in ("elif", "else", "endif") and not holds:
+            raise HeaderError(path, number, f"#{word} without #if")
         elif word == "elif":
             holds[-1] = None
         elif word == "else":
@@ -180,7 +189,7 @@ class _Reader:
         elif word == "endif":
             holds.pop()
         elif word == "define":
-            if not any(state is not True for state in holds):
+            if all(holds):
                 self._macros.add(re.split(r"\W", rest)[0])
         elif word == "include":
             name = rest.strip('"<>')
@@ -201,13 +210,19 @@ class _Reader:
 
     def type_of(self, words: str) -> str | None:
         """Return one of `NUMBERS`, `void` or a struct of words such as `const quadsim_real`; None if not known."""
-        parts = [word for word in words.split() if word != "const"]
-        if len(parts) == 2 and parts[0] == ENUM:
-            return ENUM
+        if words in self._known:
+            return self._known[words]
+        parts = words.split()
+        if "const" in parts:
+            parts.remove("const")
         name = " ".join(parts)
         name = self._types.get(name, name)
-        known = name in NUMBERS or name == "void" or name in self.structs
-        return name if known and name != ENUM else None
+        if len(parts) == 2 and parts[0] == ENUM:
+            name = ENUM
+        elif name == ENUM or not (name in NUMBERS or name == "void" or name in self.structs):
+            return None
+        self._known[words] = name
+        return name
 
 
 class _File:
@@ -223,7 +238,7 @@ class _File:
         text = self._text
         at = 0
         while True:
-            at = _SPACE.match(text, at).end()  # type: ignore[union-attr]  # which matches nothing, too
+            at = self._after_space(at)
             if at == len(text):
                 return
             if found := _STATIC.match(text, at):
@@ -240,6 +255,11 @@ class _File:
             else:
                 raise self._error(at, f"{self._shown(at)!r} is not known here; see quadsim/core/headers.py")
             at = found.end()
+
+    def _after_space(self, at: int) -> int:
+        found = _SPACE.match(self._text, at)
+        assert found is not None
+        return found.end()
 
     def _end_of_definition(self, start: int, at: int) -> int:
         """Return the end of a static function or constant whose body or semicolon is at a place."""
@@ -298,7 +318,7 @@ class _File:
         if found is None:
             raise self._error(at, f"{statement!r} is not a member that can be mirrored")
         kind = self._type(at, found[1])
-        members = []
+        members: list[Variable] = []
         for text in (found[2], *others):
             declarator = _DECLARATOR.fullmatch(text)
             if declarator is None:

@@ -131,7 +131,7 @@ def fill(member: Any, values: ArrayLike) -> None:
     np.ctypeslib.as_array(member)[...] = values
 
 
-def set_members(struct: Struct, **values: ArrayLike) -> None:
+def set_members(struct: Struct, /, **values: ArrayLike) -> None:
     """Set numbers and arrays of a struct; as many numbers as an array has, in any shape."""
     for name, value in values.items():
         member = getattr(struct, name)

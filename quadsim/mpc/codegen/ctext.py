@@ -11,6 +11,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from quadsim.core.mirror import Struct
+from quadsim.mpc.core.solver import ENTRIES
 from quadsim.mpc.core.tables import NO_BOUND
 from quadsim.state import Array
 
@@ -18,8 +19,6 @@ Precision = Literal["double", "float"]
 _KINDS: Final = {np.dtype(np.uint8): "unsigned char", np.dtype(np.intc): "int"}
 LEAST_FLOAT: Final = 1.2e-38
 """Magnitude below which a number becomes 0: some compilers reject constants that single precision would truncate."""
-ELEMENT_TYPES: Final = {"axes": "quadsim_axis", "rows": "quadsim_row", "terms": "quadsim_term"}
-"""Element types of the lists among a struct's members."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class CText:
                 blocks += [block for inner, _ in parts for block in inner]
                 entries = ["{" + ", ".join(f".{k} = {v}" for k, v in part.items()) + "}" for _, part in parts]
                 lines = ",\n".join(entries or ["{0}"]).splitlines()
-                blocks.append(self._array(ELEMENT_TYPES[name], name, len(value), lines))
+                blocks.append(self._array(ENTRIES[name].__name__, name, len(value), lines))
             elif isinstance(value, np.ndarray):
                 blocks.append(self.array(f"{name}{suffix}", value))
             else:

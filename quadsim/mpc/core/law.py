@@ -89,7 +89,8 @@ class CompiledPreparation:
         self._shared, self._robust, self.problem = shared, shared.robust, with_constraints(law.problem)
         self.delay = 0.0 if law.settings is None else law.settings.delay
         # The struct and its views point into this memory.
-        self._memory, self._mpc = np.zeros(self._library.quadsim_mpc_reals(shared.struct)), struct("quadsim_mpc")()
+        self._memory = np.zeros(self._library.quadsim_mpc_reals(shared.struct))
+        self._mpc = struct("quadsim_mpc")()
         mpc, N, n = self._mpc, law.problem.horizon, law.problem.model.n
         self._library.quadsim_mpc_start(mpc, shared.struct, self._memory.ctypes.data)
         self.optimum = Optimum(self.problem, shared.problem, mpc.work)

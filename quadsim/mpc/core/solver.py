@@ -32,7 +32,7 @@ Filled = TypeVar("Filled", bound=Struct)
 
 WorkStruct: Final = struct("quadsim_work")
 ENTRIES: Final = {"axes": struct("quadsim_axis"), "rows": struct("quadsim_row"), "terms": struct("quadsim_term")}
-"""Entries of the members of a problem that are lists."""
+"""Structs of the lists among the members of a problem, by their names."""
 
 
 class CoreProblem:

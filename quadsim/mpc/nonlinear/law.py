@@ -69,12 +69,10 @@ class NonlinearLaw:
         self._query = measured, before, _view(law.states, N + 1, N_BODY), _view(law.thrusts, N, N_ROTORS)
         self.plan = _view(law.plan, self.horizon, N_ROTORS)
         sqp.bind(law.work, self.world, self._query)
-        self._state, self.structtitude, self._rates, self._acting = (
-            np.zeros(size) for size in (N_STATES, 4, 3, N_ROTORS)
-        )
+        self._state, self._attitude, self._rates, self._acting = (np.zeros(size) for size in (N_STATES, 4, 3, N_ROTORS))
         self._preview = np.zeros((self.horizon, len(REFERENCE_STATES)))
         self._motion = np.zeros((self.horizon + 1, WIDTH_OF_MOTION))
-        given = [array.ctypes.data for array in (self._state, self.structtitude, self._rates)]
+        given = [array.ctypes.data for array in (self._state, self._attitude, self._rates)]
         self._references = self._preview.ctypes.data, self._motion.ctypes.data
         self._given, self._command = given, self._acting.ctypes.data
 
@@ -100,7 +98,7 @@ class NonlinearLaw:
     def begin(self, periods: int, flying: bool, now: StepInputs, state: Array, reference: Array, acting: Array) -> bool:
         """Make the query of a period from its inputs, so many periods after the last; False if they are implausible."""
         self._state[:], self._acting[:] = state, acting
-        self.structtitude[:] = math.nan if now.attitude is None else now.attitude
+        self._attitude[:] = math.nan if now.attitude is None else now.attitude
         self._rates[:] = math.nan if now.body_rates is None else now.body_rates
         if now.motion is None:
             self._preview[:] = reference

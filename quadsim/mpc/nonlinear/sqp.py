@@ -183,10 +183,8 @@ class SQP:
         self._price, self._own = self._view("price", N, p.slacks), self._view("own", N, N_ROTORS)
         self._multiplier = self._view("multiplier", p.room)
         self._row = self._view("row", p.room, kind=ctypes.c_int)
-        self._free, self._held = (
-            self._view("free", N, p.slacks, kind=ctypes.c_int),
-            self._view("held", N, N_ROTORS, kind=ctypes.c_int),
-        )
+        self._free = self._view("free", N, p.slacks, kind=ctypes.c_int)
+        self._held = self._view("held", N, N_ROTORS, kind=ctypes.c_int)
         self._measured, self._before = arrays[:2]
         self._arguments = work, world.struct, *(array.ctypes.data for array in arrays)
 
