@@ -13,7 +13,8 @@ from timing import Record, flown, options, run, undisturbed
 
 from quadsim.commands.app import load
 from quadsim.console.progress import Progress
-from quadsim.core.structs import SAMPLE, TrackStruct, plant_library
+from quadsim.core.mirror import core_library
+from quadsim.core.structs import SAMPLE, SAMPLES, TrackStruct
 from quadsim.scenarios.assembly import Assembly
 
 SHORT: Final = 10.0  # [s] that is flown of a longer flight
@@ -89,8 +90,8 @@ def _filter_sample(rounds: int, samples: int = 1000) -> float:
 
     def use() -> None:
         track = TrackStruct.from_buffer_copy(estimator.track)
-        given = taken.ctypes.data, samples, commands.ctypes.data, grounded.ctypes.data, 0, -1
-        plant_library().quadsim_filter_run(estimator.struct, track, *given)
+        given = taken.ctypes.data_as(SAMPLES), samples, commands.ctypes.data, grounded.ctypes.data, 0, -1
+        core_library().quadsim_filter_run(estimator.struct, track, *given)
 
     return min(_timed(use) for _ in range(rounds)) / samples
 

@@ -84,7 +84,7 @@ class Replay:
         for _ in range(self._repeats):
             for part, before in zip(self._memory, memory, strict=True):
                 np.copyto(part, before)
-            ctypes.memmove(sqp._at, work, len(work))
+            ctypes.memmove(ctypes.byref(sqp._work), work, len(work))
             started = clock.thread_time()
             again = sqp._library.quadsim_nmpc_step(*sqp._arguments)
             spent.append(clock.thread_time() - started)

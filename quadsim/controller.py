@@ -15,7 +15,7 @@ from quadsim.state import Array
 from quadsim.vehicle import LARGEST
 
 if TYPE_CHECKING:
-    from quadsim.core.structs import InnerStruct
+    from quadsim.core.mirror import Struct
 
 SOLVED: Final = "solved"  # status: a QP solver or the core computed the optimum
 UNCONSTRAINED: Final = "unconstrained"
@@ -174,7 +174,7 @@ class Settling(Protocol):
 class Engaging(Protocol):
     """An inner loop that the compiled core may answer for."""
 
-    def engage(self, command: Array, rotors: Array) -> InnerStruct | None:
+    def engage(self, command: Array, rotors: Array) -> Struct | None:
         """Let a command fly from now on, at rotor speeds (4,) [rad/s].
 
         Returns:

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from quadsim.core.structs import SAMPLE, Fate, plant_library
+from quadsim.core.mirror import core_library
+from quadsim.core.structs import SAMPLE, Fate
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import steps_type
 from quadsim.sim.sensing import KINDS, Sampler, Sensor, SensorFault, SensorName, truth
@@ -48,7 +49,7 @@ def follow(navigation: Navigation, physics: Array, commands: Array, first: int, 
     sensing = navigation.begin(len(physics))
     for step, row in enumerate(physics, first + 1):
         motion = np.ascontiguousarray(row[1:])
-        plant_library().quadsim_sense(sensing, step, motion.ctypes.data)
+        core_library().quadsim_sense(sensing, step, motion.ctypes.data)
     flown = np.zeros(len(physics), steps_type())
     flown["physics"], flown["commands"] = physics, commands
     navigation.record(flown, on_ground=on_ground)

@@ -27,7 +27,7 @@ USERS_IMPORT = ("quadsim", "quadsim.gym")
 MPC_MAY_IMPORT = {
     f"quadsim.{name}" for name in ("vehicle", "state", "rotation", "errors", "fields", "controller", "motion", "space",
                                       "ties", "input_limits",
-                                      "shorthands", "core.library", "core.structs", "core.inner")
+                                      "shorthands", "core.mirror", "core.structs", "core.inner")
 }  # fmt: skip
 RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it may import at its top what is heavy."""

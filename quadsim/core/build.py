@@ -1,6 +1,7 @@
 """Compile the library beside this file: run by the build hook, by the loader, or by hand as a script.
 
-It needs only the standard library and imports nothing of quadsim: the hook runs it in a separate environment.
+It needs only the standard library and `headers.py` beside it, and imports nothing of quadsim: the hook runs it in a
+separate environment.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import sys
 import sysconfig
 import tempfile
 from pathlib import Path
+from types import ModuleType
 from typing import Final
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -22,6 +24,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 FOLDERS: Final = ("quadsim/core", "quadsim/mpc/core/c")
 """Every C file in them is compiled into the library."""
 LIBRARY: Final = "quadsim/core/_core.so"  # the suffix is free for ctypes; macOS takes .so as well
+_HEADERS: Final = Path(__file__).with_name("headers.py")
 FLAGS: Final = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction, no optimisation level changes a bit of what these files compute by IEEE 754 arithmetic.
 
@@ -53,13 +56,29 @@ def sources(root: Path = ROOT) -> list[Path]:
 
 
 def include(root: Path = ROOT) -> list[str]:
-    """Return the option for headers of ours that C files of `mpc` include."""
-    return ["-I", str(root / FOLDERS[0])]
+    """Return the options for our headers, which C files of `mpc` and the table of offsets include."""
+    return [option for folder in FOLDERS for option in ("-I", str(root / folder))]
+
+
+def write_layout(root: Path, folder: Path) -> Path:
+    """Write the C file of the table of offsets that Python's mirrors are compared with; see `quadsim.core.headers`.
+
+    Raises:
+        CompilationError: a header has something that cannot be mirrored.
+    """
+    headers = _headers()
+    try:
+        declared = headers.read_headers(file for file in sources(root) if file.suffix == ".h")
+    except headers.HeaderError as error:
+        raise CompilationError(f"error: {error}") from error
+    path = folder / "layout.c"
+    path.write_text(headers.layout_source(declared), encoding="utf-8")
+    return path
 
 
 def stamp(root: Path = ROOT) -> str:
     """Return a text that identifies all that determines the library's bits but the compiler: flags and sources."""
-    digest = hashlib.sha256(" ".join(FLAGS).encode())
+    digest = hashlib.sha256(" ".join(FLAGS).encode() + _HEADERS.read_bytes())
     for file in sources(root):
         digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
     return f"quadsim sources {digest.hexdigest()[:16]}"
@@ -118,22 +137,34 @@ def compile_library(root: Path = ROOT) -> Path:
     """Compile the library; it replaces an older one atomically, and running processes keep theirs.
 
     Raises:
-        CompilationError: there is no compiler, it fails, or the folder cannot be written.
+        CompilationError: there is no compiler, it fails, a header cannot be mirrored, or the folder cannot be written.
     """
     library = root / LIBRARY
     units = [str(file) for file in sources(root) if file.suffix == ".c"]
-    command = [*compiler(), *FLAGS, *include(root), f'-DQUADSIM_SOURCES="{stamp(root)}"', *units, "-lm", "-o"]
+    command = [*compiler(), *FLAGS, *include(root), f'-DQUADSIM_SOURCES="{stamp(root)}"', *units]
     try:
         with tempfile.TemporaryDirectory(dir=library.parent, prefix=f"{library.name}.") as scratch:
             partial = Path(scratch) / library.name
+            command += [str(write_layout(root, Path(scratch))), "-lm", "-o", str(partial)]
             environment = {"ZIG_GLOBAL_CACHE_DIR": scratch, **os.environ}  # which is 70 MB
-            done = subprocess.run([*command, str(partial)], env=environment, capture_output=True, text=True)
+            done = subprocess.run(command, env=environment, capture_output=True, text=True)
             if done.returncode:
                 raise CompilationError(f"{shlex.join(command[:1])} fails:\n{done.stderr}")
             partial.replace(library)
     except OSError as error:
         raise CompilationError(str(error)) from error
     return library
+
+
+def _headers() -> ModuleType:
+    """Load `headers.py` by its path: by its name it is not found where nothing of quadsim can be imported."""
+    spec = importlib.util.spec_from_file_location("quadsim_headers", _HEADERS)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 if __name__ == "__main__":

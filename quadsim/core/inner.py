@@ -7,19 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from quadsim.core.structs import InnerStruct, plant_library
+from quadsim.core.mirror import Struct, core_library
+from quadsim.core.structs import InnerStruct
 from quadsim.state import Array
 
 
 class CompiledLoop:
     """An inner loop whose constants and state are a struct of the core; `quadsim.controller.InnerLoop`."""
 
-    def __init__(self, struct: InnerStruct, *, delay: int = 0) -> None:
+    def __init__(self, struct: Struct, *, delay: int = 0) -> None:
         """Take over a struct whose constants are filled in; `delay` calls pass before an answer comes out."""
         self._struct, self._queue = struct, np.zeros((max(delay, 1), 4))
         struct.delay = delay
 
-    def engage(self, command: Array, rotors: Array) -> InnerStruct | None:
+    def engage(self, command: Array, rotors: Array) -> Struct | None:
         """Let a command fly from now on, at rotor speeds (4,) [rad/s].
 
         Returns:
@@ -31,10 +32,10 @@ class CompiledLoop:
         """See `quadsim.controller.InnerLoop`."""
         struct = self._engaged(commanded)
         rates, rotors, attitude = (np.ascontiguousarray(given, np.float64) for given in (rates, rotors, attitude))
-        plant_library().quadsim_answer(struct, time, rates.ctypes.data, rotors.ctypes.data, attitude.ctypes.data)
+        core_library().quadsim_answer(struct, time, rates.ctypes.data, rotors.ctypes.data, attitude.ctypes.data)
         return np.array(struct.answer)
 
-    def _engaged(self, command: Array) -> InnerStruct:
+    def _engaged(self, command: Array) -> Struct:
         struct = self._struct
         struct.command[: command.size], struct.holds_attitude = command, command.size > len(struct.answer)
         struct.queue = self._queue.ctypes.data

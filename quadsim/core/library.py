@@ -1,21 +1,13 @@
-"""The library of quadsim's C, for the modules that declare its functions."""
+"""The library of quadsim's C; `quadsim.core.mirror` gives its functions their types."""
 
 from __future__ import annotations
 
 import ctypes
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
-
-import numpy as np
-from numpy.typing import ArrayLike
 
 from quadsim.core.build import LIBRARY, ROOT, CompilationError, compile_library, is_current
 from quadsim.errors import FileError
-
-INT: Final = ctypes.c_int
-REAL: Final = ctypes.c_double
-AT: Final = ctypes.c_void_p
 
 
 @cache
@@ -38,31 +30,12 @@ def load_from(root: Path) -> ctypes.CDLL:
         except CompilationError as error:
             lines = str(error).splitlines()
             reason = next((line for line in lines if "error:" in line), lines[0])
-            problem = f"{problem}, and it cannot be compiled ({reason}); {_remedy(root)}"
+            problem = f"{problem}, and it cannot be compiled ({reason}); {remedy(root)}"
             raise FileError(root / LIBRARY, problem) from error
         library = _loaded(root)
         if isinstance(library, str):
-            raise FileError(root / LIBRARY, f"{library}; {_remedy(root)}")
+            raise FileError(root / LIBRARY, f"{library}; {remedy(root)}")
     return library
-
-
-def check_sizes(**mirrors: type[ctypes.Structure]) -> None:
-    """Assert that structs have the sizes that the library states, e.g. of `quadsim_axis` in `quadsim_axis_size`."""
-    for name, mirror in mirrors.items():
-        size = ctypes.c_size_t.in_dll(load_library(), f"{name}_size").value
-        assert ctypes.sizeof(mirror) == size, f"{name} has {size} bytes, not {ctypes.sizeof(mirror)}"
-
-
-def struct_members(kind: type[Any], names: str) -> list[tuple[str, Any]]:
-    """Return members of a struct, as `x n:3`."""
-    parts = (name.partition(":") for name in names.split())
-    return [(name, kind * int(size) if size else kind) for name, _, size in parts]
-
-
-def set_arrays(struct: ctypes.Structure, **arrays: ArrayLike) -> None:
-    """Set array members of a struct."""
-    for name, values in arrays.items():
-        getattr(struct, name)[:] = np.asarray(values, float).ravel().tolist()
 
 
 def _loaded(root: Path) -> ctypes.CDLL | str:
@@ -78,7 +51,7 @@ def _loaded(root: Path) -> ctypes.CDLL | str:
         return f"cannot be loaded ({error})"
 
 
-def _remedy(root: Path) -> str:
+def remedy(root: Path) -> str:
     """Return the command that compiles the library; pip fetches a compiler where there is none."""
     checkout = (root / "hatch_build.py").is_file()
     return "run: pip install " + (f"--editable {root}" if checkout else "--force-reinstall --no-deps quadsim")

@@ -9,7 +9,7 @@ from typing import Any
 
 import mujoco
 
-from quadsim.core.structs import plant_library
+from quadsim.core.mirror import core_library
 from quadsim.errors import InputError
 
 
@@ -29,7 +29,7 @@ def step_address() -> int:
     except (OSError, AttributeError, ValueError, LookupError) as error:
         remedy = "install a release that pyproject.toml names"
         raise InputError(f"MuJoCo {mujoco.__version__} cannot be stepped from C ({error}): {remedy}") from error
-    trap.value = ctypes.cast(plant_library().quadsim_trap, ctypes.c_void_p).value
+    trap.value = ctypes.cast(core_library().quadsim_trap, ctypes.c_void_p).value
     assert step is not None
     return step
 

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadsim.core.structs import InnerStruct, fill, plant_library
+from quadsim.core.mirror import Struct, core_library, fill
+from quadsim.core.structs import InnerStruct
 from quadsim.state import Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -63,7 +64,7 @@ def thrust_to_command(largest: float, weight: float, share: float) -> float:
     return min(largest, max(share * largest, 0.5 * (weight + largest)))
 
 
-def allocation_struct(allocation: Allocation, lower: Array, upper: Array) -> InnerStruct:
+def allocation_struct(allocation: Allocation, lower: Array, upper: Array) -> Struct:
     """Return what the core takes for an allocation within `lower` and `upper` (4,) [rad/s], which are finite."""
     struct = InnerStruct()
     fill(struct.effect, allocation.M)
@@ -81,5 +82,5 @@ def allocate(allocation: Allocation, wrench: Array, lower: Array, upper: Array) 
     """
     demanded, speeds = np.ascontiguousarray(wrench, np.float64), np.empty(N_ROTORS)
     struct = allocation_struct(allocation, lower, upper)
-    plant_library().quadsim_allocate(struct, demanded.ctypes.data, speeds.ctypes.data)
+    core_library().quadsim_allocate(struct, demanded.ctypes.data, speeds.ctypes.data)
     return speeds

@@ -44,7 +44,6 @@ from __future__ import annotations
 import ctypes
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import Annotated, Final
 
 import numpy as np
@@ -52,7 +51,7 @@ from annotated_types import doc
 from numpy.typing import ArrayLike
 
 from quadsim.controller import StepInputs
-from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, set_arrays, struct_members
+from quadsim.core.mirror import Struct, core_library, set_members, struct
 from quadsim.fields import NonNegative, Positive, Seconds
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -98,39 +97,8 @@ class RampSettings:
     largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 100.0
 
 
-class RampNumbers(ctypes.Structure):
-    """A `quadsim_ramp_numbers`."""
-
-    _fields_ = [
-        *struct_members(INT, "scaled targets moment"),
-        *struct_members(REAL, "period mass gravity least_lift gain:6 gain_of_change:6 largest:6 inertia:9 inverse:9"),
-        *struct_members(REAL, "allocation:16 momentum:4 lag left drag:3 square_drag:3 across:2 inflow:2 damping:3"),
-        *struct_members(REAL, "decay ballast"),
-    ]
-
-
-class RampState(ctypes.Structure):
-    """A `quadsim_ramp`."""
-
-    _fields_ = [
-        *struct_members(INT, "measured"),
-        *struct_members(REAL, "value:6 change:6 products:3 squares:3 acting:4"),
-        *struct_members(REAL, "velocity:3 rates:3 axis:3 turning:3 pull:3 resisting:3"),
-    ]
-
-
-@cache
-def _library() -> ctypes.CDLL:
-    library = load_library()
-    check_sizes(quadsim_ramp_numbers=RampNumbers, quadsim_ramp=RampState)
-    library.quadsim_ramp_reset.restype, library.quadsim_ramp_reset.argtypes = None, [AT] * 3
-    library.quadsim_ramp_update.restype = None
-    library.quadsim_ramp_update.argtypes = [AT, AT, INT, AT, AT, AT, AT]
-    library.quadsim_ramp_foreseen.restype = None
-    library.quadsim_ramp_foreseen.argtypes = [AT, AT, REAL, AT, AT, AT]
-    library.quadsim_ramp_scale.restype, library.quadsim_ramp_scale.argtypes = REAL, [AT] * 2
-    library.quadsim_ramp_drag.restype, library.quadsim_ramp_drag.argtypes = None, [AT] * 3
-    return library
+RampNumbers: Final = struct("quadsim_ramp_numbers")
+RampState: Final = struct("quadsim_ramp")
 
 
 class RampObserver:
@@ -158,11 +126,11 @@ class RampObserver:
         moment: bool = False,
         thrust_lag: float | None = None,
     ) -> None:
-        self._library, self._period = _library(), period
+        self._library, self._period = core_library(), period
         self.numbers = RampNumbers()
         _fill(self.numbers, settings, vehicle, period, thrust_lag)
         self.numbers.moment = moment
-        set_arrays(self.numbers, drag=np.array(drag, float), square_drag=np.array(quadratic_drag, float))
+        set_members(self.numbers, drag=np.array(drag, float), square_drag=np.array(quadratic_drag, float))
         self.bind(RampState())
         # What C reads in an update, and what it writes.
         self._measured = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(N_ROTORS)
@@ -170,16 +138,16 @@ class RampObserver:
         self._addresses = [array.ctypes.data for array in (*self._measured, *self._foreseen)]
         self.reset(vehicle.mass * vehicle.gravity if self.numbers.targets else vehicle.hover_speeds)
 
-    def bind(self, state: RampState) -> None:
+    def bind(self, state: Struct) -> None:
         """Keep the estimates in this memory from now on, as they are there."""
-        self.state, self._at = state, (ctypes.addressof(state), ctypes.addressof(self.numbers))
+        self.state = state
         self._value, self._change, self._acting = map(np.ctypeslib.as_array, (state.value, state.change, state.acting))
 
     def reset(self, acting: Array | float) -> None:
         """Clear the estimates; the rotors turn at `acting` (4,) [rad/s], or give this thrust [N] with `thrust_lag`."""
         command = self._measured[-1]
         command[:] = acting
-        self._library.quadsim_ramp_reset(*self._at, command.ctypes.data)
+        self._library.quadsim_ramp_reset(self.state, self.numbers, command.ctypes.data)
         self._time = 0.0
 
     def adopt(self, other: RampObserver) -> None:
@@ -187,7 +155,7 @@ class RampObserver:
         same_commands = self.numbers.targets == other.numbers.targets
         shared = np.array([True, True, self.numbers.scaled == other.numbers.scaled, *[same_commands] * 3])
         largest, acting = np.array(self.numbers.largest), self._acting.copy()
-        ctypes.memmove(self._at[0], other._at[0], ctypes.sizeof(RampState))
+        ctypes.memmove(ctypes.byref(self.state), ctypes.byref(other.state), ctypes.sizeof(RampState))
         self._value[:] = np.where(shared, np.clip(self._value, -largest, largest), 0.0)
         self._change[:] = np.where(shared, self._change, 0.0)
         if not same_commands:
@@ -202,7 +170,7 @@ class RampObserver:
         """
         for array, value in zip(self._measured, (velocity, attitude, rates, command), strict=True):
             array[:] = value
-        self._library.quadsim_ramp_update(*self._at, self.follows(time), *self._addresses[:4])
+        self._library.quadsim_ramp_update(self.state, self.numbers, self.follows(time), *self._addresses[:4])
 
     def follows(self, time: float) -> bool:
         """Return whether an update at a time [s] follows the one before by a period, and remember the time."""
@@ -214,14 +182,14 @@ class RampObserver:
 
         Acceleration [m/s^2] and its rate of change [m/s^3], world axes; angular acceleration [rad/s^2], body axes.
         """
-        self._library.quadsim_ramp_foreseen(*self._at, ahead, *self._addresses[4:])
+        self._library.quadsim_ramp_foreseen(self.state, self.numbers, ahead, *self._addresses[4:])
         force, change, torque = self._foreseen.copy()
         return force, change, torque
 
     @property
     def thrust_scale(self) -> float:
         """The thrust that rotors give over the modelled one, kappa, in the period that follows the last measurement."""
-        return float(self._library.quadsim_ramp_scale(*self._at))
+        return float(self._library.quadsim_ramp_scale(self.state, self.numbers))
 
     def log(self, now: StepInputs) -> None:
         """Log the thrust scale, where it is estimated, as `thrust_scale`."""
@@ -235,13 +203,11 @@ class RampObserver:
         A least-squares fit of d_b + diag(drag) v_b that weights older samples less; zero while the vehicle is slow.
         """
         drag = np.empty(3)
-        self._library.quadsim_ramp_drag(*self._at, drag.ctypes.data)
+        self._library.quadsim_ramp_drag(self.state, self.numbers, drag.ctypes.data)
         return drag
 
 
-def _fill(
-    numbers: RampNumbers, settings: RampSettings, vehicle: Vehicle, period: float, thrust_lag: float | None
-) -> None:
+def _fill(numbers: Struct, settings: RampSettings, vehicle: Vehicle, period: float, thrust_lag: float | None) -> None:
     """Fill in all numbers but what the model knows of the air."""
     bandwidths = settings.force or FORCE_SHARE / period, settings.torque or TORQUE_SHARE / period
     pole = np.exp(-period * np.repeat(bandwidths, 3))
@@ -258,7 +224,7 @@ def _fill(
     lag = (settings.rotor_lag or 0.0) if thrust_lag is None else thrust_lag
     numbers.lag, numbers.left = lag / period, math.exp(-period / lag) if lag else 0.0
     rotor_inertia = (vehicle.rotor_inertia or 0.0) if lag else 0.0
-    set_arrays(
+    set_members(
         numbers,
         gain=gain,
         gain_of_change=gain_of_change,

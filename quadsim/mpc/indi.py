@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING, Annotated
 from annotated_types import doc
 
 from quadsim.core.inner import CompiledLoop
-from quadsim.core.structs import LoopKind, fill
+from quadsim.core.mirror import fill
+from quadsim.core.structs import LoopKind
 from quadsim.fields import Hertz
 from quadsim.mpc.allocation import allocation_struct, make_allocation
 from quadsim.vehicle import Vehicle

@@ -22,7 +22,7 @@ from quadsim.controller import (
     takes_targets,
 )
 from quadsim.core.inner import CompiledLoop
-from quadsim.core.structs import InnerStruct
+from quadsim.core.mirror import Struct
 from quadsim.mpc.fallback.contract import Guard
 from quadsim.mpc.indi import TorqueIncrement
 from quadsim.state import Array
@@ -135,7 +135,7 @@ class Pilot:
         self._target, self._fresh, self._rates = self._hover, True, None
         return stopped(self._slowest.copy(), self.horizon, now.phase)
 
-    def engage(self, command: Array, rotors: Array) -> InnerStruct | None:
+    def engage(self, command: Array, rotors: Array) -> Struct | None:
         """Let a target fly from now on, at rotor speeds (4,) [rad/s]; the autopilot is reset before its first.
 
         Returns:

@@ -26,7 +26,8 @@ from annotated_types import Len, doc
 
 from quadsim.controller import AutopilotLoop
 from quadsim.core.inner import CompiledLoop
-from quadsim.core.structs import InnerStruct, LoopKind, fill
+from quadsim.core.mirror import fill
+from quadsim.core.structs import InnerStruct, LoopKind
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Fraction, Hertz, NonNegative, filled, require_floor
 from quadsim.sim.effects import Effects

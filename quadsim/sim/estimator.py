@@ -46,7 +46,6 @@ of before is kept with the initial covariance, for the sensors to correct.  The 
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -56,7 +55,8 @@ import numpy as np
 from annotated_types import Gt, Lt, doc
 from numpy.typing import NDArray
 
-from quadsim.core.structs import SAMPLE, FilterStruct, TrackStruct, fill, plant_library
+from quadsim.core.mirror import Struct, core_library, fill
+from quadsim.core.structs import SAMPLE, SAMPLES, FilterStruct, TrackStruct
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.rotation import exponential, multiply, normalise
@@ -222,8 +222,8 @@ class ErrorStateFilter:
         self._run(ahead, self._waiting, until=self._step)
         return np.array(ahead.mean), np.array(ahead.P)
 
-    def _run(self, track: TrackStruct, samples: NDArray[np.void], *, until: int) -> None:
+    def _run(self, track: Struct, samples: NDArray[np.void], *, until: int) -> None:
         """Use samples, then predict to a step, unless that is past."""
         flown = self._commands.ctypes.data, self._grounded.ctypes.data
-        given = ctypes.byref(self.struct), ctypes.byref(track), samples.ctypes.data, len(samples)
-        plant_library().quadsim_filter_run(*given, *flown, self._base, until)
+        given = self.struct, track, samples.ctypes.data_as(SAMPLES), len(samples)
+        core_library().quadsim_filter_run(*given, *flown, self._base, until)

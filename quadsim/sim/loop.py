@@ -28,7 +28,8 @@ from quadsim.controller import (
     StepInputs,
     takes_targets,
 )
-from quadsim.core.structs import InnerStruct, SensingStruct
+from quadsim.core.mirror import Struct
+from quadsim.core.structs import InnerStruct
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError, described
 from quadsim.flight.log import FlightLog, LoggedSignals
 from quadsim.flight.phase import check_loss
@@ -378,7 +379,7 @@ class ClosedLoop:
             rotors=plant.speeds,
         )
 
-    def _hold(self, inner: InnerLoop | None, row: Array, steps: int, sensing: SensingStruct | None) -> None:
+    def _hold(self, inner: InnerLoop | None, row: Array, steps: int, sensing: Struct | None) -> None:
         """Fly physics steps under a command, by an inner loop if there is one.
 
         Raises:

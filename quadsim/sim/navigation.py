@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from quadsim.core.structs import SAMPLE, Fate, SensingStruct, SensorStruct, plant_library
+from quadsim.core.mirror import Struct, core_library
+from quadsim.core.structs import SAMPLE, Fate, SensingStruct, SensorStruct
 from quadsim.errors import ParameterError
 from quadsim.rotation import body_to_euler_rates, euler_to_quaternion
 from quadsim.sim.estimator import (
@@ -107,12 +108,12 @@ class Navigation:
             self.filter.reset(np.concatenate([*known, np.zeros(3)]), speeds, copy.deepcopy(self._rng))
         self._prepare(0, 1)
         motion = np.ascontiguousarray(physics[1:])
-        plant_library().quadsim_sense(self._sensing, 0, motion.ctypes.data)
+        core_library().quadsim_sense(self._sensing, 0, motion.ctypes.data)
         self._hear(0, physics)
         if self.filter is not None:
             self.filter.advance(np.empty((0, len(speeds))), self._arrived())
 
-    def begin(self, steps: int) -> SensingStruct:
+    def begin(self, steps: int) -> Struct:
         """Draw the errors of the samples of the next physics steps; return what takes them."""
         self._prepare(self._step + 1, self._step + 1 + steps)
         return self._sensing
@@ -178,7 +179,7 @@ class Navigation:
     def _hear(self, step: int, physics: Array) -> None:
         """Hold the newest sample of each sensor to arrive by a physics step, at MuJoCo's state (14,)."""
         motion = np.ascontiguousarray(physics[1:])
-        plant_library().quadsim_hear(self._sensing, step, motion.ctypes.data)
+        core_library().quadsim_hear(self._sensing, step, motion.ctypes.data)
 
     def _arrived(self) -> list[NDArray[np.void]]:
         """Return the samples that have arrived since the last call, without lost ones."""

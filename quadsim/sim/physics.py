@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadsim.controller import FALLBACK, MISSED, Command, Phase, Statistics, StepInputs
-from quadsim.core.structs import plant_library
+from quadsim.core.mirror import core_library
 from quadsim.errors import ParameterError
 from quadsim.flight.log import (
     ControlLog,
@@ -104,7 +104,7 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
         physics = np.ascontiguousarray(physics, np.float64)
     states = np.empty((len(physics), N_STATES))
     width = physics.strides[0] // 8
-    plant_library().quadsim_states(physics.ctypes.data, len(physics), width, yaw, states.ctypes.data)
+    core_library().quadsim_states(physics.ctypes.data, len(physics), width, yaw, states.ctypes.data)
     return states
 
 

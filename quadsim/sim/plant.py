@@ -13,15 +13,12 @@ import numpy as np
 
 from quadsim.border import numbers_of, user_code
 from quadsim.controller import LARGEST_SPEED, check_command
+from quadsim.core.mirror import Struct, core_library, fill
 from quadsim.core.stepping import addresses, step_address
 from quadsim.core.structs import (
     End,
-    InnerStruct,
-    SensingStruct,
     StepsStruct,
     VehicleStruct,
-    fill,
-    plant_library,
 )
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError, RaisedError
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
@@ -204,7 +201,7 @@ class Plant:
         for force in self._own:
             getattr(force, "reset", lambda: None)()
 
-    def _make_struct(self) -> VehicleStruct:
+    def _make_struct(self) -> Struct:
         """Return the core's vehicle, with all that does not change."""
         v, vehicle, effects, data = VehicleStruct(), self.vehicle, self.effects, self._data
         v.timestep, v.plausible, v.fastest_valid = self.timestep, _PLAUSIBLE, LARGEST_SPEED
@@ -313,8 +310,8 @@ class Plant:
         command: Array,
         steps: int,
         *,
-        loop: InnerStruct | None = None,
-        sensing: SensingStruct | None = None,
+        loop: Struct | None = None,
+        sensing: Struct | None = None,
         ask: Answers | None = None,
     ) -> None:
         """Fly some steps of the period that `begin` began.
@@ -347,12 +344,12 @@ class Plant:
         self,
         end: int,
         command: Array,
-        loop: InnerStruct | None,
-        sensing: SensingStruct | None,
+        loop: Struct | None,
+        sensing: Struct | None,
         ask: Answers | None,
     ) -> None:
         """Let the core fly to a physics step while only vehicle and air change."""
-        v, rows, fly = self._struct, self._rows, plant_library().quadsim_fly
+        v, rows, fly = self._struct, self._rows, core_library().quadsim_fly
         while self._step < end:
             before, why = self._step, fly(v, loop, sensing, rows, command.ctypes.data, end)
             if v.now > before:
@@ -360,7 +357,7 @@ class Plant:
                 self._step, self._charge = v.now, v.charge
                 self._speeds = np.array(v.speeds)
             if why == End.FAILED:
-                complaint = plant_library().quadsim_complaint().decode(errors="replace")
+                complaint = core_library().quadsim_complaint().decode(errors="replace")
                 raise DivergenceError(f"the plant diverged: MuJoCo reports {complaint}", time=self.time)
             if why == End.DIVERGED:
                 raise DivergenceError("the plant diverged: its state is not finite or not plausible", time=self.time)

@@ -20,7 +20,7 @@ from quadsim.commands.app import app
 from quadsim.commands.cli import main
 from quadsim.commands.doctor import capabilities
 from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
-from quadsim.core import library
+from quadsim.core import library, mirror
 from quadsim.core.build import LIBRARY
 from quadsim.errors import OutputError, RenderingUnavailableError
 from quadsim.features.campaign.plan import read_campaign
@@ -163,8 +163,8 @@ def test_without_the_library_doctor_and_a_flight_by_the_core_say_what_compiles_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(library, "ROOT", tmp_path)
-    monkeypatch.setattr(solver, "load_library", library.load_library.__wrapped__)
-    monkeypatch.setattr(solver, "core_library", solver.core_library.__wrapped__)
+    monkeypatch.setattr(mirror, "load_library", library.load_library.__wrapped__)
+    monkeypatch.setattr(solver, "core_library", mirror.core_library.__wrapped__)
     expected = f"{tmp_path / LIBRARY}: is missing, and it cannot be compiled ("
     line = capabilities()["solvers"]["core"]
     assert line.startswith(expected)

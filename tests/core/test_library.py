@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import shutil
 import subprocess
 import sys
@@ -10,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from quadsim.core import build, library
+from quadsim.core import build, headers, library
 from quadsim.core.build import LIBRARY, PLATFORM, TARGETS, ZIG, CompilationError
 from quadsim.core.library import load_from, load_library
+from quadsim.core.mirror import check_layout, make_structs
 from quadsim.errors import FileError
 
 ANSWER = "quadsim/mpc/core/c/answer.c"
@@ -188,6 +190,24 @@ def test_the_compiler_s_first_error_is_shown(tree: Path) -> None:
     assert not (tree / LIBRARY).exists()
 
 
+def test_a_header_that_cannot_be_mirrored_is_named_by_its_line(tree: Path) -> None:
+    (tree / ANSWER).with_name("answer.h").write_text("typedef struct wrong {\n    int flag : 1;\n} wrong;\n")
+    with pytest.raises(FileError, match=r"cannot be compiled \(error: .*answer\.h: line 2: 'int flag : 1' is not a m"):
+        load_from(tree)
+    assert not (tree / LIBRARY).exists()
+
+
+def test_the_library_states_where_the_compiler_puts_members(tree: Path) -> None:
+    header = (tree / ANSWER).with_name("answer.h")
+    header.write_text("typedef struct toy {\n    char flag;\n    double x[2];\n    int n;\n} toy;\n")
+    structs = make_structs(headers.read_headers([header]))
+    check_layout(load_from(tree), structs)
+    header.write_text(header.read_text().replace("    int n;\n", "").replace("    char", "    int n;\n    char"))
+    structs = make_structs(headers.read_headers([header]))
+    with pytest.raises(ValueError, match=r"toy\.n has 4 bytes at 24, not 4 at 0"):
+        check_layout(ctypes.CDLL(str(tree / LIBRARY)), structs)
+
+
 def test_a_compiler_that_does_not_exist_is_named(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(FileError, match=r"cannot be compiled \(.*'no-such-compiler'\)"):
@@ -196,6 +216,7 @@ def test_a_compiler_that_does_not_exist_is_named(tree: Path, monkeypatch: pytest
 
 def test_the_script_prints_the_library_or_all_that_the_compiler_says(tree: Path) -> None:
     script = shutil.copy2(build.__file__, tree / "quadsim" / "core")
+    shutil.copy2(headers.__file__, tree / "quadsim" / "core")
 
     def run() -> subprocess.CompletedProcess[str]:
         return subprocess.run([sys.executable, script], capture_output=True, text=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from quadsim.core.build import FLAGS, ROOT, include, sources, stamp
+from quadsim.core.build import FLAGS, ROOT, include, sources, stamp, write_layout
 
 NEAR_GROUND = {"effects.rotors": {}, "effects.ground": {"effect": True, "rotor_radius": 0.1}}
 MOTION_CAPTURE = {
@@ -49,6 +49,7 @@ def sanitized(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     library = tmp_path_factory.mktemp("sanitized") / "core.so"
     flags = [flag for flag in FLAGS if flag != "-O3"]
     units = [str(file) for file in sources() if file.suffix == ".c"]
+    units.append(str(write_layout(ROOT, library.parent)))
     command = ["gcc", *flags, *include(), "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     subprocess.run([*command, f'-DQUADSIM_SOURCES="{stamp()}"', *units, "-lm", "-o", str(library)], check=True)
     found = subprocess.run(["gcc", "-print-file-name=libasan.so"], check=True, capture_output=True, text=True)

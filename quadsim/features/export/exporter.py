@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -12,6 +11,7 @@ from typing import Any, Final, get_args
 import numpy as np
 
 from quadsim.controller import ROTORS
+from quadsim.core.mirror import core_library
 from quadsim.errors import ExportError, ParameterError
 from quadsim.features.export.record import Recording, record
 from quadsim.mpc.bounded import Weighted
@@ -21,7 +21,7 @@ from quadsim.mpc.codegen.nonlinear import CNonlinear
 from quadsim.mpc.codegen.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
 from quadsim.mpc.codegen.targets import TARGETS, Machine
 from quadsim.mpc.core.numbers import AVOIDS, Exportable, exportable
-from quadsim.mpc.core.solver import CoreProblem, Work, core_library
+from quadsim.mpc.core.solver import CoreProblem, WorkStruct
 from quadsim.mpc.laws.geometric import Geometric
 from quadsim.mpc.nonlinear.rigidbody import N_BODY, P, V
 from quadsim.mpc.nonlinear.settings import Nonlinear
@@ -80,9 +80,9 @@ class LinearSearch:
         self._library, self._shared = core_library(), CoreProblem(problem)
         struct = self._struct = type(self._shared.struct).from_buffer_copy(self._shared.struct)
         struct.room, struct.changes = room or struct.room, changes or struct.changes
-        at, self._work = ctypes.addressof(struct), np.zeros(ctypes.sizeof(Work), np.uint8)
-        self._memory = np.zeros(self._library.quadsim_work_reals(at))
-        self._library.quadsim_work_start(self._work.ctypes.data, at, self._memory.ctypes.data)
+        self._work = WorkStruct()
+        self._memory = np.zeros(self._library.quadsim_work_reals(struct))
+        self._library.quadsim_work_start(self._work, struct, self._memory.ctypes.data)
         rest, speeds = np.zeros(problem.model.n), np.array(problem.model.u_bar)
         rest[N_STATES:] = (self._shared.tables.modes @ speeds)[: rest.size - N_STATES]
         self._query = np.zeros((problem.horizon, len(problem.objective.C_r))), rest, speeds, speeds
@@ -91,9 +91,9 @@ class LinearSearch:
         """See `Solves`."""
         state = self._query[1].copy()
         state[[*POSITION, *VELOCITY]] += offset
-        self._library.quadsim_work_reset(self._work.ctypes.data)
-        arguments = (self._work, state, *self._query)
-        found: int = self._library.quadsim_optimise(*(part.ctypes.data for part in arguments))
+        self._library.quadsim_work_reset(self._work)
+        addresses = (part.ctypes.data for part in (state, *self._query))
+        found: int = self._library.quadsim_optimise(self._work, *addresses)
         return found < len(Method)
 
 

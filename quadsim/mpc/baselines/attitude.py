@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.mpc.baselines.compiled import geometric_library
+from quadsim.core.mirror import core_library
 from quadsim.mpc.nonlinear.rigidbody import rotation
 from quadsim.rotation import body_to_world, euler_to_body_rates
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array
@@ -52,7 +52,7 @@ def limit_force(force: Array, *, least: float, tilt: float) -> Array:
     The limit changes the vertical part only if it is too small; the horizontal part keeps its direction.
     """
     force, limited = np.ascontiguousarray(force, np.float64), np.empty(3)
-    geometric_library().quadsim_geometric_limit(force.ctypes.data, least, math.tan(tilt), limited.ctypes.data)
+    core_library().quadsim_geometric_limit(force.ctypes.data, least, math.tan(tilt), limited.ctypes.data)
     return limited
 
 

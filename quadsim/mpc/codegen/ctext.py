@@ -10,6 +10,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from quadsim.core.mirror import Struct
+from quadsim.mpc.core.solver import ENTRIES
 from quadsim.mpc.core.tables import NO_BOUND
 from quadsim.state import Array
 
@@ -17,8 +19,6 @@ Precision = Literal["double", "float"]
 _KINDS: Final = {np.dtype(np.uint8): "unsigned char", np.dtype(np.intc): "int"}
 LEAST_FLOAT: Final = 1.2e-38
 """Magnitude below which a number becomes 0: some compilers reject constants that single precision would truncate."""
-ELEMENT_TYPES: Final = {"axes": "quadsim_axis", "rows": "quadsim_row", "terms": "quadsim_term"}
-"""Element types of the lists among a struct's members."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,7 @@ class CText:
         lines = [wrap.fill(f".{member} = {value},") for member, value in members.items()]
         return "\n".join([f"static const {kind} {name} = {{", *lines, "};\n"])
 
-    def mirrored(
-        self, struct: ctypes.Structure, pointers: Mapping[str, str] | None = None, **others: int
-    ) -> dict[str, str]:
+    def mirrored(self, struct: Struct, pointers: Mapping[str, str] | None = None, **others: int) -> dict[str, str]:
         """Return the initialisers of a struct that Python mirrors.
 
         Args:
@@ -75,7 +73,7 @@ class CText:
                 initialisers[name] = self.value(value)
         return initialisers
 
-    def structs(self, kind: str, name: str, structs: Iterable[ctypes.Structure]) -> str:
+    def structs(self, kind: str, name: str, structs: Iterable[Struct]) -> str:
         """Return a constant array of structs without pointers, that Python mirrors."""
         lines = ["{" + ", ".join(self.mirrored(struct).values()) + "}," for struct in structs]
         return self._array(kind, name, len(lines), lines or ["{0}"])
@@ -90,7 +88,7 @@ class CText:
                 blocks += [block for inner, _ in parts for block in inner]
                 entries = ["{" + ", ".join(f".{k} = {v}" for k, v in part.items()) + "}" for _, part in parts]
                 lines = ",\n".join(entries or ["{0}"]).splitlines()
-                blocks.append(self._array(ELEMENT_TYPES[name], name, len(value), lines))
+                blocks.append(self._array(ENTRIES[name].__name__, name, len(value), lines))
             elif isinstance(value, np.ndarray):
                 blocks.append(self.array(f"{name}{suffix}", value))
             else:

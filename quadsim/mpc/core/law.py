@@ -6,7 +6,7 @@ import ctypes
 import math
 import time as clock
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Final, NoReturn
 
 import numpy as np
@@ -21,17 +21,16 @@ from quadsim.controller import (
     StepInputs,
     stopped,
 )
-from quadsim.core.library import check_sizes
+from quadsim.core.mirror import core_library, set_members, struct
 from quadsim.mpc.condensing import Condensed
 from quadsim.mpc.core.numbers import Exportable, controller_numbers, robust_numbers
-from quadsim.mpc.core.solver import PROBLEMS, Core, Key, Optimum, Work, core_library, core_problem
+from quadsim.mpc.core.solver import PROBLEMS, Core, Key, Optimum, core_problem
 from quadsim.mpc.core.tables import with_constraints
 from quadsim.mpc.equilibrium import Trim
-from quadsim.mpc.fallback.structs import STATUSES, GuardStruct, TrimStruct
+from quadsim.mpc.fallback.structs import STATUSES
 from quadsim.mpc.heading import predict_in_heading_frame
 from quadsim.mpc.linear import Remembered
 from quadsim.mpc.model import hover_model
-from quadsim.mpc.nonlinear.model import SUBSTEPS
 from quadsim.mpc.ocp import Equilibrium, Query
 from quadsim.mpc.paper import rollout
 from quadsim.mpc.robust.settings import LONGEST_SPAN
@@ -42,62 +41,6 @@ from quadsim.vehicle import N_ROTORS
 INVALID: Final = STATUSES.index(INVALID_DATA)
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _SAME_TIME: Final = 1e-6  # [s]
-_INT, _REAL, _AT = ctypes.c_int, ctypes.c_double, ctypes.c_void_p
-
-
-def _arrays(**sizes: int) -> list[tuple[str, type]]:
-    return [(name, _REAL * size) for name, size in sizes.items()]
-
-
-class _Robust(ctypes.Structure):
-    _fields_ = [
-        *((name, _INT) for name in ("observes", "heading", "under_way")),
-        *((name, _REAL) for name in ("gravity", "least_lift", "upright", "period", "delay", "delayed_share")),
-        *((name, _REAL) for name in ("rest_of_period", "spun_period", "spun_delay", "spun_before", "largest_turn")),
-        *_arrays(effectiveness=16, allocation=16, gyration=3, slope_inverse=16, modes=16, gain=6, largest=6),
-        *_arrays(decay_before=4 * SUBSTEPS, decay_delay=4 * SUBSTEPS, decay_period=4 * SUBSTEPS),
-        *_arrays(plausible_state=12, plausible_reference=4),
-    ]
-
-
-class _Controller(ctypes.Structure):
-    _fields_ = [
-        *((name, _AT) for name in ("problem", "robust", "fallback", "C_r")),
-        *_arrays(hover=4),
-        ("follows_rates", _INT),
-        ("period", _REAL),
-    ]
-
-
-class _MPC(ctypes.Structure):
-    _fields_ = [
-        *(("controller", _AT), ("work", Work), ("wanted", _AT), ("kept", _AT), ("sent", _AT)),
-        *_arrays(state=16, rest=16, resting=4, before=4),
-        *(("headed", _INT), ("heading", _REAL), ("known", _INT)),
-        *_arrays(rotors=4, ahead=12, turning=4, estimate=6),
-        ("trim", TrimStruct),
-        *_arrays(effectiveness=16),
-        ("guard", GuardStruct),
-    ]
-
-
-@cache
-def _library() -> ctypes.CDLL:
-    library = core_library()
-    check_sizes(
-        quadsim_robust=_Robust,
-        quadsim_controller=_Controller,
-        quadsim_trim=TrimStruct,
-        quadsim_guard=GuardStruct,
-        quadsim_mpc=_MPC,
-    )
-    library.quadsim_mpc_reals.restype, library.quadsim_mpc_reals.argtypes = ctypes.c_long, [_AT]
-    library.quadsim_mpc_start.restype, library.quadsim_mpc_start.argtypes = None, [_AT] * 3
-    library.quadsim_mpc_reset.restype, library.quadsim_mpc_reset.argtypes = None, [_AT] * 2
-    library.quadsim_mpc_stand.restype, library.quadsim_mpc_stand.argtypes = None, [_AT] * 2
-    library.quadsim_mpc_learn.restype, library.quadsim_mpc_learn.argtypes = None, [_AT] * 2
-    library.quadsim_mpc_solve.argtypes = [_AT] * 4
-    return library
 
 
 class _Shared:
@@ -109,24 +52,20 @@ class _Shared:
         numbers, robust = controller_numbers(law), None
         self._C_r = np.ascontiguousarray(law.problem.objective.C_r)
         if law.settings is not None:
-            members = robust_numbers(law, self.problem.tables.modes)
-            robust = _Robust(**{name: _plain(value) for name, value in members.items()})
+            robust = struct("quadsim_robust")()
+            set_members(robust, **robust_numbers(law, self.problem.tables.modes))
         self.robust = robust
-        self.struct = _Controller(
+        self.struct = struct("quadsim_controller")(
             problem=ctypes.addressof(self.problem.struct),
             robust=None if robust is None else ctypes.addressof(robust),
             C_r=self._C_r.ctypes.data,
-            **{name: _plain(value) for name, value in numbers.items()},
         )
+        set_members(self.struct, **numbers)
 
 
 @lru_cache(PROBLEMS)
 def _shared(key: Key[Exportable]) -> _Shared:
     return _Shared(key.of)
-
-
-def _plain(value: float | Array) -> float | tuple[float, ...]:
-    return tuple(value.ravel().tolist()) if isinstance(value, np.ndarray) else value
 
 
 class CompiledPreparation:
@@ -146,15 +85,14 @@ class CompiledPreparation:
     yaw: Final = 0.0
 
     def __init__(self, law: Exportable) -> None:
-        self._library, shared = _library(), _shared(Key.to(law))
+        self._library, shared = core_library(), _shared(Key.to(law))
         self._shared, self._robust, self.problem = shared, shared.robust, with_constraints(law.problem)
         self.delay = 0.0 if law.settings is None else law.settings.delay
-        controller = ctypes.addressof(shared.struct)
         # The struct and its views point into this memory.
-        self._memory, self._mpc = np.zeros(self._library.quadsim_mpc_reals(controller)), _MPC()
+        self._memory = np.zeros(self._library.quadsim_mpc_reals(shared.struct))
+        self._mpc = struct("quadsim_mpc")()
         mpc, N, n = self._mpc, law.problem.horizon, law.problem.model.n
-        self._at = ctypes.addressof(mpc)
-        self._library.quadsim_mpc_start(self._at, controller, self._memory.ctypes.data)
+        self._library.quadsim_mpc_start(mpc, shared.struct, self._memory.ctypes.data)
         self.optimum = Optimum(self.problem, shared.problem, mpc.work)
         trim = mpc.trim
         parts = (mpc.resting, mpc.turning, mpc.rotors, mpc.ahead, mpc.estimate, trim.commands, trim.lift, trim.twist)
@@ -165,7 +103,7 @@ class CompiledPreparation:
         whole = 0 if self._robust is None else self._robust.under_way
         self._sent = _view(mpc.sent, whole * N_ROTORS).reshape(whole, N_ROTORS)
         self._state, self._path, self._acting = (np.zeros(shape) for shape in (N_STATES, (N, 4), N_ROTORS))
-        self._arguments = self._at, *(array.ctypes.data for array in (self._state, self._path, self._acting))
+        self._arguments = mpc, *(array.ctypes.data for array in (self._state, self._path, self._acting))
         self.found, self.started = INVALID, 0.0
         self.reset(shared.nominal.u_bar)
 
@@ -181,7 +119,7 @@ class CompiledPreparation:
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s]."""
         self._acting[:] = speeds
-        self._library.quadsim_mpc_reset(self._at, self._acting.ctypes.data)
+        self._library.quadsim_mpc_reset(self._mpc, self._acting.ctypes.data)
         self._called_at = self._measured = -math.inf
         self._made: Trim | None = None  # of the estimate now, if it has been asked for
 
@@ -199,7 +137,7 @@ class CompiledPreparation:
             disturbance = disturbance if memory.estimate is None else memory.estimate
         if disturbance is not None:
             estimate = np.array(disturbance, float)
-            self._library.quadsim_mpc_learn(self._at, estimate.ctypes.data)
+            self._library.quadsim_mpc_learn(self._mpc, estimate.ctypes.data)
             self._made = None
 
     @property
@@ -238,7 +176,7 @@ class CompiledPreparation:
     def stand(self, now: StepInputs, acting: Array) -> None:
         """See `quadsim.mpc.linear.Preparation`."""
         self._acting[:], self._called_at, self._made = acting, now.time, None
-        self._library.quadsim_mpc_stand(self._at, self._acting.ctypes.data)
+        self._library.quadsim_mpc_stand(self._mpc, self._acting.ctypes.data)
 
     def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query | None:
         """See `quadsim.mpc.linear.Preparation`."""
@@ -333,4 +271,4 @@ class CompiledGain:
 def _view(address: int, count: int) -> Array:
     if not count:
         return np.empty(0)
-    return np.ctypeslib.as_array((_REAL * count).from_address(address))
+    return np.ctypeslib.as_array((ctypes.c_double * count).from_address(address))

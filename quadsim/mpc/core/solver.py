@@ -7,13 +7,13 @@ import math
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from functools import cache, cached_property, lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, Final, Generic, NoReturn, TypeVar
 
 import numpy as np
 
 from quadsim.controller import CORE, GAIN, SOLVED, UNCONSTRAINED, Statistics
-from quadsim.core.library import check_sizes, load_library
+from quadsim.core.mirror import Struct, core_library, struct
 from quadsim.mpc.condensing import Condensed
 from quadsim.mpc.core.tables import members, tables
 from quadsim.mpc.ocp import Problem, Query
@@ -28,62 +28,11 @@ PROBLEMS: Final = 16
 """Number of problems whose tables are cached, most recently used first."""
 
 Made = TypeVar("Made")
-Filled = TypeVar("Filled", bound=ctypes.Structure)
+Filled = TypeVar("Filled", bound=Struct)
 
-_INT, _REAL, _AT = ctypes.c_int, ctypes.c_double, ctypes.c_void_p
-
-
-def _of(kind: type, names: str) -> list[tuple[str, type]]:
-    return [(name, kind) for name in names.split()]
-
-
-class _Axis(ctypes.Structure):
-    _fields_ = [
-        *_of(_INT, "states inputs first outputs targets before"),
-        *_of(_AT, "state target row B closed K inverse W W_end C responses"),
-    ]
-
-
-class _Row(ctypes.Structure):
-    _fields_ = [*_of(_INT, "axis output later first past soft"), *_of(_REAL, "l1 compliance")]
-
-
-class _Term(ctypes.Structure):
-    _fields_ = [*_of(_REAL, "coefficient"), *_of(_INT, "input lag")]
-
-
-class _Problem(ctypes.Structure):
-    _fields_ = [
-        *_of(_INT, "horizon states step_rows parts regulated room changes bounds_differ mixed"),
-        *_of(_AT, "axes rows terms T T_inverse lower upper scale tolerance"),
-    ]
-
-
-STRUCTS: Final = {"axes": _Axis, "rows": _Row, "terms": _Term}
-"""Members of a problem that are lists."""
-
-
-class Work(ctypes.Structure):
-    """A `quadsim_work`."""
-
-    _fields_ = [
-        *(*_of(_AT, "p"), *_of(_INT, "changes")),
-        *_of(_AT, "plan multiplier value shift last side start"),
-        *(*_of(_AT, "w dw u pull push"), *_of(_INT, "count spent solved passed_over")),
-        *(*_of(_REAL, "slack largest"), *_of(_AT, "row z goal forward pivot column sums factor")),
-    ]
-
-
-@cache
-def core_library() -> ctypes.CDLL:
-    """Return the library with its functions declared."""
-    library = load_library()
-    check_sizes(quadsim_axis=_Axis, quadsim_row=_Row, quadsim_term=_Term, quadsim_problem=_Problem, quadsim_work=Work)
-    library.quadsim_work_reals.restype, library.quadsim_work_reals.argtypes = ctypes.c_long, [_AT]
-    library.quadsim_work_start.argtypes = [_AT, _AT, _AT]
-    library.quadsim_work_reset.argtypes = [_AT]
-    library.quadsim_optimise.argtypes = [_AT] * 6
-    return library
+WorkStruct: Final = struct("quadsim_work")
+ENTRIES: Final = {"axes": struct("quadsim_axis"), "rows": struct("quadsim_row"), "terms": struct("quadsim_term")}
+"""Structs of the lists among the members of a problem, by their names."""
 
 
 class CoreProblem:
@@ -99,7 +48,7 @@ class CoreProblem:
         N, rows = problem.horizon, self.tables.rows
         at_most = N * (N_ROTORS + sum(math.isfinite(row.l1) for row in rows))
         room = min(N * len(rows), at_most) + 1
-        self.struct = self._filled(_Problem, members(self.tables, room=room, changes=MOST_CHANGES))
+        self.struct = self._filled(struct("quadsim_problem"), members(self.tables, room=room, changes=MOST_CHANGES))
 
     def _filled(self, kind: type[Filled], values: Mapping[str, Any]) -> Filled:
         """Return a struct, and keep the memory that it points to."""
@@ -107,7 +56,7 @@ class CoreProblem:
 
     def _member(self, name: str, value: Any) -> int | float:
         if isinstance(value, list):
-            kind = STRUCTS[name]
+            kind = ENTRIES[name]
             value = (kind * len(value))(*(self._filled(kind, entry) for entry in value))
         elif not isinstance(value, np.ndarray):
             return value
@@ -159,7 +108,7 @@ class Optimum:
     The work and its views point into memory that the caller keeps.
     """
 
-    def __init__(self, problem: Problem, shared: CoreProblem, work: Work) -> None:
+    def __init__(self, problem: Problem, shared: CoreProblem, work: Struct) -> None:
         self._problem, self._shared, self._work = problem, shared, work
         self._piqp: QPSolver | None = None
         rows = problem.rows
@@ -169,9 +118,9 @@ class Optimum:
             read_only(np.zeros((problem.horizon, count))) for count in (rows.soft.size, len(rows.D))
         )
         step_rows = shared.struct.step_rows
-        self._plan = self._view(work.plan, _REAL, N_ROTORS)
+        self._plan = self._view(work.plan, ctypes.c_double, N_ROTORS)
         self._multiplier, self._value, self._shift = (
-            self._view(at, _REAL, step_rows) for at in (work.multiplier, work.value, work.shift)
+            self._view(at, ctypes.c_double, step_rows) for at in (work.multiplier, work.value, work.shift)
         )
         self._side = self._view(work.last, ctypes.c_int8, step_rows)
 
@@ -240,17 +189,16 @@ class Core:
         self._modes = self._shared.tables.modes if problem.model.n > N_STATES else None
         p = self._shared.struct
         # The work struct and its views point into this memory.
-        self._memory = np.zeros(self._library.quadsim_work_reals(ctypes.addressof(p)))
-        self._work = Work()
-        self._at = ctypes.addressof(self._work)
-        self._library.quadsim_work_start(self._at, ctypes.addressof(p), self._memory.ctypes.data)
+        self._memory = np.zeros(self._library.quadsim_work_reals(p))
+        self._work = WorkStruct()
+        self._library.quadsim_work_start(self._work, p, self._memory.ctypes.data)
         self._optimum = Optimum(problem, self._shared, self._work)
         sizes = p.states, p.horizon * p.regulated, p.states, N_ROTORS, N_ROTORS
         self._query = np.zeros(sum(sizes))
         parts = np.split(self._query, np.cumsum(sizes[:-1]))
         self._state, desired, self._x_s, self._u_s, self._before = parts
         self._desired = desired.reshape(p.horizon, -1)
-        self._arguments = self._at, *(part.ctypes.data for part in parts)
+        self._arguments = self._work, *(part.ctypes.data for part in parts)
 
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
@@ -258,7 +206,7 @@ class Core:
 
     def reset(self) -> None:
         """See `quadsim.mpc.solvers.Solver.reset`."""
-        self._library.quadsim_work_reset(self._at)
+        self._library.quadsim_work_reset(self._work)
         self._optimum.reset()
 
     def solve(self, query: Query) -> Answer:

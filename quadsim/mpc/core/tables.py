@@ -22,6 +22,7 @@ from typing import Any, Final
 import numpy as np
 import scipy.linalg
 
+from quadsim.core.mirror import constant
 from quadsim.errors import ParameterError
 from quadsim.mpc.condensing import condensed_cost, states_rows
 from quadsim.mpc.constraints import Constraint, Rows
@@ -37,8 +38,8 @@ LARGEST_RESPONSES: Final = 2**20
 """Largest total of entries of all responses that the core takes: 8 MiB."""
 LEAST_QUADRATIC: Final = 1e-9
 """Share of l1 that replaces a zero quadratic penalty, for which a step length is undefined."""
-MOST_STATES: Final = 20
-"""Most states of an axis, including previous inputs where changes have a weight; as in quadsim_core.h."""
+MOST_STATES: Final = constant("QUADSIM_MOST_STATES")
+"""Most states of an axis, including previous inputs where changes have a weight."""
 MOST_STEP_ROWS: Final = 256
 """Most rows of a step, numbered in bytes."""
 NO_BOUND: Final = 1e30

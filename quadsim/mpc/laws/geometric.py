@@ -16,7 +16,7 @@ import numpy as np
 from annotated_types import Len, doc
 
 from quadsim.controller import ROTORS, TARGET_SIZES, Command, Phase, StepInputs
-from quadsim.core.library import set_arrays
+from quadsim.core.mirror import Struct, core_library, set_members, struct
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.motion import Motion
@@ -24,15 +24,6 @@ from quadsim.mpc.allocation import allocate, make_allocation
 from quadsim.mpc.answer import ActuatorBounds
 from quadsim.mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured
 from quadsim.mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
-from quadsim.mpc.baselines.compiled import (
-    AttitudeStruct,
-    DisturbanceStruct,
-    GeometricNumbersStruct,
-    GeometricStruct,
-    MotionStruct,
-    TargetStruct,
-    geometric_library,
-)
 from quadsim.mpc.baselines.law import FeedbackLaw, Tuned
 from quadsim.mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIEW_DEGREE, Target, differentiator
 from quadsim.mpc.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, require_lags, require_space
@@ -47,6 +38,11 @@ from quadsim.vehicle import Vehicle
 
 Commands: TypeAlias = Literal["rotors", "rates", "attitude"]
 
+GeometricNumbersStruct: Final = struct("quadsim_geometric_numbers")
+MotionStruct: Final = struct("quadsim_geometric_motion")
+TargetStruct: Final = struct("quadsim_geometric_target")
+DisturbanceStruct: Final = struct("quadsim_geometric_disturbance")
+GeometricStruct: Final = struct("quadsim_geometric")
 
 NO_LAG: Final = (0.0, 0.0, 0.0, 0.0)
 
@@ -169,29 +165,29 @@ class GeometricController(FeedbackLaw):
         self.k_R = gains.k_R * np.array([1.0, 1.0, YAW_SHARE**2])
         self.k_Omega = gains.k_Omega * np.array([1.0, 1.0, YAW_SHARE])
         self._allocation = make_allocation(vehicle)
-        self._library = geometric_library()
+        self._library = core_library()
         self.pointed = previews(settings, period)
         self.numbers = geometric_numbers(vehicle, period, settings, gains)
-        set_arrays(self.numbers, k_R=self.k_R, k_Omega=self.k_Omega)
+        set_members(self.numbers, k_R=self.k_R, k_Omega=self.k_Omega)
         self.numbers.preview, self.numbers.course = (array.ctypes.data for array in self.pointed.values())
-        self._law, self._motion, self._target = GeometricStruct(), MotionStruct(), TargetStruct()
-        self._at = ctypes.addressof(self._law)
-        self._here = ctypes.addressof(self._motion), ctypes.addressof(self._target)
+        self._law = GeometricStruct()
+        self._motion = MotionStruct()
+        self._target = TargetStruct()
         if self.observer is not None:
             self.observer.bind(self._law.ramp)
             self.numbers.ramp = ctypes.addressof(self.observer.numbers)
-        self._library.quadsim_geometric_start(self._at, ctypes.addressof(self.numbers), None)
+        self._library.quadsim_geometric_start(self._law, self.numbers, None)
         super().__init__(vehicle, period, settings, target_model(vehicle, period, lags) if self._targets else None)
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], or target."""
         super().reset(speeds)
-        self._library.quadsim_geometric_reset(self._at, self._before.ctypes.data)
+        self._library.quadsim_geometric_reset(self._law, self._before.ctypes.data)
 
     def adopt(self, previous: object) -> None:
         """Take over the integrals and the observer of the previous law."""
         if isinstance(previous, GeometricController):
-            set_arrays(self._law, **vars(previous.integrals))
+            set_members(self._law, **vars(previous.integrals))
             if self.observer is not None and previous.observer is not None:
                 self.observer.adopt(previous.observer)
 
@@ -212,7 +208,9 @@ class GeometricController(FeedbackLaw):
         self._aim(reference, now.motion)
         follows = flying and self.observer is not None and self.observer.follows(now.time)
         acting = np.ascontiguousarray(before, np.float64)
-        self._library.quadsim_geometric_solve(self._at, flying, follows, *self._here, acting.ctypes.data)
+        self._library.quadsim_geometric_solve(
+            self._law, flying, follows, self._motion, self._target, acting.ctypes.data
+        )
         if flying and self.observer is not None:
             self.observer.log(now)
         command = np.array(self._law.command[: TARGET_SIZES[self.commands]])
@@ -221,7 +219,7 @@ class GeometricController(FeedbackLaw):
         speeds = allocate(self._allocation, command, *self.bounds.reach(before))
         given, smallest = self._allocation.wrench(speeds), 1e-6 * self._allocation.scale.max()
         if flying and np.allclose(given, command, rtol=0.0, atol=smallest):
-            self._library.quadsim_geometric_integrate(self._at, *self._here)
+            self._library.quadsim_geometric_integrate(self._law, self._motion, self._target)
         return self._held_for_a_period(speeds)
 
     def _measure(self, state: Array, attitude: Array | None, rates: Array | None) -> None:
@@ -230,18 +228,17 @@ class GeometricController(FeedbackLaw):
             None if array is None else np.ascontiguousarray(array, np.float64) for array in (state, attitude, rates)
         ]
         addresses = (None if array is None else array.ctypes.data for array in arrays)
-        self._library.quadsim_geometric_measure(*addresses, self._here[0])
+        self._library.quadsim_geometric_measure(*addresses, self._motion)
 
     def _aim(self, reference: Array, motion: Motion | None) -> None:
         """Take the target of a preview (N, 4), with feed-forward that of a motion if the course has one."""
-        numbers = ctypes.addressof(self.numbers)
         if self._feedforward and motion is not None:
             samples = slice(self.motion_rows)
             rows = np.hstack([motion.position[samples], motion.attitude[samples]])
-            self._library.quadsim_geometric_course(numbers, *rows.shape, rows.ctypes.data, self._here[1])
+            self._library.quadsim_geometric_course(self.numbers, *rows.shape, rows.ctypes.data, self._target)
         else:
             preview = np.ascontiguousarray(reference, np.float64)
-            self._library.quadsim_geometric_preview(numbers, preview.ctypes.data, self._here[1])
+            self._library.quadsim_geometric_preview(self.numbers, preview.ctypes.data, self._target)
 
     def target(self, reference: Array, motion: Motion | None = None) -> Target:
         """Return the target of a preview (N, 4) of x, y, z [m], yaw [rad], or with feed-forward that of a given motion.
@@ -250,7 +247,7 @@ class GeometricController(FeedbackLaw):
         that they agree with the flown path.  Near the end of the course fewer samples give fewer derivatives.
         """
         self._aim(reference, motion)
-        path, yaw = np.array(self._target.path).reshape(-1, 3), list(self._target.yaw)
+        path, yaw = np.array(self._target.path), list(self._target.yaw)
         return Target(
             position=path[0],
             velocity=path[1],
@@ -305,8 +302,8 @@ class GeometricController(FeedbackLaw):
     def integrate(self, integrals: Integrals, motion: Measured, target: Target, desired: DesiredAttitude) -> Integrals:
         """Return the integrals of e_v + c_1 e_x and e_Omega + c_2 e_R one period later, saturated."""
         law, (measured, wanted) = self._copy(integrals), _structs(motion, target)
-        set_arrays(law.desired, **vars(desired))
-        self._library.quadsim_geometric_integrate(*map(ctypes.addressof, (law, measured, wanted)))
+        set_members(law.desired, **vars(desired))
+        self._library.quadsim_geometric_integrate(law, measured, wanted)
         return _integrals_of(law)
 
     def _evaluate(
@@ -320,32 +317,37 @@ class GeometricController(FeedbackLaw):
     ) -> tuple[Array, DesiredAttitude]:
         law, structs, result = self._copy(integrals), _structs(motion, target), np.empty(size)
         d = DisturbanceStruct()
-        set_arrays(d, **dict(zip(("force", "change", "torque"), disturbance, strict=True)))
-        law_in_c(*map(ctypes.addressof, (law, *structs, d)), result.ctypes.data)
-        attitude, rates, acceleration = (np.array(getattr(law.desired, name)) for name, _ in AttitudeStruct._fields_)
-        return result, DesiredAttitude(attitude=attitude.reshape(3, 3), rates=rates, acceleration=acceleration)
+        set_members(d, **dict(zip(("force", "change", "torque"), disturbance, strict=True)))
+        law_in_c(law, *structs, d, result.ctypes.data)
+        desired = law.desired
+        attitude = DesiredAttitude(
+            attitude=np.reshape(desired.attitude, (3, 3)),
+            rates=np.array(desired.rates),
+            acceleration=np.array(desired.acceleration),
+        )
+        return result, attitude
 
-    def _copy(self, integrals: Integrals) -> GeometricStruct:
+    def _copy(self, integrals: Integrals) -> Struct:
         """Return the law with other integrals."""
         law = GeometricStruct.from_buffer_copy(self._law)
-        set_arrays(law, **vars(integrals))
+        set_members(law, **vars(integrals))
         return law
 
 
-def _integrals_of(law: GeometricStruct) -> Integrals:
+def _integrals_of(law: Struct) -> Integrals:
     return Integrals(translation=np.array(law.translation), rotation=np.array(law.rotation))
 
 
-def _structs(motion: Measured, target: Target) -> tuple[MotionStruct, TargetStruct]:
+def _structs(motion: Measured, target: Target) -> tuple[Struct, Struct]:
     """Return both as C takes them."""
     measured, wanted = MotionStruct(), TargetStruct()
     measured.yaw = motion.yaw
-    set_arrays(measured, **{name: getattr(motion, name) for name in ("position", "velocity", "attitude", "rates")})
+    set_members(measured, **{name: getattr(motion, name) for name in ("position", "velocity", "attitude", "rates")})
     path = (target.position, target.velocity, target.acceleration, target.jerk, target.snap)
-    set_arrays(wanted, path=np.stack(path), yaw=(target.yaw, target.yaw_rate, target.yaw_acceleration))
+    set_members(wanted, path=np.stack(path), yaw=(target.yaw, target.yaw_rate, target.yaw_acceleration))
     if target.heading is not None:
         wanted.headed = 1
-        set_arrays(wanted, heading=target.heading)
+        set_members(wanted, heading=target.heading)
     return measured, wanted
 
 
@@ -358,9 +360,7 @@ def previews(settings: Geometric, period: float) -> dict[str, Array]:
     return {"preview": np.ascontiguousarray(preview), "course": np.concatenate(course)}
 
 
-def geometric_numbers(
-    vehicle: Vehicle, period: float, settings: Geometric, gains: GeometricGains
-) -> GeometricNumbersStruct:
+def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gains: GeometricGains) -> Struct:
     """Return the law's numbers for C but for `k_R`, `k_Omega`, and what they point to."""
     numbers, targets, bounds = GeometricNumbersStruct(), settings.commands != ROTORS, settings.actuators(vehicle)
     lags, half, weight = settings.inner_lag or NO_LAG, 0.5 * period, vehicle.mass * vehicle.gravity
@@ -374,7 +374,7 @@ def geometric_numbers(
     numbers.least_lift, numbers.slope = LEAST_THRUST_SHARE * weight, math.tan(math.radians(settings.tilt))
     numbers.ahead = half + (lags[0] if targets else 0.0)
     numbers.turning = float(vehicle.hover_speeds.sum())
-    set_arrays(
+    set_members(
         numbers,
         k_attitude=gains.k_attitude,
         lead=np.array(lags[1:]) + (half if settings.feedforward else 0.0),

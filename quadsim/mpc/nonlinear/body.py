@@ -4,63 +4,32 @@ from __future__ import annotations
 
 import ctypes
 import math
-from functools import cache
 from typing import Final
 
 import numpy as np
 
-from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, set_arrays, struct_members
+from quadsim.core.mirror import Struct, constant, core_library, set_members, struct
 from quadsim.mpc.nonlinear.rigidbody import N_BODY, Inputs, RigidBody
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 
-STATES_ROOM: Final = 21
-
-
-class ProblemStruct(ctypes.Structure):
-    """A `quadsim_nmpc_problem`."""
-
-    _fields_ = [
-        *struct_members(
-            INT, "horizon actuators targets speeds moments substeps difference shifts moves tilts turns places"
-        ),
-        *struct_members(INT, "rows bound_nodes faces slacks room changes iterations corrections"),
-        *struct_members(REAL, "tolerance step gravity largest effect:16 gyration:3 moment:6 inflow:6 damping:9 lead:4"),
-        *struct_members(AT, "left"),
-        *struct_members(REAL, "weight:21 effort:4 move"),
-        *struct_members(AT, "terminal"),
-        *struct_members(REAL, "lower:4 upper:4 tilt turn:3"),
-        *struct_members(AT, "terms first bounds slack linear quadratic"),
-    ]
-
-
-class WorldStruct(ctypes.Structure):
-    """A `quadsim_nmpc_world`."""
-
-    _fields_ = struct_members(REAL, "acceleration:3 angular:3 drag:3 square_drag:3 thrust_scale")
-
-
-@cache
-def _library() -> ctypes.CDLL:
-    library = load_library()
-    check_sizes(quadsim_nmpc_problem=ProblemStruct, quadsim_nmpc_world=WorldStruct)
-    library.quadsim_nmpc_advance.restype = library.quadsim_nmpc_slopes.restype = None
-    library.quadsim_nmpc_slopes.argtypes = [AT] * 7
-    library.quadsim_nmpc_advance.argtypes = [AT, AT, INT, AT, AT, AT]
-    return library
+STATES_ROOM: Final = constant("QUADSIM_NMPC_MOST")
+"""Most states, with the input before."""
+ProblemStruct: Final = struct("quadsim_nmpc_problem")
+WorldStruct: Final = struct("quadsim_nmpc_world")
 
 
 class World:
     """What a model knows of its surroundings, in the core's layout.
 
     Attributes:
-        address: of the struct.
+        struct: that layout.
         numbers: (13,) its view: acceleration, angular acceleration, drag, quadratic drag over the mass, thrust scale.
     """
 
-    def __init__(self, struct: WorldStruct) -> None:
-        self._struct, self.address = struct, ctypes.addressof(struct)
-        self.numbers = np.ctypeslib.as_array((REAL * 13).from_buffer(struct))
+    def __init__(self, struct: Struct) -> None:
+        self.struct = struct
+        self.numbers = np.ctypeslib.as_array((ctypes.c_double * 13).from_buffer(struct))
 
     @classmethod
     def of(cls, model: RigidBody) -> World:
@@ -76,7 +45,7 @@ class World:
         numbers[6:9], numbers[9:12], numbers[12] = model.drag / mass, model.quadratic_drag / mass, model.thrust_scale
 
 
-def body_numbers(model: RigidBody, p: ProblemStruct) -> Array:
+def body_numbers(model: RigidBody, p: Struct) -> Array:
     """Fill in the rigid body's numbers; return (2 substeps + 1, 4) what p.left points to, which the caller keeps."""
     p.actuators, p.targets, p.speeds = model.actuators, model.targets, model.inputs is Inputs.SPEED
     p.moments, p.substeps, p.step, p.gravity = model.moments, model.substeps, model.step, model.gravity
@@ -85,7 +54,7 @@ def body_numbers(model: RigidBody, p: ProblemStruct) -> Array:
     gyration = (0.0, 0.0, 0.0) if model.targets else ((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz)
     lag = np.array(model.lags)
     air = {"moment": model.moment, "inflow": model.inflow, "damping": model.damping}
-    set_arrays(p, effect=model.effect, gyration=gyration, lead=lag / model.step, **air)
+    set_members(p, effect=model.effect, gyration=gyration, lead=lag / model.step, **air)
     instants = np.arange(2 * model.substeps + 1)[:, None] * (0.5 * model.step / model.substeps)
     left = np.where(lag > 0.0, np.exp(-instants / np.where(lag > 0.0, lag, 1.0)), 0.0)
     p.left = left.ctypes.data
@@ -105,7 +74,7 @@ class Body:
     """
 
     def __init__(self, model: RigidBody) -> None:
-        self.struct, self._n, self._library = ProblemStruct(), model.n, _library()
+        self.struct, self._n, self._library = ProblemStruct(), model.n, core_library()
         self.left = body_numbers(model, self.struct)
         self.world = World.of(model)
 
@@ -118,8 +87,9 @@ class Body:
         x, u, end = np.ascontiguousarray(x), np.ascontiguousarray(u), np.empty(x.shape)
         assert x.shape == (*u.shape[:-1], self._n)
         assert u.shape[-1] == N_ROTORS
-        at = ctypes.addressof(self.struct), self.world.address, math.prod(x.shape[:-1])
-        self._library.quadsim_nmpc_advance(*at, x.ctypes.data, u.ctypes.data, end.ctypes.data)
+        count = math.prod(x.shape[:-1])
+        arrays = (array.ctypes.data for array in (x, u, end))
+        self._library.quadsim_nmpc_advance(self.struct, self.world.struct, count, *arrays)
         return end
 
     def linearise(self, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
@@ -138,8 +108,8 @@ class Body:
         slopes, end, frames = np.empty((M, N_BODY, width_of(n))), np.empty((M, n)), np.ascontiguousarray(frames)
         for i in range(M):
             arrays = (x[i], u[i], frames[i : i + 2], slopes[i], end[i])
-            at = ctypes.addressof(self.struct), self.world.address
-            self._library.quadsim_nmpc_slopes(*at, *(array.ctypes.data for array in arrays))
+            addresses = (array.ctypes.data for array in arrays)
+            self._library.quadsim_nmpc_slopes(self.struct, self.world.struct, *addresses)
         return *unpacked(slopes, n, 0, self.left[-1]), end
 
 

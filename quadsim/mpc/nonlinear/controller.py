@@ -38,7 +38,7 @@ from quadsim.controller import (
     StepInputs,
     stopped,
 )
-from quadsim.core.library import set_arrays
+from quadsim.core.mirror import Struct, set_members
 from quadsim.errors import ParameterError
 from quadsim.mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, resized
 from quadsim.mpc.bounded import resolved_lag
@@ -211,7 +211,7 @@ class NonlinearMPC:
             return speeds / self._model.scale
         return self._model.shares(self._vehicle.mean_coefficient * np.square(speeds))
 
-    def _law_numbers(self) -> NumbersStruct:
+    def _law_numbers(self) -> Struct:
         vehicle, model, observer = self._vehicle, self._model, self._observer
         numbers = NumbersStruct(
             stride=self._stride,
@@ -224,7 +224,7 @@ class NonlinearMPC:
             converged=CONVERGED,
         )
         lifts = vehicle.mass * vehicle.gravity * vehicle.thrust_shares
-        set_arrays(
+        set_members(
             numbers,
             scale=model.scale,
             level=self._level,
@@ -234,7 +234,7 @@ class NonlinearMPC:
             square_drag=model.quadratic_drag / vehicle.mass,
         )
         if observer is not None:
-            set_arrays(numbers, gain=observer.gain, largest=observer.largest)
+            set_members(numbers, gain=observer.gain, largest=observer.largest)
         return numbers
 
     def _speeds(self, shares: Array) -> Array:

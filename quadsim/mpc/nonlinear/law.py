@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import ctypes
 import math
-from functools import cache
 from typing import Final, NoReturn
 
 import numpy as np
 
 from quadsim.controller import StepInputs
-from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, struct_members
+from quadsim.core.mirror import Struct, core_library, struct
 from quadsim.motion import Motion
-from quadsim.mpc.disturbance import RampObserver, RampState
-from quadsim.mpc.fallback.structs import GuardStruct, TrimStruct
-from quadsim.mpc.nonlinear.body import STATES_ROOM, ProblemStruct, World, WorldStruct
+from quadsim.mpc.disturbance import RampObserver
+from quadsim.mpc.nonlinear.body import World
 from quadsim.mpc.nonlinear.rigidbody import N_BODY
-from quadsim.mpc.nonlinear.sqp import SQP, SQPStatus, WorkStruct
+from quadsim.mpc.nonlinear.sqp import SQP, SQPStatus
 from quadsim.state import N_STATES, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -28,52 +26,8 @@ WIDTH_OF_MOTION: Final = N_BODY + N_ROTORS
 """Numbers in a row of a motion: position, quaternion, velocity, body rates, thrusts."""
 
 
-class NumbersStruct(ctypes.Structure):
-    """A `quadsim_nonlinear_numbers`."""
-
-    _fields_ = [
-        *struct_members(AT, "problem period unlagged fallback ramp"),
-        *struct_members(INT, "stride motion observes"),
-        *struct_members(REAL, "control_period mass coefficient left scale:4 level:4 lifts:4 inverse:16"),
-        *struct_members(REAL, "drag:3 square_drag:3 gain:6 largest:6 least_lift converged"),
-    ]
-
-
-class _Law(ctypes.Structure):
-    _fields_ = [
-        *struct_members(AT, "numbers"),
-        ("work", WorkStruct),
-        ("world", WorldStruct),
-        ("guard", GuardStruct),
-        ("trim", TrimStruct),
-        *struct_members(AT, "states thrusts plan kept"),
-        *struct_members(REAL, f"measured:{STATES_ROOM} before:4 rotors:4 rotors_before:4"),
-        *struct_members(INT, "called turned"),
-        *struct_members(REAL, "quaternion:4 side"),
-        *struct_members(INT, "headed"),
-        *struct_members(REAL, "heading"),
-        *struct_members(INT, "learns"),
-        *struct_members(REAL, f"last:{STATES_ROOM} estimate:6"),
-        ("ramp", RampState),
-        *struct_members(REAL, f"ahead:{N_BODY + 1}"),
-        ("then", WorldStruct),
-    ]
-
-
-@cache
-def _library() -> ctypes.CDLL:
-    library = load_library()
-    check_sizes(quadsim_nonlinear_numbers=NumbersStruct, quadsim_nonlinear=_Law)
-    for name in ("reals", "ints"):
-        function = getattr(library, f"quadsim_nonlinear_{name}")
-        function.restype, function.argtypes = ctypes.c_long, [AT]
-    library.quadsim_nonlinear_start.restype, library.quadsim_nonlinear_start.argtypes = None, [AT] * 4
-    library.quadsim_nonlinear_reset.restype, library.quadsim_nonlinear_reset.argtypes = None, [AT] * 2
-    library.quadsim_nonlinear_learn.restype, library.quadsim_nonlinear_learn.argtypes = None, [AT] * 2
-    library.quadsim_nonlinear_stand.restype, library.quadsim_nonlinear_stand.argtypes = None, [AT, INT, AT]
-    library.quadsim_nonlinear_begin.argtypes = [AT, INT, INT, INT, *[AT] * 5]
-    library.quadsim_nonlinear_end.argtypes = [AT, INT]
-    return library
+NumbersStruct: Final = struct("quadsim_nonlinear_numbers")
+_LawStruct: Final = struct("quadsim_nonlinear")
 
 
 class NonlinearLaw:
@@ -93,21 +47,20 @@ class NonlinearLaw:
 
     def __init__(
         self,
-        numbers: NumbersStruct,
+        numbers: Struct,
         sqp: SQP,
-        period: ProblemStruct,
-        unlagged: ProblemStruct,
+        period: Struct,
+        unlagged: Struct,
         ramp: RampObserver | None,
     ) -> None:
-        self._library, self.numbers, self.ramp = _library(), numbers, ramp
+        self._library, self.numbers, self.ramp = core_library(), numbers, ramp
         self._problems = sqp.struct, period, unlagged  # whose addresses the numbers have
         numbers.problem, numbers.period, numbers.unlagged = map(ctypes.addressof, self._problems)
         numbers.ramp = None if ramp is None else ctypes.addressof(ramp.numbers)
-        at, (reals, ints) = ctypes.addressof(numbers), memory_of(numbers, sqp.struct)
+        reals, ints = memory_of(numbers, sqp.struct)
         self._memory = np.zeros(reals), np.zeros(ints, np.intc)
-        self.struct = law = _Law()
-        self._at = ctypes.addressof(law)
-        self._library.quadsim_nonlinear_start(self._at, at, *(part.ctypes.data for part in self._memory))
+        self.struct = law = _LawStruct()
+        self._library.quadsim_nonlinear_start(law, numbers, *(part.ctypes.data for part in self._memory))
         if ramp is not None:
             ramp.bind(law.ramp)
         N, n, self.horizon = sqp.horizon, N_BODY + sqp.struct.actuators, sqp.horizon * numbers.stride
@@ -130,17 +83,17 @@ class NonlinearLaw:
     def reset(self, command: Array) -> None:
         """Restart after a command (4,), which acts."""
         self._acting[:] = command
-        self._library.quadsim_nonlinear_reset(self._at, self._command)
+        self._library.quadsim_nonlinear_reset(self.struct, self._command)
 
     def learn(self, estimate: Array) -> None:
         """Start from an estimate (6,) of the disturbance; without an observer nothing changes."""
         estimate = np.array(estimate, float)
-        self._library.quadsim_nonlinear_learn(self._at, estimate.ctypes.data)
+        self._library.quadsim_nonlinear_learn(self.struct, estimate.ctypes.data)
 
     def stand(self, periods: int, acting: Array) -> None:
         """Pass a period on the ground, so many periods after the last, with a command (4,) in force."""
         self._acting[:] = acting
-        self._library.quadsim_nonlinear_stand(self._at, periods, self._command)
+        self._library.quadsim_nonlinear_stand(self.struct, periods, self._command)
 
     def begin(self, periods: int, flying: bool, now: StepInputs, state: Array, reference: Array, acting: Array) -> bool:
         """Make the query of a period from its inputs, so many periods after the last; False if they are implausible."""
@@ -151,7 +104,7 @@ class NonlinearLaw:
             self._preview[:] = reference
         else:
             put_motion(now.motion, self._motion)
-        asked = (self._at, periods, flying, now.motion is not None, *self._given)
+        asked = (self.struct, periods, flying, now.motion is not None, *self._given)
         return bool(
             self._library.quadsim_nonlinear_begin(*asked, self._references[now.motion is not None], self._command)
         )
@@ -169,7 +122,7 @@ class NonlinearLaw:
 
     def end(self, answer: SQPStatus) -> int:
         """Return the period's status, of `quadsim.mpc.fallback.structs.STATUSES`, and put its commands into `plan`."""
-        return int(self._library.quadsim_nonlinear_end(self._at, answer))
+        return int(self._library.quadsim_nonlinear_end(self.struct, answer))
 
     def adopt(self, other: NonlinearLaw, rotors: tuple[Array, Array] | None) -> None:
         """Take over what another law knows; of actuators only where both command the same.
@@ -207,12 +160,11 @@ def reference_rows(now: StepInputs, reference: Array, rows: int) -> Array:
     return samples
 
 
-def memory_of(numbers: NumbersStruct, problem: ProblemStruct) -> tuple[int, int]:
+def memory_of(numbers: Struct, problem: Struct) -> tuple[int, int]:
     """Return the reals and integers of memory that a law with another program needs."""
-    library, other = _library(), NumbersStruct.from_buffer_copy(numbers)
+    library, other = core_library(), NumbersStruct.from_buffer_copy(numbers)
     other.problem = ctypes.addressof(problem)
-    at = ctypes.addressof(other)
-    return library.quadsim_nonlinear_reals(at), library.quadsim_nonlinear_ints(at)
+    return library.quadsim_nonlinear_reals(other), library.quadsim_nonlinear_ints(other)
 
 
 def put_motion(motion: Motion, rows: Array) -> None:
@@ -228,4 +180,4 @@ def put_motion(motion: Motion, rows: Array) -> None:
 
 
 def _view(address: int, *shape: int) -> Array:
-    return np.ctypeslib.as_array((REAL * math.prod(shape)).from_address(address)).reshape(shape)
+    return np.ctypeslib.as_array((ctypes.c_double * math.prod(shape)).from_address(address)).reshape(shape)

@@ -7,12 +7,11 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from enum import IntEnum
-from functools import cache
 from typing import Any, Final, NamedTuple, NoReturn
 
 import numpy as np
 
-from quadsim.core.library import AT, INT, REAL, check_sizes, load_library, set_arrays, struct_members
+from quadsim.core.mirror import Struct, constant, core_library, set_members, struct
 from quadsim.errors import ParameterError
 from quadsim.mpc.constraints import Constraint
 from quadsim.mpc.nonlinear.body import STATES_ROOM, ProblemStruct, World, body_numbers, unpacked, width_of
@@ -28,7 +27,7 @@ _CURVATURE: Final = 1e-5
 """Curvature of a price without one, about the optimum that the core iterates for, per l1."""
 _OWN_SLACKS: Final = {"tilt": 0, "body_rates": 1, "space": 2}
 """Slacks of a node by the constraints that have them; those of all others follow."""
-_TILT_SIDES: Final = 12
+_TILT_SIDES: Final = constant("QUADSIM_NMPC_SIDES")
 OWN_NAMES: Final = ("inputs", "tilt", "body_rates")
 """Constraints whose rows the core has by themselves."""
 
@@ -45,37 +44,8 @@ class SQPStatus(IntEnum):
     NOT_FINITE = 6
 
 
-class _Term(ctypes.Structure):
-    _fields_ = [*struct_members(REAL, "coefficient"), *struct_members(INT, "entry lag")]
-
-
-class WorkStruct(ctypes.Structure):
-    """A `quadsim_nmpc_work`."""
-
-    _fields_ = [
-        *struct_members(AT, "p"),
-        *struct_members(INT, "planned shifted doubtful iterations count changes rounds inner patience allowed ends"),
-        *struct_members(REAL, "defect moved violation share largest least measured:21 start:21 before:4"),
-        *struct_members(AT, "x u frame goal aim face beyond map offset end axis known gain inverse feed more s v"),
-        *struct_members(AT, "value own response factor multiplier r d price rate origin x_before u_before last"),
-        *struct_members(AT, "row slot free held"),
-    ]
-
-
-@cache
-def _library() -> ctypes.CDLL:
-    library = load_library()
-    check_sizes(quadsim_nmpc_term=_Term, quadsim_nmpc_problem=ProblemStruct, quadsim_nmpc_work=WorkStruct)
-    for name in ("reals", "ints"):
-        function = getattr(library, f"quadsim_nmpc_{name}")
-        function.restype, function.argtypes = ctypes.c_long, [AT]
-    library.quadsim_nmpc_start.restype, library.quadsim_nmpc_start.argtypes = None, [AT] * 4
-    library.quadsim_nmpc_reset.restype, library.quadsim_nmpc_reset.argtypes = None, [AT]
-    library.quadsim_nmpc_step.argtypes = library.quadsim_nmpc_begin.argtypes = [AT] * 6
-    library.quadsim_nmpc_linearise.restype, library.quadsim_nmpc_linearise.argtypes = None, [AT] * 2
-    library.quadsim_nmpc_solve.argtypes = [AT]
-    library.quadsim_nmpc_keep.argtypes = [AT] * 3
-    return library
+_TermStruct: Final = struct("quadsim_nmpc_term")
+_WorkStruct: Final = struct("quadsim_nmpc_work")
 
 
 class _StatedRow(NamedTuple):
@@ -126,7 +96,7 @@ class SQP:
         faces: int = 0,
         price: tuple[float, float] | None = None,
     ) -> None:
-        self._library, self._n, self.horizon = _library(), model.n, problem.horizon
+        self._library, self._n, self.horizon = core_library(), model.n, problem.horizon
         self.clock: Callable[[], float] = time.perf_counter
         self._time_limit, self._deadline = time_limit, math.inf
         self.pointed: dict[str, Array] = {}
@@ -170,17 +140,17 @@ class SQP:
         terminal[: model.n, : model.n] = end[: model.n, : model.n]
         if moves:
             weights[model.n : size] = p.move
-        set_arrays(p, weight=weights, effort=np.diag(problem.objective.Q_u), lower=inputs[0], upper=inputs[1])
+        set_members(p, weight=weights, effort=np.diag(problem.objective.Q_u), lower=inputs[0], upper=inputs[1])
         if tilt is not None:
             p.tilt = float(tilt.upper[0])
         if rates is not None:
-            set_arrays(p, turn=np.minimum(rates.upper, _HARD))
+            set_members(p, turn=np.minimum(rates.upper, _HARD))
         terms = [term for row in rows for term in row.terms]
         first = np.cumsum([0, *(len(row.terms) for row in rows)])
         linear, quadratic = np.array(prices).T
         self._prices = linear, np.where(quadratic > 0.0, quadratic, _CURVATURE * linear)
         self.pointed["left"], p.terminal = body_numbers(model, p), self._array("terminal", terminal)
-        self.terms = (_Term * max(len(terms), 1))(*(_Term(*term) for term in terms))
+        self.terms = (_TermStruct * max(len(terms), 1))(*(_TermStruct(*term) for term in terms))
         p.terms, p.bounds = ctypes.addressof(self.terms), self._array("bounds", bounds)
         p.first = self._array("first", first, np.intc)
         p.slack = self._array("slack", [row.slack for row in rows], np.intc)
@@ -194,18 +164,16 @@ class SQP:
         self._make_work()
 
     def _make_work(self) -> None:
-        p, library, N, work = self.struct, self._library, self.horizon, WorkStruct()
-        at = ctypes.addressof(p)
-        self._memory = np.zeros(library.quadsim_nmpc_reals(at)), np.zeros(library.quadsim_nmpc_ints(at), np.intc)
-        library.quadsim_nmpc_start(ctypes.addressof(work), at, *(part.ctypes.data for part in self._memory))
+        p, library, N, work = self.struct, self._library, self.horizon, _WorkStruct()
+        self._memory = np.zeros(library.quadsim_nmpc_reals(p)), np.zeros(library.quadsim_nmpc_ints(p), np.intc)
+        library.quadsim_nmpc_start(work, p, *(part.ctypes.data for part in self._memory))
         arrays = (np.zeros(self._n), np.zeros(N_ROTORS), np.zeros((N + 1, N_BODY)), np.zeros((N, N_ROTORS)))
         self.bind(work, self._world, arrays)
 
-    def bind(self, work: WorkStruct, world: World, arrays: tuple[Array, Array, Array, Array]) -> None:
+    def bind(self, work: Struct, world: World, arrays: tuple[Array, Array, Array, Array]) -> None:
         """Use another work of the same problem, another world and other arrays for the arguments of `step`."""
         p, N = self.struct, self.horizon
         self._work, self._world, self._asked, self._status = work, world, arrays, ctypes.c_int()
-        self._at = ctypes.addressof(work)
         self._size = self._n + N_ROTORS * bool(p.moves)
         self._x, self._u = self._view("x", N + 1, self._size), self._view("u", N, N_ROTORS)
         self._s, self._v = self._view("s", N + 1, self._size), self._view("v", N, N_ROTORS)
@@ -214,10 +182,11 @@ class SQP:
         self._origin = self._view("origin", N, p.slacks)
         self._price, self._own = self._view("price", N, p.slacks), self._view("own", N, N_ROTORS)
         self._multiplier = self._view("multiplier", p.room)
-        self._row = self._view("row", p.room, kind=INT)
-        self._free, self._held = self._view("free", N, p.slacks, kind=INT), self._view("held", N, N_ROTORS, kind=INT)
+        self._row = self._view("row", p.room, kind=ctypes.c_int)
+        self._free = self._view("free", N, p.slacks, kind=ctypes.c_int)
+        self._held = self._view("held", N, N_ROTORS, kind=ctypes.c_int)
         self._measured, self._before = arrays[:2]
-        self._arguments = self._at, self._world.address, *(array.ctypes.data for array in arrays)
+        self._arguments = work, world.struct, *(array.ctypes.data for array in arrays)
 
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
@@ -227,7 +196,7 @@ class SQP:
         array = self.pointed[name] = np.ascontiguousarray(values, kind)
         return array.ctypes.data
 
-    def _view(self, name: str, *shape: int, kind: Any = REAL) -> Array:
+    def _view(self, name: str, *shape: int, kind: Any = ctypes.c_double) -> Array:
         count = math.prod(shape)
         if not count:
             return np.zeros(shape)
@@ -239,7 +208,7 @@ class SQP:
 
     def reset(self) -> None:
         """Forget the plan and the active set."""
-        self._library.quadsim_nmpc_reset(self._at)
+        self._library.quadsim_nmpc_reset(self._work)
 
     @property
     def plan(self) -> tuple[Array, Array] | None:
@@ -288,17 +257,17 @@ class SQP:
 
     def linearise(self) -> None:
         """Make the program of the stored plan."""
-        self._library.quadsim_nmpc_linearise(self._at, self._world.address)
+        self._library.quadsim_nmpc_linearise(self._work, self._world.struct)
 
     def solve(self) -> SQPStatus:
         """Return the status of the program's optimum."""
-        return SQPStatus(self._library.quadsim_nmpc_solve(self._at))
+        return SQPStatus(self._library.quadsim_nmpc_solve(self._work))
 
     def keep(self, status: SQPStatus) -> tuple[SQPStatus, bool]:
         """Keep the optimum as the plan; return the plan's status, and whether another step should follow."""
         self._status.value = status
         self._work.ends = self._time_limit is not None and self.clock() >= self._deadline
-        on = self._library.quadsim_nmpc_keep(self._at, self._world.address, ctypes.addressof(self._status))
+        on = self._library.quadsim_nmpc_keep(self._work, self._world.struct, ctypes.byref(self._status))
         return SQPStatus(self._status.value), bool(on)
 
     @property

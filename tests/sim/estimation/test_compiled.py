@@ -11,7 +11,8 @@ import pytest
 from numpy_filter import Estimate, difference, drive, inflate, lifts, motion_model, predict_estimate, stand, update
 from scipy.spatial.transform import Rotation
 
-from quadsim.core.structs import SAMPLE, TrackStruct, fill, plant_library
+from quadsim.core.mirror import core_library, fill
+from quadsim.core.structs import SAMPLE, SAMPLES, TrackStruct
 from quadsim.sim.estimator import ErrorStateFilter, EstimatorSettings
 from quadsim.sim.sensing import KINDS, Sensor, SensorName
 from quadsim.vehicle import Vehicle
@@ -46,8 +47,8 @@ def track_of(estimate: Estimate) -> TrackStruct:
 def run(
     filter_: ErrorStateFilter, track: TrackStruct, samples: np.ndarray, commands: np.ndarray, grounded: np.ndarray
 ) -> None:
-    plant_library().quadsim_filter_run(
-        *(ctypes.byref(filter_.struct), ctypes.byref(track), samples.ctypes.data, len(samples)),
+    core_library().quadsim_filter_run(
+        *(filter_.struct, ctypes.byref(track), samples.ctypes.data_as(SAMPLES), len(samples)),
         *(commands.ctypes.data, grounded.ctypes.data, 0, len(commands)),
     )
 
