@@ -183,7 +183,7 @@ class Flight(Result):
         `sentence` and `advice` are for users; `docs/audit.md` explains the other entries.
         """
         explanation = self._explanation
-        if explanation is None or self.try_remedies is None:
+        if explanation is None or self.recorded is not None or self.try_remedies is None:
             return explanation
         return self.try_remedies(explanation, self)
 

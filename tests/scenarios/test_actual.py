@@ -124,7 +124,7 @@ def test_both_vehicles_are_recorded_and_shown(tmp_path: Path) -> None:
     Rollout(scenario).fly().save(directory, **NO_PRODUCTS)
     run, flight = read_flight(directory), quadsim.read(directory)
     assert (run.summary["vehicle"]["mass"], run.summary["actual"]["mass"]) == (4.0, 4.4)
-    assert (flight.vehicle.mass, flight.actual.mass, run.vehicle.arm_length) == (4.0, 4.4, 0.35)
+    assert (flight.vehicle.mass, flight.actual.mass, run.actual.arm_length) == (4.0, 4.4, 0.35)
     assert reaudit(directory).satisfied == flight.satisfied
     cells = {row.label: row.cells[0].text for row in comparison_rows([run])}
     assert cells["vehicle"] == "lopes2011, modelled with mass 4.0 for 4.4, arm_length 0.3 for 0.35"
