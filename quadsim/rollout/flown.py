@@ -453,7 +453,7 @@ class Flight(Result):
         """See `Result.outputs`."""
         from quadsim.console import console
 
-        if self.directory is None:
+        if self.directory is None or self.checked is not None:
             return
         yield console.written_to(self.directory)
         products = self.numbers.get("products", {})

@@ -109,6 +109,8 @@ def test_a_check_of_a_run_is_its_flight_with_the_new_audit(tmp_path: Path) -> No
     assert checked.checked.again is not None
     assert [finding.limit for finding in checked.checked.again] == [*checked.limits]
     assert checked.to_json()["reaudit"]["notes"] == [*checked.notes]
+    last = "audited again from the tables, 200 rows per second: as recorded"
+    assert checked.text().splitlines()[-1] == last, "a check writes nothing"
     assert quadsim.read(tmp_path / "run").notes == ()
     unaudited = {**SHORT, "constraints": [], "controller": {"type": "pid"}}
     flown = run("hover", tmp_path / "unaudited", unaudited)
