@@ -54,10 +54,14 @@ IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
 """Distributions whose import name is not their own."""
 HANDING_OUT = ("quadsim", "quadsim.mpc", "quadsim.gym")
 """Modules with a table of public names, each imported on first use; `quadsim` also starts the command."""
-MOST_DEFINED_TWICE = 20
-"""Public names that several modules define: they may only get fewer."""
+DEFINED_TWICE = {
+    *("Draws", "Flags", "Guard", "LARGEST_RATES", "MOST_ROWS", "NUMBER", "Overlay", "Rows", "Solving", "Steps"),
+    *("TARGETS", "UPRIGHT", "WIDTH", "YawTurns", "drawn_flights", "export", "fly", "load_vehicle", "main"),
+    "thrust_axis",
+}
+"""Public names that two modules define, for two things or as a function and its command; no name joins them."""
 MOST_FORMULAS_TWICE = 2
-"""Formulas that several C files of the library have: they may only get fewer."""
+"""Formulas that two C files have: angles of a quaternion, in the plant and in a law that is exported by itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,7 +317,8 @@ def test_few_public_names_are_defined_twice() -> None:
         for name in public_names(path.read_text()):
             places.setdefault(name, []).append(module)
     twice = {name: sorted(of) for name, of in sorted(places.items()) if len(of) > 1}
-    assert len(twice) <= MOST_DEFINED_TWICE, twice
+    assert {name: of for name, of in twice.items() if name not in DEFINED_TWICE} == {}
+    assert {*twice} == DEFINED_TWICE, "no longer defined twice"
 
 
 def formulas(source: str) -> Iterator[tuple[str, ...]]:

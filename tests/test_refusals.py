@@ -388,7 +388,7 @@ MISTAKES = {
     ".".join(40_000 * "a") + "=1": NESTED,
     "controller={" + ".".join(40_000 * "a") + "=1}": NESTED,
     "constraints=[" + ",".join(["{}"] * 1001) + "]": "constraints must be a list of 1000 or fewer entries; got [{}@",
-    "events.2.at=3": "events must be a list of 20000 or fewer entries; got {'2': {'at': 3}}",
+    "events.2.at=3": "--set must be a path to a field; events has none; got 'events.2.at=3'",
     "base=hover": "--set must be of a field other than base, which only a file can have; got 'base=hover'",
 }
 

@@ -9,13 +9,11 @@ from pathlib import Path
 
 import pytest
 import rooms as taking
-from test_architecture import PACKAGES, Import, imports_of, modules
+from test_architecture import Import, imports_of, modules
 
 import quadsim
 from quadsim.features.entries import FEATURES, commands_of
 
-MOST_USED = 296
-"""Names of the core that features import, each counted once; they may only get fewer."""
 LISTS = ("quadsim", "quadsim.gym", "quadsim.features.entries")
 """Where a feature is named: what users import, and the list of the features."""
 
@@ -52,19 +50,6 @@ def test_the_core_names_no_feature_and_no_feature_names_another(imports: list[Im
         and item.importer not in LISTS
     ]
     assert wrong == []
-
-
-def test_features_use_few_names_of_the_core() -> None:
-    used = {
-        (node.module, name.name)
-        for module, path in modules().items()
-        if (feature := feature_of(module)) is not None
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(PACKAGES)
-        if feature_of(str(node.module)) != feature
-        for name in node.names
-    }
-    assert 0 < len(used) <= MOST_USED, sorted(used)
 
 
 TESTS = Path(taking.__file__).resolve().parent

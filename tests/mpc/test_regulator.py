@@ -66,7 +66,12 @@ def test_states_that_nothing_weighted_shows_are_named(weights: str, adrift: str)
 
 
 def test_a_weight_that_rounding_swallows_is_refused() -> None:
-    assert refusals(weighted("{x=1.0, y=1.0, z=1.0, yaw=1e-20}")) == {
+    """Files state no weight below 1e-12; a problem of one's own may."""
+    problem = weighted("{x=1.0, y=1.0, z=1.0, yaw=1.0}")
+    weights = problem.objective.Q_y.copy()
+    shows_yaw = problem.objective.C_r[:, STATE_NAMES.index("yaw")] != 0.0
+    weights[np.ix_(shows_yaw, shows_yaw)] = 1e-20
+    assert refusals(replace(problem, objective=replace(problem.objective, Q_y=weights))) == {
         "terminal: left out, or weights on all of x, y, z and yaw: with these weights nothing brings yaw, yaw_rate to "
         "rest",
         "output_weights: such that every unweighted state comes to rest: weigh x, y, z and yaw; with these weights "

@@ -22,7 +22,7 @@ _ADVICE: Final = (
 _WHOLE: Final = 32767.0  # 1 in a component of the quaternion
 _G: Final = 9.80665  # [m/s^2]
 _POLES: Final = 14  # of a motor, by default
-_BITS_OF_ONE: Final = 0x3F800000  # of a float
+_BITS_OF_ONE: Final = int.from_bytes(struct.pack(">f", 1.0))  # a header states a float by its bits
 _LARGEST_SCALE: Final = 1e3  # of a gyro's unit [deg/s]
 
 
