@@ -26,9 +26,8 @@ def measure(name: str, quick: bool, workers: int | None, report: Progress) -> li
     width, height, seconds = (320, 180, 0.5) if quick else (1280, 720, 4.0)
     reports: list[tuple[int, int, float]] = []  # frames done, of how many, after how long [s]
     with tempfile.TemporaryDirectory() as scratch:
-        directory = Path(scratch) / "run"
         rollout = Rollout(load(name).replace({"duration": seconds, "constraints": []}))
-        rollout.fly(report).save(directory, video=False, recording=False, figures=False)
+        flight = rollout.fly(report).as_stored()
         watch = Stopwatch()
 
         def reached(done: int, total: int) -> None:
@@ -36,8 +35,8 @@ def measure(name: str, quick: bool, workers: int | None, report: Progress) -> li
             report("film", done, total)
 
         render_video(
-            directory,
-            directory / "film.mp4",
+            flight,
+            Path(scratch) / "film.mp4",
             workers=workers,
             width=width,
             height=height,

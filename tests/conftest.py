@@ -18,10 +18,9 @@ from support import NO_PRODUCTS, draw_nothing, fly_here
 
 from quadsim.console.progress import Progress, silent
 from quadsim.features.entries import FEATURES
-from quadsim.flight import rundir
-from quadsim.flight.rundir import Run
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
+from quadsim.rollout.stored import read_flight
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import scenario_names
 from quadsim.scenarios.loading import load_scenario
@@ -126,15 +125,15 @@ def vehicle() -> Vehicle:
 
 
 @pytest.fixture(scope="session")
-def short_run(fly_once: Fly, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def short_run(fly_once: Fly, tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """Six seconds of the constrained flight in a run directory with its summary, scenario and Parquet files."""
     directory = tmp_path_factory.mktemp("short") / "paper-constrained"
     fly_once("paper-constrained", "duration=6.0").save(directory, **NO_PRODUCTS)
-    return rundir.load_run(directory)
+    return read_flight(directory)
 
 
 @pytest.fixture(scope="session")
-def short_run_directory(short_run: Run) -> Path:
+def short_run_directory(short_run: Flight) -> Path:
     return short_run.directory
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -19,6 +20,7 @@ from scipy.linalg import block_diag
 
 from quadsim.controller import Controller
 from quadsim.errors import described
+from quadsim.flight.audit import Limit, audit
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.mpc.constraints import Bounds, Constraint, Penalty
 from quadsim.mpc.laws.constrained import Constrained
@@ -72,6 +74,21 @@ def fly_here(patch: pytest.MonkeyPatch) -> None:
 def draw_nothing(patch: pytest.MonkeyPatch) -> None:
     """Leave the files of figures empty, for tests of all else."""
     patch.setattr("quadsim.report.to_matplotlib.to_png", lambda *_, **__: b"")
+
+
+def renamed(flight: Flight, name: str) -> Flight:
+    """A flight as if its scenario had another name."""
+    return replace(flight, scenario=flight.scenario.altered(name=name))
+
+
+def recording(flight: Flight, **entries: Any) -> Flight:
+    """A flight as if it had been recorded with other entries of its summary."""
+    return replace(flight, recorded={**copy.deepcopy(dict(flight.summary)), **entries})
+
+
+def judged_by(flight: Flight, *limits: Limit) -> Flight:
+    """A flight that is audited against these limits alone."""
+    return replace(flight, findings=audit(flight.log, limits))
 
 
 def constrained_mpc(problem: Problem, solver: Solver | None = None) -> LinearMPC:

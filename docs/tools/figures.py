@@ -276,7 +276,7 @@ def chain() -> Figure:
 
     with tempfile.TemporaryDirectory() as folder:
         flight, _ = flight_chain.fly(Path(folder))
-    return replace(flight_figures.signals([flight.run], flight_chain.SIGNALS), key="chain", title="")
+    return replace(flight_figures.signals([flight], flight_chain.SIGNALS), key="chain", title="")
 
 
 OF_GUIDES: Final[tuple[Callable[[], Figure], ...]] = (
@@ -290,7 +290,7 @@ def paper() -> list[Figure]:
     """Figures 2 to 5."""
     made = []
     for name, keys in flight_figures.PAPER_FIGURES.items():
-        run = quadsim.fly(name, progress=False).run
+        run = quadsim.fly(name, progress=False)
         for key, figure in zip(keys, (flight_figures.states([run]), flight_figures.inputs([run])), strict=True):
             made.append(replace(figure, key=key.rstrip("_"), title=""))
     return made

@@ -14,11 +14,10 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from quadsim.flight.audit import SIGNALS
-from quadsim.flight.rundir import Run
 from quadsim.palette import ON_DARK
 from quadsim.report.figure import bounds_of
 from quadsim.report.film import painter as ink
-from quadsim.report.film.frames import Footage, MarginTrack, Shot, make_footage, ranked_tracks
+from quadsim.report.film.frames import Filmed, Footage, MarginTrack, Shot, filmed, make_footage, ranked_tracks
 from quadsim.report.film.painter import Painter
 from quadsim.report.film.video import rendering_backend
 from quadsim.state import Array
@@ -42,7 +41,7 @@ def start() -> None:
     os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = rendering_backend()
 
 
-def panels(run: Run, title: str, shot: Shot) -> Iterator[Image.Image]:
+def panels(run: Filmed, title: str, shot: Shot) -> Iterator[Image.Image]:
     """Frames of a flight, `shot.width` wide: title, picture (`shot.height`), tilt over time, nearest margins."""
     from quadsim.report.film.render_worker import FilmStage
 
@@ -70,7 +69,7 @@ def panels(run: Run, title: str, shot: Shot) -> Iterator[Image.Image]:
 class Plot:
     """Roll and pitch over time, or the tilt of a vehicle that may turn upside down: red beyond their bounds."""
 
-    def __init__(self, run: Run, footage: Footage, left: float, top: float, width: float) -> None:
+    def __init__(self, run: Filmed, footage: Footage, left: float, top: float, width: float) -> None:
         names = ("roll", "pitch") if run.log.plant.attitude is None else ("tilt",)
         self._left, self._top, self._width, self._times = left, top, width, footage.times
         self._grid = np.linspace(footage.times[0], footage.times[-1], round(4 * width))
@@ -135,9 +134,9 @@ def side_by_side(path: Path) -> None:
 
     films = []
     for name in ("paper-unconstrained", "paper-constrained"):
-        run = quadsim.fly(name, progress=False).run
-        shot = Shot(run="", width=396, height=216, fps=8, speed=3.0, count=75)
-        films.append(panels(run, f"{name.removeprefix('paper-').capitalize()} MPC", shot))
+        run = quadsim.fly(name, progress=False)
+        shot = Shot(width=396, height=216, fps=8, speed=3.0, count=75)
+        films.append(panels(filmed(run), f"{name.removeprefix('paper-').capitalize()} MPC", shot))
     frames = []
     for left, right in zip(*films, strict=True):
         image = Image.new("RGB", (left.width + right.width + GAP, left.height), GROUND)

@@ -16,9 +16,8 @@ from drawings import svg
 from library import FILMS as NAMES
 
 from quadsim.errors import RenderingUnavailableError
-from quadsim.flight.rundir import Run
 from quadsim.palette import COLOUR
-from quadsim.report.film.frames import Shot, make_footage, ranked_tracks, thin
+from quadsim.report.film.frames import Filmed, Shot, filmed, make_footage, ranked_tracks, thin
 from quadsim.state import Array
 from quadsim.ties import first_smallest
 
@@ -61,14 +60,14 @@ def polyline(points: Array, looks: str) -> str:
     return f'<polyline points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in points[kept])}" fill="none" {looks}/>'
 
 
-def take(name: str, fps: int) -> tuple[Run, str, Shot]:
+def take(name: str, fps: int) -> tuple[Filmed, str, Shot]:
     """A scenario's flight, the title of its film, and its pictures, so many a second."""
     film.start()
     import quadsim
 
-    run = quadsim.fly(name, progress=False).run
+    run = filmed(quadsim.fly(name, progress=False))
     speed = max(1.0, run.end / LONGEST)
-    shot = Shot(run="", width=480, height=270, fps=fps, speed=speed, count=round(run.end * fps / speed))
+    shot = Shot(width=480, height=270, fps=fps, speed=speed, count=round(run.end * fps / speed))
     return run, name if speed == 1.0 else f"{name}, {speed:.1f} times as fast", shot
 
 

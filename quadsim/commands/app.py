@@ -45,13 +45,12 @@ if TYPE_CHECKING:
     from quadsim.mpc.pilot import Pilot
     from quadsim.rollout.flight_plot import Overlay
     from quadsim.rollout.flown import Flight
-    from quadsim.rollout.reaudit import Reaudit
     from quadsim.rollout.rollout import Rollout
     from quadsim.scenarios.catalogue import Catalogue
     from quadsim.scenarios.schema.scenario import Scenario
     from quadsim.vehicle import Vehicle
 else:
-    Catalogue = Flight = Listing = Overlay = Reaudit = Result = Any
+    Catalogue = Flight = Listing = Overlay = Result = Any
 
 
 def _examples(*lines: str) -> str:
@@ -312,9 +311,8 @@ def run(
         _log.info(note)
     with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory:
         with reporting(progress) as report:
-            flight = replace(Rollout(*parts).fly(report), directory=directory)
-        write_run(flight, directory, products, overwrite=overwrite, fps=fps, progress=progress, flown=flown)
-    return flight
+            flight = Rollout(*parts).fly(report)
+        return write_run(flight, directory, products, overwrite=overwrite, fps=fps, progress=progress, flown=flown)
 
 
 def start(
@@ -374,26 +372,9 @@ def read(directory: str | Path) -> Flight:
         >>> bool((read.command == flight.command).all()), read.outcome
         (True, 'satisfied')
     """
-    from quadsim.flight.rundir import findings_of
-    from quadsim.rollout.flown import Flight
-    from quadsim.rollout.reaudit import stored_run, stored_scenario
-    from quadsim.scenarios.assembly import Assembly
-    from quadsim.vehicle import Vehicle
+    from quadsim.rollout.stored import read_flight
 
-    directory = Path(directory)
-    run = stored_run(directory)
-    law = run.summary["controller"]
-    return Flight(
-        assembly=Assembly(stored_scenario(directory), Vehicle(**run.summary["vehicle"])),
-        log=run.log,
-        findings=findings_of(run.summary),
-        controller=law["name"],
-        solver=law["solver"],
-        simulate_s=run.summary["wall_s"]["simulate"],
-        tallies={},
-        directory=directory,
-        recorded=run.summary,
-    )
+    return read_flight(Path(directory))
 
 
 @app.command(
@@ -409,7 +390,7 @@ def check(
     seed: Whole | None = None,
     junit: File | None = None,
     progress: Watched = True,
-) -> Reaudit:
+) -> Flight:
     """Audit a scenario (flown first) or a finished run; exit 1 if a constraint fails.
 
     A finished run is audited again from its tables; the result is compared with its summary, and its files with
@@ -437,7 +418,8 @@ def check(
     from quadsim.console.junit import junit_file, write_junit
     from quadsim.console.progress import reporting
     from quadsim.console.results import after
-    from quadsim.rollout import reaudit
+    from quadsim.rollout.flown import Check
+    from quadsim.rollout.reaudit import reaudit
     from quadsim.rollout.rollout import Rollout
     from quadsim.scenarios import loading
     from quadsim.scenarios.catalogue import names_directory
@@ -449,14 +431,13 @@ def check(
             raise ParameterError("", option, value, "absent when a finished run is checked")
         if (owner := owner_of(Path(target))) is not None:
             raise InputError(owner.check_advice(target))
-        audited = reaudit.reaudit(Path(target))
+        audited = reaudit(Path(target))
         for note in audited.notes:
             _log.info("%s: %s", target, note)
     else:
         assembly = loading.assemble(target, changes, seed)
         with reporting(progress) as report:
-            flight = Rollout(assembly).fly(report)
-        audited = reaudit.Reaudit(summary=dict(flight.summary), findings=flight.findings, satisfied=flight.satisfied)
+            audited = replace(Rollout(assembly).fly(report), checked=Check())
     if file is not None:
         with after(audited, file):
             write_junit(audited, file)
@@ -589,10 +570,10 @@ def plot(
     """
     from quadsim.rollout.flight_plot import plot_runs
     from quadsim.rollout.flown import Flight
-    from quadsim.rollout.reaudit import stored_run
+    from quadsim.rollout.stored import read_flight
 
     each = [flights] if isinstance(flights, Flight | str | Path) else flights
-    runs = [flight.undiagnosed_run if isinstance(flight, Flight) else stored_run(Path(flight)) for flight in each]
+    runs = [flight if isinstance(flight, Flight) else read_flight(Path(flight)) for flight in each]
     return plot_runs(runs, signals, labels=labels, width=width, out=out, overwrite=overwrite)
 
 
@@ -644,7 +625,7 @@ def film(
     from quadsim.report.film.video import Estimate, render_gif, render_video
     from quadsim.rollout.reaudit import reaudit
 
-    reaudit(Path(directory), products=False)
+    flight = reaudit(Path(directory), products=False)
     directory = absolute(directory)
     path = absolute(directory / rundir.VIDEO_FILE if out is None else out)
     if workers is not None and workers < 1:
@@ -658,7 +639,7 @@ def film(
             estimate(done, total)
             report("video", done, total)
 
-        render = partial(make, directory, workers=workers, fps=fps, progress=follow)
+        render = partial(make, flight, workers=workers, fps=fps, progress=follow)
         if path.parent != directory:
             render(path, overwrite=overwrite)
         else:  # a product of the run, which its summary lists

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Final, Protocol, TypeAlias
 from xml.etree import ElementTree
 
 from quadsim.errors import printable
 from quadsim.flight.audit import Finding
-from quadsim.flight.rundir import findings_of
+from quadsim.flight.record import FlightRecord
 from quadsim.outputs import absolute, require_file, writing_file
 from quadsim.report.comparison import failed_takeoff, failure_sentences
 from quadsim.report.table import format_number
@@ -57,20 +57,19 @@ def write_junit(result: Judged, path: str | Path) -> Path:
     return write_cases(*result.verdicts(), Path(path))
 
 
-def flight_verdicts(summary: dict[str, Any]) -> tuple[str, Cases]:
-    """Suite and cases of a run's summary: one for the flight, and one per constraint.
+def flight_verdicts(flight: FlightRecord) -> tuple[str, Cases]:
+    """Suite and cases of a flight: one for the flight, and one per constraint.
 
     A constraint that is not required is a case that passes, with what was measured in its output.  One that is
     required and was not reached is `skipped`: the flight shows neither that it holds nor that it does not.
     """
-    text = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
-    failed = summary["controller"].get("unrecovered") or failed_takeoff(summary)
-    whole = summary["status"] == "completed" and not failed
-    findings = findings_of(summary)
-    cases = [("flight", whole, text), *map(_case, findings)]
-    if not findings:
-        cases.append(("audit", False, "; ".join(summary["audit_notes"])))
-    return summary["scenario"], cases
+    text = "; ".join([flight.log.reason or "completed", *failure_sentences(flight)])
+    failed = flight.numbers["controller"].get("unrecovered") or failed_takeoff(flight)
+    whole = flight.log.reason is None and not failed
+    cases = [("flight", whole, text), *map(_case, flight.findings)]
+    if not flight.findings:
+        cases.append(("audit", False, "; ".join(flight.numbers["audit_notes"])))
+    return flight.name, cases
 
 
 def write_cases(suite: str, cases: Cases, path: Path) -> Path:

@@ -1,4 +1,4 @@
-"""A flight's summary as tables and sentences: outcome, tracking, audit, controller, effects."""
+"""A flight as tables and sentences: outcome, tracking, audit, controller, effects."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.text import Text
 from quadsim.console import console
 from quadsim.controller import OPTIMAL, Phase, counts
 from quadsim.flight.audit import VERDICT_TEXT, Finding
-from quadsim.flight.rundir import findings_of
+from quadsim.flight.record import FlightRecord
 from quadsim.mpc.laws import law_name
 from quadsim.report.comparison import (
     NOT_REQUIRED,
@@ -33,52 +33,50 @@ _NAMED: Final = 3  # violated constraints named in the first line
 _SPARE: Final = ("beyond", "sampled", "plant", "bounds")  # columns that a narrow console does without, in this order
 
 
-def summary_tables(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
-    """Yield the tables and sentences of a summary: the verdict and its reasons, audit, tracking, timing, the rest."""
-    flown = f"{summary['duration']:.2f} s flown"
-    if "cut_before" in summary.get("course", {}):
-        flown += f", of a course that ends at {summary['course']['cut_before']:g} s"
-    simulated = console.styled(f"  {flown}")
-    yield console.styled((summary["scenario"], "bold"), "  ") + outcome_line(summary) + simulated
-    if summary.get("description"):
-        yield summary["description"]
-    yield from summary.get("traceback", ())
-    yield from failure_sentences(summary)
-    if summary["constraints"]:
-        yield audit_table(findings_of(summary))
-    yield from summary.get("audit_notes", ())
-    if summary["tracking"]:
-        yield _tracking_table(summary)
-        yield from _controller_lines(summary)
-    if "course" in summary:
-        yield f"{summary['course']['sentence']} {summary['course'].get('advice', '')}".rstrip()
-        yield from summary["course"].get("notes", ())
-    yield from summary.get("model_notes", ())
-    yield from _effect_lines(summary)
-    if "reaudit" in summary:
-        again = summary["reaudit"]
-        phrase = "as recorded" if again["satisfied"] == summary["satisfied"] else "a different verdict than recorded"
-        yield f"audited again from the tables, {again['rate']:g} rows per second: {phrase}"
+def summary_tables(flight: FlightRecord) -> Iterator[RenderableType]:
+    """Yield a flight's tables and sentences: the verdict and its reasons, audit, tracking, timing, the rest."""
+    numbers = flight.numbers
+    flown = f"{numbers['duration']:.2f} s flown"
+    course = numbers.get("course", {})
+    if "cut_before" in course:
+        flown += f", of a course that ends at {course['cut_before']:g} s"
+    yield console.styled((flight.name, "bold"), "  ") + outcome_line(flight) + console.styled(f"  {flown}")
+    if numbers.get("description"):
+        yield numbers["description"]
+    yield from flight.log.traceback
+    yield from failure_sentences(flight)
+    if flight.findings:
+        yield audit_table(flight.findings)
+    yield from numbers.get("audit_notes", ())
+    if numbers["tracking"]:
+        yield _tracking_table(flight)
+        yield from _controller_lines(numbers)
+    if course:
+        yield f"{course['sentence']} {course.get('advice', '')}".rstrip()
+        yield from course.get("notes", ())
+    yield from numbers.get("model_notes", ())
+    yield from _effect_lines(numbers)
 
 
-def outcome_line(summary: Mapping[str, Any]) -> Text:
+def outcome_line(flight: FlightRecord) -> Text:
     """Return the outcome with its reason, or the verdict on the required constraints, and the expected verdict."""
-    expected, as_expected = summary.get("expected", "satisfied"), summary.get("as_expected", True)
+    verdict = flight.outcome
+    expected = flight.numbers.get("expected", "satisfied")
+    as_expected = flight.numbers.get("as_expected", True)
     remark = ""
     if expected != "satisfied":
         remark = ", as the scenario expects" if as_expected else f"; the scenario expects: {expected}"
-    colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
-    verdict = summary["verdict"]
-    if summary["status"] != "completed":
-        return console.styled((f"{verdict}{remark}", colour), f": {summary['reason']}")
+    colour = "green" if as_expected and (remark or verdict == "satisfied") else "red"
+    if flight.log.reason is not None:
+        return console.styled((f"{verdict}{remark}", colour), f": {flight.log.reason}")
     if verdict in ("incomplete", "unaudited"):
         colour = "green" if remark and as_expected else "yellow"
-        what = required(summary).text if verdict == "incomplete" else "no constraint was audited"
+        what = required(flight).text if verdict == "incomplete" else "no constraint was audited"
         return console.styled((f"{verdict}, {what}{remark}", colour))
-    phrase = "every required constraint holds" if summary["satisfied"] else _violations(findings_of(summary))
-    phrase = violated_otherwise(summary) or phrase
-    line = console.styled((f"{crash(summary) or 'completed'}, {phrase}{remark}", colour))
-    if violated := violated_unrequired(findings_of(summary)):
+    phrase = "every required constraint holds" if verdict == "satisfied" else _violations(flight.findings)
+    phrase = violated_otherwise(flight) or phrase
+    line = console.styled((f"{crash(flight) or 'completed'}, {phrase}{remark}", colour))
+    if violated := violated_unrequired(flight.findings):
         line += console.styled("; ", (f"{NOT_REQUIRED}: {', '.join(violated)}", "yellow"))
     return line
 
@@ -133,10 +131,10 @@ def _verdict(finding: Finding) -> Text:
     return console.styled((text, "green" if finding.verdict == "satisfied" else "yellow"))
 
 
-def _tracking_table(summary: Mapping[str, Any]) -> Table:
-    channels, lines = [*summary["tracking"]["unit"]], []
+def _tracking_table(flight: FlightRecord) -> Table:
+    channels, lines = [*flight.numbers["tracking"]["unit"]], []
     for measure in ("rmse", "max_error", "final_error", "overshoot"):
-        columns = [tracking_values([summary], measure, channel) for channel in channels]
+        columns = [tracking_values([flight], measure, channel) for channel in channels]
         head = ["", *(f"{channel} [{unit}]" for channel, (unit, _) in zip(channels, columns, strict=True))]
         numbers = (math.nan if value is None else value for _, (value,) in columns)
         cells = (short_number(number, unit) for number, (unit, _) in zip(numbers, columns, strict=True))
@@ -144,8 +142,8 @@ def _tracking_table(summary: Mapping[str, Any]) -> Table:
     return console.table("tracking, real minus filtered reference", head, lines)
 
 
-def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    control, controller = summary["control"], summary["controller"]
+def _controller_lines(numbers: Mapping[str, Any]) -> Iterator[str]:
+    control, controller = numbers["control"], numbers["controller"]
     times, usual = controller["step_ms"], OPTIMAL | {Phase.LANDED, Phase.CRASHED}
     refused = ", ".join(f"{n} {status}" for status, n in controller["statuses"].items() if status not in usual)
     where = f" ({controller['solver']})" if controller["solver"].startswith("C99") else ""
@@ -163,16 +161,16 @@ def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     )
     yield (
         f"commanded speeds {speeds} rad/s, steps {steps} rad/s per period; "
-        f"simulated in {summary['wall_s']['simulate']:.2f} s"
+        f"simulated in {numbers['wall_s']['simulate']:.2f} s"
     )
 
 
-def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+def _effect_lines(numbers: Mapping[str, Any]) -> Iterator[str]:
     """Yield the effects of a flight, if any: events, ground, late commands, errors of the estimate."""
-    if events := summary.get("events"):
+    if events := numbers.get("events"):
         yield f"events: {'; '.join(event_sentences(events))}"
-    if "ground" in summary:
-        ground = summary["ground"]
+    if "ground" in numbers:
+        ground = numbers["ground"]
         left = "started in the air" if ground["started"] == "flying" else "never left it"
         if ground["takeoff_time"] is not None:
             left = f"left it at {ground['takeoff_time']:.2f} s"
@@ -184,14 +182,14 @@ def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
                 f"{touch['horizontal_speed']:.3g} m/s along and {touch['tilt']:.3g} deg of tilt"
             )
         yield f"ground: {left}{met}; {ground['phase']} at the end"
-    if "computation" in summary:
-        delay = summary["computation"]["delay_ms"]
+    if "computation" in numbers:
+        delay = numbers["computation"]["delay_ms"]
         yield (
             f"simulated computation: p50 {delay['p50']:.3g}, p99 {delay['p99']:.3g}, max {delay['max']:.3g} ms; "
-            f"{summary['computation']['missed']} commands arrived too late"
+            f"{numbers['computation']['missed']} commands arrived too late"
         )
-    if "estimation" in summary:
-        rmse = summary["estimation"]["rmse"]
+    if "estimation" in numbers:
+        rmse = numbers["estimation"]["rmse"]
         lengths = ", ".join(f"{name} {rmse[name]:.3g}" for name in ("x", "y", "z"))
         angles = ", ".join(f"{name} {math.degrees(rmse[name]):.3g}" for name in ("roll", "pitch", "yaw"))
         yield f"RMS error of the measured state: {lengths} m; {angles} deg"

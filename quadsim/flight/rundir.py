@@ -1,4 +1,4 @@
-"""A run's directory: tables, scenario and `summary.json`, with the SHA-256 of each file; how to read it back."""
+"""A run's directory: its files, and `summary.json`, with the SHA-256 of each; limits and findings to JSON and back."""
 
 from __future__ import annotations
 
@@ -7,20 +7,18 @@ import math
 import os
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields
 from pathlib import Path
 from types import NoneType
 from typing import Any, Final
 
 from quadsim.errors import FileError, printable
 from quadsim.flight.audit import Finding, Limit, SpaceLimit
-from quadsim.flight.log import FlightLog
-from quadsim.flight.parquet import read_log, require_format
+from quadsim.flight.parquet import require_format
 from quadsim.input_limits import LARGEST_JSON
 from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.outputs import file_hashes
 from quadsim.space import shape_from_json, shape_to_json
-from quadsim.vehicle import Vehicle
 
 NUMBER: Final = (int, float)
 MAYBE_NUMBER: Final = (int, float, NoneType)
@@ -164,46 +162,6 @@ SCENARIO_FILE: Final = "scenario.toml"
 RECORDING_FILE: Final = "flight.rrd"
 VIDEO_FILE: Final = "flight.mp4"
 FIGURES_DIR: Final = "figures"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """A finished run, read back from its directory."""
-
-    directory: Path  # its path
-    summary: dict[str, Any]  # `summary.json`
-    log: FlightLog  # the flight, its plant rows at the log rate
-    vehicle: Vehicle  # the vehicle flown, with its actual parameters
-    limits: tuple[Limit, ...]  # the constraints it was audited against
-    label: str | None = None  # its name in a comparison; None: see `quadsim.report.comparison.run_names`
-
-    @property
-    def name(self) -> str:
-        """The scenario's name."""
-        return str(self.summary["scenario"])
-
-    @property
-    def end(self) -> float:
-        """Last time of the flight [s]."""
-        return float(self.log.plant.t[-1])
-
-
-def load_run(directory: Path) -> Run:
-    """Read a run back.
-
-    Raises:
-        FileError: a file is missing or damaged.
-    """
-    summary = read_summary(directory)
-    try:
-        vehicle = Vehicle(**summary.get("actual", summary["vehicle"]))
-        limits = tuple(limit_from_json(entry) for entry in summary["constraints"])
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise FileError(directory / SUMMARY_FILE, f"is damaged ({error})") from error
-    raised = tuple(summary.get("traceback", ()))
-    interrupted = summary.get("verdict") == "aborted" and not raised
-    log = replace(read_log(directory, reason=summary["reason"]), interrupted=interrupted, traceback=raised)
-    return Run(directory=directory, summary=summary, log=log, vehicle=vehicle, limits=limits)
 
 
 def damaged_files(directory: Path, summary: Mapping[str, Any]) -> list[str]:

@@ -1,6 +1,6 @@
 """Several runs -> the rows of one table.
 
-Plain data from the runs' summaries, shown by the terminal, the page and the Markdown table.
+Plain data from the flights' audits and numbers, shown by the terminal, the page and the Markdown table.
 """
 
 from __future__ import annotations
@@ -9,30 +9,26 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from quadsim.controller import Phase
 from quadsim.errors import ParameterError, printable
 from quadsim.flight.audit import VERDICT_TEXT, Finding, Limit, SpaceLimit, limit_differences, worst_finding
-from quadsim.flight.rundir import findings_of
+from quadsim.flight.record import FlightRecord
 from quadsim.mpc.laws import law_name
 from quadsim.report.table import ABSENT, Cell, Mark, QuantityRow, format_number, short_number
 from quadsim.space import Obstacle
 from quadsim.state import VELOCITY
 from quadsim.ties import TIE_SHARE, tied
 
-if TYPE_CHECKING:
-    from quadsim.flight.rundir import Run
-
-Summary = Mapping[str, Any]
 GLANCE: Final = "At a glance"
 NOT_REQUIRED: Final = "violated, not required"
 _ROUNDING: Final = 1e-3  # share of its tolerance below which a margin is shown as 0
 _MOST_DIFFERENCES: Final = 4  # differences of two audits that a sentence names
 _MOST_EVENTS: Final = 12  # most events of a flight that are named
-_Line = tuple[str, str, Callable[[Summary], Cell]]  # a row's label, its unit, and the cell of a summary
+_Line = tuple[str, str, Callable[[FlightRecord], Cell]]  # a row's label, its unit, and the cell of a flight
 
 
 def nested(data: Any, *keys: str) -> Any:
@@ -42,20 +38,25 @@ def nested(data: Any, *keys: str) -> Any:
     return data
 
 
-def run_names(runs: Sequence[Run]) -> tuple[str, ...]:
+def run_names(runs: Sequence[FlightRecord]) -> tuple[str, ...]:
     """A distinct name for each run: its label, or else its scenario's name.
 
     Runs of one scenario add what tells them apart: their controllers' names, or else those of their directories; or
     they are numbered.
     """
     parts: list[tuple[str, ...]] = [(run.label or run.name,) for run in runs]
-    laws = [law_name(printable(str(nested(run.summary, "controller", "name") or ABSENT))) for run in runs]
-    for further in (laws, [printable(run.directory.name) for run in runs]):
+    laws = [law_name(printable(str(nested(run.numbers, "controller", "name") or ABSENT))) for run in runs]
+    for further in (laws, [printable(_folder_name(run)) for run in runs]):
         peers = {part: {more for more, other in zip(further, parts, strict=True) if other == part} for part in parts}
         parts = [(*part, more) if len(peers[part]) > 1 else part for part, more in zip(parts, further, strict=True)]
     names = [part[0] + (f" ({', '.join(part[1:])})" if part[1:] else "") for part in parts]
     seen = Counter(names)
     return tuple(name if seen[name] == 1 else f"{name}, {names[: i + 1].count(name)}" for i, name in enumerate(names))
+
+
+def _folder_name(run: FlightRecord) -> str:
+    """Return the name of a flight's directory, or of its scenario where it has none."""
+    return run.name if run.directory is None else run.directory.name
 
 
 def check_names(names: Sequence[str], count: int, field: str = "names") -> None:
@@ -70,9 +71,9 @@ def check_names(names: Sequence[str], count: int, field: str = "names") -> None:
         raise ParameterError("", field, shown, f"{count} different texts, one for each target")
 
 
-def distinct_courses(runs: Sequence[Run]) -> list[Run]:
+def distinct_courses(runs: Sequence[FlightRecord]) -> list[FlightRecord]:
     """Return one run per filtered reference; of runs with equal references as far as both flew, the longest."""
-    chosen: list[Run] = []
+    chosen: list[FlightRecord] = []
     for run in sorted(runs, key=lambda run: run.log.control.t.size, reverse=True):
         course = run.log.control.reference
         if not any(np.array_equal(course, other.log.control.reference[: len(course)]) for other in chosen):
@@ -89,39 +90,38 @@ def different_audits(first: str, second: str, differences: Sequence[str]) -> str
     )
 
 
-def conclusion(runs: Sequence[Run], names: Sequence[str]) -> Cell:
+def conclusion(runs: Sequence[FlightRecord], names: Sequence[str]) -> Cell:
     """Return who holds the constraints, and who tracks closer by how much, as a sentence.
 
     Errors are compared among completed flights of one course.
     """
-    findings = [findings_of(run.summary) for run in runs]
-    marks = [_holding_mark(run, each) for run, each in zip(runs, findings, strict=True)]
+    marks = [_holding_mark(run) for run in runs]
     mark = next((mark for mark in (Mark.BAD, Mark.WARN, Mark.NONE) if mark in marks), Mark.GOOD)
-    parts = [_who_holds(runs, names, findings), *filter(None, [_who_is_closer(runs, names)])]
+    parts = [_who_holds(runs, names), *filter(None, [_who_is_closer(runs, names)])]
     return Cell(text=f"{'; '.join(parts)}.", mark=mark)
 
 
-def _holding_mark(run: Run, findings: Sequence[Finding]) -> Mark:
-    if run.summary["verdict"] in ("violated", "lost", "aborted"):
+def _holding_mark(run: FlightRecord) -> Mark:
+    if run.outcome in ("violated", "lost", "aborted"):
         return Mark.BAD
-    if not findings:
+    if not run.findings:
         return Mark.NONE
-    return Mark.GOOD if all(finding.verdict == "satisfied" for finding in findings) else Mark.WARN
+    return Mark.GOOD if all(finding.verdict == "satisfied" for finding in run.findings) else Mark.WARN
 
 
-def _who_holds(runs: Sequence[Run], names: Sequence[str], findings: Sequence[Sequence[Finding]]) -> str:
+def _who_holds(runs: Sequence[FlightRecord], names: Sequence[str]) -> str:
     """Name the flights that hold their constraints, and what the others do instead."""
     holds, others = list[str](), list[str]()
-    for run, name, each in zip(runs, names, findings, strict=True):
-        failing = [finding.limit.name for finding in each if finding.verdict == "violated"]
-        missed = [finding.limit.name for finding in each if finding.verdict == "incomplete"]
-        verdict = run.summary["verdict"]
+    for run, name in zip(runs, names, strict=True):
+        failing = [finding.limit.name for finding in run.findings if finding.verdict == "violated"]
+        missed = [finding.limit.name for finding in run.findings if finding.verdict == "incomplete"]
+        verdict = run.outcome
         deeds = [f"was {verdict}"] if verdict in ("lost", "aborted") else []
         deeds += [f"violates {_joined(failing)}"] if failing else []
         deeds += [f"does not reach {_joined(missed)}"] if missed and not deeds else []
-        if verdict == "violated" and not failing and (reason := violated_otherwise(run.summary)):
+        if verdict == "violated" and not failing and (reason := violated_otherwise(run)):
             deeds = [f"holds its constraints, {reason}"]
-        deeds += ["is not audited"] if not each and not deeds else []
+        deeds += ["is not audited"] if not run.findings and not deeds else []
         if deeds:
             others.append(f"{name} {' and '.join(deeds)}")
         else:
@@ -136,12 +136,12 @@ def _who_holds(runs: Sequence[Run], names: Sequence[str], findings: Sequence[Seq
     return text if text.startswith(tuple(names)) else text[0].upper() + text[1:]
 
 
-def _who_is_closer(runs: Sequence[Run], names: Sequence[str]) -> str | None:
+def _who_is_closer(runs: Sequence[FlightRecord], names: Sequence[str]) -> str | None:
     """Compare position errors (RMS); None unless two completed flights or more followed one course."""
     errors = {
         name: (error, run)
         for run, name in zip(runs, names, strict=True)
-        if (error := _position_error(run.summary)) is not None and run.summary["status"] == "completed"
+        if (error := _position_error(run)) is not None and run.log.status == "completed"
     }
     if len(errors) < 2 or len(distinct_courses([run for _, run in errors.values()])) > 1:
         return None
@@ -165,44 +165,43 @@ def _joined(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
-def comparison_rows(runs: Sequence[Run]) -> list[QuantityRow]:
-    """Everything the summaries say, side by side; a value that a run lacks is shown as `-`."""
-    summaries = [run.summary for run in runs]
+def comparison_rows(runs: Sequence[FlightRecord]) -> list[QuantityRow]:
+    """Everything that is known of flights, side by side; a value that a run lacks is shown as `-`."""
 
-    def rows(group: str, lines: Iterable[_Line], only_with: str = "status") -> Iterator[QuantityRow]:
-        if any(summary.get(only_with) for summary in summaries):
+    def rows(group: str, lines: Iterable[_Line], only_with: str = "") -> Iterator[QuantityRow]:
+        if not only_with or any(run.numbers.get(only_with) for run in runs):
             for label, unit, cell in lines:
-                yield QuantityRow(group=group, label=label, unit=unit, cells=tuple(map(cell, summaries)))
+                yield QuantityRow(group=group, label=label, unit=unit, cells=tuple(map(cell, runs)))
 
     return [
         *rows(GLANCE, _GLANCE),
-        _best_smallest(GLANCE, "RMS error, position", "m", summaries, list(map(_position_error, summaries))),
+        _best_smallest(GLANCE, "RMS error, position", "m", runs, list(map(_position_error, runs))),
         QuantityRow(group=GLANCE, label="highest speed", unit="m/s", cells=tuple(map(_highest_speed, runs))),
         *rows(GLANCE, [("step time", "ms", _step_time)]),
         *rows("Flight", _FLIGHT),
         *rows("Course", _COURSE, "course"),
-        *_tracking_rows(summaries),
-        *_constraint_rows(summaries),
+        *_tracking_rows(runs),
+        *_constraint_rows(runs),
         *rows("Ground", _GROUND, "ground"),
         *rows("Measured state", _ESTIMATION, "estimation"),
         *rows("Commands", _COMMANDS),
         *rows("Solver", _SOLVER),
         *rows("Simulated computation", _COMPUTATION, "computation"),
-        *_step_time_rows(summaries),
+        *_step_time_rows(runs),
         *rows("Time", _TIMES),
     ]
 
 
-def outcome(summary: Summary) -> Cell:
+def outcome(flight: FlightRecord) -> Cell:
     """Return the verdict with its reason, and the constraints that are violated but not required."""
-    cell = verdict_cell(summary)
-    if summary["status"] != "completed":
-        cell = replace(cell, text=f"{cell.text}: {summary.get('reason')}")
-    elif summary["verdict"] == "incomplete":
-        cell = replace(cell, text=f"{cell.text}; {required(summary).text}")
-    elif sentence := failed_takeoff(summary):
+    cell = verdict_cell(flight)
+    if flight.log.status != "completed":
+        cell = replace(cell, text=f"{cell.text}: {flight.log.reason}")
+    elif flight.outcome == "incomplete":
+        cell = replace(cell, text=f"{cell.text}; {required(flight).text}")
+    elif sentence := failed_takeoff(flight):
         cell = replace(cell, text=f"{cell.text}: {sentence}")
-    if violated := violated_unrequired(findings_of(summary)):
+    if violated := violated_unrequired(flight.findings):
         mark = Mark.WARN if cell.mark is Mark.GOOD else cell.mark
         cell = Cell(text=f"{cell.text}; {NOT_REQUIRED}: {', '.join(violated)}", mark=mark)
     return cell
@@ -213,45 +212,45 @@ def violated_unrequired(findings: Iterable[Finding]) -> list[str]:
     return [finding.limit.name for finding in findings if finding.verdict == "violated" and not finding.limit.required]
 
 
-def _worst_constraint(summary: Summary) -> Cell:
+def _worst_constraint(flight: FlightRecord) -> Cell:
     """Return the constraint that came closest to its bound, or went furthest beyond it, with its verdict."""
-    worst = worst_finding(findings_of(summary))
+    worst = worst_finding(flight.findings)
     if worst is None:
         return Cell()
     cell = _verdict(worst)
     return replace(cell, text=f"{worst.limit.name} {cell.text}")
 
 
-def _position_error(summary: Summary) -> float | None:
-    errors = [nested(summary, "tracking", "rmse", axis) for axis in "xyz"]
+def _position_error(flight: FlightRecord) -> float | None:
+    errors = [nested(flight.numbers, "tracking", "rmse", axis) for axis in "xyz"]
     return None if None in errors else math.hypot(*errors)
 
 
-def _highest_speed(run: Run) -> Cell:
+def _highest_speed(run: FlightRecord) -> Cell:
     speeds = np.linalg.norm(run.log.plant.state[:, VELOCITY], axis=1)
     speeds = speeds[np.isfinite(speeds)]
     return Cell(text=format_number(float(speeds.max()))) if speeds.size else Cell()
 
 
-def _step_time(summary: Summary) -> Cell:
-    median, longest = (nested(summary, "controller", "step_ms", measure) for measure in ("p50", "max"))
-    deadline = nested(summary, "controller", "deadline_ms")
+def _step_time(flight: FlightRecord) -> Cell:
+    median, longest = (nested(flight.numbers, "controller", "step_ms", measure) for measure in ("p50", "max"))
+    deadline = nested(flight.numbers, "controller", "deadline_ms")
     if median is None:
         return Cell()
     text = f"median {format_number(median)}, maximum {format_number(longest)}, deadline {format_number(deadline)}"
-    return Cell(text=text, mark=Mark.WARN if nested(summary, "controller", "deadline_misses") else Mark.NONE)
+    return Cell(text=text, mark=Mark.WARN if nested(flight.numbers, "controller", "deadline_misses") else Mark.NONE)
 
 
-def violated_otherwise(summary: Summary) -> str | None:
+def violated_otherwise(flight: FlightRecord) -> str | None:
     """Return what else than a required constraint, none of which is violated, makes a completed flight `violated`.
 
     That is no take-off, or permanent fallback; None if it is neither.
     """
-    if any(finding.limit.required and finding.verdict == "violated" for finding in findings_of(summary)):
+    if any(finding.limit.required and finding.verdict == "violated" for finding in flight.findings):
         return None
-    if failed_takeoff(summary):
+    if failed_takeoff(flight):
         return "but it never took off"
-    return "but in permanent fallback" if summary["controller"].get("unrecovered") else None
+    return "but in permanent fallback" if flight.numbers["controller"].get("unrecovered") else None
 
 
 def fallback_sentence(periods: int) -> str:
@@ -264,52 +263,52 @@ def takeoff_sentence(told: float) -> str:
     return f"told to take off at t = {format_number(told)} s, never left the ground"
 
 
-def failed_takeoff(summary: Summary) -> str | None:
+def failed_takeoff(flight: FlightRecord) -> str | None:
     """Say when a vehicle that never left the ground was told to; None if it need not, or did."""
-    told = summary["controller"].get("never_took_off")
+    told = flight.numbers["controller"].get("never_took_off")
     return None if told is None else takeoff_sentence(told)
 
 
-def crash(summary: Summary) -> str | None:
+def crash(flight: FlightRecord) -> str | None:
     """Say that the vehicle crashed, and which obstacles it touched; None if it did not."""
-    if Phase.CRASHED not in summary["controller"].get("statuses", ()):
+    if Phase.CRASHED not in flight.numbers["controller"].get("statuses", ()):
         return None
-    violated = [finding.limit for finding in findings_of(summary) if finding.verdict == "violated"]
+    violated = [finding.limit for finding in flight.findings if finding.verdict == "violated"]
     touched = [limit.name for limit in violated if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Obstacle)]
     return f"crashed, touched {', '.join(touched)}" if touched else "crashed"
 
 
-def failure_sentences(summary: Summary) -> list[str]:
+def failure_sentences(flight: FlightRecord) -> list[str]:
     """Return what failed other than a constraint: the take-off, or as in `optimum_sentences`."""
-    return [*filter(None, [failed_takeoff(summary)]), *optimum_sentences(summary)]
+    return [*filter(None, [failed_takeoff(flight)]), *optimum_sentences(flight)]
 
 
-def optimum_sentences(summary: Summary) -> list[str]:
+def optimum_sentences(flight: FlightRecord) -> list[str]:
     """Return why there was no optimum: permanent fallback, and the reason for the first QP without an answer."""
-    periods, diagnosis = summary["controller"].get("unrecovered"), summary.get("diagnosis")
+    periods, diagnosis = flight.numbers["controller"].get("unrecovered"), flight.diagnosis
     sentences = [fallback_sentence(periods)] if periods else []
     return sentences + ([] if diagnosis is None else [diagnosis["sentence"], *filter(None, [diagnosis["advice"]])])
 
 
-def event_sentences(events: Sequence[Summary]) -> list[str]:
+def event_sentences(events: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the events with their times, only the first ones if there are many."""
     sentences = [f"{event['text']} at {format_number(event['time'])} s" for event in events[:_MOST_EVENTS]]
     return sentences + ([f"{len(events) - _MOST_EVENTS} more"] if len(events) > _MOST_EVENTS else [])
 
 
-def verdict_cell(summary: Summary) -> Cell:
+def verdict_cell(flight: FlightRecord) -> Cell:
     """Return the verdict, and whether the scenario expects it; runs of older versions state no expectation."""
-    word, expected = summary["verdict"], summary.get("expected")
+    word, expected = flight.outcome, flight.numbers.get("expected")
     if expected is None:
         return Cell(text=word)
-    if summary.get("as_expected"):
+    if flight.numbers.get("as_expected"):
         return Cell(text=f"{word}, as expected", mark=Mark.GOOD if word == "satisfied" else Mark.NONE)
     return Cell(text=f"{word} (expected {expected})", mark=Mark.BAD)
 
 
-def required(summary: Summary) -> Cell:
+def required(flight: FlightRecord) -> Cell:
     """The verdict on the constraints that the scenario demands, naming those that do not hold."""
-    findings = findings_of(summary)
+    findings = flight.findings
     if not findings:
         return Cell(text="none audited", mark=Mark.WARN)
     demanded = [finding for finding in findings if finding.limit.required]
@@ -323,18 +322,18 @@ def required(summary: Summary) -> Cell:
     return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none required")
 
 
-def tracking_values(summaries: Sequence[Summary], measure: str, channel: str) -> tuple[str, list[float | None]]:
+def tracking_values(runs: Sequence[FlightRecord], measure: str, channel: str) -> tuple[str, list[float | None]]:
     """Unit and values of one tracking measure; angles in degrees."""
-    units = {nested(summary, "tracking", "unit", channel) for summary in summaries} - {None}
-    values = [nested(summary, "tracking", measure, channel) for summary in summaries]
+    units = {nested(run.numbers, "tracking", "unit", channel) for run in runs} - {None}
+    values = [nested(run.numbers, "tracking", measure, channel) for run in runs]
     if units == {"rad"}:
         return "deg", [None if value is None else math.degrees(value) for value in values]
     return "/".join(sorted(units)), values
 
 
-def _present_keys(summaries: Sequence[Summary], *path: str) -> list[str]:
-    """Keys that any summary has at a path, in order."""
-    return list(dict.fromkeys(key for summary in summaries for key in nested(summary, *path) or {}))
+def _present_keys(runs: Sequence[FlightRecord], *path: str) -> list[str]:
+    """Keys that any flight has at a path of its numbers, in order."""
+    return list(dict.fromkeys(key for run in runs for key in nested(run.numbers, *path) or {}))
 
 
 def _bounds(finding: Finding) -> Cell:
@@ -356,39 +355,42 @@ def tolerance_text(limit: Limit) -> str:
     return f"{plant:.3g}" if plant == sampled else f"{plant:.3g}, {sampled:.3g} at the samples"
 
 
-def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[QuantityRow]:
+def _tracking_rows(runs: Sequence[FlightRecord]) -> Iterator[QuantityRow]:
     measures = {"rmse": "RMS error", "max_error": "largest error", "final_error": "final error"}
     for measure, label in {**measures, "overshoot": "overshoot"}.items():
-        for channel in _present_keys(summaries, "tracking", measure):
-            unit, values = tracking_values(summaries, measure, channel)
-            yield _best_smallest("Tracking", f"{label}, {channel}", unit, summaries, values)
+        for channel in _present_keys(runs, "tracking", measure):
+            unit, values = tracking_values(runs, measure, channel)
+            yield _best_smallest("Tracking", f"{label}, {channel}", unit, runs, values)
     # One row per step of the courses; `-` where an output does not settle or a run has no such step.
     settled = [
-        {(entry["channel"], entry["time"]): entry["settled"] for entry in nested(summary, "tracking", "settling") or ()}
-        for summary in summaries
+        {
+            (entry["channel"], entry["time"]): entry["settled"]
+            for entry in nested(run.numbers, "tracking", "settling") or ()
+        }
+        for run in runs
     ]
     for channel, time in dict.fromkeys(step for steps in settled for step in steps):
         times = [steps.get((channel, time)) for steps in settled]
-        yield _best_smallest("Tracking", f"settling, {channel} at {time:g} s", "s", summaries, times)
+        yield _best_smallest("Tracking", f"settling, {channel} at {time:g} s", "s", runs, times)
 
 
-def _step_time_rows(summaries: Sequence[Summary]) -> Iterator[QuantityRow]:
+def _step_time_rows(runs: Sequence[FlightRecord]) -> Iterator[QuantityRow]:
     measures = {"p50": "median", "p95": "95th percentile", "p99": "99th percentile", "max": "maximum"}
     for clock, part in {"step_ms": "whole step", "solve_ms": "optimum alone, by any answerer"}.items():
         for measure, label in measures.items():
-            values = [nested(summary, "controller", clock, measure) for summary in summaries]
-            yield _best_smallest("Time", f"{part}, {label}", "ms", summaries, values)
+            values = [nested(run.numbers, "controller", clock, measure) for run in runs]
+            yield _best_smallest("Time", f"{part}, {label}", "ms", runs, values)
 
 
 def _best_smallest(
-    group: str, label: str, unit: str, summaries: Sequence[Summary], values: Sequence[float | None]
+    group: str, label: str, unit: str, runs: Sequence[FlightRecord], values: Sequence[float | None]
 ) -> QuantityRow:
     """Return a row with its smallest magnitude marked, among completed flights and if they differ."""
     texts = [format_number(value) for value in values]
     eligible = {
         i: abs(value)
-        for i, (summary, value) in enumerate(zip(summaries, values, strict=True))
-        if value is not None and summary["status"] == "completed"
+        for i, (run, value) in enumerate(zip(runs, values, strict=True))
+        if value is not None and run.log.status == "completed"
     }
     differ = len({texts[i] for i in eligible}) > 1
     best = {i for i in eligible if differ and texts[i] == texts[min(eligible, key=eligible.__getitem__)]}
@@ -396,8 +398,8 @@ def _best_smallest(
     return QuantityRow(group=group, label=label, unit=unit, cells=cells)
 
 
-def _constraint_rows(summaries: Sequence[Summary]) -> Iterator[QuantityRow]:
-    audits = [{finding.limit.name: finding for finding in findings_of(summary)} for summary in summaries]
+def _constraint_rows(runs: Sequence[FlightRecord]) -> Iterator[QuantityRow]:
+    audits = [{finding.limit.name: finding for finding in run.findings} for run in runs]
     for name in dict.fromkeys(name for audit in audits for name in audit):
         entries = [audit.get(name) for audit in audits]
         own_unit = next(entry.limit.unit for entry in entries if entry is not None)
@@ -452,58 +454,58 @@ def _violation(finding: Finding) -> Cell:
     return Cell(text=format_number(seconds), mark=_verdict_mark(finding) if seconds > 0.0 else Mark.NONE)
 
 
-def _lowest_speed(summary: Summary) -> Cell:
+def _lowest_speed(flight: FlightRecord) -> Cell:
     """Return the lowest rotor speed that the course requires; none if it requires a negative thrust."""
-    if any(problem.startswith("not flyable") for problem in nested(summary, "course", "problems") or ()):
+    if any(problem.startswith("not flyable") for problem in nested(flight.numbers, "course", "problems") or ()):
         return Cell(text="not flyable", mark=Mark.BAD)
-    return _number("course", "rotor_min")(summary)
+    return _number("course", "rotor_min")(flight)
 
 
-def mismatch(summary: Summary) -> tuple[str, ...]:
+def mismatch(flight: FlightRecord) -> tuple[str, ...]:
     """Return the vehicle parameters that the controller has wrong, as one text; none if there are none."""
-    actual, modelled = summary.get("actual", {}), summary["vehicle"]
+    actual, modelled = flight.numbers.get("actual", {}), flight.numbers["vehicle"]
     wrong = [f"{name} {modelled[name]} for {value}" for name, value in actual.items() if value != modelled[name]]
     return (", ".join(wrong),) if wrong else ()
 
 
-def _text(value: Callable[[Summary], object]) -> Callable[[Summary], Cell]:
-    return lambda summary: Cell(text=str(value(summary)))
+def _text(value: Callable[[FlightRecord], object]) -> Callable[[FlightRecord], Cell]:
+    return lambda flight: Cell(text=str(value(flight)))
 
 
-def _number(*keys: str, unit: str = "", wrong: Mark = Mark.NONE) -> Callable[[Summary], Cell]:
+def _number(*keys: str, unit: str = "", wrong: Mark = Mark.NONE) -> Callable[[FlightRecord], Cell]:
     """Return the number at a path, in degrees if that is its unit; marked as wrong unless zero."""
 
-    def cell(summary: Summary) -> Cell:
-        value = nested(summary, *keys)
+    def cell(flight: FlightRecord) -> Cell:
+        value = nested(flight.numbers, *keys)
         shown = math.degrees(value) if unit == "deg" and value is not None else value
         return Cell(text=format_number(shown), mark=wrong if value else Mark.NONE)
 
     return cell
 
 
-def _counts(key: str) -> Callable[[Summary], Cell]:
-    def cell(summary: Summary) -> Cell:
-        counts = summary["controller"].get(key)
+def _counts(key: str) -> Callable[[FlightRecord], Cell]:
+    def cell(flight: FlightRecord) -> Cell:
+        counts = flight.numbers["controller"].get(key)
         return Cell(text=", ".join(f"{name}: {count}" for name, count in counts.items())) if counts else Cell()
 
     return cell
 
 
-def _iterations(measure: str) -> Callable[[Summary], Cell]:
+def _iterations(measure: str) -> Callable[[FlightRecord], Cell]:
     """Iterations of each answerer that iterates: they are not comparable."""
 
-    def cell(summary: Summary) -> Cell:
-        answerers = summary["controller"].get("iterations_by", {})
+    def cell(flight: FlightRecord) -> Cell:
+        answerers = flight.numbers["controller"].get("iterations_by", {})
         return Cell(text=", ".join(f"{by}: {format_number(n[measure])}" for by, n in answerers.items()) or ABSENT)
 
     return cell
 
 
-def _listed(key: str, form: str, mark: Mark) -> Callable[[Summary], Cell]:
+def _listed(key: str, form: str, mark: Mark) -> Callable[[FlightRecord], Cell]:
     """Entries of the course in one cell; `none` where there are none, `-` where a run does not say."""
 
-    def cell(summary: Summary) -> Cell:
-        entries = nested(summary, "course", key)
+    def cell(flight: FlightRecord) -> Cell:
+        entries = nested(flight.numbers, "course", key)
         if not entries:
             return Cell() if entries is None else Cell(text="none")
         return Cell(text="; ".join(map(form.format, entries)), mark=mark)
@@ -511,15 +513,15 @@ def _listed(key: str, form: str, mark: Mark) -> Callable[[Summary], Cell]:
     return cell
 
 
-def _phase(summary: Summary) -> Cell:
-    if not summary.get("ground"):
+def _phase(flight: FlightRecord) -> Cell:
+    if not flight.numbers.get("ground"):
         return Cell()
-    crashed = nested(summary, "ground", "crashed")
-    return Cell(text=str(nested(summary, "ground", "phase")), mark=Mark.BAD if crashed else Mark.NONE)
+    crashed = nested(flight.numbers, "ground", "crashed")
+    return Cell(text=str(nested(flight.numbers, "ground", "phase")), mark=Mark.BAD if crashed else Mark.NONE)
 
 
-def _refused(summary: Summary) -> Cell:
-    samples = nested(summary, "estimation", "samples") or {}
+def _refused(flight: FlightRecord) -> Cell:
+    samples = nested(flight.numbers, "estimation", "samples") or {}
     parts = [f"{name} {n['rejected']} of {n['accepted'] + n['rejected']}" for name, n in samples.items()]
     return Cell(text=", ".join(parts) or ABSENT)
 
@@ -527,16 +529,16 @@ def _refused(summary: Summary) -> Cell:
 _GLANCE: Final[tuple[_Line, ...]] = (("outcome", "", outcome), ("worst constraint", "", _worst_constraint))
 _FLIGHT: Final[tuple[_Line, ...]] = (
     ("required constraints", "", required),
-    ("audit", "", lambda summary: Cell(text="; ".join(summary.get("audit_notes", ())) or "as the controller bounds")),
-    ("why no optimum", "", _text(lambda summary: "; ".join(optimum_sentences(summary)) or ABSENT)),
-    ("events", "", _text(lambda summary: "; ".join(event_sentences(summary.get("events", ()))) or ABSENT)),
+    ("audit", "", _text(lambda flight: "; ".join(flight.numbers.get("audit_notes", ())) or "as the controller bounds")),
+    ("why no optimum", "", _text(lambda flight: "; ".join(optimum_sentences(flight)) or ABSENT)),
+    ("events", "", _text(lambda flight: "; ".join(event_sentences(flight.numbers.get("events", ()))) or ABSENT)),
     ("time flown", "s", _number("duration")),
-    ("controller", "", _text(lambda summary: law_name(summary["controller"].get("name", ABSENT)))),
-    ("QP solver", "", _text(lambda summary: summary["controller"].get("solver") or ABSENT)),
-    ("horizon", "periods", _text(lambda summary: summary["controller"].get("horizon", ABSENT))),
-    ("vehicle", "", _text(lambda summary: ", modelled with ".join([summary["vehicle"]["name"], *mismatch(summary)]))),
-    ("mass", "kg", _text(lambda summary: format_number(summary.get("actual", summary["vehicle"])["mass"]))),
-    ("seed", "", _text(lambda summary: summary.get("seed", ABSENT))),
+    ("controller", "", _text(lambda flight: law_name(flight.numbers["controller"].get("name", ABSENT)))),
+    ("QP solver", "", _text(lambda flight: flight.numbers["controller"].get("solver") or ABSENT)),
+    ("horizon", "periods", _text(lambda flight: flight.numbers["controller"].get("horizon", ABSENT))),
+    ("vehicle", "", _text(lambda flight: ", modelled with ".join([flight.actual.name, *mismatch(flight)]))),
+    ("mass", "kg", _text(lambda flight: format_number(flight.actual.mass))),
+    ("seed", "", _text(lambda flight: flight.numbers.get("seed", ABSENT))),
 )
 _COURSE: Final[tuple[_Line, ...]] = (
     ("largest tilt required", "deg", _number("course", "tilt")),

@@ -12,13 +12,13 @@ from urllib.parse import quote
 
 from quadsim.errors import OutputError, ParameterError
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
+from quadsim.flight.record import FlightRecord
 from quadsim.flight.rundir import (
     FIGURES_DIR,
     RECORDING_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
     VIDEO_FILE,
-    Run,
     require_inside,
 )
 from quadsim.outputs import optional, writing
@@ -47,7 +47,7 @@ _FILES: Final = {
 
 
 def write_comparison(
-    runs: Sequence[Run], directory: Path, *, notes: Sequence[str] = (), overwrite: bool = False
+    runs: Sequence[FlightRecord], directory: Path, *, notes: Sequence[str] = (), overwrite: bool = False
 ) -> Path:
     """Write a comparison of runs, which appears complete or not at all; returns the page, `directory/index.html`.
 
@@ -66,6 +66,8 @@ def write_comparison(
         raise ParameterError("comparison", "runs", 0, "one or more")
     target = directory.resolve()
     for run in runs:
+        if run.directory is None:
+            continue
         require_inside(run.directory)  # copying follows links
         if run.directory.resolve().is_relative_to(target):
             raise OutputError(directory, f"it holds the run {run.directory}, which must stay; choose another --out")
@@ -107,42 +109,50 @@ def _folder_names(names: Sequence[str]) -> list[str]:
     return folders
 
 
-def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) -> RunView:
+def _place(run: FlightRecord, name: str, folder: str, colour: str, page_directory: Path) -> RunView:
     """Copy what a run has to offer beside the page."""
     place = page_directory / folder
     place.mkdir()
-    files = {}
-    for file, label in _FILES.items():
-        if (run.directory / file).is_file():
-            shutil.copyfile(run.directory / file, place / file)
-            files[label] = quote(f"{folder}/{file}")
-    if (run.directory / FIGURES_DIR).is_dir():
-        shutil.copytree(run.directory / FIGURES_DIR, place / FIGURES_DIR)
-        for path in sorted((place / FIGURES_DIR).glob("*.png")):
-            files[f"figure: {path.stem}"] = quote(path.relative_to(page_directory).as_posix())
+    source = run.directory
+    files: dict[str, str] = {}
     video = poster = None
-    if (run.directory / VIDEO_FILE).is_file():
+    if source is not None:
+        files = _copied(source, place, folder)
+    if source is not None and (source / VIDEO_FILE).is_file():
         from quadsim.report.film.video import write_poster
 
         video = f"{folder}.mp4"
-        shutil.copyfile(run.directory / VIDEO_FILE, page_directory / video)
+        shutil.copyfile(source / VIDEO_FILE, page_directory / video)
         poster = f"{folder}.jpg" if write_poster(page_directory / video, page_directory / f"{folder}.jpg") else None
-    summary = run.summary
-    vehicle = f"Vehicle: {run.vehicle.description or run.vehicle.name}"
+    vehicle = f"Vehicle: {run.actual.description or run.actual.name}"
     return RunView(
         name=name,
         colour=colour,
-        description=summary.get("description", ""),
-        facts=(", modelled with ".join([vehicle, *mismatch(summary)]), _made_with(run)),
+        description=run.numbers.get("description", ""),
+        facts=(", modelled with ".join([vehicle, *mismatch(run)]), _made_with(run)),
         video=video,
         poster=poster,
         files=files,
     )
 
 
-def _made_with(run: Run) -> str:
+def _copied(source: Path, place: Path, folder: str) -> dict[str, str]:
+    """Copy the files and figures of a run directory; return the link to each by what it is."""
+    files = {}
+    for file, label in _FILES.items():
+        if (source / file).is_file():
+            shutil.copyfile(source / file, place / file)
+            files[label] = quote(f"{folder}/{file}")
+    if (source / FIGURES_DIR).is_dir():
+        shutil.copytree(source / FIGURES_DIR, place / FIGURES_DIR)
+        for path in sorted((place / FIGURES_DIR).glob("*.png")):
+            files[f"figure: {path.stem}"] = quote(f"{folder}/{FIGURES_DIR}/{path.name}")
+    return files
+
+
+def _made_with(run: FlightRecord) -> str:
     """Versions and machine: what timings, and the last digits, depend on."""
-    versions, machine = run.summary.get("versions", {}), run.summary.get("machine", {})
+    versions, machine = run.numbers.get("versions", {}), run.numbers.get("machine", {})
     packages = [f"{name} {versions[name]}" for name in ("quadsim", "mujoco", "piqp") if name in versions]
     where = f"{machine['processor']}, {machine['cores']} cores" if {"processor", "cores"} <= machine.keys() else ""
     return " on ".join(filter(None, (", ".join(packages), where)))

@@ -13,7 +13,6 @@ import numpy as np
 
 from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, columns_of
-from quadsim.flight.rundir import Run
 from quadsim.space import AnyObstacle, Obstacle, Region, footprint
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 
@@ -254,13 +253,13 @@ def has_space(limits: Iterable[Limit]) -> bool:
     return any(isinstance(limit, SpaceLimit) for limit in limits)
 
 
-def region_edges(run: Run) -> Iterator[tuple[SpaceLimit, Array]]:
+def region_edges(limits: Iterable[Limit], log: FlightLog) -> Iterator[tuple[SpaceLimit, Array]]:
     """Each region with its edges (E, 2, 3) [m], cut off around course and path."""
-    regions = [limit for limit in run.limits if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Region)]
+    regions = [limit for limit in limits if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Region)]
     if not regions:
         return
-    course = run.log.control.reference[:, :3]
-    path = run.log.plant.state[:, POSITION]
+    course = log.control.reference[:, :3]
+    path = log.plant.state[:, POSITION]
     points = np.concatenate([course, path[np.isfinite(path).all(axis=1)]])
     middle = points[0]
     points = np.clip(points, middle - _LONG, middle + _LONG)

@@ -13,7 +13,7 @@ import numpy as np
 from quadsim.errors import InputError, UnknownNameError
 from quadsim.flight.audit import SIGNALS, TERM_SIGNALS, SpaceLimit, margins_at
 from quadsim.flight.metrics import percentiles
-from quadsim.flight.rundir import Run
+from quadsim.flight.record import FlightRecord
 from quadsim.palette import COLOUR, CYCLE, line_colour
 from quadsim.report.comparison import distinct_courses, run_names
 from quadsim.report.figure import (
@@ -60,7 +60,7 @@ _MOST_NAMED: Final = 9  # largest number of obstacles and regions named in the l
 _DIRECTIONS: Final = 300  # number of directions that sample the hull of a solid
 
 
-def write_figures(run: Run, directory: Path) -> list[Path]:
+def write_figures(run: FlightRecord, directory: Path) -> list[Path]:
     """Write the figures of one run as PNG; none if no control period was flown.
 
     The two scenarios of the paper carry its figure numbers in their file names, e.g. `figure4_states.png`.
@@ -82,7 +82,7 @@ def write_figures(run: Run, directory: Path) -> list[Path]:
     )
 
 
-def page_figures(runs: Sequence[Run]) -> list[Figure | Scene]:
+def page_figures(runs: Sequence[FlightRecord]) -> list[Figure | Scene]:
     """Return a page's figures of the runs that flew at least one control period."""
     flown = [run for run in runs if run.log.control.t.size]
     if not flown:
@@ -93,12 +93,12 @@ def page_figures(runs: Sequence[Run]) -> list[Figure | Scene]:
     return [*figures, path(runs)]
 
 
-def overview(runs: Sequence[Run]) -> Figure:
+def overview(runs: Sequence[FlightRecord]) -> Figure:
     """Plot position, roll, pitch and rotor speeds of runs."""
     return replace(signals(runs, ("x", "roll", "y", "pitch", "z", "speed")), key="comparison", columns=2)
 
 
-def signals(runs: Sequence[Run], names: Sequence[str]) -> Figure:
+def signals(runs: Sequence[FlightRecord], names: Sequence[str]) -> Figure:
     """Plot one panel per name over time, each with all runs that have it.
 
     Args:
@@ -120,7 +120,7 @@ def signals(runs: Sequence[Run], names: Sequence[str]) -> Figure:
     return _timed("signals", "", tuple(known[name](runs, name) for name in names), runs, columns=1)
 
 
-def _panels(runs: Sequence[Run]) -> dict[str, Callable[[Sequence[Run], str], Panel]]:
+def _panels(runs: Sequence[FlightRecord]) -> dict[str, Callable[[Sequence[FlightRecord], str], Panel]]:
     """What `signals` can plot of these runs: the panel of each name."""
     return {
         **dict.fromkeys((name for run in runs for name in run.log.control.logged), _logged),
@@ -133,7 +133,7 @@ def _panels(runs: Sequence[Run]) -> dict[str, Callable[[Sequence[Run], str], Pan
     }
 
 
-def states(runs: Sequence[Run]) -> Figure:
+def states(runs: Sequence[FlightRecord]) -> Figure:
     """Plot position and attitude; also tilt and quaternion if the vehicle may turn upside down."""
     plants = [run.log.plant for run in runs]
     if all(plant.attitude is None for plant in plants):
@@ -153,7 +153,7 @@ def states(runs: Sequence[Run]) -> Figure:
     return _timed("states", "position and attitude", tuple(panels), runs)
 
 
-def inputs(runs: Sequence[Run]) -> Figure:
+def inputs(runs: Sequence[FlightRecord]) -> Figure:
     """Plot rotor speeds and their steps: one panel for a single run, one panel per rotor for several."""
     titles = {"speed": "rotor speed", "slew": "step per period"}
     if len(runs) == 1:
@@ -171,7 +171,7 @@ def inputs(runs: Sequence[Run]) -> Figure:
     return _timed("inputs", "rotor speeds and their steps", tuple(panels), runs)
 
 
-def targets(run: Run) -> list[Figure]:
+def targets(run: FlightRecord) -> list[Figure]:
     """Plot thrust and body rates that an autopilot was to fly, and what it flew; no figure without one."""
     target, plant = run.log.control.target, run.log.plant
     if target is None or plant.thrust is None:
@@ -188,7 +188,7 @@ def targets(run: Run) -> list[Figure]:
     return [_timed("targets", "targets of the autopilot", tuple(panels), [run])]
 
 
-def times(runs: Sequence[Run]) -> Figure:
+def times(runs: Sequence[FlightRecord]) -> Figure:
     """Plot computation times against the deadline, iterations and active constraints."""
     reported = [key for key in _CLOCKS if any(np.isfinite(getattr(run.log.timing, key)).any() for run in runs)]
     panels = [_clock(runs, key) for key in reported]
@@ -201,7 +201,7 @@ def times(runs: Sequence[Run]) -> Figure:
     return _timed("solve_times", "time to compute a command", tuple(panels), runs)
 
 
-def _clock(runs: Sequence[Run], key: str) -> Panel:
+def _clock(runs: Sequence[FlightRecord], key: str) -> Panel:
     """Plot a computation time per period, and the deadline of a whole step."""
     curves, title = [], _CLOCKS[key]
     for i, label, run in _flown(runs):
@@ -213,13 +213,13 @@ def _clock(runs: Sequence[Run], key: str) -> Panel:
             spent = percentiles(values)
             title = f"{title}: median {spent['p50']:.3g}, p99 {spent['p99']:.3g}, max {spent['max']:.3g}"
     deadlines = (
-        {float(run.summary["controller"]["deadline_ms"]) for _, _, run in _flown(runs)} if key == "step_ms" else ()
+        {float(run.numbers["controller"]["deadline_ms"]) for _, _, run in _flown(runs)} if key == "step_ms" else ()
     )
     bounds = tuple(Bound(value=deadline, start=0.0, stop=_end(runs)) for deadline in sorted(deadlines))
     return Panel(title=title, y_label="time [ms]", y_log=True, series=tuple(curves), bounds=bounds)
 
 
-def effects(run: Run) -> list[Figure]:
+def effects(run: FlightRecord) -> list[Figure]:
     """Plot, as far as recorded: commanded and actual rotor speeds, forces, wind, battery, measurement errors."""
     plant, control = run.log.plant, run.log.control
     commanded = commanded_speeds(run.log)
@@ -235,7 +235,7 @@ def effects(run: Run) -> list[Figure]:
     return [_timed("effects", "effects", tuple(panels), [run])] if panels else []
 
 
-def space(run: Run) -> list[Figure]:
+def space(run: FlightRecord) -> list[Figure]:
     """Plot a flight among obstacles and regions from above, and its clearances; no figure without any."""
     if not has_space(run.limits):
         return []
@@ -255,7 +255,7 @@ def space(run: Run) -> list[Figure]:
     return [_timed("space", "from above, and clearances", (_above([run]), clear), [run], columns=1)]
 
 
-def xy(run: Run) -> list[Figure]:
+def xy(run: FlightRecord) -> list[Figure]:
     """Plot a flight from above if its course moves in x and y at one height, and `space` does not show it."""
     course = run.log.control.reference[:, :3]
     spans = course.max(axis=0) - course.min(axis=0)
@@ -263,7 +263,7 @@ def xy(run: Run) -> list[Figure]:
     return [_timed("xy", "path", (_above([run]),), [run], columns=1)] if planar and not space(run) else []
 
 
-def _above(runs: Sequence[Run]) -> Panel:
+def _above(runs: Sequence[FlightRecord]) -> Panel:
     """Plot flights and their courses from above, with obstacles and the edges of regions."""
     areas, regions = [], []
     for run in {run.limits: run for run in reversed(runs)}.values():  # the first run with these limits
@@ -278,7 +278,7 @@ def _above(runs: Sequence[Run]) -> Panel:
                     areas.append(Area(outline=outline, colour=COLOUR.obstacle, opacity=opacity, label="obstacle"))
         regions += [
             Series(x=edge[:, 0], y=edge[:, 1], colour=COLOUR.bound, label="region", dashed=True, width=0.9)
-            for _, edges in region_edges(run)
+            for _, edges in region_edges(run.limits, run.log)
             for edge in edges
         ]
     courses = (run.log.control.reference for run in distinct_courses(runs))
@@ -299,7 +299,7 @@ def _point(place: Array, label: str, colour: str, **looks: Any) -> Series:
     return Series(x=place[:1], y=place[1:2], label=label, colour=colour, style="points", **looks)
 
 
-def path(runs: Sequence[Run]) -> Scene:
+def path(runs: Sequence[FlightRecord]) -> Scene:
     """Draw flights and courses in space, with obstacles at their start and the edges of regions."""
     solids, paths = [], []
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
@@ -308,7 +308,8 @@ def path(runs: Sequence[Run]) -> Scene:
             for solid in obstacle.solids:
                 corners = np.unique(solid.support(directions).round(4), axis=0)
                 solids.append((corners + obstacle.position, obstacle.name))
-        for limit, edges in region_edges(next(run for run in runs if run.limits == limits)):
+        first = next(run for run in runs if run.limits == limits)
+        for limit, edges in region_edges(limits, first.log):
             lines = np.insert(edges, 2, np.nan, axis=1).reshape(-1, 3)
             paths.append((lines, limit.name, COLOUR.bound, "", True))
     for run in distinct_courses(runs):
@@ -318,7 +319,7 @@ def path(runs: Sequence[Run]) -> Scene:
     return Scene(key="path", title="path in space", paths=tuple(paths), solids=tuple(solids))
 
 
-def _signal(runs: Sequence[Run], name: str) -> Panel:
+def _signal(runs: Sequence[FlightRecord], name: str) -> Panel:
     """Plot a signal of the audit with reference and bounds; for a single run also the measured state if it differs.
 
     What every rotor has is a curve per rotor for a single run, and for several the range over the rotors of each.
@@ -354,7 +355,7 @@ def _of_run(i: int, label: str, x: Array, y: Array, **looks: Any) -> Series:
     return Series(x=x, y=y, colour=line_colour(i), label=label, group=f"run{i}", dashed=dashed, **looks)
 
 
-def _error(runs: Sequence[Run], name: str) -> Panel:
+def _error(runs: Sequence[FlightRecord], name: str) -> Panel:
     """Plot the distance of the true position from the filtered reference."""
     curves = tuple(
         _of_run(i, label, run.log.control.t, np.linalg.norm(run.log.control.tracking_error[:, :3], axis=1))
@@ -363,7 +364,7 @@ def _error(runs: Sequence[Run], name: str) -> Panel:
     return Panel(title="position error", unit="m", series=curves)
 
 
-def _margin(runs: Sequence[Run], name: str) -> Panel:
+def _margin(runs: Sequence[FlightRecord], name: str) -> Panel:
     """Plot the signed margin to a constraint, negative beyond its bound, at the highest rate of its signal."""
     curves, units = [], []
     for i, label, run in _flown(runs):
@@ -378,7 +379,7 @@ def _margin(runs: Sequence[Run], name: str) -> Panel:
     return Panel(title=title, unit=_one_unit(name, units), series=tuple(curves), bounds=(bound,))
 
 
-def _logged(runs: Sequence[Run], name: str) -> Panel:
+def _logged(runs: Sequence[FlightRecord], name: str) -> Panel:
     """Plot a signal that the controller logged."""
     logs = [(i, label, run.log.control) for i, label, run in _flown(runs) if name in run.log.control.logged]
     curves = tuple(_of_run(i, label, log.t, log.logged[name][1]) for i, label, log in logs)
@@ -410,21 +411,21 @@ def _acting(rotor: int, t: Array, commanded: Array, speeds: Array) -> Panel:
     return Panel(title=f"rotor {rotor + 1}", unit=SIGNALS["speed"].unit, series=(command, acting))
 
 
-def _bounds(runs: Sequence[Run], signal: str) -> tuple[Bound, ...]:
+def _bounds(runs: Sequence[FlightRecord], signal: str) -> tuple[Bound, ...]:
     limits = [limit for run in runs for limit in run.limits]
     bounds = bounds_of(limits, signal, _end(runs))
     return tuple(Bound(value=value, start=start, stop=stop) for value, start, stop in bounds)
 
 
-def _end(runs: Sequence[Run]) -> float:
+def _end(runs: Sequence[FlightRecord]) -> float:
     return max(run.end for run in runs)
 
 
-def _flown(runs: Sequence[Run]) -> Iterator[tuple[int, str, Run]]:
+def _flown(runs: Sequence[FlightRecord]) -> Iterator[tuple[int, str, FlightRecord]]:
     """Return number, name and run of runs that flew a period; a single run without a label is named `flight`."""
     names = ("flight",) if len(runs) == 1 and runs[0].label is None else run_names(runs)
     return ((i, name, run) for i, (name, run) in enumerate(zip(names, runs, strict=True)) if run.log.control.t.size)
 
 
-def _timed(key: str, title: str, panels: tuple[Panel, ...], runs: Sequence[Run], columns: int = 2) -> Figure:
+def _timed(key: str, title: str, panels: tuple[Panel, ...], runs: Sequence[FlightRecord], columns: int = 2) -> Figure:
     return Figure(key=key, title=title, panels=panels, columns=columns, end=_end(runs))

@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import tempfile
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from quadsim.assets import read_toml
 from quadsim.console.progress import Progress, silent
 from quadsim.console.results import Result, Shown, after
-from quadsim.errors import OutputError, ParameterError
-from quadsim.flight import metrics, rundir
-from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
+from quadsim.errors import ParameterError
+from quadsim.flight.audit import Limit, audit, limit_differences
+from quadsim.flight.rundir import VIDEO_FILE, limit_to_json
 from quadsim.outputs import reserving
 from quadsim.report.comparison import check_names, different_audits
 from quadsim.report.table import Cell, QuantityRow
-from quadsim.rollout.flown import INTERRUPTED, Flight, add_films, require_film, worst_margin
-from quadsim.rollout.reaudit import reaudit, stored_run
+from quadsim.rollout.flown import Flight, add_films, require_film, require_product, worst_margin, write_run
+from quadsim.rollout.reaudit import reaudit
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.catalogue import names_directory
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.writing import plain
 
 if TYPE_CHECKING:
     from quadsim.report.figure import Figure
@@ -44,7 +42,7 @@ Compared = Flight | Scenario | str | Path
 class FlightComparison(Result):
     """Flights side by side."""
 
-    runs: tuple[rundir.Run, ...]  # the flights
+    flights: tuple[Flight, ...]
     rows: list[QuantityRow]  # the table, a row per quantity
     notes: tuple[str, ...]  # in what controllers and audits differ, and whose constraints they were audited against
     names: tuple[str, ...]  # column names, one per flight
@@ -52,9 +50,8 @@ class FlightComparison(Result):
 
     def __repr__(self) -> str:
         flights = []
-        for name, run in zip(self.names, self.runs, strict=True):
-            findings = map(rundir.finding_from_json, run.summary["constraints"])
-            flights.append(f"\n {name}: {run.summary['verdict']}{worst_margin(findings)}")
+        for name, flight in zip(self.names, self.flights, strict=True):
+            flights.append(f"\n {name}: {flight.outcome}{worst_margin(flight.findings)}")
         more = f"\n and {len(flights) - _FIRST} more" if len(flights) > _FIRST else ""
         return f"<FlightComparison of {len(flights)} flights{''.join(flights[:_FIRST])}{more}>"
 
@@ -63,14 +60,14 @@ class FlightComparison(Result):
         """Who holds the constraints, and who tracks closer."""
         from quadsim.report.comparison import conclusion
 
-        return conclusion(self.runs, self.names)
+        return conclusion(self.flights, self.names)
 
     def small_plot(self) -> Figure | None:
         """See `Result.small_plot`: position over time."""
         from quadsim.report.flight_figures import signals
 
-        flown = [run for run in self.runs if run.log.control.t.size]
-        return signals(self.runs, ("x", "y", "z")) if flown else None
+        flown = [flight for flight in self.flights if flight.time.size]
+        return signals(self.flights, ("x", "y", "z")) if flown else None
 
     def to_markdown(self) -> str:
         """The table as Markdown."""
@@ -146,54 +143,52 @@ def compare_flights(
     whose = None if constraints is None else place_of(constraints, targets)
     check_names(names, len(targets))
     require_film(products.get("video"), fps)
-    for target in targets:
-        _check(target)
+    opened = [_opened(target) for target in targets]
     with contextlib.ExitStack() as stack:
-        scratch = stack.enter_context(tempfile.TemporaryDirectory())
         if out is not None:
             stack.enter_context(reserving(out, overwrite=overwrite))
-        beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
-        saved = dict.fromkeys(("recording", "figures"), False) if out is None else products
-        runs = tuple(_run_of(target, beside, progress, saved, pictures=out is not None) for target in targets)
+        beside = None if out is None else out.parent / f"{out.name}-runs"
+        flights = tuple(_flight_of(target, beside, progress, products) for target in opened)
         if names:
-            runs = tuple(replace(run, label=name) for run, name in zip(runs, names, strict=True))
-        names = run_names(runs)
+            flights = tuple(flight.labelled(name) for flight, name in zip(flights, names, strict=True))
+        names = run_names(flights)
         if whose is None:
-            notes = _differences(runs, names)
+            notes = _differences(flights, names)
         else:
-            limits = runs[whose].limits
-            runs = tuple(audited_against(run, limits) for run in runs)
+            limits = flights[whose].limits
+            flights = tuple(audited_against(flight, limits) for flight in flights)
             notes = (f"All are audited against the constraints of {names[whose]}, at the rate of their tables.",)
-        controllers = [_controller_of(target, run) for target, run in zip(targets, runs, strict=True)]
-        notes = (*controller_differences(controllers, names), *notes)
+        notes = (*controller_differences([_controller_of(flight) for flight in flights], names), *notes)
         progress("comparison", 0, 1)
-        comparison = FlightComparison(runs=runs, rows=comparison_rows(runs), names=names, notes=notes, page=None)
-        if out is None:
+        rows = comparison_rows(flights)
+        comparison = FlightComparison(flights=flights, rows=rows, names=names, notes=notes, page=None)
+        if out is None or beside is None:
             return comparison
         with after(comparison, out):
-            page = write_comparison(runs, out, notes=notes, overwrite=overwrite)
+            page = write_comparison(flights, out, notes=notes, overwrite=overwrite)
             comparison = replace(comparison, page=page)
             if flown is not None:
                 flown(comparison)
-            if unfilmed := _unfilmed(runs, beside, products.get("video")):
+            if unfilmed := _unfilmed(flights, beside, products.get("video")):
                 note = f"the page without them: {short_path(page)}"
-                failed = add_films(unfilmed, note=note, progress=progress, fps=fps)
-                write_comparison(runs, out, notes=notes, overwrite=True)
-                for path, problem in failed.items():
-                    if products.get("video") and problem != INTERRUPTED:
-                        raise OutputError(path, f"{problem}; all else is there")
+                filmed = add_films(unfilmed, note=note, progress=progress, fps=fps)
+                write_comparison(flights, out, notes=notes, overwrite=True)
+                if products.get("video"):
+                    for flight in filmed:
+                        require_product(flight, VIDEO_FILE)
             return comparison
 
 
-def _unfilmed(runs: Sequence[rundir.Run], beside: Path, video: bool | None) -> list[rundir.Run]:
+def _unfilmed(flights: Sequence[Flight], beside: Path, video: bool | None) -> list[Flight]:
     """Return what to film: on request all flights that have no film, else those that were saved beside the page."""
-    directories = {run.directory: run for run in runs if video or run.directory.parent == beside}
-    filmed = {place for place in directories if (place / rundir.VIDEO_FILE).exists()}
-    return [
-        run
-        for place, run in directories.items()
-        if video is not False and place not in filmed and run.log.control.t.size and not run.log.interrupted
-    ]
+    unfilmed: dict[Path, Flight] = {}
+    for flight in flights:
+        place = flight.directory
+        if place is None or video is False or not flight.time.size or flight.log.interrupted:
+            continue
+        if (video or place.parent == beside) and not (place / VIDEO_FILE).exists():
+            unfilmed[place] = flight
+    return list(unfilmed.values())
 
 
 def place_of(target: Compared, targets: Sequence[Compared]) -> int:
@@ -205,26 +200,19 @@ def place_of(target: Compared, targets: Sequence[Compared]) -> int:
     raise ParameterError("", "--constraints", str(target), rule)
 
 
-def _differences(runs: Sequence[rundir.Run], names: Sequence[str]) -> tuple[str, ...]:
+def _differences(flights: Sequence[Flight], names: Sequence[str]) -> tuple[str, ...]:
     """Return a sentence if flights are audited against different constraints or tolerances."""
-    for run, name in zip(runs[1:], names[1:], strict=True):
-        if differences := limit_differences(runs[0].limits, run.limits, demands=False):
+    for flight, name in zip(flights[1:], names[1:], strict=True):
+        if differences := limit_differences(flights[0].limits, flight.limits, demands=False):
             return (different_audits(names[0], name, differences),)
     return ()
 
 
-def _controller_of(target: Compared, run: rundir.Run) -> Mapping[str, Any] | None:
-    """Return the table of a flight's controller; None where no scenario states what flew."""
-    if isinstance(target, Flight) and target.directory is None:
-        if target.own_code:
-            return None
-        tables = tomllib.loads(target.scenario.to_toml())
-    else:
-        path = run.directory / rundir.SCENARIO_FILE
-        if not path.is_file():
-            return None
-        tables = read_toml(path)
-    controller = tables.get("controller")
+def _controller_of(flight: Flight) -> Mapping[str, Any] | None:
+    """Return the table of a flight's controller; None where its scenario does not state what flew."""
+    if flight.own_code:
+        return None
+    controller = plain(flight.scenario.controller)
     return {"type": controller} if isinstance(controller, str) else controller
 
 
@@ -257,49 +245,43 @@ def _controller_difference(a: str, first: Mapping[str, Any], b: str, second: Map
     return parts
 
 
-def audited_against(run: rundir.Run, limits: Sequence[Limit]) -> rundir.Run:
-    """Return a run that is audited again from its tables, against other constraints."""
-    findings = audit(run.log, limits)
-    failed = metrics.failure(run.log.control) is not None
-    verdict = flight_verdict(findings, aborted=run.log.aborted, lost=run.log.reason is not None, failed=failed)
+def audited_against(flight: Flight, limits: Sequence[Limit]) -> Flight:
+    """Return a flight that is audited again, from the rows that it has, against other constraints."""
+    findings = audit(flight.log, limits)
+    verdict = flight.verdict_of(findings)
     again = {
-        "constraints": [rundir.limit_to_json(finding) for finding in findings],
+        "constraints": [limit_to_json(finding) for finding in findings],
         "verdict": verdict,
         "satisfied": verdict == "satisfied",
         "expected": None,
         "audit_notes": [],
     }
-    return replace(run, summary={**run.summary, **again}, limits=tuple(finding.limit for finding in findings))
+    return replace(flight, findings=findings, recorded={**flight.summary, **again})
 
 
-def _check(target: Compared) -> None:
-    """Reject targets that cannot be compared, before any flight."""
+def _opened(target: Compared) -> Flight | Scenario:
+    """Return a flight, read where the target is a run directory, or the scenario to fly.
+
+    Raises:
+        InputError: the target cannot be compared.
+    """
     if isinstance(target, Flight | Scenario):
-        return
-    if names_directory(target):
-        for note in reaudit(Path(target), products=False).notes:
-            _log.info("%s: %s", target, note)
-    else:
-        load_scenario(str(target))
+        return target
+    if not names_directory(target):
+        return load_scenario(str(target))
+    flight = reaudit(Path(target), products=False)
+    for note in flight.notes:
+        _log.info("%s: %s", target, note)
+    return flight
 
 
-def _run_of(
-    target: Compared, beside: Path, progress: Progress, products: Mapping[str, bool | None], *, pictures: bool
-) -> rundir.Run:
-    """Return a target as a run; fly and save it beside the page if necessary."""
-    if isinstance(target, Flight):
-        if target.directory is not None or not pictures:
-            return target.run
-        with reserving(beside / target.scenario.name, free=True) as place:
-            return _saved(target, place, progress, products)
-    if not isinstance(target, Scenario) and names_directory(target):
-        return stored_run(Path(target))
-    scenario = target if isinstance(target, Scenario) else load_scenario(str(target))
-    with reserving(beside / scenario.name, free=True) as place:
-        return _saved(Rollout(scenario).fly(progress), place, progress, products)
-
-
-def _saved(flight: Flight, place: Path, progress: Progress, products: Mapping[str, bool | None]) -> rundir.Run:
-    recording, figures = (products.get(name) for name in ("recording", "figures"))
-    flight.save(place, video=False, recording=recording, figures=figures, progress=progress)
-    return rundir.load_run(place)
+def _flight_of(
+    target: Flight | Scenario, beside: Path | None, progress: Progress, products: Mapping[str, bool | None]
+) -> Flight:
+    """Return a target as a flight; fly it if necessary, and save it beside the page, if there is one."""
+    flight = target if isinstance(target, Flight) else Rollout(target).fly(progress)
+    if beside is None or flight.directory is not None:
+        return flight if isinstance(target, Flight) else flight.as_stored()
+    with reserving(beside / flight.name, free=True) as place:
+        written = write_run(flight, place, {**products, "video": False}, overwrite=False, progress=progress, flown=None)
+    return written.as_stored()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from quadsim.console.results import Result, Shown
 from quadsim.errors import InputError, ParameterError
-from quadsim.flight.rundir import Run
+from quadsim.flight.record import FlightRecord
 from quadsim.report.comparison import check_names
 from quadsim.report.flight_figures import signals as draw_signals
 from quadsim.report.to_matplotlib import draw, figure_file, show_window, write_figure
@@ -50,7 +49,7 @@ class Overlay(list[Any], Result):
 
 
 def plot_runs(
-    runs: Sequence[Run],
+    runs: Sequence[FlightRecord],
     signals: Sequence[str],
     *,
     labels: Sequence[str] = (),
@@ -65,7 +64,7 @@ def plot_runs(
     if not _WIDTHS[0] <= width <= _WIDTHS[1]:
         raise ParameterError("", "width", width, "{:g} to {:g} in".format(*_WIDTHS))
     if labels:
-        runs = [replace(run, label=label) for run, label in zip(runs, labels, strict=True)]
+        runs = [run.labelled(label) for run, label in zip(runs, labels, strict=True)]
     if out is not None:
         out = figure_file(out, overwrite=overwrite)
     figure = draw_signals(runs, signals or _USUAL)

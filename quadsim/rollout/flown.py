@@ -7,7 +7,7 @@ import logging
 import shlex
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from html import escape
 from importlib.util import find_spec
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from quadsim.console.junit import Cases, flight_verdicts
 from quadsim.console.progress import Progress, reporting, silent
 from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown, plot_html
 from quadsim.controller import NOT_CONVERGED
@@ -24,6 +25,7 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import (
     VERDICT_TEXT,
     Finding,
+    Limit,
     flight_verdict,
     margins_at,
     margins_sampled,
@@ -32,7 +34,7 @@ from quadsim.flight.audit import (
 from quadsim.flight.log import FlightLog, PlantLog, columns_of
 from quadsim.flight.parquet import FORMAT, log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
-from quadsim.outputs import absolute, adding, amend, to_json, writing
+from quadsim.outputs import absolute, adding, amend, file_hashes, to_json, writing
 from quadsim.plausibility import implausible
 from quadsim.rollout.flight_events import story
 from quadsim.rollout.machine import machine, versions
@@ -59,18 +61,30 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger("quadsim")
 _PRODUCTS: Final = {rundir.RECORDING_FILE: "recording", rundir.FIGURES_DIR: "figures", rundir.VIDEO_FILE: "video"}
 INTERRUPTED: Final = "interrupted (Ctrl-C)"
+MADE: Final = "made"  # of a product in a summary; a text says why another one is not there
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """What `quadsim check` adds to a flight."""
+
+    notes: tuple[str, ...] = ()  # remarks for the user that are not errors
+    again: tuple[Finding, ...] | None = None
+    """The audit from the tables of a run, at the control samples and at the log rate; None of a flight that was flown
+    to be checked."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Flight(Result):
-    """A flown scenario.
+    """A flown scenario: the one record from which text, JSON, tables, figures and films are made.
 
     Arrays with one row per control period k, taken at t_k, are `time`, `state`, `measured`, `reference`, `command` and
     `margins`; `plant` has the vehicle in between, at the physics rate (when read from a directory: at the scenario's
     `log_rate`). Angles are in rad; `docs/conventions.md` defines states, frames and margins.
 
     Attributes:
-        assembly: the parts of its scenario, which is resolved: it contains every number of its vehicle.
+        scenario: the scenario flown, with every number of its vehicle.
+        assembly: the parts that were built of it.
         log: the flight as stacked arrays.
         findings: the audit, one per constraint of the scenario.
         controller: name of the control law.
@@ -78,7 +92,10 @@ class Flight(Result):
         simulate_s: wall time of the closed loop alone [s].
         tallies: counts of each sensor's samples in the estimator; empty without one.
         directory: where it was read from or written to; None if it is only in memory.
-        recorded: `summary.json` of a flight that was read; None for a new flight.
+        label: its name in comparisons and legends; None for that of its scenario, and what tells its flights apart.
+        recorded: `summary.json` as it was read or written; None for a flight that is only in memory.
+        thinned: whether `plant` has the rows at the scenario's `log_rate` alone, as files have them.
+        checked: what `quadsim check` adds; None for a flight that was not checked.
         infeasible_period: the first period whose QP had no answer; None if there is none, or the flight was read.
         own_code: whether a controller, force or autopilot flew that was passed in, which the scenario cannot repeat.
         try_remedies: flies what the explanation of a failure suggests, see `quadsim.rollout.remedies.tried`; None for a
@@ -93,7 +110,8 @@ class Flight(Result):
         True
     """
 
-    assembly: Assembly
+    scenario: Scenario
+    assembly: Assembly = field(repr=False)
     log: FlightLog = field(repr=False)
     findings: tuple[Finding, ...] = field(repr=False)
     controller: str
@@ -101,15 +119,22 @@ class Flight(Result):
     simulate_s: float
     tallies: Mapping[SensorName, Tally] = field(repr=False)
     directory: Path | None = None
+    label: str | None = None
     recorded: Mapping[str, Any] | None = field(default=None, repr=False)
+    thinned: bool = field(default=False, repr=False)
+    checked: Check | None = field(default=None, repr=False)
     infeasible_period: InfeasiblePeriod | None = field(default=None, repr=False)
     own_code: bool = field(default=False, repr=False)
     try_remedies: Callable[[Mapping[str, Any], Flight], dict[str, Any]] | None = field(default=None, repr=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle an assembly that does not need its vehicle's file."""
+        return {**vars(self), "assembly": self.assembly.of(self.scenario)}
+
     @property
-    def scenario(self) -> Scenario:
-        """The scenario flown, with every number of its vehicle."""
-        return self.assembly.scenario
+    def name(self) -> str:
+        """The scenario's name."""
+        return self.scenario.name
 
     @property
     def vehicle(self) -> Vehicle:
@@ -137,8 +162,12 @@ class Flight(Result):
     @property
     def outcome(self) -> FlightVerdict:
         """The verdict in one word, see `quadsim.flight.audit.flight_verdict`."""
+        return self.verdict_of(self.findings)
+
+    def verdict_of(self, findings: Sequence[Finding]) -> FlightVerdict:
+        """Return the verdict that another audit of this flight gives, see `quadsim.flight.audit.flight_verdict`."""
         return flight_verdict(
-            self.findings,
+            findings,
             aborted=self.log.aborted,
             lost=self.log.reason is not None,
             failed=metrics.failure(self.log.control) is not None,
@@ -154,7 +183,7 @@ class Flight(Result):
         `sentence` and `advice` are for users; `docs/audit.md` explains the other entries.
         """
         explanation = self._explanation
-        if explanation is None or self.try_remedies is None:
+        if explanation is None or self.recorded is not None or self.try_remedies is None:
             return explanation
         return self.try_remedies(explanation, self)
 
@@ -170,6 +199,21 @@ class Flight(Result):
         spec = self.scenario.controller_at(self.infeasible_period.time)
         scenario = self.scenario.altered(controller=spec, events=())
         return diagnose(self.infeasible_period, scenario, self.vehicle, self.log.control.status)
+
+    @property
+    def limits(self) -> tuple[Limit, ...]:
+        """The constraints that it was audited against."""
+        return tuple(finding.limit for finding in self.findings)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks of `quadsim check` that are not errors."""
+        return () if self.checked is None else self.checked.notes
+
+    @property
+    def end(self) -> float:
+        """Last time of the flight [s]."""
+        return float(self.log.plant.t[-1])
 
     @property
     def audit(self) -> tuple[Finding, ...]:
@@ -235,35 +279,35 @@ class Flight(Result):
     @cached_property
     def summary(self) -> Mapping[str, Any]:
         """All numbers: the content of `summary.json`."""
-        return self._numbers if self.recorded is not None else {**self._numbers, "diagnosis": self.diagnosis}
+        return {**self.numbers, "diagnosis": self.diagnosis}
 
     @cached_property
-    def _numbers(self) -> Mapping[str, Any]:
+    def numbers(self) -> Mapping[str, Any]:
         """`summary` before a change that its diagnosis advises is flown."""
-        return self.recorded if self.recorded is not None else summarise(self)
+        return summarise(self) if self.recorded is None else self.recorded
 
     @cached_property
     def metrics(self) -> dict[str, float]:
         """The flight's numbers by name, e.g. `rmse.x`, `speed_max`, `step_ms.p99`; units as in `summary`."""
-        numbers = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self._numbers[name]))
+        numbers = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self.numbers[name]))
         return {
             name: value for name, value in numbers if isinstance(value, int | float) and not isinstance(value, bool)
         }
 
-    @property
-    def run(self) -> rundir.Run:
-        """The flight in the form that figures and pages use."""
-        return self._run(self.summary)
+    def to_toml(self) -> str:
+        """Return the file of its scenario, as `save` writes it."""
+        return self.assembly.to_toml(self.scenario)
 
-    @property
-    def undiagnosed_run(self) -> rundir.Run:
-        """`run` for figures, before a change that its diagnosis advises is flown."""
-        return self._run(self._numbers)
+    def labelled(self, label: str) -> Flight:
+        """Return the flight under another name in comparisons and legends."""
+        return replace(self, label=label)
 
-    def _run(self, summary: Mapping[str, Any]) -> rundir.Run:
-        limits = tuple(finding.limit for finding in self.findings)
-        directory = self.directory or Path(self.scenario.name)
-        return rundir.Run(directory=directory, summary=dict(summary), log=self.log, vehicle=self.actual, limits=limits)
+    def as_stored(self) -> Flight:
+        """Return the flight with the plant's rows that its files have; numbers and audit are those of all rows."""
+        if self.thinned:
+            return self
+        plant = self.log.plant.every(self.scenario.plant_stride)
+        return replace(self, log=replace(self.log, plant=plant), recorded=self.summary, thinned=True)
 
     def to_arrow(self, table: str = "flight") -> pa.Table:
         """A table of the flight, units in its columns' metadata.
@@ -303,7 +347,7 @@ class Flight(Result):
         """
         from quadsim.rollout.flight_plot import plot_runs
 
-        return plot_runs([self.undiagnosed_run], signals, **options)
+        return plot_runs([self], signals, **options)
 
     def save(
         self,
@@ -336,101 +380,109 @@ class Flight(Result):
             OutputError: the directory cannot be written or contains other files, the flight was read from a directory,
                 or a requested product failed; in that case the tables and the summary are written.
         """
-        if self.recorded is not None:
+        if self.thinned:
             raise OutputError(directory, f"this flight is on disk already, in {self.directory}; copy that directory")
         require_film(video, fps)
-        if self.write_tables(directory, overwrite=overwrite):
+        flight, whole = self.write_tables(directory, overwrite=overwrite)
+        if whole:
             products = {"video": video, "recording": recording, "figures": figures}
-            self.add_products(directory, **products, fps=fps, progress=progress)
+            _require_products(add_products(flight, products, fps=fps, progress=progress), products)
         return Path(directory)
 
-    def write_tables(self, directory: str | Path, *, overwrite: bool = False) -> bool:
+    def write_tables(self, directory: str | Path, *, overwrite: bool = False) -> tuple[Flight, bool]:
         """Write the run directory without figures, recording and video; errors as `save`.
 
         Returns:
-            Whether products may follow: Ctrl-C here is heeded, but loses no flight.
+            The flight as it was written, and whether products may follow: Ctrl-C here is heeded, but loses no flight.
         """
         started = clock.perf_counter() - self.simulate_s
+        target = absolute(directory)
 
-        def write(*, overwrite: bool) -> None:
-            with writing(directory, overwrite=overwrite) as partial:
-                (partial / rundir.SCENARIO_FILE).write_text(self.assembly.to_toml(), encoding="utf-8")
+        def write(*, overwrite: bool) -> Flight:
+            with writing(target, overwrite=overwrite) as partial:
+                (partial / rundir.SCENARIO_FILE).write_text(self.to_toml(), encoding="utf-8")
                 course = self.scenario.reference
                 if isinstance(course, Csv) and course.content is not None:
                     (partial / course.file).write_bytes(course.content)
                 write_log(partial, self.log, plant_stride=self.scenario.plant_stride, metadata=self.metadata)
                 wall_s = {"simulate": self.simulate_s, "total": clock.perf_counter() - started}
-                summary = to_json({**self._numbers, "wall_s": wall_s})
-                (partial / rundir.SUMMARY_FILE).write_text(summary, encoding="utf-8")
+                summary = {**self.numbers, "wall_s": wall_s, "products": {}, "files": file_hashes(partial)}
+                (partial / rundir.SUMMARY_FILE).write_text(to_json(summary), encoding="utf-8")
+            return replace(self, directory=target, recorded=summary)
 
         try:
-            write(overwrite=overwrite)
+            written = write(overwrite=overwrite)
         except KeyboardInterrupt:
-            write(overwrite=True)
-            return False
+            return write(overwrite=True), False
         try:
             if self._explanation is not None:
                 diagnosis = self.diagnosis  # which flies the changes that it advises
-                amend(absolute(directory), {"diagnosis": diagnosis})
+                amend(target, {"diagnosis": diagnosis})
+                return written._recording(diagnosis=diagnosis), True
         except KeyboardInterrupt:
-            return False
-        return True
+            return written, False
+        return written, True
 
-    def add_products(
-        self,
-        directory: str | Path,
-        *,
-        video: bool | None = None,
-        recording: bool | None = None,
-        figures: bool | None = None,
-        fps: int | None = None,
-        progress: Progress = silent,
-    ) -> None:
-        """Add figures, recording and video to the run directory; arguments and errors as `save`."""
-        target, started = absolute(directory), clock.perf_counter()
-        before = rundir.read_summary(target)["wall_s"]["total"]
-        requested = {"recording": recording, "figures": figures, "video": video}
-        failed = _add_products(self, target, requested, progress, fps)
-        amend(target, {"wall_s": {"total": before + clock.perf_counter() - started}})
-        for path, problem in failed.items():
-            raise OutputError(path, f"{problem}; all else is there")
+    def _recording(self, **entries: Any) -> Flight:
+        """Return the flight with other entries of its summary."""
+        return replace(self, recorded={**self.numbers, **entries})
 
     @property
     def exit_status(self) -> int:
-        """See `Result.exit_status`."""
+        """See `Result.exit_status`; 1 of a check that does not show that every constraint of the scenario holds."""
+        if self.checked is not None:
+            again = self.findings if self.checked.again is None else self.checked.again
+            return EXIT_DONE if self.satisfied and self.verdict_of(again) == "satisfied" else EXIT_FAILED
         return EXIT_DONE if self.outcome in ("satisfied", "incomplete", "unaudited") else EXIT_FAILED
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
         from quadsim.console.summary_tables import summary_tables
 
-        return summary_tables(self.to_json())
+        yield from summary_tables(self)
+        if self.checked is not None and self.checked.again is not None:
+            alike = (self.verdict_of(self.checked.again) == "satisfied") == self.satisfied
+            phrase = "as recorded" if alike else "a different verdict than recorded"
+            yield f"audited again from the tables, {self.scenario.log_rate:g} rows per second: {phrase}"
+
+    def verdicts(self) -> tuple[str, Cases]:
+        """See `quadsim.console.junit.Judged`."""
+        return flight_verdicts(self)
 
     def outputs(self) -> Shown:
         """See `Result.outputs`."""
         from quadsim.console import console
 
-        if self.directory is None:
+        if self.directory is None or self.checked is not None:
             return
         yield console.written_to(self.directory)
+        products = self.numbers.get("products", {})
         for name in (rundir.VIDEO_FILE, rundir.FIGURES_DIR):
-            if (self.directory / name).exists():
+            if products.get(name) == MADE:
                 yield console.to_open(self.directory / name)
-        if (self.directory / rundir.RECORDING_FILE).exists():
+        if products.get(rundir.RECORDING_FILE) == MADE:
             yield console.to_open(self.directory, "quadsim view")
         if self.time.size:
             words = ("quadsim", "plot", console.short_path(self.directory), "--out", f"{self.directory.name}.pdf")
             yield console.command(shlex.join(words))
 
     def to_json(self) -> dict[str, Any]:
-        """Return `summary.json`, the recorded one if the flight is on disk."""
-        return dict(self.summary) if self.directory is None else rundir.read_summary(self.directory)
+        """Return `summary.json`, with the new audit of a run that was checked under `reaudit`."""
+        summary = dict(self.summary)
+        if self.checked is not None and self.checked.again is not None:
+            summary["reaudit"] = {
+                "rate": self.scenario.log_rate,
+                "satisfied": self.verdict_of(self.checked.again) == "satisfied",
+                "constraints": [limit_to_json(finding) for finding in self.checked.again],
+                "notes": [*self.notes],
+            }
+        return summary
 
     def small_plot(self) -> Figure | None:
         """See `Result.small_plot`: position over time."""
         from quadsim.report.flight_figures import signals
 
-        return signals([self.undiagnosed_run], ("x", "y", "z")) if self.time.size else None
+        return signals([self], ("x", "y", "z")) if self.time.size else None
 
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""
@@ -443,7 +495,7 @@ class Flight(Result):
         )
         errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz" if self.time.size)
         return (
-            f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self._numbers['duration']:g} s flown, "
+            f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self.numbers['duration']:g} s flown, "
             f"RMS error [m]: {errors or 'none'}</p>"
             "<table><tr><th>constraint</th><th>margin</th><th>tolerance</th><th>verdict</th></tr>"
             f"{rows}</table>{plot_html(self.small_plot())}"
@@ -486,19 +538,22 @@ def write_run(
     fps: int | None = None,
     progress: Progress | bool,
     flown: Callable[[Flight], object] | None,
-) -> None:
-    """Write the tables, call `flown`, and add the products."""
-    more = flight.write_tables(directory, overwrite=overwrite)
+) -> Flight:
+    """Write the tables, call `flown`, and add the products; return the flight as it was written."""
+    flight, whole = flight.write_tables(directory, overwrite=overwrite)
     if flown is not None:
         flown(flight)
-    if more:
-        with reporting(progress) as report:
-            try:
-                flight.add_products(directory, fps=fps, progress=report, **products)
-            except OutputError as error:
-                if error.path.parent == directory:  # a product that was requested explicitly
-                    error.result = flight
-                raise
+    if not whole:
+        return flight
+    with reporting(progress) as report:
+        try:
+            flight = add_products(flight, products, fps=fps, progress=report)
+            _require_products(flight, products)
+        except OutputError as error:
+            if error.path.parent == flight.directory:  # a product that was requested explicitly
+                error.result = flight
+            raise
+    return flight
 
 
 def require_film(video: bool | None, fps: int | None = None) -> None:
@@ -572,74 +627,132 @@ def summarise(flight: Flight) -> dict[str, Any]:
     }
 
 
-def _add_products(
-    flight: Flight, directory: Path, requested: Mapping[str, bool | None], progress: Progress, fps: int | None
-) -> dict[Path, str]:
-    """Add recording, figures and video, made from the files; return which requested ones failed, and why.
+def add_products(
+    flight: Flight, requested: Mapping[str, bool | None], *, progress: Progress = silent, fps: int | None = None
+) -> Flight:
+    """Add recording, figures and video to the directory of a flight that was written; return it with them.
 
-    Ctrl-C stops the current one and skips the rest.
+    Ctrl-C stops the current one and skips the rest.  What fails is recorded, with the reason.
     """
-    run, failed = rundir.load_run(directory), dict[Path, str]()
-    has_periods = bool(run.log.control.t.size)
+    from quadsim.console.console import short_path
+
+    started = clock.perf_counter()
+    shown = flight.as_stored()
+    products = _Products(flight)
     if requested["recording"] is not False:
-        with _product(directory, rundir.RECORDING_FILE, failed) as folder:
+        with products.making(rundir.RECORDING_FILE) as folder:
             from quadsim.report.recording import write_recording
 
             progress("recording", 0, 1)
-            write_recording(run, folder / rundir.RECORDING_FILE)
+            write_recording(shown, folder / rundir.RECORDING_FILE)
         progress("recording", 1, 1)
-    if requested["figures"] is not False and has_periods and INTERRUPTED not in failed.values():
-        with _product(directory, rundir.FIGURES_DIR, failed) as folder:
+    has_periods = bool(flight.time.size)
+    if requested["figures"] is not False and has_periods and not products.interrupted:
+        with products.making(rundir.FIGURES_DIR) as folder:
             from quadsim.report.flight_figures import write_figures
 
             progress("figures", 0, 1)
-            write_figures(run, folder / rundir.FIGURES_DIR)
+            write_figures(shown, folder / rundir.FIGURES_DIR)
             progress("figures", 1, 1)
-    interrupted = flight.log.interrupted or INTERRUPTED in failed.values()
-    if requested["video"] is not False and has_periods and not interrupted:
-        from quadsim.console.console import short_path
+    flight = products.recorded()
+    if requested["video"] is not False and has_periods and not (flight.log.interrupted or products.interrupted):
+        note = f"all else is in {short_path(products.directory)}"
+        (flight,) = add_films([flight], note=note, progress=progress, fps=fps)
+    wall_s = flight.numbers["wall_s"]
+    wall_s = {**wall_s, "total": wall_s["total"] + clock.perf_counter() - started}
+    amend(products.directory, {"wall_s": wall_s})
+    return flight._recording(wall_s=wall_s)
 
-        failed |= add_films([run], note=f"all else is in {short_path(directory)}", progress=progress, fps=fps)
-    demanded = {name: requested[product] for name, product in _PRODUCTS.items()}
-    return {path: problem for path, problem in failed.items() if demanded[path.name] and problem != INTERRUPTED}
+
+def _require_products(flight: Flight, requested: Mapping[str, bool | None]) -> None:
+    """Raise if a product that was requested is not there.
+
+    Raises:
+        OutputError: naming the first such product, and why.
+    """
+    for name, product in _PRODUCTS.items():
+        if requested[product]:
+            require_product(flight, name)
+
+
+def require_product(flight: Flight, name: str) -> None:
+    """Raise if making a product of a run directory failed; not if Ctrl-C stopped it.
+
+    Raises:
+        OutputError: with the reason.
+    """
+    state = flight.numbers.get("products", {}).get(name, MADE)
+    if state not in (MADE, INTERRUPTED):
+        raise OutputError((flight.directory or Path()) / name, f"{state}; all else is there")
 
 
 def add_films(
-    runs: Sequence[rundir.Run], *, note: str, progress: Progress = silent, fps: int | None = None
-) -> dict[Path, str]:
-    """Film flights into their run directories; return which films failed, and why.
+    flights: Sequence[Flight], *, note: str, progress: Progress = silent, fps: int | None = None
+) -> list[Flight]:
+    """Film flights into their run directories; return them with their films.
 
     Ctrl-C stops the current one and skips the rest.  `note` says, beside the estimated time, what can be opened
     meanwhile.
     """
     from quadsim.report.film.video import Estimate, frame_count, frame_rate, render_video
 
-    failed: dict[Path, str] = {}
-    estimate = Estimate([frame_count(run.end, frame_rate(run.end, fps)) for run in runs], note)
+    estimate = Estimate([frame_count(flight.end, frame_rate(flight.end, fps)) for flight in flights], note)
 
     def follow(done: int, total: int) -> None:
         estimate(done, total)
         progress("video", done, total)
 
-    for run in runs:
-        if INTERRUPTED not in failed.values():
-            with _product(run.directory, rundir.VIDEO_FILE, failed) as folder:
+    filmed = list[Flight]()
+    interrupted = False
+    for flight in flights:
+        products = _Products(flight)
+        if not interrupted:
+            with products.making(rundir.VIDEO_FILE) as folder:
                 progress("video", 0, 1)  # until the renderer has started
-                render_video(run.directory, folder / rundir.VIDEO_FILE, progress=follow, fps=fps)
-    return failed
+                render_video(flight.as_stored(), folder / rundir.VIDEO_FILE, progress=follow, fps=fps)
+        interrupted = interrupted or products.interrupted
+        filmed.append(products.recorded())
+    return filmed
 
 
-@contextlib.contextmanager
-def _product(directory: Path, name: str, failed: dict[Path, str]) -> Iterator[Path]:
-    """A folder for a product of a run directory; if it cannot be made, the summary and `failed` say why."""
-    try:
-        with adding(directory, products={name: "made"}) as folder:
-            yield folder
-        return
-    except KeyboardInterrupt:
-        problem = INTERRUPTED
-    except Exception as error:
-        problem = failure_line(error)
-    failed[directory / name] = problem
-    amend(directory, {"products": {name: problem}})
-    _log.warning("%s %s", name, problem)
+class _Products:
+    """The products of a flight's directory as they are made: which are there, and why others are not."""
+
+    def __init__(self, flight: Flight) -> None:
+        assert flight.directory is not None
+        self.directory = flight.directory
+        self._flight = flight
+        self._states = dict[str, str]()
+        self._hashes = dict[str, str]()
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C stopped one."""
+        return INTERRUPTED in self._states.values()
+
+    @contextlib.contextmanager
+    def making(self, name: str) -> Iterator[Path]:
+        """A folder for a product; if it cannot be made, the summary says why."""
+        try:
+            with adding(self.directory, products={name: MADE}) as folder:
+                yield folder
+                hashes = file_hashes(folder)
+        except KeyboardInterrupt:
+            self._fail(name, INTERRUPTED)
+        except Exception as error:
+            self._fail(name, failure_line(error))
+        else:
+            self._states[name] = MADE
+            self._hashes |= hashes
+
+    def _fail(self, name: str, problem: str) -> None:
+        self._states[name] = problem
+        amend(self.directory, {"products": {name: problem}})
+        _log.warning("%s %s", name, problem)
+
+    def recorded(self) -> Flight:
+        """Return the flight with these products in its summary."""
+        before = self._flight.numbers
+        products = {**before.get("products", {}), **self._states}
+        files = dict(sorted({**before["files"], **self._hashes}.items()))
+        return self._flight._recording(products=products, files=files)

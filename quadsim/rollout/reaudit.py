@@ -11,29 +11,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from quadsim.console.junit import Cases, flight_verdicts
-from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from quadsim.controller import MISSED
 from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import metrics, rundir
-from quadsim.flight.audit import Finding, FlightVerdict, audit, flight_verdict, margins_at
+from quadsim.flight.audit import Finding, audit, margins_at
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, columns_of
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
-from quadsim.flight.rundir import finding_from_json, limit_to_json
-from quadsim.report.comparison import comparison_rows
+from quadsim.flight.rundir import limit_to_json
+from quadsim.rollout.flown import Check, Flight
+from quadsim.rollout.stored import read_flight
 from quadsim.scenarios.assembly import Assembly
-from quadsim.scenarios.courses.csv_course import Csv
-from quadsim.scenarios.loading import parse_scenario
-from quadsim.scenarios.plugin import is_plugin
-from quadsim.scenarios.schema.bases import read_whole
-from quadsim.scenarios.schema.controllers import LAWS
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.scenarios.schema.settings import leaves
 from quadsim.sim.computation import physics_steps
@@ -51,42 +45,8 @@ _COMMANDED: Final = tuple(columns_of(ControlLog)["speeds"].units)
 _TURNING: Final = tuple(columns_of(PlantLog)["speeds"].units)
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
-class Reaudit(Result):
-    """The audit from a run's tables, or of a flight in memory."""
-
-    summary: dict[str, Any]  # `summary.json`
-    findings: tuple[Finding, ...]  # the audit, from tables at the control samples and at the log rate
-    satisfied: bool  # the verdict on the flight that follows
-    rate: float | None = None  # rows per second of `plant.parquet` [Hz]; None for a flight in memory
-    notes: tuple[str, ...] = ()  # remarks for the user that are not errors
-
-    @property
-    def exit_status(self) -> int:
-        """See `Result.exit_status`; also 1 if a constraint was not reached, since it was not shown to hold."""
-        return EXIT_DONE if self.satisfied and self.summary["satisfied"] else EXIT_FAILED
-
-    def shown(self) -> Shown:
-        """See `Result.shown`."""
-        from quadsim.console.summary_tables import summary_tables
-
-        return summary_tables(self.to_json())
-
-    def verdicts(self) -> tuple[str, Cases]:
-        """See `quadsim.console.junit.Judged`."""
-        return flight_verdicts(self.summary)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the summary, with the new audit under `reaudit`."""
-        if self.rate is None:
-            return self.summary
-        entries = [limit_to_json(finding) for finding in self.findings]
-        again = {"rate": self.rate, "satisfied": self.satisfied, "constraints": entries, "notes": list(self.notes)}
-        return {**self.summary, "reaudit": again}
-
-
-def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
-    """Audit a finished run again from its tables, and compare the result with its summary.
+def reaudit(directory: Path, *, products: bool = True) -> Flight:
+    """Read a finished run, audit it again from its tables, and compare the result with its summary.
 
     Film, recording and figures must be present if `products` is true; they can be made again.
 
@@ -94,68 +54,24 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
         FileError: a file is missing, changed or damaged, or the summary contradicts the tables; the message names the
             differences.
     """
-    summary = rundir.read_summary(directory)
-    differing = list(_changed(directory, summary, products=products))
     try:
-        scenario = stored_scenario(directory)
-        run = stored_run(directory)
-        log = run.log
-        findings = audit(log, Assembly(scenario).limits)
+        flight = read_flight(directory)
+        assembly = Assembly(flight.scenario)
+        again = audit(flight.log, assembly.limits)
     except InputError as error:
-        raise _contradiction(directory, differing or [f"it cannot be audited again: {error}"]) from error
-    differing += _inconsistencies(scenario, run)
-    differing += _differences(summary, scenario, log, findings)
+        changed = list(_changed(directory, rundir.read_summary(directory), products=products))
+        raise _contradiction(directory, changed or [f"it cannot be audited again: {error}"]) from error
+    summary = flight.summary
+    differing = list(_changed(directory, summary, products=products))
+    differing += _inconsistencies(flight)
+    differing += _differences(flight, again, assembly.course_steps)
     if differing:
         raise _contradiction(directory, differing)
     notes = []
     if others := _unlisted(directory, summary):
         shown = ", ".join(others[:MOST_REPORTED]) + (" ..." if len(others) > MOST_REPORTED else "")
         notes.append(f"not of this run: {printable(shown)}")
-    return Reaudit(
-        summary=summary,
-        findings=findings,
-        satisfied=_verdict(log, findings) == "satisfied",
-        rate=scenario.log_rate,
-        notes=tuple(notes),
-    )
-
-
-def stored_run(directory: Path) -> rundir.Run:
-    """Read a run back, and make sure that its summary can be shown.
-
-    Raises:
-        FileError: a file is missing or damaged.
-    """
-    from quadsim.console.summary_tables import summary_tables
-
-    run = rundir.load_run(directory)
-    try:
-        for _ in (*comparison_rows([run]), *summary_tables(run.summary)):
-            pass
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        what = f"{type(error).__name__}: {printable(str(error))}"
-        raise FileError(directory / rundir.SUMMARY_FILE, f"is damaged ({what[:200]})") from error
-    return run
-
-
-def stored_scenario(directory: Path) -> Scenario:
-    """Return the scenario of a run from its directory, without reading any other file.
-
-    Its controller is not needed: a controller of a package that is not installed here is replaced.
-
-    Raises:
-        InputError: it is missing or malformed.
-    """
-    path = directory / rundir.SCENARIO_FILE
-    if not path.is_file():
-        raise FileError(path, "is missing or no file")
-    data = read_whole(path)
-    match data.get("controller"):
-        case {"type": str(name), **fields} if name not in LAWS and not is_plugin(name):
-            data["controller"] = {**fields, "type": "elsewhere:Controller"}
-    scenario = parse_scenario(data, source=str(path))
-    course = scenario.reference
-    return scenario.altered(reference=course.located(directory)) if isinstance(course, Csv) else scenario
+    return replace(flight, checked=Check(notes=tuple(notes), again=again))
 
 
 def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> Iterator[str]:
@@ -178,9 +94,10 @@ def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     return sorted(files - {rundir.SUMMARY_FILE, *summary["files"]})
 
 
-def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
+def _inconsistencies(flight: Flight) -> Iterator[str]:
     """Yield contradictions among a run's tables, or with the scenario's rates."""
-    control, timing, plant = run.log.control, run.log.timing, run.log.plant
+    scenario = flight.scenario
+    control, timing, plant = flight.log.control, flight.log.timing, flight.log.plant
     for name, columns, rows, t in (
         (FLIGHT_FILE, STATE_NAMES, control.truth, control.t),
         (FLIGHT_FILE, REFERENCE_NAMES, control.reference, control.t),
@@ -208,7 +125,7 @@ def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
     if _holds_commands(scenario):
         starts = np.arange(plant.t.size - 1) * stride  # the last row ends the flight
         speeds, known = _in_force(scenario, control, starts)
-        limits = (run.vehicle.speed_min, run.vehicle.speed_max) if scenario.plant.limit_speeds else (0.0, None)
+        limits = (flight.actual.speed_min, flight.actual.speed_max) if scenario.plant.limit_speeds else (0.0, None)
         applied = np.clip(speeds, *limits)
         wrong = (np.abs(applied - plant.speeds[:-1]) > ARITHMETIC_TOLERANCE * np.maximum(1.0, applied)) & known[:, None]
         yield from _where(wrong, _TURNING, plant.t, f"of {PLANT_FILE} is not the speed that {FLIGHT_FILE} commands")
@@ -249,10 +166,9 @@ def _holds_commands(scenario: Scenario) -> bool:
     return commands_held and not lagging and Assembly(scenario).effects.rotors is None
 
 
-def _differences(
-    summary: Mapping[str, Any], scenario: Scenario, log: FlightLog, findings: Sequence[Finding]
-) -> Iterator[str]:
-    """Yield differences of a summary from the run's scenario and tables."""
+def _differences(flight: Flight, findings: Sequence[Finding], course: Sequence[metrics.CourseStep]) -> Iterator[str]:
+    """Yield differences of a flight's summary from its scenario, its tables and the audit made of them."""
+    summary, scenario, log = flight.summary, flight.scenario, flight.log
     periods, completed, reason = log.control.t.size, summary["status"] == "completed", summary["reason"]
     duration = round(periods * scenario.control_period, 9)
     stated = {"scenario": scenario.name, "seed": scenario.seed, "expected": scenario.expect, "duration": duration}
@@ -263,7 +179,7 @@ def _differences(
     if completed != (reason is None):
         yield f"status is recorded as {summary['status']!r:.40}, and reason as {reason!r:.80}"
     deadline_ms = 1e3 * scenario.control_period
-    numbers = metrics.flight_numbers(log, deadline_ms=deadline_ms, course=Assembly(scenario).course_steps)
+    numbers = metrics.flight_numbers(log, deadline_ms=deadline_ms, course=course)
     before = dict(leaves({key: summary[key] for key in numbers}))
     for key, again in leaves(numbers):
         yield from _recorded(key, before.get(key, again), again, "the tables give", ARITHMETIC_TOLERANCE)
@@ -272,23 +188,16 @@ def _differences(
     if names != expected:
         yield f"the constraints recorded are {', '.join(names) or 'none'}, and the scenario's {', '.join(expected)}"
         return
-    recorded = tuple(map(finding_from_json, entries))
-    for entry, written, finding in zip(entries, recorded, findings, strict=True):
+    for entry, written, finding in zip(entries, flight.findings, findings, strict=True):
         yield from (f"{finding.limit.name}: {what}" for what in _constraint_differences(entry, finding, scenario, log))
         implied = written.verdict
         if entry["satisfied"] != written.satisfied or entry.get("verdict", implied) != implied:
             yield f"{entry['name']}: satisfied is {entry['satisfied']}, and its worst margins say {implied}"
-    outcome = _verdict(log, recorded)
+    outcome = flight.outcome
     yield from _recorded("satisfied", summary["satisfied"], outcome == "satisfied", "its audit and outcome make it")
     yield from _recorded("verdict", summary["verdict"], outcome, "its audit and outcome make it")
     if summary.get("as_expected") and outcome != scenario.expect:
         yield f"as_expected is recorded as True, and the flight is {outcome} where {scenario.expect} is expected"
-
-
-def _verdict(log: FlightLog, findings: Sequence[Finding]) -> FlightVerdict:
-    """Return the verdict on a flight with these findings."""
-    failed = metrics.failure(log.control) is not None
-    return flight_verdict(findings, aborted=log.aborted, lost=log.reason is not None, failed=failed)
 
 
 def _recorded(key: str, before: Any, again: Any, source: str, rounding: float = 0.0) -> Iterator[str]:

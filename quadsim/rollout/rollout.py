@@ -306,8 +306,10 @@ class Rollout:
         scenario = self._events.flown()
         self.loop.quaternions = needs_quaternions(scenario)
         log = self.loop.log()
+        assembly = self._events.assembly.of(scenario)
         return Flight(
-            assembly=self._events.assembly.of(scenario).recorded,
+            scenario=assembly.recording,
+            assembly=assembly,
             log=log,
             findings=audit(log, self.limits),
             controller=self._law[0],

@@ -120,6 +120,8 @@ class Assembly:
 
     def of(self, scenario: Scenario) -> Assembly:
         """Return the assembly of a scenario with other events, controller or duration; vehicle and course stay."""
+        if scenario is self.scenario:
+            return self
         other = Assembly(scenario)
         vars(other).update({name: part for name, part in vars(self).items() if name in _OF_ALL_EVENTS})
         return other
@@ -127,18 +129,27 @@ class Assembly:
     @property
     def resolved(self) -> Assembly:
         """The assembly of the scenario with every derived value stated: numbers of its vehicle, sizes and solver."""
+        return self.of(self._stating(self.scenario))
+
+    def _stating(self, scenario: Scenario) -> Scenario:
+        """Return a scenario, this one or `recording`, with every derived value stated."""
         controller, events = self._stated_laws()
         vehicle, autopilot = self._numbers
         fields = {"vehicle": vehicle, "autopilot": autopilot, "effects": self.effects}
-        return self.of(self.scenario.altered(**fields, controller=controller, events=events))
+        return scenario.altered(**fields, controller=controller, events=events)
 
     @property
     def recorded(self) -> Assembly:
-        """The assembly of the scenario with the numbers of its vehicle's file, which it then does not need.
+        """The assembly of `recording`."""
+        return self.of(self.recording)
+
+    @property
+    def recording(self) -> Scenario:
+        """The scenario with the numbers of its vehicle's file, which it then does not need.
 
         Effects continue to take their sizes from the vehicle.
         """
-        return self.of(self.scenario.recording(*self._numbers))
+        return self.scenario.recording(*self._numbers)
 
     @property
     def _numbers(self) -> tuple[VehicleTable, AutopilotSettings | None]:
@@ -146,10 +157,13 @@ class Assembly:
         numbers = {name: getattr(self.vehicle, name) for name in VEHICLE_UNITS}
         return replace(self.scenario.vehicle, **numbers), self.autopilot
 
-    def to_toml(self) -> str:
-        """Return the scenario's file: what it states, defaults included; what is derived stands in comments."""
-        events = self.scenario.events
-        return self.scenario.written(self.resolved.scenario.altered(events=events))
+    def to_toml(self, scenario: Scenario | None = None) -> str:
+        """Return the scenario's file, or that of `recording`.
+
+        It has what the scenario states, defaults included; what is derived stands in comments.
+        """
+        scenario = self.scenario if scenario is None else scenario
+        return scenario.written(self._stating(scenario).altered(events=scenario.events))
 
     def audited(self) -> Assembly:
         """Return the assembly with the bounds of a user's controller, which builds it, as constraints."""

@@ -202,14 +202,14 @@ def test_run_prints_tables_and_where_the_files_are(here: Path, capsys: pytest.Ca
 def test_run_prints_the_verdict_before_its_film_and_what_to_open_at_its_end(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before, make = [], flown._add_products
+    before, make = [], flown.add_products
 
-    def slow(*arguments: Any) -> dict[str, str]:
+    def slow(*arguments: Any, **options: Any) -> flown.Flight:
         before.append(capsys.readouterr().out)
         assert rundir.read_summary(here / "runs" / "hover")["verdict"] == "satisfied"
-        return make(*arguments)
+        return make(*arguments, **options)
 
-    monkeypatch.setattr(flown, "_add_products", slow)
+    monkeypatch.setattr(flown, "add_products", slow)
     assert main(["run", "hover", *SHORT, "--no-video", "--no-figures"]) == EXIT_DONE
     assert before[0].startswith("hover  completed, every required constraint holds  0.50 s flown\n")
     commands = ["quadsim view runs/hover", "quadsim plot runs/hover --out hover.pdf"]

@@ -16,6 +16,7 @@ import pytest
 
 from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from quadsim.flight import rundir
+from quadsim.rollout.stored import read_flight
 
 pytestmark = pytest.mark.slow("process")
 
@@ -104,7 +105,7 @@ def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> N
         assert (done.returncode, done.stderr, list(tmp_path.iterdir())) == (EXIT_WRONG_INPUT, message, [])
     else:
         assert (done.returncode, done.stderr) == (EXIT_DONE, "")
-        rundir.load_run(tmp_path / "run")
+        read_flight(tmp_path / "run")
 
 
 def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path) -> None:
@@ -142,7 +143,7 @@ def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path) -> N
     assert err == "quadsim: interrupted (SIGTERM); what was finished is kept, and nothing is half written\n"
     assert "interrupted (Ctrl-C)" in out
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    run = rundir.load_run(tmp_path / "run")
+    run = read_flight(tmp_path / "run")
     assert run.summary["status"] == "aborted"
     assert run.summary["reason"].endswith("interrupted (Ctrl-C)")
     assert 0.0 < run.summary["duration"] < 1800.0
@@ -208,7 +209,7 @@ def test_a_command_that_is_stopped_never_ends_with_0_and_keeps_what_is_finished(
         said = "quadsim: interrupted (SIGTERM); " if caught else "quadsim: interrupted (Ctrl-C); "
         assert done.stderr.splitlines()[-1].startswith(said)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-    run = rundir.load_run(tmp_path / "run")
+    run = read_flight(tmp_path / "run")
     assert rundir.damaged_files(run.directory, run.summary) == []
     assert (run.summary["status"], run.log.control.t.size) == ("completed", 10)
 

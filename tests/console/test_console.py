@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import io
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,12 +13,13 @@ from xml.etree import ElementTree
 import pytest
 from rich.console import RenderableType
 from rich.text import Text
+from support import recording, renamed
 
 from quadsim.console import console
 from quadsim.console.junit import write_cases
 from quadsim.console.summary_tables import audit_table, summary_tables
 from quadsim.errors import printable
-from quadsim.flight.rundir import findings_of
+from quadsim.flight.audit import Finding
 from quadsim.report.table import Cell, Grid, Mark, QuantityRow, short_number, to_markdown
 
 NASTY = ("[/bold]", "[link=file:///decoy]x[/link]", "\x1b[2J\x1b]0;title\x07", "a\r\nquadsim: all is well", "\ud800")
@@ -37,17 +38,18 @@ def test_what_steers_a_terminal_becomes_an_escape() -> None:
 
 @pytest.mark.parametrize("nasty", NASTY)
 def test_a_foreign_summary_is_shown_as_text(nasty: str, short_run: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    summary = copy.deepcopy(short_run.summary)
-    summary |= {"scenario": nasty, "status": nasty, "reason": nasty, "expected": nasty, "as_expected": False}
-    summary["controller"] |= {"name": nasty, "solver": nasty, "statuses": {nasty: 3}}
-    summary["course"]["sentence"] = nasty
-    for entry in summary["constraints"]:
-        entry |= {"name": nasty, "unit": nasty}
+    course = {**short_run.summary["course"], "sentence": nasty}
+    controller = {**short_run.summary["controller"], "name": nasty, "solver": nasty, "statuses": {nasty: 3}}
+    flight = recording(
+        renamed(short_run, nasty), expected=nasty, as_expected=False, course=course, controller=controller
+    )
+    findings = [replace(each, limit=replace(each.limit, name=nasty)) for each in short_run.findings]
+    flight = replace(flight, findings=tuple(findings), log=replace(short_run.log, reason=nasty))
     cells = tuple(Cell(text=nasty, mark=mark) for mark in (Mark.NONE, Mark.BAD))
     row = QuantityRow(group=nasty, label="outcome", unit=nasty, cells=cells, headline=True)
     grid = Grid(key="k", title=nasty, head=(nasty, nasty), lines=(cells,), note=nasty)
     path = Path(nasty.encode(errors="replace").decode())
-    parts = [*summary_tables(summary), console.written_to(path), console.to_open(path), *console.grids([grid])]
+    parts = [*summary_tables(flight), console.written_to(path), console.to_open(path), *console.grids([grid])]
     parts += [*console.listing({nasty: {nasty: nasty}}), console.table(nasty, [nasty], [[nasty]])]
     console.show(parts)
     console.say(nasty)
@@ -74,14 +76,15 @@ def test_sentences_break_at_spaces_and_paths_and_commands_stay_whole(short_run: 
     assert " ".join(lines).split() == [*words, str(path), *words] * 2
     assert [line for line in lines if len(line) > width] == [str(path)] * 2
     assert shown([console.to_open(path / "a flight.mp4")], width) == [f"open '{path}/a flight.mp4'"]
-    assert max(map(len, shown(summary_tables(short_run.summary), width))) <= width
+    assert max(map(len, shown(summary_tables(short_run), width))) <= width
 
 
 @pytest.mark.parametrize("width", [60, 80, 120, 160])
 def test_a_verdict_is_never_cut_and_names_the_tolerance_that_it_needs(short_run: Any, width: int) -> None:
-    roll, *others = copy.deepcopy(short_run.summary["constraints"])
-    roll |= {"name": "roll_of_the_" + "vehicle" * 6, "worst_margin": -0.04, "worst_margin_sampled": 0.0}
-    table = audit_table(findings_of({"constraints": [roll, *others]}))
+    roll, *others = short_run.findings
+    limit = replace(roll.limit, name="roll_of_the_" + "vehicle" * 6)
+    roll = replace(roll, limit=limit, worst_margin=-0.04, worst_margin_sampled=0.0)
+    table = audit_table([roll, *others])
     text = "\n".join(lines := shown([table], width))
     assert "0.05, 0.01 s" in text
     assert "-0.04" in text
@@ -91,27 +94,29 @@ def test_a_verdict_is_never_cut_and_names_the_tolerance_that_it_needs(short_run:
 
 
 def test_the_legend_of_an_audit_explains_only_what_occurs(short_run: Any) -> None:
-    (roll, *_), slew = short_run.summary["constraints"], short_run.summary["constraints"][3]
-    assert (slew["name"], roll["name"]) == ("slew", "roll")
-    roll = roll | {"worst_margin": 2.0, "worst_margin_sampled": 2.0, "peak_plant": 3.0, "peak_sampled": 3.0}
-    violated = roll | {"worst_margin": -2.0, "time_violated": 0.3, "required": False, "peak_plant": math.nan}
+    roll, slew = short_run.findings[0], short_run.findings[3]
+    assert (slew.limit.name, roll.limit.name) == ("slew", "roll")
+    roll = replace(roll, worst_margin=2.0, worst_margin_sampled=2.0, peak_plant=3.0, peak_sampled=3.0)
+    reported = replace(roll.limit, required=False)
+    violated = replace(roll, limit=reported, worst_margin=-2.0, time_violated=0.3, peak_plant=math.nan)
 
-    def legend(*entries: Any) -> str:
-        return audit_table(findings_of({"constraints": [*entries]})).caption or ""  # type: ignore[return-value]
+    def legend(finding: Finding) -> str:
+        return audit_table([finding]).caption or ""  # type: ignore[return-value]
 
     assert legend(roll) == "tolerance: at the physics rate and at the samples (s)"
-    assert legend(slew | {"worst_margin": 1.0, "worst_margin_sampled": 1.0}) == "-: no value"
+    assert legend(replace(slew, worst_margin=1.0, worst_margin_sampled=1.0)) == "-: no value"
     assert [part.partition(":")[0] for part in legend(violated).split("; ")] == [
         *("margin", "tolerance", "beyond", "-", "*"),
     ]
 
 
 def test_a_summary_begins_with_its_verdict_and_shows_deg_and_no_rounding(short_run: Any) -> None:
-    summary = copy.deepcopy(short_run.summary)
+    flight = recording(short_run)
+    summary = flight.numbers
     summary["tracking"]["rmse"] |= {"x": -3e-11, "y": 0.56712, "yaw": math.radians(4.64)}
     summary["control"] |= {"slew_min": -1e-9, "slew_max": 0.0}
     summary["controller"]["answered_by"] = {"piqp-multistage": 3, "gain": 197}
-    verdict, *lines = shown(summary_tables(summary), 120)
+    verdict, *lines = shown(summary_tables(flight), 120)
     text = "\n".join(lines)
     assert verdict.startswith("paper-constrained  ")
     titles = ["audit at the physics rate", "tracking, real minus", "constrained MPC: ", "whole step: median"]

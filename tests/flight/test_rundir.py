@@ -13,8 +13,10 @@ import pytest
 from quadsim.errors import FileError
 from quadsim.flight import rundir
 from quadsim.flight.audit import audit
-from quadsim.flight.rundir import Run, limit_from_json, limit_to_json
+from quadsim.flight.rundir import limit_from_json, limit_to_json
 from quadsim.outputs import to_json
+from quadsim.rollout.flown import Flight
+from quadsim.rollout.stored import read_flight
 
 
 @pytest.fixture
@@ -23,7 +25,7 @@ def copied(short_run_directory: Path, tmp_path: Path) -> Path:
     return shutil.copytree(short_run_directory, tmp_path / "run")
 
 
-def test_a_run_is_read_back(short_run: Run) -> None:
+def test_a_run_is_read_back(short_run: Flight) -> None:
     assert short_run.name == "paper-constrained"
     assert short_run.vehicle.hover_speed == pytest.approx(192.8, rel=1e-6)
     assert short_run.log.status == "completed"
@@ -31,7 +33,7 @@ def test_a_run_is_read_back(short_run: Run) -> None:
     assert short_run.limits[0].stop == math.inf
 
 
-def test_limits_come_back_from_the_summary(short_run: Run) -> None:
+def test_limits_come_back_from_the_summary(short_run: Flight) -> None:
     for finding, entry in zip(audit(short_run.log, short_run.limits), short_run.summary["constraints"], strict=True):
         assert limit_from_json(limit_to_json(finding)) == finding.limit
         assert limit_from_json(json.loads(json.dumps(entry))) == finding.limit
@@ -68,4 +70,4 @@ def test_a_damaged_summary_is_refused(copied: Path, change: dict[str, Any], mess
     summary = rundir.read_summary(copied)
     (copied / "summary.json").write_text(to_json(summary | change))
     with pytest.raises(FileError, match=rf"summary\.json: .*{message}"):
-        rundir.load_run(copied)
+        read_flight(copied)

@@ -10,15 +10,15 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from browser import CLASHES, opened
-from support import draw_nothing
+from support import draw_nothing, recording, renamed
 
 from quadsim.errors import OutputError, ParameterError
-from quadsim.flight.rundir import Run
 from quadsim.report import comparison_page
 from quadsim.report.comparison_page import write_comparison
 from quadsim.report.figure import Figure
 from quadsim.report.flight_figures import page_figures
 from quadsim.report.to_plotly import to_plot
+from quadsim.rollout.flown import Flight
 
 pytestmark = pytest.mark.slow("comparisons")
 
@@ -34,7 +34,7 @@ def _undrawn() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def filmed_run(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def filmed_run(short_run: Flight, tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """The short flight with a video, a recording and a figure beside it; nothing reads them but a browser."""
     directory = tmp_path_factory.mktemp("filmed") / "run"
     shutil.copytree(short_run.directory, directory)
@@ -46,13 +46,9 @@ def filmed_run(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.fixture(scope="module")
-def page_of_two(filmed_run: Run, aborted_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page_of_two(filmed_run: Flight, aborted_run: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of the filmed flight and the one that was lost."""
     return write_comparison([filmed_run, aborted_run], tmp_path_factory.mktemp("page") / "out")
-
-
-def renamed(run: Run, scenario: str) -> Run:
-    return dataclasses.replace(run, summary={**run.summary, "scenario": scenario})
 
 
 def without_scripts(page: str) -> str:
@@ -87,12 +83,14 @@ def test_the_text_gives_outcomes_reasons_and_numbers_and_nothing_is_fetched(page
     assert "lost/flight.rrd" not in text
 
 
-def test_hostile_names_are_text_and_other_courses_and_verdicts_are_pointed_out(short_run: Run, tmp_path: Path) -> None:
+def test_hostile_names_are_text_and_other_courses_and_verdicts_are_pointed_out(
+    short_run: Flight, tmp_path: Path
+) -> None:
     control = dataclasses.replace(short_run.log.control, reference=short_run.log.control.reference + 1.0)
-    summary = {**short_run.summary, "expected": "lost", "as_expected": False, "constraints": []}
-    summary["verdict"] = "satisfied"
     log = dataclasses.replace(short_run.log, control=control)
-    other = dataclasses.replace(short_run, log=log, summary=summary)
+    held = short_run.findings[:1]
+    other = dataclasses.replace(short_run, log=log, findings=held)
+    other = recording(other, expected="lost", as_expected=False)
     page = write_comparison([renamed(short_run, HOSTILE), other], tmp_path / "out")
     text = page.read_text()
     assert "The runs follow 2 different courses" in text
@@ -103,7 +101,7 @@ def test_hostile_names_are_text_and_other_courses_and_verdicts_are_pointed_out(s
 
 
 def test_runs_of_one_name_keep_their_files_apart(
-    short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short_run: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(comparison_page, "page_figures", lambda runs: [])
     page = write_comparison([short_run, short_run, renamed(short_run, "!"), renamed(short_run, "?")], tmp_path / "out")
@@ -112,15 +110,17 @@ def test_runs_of_one_name_keep_their_files_apart(
     assert {"run", "run-2"} <= folders
 
 
-def test_runs_without_a_period_or_constraints_are_compared(short_run: Run, empty_run: Run, tmp_path: Path) -> None:
-    free = dataclasses.replace(short_run, limits=(), summary={**short_run.summary, "constraints": []})
+def test_runs_without_a_period_or_constraints_are_compared(
+    short_run: Flight, empty_run: Flight, tmp_path: Path
+) -> None:
+    free = dataclasses.replace(short_run, findings=())
     assert write_comparison([empty_run, free], tmp_path / "two").is_file()
     text = write_comparison([empty_run], tmp_path / "one").read_text()
     assert 'class="plot"' not in text
     assert "primal_infeasible" in text
 
 
-def test_a_place_that_holds_a_run_is_refused_and_no_runs_too(short_run: Run) -> None:
+def test_a_place_that_holds_a_run_is_refused_and_no_runs_too(short_run: Flight) -> None:
     for place in (short_run.directory, short_run.directory.parent):
         with pytest.raises(OutputError, match="holds the run"):
             write_comparison([short_run], place)
@@ -129,7 +129,7 @@ def test_a_place_that_holds_a_run_is_refused_and_no_runs_too(short_run: Run) -> 
     assert (short_run.directory / "summary.json").is_file()
 
 
-def test_plots_of_many_long_runs_stay_small(short_run: Run) -> None:
+def test_plots_of_many_long_runs_stay_small(short_run: Flight) -> None:
     t = np.linspace(0.0, 360.0, 72_001)
     rows = np.arange(t.size) % short_run.log.plant.t.size
     plant = dataclasses.replace(
@@ -139,7 +139,7 @@ def test_plots_of_many_long_runs_stay_small(short_run: Run) -> None:
     assert sum(len(to_plot(each).json) for each in page_figures([long] * 10) if isinstance(each, Figure)) < 3e6
 
 
-def test_a_browser_draws_the_page_and_has_no_complaint(short_run: Run, aborted_run: Run, tmp_path: Path) -> None:
+def test_a_browser_draws_the_page_and_has_no_complaint(short_run: Flight, aborted_run: Flight, tmp_path: Path) -> None:
     page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out")
     with opened(page) as tab:
         tab.evaluate("Plotly.relayout('states', {'xaxis.range': [1, 2]})")
@@ -192,7 +192,7 @@ def test_the_first_screen_has_the_video_and_five_rows_and_a_phone_all_of_it(page
     assert light["ink"] != dark["ink"]
 
 
-def test_a_film_that_cannot_be_read_has_no_poster(filmed_run: Run, tmp_path: Path) -> None:
+def test_a_film_that_cannot_be_read_has_no_poster(filmed_run: Flight, tmp_path: Path) -> None:
     damaged = shutil.copytree(filmed_run.directory, tmp_path / "damaged")
     (damaged / "flight.mp4").write_bytes(b"film")
     page = write_comparison([dataclasses.replace(filmed_run, directory=damaged)], tmp_path / "out")

@@ -15,11 +15,10 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from support import small_log
+from support import judged_by, renamed, small_log
 
 from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
 from quadsim.flight.log import FlightLog
-from quadsim.flight.rundir import Run
 from quadsim.palette import COLOUR
 from quadsim.report import flight_figures
 from quadsim.report.figure import (
@@ -38,14 +37,11 @@ from quadsim.report.figure import (
 from quadsim.report.flight_figures import effects, inputs, overview, page_figures, states, times, write_figures
 from quadsim.report.to_matplotlib import draw, figure_html, to_png
 from quadsim.report.to_plotly import thinned_curve, to_plot
+from quadsim.rollout.flown import Flight
 from quadsim.space import Cylinder
 from quadsim.state import INDEX, POSITION, Array
 
 pytestmark = pytest.mark.slow("figures")
-
-
-def named(run: Run, scenario: str) -> Run:
-    return dataclasses.replace(run, summary={**run.summary, "scenario": scenario})
 
 
 def panels(figure: Figure) -> dict[str, Panel]:
@@ -56,7 +52,7 @@ def curves(panel: Panel) -> dict[str, Series]:
     return {series.label: series for series in panel.series}
 
 
-def with_effects(run: Run) -> Run:
+def with_effects(run: Flight) -> Flight:
     """The flight as if it had met with wrench, wind, lagging rotors and errors of measurement."""
     plant, control, rng = run.log.plant, run.log.control, np.random.default_rng(0)
     wrench, wind = rng.normal(size=(plant.t.size, 6)), rng.normal(size=(plant.t.size, 3))
@@ -66,7 +62,7 @@ def with_effects(run: Run) -> Run:
 
 
 @pytest.mark.witness("figures")
-def test_the_papers_scenario_gives_the_papers_figure_numbers(short_run: Run, tmp_path: Path) -> None:
+def test_the_papers_scenario_gives_the_papers_figure_numbers(short_run: Flight, tmp_path: Path) -> None:
     paths = write_figures(short_run, tmp_path)
     assert [path.name for path in paths] == ["figure4_states.png", "figure5_inputs.png", "solve_times.png"]
     for path in paths:
@@ -75,14 +71,14 @@ def test_the_papers_scenario_gives_the_papers_figure_numbers(short_run: Run, tmp
         assert 0.01 < np.mean(np.any(picture < 0.95, axis=-1)) < 0.5, "not blank"
 
 
-def test_a_planar_course_is_drawn_from_above(short_run: Run, tmp_path: Path) -> None:
+def test_a_planar_course_is_drawn_from_above(short_run: Flight, tmp_path: Path) -> None:
     control = short_run.log.control
     angle = np.linspace(0.0, 2.0 * np.pi, control.t.size)
     reference = np.stack([2.0 * np.cos(angle), np.sin(angle), np.ones_like(angle), 0.0 * angle], axis=1)
 
-    def flown(reference: Array) -> Run:
+    def flown(reference: Array) -> Flight:
         log = dataclasses.replace(short_run.log, control=dataclasses.replace(control, reference=reference))
-        return dataclasses.replace(named(short_run, "circle"), log=log)
+        return dataclasses.replace(renamed(short_run, "circle"), log=log)
 
     run = flown(reference)
     assert write_figures(run, tmp_path)[-1].name == "xy.png"
@@ -98,8 +94,10 @@ def test_a_planar_course_is_drawn_from_above(short_run: Run, tmp_path: Path) -> 
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_another_scenario_gives_plain_names_and_its_effects(short_run: Run, empty_run: Run, tmp_path: Path) -> None:
-    run = with_effects(named(short_run, "hover"))
+def test_another_scenario_gives_plain_names_and_its_effects(
+    short_run: Flight, empty_run: Flight, tmp_path: Path
+) -> None:
+    run = with_effects(renamed(short_run, "hover"))
     assert [path.stem for path in write_figures(run, tmp_path)] == ["states", "inputs", "solve_times", "effects"]
     assert write_figures(empty_run, tmp_path) == page_figures([empty_run]) == [], "it has no control period"
     assert effects(short_run) == [], "an ideal flight"
@@ -113,7 +111,7 @@ def test_another_scenario_gives_plain_names_and_its_effects(short_run: Run, empt
     np.testing.assert_allclose(measured, np.degrees(run.log.control.state[:, INDEX["roll"]]))
 
 
-def test_states_are_those_of_the_plant_with_units_references_and_bounds(short_run: Run) -> None:
+def test_states_are_those_of_the_plant_with_units_references_and_bounds(short_run: Flight) -> None:
     result = panels(states([short_run]))
     assert list(result) == ["x [m]", "roll [deg]", "y [m]", "pitch [deg]", "z [m]", "yaw [deg]"]
     plant, control = short_run.log.plant, short_run.log.control
@@ -127,15 +125,15 @@ def test_states_are_those_of_the_plant_with_units_references_and_bounds(short_ru
     assert "measured" not in states([short_run]).labels
     assert result["z [m]"].least_range is None, "it moves"
     assert times([short_run]).panels[0].bounds[0].value == 50.0, "the deadline"
-    late = dataclasses.replace(short_run, limits=(Limit(name="late", signal="roll", upper=5.0, start=100.0),))
+    late = judged_by(short_run, Limit(name="late", signal="roll", upper=5.0, start=100.0))
     assert panels(states([late]))["roll [deg]"].bounds == (), "it begins after the flight"
 
 
-def test_inputs_are_the_commands_of_each_rotor(short_run: Run) -> None:
+def test_inputs_are_the_commands_of_each_rotor(short_run: Flight) -> None:
     speeds = short_run.log.control.speeds
     alone = curves(panels(inputs([short_run]))["rotor speed [rad/s]"])
     np.testing.assert_array_equal(alone["rotor 3"].y, speeds[:, 2])
-    overlaid = panels(inputs([short_run, named(short_run, "other")]))["rotor speed, rotor 3 [rad/s]"]
+    overlaid = panels(inputs([short_run, renamed(short_run, "other")]))["rotor speed, rotor 3 [rad/s]"]
     assert {label: series.group for label, series in curves(overlaid).items()} == {
         "paper-constrained": "run0",
         "other": "run1",
@@ -144,8 +142,8 @@ def test_inputs_are_the_commands_of_each_rotor(short_run: Run) -> None:
     assert {bound.value for bound in overlaid.bounds} == {0.0, 250.0}
 
 
-def test_a_comparison_names_every_run_and_shows_the_range_of_its_rotors(short_run: Run) -> None:
-    figure = overview([short_run, named(short_run, "other $x$ <b>")])
+def test_a_comparison_names_every_run_and_shows_the_range_of_its_rotors(short_run: Flight) -> None:
+    figure = overview([short_run, renamed(short_run, "other $x$ <b>")])
     assert to_png(figure, dpi=30) == to_png(figure, dpi=30)
     assert list(figure.labels) == ["reference, filtered", "paper-constrained", "other $x$ <b>"]
     (band, _) = figure.panels[-1].bands
@@ -200,10 +198,10 @@ def test_thinning_keeps_ends_extremes_and_gaps() -> None:
     np.testing.assert_array_equal(thinned_curve(values[:300], 300), np.arange(300))
 
 
-def test_a_run_among_obstacles_is_drawn_from_above_with_its_clearances(short_run: Run) -> None:
+def test_a_run_among_obstacles_is_drawn_from_above_with_its_clearances(short_run: Flight) -> None:
     pillar = Cylinder(name="pillar", position=(1.0, 0.0, 1.0), radius=0.1, height=3.0)
     limit = SpaceLimit(name="pillar", shape=pillar, radius=0.2)
-    (figure,) = flight_figures.space(dataclasses.replace(short_run, limits=(limit,)))
+    (figure,) = flight_figures.space(judged_by(short_run, limit))
     above, clearance = figure.panels
     np.testing.assert_allclose(np.hypot(*(above.areas[0].outline - [1.0, 0.0]).T), 0.1)
     assert [bound.value for bound in clearance.bounds] == [0.0]
@@ -211,7 +209,7 @@ def test_a_run_among_obstacles_is_drawn_from_above_with_its_clearances(short_run
     assert to_png(figure, dpi=30)
 
 
-def test_every_signal_can_be_drawn(short_run: Run) -> None:
+def test_every_signal_can_be_drawn(short_run: Flight) -> None:
     figure = flight_figures.signals([short_run], list(SIGNALS))
     assert [panel.unit for panel in figure.panels] == [signal.unit for signal in SIGNALS.values()]
 

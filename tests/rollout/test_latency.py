@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import quadsim
-from quadsim.flight.rundir import load_run
 from quadsim.report.figure import commanded_speeds
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.reaudit import reaudit
+from quadsim.rollout.stored import read_flight
 from quadsim.scenarios.schema.scenario import Scenario
 
 pytestmark = pytest.mark.slow("latency")
@@ -60,7 +60,7 @@ def test_its_run_is_written_drawn_and_audited_again(late: Scenario, tmp_path: Pa
     flight = flown(late, **KNOWN, duration=3.0)
     flight.save(tmp_path / "run", video=False)
     assert reaudit(tmp_path / "run").satisfied
-    commanded = commanded_speeds(load_run(tmp_path / "run").log)
+    commanded = commanded_speeds(read_flight(tmp_path / "run").log)
     assert commanded is not None
     again = flown(flight.scenario)
     assert again.log.plant.state.tobytes() == flight.log.plant.state.tobytes()

@@ -10,6 +10,7 @@ from quadsim.commands import cli
 from quadsim.flight import rundir
 from quadsim.rollout.flown import summarise
 from quadsim.rollout.rollout import Rollout
+from quadsim.rollout.stored import read_flight
 from quadsim.scenarios.loading import load_scenario
 
 UNSTABLE = '''
@@ -59,7 +60,7 @@ def test_an_unstable_controller_ends_as_lost_with_exit_status_1(
     summary = rundir.read_summary(out)
     assert (summary["status"], summary["lost"], summary["satisfied"]) == ("aborted", "tilt", False)
     assert 0.0 < summary["duration"] < 20.0
-    run = rundir.load_run(out)
+    run = read_flight(out)
     assert run.log.plant.t[-1] == pytest.approx(summary["duration"])
     assert cli.main(["check", str(out)]) == 1
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
@@ -54,7 +53,7 @@ def test_flights_lie_over_one_another_with_reference_and_bounds(pair: tuple[Flig
 
 
 def test_a_margin_is_the_audit_s_with_its_bound_at_zero(pair: tuple[Flight, Flight]) -> None:
-    panel, step = signals([flight.run for flight in pair], ["margin.pitch", "margin.slew"]).panels
+    panel, step = signals(pair, ["margin.pitch", "margin.slew"]).panels
     assert (panel.heading, [bound.value for bound in panel.bounds]) == ("margin of pitch [deg]", [0.0])
     assert len(panel.series) == len(step.series) == 1, "a PID controller has no bounds"
     assert panel.series[0].y.min() == pair[0].margins["pitch"].min()
@@ -101,7 +100,7 @@ def test_a_legend_is_not_wider_than_its_figure(pair: tuple[Flight, Flight]) -> N
 
 
 def test_where_colours_repeat_lines_are_dashed(pair: tuple[Flight, Flight]) -> None:
-    runs = [replace(pair[0].run, label=str(i)) for i in range(len(CYCLE) + 1)]
+    runs = [pair[0].labelled(str(i)) for i in range(len(CYCLE) + 1)]
     first, *_, last = draw(signals(runs, ["tilt"]), width=7.0).axes[0].get_lines()
     assert first.get_color() == last.get_color()
     assert (first.get_linestyle(), last.get_linestyle()) == ("-", "--")

@@ -236,7 +236,8 @@ def test_what_a_run_records_is_what_its_tables_give(
     flight = fly_once(name)
     scenario = flight.scenario.altered(log_rate=rate)
     monkeypatch.setattr(
-        "quadsim.rollout.rollout.Rollout.fly", lambda *_, **__: replace(flight, assembly=Assembly(scenario))
+        "quadsim.rollout.rollout.Rollout.fly",
+        lambda *_, **__: replace(flight, scenario=scenario, assembly=Assembly(scenario)),
     )
     out = str(tmp_path / "run")
     status = main(["run", name, "--set", f"log_rate={rate}", *TABLES, "--json", "--out", out])

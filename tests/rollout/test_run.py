@@ -18,9 +18,10 @@ from quadsim.assets import vehicle_path
 from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
-from quadsim.flight.rundir import Run
+from quadsim.rollout.flown import Flight
 from quadsim.rollout.machine import PACKAGES
 from quadsim.rollout.rollout import Rollout
+from quadsim.rollout.stored import read_flight
 from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.sim import loop
 
@@ -49,9 +50,9 @@ CONTRACT = {
 """Tables of the summary, and what each has at least."""
 
 
-def run(target: Path, *settings: str, name: str = "paper-constrained") -> Run:
+def run(target: Path, *settings: str, name: str = "paper-constrained") -> Flight:
     Rollout(load_scenario(name, settings)).fly().save(target, **NO_PRODUCTS)
-    return rundir.load_run(target)
+    return read_flight(target)
 
 
 def interrupt_after(periods: int) -> Callable[[str, int, int], None]:
@@ -74,7 +75,7 @@ def test_equal_scenarios_give_equal_bytes(short_run_directory: Path, tmp_path: P
     assert (again / TIMING_FILE).read_bytes() != (short_run_directory / TIMING_FILE).read_bytes()  # a clock's
 
 
-def test_the_summary_has_every_entry_of_the_contract(short_run: Run) -> None:
+def test_the_summary_has_every_entry_of_the_contract(short_run: Flight) -> None:
     for path, keys in CONTRACT.items():
         value: Any = short_run.summary
         for key in filter(None, path.split(".")):
@@ -82,7 +83,7 @@ def test_the_summary_has_every_entry_of_the_contract(short_run: Run) -> None:
         assert value.keys() >= keys, path
 
 
-def test_the_summary_is_that_of_the_flight(short_run: Run) -> None:
+def test_the_summary_is_that_of_the_flight(short_run: Flight) -> None:
     summary, log = short_run.summary, short_run.log
     assert (summary["scenario"], summary["status"], summary["reason"]) == ("paper-constrained", "completed", None)
     assert (summary["duration"], summary["seed"]) == (6.0, 0)
@@ -121,11 +122,11 @@ def test_a_flight_that_cannot_begin_is_recorded_with_its_reason(tmp_path: Path) 
     assert {"scenario.toml", FLIGHT_FILE, TIMING_FILE, PLANT_FILE} == set(flown.summary["files"])
 
 
-def test_ctrl_c_in_flight_keeps_what_was_flown(short_run: Run, tmp_path: Path) -> None:
+def test_ctrl_c_in_flight_keeps_what_was_flown(short_run: Flight, tmp_path: Path) -> None:
     scenario = load_scenario("paper-constrained", ["duration=6.0"])
     flight = Rollout(scenario).fly(interrupt_after(33))
     flight.save(tmp_path / "run", **NO_PRODUCTS)
-    flown = rundir.load_run(tmp_path / "run")
+    flown = read_flight(tmp_path / "run")
     assert flight.log.interrupted
     assert flown.summary["reason"] == "at t = 1.650 s: interrupted (Ctrl-C)"
     assert flown.log.control.t.size == 33

@@ -15,13 +15,13 @@ from quadsim.console.summary_tables import outcome_line
 from quadsim.controller import Phase
 from quadsim.errors import FileError
 from quadsim.flight.audit import Finding, SpaceLimit
-from quadsim.flight.rundir import load_run
 from quadsim.report.figure import Scene, has_space, obstacles_in, outlines, region_edges
 from quadsim.report.flight_figures import page_figures, write_figures
 from quadsim.report.recording import write_recording
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.reaudit import reaudit
 from quadsim.rollout.rollout import Rollout
+from quadsim.rollout.stored import read_flight
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.scenarios.schema.writing import plain
@@ -85,7 +85,7 @@ def test_the_extent_is_the_vehicle_s_or_the_scenario_s() -> None:
 
 def test_a_touch_is_a_crash_at_the_distance_that_the_audit_measures(crashed: Flight) -> None:
     assert crashed.outcome == "violated"
-    assert outcome_line(crashed.summary).plain.startswith("crashed, touched pillar, a required constraint is violated")
+    assert outcome_line(crashed).plain.startswith("crashed, touched pillar, a required constraint is violated")
     assert not cleared(crashed)[0].satisfied
     log, limit = crashed.log, cleared(crashed)[0].limit
     clearance = limit.source.finest(log)[1]
@@ -109,7 +109,7 @@ def test_a_run_with_shapes_is_read_audited_again_and_drawn(crashed: Flight, tmp_
     directory = tmp_path / "run"
     directory.mkdir()
     crashed.save(directory, **NO_PRODUCTS)
-    run = load_run(directory)
+    run = read_flight(directory)
     assert run.limits == tuple(finding.limit for finding in crashed.findings)
     assert not reaudit(directory).satisfied
     assert {path.stem for path in write_figures(run, tmp_path / "figures")} >= {"space"}
@@ -117,7 +117,7 @@ def test_a_run_with_shapes_is_read_audited_again_and_drawn(crashed: Flight, tmp_
     assert len(scene.solids) == 8, "four of the wall"
     write_recording(run, tmp_path / "flight.rrd")
     assert has_space(run.limits)
-    assert [len(edges) for _, edges in region_edges(run)] == [12, 12]
+    assert [len(edges) for _, edges in region_edges(run.limits, run.log)] == [12, 12]
     (outline,) = outlines(obstacles_in(run.limits)[0], 0.0)
     np.testing.assert_allclose(np.linalg.norm(outline - [1.0, 0.0], axis=1), 0.1)
 

@@ -15,12 +15,12 @@ from support import NO_PRODUCTS
 
 import quadsim
 from quadsim.controller import StepInputs
-from quadsim.flight import rundir
 from quadsim.mpc.ocp import Problem
 from quadsim.report.comparison import comparison_rows
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.reaudit import reaudit
 from quadsim.rollout.rollout import Rollout
+from quadsim.rollout.stored import read_flight
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.scenarios.schema.scenario import Scenario
@@ -122,9 +122,9 @@ def test_both_vehicles_are_recorded_and_shown(tmp_path: Path) -> None:
     scenario = load_scenario("hover", ["duration=0.5", "actual.mass=4.4", "actual.arm_length=0.35"])
     directory = tmp_path / "heavy"
     Rollout(scenario).fly().save(directory, **NO_PRODUCTS)
-    run, flight = rundir.load_run(directory), quadsim.read(directory)
+    run, flight = read_flight(directory), quadsim.read(directory)
     assert (run.summary["vehicle"]["mass"], run.summary["actual"]["mass"]) == (4.0, 4.4)
-    assert (flight.vehicle.mass, flight.actual.mass, run.vehicle.arm_length) == (4.0, 4.4, 0.35)
+    assert (flight.vehicle.mass, flight.actual.mass, run.actual.arm_length) == (4.0, 4.4, 0.35)
     assert reaudit(directory).satisfied == flight.satisfied
     cells = {row.label: row.cells[0].text for row in comparison_rows([run])}
     assert cells["vehicle"] == "lopes2011, modelled with mass 4.0 for 4.4, arm_length 0.3 for 0.35"

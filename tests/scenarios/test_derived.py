@@ -159,7 +159,7 @@ def test_a_flight_cut_by_hand_states_its_duration(eight: Scenario) -> None:
             started.step()
         flight = started.flight()
     assert not flight.scenario.ends_with_course
-    again = parse_scenario(tomllib.loads(flight.assembly.to_toml()))
+    again = parse_scenario(tomllib.loads(flight.to_toml()))
     assert again.duration == 20 * eight.control_period
     assert (quadsim.fly(again, progress=False).command == flight.command).all()
 

@@ -186,7 +186,7 @@ def test_a_campaign_names_the_same_worst_constraint_and_margin_as_the_flight(fli
     row = flown_row(flight.log, flight.findings, verdict=flight.outcome, wall_s=0.0, machine="")
     expected = (None, None) if worst is None else (worst.limit.name, worst_share(flight.findings))
     assert (row.get("worst_constraint"), row.get("worst_margin")) == expected
-    shown = next(row.cells[0].text for row in comparison_rows([flight.run]) if row.label == "worst constraint")
+    shown = next(row.cells[0].text for row in comparison_rows([flight]) if row.label == "worst constraint")
     assert shown.startswith("-" if worst is None else f"{worst.limit.name} ")
     assert ("worst margin: " in repr(flight)) == (worst is not None)
 

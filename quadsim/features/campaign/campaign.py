@@ -25,7 +25,7 @@ from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.features.campaign import store as records
 from quadsim.features.campaign.campaign_report import campaign_overview, write_report
 from quadsim.features.campaign.plan import Plan
-from quadsim.features.campaign.rows import make_table, read_table
+from quadsim.features.campaign.rows import make_table
 from quadsim.features.campaign.statistics import Judgement, estimate, proportion, worst_flight
 from quadsim.features.campaign.store import (
     FLIGHTS_FILE,
@@ -157,12 +157,12 @@ def fly_campaign(
             manifest["flown"] = int(np.count_nonzero(progress.outcomes[: progress.wanted] >= 0))
             records.write(manifest, files)
 
-        table = progress.store.close(progress.wanted)
+        table, times = progress.store.close(progress.wanted)
         spec, directory = plan.spec, files.path
         about = {"campaign": spec.name, "scenario": plan.scenario.name, "failure": [*spec.failure]}
         summary = about | estimate(table, plan.limits)
         # flights by the processor that flew them; those that raised, or that no process came back from, have none
-        processors = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
+        processors = times["machine"].drop_null().to_pylist()
         manifest["machines"] = dict(sorted(Counter(processors).items()))
         manifest["status"] = "complete" if progress.wanted == spec.flights else "stopped"
         manifest["files"] = {TIMES_FILE: digest_of(directory / TIMES_FILE)}

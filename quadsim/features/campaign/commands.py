@@ -246,8 +246,8 @@ def replay(
     products = {"video": video, "recording": recording, "figures": figures}
     with run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
         with reporting(progress) as report:
-            again = replace(Rollout(recorded.scenario).fly(report), directory=directory)
-        write_run(again, directory, products, overwrite=overwrite, progress=progress, flown=flown)
+            again = Rollout(recorded.scenario).fly(report)
+        again = write_run(again, directory, products, overwrite=overwrite, progress=progress, flown=flown)
     return compare_replay(again, recorded)
 
 

@@ -120,8 +120,8 @@ class Store:
             first = min(row["flight"] for row in rows)
             self._files.write({f"{PARTS_DIR}/part-{first:09d}.parquet": _encoded(make_table(rows, self._schema))})
 
-    def close(self, flights: int) -> pa.Table:
-        """Put the first `flights` flights into their final two tables, remove the parts, return `flights.parquet`.
+    def close(self, flights: int) -> tuple[pa.Table, pa.Table]:
+        """Put the first `flights` flights into their final two tables, which are returned, and remove the parts.
 
         Raises:
             OutputError: they cannot be written; the parts are still there.
@@ -130,7 +130,7 @@ class Store:
         table, times = split_times(whole.filter(pc.less(whole["flight"], flights)))
         self._files.write({TIMES_FILE: _encoded(times), FLIGHTS_FILE: _encoded(table)})
         self._files.remove(self._parts())
-        return table
+        return table, times
 
     def _parts(self) -> list[str]:
         """Return the paths of the parts, relative to the directory."""

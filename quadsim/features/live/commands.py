@@ -52,7 +52,7 @@ def live(
         quadsim.errors.ParameterError: --port must be from 1 to 65535, or 0 for any that is free; got 70000
     """
     from quadsim.features.live.serving import fly_live
-    from quadsim.rollout.reaudit import reaudit, stored_scenario
+    from quadsim.rollout.reaudit import reaudit
     from quadsim.scenarios.catalogue import names_directory
     from quadsim.scenarios.loading import load_scenario
 
@@ -60,8 +60,7 @@ def live(
     if onward:
         if changes or seed is not None:
             raise ParameterError("", "--set" if changes else "--seed", "given", "absent when a run is continued")
-        reaudit(Path(str(scenario)), products=False)
-        scenario = stored_scenario(Path(str(scenario)))
+        scenario = reaudit(Path(str(scenario)), products=False).scenario
     flown = load_scenario(scenario, changes, seed)
     other = None if against is None else load_scenario(against).controller
     place = {"port": port, "host": host, "browser": browser}

@@ -298,7 +298,7 @@ class Page:
 
     async def _download(self, event: Any) -> None:
         if self._session.k:
-            text = await self._ask(lambda session: session.flight().assembly.to_toml())
+            text = await self._ask(lambda session: session.flight().to_toml())
             _send(event.client, f"{self._session.scenario.name}.toml", text)
 
     async def _scene(self, event: Any) -> None:

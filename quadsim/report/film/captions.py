@@ -12,12 +12,10 @@ from PIL import Image
 
 from quadsim.controller import LAW, OPTIMAL, STOPPED, Phase
 from quadsim.flight.audit import Limit
-from quadsim.flight.rundir import Run
 from quadsim.mpc.laws import law_name
 from quadsim.palette import ON_DARK
-from quadsim.report.comparison import failure_sentences
 from quadsim.report.film import painter as ink
-from quadsim.report.film.frames import Footage, MarginTrack, ranked_tracks
+from quadsim.report.film.frames import Filmed, Footage, MarginTrack, ranked_tracks
 from quadsim.report.film.painter import Painter, Picture, shade, text_width
 from quadsim.report.table import ABSENT
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
@@ -46,12 +44,11 @@ class Overlay:
     Lengths below are design pixels of a 1280 x 720 frame, scaled to the frame's real size.
     """
 
-    def __init__(self, run: Run, footage: Footage, *, width: int, height: int) -> None:
+    def __init__(self, run: Filmed, footage: Footage, *, width: int, height: int) -> None:
         self._run, self._footage = run, footage
         self._scale = min(width / 1280.0, height / 720.0)
         self._width, self._height = width / self._scale, height / self._scale
-        controller = run.summary.get("controller", {})
-        self._subtitle = law_name(controller.get("name", ""))
+        self._subtitle = law_name(run.controller)
         self._grounded = any(phase != Phase.FLYING for phase in run.log.control.phase)
         self._ranked = ranked_tracks(footage.margins)  # fixed, so that rows keep their place
 
@@ -99,13 +96,13 @@ class Overlay:
         ):
             if vectors is not None:
                 lines.append((f"{what} {np.linalg.norm(vectors[i]):.2g} {unit}", 14, colour))
-        happened = [event for event in self._run.summary.get("events", ()) if 0.0 <= time - event["time"] <= _SHOWN]
+        happened = [event for event in self._run.events if 0.0 <= time - event["time"] <= _SHOWN]
         lines += [(event["text"][:_WIDEST], 15, ON_DARK.warning) for event in happened[-_MOST_EVENTS:]]
         reason = self._run.log.reason
         if reason is not None and time >= control.t[-1]:
             lines.append((f"aborted {reason}"[:130], 15, ON_DARK.violated))
         if time >= self._footage.times[-1] - _LAST:
-            wrapped = [textwrap.wrap(sentence, _WIDEST) for sentence in failure_sentences(self._run.summary)]
+            wrapped = [textwrap.wrap(sentence, _WIDEST) for sentence in self._run.failures]
             parts = [part for sentence in wrapped for part in sentence]
             lines += [(part, 14, ON_DARK.warning) for part in parts[:_MOST_LINES]]
             if len(parts) > _MOST_LINES:

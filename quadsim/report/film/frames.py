@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -10,10 +10,13 @@ import numpy as np
 
 from quadsim.errors import FileError
 from quadsim.flight.audit import Limit, Mask, margins_at, margins_sampled
-from quadsim.flight.rundir import Run
+from quadsim.flight.log import FlightLog
+from quadsim.flight.record import FlightRecord
+from quadsim.report.comparison import failure_sentences
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import EULER, POSITION, Array, tilt
 from quadsim.ties import in_order
+from quadsim.vehicle import Vehicle
 
 _CAMERA_MEMORY: Final = 0.7  # time constant [s] of the camera's smoothing, forward and backward
 _LEASH: Final = 0.6  # how far the camera's aim may be from the vehicle, in arm lengths per axis
@@ -22,10 +25,47 @@ _TOLERANCE: Final = 0.03  # how far a drawn path may be from the real one, in ar
 
 
 @dataclass(frozen=True, kw_only=True)
+class Filmed:
+    """What a film shows of a flight: what the processes that render it are given."""
+
+    name: str  # the scenario's
+    controller: str  # name of the control law
+    vehicle: Vehicle  # the vehicle flown
+    log: FlightLog
+    limits: tuple[Limit, ...]  # the constraints it was audited against
+    events: tuple[Mapping[str, Any], ...]  # `time` [s] and `text` of each
+    failures: tuple[str, ...]  # sentences on what failed other than a constraint
+
+    @property
+    def end(self) -> float:
+        """Last time of the flight [s]."""
+        return float(self.log.plant.t[-1])
+
+
+def filmed(flight: FlightRecord) -> Filmed:
+    """Return what a film shows of a flight.
+
+    Raises:
+        FileError: the flight ended before its first control period.
+    """
+    if flight.log.control.t.size == 0 or flight.log.plant.t.size == 0:
+        place = flight.directory or flight.name
+        raise FileError(place, "holds nothing to film: the flight ended before its first control period")
+    return Filmed(
+        name=flight.name,
+        controller=flight.numbers["controller"].get("name", ""),
+        vehicle=flight.actual,
+        log=flight.log,
+        limits=flight.limits,
+        events=tuple(flight.numbers.get("events", ())),
+        failures=tuple(failure_sentences(flight)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Shot:
     """The frames to film, and their size."""
 
-    run: str  # the run directory
     width: int = 1280  # [pixels], even
     height: int = 720  # [pixels], even
     fps: int = 30  # frames per second of film
@@ -93,21 +133,10 @@ class Footage:
     force: Array | None  # (F, 3) external force, world [N]; None where there is none
 
 
-def film_end(run: Run) -> float:
-    """Last simulated time [s] there is something to film of.
-
-    Raises:
-        FileError: the flight ended before its first control period.
-    """
-    if run.log.control.t.size == 0 or run.log.plant.t.size == 0:
-        raise FileError(run.directory, "holds nothing to film: the flight ended before its first control period")
-    return run.end
-
-
-def make_footage(run: Run, times: Array) -> Footage:
+def make_footage(run: Filmed, times: Array) -> Footage:
     """Read a flight at frame times; times beyond the flight show its ends."""
     plant, control = run.log.plant, run.log.control
-    times = np.clip(times, 0.0, film_end(run))
+    times = np.clip(times, 0.0, run.end)
     row = np.clip(np.searchsorted(plant.t, times + 1e-9, side="right") - 1, 0, max(plant.t.size - 2, 0))
     after = np.minimum(row + 1, plant.t.size - 1)
     share = ((times - plant.t[row]) / np.where(after > row, plant.t[after] - plant.t[row], 1.0))[:, None]
@@ -149,7 +178,7 @@ def _row_before(t: Array, times: Array) -> np.ndarray[Any, np.dtype[np.intp]]:
     return np.clip(np.searchsorted(t, times + 1e-9, side="right") - 1, 0, t.size - 1)
 
 
-def _track(run: Run, limit: Limit, times: Array) -> MarginTrack:
+def _track(run: Filmed, limit: Limit, times: Array) -> MarginTrack:
     t, values = limit.source.finest(run.log)
     margin = margins_at(limit, t, values)
     violated, sampled = limit.violated(margin), margins_sampled(limit, run.log)

@@ -19,12 +19,11 @@ import mujoco
 import numpy as np
 
 from quadsim.controller import Phase
-from quadsim.flight.rundir import Run, load_run
 from quadsim.palette import COLOUR, rgba
 from quadsim.report.figure import obstacles_in, region_edges
 from quadsim.report.film.camera import REQUEST
 from quadsim.report.film.captions import Overlay
-from quadsim.report.film.frames import Footage, Shot, make_footage, thin
+from quadsim.report.film.frames import Filmed, Footage, Shot, make_footage, thin
 from quadsim.report.film.painter import Picture
 from quadsim.sim.airframe import FLOOR, PROPELLER_NAMES, compile_model, obstacle_body
 from quadsim.space import Obstacle
@@ -95,12 +94,12 @@ class FilmStage:
     line to the floor.
     """
 
-    def __init__(self, run: Run, footage: Footage, *, width: int, height: int) -> None:
+    def __init__(self, run: Filmed, footage: Footage, *, width: int, height: int) -> None:
         self._run, self._footage = run, footage
         self._arm = run.vehicle.longest_arm
         self._obstacles = obstacles_in(run.limits)
         self._model = compile_model(run.vehicle, visuals=True, obstacles=self._obstacles)
-        self._regions = list(region_edges(run))
+        self._regions = list(region_edges(run.limits, run.log))
         lowest = max(float(footage.path[:, 2].min()), -_DEEPEST_FLOOR)
         self._floor = min(lowest, 0.0) + float(self._model.geom(FLOOR).pos[2])
         self._model.geom(FLOOR).pos[2] = self._floor
@@ -186,7 +185,7 @@ class FilmStage:
         self._connect(mujoco.mjtGeom.mjGEOM_LINE, 1.0, self._footage.position[i], foot, _SHADOW_COLOUR)
 
 
-def frames(run: Run, shot: Shot) -> Iterator[Picture]:
+def frames(run: Filmed, shot: Shot) -> Iterator[Picture]:
     """The frames of a shot, each (height, width, 3)."""
     footage = make_footage(run, shot.times)
     overlay = Overlay(run, footage, width=shot.width, height=shot.height) if shot.captions else None
@@ -196,7 +195,7 @@ def frames(run: Run, shot: Shot) -> Iterator[Picture]:
             yield picture if overlay is None else overlay.draw(picture, i)
 
 
-def film_shot(shot: Shot, path: Path) -> None:
+def film_shot(run: Filmed, shot: Shot, path: Path) -> None:
     """Render a shot and encode it as H.264, reporting frames done on stdout."""
     options = ["-preset", "veryfast", "-crf", "23", "-threads", "1"]
     writer: Any = imageio.get_writer(
@@ -204,7 +203,7 @@ def film_shot(shot: Shot, path: Path) -> None:
         macro_block_size=1, ffmpeg_log_level="error", output_params=options,
     )  # fmt: skip
     with writer:
-        for i, picture in enumerate(frames(load_run(Path(shot.run)), shot), start=1):
+        for i, picture in enumerate(frames(run, shot), start=1):
             writer.append_data(picture)
             print(i, flush=True)
 
@@ -234,12 +233,13 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
 
 
 def carry_out(arguments: list[str]) -> None:
-    """Do `serve` or `film SHOT MP4`."""
+    """Do `serve` or `film FLIGHT SHOT MP4`, the flight a pickled `Filmed`."""
     match arguments:
         case ["serve"]:
             serve(sys.stdin.buffer, sys.stdout.buffer)
-        case ["film", shot, path]:
-            film_shot(Shot(**json.loads(shot)), Path(path))
+        case ["film", flight, shot, path]:
+            run: Filmed = pickle.loads(Path(flight).read_bytes())
+            film_shot(run, Shot(**json.loads(shot)), Path(path))
         case _:
             raise SystemExit(carry_out.__doc__)
 

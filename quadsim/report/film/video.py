@@ -1,4 +1,4 @@
-"""A run directory -> a film of its flight, rendered after the flight in child processes.
+"""A flight -> its film, rendered after the flight in child processes.
 
 The caller never touches OpenGL: each child (`render_worker`) gets its own environment, renders and encodes a run of
 frames, and ffmpeg joins the pieces without encoding again.
@@ -12,6 +12,7 @@ import itertools
 import json
 import logging
 import os
+import pickle
 import selectors
 import shutil
 import subprocess
@@ -24,9 +25,9 @@ from typing import IO, Final
 
 from quadsim.assets import own_packages
 from quadsim.errors import OutputError, ParameterError, RenderingUnavailableError
-from quadsim.flight.rundir import load_run
+from quadsim.flight.record import FlightRecord
 from quadsim.outputs import writing_file
-from quadsim.report.film.frames import Shot, film_end
+from quadsim.report.film.frames import Filmed, Shot, filmed
 
 BACKENDS: Final = ("egl", "osmesa")  # off-screen back ends, in the order tried
 _WORKER: Final = (sys.executable, "-P", "-m", "quadsim.report.film.render_worker")
@@ -150,7 +151,7 @@ def rough_time(seconds: float) -> str:
 
 
 def render_video(
-    run_directory: Path,
+    flight: FlightRecord,
     path: Path,
     *,
     workers: int | None = None,
@@ -160,27 +161,27 @@ def render_video(
     fps: int | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Film a run as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all.
+    """Film a flight as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all.
 
     Width and height are even [pixels].  `workers` is how many processes render, at most; the machine's cores when None.
     `progress` is called with frames done and frames in all, in the caller's thread.  `fps` is in frames per second;
     None as in `frame_rate`.
 
     Raises:
-        FileError: the run cannot be read, or holds nothing to film.
+        FileError: the flight holds nothing to film.
         OutputError: the film cannot be written, or a renderer failed; nothing is left behind.
         ParameterError: there are to be no workers, or `fps` is outside `FPS_RANGE`.
         RenderingUnavailableError: this machine cannot render.
     """
-    end = film_end(load_run(run_directory))
-    rate = frame_rate(end, fps)
-    shot = Shot(run=str(run_directory), width=width, height=height, fps=rate, count=frame_count(end, rate))
+    run = filmed(flight)
+    rate = frame_rate(run.end, fps)
+    shot = Shot(width=width, height=height, fps=rate, count=frame_count(run.end, rate))
     with _making(path, overwrite) as new:
-        _film(shot, new, workers, progress)
+        _film(run, shot, new, workers, progress)
 
 
 def render_gif(
-    run_directory: Path,
+    flight: FlightRecord,
     path: Path,
     *,
     workers: int | None = None,
@@ -188,16 +189,17 @@ def render_gif(
     fps: int | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Film a run as a small looping GIF without captions, six times as fast; arguments and errors as `render_video`.
+    """Film a flight as a small looping GIF without captions, six times as fast; arguments and errors as `render_video`.
 
     It is rendered at twice its size and scaled down, which smooths its edges.  Its `fps` is 8 by default.
     """
+    run = filmed(flight)
     speed, rate = 6.0, frame_rate(0.0, 8 if fps is None else fps)
-    count = frame_count(film_end(load_run(run_directory)) / speed, rate)
-    shot = Shot(run=str(run_directory), width=960, height=540, fps=rate, speed=speed, count=count, captions=False)
+    count = frame_count(run.end / speed, rate)
+    shot = Shot(width=960, height=540, fps=rate, speed=speed, count=count, captions=False)
     with _making(path, overwrite) as new:
         film = new.with_suffix(".mp4")
-        backend = _film(shot, film, workers, progress)
+        backend = _film(run, shot, film, workers, progress)
         # small by few colours and little noise
         scaled = "scale=480:-2:flags=area,hqdn3d=3:3:0:0,split[a][b]"
         colours = "[a]palettegen=max_colors=96:stats_mode=diff[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
@@ -211,15 +213,18 @@ def write_poster(film: Path, poster: Path) -> bool:
     return subprocess.run([*_ffmpeg(), "-i", str(film), *frame], capture_output=True).returncode == 0
 
 
-def _film(shot: Shot, path: Path, workers: int | None, progress: FrameProgress | None) -> str:
+def _film(run: Filmed, shot: Shot, path: Path, workers: int | None, progress: FrameProgress | None) -> str:
     """Film a shot in pieces and join them; the back end that did it."""
     pieces = worker_count(shot.count, workers)
     backend = rendering_backend()
     edges = [shot.count * piece // pieces for piece in range(pieces + 1)]
     shots = [replace(shot, first=a, count=b - a) for a, b in itertools.pairwise(edges)]
     names = [f"piece{piece}.mp4" for piece in range(pieces)]
+    content = path.parent / "flight.pickle"
+    content.write_bytes(pickle.dumps(run))
     commands = [
-        (*_WORKER, "film", json.dumps(asdict(s)), str(path.parent / name)) for s, name in zip(shots, names, strict=True)
+        (*_WORKER, "film", str(content), json.dumps(asdict(part)), str(path.parent / name))
+        for part, name in zip(shots, names, strict=True)
     ]
     _work(commands, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
     listing = path.parent / "pieces.txt"

@@ -27,7 +27,7 @@ from typing import Final
 import numpy as np
 
 from quadsim.errors import FileError, OutputError, ViewerUnavailableError
-from quadsim.flight.rundir import Run
+from quadsim.flight.record import FlightRecord
 from quadsim.outputs import writing_file
 
 _CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
@@ -36,7 +36,7 @@ _VIEWER: Final = (sys.executable, "-P", "-c", _CALL, "--bind=127.0.0.1", "--port
 _INTERRUPTED: Final = 130  # the viewer's exit status after Ctrl-C
 
 
-def write_recording(run: Run, path: Path) -> None:
+def write_recording(run: FlightRecord, path: Path) -> None:
     """Write a run, completed or not, as a new `.rrd` with its layout inside; it appears complete or not at all.
 
     Raises:
@@ -46,7 +46,7 @@ def write_recording(run: Run, path: Path) -> None:
         new.write_bytes(_encode(run, path))
 
 
-def _encode(run: Run, path: Path) -> bytes:
+def _encode(run: FlightRecord, path: Path) -> bytes:
     """The file's content, made in memory: rerun's own file writer hides from Python why it failed."""
     import rerun as rr
     import rerun.blueprint as rrb
@@ -54,7 +54,7 @@ def _encode(run: Run, path: Path) -> bytes:
     from quadsim.report.recording.plots import send_plots, send_texts
     from quadsim.report.recording.world import TIMELINE, scene_views, send_airframe, send_scene, send_space
 
-    digest = hashlib.sha256(repr((run.vehicle, run.limits)).encode())
+    digest = hashlib.sha256(repr((run.actual, run.limits)).encode())
     for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
         digest.update(np.ascontiguousarray(array).tobytes())
     # the viewer merges recordings that share an identity
@@ -67,7 +67,7 @@ def _encode(run: Run, path: Path) -> bytes:
     rr.set_strict_mode(True)  # otherwise what cannot be recorded is left out with a warning
     try:
         recording.send_recording_name(run.name)
-        send_airframe(recording, run.vehicle)
+        send_airframe(recording, run.actual)
         send_scene(recording, run)
         send_space(recording, run)
         send_texts(recording, run)

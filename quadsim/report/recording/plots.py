@@ -14,7 +14,7 @@ from quadsim.controller import OPTIMAL, Phase
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
 from quadsim.flight.log import PlantLog, columns_of
 from quadsim.flight.metrics import never_took_off, unrecovered
-from quadsim.flight.rundir import Run
+from quadsim.flight.record import FlightRecord
 from quadsim.palette import line_colour
 from quadsim.report.comparison import comparison_rows, fallback_sentence, takeoff_sentence
 from quadsim.report.figure import (
@@ -42,7 +42,7 @@ from quadsim.vehicle import N_ROTORS
 _ACTIVE: Final = 0.002  # A limit is active where its margin is below this fraction of the allowed band
 
 
-def send_plots(recording: rr.RecordingStream, run: Run) -> rrb.Tabs:
+def send_plots(recording: rr.RecordingStream, run: FlightRecord) -> rrb.Tabs:
     """Send all signals over time, at the log rate where it exists between control samples; return their views.
 
     A view names only what was sent, and one without content is left out.
@@ -61,7 +61,9 @@ def send_plots(recording: rr.RecordingStream, run: Run) -> rrb.Tabs:
     )
 
 
-def _send_signals(recording: rr.RecordingStream, run: Run, reached: Sequence[Limit]) -> list[rrb.TimeSeriesView]:
+def _send_signals(
+    recording: rr.RecordingStream, run: FlightRecord, reached: Sequence[Limit]
+) -> list[rrb.TimeSeriesView]:
     """Every signal there is, and the reference; of flights that may turn upside down quaternion and body rates too."""
     log, views = run.log, list[rrb.TimeSeriesView]()
     for title, names in panels(log).items():
@@ -96,7 +98,9 @@ def _send_signals(recording: rr.RecordingStream, run: Run, reached: Sequence[Lim
     return views
 
 
-def _send_margins(recording: rr.RecordingStream, run: Run, reached: Sequence[Limit]) -> list[rrb.TimeSeriesView]:
+def _send_margins(
+    recording: rr.RecordingStream, run: FlightRecord, reached: Sequence[Limit]
+) -> list[rrb.TimeSeriesView]:
     """The margins of limits at the samples; those of one unit in one plot."""
     views = list[rrb.TimeSeriesView]()
     for unit in dict.fromkeys(limit.unit for limit in reached):
@@ -110,7 +114,7 @@ def _send_margins(recording: rr.RecordingStream, run: Run, reached: Sequence[Lim
     return views
 
 
-def _send_limit(recording: rr.RecordingStream, limit: Limit, run: Run) -> bool:
+def _send_limit(recording: rr.RecordingStream, limit: Limit, run: FlightRecord) -> bool:
     """Send a limit's bounds over its time window and its verdicts; return whether the flight reached the window."""
     t, margins = run.log.control.t, margins_sampled(limit, run.log)
     inside = np.isfinite(margins)
@@ -136,7 +140,9 @@ def _send_limit(recording: rr.RecordingStream, limit: Limit, run: Run) -> bool:
     return True
 
 
-def _send_solver(recording: rr.RecordingStream, run: Run) -> tuple[list[rrb.TimeSeriesView], list[rrb.TimeSeriesView]]:
+def _send_solver(
+    recording: rr.RecordingStream, run: FlightRecord
+) -> tuple[list[rrb.TimeSeriesView], list[rrb.TimeSeriesView]]:
     """Clock times, and what is known of the answers."""
     sent = list[str]()
     control, timing = run.log.control, run.log.timing
@@ -150,7 +156,7 @@ def _send_solver(recording: rr.RecordingStream, run: Run) -> tuple[list[rrb.Time
         ("slack", np.degrees(control.slack), "slack [deg]", second),
     ):
         sent += _send_curves(recording, f"solver/{name}", control.t, values, {label: colour})
-    deadline = run.summary["controller"].get("deadline_ms")
+    deadline = run.numbers["controller"].get("deadline_ms")
     if deadline is not None:
         ends = run.log.plant.t[[0, -1]]
         sent += _send_curves(recording, "solver/deadline_ms", ends, np.full(2, deadline), {"deadline [ms]": BOUND})
@@ -165,7 +171,7 @@ def _send_solver(recording: rr.RecordingStream, run: Run) -> tuple[list[rrb.Time
     return times, [view for views in answers for view in views]
 
 
-def _send_effects(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
+def _send_effects(recording: rr.RecordingStream, run: FlightRecord) -> list[rrb.TimeSeriesView]:
     """Send commands that rotors do not follow at once, external force, wind, and battery, where they exist."""
     t, views = run.log.plant.t, list[rrb.TimeSeriesView]()
     commanded = commanded_speeds(run.log)
@@ -180,14 +186,15 @@ def _send_effects(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSerie
     return views
 
 
-def send_texts(recording: rr.RecordingStream, run: Run) -> None:
+def send_texts(recording: rr.RecordingStream, run: FlightRecord) -> None:
     """The summary, and what happened when.
 
     Changes of the status, of who answers and of the phase; why the first QP without an answer had none; when permanent
     fallback begins; when a vehicle that stays on the ground was told to leave it; the flight's events and its end.
     """
-    log, summary = run.log.control, run.summary
-    diagnosis, periods = summary.get("diagnosis") or {}, unrecovered(log)
+    log = run.log.control
+    diagnosis = run.diagnosis or {}
+    periods = unrecovered(log)
     answers = list(zip(log.status, log.answered_by, log.fallback.tolist(), strict=True))
     events = [
         (
@@ -205,7 +212,7 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
         events.append((float(log.t[-periods]), fallback_sentence(periods), "ERROR"))
     if (told := never_took_off(log)) is not None:
         events.append((told, takeoff_sentence(told), "ERROR"))
-    events += [(event["time"], event["text"], "WARN") for event in summary.get("events", ())]
+    events += [(event["time"], event["text"], "WARN") for event in run.numbers.get("events", ())]
     reason = run.log.reason
     events.append((run.end, "completed", "INFO") if reason is None else (run.end, f"aborted: {reason}", "ERROR"))
     times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
@@ -250,7 +257,7 @@ def _send_curves(
 
 
 def _view(
-    title: str, contents: Sequence[str], run: Run, *, ends: tuple[float, float] | None = None
+    title: str, contents: Sequence[str], run: FlightRecord, *, ends: tuple[float, float] | None = None
 ) -> list[rrb.TimeSeriesView]:
     """Curves over the whole flight, and the legend to their right; `ends` of the vertical axis; no view of nothing."""
     if not contents:

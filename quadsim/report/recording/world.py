@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 from quadsim.controller import Phase
 from quadsim.flight.audit import SIGNALS
 from quadsim.flight.log import FlightLog
-from quadsim.flight.rundir import Run
+from quadsim.flight.record import FlightRecord
 from quadsim.palette import COLOUR, line_colour, on_dark, rgb
 from quadsim.report.figure import obstacles_in, region_edges
 from quadsim.rotation import euler_to_quaternion
@@ -124,23 +124,23 @@ def _part(solid: Solid, colour: Any) -> rr.AsComponents:
     return rr.Ellipsoids3D(centers=centres, half_sizes=[half], **turned)
 
 
-def send_scene(recording: rr.RecordingStream, run: Run) -> None:
+def send_scene(recording: rr.RecordingStream, run: FlightRecord) -> None:
     """Axes and paths, how the vehicle moves through them, and what the controller predicts."""
     control, plant = run.log.control, run.log.plant
     position = plant.state[:, POSITION]
-    thickness = min(0.02, 0.06 * run.vehicle.longest_arm)
+    thickness = min(0.02, 0.06 * run.actual.longest_arm)
     axes = rr.Arrows3D(
         origins=np.zeros((3, 3)), vectors=np.eye(3), radii=thickness, colors=AXIS_COLOURS, labels=["x", "y", "z"]
     )
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("world/axes", axes, static=True)
-    dashes = _dashes(control.reference[:, :3], _DASH * run.vehicle.longest_arm)
+    dashes = _dashes(control.reference[:, :3], _DASH * run.actual.longest_arm)
     _log_lines(recording, "world/reference", REFERENCE, 1.2, dashes)
     _log_lines(recording, "world/path", on_screen(COLOUR.flown, 60), 1.0, [position])
 
     # The body turns below an entity that only moves: views that start there follow the vehicle without tilting.
     thrusts = np.zeros((plant.t.size, N_ROTORS, 3))
-    thrusts[..., 2] = run.vehicle.longest_arm * np.square(plant.speeds / run.vehicle.hover_speed)
+    thrusts[..., 2] = run.actual.longest_arm * np.square(plant.speeds / run.actual.hover_speed)
     turned = euler_to_quaternion(plant.state[:, EULER]) if plant.attitude is None else plant.attitude
     attitude = _vector_first(turned)
     arrows = rr.Arrows3D.columns(vectors=thrusts.reshape(-1, 3)).partition([N_ROTORS] * plant.t.size)
@@ -148,12 +148,12 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     recording.send_columns("world/vehicle/body", [time_column(plant.t)], rr.Transform3D.columns(quaternion=attitude))
     recording.send_columns("world/vehicle/body/thrust", [time_column(plant.t)], arrows)
     if plant.wrench is not None and np.any(plant.wrench[:, :3]):
-        vehicle = run.vehicle
+        vehicle = run.actual
         scale = _FORCE_SCALE * vehicle.longest_arm / (vehicle.mass * vehicle.gravity / N_ROTORS)
         _send_arrows(recording, run, "external_force", scale * plant.wrench[:, :3], DISTURBANCE, behind=0.0)
     if plant.wind is not None and np.any(plant.wind):
         strongest = float(np.linalg.norm(plant.wind, axis=1).max())
-        drawn = _WIND_LENGTH * run.vehicle.longest_arm / strongest * plant.wind
+        drawn = _WIND_LENGTH * run.actual.longest_arm / strongest * plant.wind
         _send_arrows(recording, run, "wind", drawn, DISTURBANCE, behind=1.3)
 
     if control.t.size:
@@ -171,7 +171,7 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
         recording.send_columns("world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=shown))
 
 
-def send_space(recording: rr.RecordingStream, run: Run) -> None:
+def send_space(recording: rr.RecordingStream, run: FlightRecord) -> None:
     """Obstacles, which move where they do, and regions, which are there while they hold."""
     for obstacle in obstacles_in(run.limits):
         entity = f"world/obstacles/{obstacle.name}"
@@ -183,7 +183,7 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
             recording.send_columns(entity, [time_column(t)], moving)
         else:
             recording.log(entity, rr.Transform3D(translation=obstacle.position), static=True)
-    for limit, edges in region_edges(run):
+    for limit, edges in region_edges(run.limits, run.log):
         entity = f"world/regions/{limit.name}"
         _log_lines(recording, entity, BOUND, 1.2)
         times = np.array([max(limit.start, 0.0), limit.stop])
@@ -191,9 +191,9 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
         recording.send_columns(entity, [time_column(times[np.isfinite(times)])], strips)
 
 
-def scene_views(run: Run) -> rrb.Vertical:
+def scene_views(run: FlightRecord) -> rrb.Vertical:
     """Course and vehicle in space, and the summary."""
-    behind = run.vehicle.longest_arm * np.array([-3.0, -3.5, 2.2])
+    behind = run.actual.longest_arm * np.array([-3.0, -3.5, 2.2])
     return rrb.Vertical(
         _view("Course", "/world", *_overview(run)),
         rrb.Horizontal(
@@ -204,12 +204,12 @@ def scene_views(run: Run) -> rrb.Vertical:
     )
 
 
-def _overview(run: Run) -> tuple[Array, Array]:
+def _overview(run: FlightRecord) -> tuple[Array, Array]:
     """Where the eye is and where it looks [m] to see the whole course."""
     path, course = run.log.plant.state[:, POSITION], run.log.control.reference[:, :3]
     path = path[np.isfinite(path).all(axis=1)]  # a flight that diverged ends in anything
     course = course if len(course) else path
-    low, high, least = course.min(axis=0), course.max(axis=0), 10 * run.vehicle.longest_arm
+    low, high, least = course.min(axis=0), course.max(axis=0), 10 * run.actual.longest_arm
     slack = max(float((high - low).max()), least)
     path = np.clip(path, low - slack, high + slack)  # a lost vehicle leaves the picture
     low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
@@ -231,10 +231,10 @@ def _view(name: str, origin: str, eye: Array, target: Array) -> rrb.Spatial3DVie
 
 
 def _send_arrows(
-    recording: rr.RecordingStream, run: Run, name: str, vectors: Array, colour: Colour, *, behind: float
+    recording: rr.RecordingStream, run: FlightRecord, name: str, vectors: Array, colour: Colour, *, behind: float
 ) -> None:
     """Arrows (M, 3) above the rotor discs that move with the vehicle, begun by `behind` of their length before it."""
-    entity, unit = f"world/vehicle/{name}", run.vehicle.longest_arm / DRAWN_ARM
+    entity, unit = f"world/vehicle/{name}", run.actual.longest_arm / DRAWN_ARM
     recording.log(entity, rr.Arrows3D.from_fields(radii=0.01 * unit, colors=colour), static=True)
     origins = np.array([0.0, 0.0, 0.08 * unit]) - behind * vectors
     columns = rr.Arrows3D.columns(vectors=vectors, origins=origins)

@@ -28,8 +28,8 @@ from quadsim.features.campaign.rows import (
 from quadsim.features.campaign.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store, read_flights
 from quadsim.flight import rundir
 from quadsim.flight.audit import Finding, Limit, audit, worst_finding
-from quadsim.flight.rundir import Run
 from quadsim.outputs import Growing, growing
+from quadsim.rollout.flown import Flight
 from quadsim.rollout.many import Row
 
 FAILED: Row = {"status": "error", "verdict": "error", "reason": "x", "violated": True, "crashed": False}
@@ -58,7 +58,7 @@ def test_rows_come_back_sorted_from_whatever_parts(tmp_path: Path) -> None:
         store.append([])
     with store_in(tmp_path) as store:
         assert flights(store) == [1, 2, 3], "one that is there twice counts once"
-        assert store.close(flights=3)["flight"].to_pylist() == [1, 2], "those beyond the first three do not"
+        assert store.close(flights=3)[0]["flight"].to_pylist() == [1, 2], "those beyond the first three do not"
 
 
 def test_the_end_is_the_same_however_it_was_appended(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_dying_while_closing_loses_nothing(tmp_path: Path, monkeypatch: pytest.M
             store.close(flights=3)
     with store_in(tmp_path) as store:
         assert flights(store) == [0, 1, 2]
-        assert store.close(flights=3).num_rows == 3
+        assert store.close(flights=3)[0].num_rows == 3
     assert read_table(tmp_path / TIMES_FILE)["flight"].to_pylist() == [0, 1, 2]
 
 
@@ -166,7 +166,7 @@ def finding(limit: Limit, margin: float, sampled: float | None = None) -> Findin
     )
 
 
-def test_a_row_follows_the_schema(short_run: Run) -> None:
+def test_a_row_follows_the_schema(short_run: Flight) -> None:
     schema = make_schema({"mass": (pa.float64(), "kg"), "kind": (pa.string(), "-")}, short_run.limits)
     row = flown_row(
         short_run.log, audit(short_run.log, short_run.limits), verdict="violated", wall_s=1.5, machine="x86"
@@ -181,7 +181,7 @@ def test_a_row_follows_the_schema(short_run: Run) -> None:
     assert units == {"margin.roll": "deg", "rmse.x": "m", "verdict": "-", "draw.mass": "kg", "draw.kind": "-"}
 
 
-def test_a_row_agrees_with_the_summary(short_run: Run) -> None:
+def test_a_row_agrees_with_the_summary(short_run: Flight) -> None:
     row = flown_row(
         short_run.log, audit(short_run.log, short_run.limits), verdict="satisfied", wall_s=0.0, machine="x86"
     )
@@ -194,7 +194,7 @@ def test_a_row_agrees_with_the_summary(short_run: Run) -> None:
     assert row["satisfied.arrival_x"] is None, "neither held nor violated"
 
 
-def test_rows_are_sorted_and_clock_times_stand_apart(short_run: Run) -> None:
+def test_rows_are_sorted_and_clock_times_stand_apart(short_run: Flight) -> None:
     schema = make_schema({}, short_run.limits)
     rows = [{"flight": k, "seed": k, "failed": False, "wall_s": 1.0} for k in (2, 0, 1)]
     flights, times = split_times(make_table(rows, schema))

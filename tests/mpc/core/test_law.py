@@ -41,7 +41,7 @@ def both(scenario: Scenario) -> tuple[Flight, Flight]:
 
 def why(flight: Flight) -> str | None:
     """The sentence about its first QP without an answer; its remedies, which are flown, have tests of their own."""
-    diagnosis = flight.undiagnosed_run.summary["diagnosis"]
+    diagnosis = flight.numbers["diagnosis"]
     return None if diagnosis is None else diagnosis["sentence"]
 
 

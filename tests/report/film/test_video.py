@@ -5,21 +5,19 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from support import NO_PRODUCTS, decode
+from support import decode, judged_by, recording
 
 from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnavailableError
 from quadsim.flight.audit import Limit, audit
-from quadsim.flight.rundir import Run
 from quadsim.palette import ON_DARK, rgb
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
-from quadsim.report.film.frames import make_footage, ranked_tracks
+from quadsim.report.film.frames import filmed, make_footage, ranked_tracks
 from quadsim.report.film.video import (
     Estimate,
     frame_count,
@@ -29,6 +27,7 @@ from quadsim.report.film.video import (
     rendering_backend,
     write_poster,
 )
+from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
 from quadsim.rotation import body_to_world
 from quadsim.scenarios.loading import load_scenario
@@ -47,13 +46,13 @@ def backend() -> str:
 
 @pytest.mark.witness("films")
 def test_the_film_has_the_frames_requested(
-    backend: str, short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    backend: str, short_run: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One of each second, in two pieces."""
     path, reports, before = tmp_path / "film" / "flight.mp4", list[tuple[int, int]](), dict(os.environ)
     path.parent.mkdir()
     monkeypatch.setattr(video, "_FEWEST_FRAMES", 3)
-    render_video(short_run.directory, path, workers=2, fps=1, progress=lambda *report: reports.append(report))
+    render_video(short_run, path, workers=2, fps=1, progress=lambda *report: reports.append(report))
     assert dict(os.environ) == before, "the caller's environment is left as it is"
     assert reports == sorted(reports)
     assert reports[-1] == (6, 6)
@@ -105,8 +104,8 @@ def test_an_estimate_waits_for_a_film_that_is_long_enough_to_be_timed(monkeypatc
     assert told((5, 500), two, monkeypatch) == ["films: about 50 s; the page is there"]
 
 
-def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path) -> None:
-    render_gif(short_run.directory, tmp_path / "film.gif")
+def test_a_gif_is_small_and_moves(backend: str, short_run: Flight, tmp_path: Path) -> None:
+    render_gif(short_run, tmp_path / "film.gif")
     frames = iio.imread(tmp_path / "film.gif")
     assert frames.shape[:3] == (8, 270, 480)
     assert np.abs(frames[3].astype(int) - frames[0]).mean() > 2.0
@@ -115,26 +114,25 @@ def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path) 
 
 @pytest.mark.parametrize("name", ["drone #2", "what?", "100 %d", "it's", "a:b"])
 def test_a_folder_of_any_name_has_its_film_its_gif_and_its_poster(backend: str, tmp_path: Path, name: str) -> None:
-    run = tmp_path / name / "run"
-    run.parent.mkdir()
-    Rollout(load_scenario("hover", ["duration=0.2"])).fly().save(run, **NO_PRODUCTS)
-    render_video(run, run.parent / "film.mp4", fps=10)
-    render_gif(run, run.parent / "film.gif")
-    assert write_poster(run.parent / "film.mp4", run.parent / "film.jpg")
-    assert {path.name for path in run.parent.iterdir()} == {"run", "film.mp4", "film.gif", "film.jpg"}
+    folder = tmp_path / name
+    folder.mkdir()
+    flight = Rollout(load_scenario("hover", ["duration=0.2"])).fly()
+    render_video(flight, folder / "film.mp4", fps=10)
+    render_gif(flight, folder / "film.gif")
+    assert write_poster(folder / "film.mp4", folder / "film.jpg")
+    assert {path.name for path in folder.iterdir()} == {"film.mp4", "film.gif", "film.jpg"}
 
 
 def test_a_flight_of_one_period_far_away_can_be_filmed_and_of_none_cannot(
-    backend: str, empty_run: Run, tmp_path: Path
+    backend: str, empty_run: Flight, tmp_path: Path
 ) -> None:
     far = load_scenario("paper-constrained", ["duration=0.05", "initial.position=[9e3, -9e3, 9e3]", "constraints=[]"])
-    Rollout(far).fly().save(tmp_path / "far", **NO_PRODUCTS)
-    render_video(tmp_path / "far", tmp_path / "film.mp4", width=320, height=180, fps=10, workers=1)
+    render_video(Rollout(far).fly(), tmp_path / "film.mp4", width=320, height=180, fps=10, workers=1)
     frames, _ = decode(tmp_path / "film.mp4")
     assert frames.shape == (1, 180, 320, 3)
     assert frames.mean() > 30.0
     with pytest.raises(FileError, match="nothing to film"):
-        render_video(empty_run.directory, tmp_path / "none.mp4")
+        render_video(empty_run, tmp_path / "none.mp4")
     assert not (tmp_path / "none.mp4").exists()
 
 
@@ -144,8 +142,8 @@ def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     script = (
         "import json, sys, time\n"
         "print(1, flush=True)\n"
-        "open(sys.argv[3], 'w').write('half a film')\n"
-        "if json.loads(sys.argv[2])['first'] == 0: time.sleep(600)\n"
+        "open(sys.argv[4], 'w').write('half a film')\n"
+        "if json.loads(sys.argv[3])['first'] == 0: time.sleep(600)\n"
         "sys.exit('Traceback ...\\nGLError: the picture is lost')\n"
     )
     monkeypatch.setattr(video, "_WORKER", (sys.executable, "-c", script))
@@ -153,20 +151,20 @@ def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("fake_worker")
-def test_a_failing_worker_stops_the_others_and_leaves_nothing(short_run: Run, tmp_path: Path):
+def test_a_failing_worker_stops_the_others_and_leaves_nothing(short_run: Flight, tmp_path: Path):
     target = tmp_path / "film.mp4"
     target.write_bytes(b"an older film")
     with pytest.raises(OutputError, match="it already exists; choose another file"):
-        render_video(short_run.directory, target, workers=2)
+        render_video(short_run, target, workers=2)
     with pytest.raises(OutputError, match="renderer failed: GLError: the picture is lost") as caught:
-        render_video(short_run.directory, target, workers=2, overwrite=True)
+        render_video(short_run, target, workers=2, overwrite=True)
     assert caught.value.path == target
     assert [entry.name for entry in tmp_path.iterdir()] == ["film.mp4"]
     assert target.read_bytes() == b"an older film"
 
 
 @pytest.mark.usefixtures("fake_worker")
-def test_ctrl_c_kills_the_workers(short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_ctrl_c_kills_the_workers(short_run: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     started: list[subprocess.Popen[bytes]] = []
     popen = subprocess.Popen
 
@@ -179,27 +177,27 @@ def test_ctrl_c_kills_the_workers(short_run: Run, tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(subprocess, "Popen", spy)
     with pytest.raises(KeyboardInterrupt):
-        render_video(short_run.directory, tmp_path / "film.mp4", workers=2, progress=interrupt)
+        render_video(short_run, tmp_path / "film.mp4", workers=2, progress=interrupt)
     assert len(started) == 2
     assert all(process.returncode is not None for process in started)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_footage_meets_the_plant_at_its_rows_and_halfway_between(short_run: Run):
+def test_footage_meets_the_plant_at_its_rows_and_halfway_between(short_run: Flight):
     plant = short_run.log.plant
     rows = np.array([10, 200, 777])
-    at = make_footage(short_run, plant.t[rows])
+    at = make_footage(filmed(short_run), plant.t[rows])
     assert at.position == pytest.approx(plant.state[rows][:, POSITION])
     x, y, z, w = at.quaternion[:, 1], at.quaternion[:, 2], at.quaternion[:, 3], at.quaternion[:, 0]
     up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
     assert up == pytest.approx(body_to_world(plant.state[rows][:, EULER])[:, :, 2])
-    between = make_footage(short_run, 0.5 * (plant.t[rows] + plant.t[rows + 1]))
+    between = make_footage(filmed(short_run), 0.5 * (plant.t[rows] + plant.t[rows + 1]))
     assert between.position == pytest.approx(0.5 * (plant.state[rows] + plant.state[rows + 1])[:, POSITION])
     assert np.linalg.norm(between.quaternion, axis=1) == pytest.approx(np.ones(3))
 
 
-def test_footage_knows_its_period_and_the_worst_margin_so_far(short_run: Run):
-    footage = make_footage(short_run, np.array([0.0, 0.049, 0.05, 3.0, 6.0]))
+def test_footage_knows_its_period_and_the_worst_margin_so_far(short_run: Flight):
+    footage = make_footage(filmed(short_run), np.array([0.0, 0.049, 0.05, 3.0, 6.0]))
     assert footage.period.tolist() == [0, 0, 1, 60, len(short_run.log.control.t) - 1]
     assert footage.turned[-1] == pytest.approx(np.sum(0.05 * short_run.log.control.speeds, axis=0), rel=1e-2)
     findings = audit(short_run.log, short_run.limits)
@@ -208,14 +206,14 @@ def test_footage_knows_its_period_and_the_worst_margin_so_far(short_run: Run):
         assert track.worst[-1] == pytest.approx(finding.worst_margin, nan_ok=True)
 
 
-def test_the_last_second_shows_why_there_was_no_answer_and_that_the_fallback_went_on(short_run: Run) -> None:
+def test_the_last_second_shows_why_there_was_no_answer_and_that_the_fallback_went_on(short_run: Flight) -> None:
     long = "cannot hold together: " + "; ".join(["roll upper at +0.15 s .. +0.40 s by 0.8 deg"] * 6)
     controller = {**short_run.summary["controller"], "unrecovered": 40}
-    footage = make_footage(short_run, np.array([4.9, 5.0, 6.0]))
+    footage = make_footage(filmed(short_run), np.array([4.9, 5.0, 6.0]))
 
     def headlines(sentence: str, advice: str) -> list[list[str]]:
         result = {"sentence": sentence, "advice": advice}
-        run = replace(short_run, summary={**short_run.summary, "controller": controller, "diagnosis": result})
+        run = filmed(recording(short_run, controller=controller, diagnosis=result))
         overlay = Overlay(run, footage, width=1280, height=720)
         return [[text for text, _, _ in overlay._headlines(i)] for i in range(3)]
 
@@ -227,7 +225,7 @@ def test_the_last_second_shows_why_there_was_no_answer_and_that_the_fallback_wen
     assert headlines("; ".join([long] * 20), "")[2][-1] == "... all of it is in summary.json"
 
 
-def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many_more(short_run: Run) -> None:
+def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many_more(short_run: Flight) -> None:
     """In the order of the file the one that is violated by metres stands last, and was never seen."""
     height = short_run.log.plant.state[-1, INDEX["z"]]
     wide = [Limit(name=f"wide_{j}", signal="z", upper=1000.0 + j) for j in range(7)]
@@ -237,13 +235,13 @@ def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many
 
     def red(*limits: Limit) -> int:
         """How many pixels of the last frame the captions paint red."""
-        run = replace(short_run, limits=limits)
+        run = filmed(judged_by(short_run, *limits))
         overlay = Overlay(run, make_footage(run, np.array([6.0])), width=1280, height=720)
         picture = overlay.draw(np.full((720, 1280, 3), 128, np.uint8), 0)
         return int(np.count_nonzero((picture == rgb(ON_DARK.violated)).all(axis=-1)))
 
     limits = (*wide, near, reported, low)
-    tracks = make_footage(replace(short_run, limits=limits), np.array([6.0])).margins
+    tracks = make_footage(filmed(judged_by(short_run, *limits)), np.array([6.0])).margins
     shown, rest = margin_rows(ranked_tracks(tracks), 0)
     assert [track.limit.name for track in shown] == ["low", "reported", "near", "wide_0", "wide_1", "wide_2"]
     assert rest == "and 4 more"
@@ -251,7 +249,7 @@ def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many
     assert red(*limits) > 0
 
 
-def test_limits_that_are_equally_near_stand_as_in_the_file(short_run: Run) -> None:
+def test_limits_that_are_equally_near_stand_as_in_the_file(short_run: Flight) -> None:
     """Their bounds differ by rounding, as margins do from one processor to another."""
     rng = np.random.default_rng(0)
     names = ("zeta", "alpha", "mid")
@@ -259,5 +257,5 @@ def test_limits_that_are_equally_near_stand_as_in_the_file(short_run: Run) -> No
         bounds = 100.0 * (1.0 + 3e-6 * rng.uniform(-1.0, 1.0, len(names)))
         limits = [Limit(name=name, signal="z", upper=bound) for name, bound in zip(names, bounds, strict=True)]
         limits.append(Limit(name="near", signal="z", upper=10.0))
-        tracks = make_footage(replace(short_run, limits=tuple(limits)), np.array([6.0])).margins
+        tracks = make_footage(filmed(judged_by(short_run, *limits)), np.array([6.0])).margins
         assert [track.limit.name for track in ranked_tracks(tracks)] == ["near", *names]

@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from support import recording
 
 import quadsim.report.recording as recording_module
 from quadsim.controller import SOLVED, UNCONSTRAINED
-from quadsim.flight.audit import SIGNALS, margins_sampled
-from quadsim.flight.rundir import Run
+from quadsim.flight.audit import SIGNALS, audit, margins_sampled
 from quadsim.report.recording import open_viewer, world, write_recording
 from quadsim.report.recording.world import PANELS, TIMELINE
+from quadsim.rollout.flown import Flight
 from quadsim.rotation import body_to_world
 from quadsim.state import EULER, POSITION
 
@@ -56,7 +57,7 @@ class Content:
 
 
 @pytest.fixture(scope="module")
-def path(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def path(short_run: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "flight.rrd"
     write_recording(short_run, path)
     return path
@@ -68,15 +69,15 @@ def content(path: Path) -> Content:
 
 
 @pytest.fixture
-def record(tmp_path: Path) -> Callable[[Run], Content]:
-    def write_and_read(run: Run) -> Content:
+def record(tmp_path: Path) -> Callable[[Flight], Content]:
+    def write_and_read(run: Flight) -> Content:
         write_recording(run, tmp_path / "flight.rrd")
         return Content(tmp_path / "flight.rrd")
 
     return write_and_read
 
 
-def test_the_vehicle_is_where_the_plant_was(content: Content, short_run: Run) -> None:
+def test_the_vehicle_is_where_the_plant_was(content: Content, short_run: Flight) -> None:
     plant = short_run.log.plant
     np.testing.assert_allclose(content.times("/world/vehicle"), plant.t, atol=1e-9)
     moved = np.array(content.rows("/world/vehicle", "translation"))[:, 0]
@@ -86,7 +87,7 @@ def test_the_vehicle_is_where_the_plant_was(content: Content, short_run: Run) ->
     np.testing.assert_allclose(forward, body_to_world(plant.state[:, EULER])[:, :, 0], atol=1e-5)
 
 
-def test_thrusts_stand_on_the_rotors_and_grow_with_squared_speeds(content: Content, short_run: Run) -> None:
+def test_thrusts_stand_on_the_rotors_and_grow_with_squared_speeds(content: Content, short_run: Flight) -> None:
     vehicle = short_run.vehicle
     origins = np.array(content.rows("/world/vehicle/body/thrust", "origins")[0])
     np.testing.assert_allclose(origins[:, :2], vehicle.hubs[:, :2], atol=1e-6)
@@ -96,7 +97,7 @@ def test_thrusts_stand_on_the_rotors_and_grow_with_squared_speeds(content: Conte
     np.testing.assert_array_equal(arrows[..., :2], 0.0)
 
 
-def test_every_period_has_its_predicted_horizon(content: Content, short_run: Run) -> None:
+def test_every_period_has_its_predicted_horizon(content: Content, short_run: Flight) -> None:
     control, predicted = short_run.log.control, short_run.log.predicted
     assert predicted is not None
     np.testing.assert_allclose(content.times("/world/horizon"), control.t, atol=1e-9)
@@ -105,7 +106,7 @@ def test_every_period_has_its_predicted_horizon(content: Content, short_run: Run
     np.testing.assert_allclose(strips[:, 1:], predicted, atol=1e-5)
 
 
-def test_the_flown_path_grows_piece_by_piece_without_gaps(content: Content, short_run: Run) -> None:
+def test_the_flown_path_grows_piece_by_piece_without_gaps(content: Content, short_run: Flight) -> None:
     pieces = [np.array(row[0]) for row in content.rows("/world/flown", "strips")]
     position = short_run.log.plant.state[:, POSITION]
     ends = [*short_run.log.control.t[1:], short_run.log.plant.t[-1]]
@@ -119,7 +120,7 @@ def test_the_flown_path_grows_piece_by_piece_without_gaps(content: Content, shor
     np.testing.assert_allclose(whole, position, atol=1e-5)
 
 
-def test_signals_are_the_audited_ones(content: Content, short_run: Run) -> None:
+def test_signals_are_the_audited_ones(content: Content, short_run: Flight) -> None:
     log = short_run.log
     for name, signal in SIGNALS.items():
         if name == "thrust":  # this flight has no target for it
@@ -133,7 +134,7 @@ def test_signals_are_the_audited_ones(content: Content, short_run: Run) -> None:
         assert sum(name in names for names in PANELS.values()) == 1
 
 
-def test_references_are_in_the_units_of_their_signals(record: Callable[[Run], Content], short_run: Run) -> None:
+def test_references_are_in_the_units_of_their_signals(record: Callable[[Flight], Content], short_run: Flight) -> None:
     reference = short_run.log.control.reference + np.eye(4)[3]  # the paper's yaw reference is zero
     control = dataclasses.replace(short_run.log.control, reference=reference)
     content = record(dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, control=control)))
@@ -141,7 +142,7 @@ def test_references_are_in_the_units_of_their_signals(record: Callable[[Run], Co
     np.testing.assert_array_equal(np.ravel(content.rows("/reference/yaw", "scalars")), np.degrees(reference[:, 3]))
 
 
-def test_bounds_margins_and_verdicts_of_the_scenario(content: Content, short_run: Run) -> None:
+def test_bounds_margins_and_verdicts_of_the_scenario(content: Content, short_run: Flight) -> None:
     reached = [limit for limit in short_run.limits if limit.start <= short_run.log.control.t[-1]]
     assert {limit.name for limit in reached} >= {"roll", "pitch", "speed", "slew"}
     assert {e.split("/")[2] for e in content.entities if e.startswith("/limits/")} == {limit.name for limit in reached}
@@ -156,7 +157,7 @@ def test_bounds_margins_and_verdicts_of_the_scenario(content: Content, short_run
 
 
 def test_forces_torques_wind_battery_and_lagging_rotors_have_their_curves(
-    record: Callable[[Run], Content], short_run: Run
+    record: Callable[[Flight], Content], short_run: Flight
 ) -> None:
     plant, rng = short_run.log.plant, np.random.default_rng(0)
     wrench, wind = rng.normal(size=(plant.t.size, 6)), rng.normal(size=(plant.t.size, 3))
@@ -199,7 +200,7 @@ def has_values(content: Content, entity: str) -> bool:
 
 @pytest.mark.parametrize("case", ["as flown", "with a target", "by a law without limits", "of one period"])
 def test_a_plot_names_only_what_was_recorded_and_none_is_blank(
-    record: Callable[[Run], Content], short_run: Run, case: str
+    record: Callable[[Flight], Content], short_run: Flight, case: str
 ) -> None:
     log, limits = short_run.log, short_run.limits
     assert any(limit.start > 6.0 for limit in limits), "one that this flight does not reach"
@@ -216,7 +217,7 @@ def test_a_plot_names_only_what_was_recorded_and_none_is_blank(
         limits = ()
     if case == "of one period":
         limits = tuple(limit for limit in limits if limit.start > 0.0)
-    content = record(dataclasses.replace(short_run, log=log, limits=limits))
+    content = record(dataclasses.replace(short_run, log=log, findings=audit(log, limits)))
     plots = named_by_the_layout(content)
     assert len(plots) > 10
     for names in plots:
@@ -225,7 +226,7 @@ def test_a_plot_names_only_what_was_recorded_and_none_is_blank(
     assert (["signals/thrust"] in plots) == (case == "with a target")
 
 
-def test_dashes_of_the_reference_lie_on_a_small_course(record: Callable[[Run], Content], short_run: Run) -> None:
+def test_dashes_of_the_reference_lie_on_a_small_course(record: Callable[[Flight], Content], short_run: Flight) -> None:
     angle, radius = np.linspace(0.0, 4.0 * math.pi, short_run.log.control.t.size), 0.2
     reference = short_run.log.control.reference.copy()
     reference[:, :3] = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
@@ -255,7 +256,7 @@ def test_rerun_finds_nothing_wrong_with_the_file_and_the_layout_is_in_force(path
 
 
 def test_events_report_each_change_of_the_solver_why_it_failed_and_the_end(
-    record: Callable[[Run], Content], short_run: Run
+    record: Callable[[Flight], Content], short_run: Flight
 ) -> None:
     control = short_run.log.control
     K = control.t.size
@@ -266,12 +267,8 @@ def test_events_report_each_change_of_the_solver_why_it_failed_and_the_end(
     changed = dataclasses.replace(control, status=tuple(status), answered_by=tuple(by), fallback=fallback)
     log = dataclasses.replace(short_run.log, control=changed, reason="the battery fell off")
     result = {"time": 2.0, "sentence": "cannot hold together: roll upper by 1 deg", "advice": "to try: more"}
-    summary = {
-        **short_run.summary,
-        "diagnosis": result,
-        "controller": {**short_run.summary["controller"], "unrecovered": 40},
-    }
-    content = record(dataclasses.replace(short_run, log=log, summary=summary))
+    controller = {**short_run.summary["controller"], "unrecovered": 40}
+    content = record(recording(dataclasses.replace(short_run, log=log), diagnosis=result, controller=controller))
     expected = [
         (0.0, "INFO", "solved by piqp-dense, fallback 0"),
         (1.0, "INFO", "unconstrained by gain, fallback 0"),
@@ -292,7 +289,7 @@ def test_events_report_each_change_of_the_solver_why_it_failed_and_the_end(
 
 
 def test_a_flight_without_predictions_or_finite_end_is_recorded(
-    record: Callable[[Run], Content], short_run: Run
+    record: Callable[[Flight], Content], short_run: Flight
 ) -> None:
     state = short_run.log.plant.state.copy()
     state[-1] = math.nan

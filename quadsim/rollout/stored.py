@@ -1,0 +1,83 @@
+"""A run directory -> the `Flight` that was written there: the one place where a flight is read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from quadsim.console.summary_tables import summary_tables
+from quadsim.errors import FileError, printable
+from quadsim.flight import rundir
+from quadsim.flight.parquet import read_log
+from quadsim.report.comparison import comparison_rows
+from quadsim.rollout.flown import Flight
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.courses.csv_course import Csv
+from quadsim.scenarios.loading import parse_scenario
+from quadsim.scenarios.plugin import is_plugin
+from quadsim.scenarios.schema.bases import read_whole
+from quadsim.scenarios.schema.controllers import LAWS
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.vehicle import Vehicle
+
+_DAMAGE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""What the entries of a damaged summary raise where they are used."""
+
+
+def read_flight(directory: Path) -> Flight:
+    """Read a flight back, and make sure that it can be shown; see `quadsim.read`.
+
+    Raises:
+        FileError: a file is missing or damaged.
+        InputError: its scenario is malformed.
+    """
+    summary = rundir.read_summary(directory)
+    try:
+        vehicle = Vehicle(**summary["vehicle"])
+        findings = rundir.findings_of(summary)
+    except _DAMAGE as error:
+        raise FileError(directory / rundir.SUMMARY_FILE, f"is damaged ({error})") from error
+    raised = tuple(summary.get("traceback", ()))
+    interrupted = summary["verdict"] == "aborted" and not raised
+    log = replace(read_log(directory, reason=summary["reason"]), interrupted=interrupted, traceback=raised)
+    scenario = stored_scenario(directory)
+    try:
+        flight = Flight(
+            scenario=scenario,
+            assembly=Assembly(scenario, vehicle),
+            log=log,
+            findings=findings,
+            controller=summary["controller"]["name"],
+            solver=summary["controller"]["solver"],
+            simulate_s=summary["wall_s"]["simulate"],
+            tallies={},
+            directory=directory,
+            recorded=summary,
+            thinned=True,
+        )
+        for _ in (*comparison_rows([flight]), *summary_tables(flight)):
+            pass
+    except _DAMAGE as error:
+        what = f"{type(error).__name__}: {printable(str(error))}"
+        raise FileError(directory / rundir.SUMMARY_FILE, f"is damaged ({what[:200]})") from error
+    return flight
+
+
+def stored_scenario(directory: Path) -> Scenario:
+    """Return the scenario of a run from its directory, without reading any other file.
+
+    Its controller is not needed: a controller of a package that is not installed here is replaced.
+
+    Raises:
+        InputError: it is missing or malformed.
+    """
+    path = directory / rundir.SCENARIO_FILE
+    if not path.is_file():
+        raise FileError(path, "is missing or no file")
+    data = read_whole(path)
+    match data.get("controller"):
+        case {"type": str(name), **fields} if name not in LAWS and not is_plugin(name):
+            data["controller"] = {**fields, "type": "elsewhere:Controller"}
+    scenario = parse_scenario(data, source=str(path))
+    course = scenario.reference
+    return scenario.altered(reference=course.located(directory)) if isinstance(course, Csv) else scenario
