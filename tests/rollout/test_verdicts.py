@@ -251,7 +251,7 @@ def test_flights_that_are_audited_differently_are_compared_by_margins_until_audi
     assert set(outcomes["values"].values()) == {"satisfied"}
     assert alike.text().startswith("All are audited against the constraints of")
     assert not quadsim.compare(a, a).notes
-    with pytest.raises(InputError, match=r"--constraints must be one of what is compared"):
+    with pytest.raises(InputError, match="--constraints"):
         quadsim.compare(a, b, constraints="elsewhere")
 
 

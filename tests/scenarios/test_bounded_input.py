@@ -63,7 +63,7 @@ def test_as_many_obstacles_as_allowed_are_read(tmp_path: Path) -> None:
 def test_many_problems_are_counted_and_some_described() -> None:
     events = [{"type": "push", "at": 1.0, "duration": 1.0, "force": [0.0, 0.0, 0.0], "odd": 1} for _ in range(1500)]
     started = clock.process_time()
-    with pytest.raises(ScenarioError, match="and 1480 more") as caught:
+    with pytest.raises(ScenarioError, match="1480") as caught:
         parse_scenario({**plain(load_scenario("hover")), "events": events})
     assert len(caught.value.problems) == 1500
     assert clock.process_time() - started < 6.0

