@@ -57,8 +57,7 @@ def test_a_run_of_another_version_says_how_to_fly_it_again(
     for command in ("check", "compare", "video"):
         assert main([command, str(other)]) == 2
         message = capsys.readouterr().err
-        assert "was made by another version of quadsim" in message
-        assert f"fly it again: quadsim run {shlex.quote(str(other / 'scenario.toml'))}" in " ".join(message.split())
+        assert f"quadsim run {shlex.quote(str(other / 'scenario.toml'))}" in " ".join(message.split())
 
 
 def test_a_campaign_of_another_version_says_how_to_fly_it_again(tmp_path: Path) -> None:

@@ -207,7 +207,7 @@ def test_a_plant_that_goes_further_than_the_recorded_margin_shows(runs: Path) ->
         return roll
 
     put(run, PLANT_FILE, "roll", change)
-    with pytest.raises(FileError, match=r"roll: worst_margin is recorded as [0-9.]+, and the tables go down to 2\.13"):
+    with pytest.raises(FileError, match=r"roll: worst_margin .* 2\.13"):
         reaudit(run)
 
 

@@ -171,7 +171,7 @@ def test_a_flight_refuses_what_it_was_not_started_for() -> None:
             started.apply({"type": "wind", "velocity": [1, 0, 0]})
         with pytest.raises(InputError, match=r"events\.0\.force"):
             started.apply({"type": "push", "duration": 0.1})
-        with pytest.raises(InputError, match=r"events.0.fields: .*horizon must be a whole number >= 1 .*; got 0"):
+        with pytest.raises(InputError, match=r"events\.0\.fields: .*horizon .* 0"):
             started.apply({"type": "controller", "fields": {"horizon": 0}})
         assert not started.scenario.events
 

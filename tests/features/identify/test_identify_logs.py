@@ -552,7 +552,7 @@ def test_ulog_whose_pulses_say_nothing(tmp_path: Path, eight: Record, name: str,
 @pytest.mark.parametrize("value", [np.nan, np.inf, 4.5])
 def test_rotors_of_a_ulog_that_are_no_number_are_refused(tmp_path: Path, eight: Record, value: float) -> None:
     path = ulog(tmp_path / "px4.ulg", px4_topics(eight), parameters={"CA_ROTOR_COUNT": value})
-    with pytest.raises(FileError, match=r"px4\.ulg: states CA_ROTOR_COUNT = .*; it must be a whole number"):
+    with pytest.raises(FileError, match=r"px4\.ulg: .*CA_ROTOR_COUNT"):
         stated_rotors(path)
 
 

@@ -210,7 +210,7 @@ def test_bounds_that_differ_from_step_to_step_hold(case: str) -> None:
 
 
 def test_rows_that_differ_from_step_to_step_are_refused() -> None:
-    with pytest.raises(ParameterError, match=r"controller\.ceiling .*with the same rows at all steps"):
+    with pytest.raises(ParameterError, match=r"controller\.ceiling"):
         below(ceiling(np.full((20, 1), 0.2), C=np.ones((20, 1, N_STATES)) * (np.arange(N_STATES) == INDEX["z"])))
 
 

@@ -118,7 +118,7 @@ def test_an_entry_without_a_name_is_set_by_its_index() -> None:
 
 def test_a_number_of_a_list_is_set_by_its_index() -> None:
     assert load_scenario("hover", ["initial.euler.2=30.0"]).initial.euler == (0.0, 0.0, 30.0)
-    with pytest.raises(UnknownNameError, match=r"^no entry of initial\.euler named '3' \(there are: 0, 1, 2\)$"):
+    with pytest.raises(UnknownNameError, match="'3'"):
         load_scenario(
             "hover", ["initial.position=[0.0, 0.0, 1.0]", "initial.euler=[0.0, 0.0, 0.0]", "initial.euler.3=1"]
         )
