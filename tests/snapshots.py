@@ -155,7 +155,7 @@ SESSIONS: Final[dict[str, Session]] = {
             f"run pushed.toml {TABLES}",
             f"run steady.toml {TABLES} --set expect=violated",
             f"run pushed.toml {TABLES} --out unaudited --set constraints=[] --set controller='{{type=\"pid\"}}'",
-            f"run hover {TABLES} --out lost --set initial.euler=[60.0,0.0,0.0]",
+            f"run hover {TABLES} --out lost --set duration=1 --set initial.euler=[20.0,0.0,0.0]",
             f"run figure-eight {TABLES} --out fast --set duration=1 --set reference.period=4 --set reference.ramp=0.2",
             "run hover --seed 3.7",
             "run hover --fps 0",
