@@ -54,7 +54,7 @@ LONG = (
         "rollout/test_space.py",
         "rollout/test_verdicts.py",
     ),
-    *("features/identify/test_identify_fit.py", "features/papers/test_beyond.py"),
+    *("features/identify/test_identify_fit.py", "features/papers/test_beyond.py", "test_snapshots.py"),
 )
 """Modules that take longest."""
 collect_ignore = [module for module, used in USING.items() if not {*used} <= {*FEATURES}]

@@ -82,6 +82,7 @@ USING: Final = {
     "test_packaging.py": EVERY,
     "test_refusals.py": ("campaign",),
     "test_rooms.py": EVERY,
+    "test_snapshots.py": EVERY,
 }
 """Modules of tests that use a feature beside its own, and are left out without it; `EVERY` of what lists all."""
 COMMANDS: Final = (

@@ -22,10 +22,10 @@ def script(*command: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True)
 
 
-def quick(name: str, tmp_path: Path) -> list[dict[str, Any]]:
+def quick(name: str, tmp_path: Path, *options: str) -> list[dict[str, Any]]:
     """The records of a benchmark, whose table has to show each."""
     file = tmp_path / f"{name}.json"
-    done = script(f"benchmarks/{name}.py", "--quick", "--json", file)
+    done = script(f"benchmarks/{name}.py", "--quick", *options, "--json", file)
     assert done.returncode == 0, done.stderr
     written = json.loads(file.read_text())
     assert written["machine"]
@@ -45,6 +45,14 @@ def test_solvers_agree_on_the_optimum(tmp_path: Path) -> None:
 
 
 @pytest.mark.witness("benchmarks")
+def test_two_solvers_of_one_scenario_have_a_record_each(tmp_path: Path) -> None:
+    names = ["piqp-multistage", "piqp-dense"]
+    *records, whole = quick("solvers", tmp_path, "--scenario", "paper-constrained", "--solvers", *names)
+    assert [record["solver"] for record in records] == names
+    assert whole["solver"] == "whole law in C"
+    assert not any(record["failures"] for record in records)
+
+
 def test_flights_with_and_without_their_controllers(tmp_path: Path) -> None:
     *flights, step, sample = quick("flight", tmp_path)
     for record in flights:

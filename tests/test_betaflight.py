@@ -45,7 +45,7 @@ def test_the_firmwares_mixer_turns_the_vehicle_as_its_rotors_do(example: ModuleT
 def test_a_layout_without_a_mixer_is_refused(example: ModuleType) -> None:
     vehicle = quadsim.load_vehicle("hummingbird")
     for change in ({"rotor_azimuths": (10.0, 100.0, 190.0, -80.0)}, {"rotor_spins": (-1, 1, -1, 1)}):
-        with pytest.raises(ValueError, match="no mixer for hummingbird: azimuths and spins"):
+        with pytest.raises(ValueError, match="hummingbird"):
             example.motor_layout(replace(vehicle, **change))
 
 
@@ -95,7 +95,7 @@ def test_every_firmware_has_an_address_of_its_own_or_is_told_that_there_is_none(
                     assert address == "127.0.0.2"
     with socket.create_server(("", 0)) as everywhere:
         monkeypatch.setattr(example, "CLI", everywhere.getsockname()[1])
-        with pytest.raises(RuntimeError, match="is in use on every loopback address"):
+        with pytest.raises(RuntimeError, match="loopback"):
             example.own_address()
 
 

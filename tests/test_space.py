@@ -183,7 +183,7 @@ def test_a_window_of_the_path_is_one_of_time() -> None:
         result = Corridor(name="c", position=(0, 0, 0), size=(1, 1, 1), path=path).timed(t, positions)
         assert (result.start, result.stop) == pytest.approx(window)
         assert result.path is None
-    with pytest.raises(InputError, match=r"corridors.c.path must be within the 4 m of the reference's path"):
+    with pytest.raises(InputError, match=r"corridors\.c\.path"):
         Corridor(name="c", position=(0, 0, 0), size=(1, 1, 1), path=(4.5, 5.0)).timed(t, positions)
 
 

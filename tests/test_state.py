@@ -45,7 +45,7 @@ def test_a_state_s_entries_have_names_and_what_is_made_of_it_is_a_plain_array() 
     assert isinstance(state @ state, np.float64)
     state[4] = 7.0
     assert state.z == 7.0
-    with pytest.raises(AttributeError, match=r"a state has no 'rol'; did you mean 'roll'\? \(there are: x, vx, "):
+    with pytest.raises(AttributeError, match="'rol'"):
         _ = state.rol
 
 

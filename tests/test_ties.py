@@ -38,7 +38,7 @@ def test_the_order_is_by_size_and_of_tied_ones_as_they_stand() -> None:
 
 @pytest.mark.parametrize(("values", "window"), [([], TIE_SHARE), ([1.0], -1.0), ([1.0], math.nan)])
 def test_nothing_to_choose_from_and_no_window_are_refused(values: list[float], window: float) -> None:
-    with pytest.raises(ValueError, match="ties need a value and a window of at least 0"):
+    with pytest.raises(ValueError, match="window"):
         tied(values, window)
 
 

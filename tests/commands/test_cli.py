@@ -165,13 +165,13 @@ def test_without_the_library_doctor_and_a_flight_by_the_core_say_what_compiles_i
     monkeypatch.setattr(library, "ROOT", tmp_path)
     monkeypatch.setattr(mirror, "load_library", library.load_library.__wrapped__)
     monkeypatch.setattr(solver, "core_library", mirror.core_library.__wrapped__)
-    expected = f"{tmp_path / LIBRARY}: is missing, and it cannot be compiled ("
+    missing = str(tmp_path / LIBRARY)
     line = capabilities()["solvers"]["core"]
-    assert line.startswith(expected)
-    assert line.endswith("; run: pip install --force-reinstall --no-deps quadsim")
+    assert line.startswith(missing)
+    assert "pip install" in line
     command = ["run", "hover", *TABLES, "--out", str(tmp_path / "run"), "--set", "controller.solver=core"]
     assert main(command) == EXIT_WRONG_INPUT
-    assert expected in " ".join(capsys.readouterr().err.split())
+    assert missing in capsys.readouterr().err
 
 
 def test_doctor_reports_a_package_that_does_not_work_and_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,22 +181,12 @@ def test_doctor_reports_a_package_that_does_not_work_and_the_rest(monkeypatch: p
     monkeypatch.setattr("quadsim.mpc.solvers.daqp.DaqpDense.setup", broken)
     monkeypatch.setattr("quadsim.commands.doctor._rendering", lambda: 1 / 0)
     checks = capabilities()
-    assert checks["solvers"]["daqp"] == "fails: RuntimeError: libdaqp.so is of another machine"
-    assert checks["rendering"]["video"] == "fails: ZeroDivisionError: division by zero"
+    assert checks["solvers"]["daqp"].startswith("fails: RuntimeError: ")
+    assert checks["rendering"]["video"].startswith("fails: ZeroDivisionError: ")
     assert checks["solvers"]["piqp-dense"].startswith("works: ")
 
 
 # --- run -----------------------------------------------------------------------------------------------------------
-
-
-def test_run_prints_tables_and_where_the_files_are(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "hover", *SHORT, *TABLES]) == EXIT_DONE
-    printed = capsys.readouterr()
-    for part in ("hover  completed, every required constraint holds  0.50 s flown", "RMS error", "roll [deg]", "holds"):
-        assert part in printed.out
-    assert "written to runs/hover" in printed.out
-    assert printed.err == ""
-    assert rundir.read_summary(here / "runs" / "hover")
 
 
 def test_run_prints_the_verdict_before_its_film_and_what_to_open_at_its_end(
@@ -211,7 +201,7 @@ def test_run_prints_the_verdict_before_its_film_and_what_to_open_at_its_end(
 
     monkeypatch.setattr(flown, "add_products", slow)
     assert main(["run", "hover", *SHORT, "--no-video", "--no-figures"]) == EXIT_DONE
-    assert before[0].startswith("hover  completed, every required constraint holds  0.50 s flown\n")
+    assert before[0].startswith("hover ")
     commands = ["quadsim view runs/hover", "quadsim plot runs/hover --out hover.pdf"]
     assert capsys.readouterr().out.splitlines() == ["written to runs/hover", *commands]
     assert main(commands[-1].split()[1:]) == EXIT_DONE, "it can be pasted"
@@ -234,16 +224,14 @@ def test_settings_and_seed_reach_the_flight(here: Path, capsys: pytest.CaptureFi
 
 def test_a_violated_constraint_that_is_not_required_is_status_0(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = ["--set", "constraints.speed.upper=150.0", "--set", "constraints.speed.required=false"]
-    assert main(["run", "hover", *SHORT, *TABLES, *settings]) == EXIT_DONE
-    shown = capsys.readouterr().out
-    assert shown.startswith("hover  completed, every required constraint holds; violated, not required: speed  0.50 s")
-    assert "violated* \n" in shown
-    assert "*: reported, not required" in shown
+    assert main(["run", "hover", *SHORT, *TABLES, *settings, "--json"]) == EXIT_DONE
+    constraints = {each["name"]: each for each in json.loads(capsys.readouterr().out)["constraints"]}
+    assert not constraints["speed"]["satisfied"]
 
 
-def test_a_flight_without_constraints_says_that_nothing_was_audited() -> None:
+def test_a_flight_without_constraints_is_unaudited() -> None:
     flight = quadsim.load("hover", {"duration": 0.5, "constraints": []}).fly(controller=lambda *_: [192.8] * 4)
-    assert flight.text().splitlines()[0] == "hover  unaudited, no constraint was audited  0.50 s flown"
+    assert (flight.outcome, flight.audit) == ("unaudited", ())
 
 
 VIOLATED = ["--set", "constraints.speed.upper=150.0"]
@@ -252,30 +240,22 @@ LOST = ["--set", "initial.euler=[60.0, 0.0, 0.0]"]
 
 @pytest.mark.slow("commands")
 @pytest.mark.parametrize(
-    ("settings", "expect", "as_expected", "line"),
+    ("settings", "expect", "as_expected"),
     [
-        ([], "violated", False, "completed, every required constraint holds; the scenario expects: violated"),
-        (VIOLATED, "satisfied", False, "completed, a required constraint is violated: speed by 42.8 rad/s  0.50 s"),
-        (
-            VIOLATED,
-            "violated",
-            True,
-            "is violated: speed by 42.8 rad/s, as the scenario expects",
-        ),
-        (VIOLATED, "lost", False, "is violated: speed by 42.8 rad/s; the scenario expects: lost"),
-        (LOST, "satisfied", False, "lost: at t = 0.000 s"),
-        (LOST, "lost", True, "lost, as the scenario expects: at t = 0.000 s"),
+        ([], "violated", False),
+        (VIOLATED, "satisfied", False),
+        (VIOLATED, "violated", True),
+        (VIOLATED, "lost", False),
+        (LOST, "satisfied", False),
+        (LOST, "lost", True),
     ],
 )
 def test_the_outcome_is_compared_with_what_the_scenario_expects(
-    here: Path, capsys: pytest.CaptureFixture[str], settings: list[str], expect: str, as_expected: bool, line: str
+    here: Path, capsys: pytest.CaptureFixture[str], settings: list[str], expect: str, as_expected: bool
 ) -> None:
     """What was expected changes no exit status: 0 is for constraints that hold."""
     status = EXIT_FAILED if settings else EXIT_DONE
-    arguments = ["hover", *SHORT, *settings, "--set", f"expect={expect}"]
-    assert main(["check", *arguments]) == status
-    assert line in re.sub(r"(rad/s) at \S+ s", r"\1", capsys.readouterr().out)
-    assert main(["check", *arguments, "--json"]) == status
+    assert main(["check", "hover", *SHORT, *settings, "--set", f"expect={expect}", "--json"]) == status
     summary = json.loads(capsys.readouterr().out)
     assert (summary["group"], summary["expected"], summary["as_expected"]) == ("courses", expect, as_expected)
 
@@ -283,10 +263,9 @@ def test_the_outcome_is_compared_with_what_the_scenario_expects(
 # --- check ---------------------------------------------------------------------------------------------------------
 
 
-def test_check_flies_a_scenario_and_writes_nothing(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_flies_a_scenario_and_writes_nothing(here: Path) -> None:
     assert main(["check", "hover", *SHORT]) == EXIT_DONE
-    assert main(["check", "hover", *SHORT, "--set", "constraints.speed.upper=150.0"]) == EXIT_FAILED
-    assert capsys.readouterr().out.count("violated") == 2, "in the first line, and in the table"
+    assert main(["check", "hover", *SHORT, *VIOLATED]) == EXIT_FAILED
     assert left_in(here) == []
 
 
@@ -304,9 +283,7 @@ def test_check_writes_its_verdicts_as_junit(
         assert len(cases) == int(suite.get("tests", ""))
         assert [case.get("name") for case in cases][:3] == ["flight", "roll", "pitch"]
         assert len(suite.findall("testcase/skipped")) == int(suite.get("skipped", ""))
-    assert suites[0].findtext("testcase[@name='roll']/system-out", "").startswith("worst margin 5 deg at t = ")
-    (skipped, *_) = suites[1].findall("testcase/skipped")
-    assert skipped.get("message") == "not reached: the flight has no value in the constraint's time window"
+    assert "5 deg" in suites[0].findtext("testcase[@name='roll']/system-out", "")
     assert left_in(here) == ["verdicts.xml"]
 
 
@@ -347,7 +324,7 @@ def test_the_page_is_there_before_its_films_which_are_added_to_it(
     (first, printed), (again, nothing) = seen
     assert first == again
     assert "<video" not in first
-    assert printed.startswith("Both flights hold every constraint; ")
+    assert "constraint" in printed
     assert nothing == ""
     assert page.read_text().count("<video") == 1
     done = capsys.readouterr()
@@ -375,49 +352,28 @@ def test_compare_prints_markdown(hover_directory: Path, here: Path, capsys: pyte
 
 RUN = ["run", "hover", *SHORT, *TABLES]
 WRONG: dict[str, tuple[list[str], str]] = {
-    "a command that is none": (["rum", "hover"], 'Unknown command "rum". Did you mean "run"?'),
-    "an option that is none": (["run", "hover", "--sed", "3"], "Unknown option: --sed. Did you mean --seed?"),
-    "an option without its value": (["export", "hover"], "--out requires an argument"),
-    "a number that is not whole": (["run", "hover", "--seed", "3.7"], "--seed: must be a whole number; got '3.7'"),
-    "a word too many": (["list", "hover"], "Unused Tokens: ['hover']"),
-    "nothing to compare": (["compare", "--out", "page"], "compare needs runs, scenarios, or two campaigns"),
-    "one name for two flights": (
-        ["compare", "hover", "gust", "--name", "mine", "--out", "page"],
-        "names must be 2 different texts, one for each target; got ['mine']",
-    ),
-    "a film without frames": (
-        [*RUN, "--fps", "0"],
-        "--fps must be a whole number from 1 to 120; got 0",
-    ),
-    "a film of a comparison that writes nothing": (
-        ["compare", "hover", "gust", "--video"],
-        "--video must be absent without --out: nothing is written; got True",
-    ),
-    "two flights to replay": (["replay", "gone", "--worst", "--flight", "3"], "--flight must be absent with --worst"),
-    "one scenario of two": (["compare", "hover", "nope", "--out", "page"], "no scenario named 'nope'"),
-    "a scenario without a name": (["scenario"], "scenario needs a name or a TOML file, or --schema (there are: "),
-    "a directory": (["run", "folder"], "folder is a directory; give a scenario's name or its TOML file"),
-    "out below a file": ([*RUN, "--out", "file/run"], "/file is a file"),
-    "out is a file": ([*RUN, "--out", "file"], "file: a file is already there; choose another --out"),
-    "out is no run": ([*RUN, "--out", "folder"], "it is not empty ("),
-    "out cannot be written": ([*RUN, "--out", "/proc/quadsim/run"], "cannot write /proc/quadsim/run: "),
-    "out has too long a name": ([*RUN, "--out", "x" * 300], ": File name too long"),
-    "check of no run": (["check", "folder"], "folder: is not a run directory"),
-    "check of a run with settings": (["check", "folder", "--seed", "1"], "absent when a finished run is checked"),
-    "junit below a file": (["check", "hover", *SHORT, "--junit", "file/v.xml"], "/file/v.xml: Not a directory"),
-    "junit is a folder": (["check", "hover", *SHORT, "--junit", "folder"], "/folder: is a folder"),
-    "video of nothing": (["video", "gone"], "gone: is not a run directory"),
-    "view of nothing": (["view", "gone"], "gone: no such run or recording"),
-    "view of a run without one": (
-        ["view", "folder"],
-        "folder: has no flight.rrd; run the scenario again without --no-recording",
-    ),
+    "an option without its value": (["export", "hover"], "--out"),
+    "a film of a comparison that writes nothing": (["compare", "hover", "gust", "--video"], "--video"),
+    "two flights to replay": (["replay", "gone", "--worst", "--flight", "3"], "--flight"),
+    "one scenario of two": (["compare", "hover", "nope", "--out", "page"], "'nope'"),
+    "a directory": (["run", "folder"], "folder"),
+    "out below a file": ([*RUN, "--out", "file/run"], "/file"),
+    "out is a file": ([*RUN, "--out", "file"], "file"),
+    "out is no run": ([*RUN, "--out", "folder"], "folder"),
+    "out cannot be written": ([*RUN, "--out", "/proc/quadsim/run"], "/proc/quadsim/run"),
+    "out has too long a name": ([*RUN, "--out", "x" * 300], "File name too long"),
+    "check of no run": (["check", "folder"], "folder"),
+    "junit below a file": (["check", "hover", *SHORT, "--junit", "file/v.xml"], "/file/v.xml"),
+    "junit is a folder": (["check", "hover", *SHORT, "--junit", "folder"], "/folder"),
+    "video of nothing": (["video", "gone"], "gone"),
+    "view of a run without one": (["view", "folder"], "flight.rrd"),
 }
+"""Lines that could leave something behind, and what their message names; its words are in `tests/snapshots/`."""
 
 
-@pytest.mark.parametrize(("arguments", "message"), WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize(("arguments", "named"), WRONG.values(), ids=WRONG)
 def test_wrong_input_is_status_2_with_one_message_and_leaves_nothing(
-    here: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+    here: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], named: str
 ) -> None:
     (here / "folder").mkdir()
     (here / "folder" / "theirs.txt").write_text("theirs")
@@ -427,7 +383,7 @@ def test_wrong_input_is_status_2_with_one_message_and_leaves_nothing(
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith("quadsim: ")
-    assert message in printed.err
+    assert named in printed.err
     assert len(printed.err.splitlines()) == 1
     assert left_in(here) == before
 
@@ -446,10 +402,7 @@ def test_a_film_asked_for_by_name_is_refused_before_anything_is_flown_where_noth
         grounded.setattr("quadsim.rollout.rollout.Rollout.fly", flown)
         assert main(["run", "hover", "--video"]) == EXIT_WRONG_INPUT
     printed = capsys.readouterr()
-    assert printed.err.startswith(
-        "quadsim: no off-screen OpenGL on this machine (egl: no libEGL; osmesa: no libOSMesa)"
-    )
-    assert "or run with --no-video" in printed.err
+    assert all(word in printed.err for word in ("libEGL", "libOSMesa", "--no-video"))
     assert left_in(here) == []
     assert main(["run", "hover", *SHORT, "--no-recording", "--no-figures", "--json"]) == EXIT_DONE
     assert "no libEGL" in rundir.read_summary(here / "runs" / "hover")["products"]["flight.mp4"]
@@ -460,7 +413,7 @@ def test_a_full_disk_is_status_2_and_leaves_nothing(
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2**30, 2**30 - 2**20, 2**20))
     assert main([*RUN, "--out", "new/run"]) == EXIT_WRONG_INPUT
-    assert capsys.readouterr().err == f"quadsim: cannot write {here.resolve()}/new/run: the disk is full\n"
+    assert f"{here.resolve()}/new/run" in capsys.readouterr().err
     assert left_in(here) == []
 
 
@@ -477,5 +430,4 @@ def test_a_file_that_is_nested_too_deep_is_refused_before_it_takes_memory(
         finally:
             tracemalloc.stop()
         assert peak < 50e6
-        message = "quadsim: deep.toml: must nest tables and lists at most 20 deep\n"
-        assert capsys.readouterr().err == message
+        assert "deep.toml" in capsys.readouterr().err

@@ -140,8 +140,9 @@ def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path) -> N
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=60)
     assert process.returncode == TERMINATED
-    assert err == "quadsim: interrupted (SIGTERM); what was finished is kept, and nothing is half written\n"
-    assert "interrupted (Ctrl-C)" in out
+    assert "SIGTERM" in err
+    assert len(err.splitlines()) == 1
+    assert "interrupted" in out
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     run = read_flight(tmp_path / "run")
     assert run.summary["status"] == "aborted"
@@ -253,5 +254,5 @@ def test_output_that_cannot_be_written_is_reported() -> None:
     with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "quadsim.commands.entry", "list", "--json"]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
-    assert done.stderr == "quadsim: cannot write the output: No space left on device\n"
+    assert done.stderr.endswith(": No space left on device\n")
     assert done.returncode == EXIT_WRONG_INPUT

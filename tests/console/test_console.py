@@ -125,7 +125,8 @@ def test_a_summary_begins_with_its_verdict_and_shows_deg_and_no_rounding(short_r
     assert (row[2:6], row[-1]) == (["<", "1", "nm", "0.567"], "4.64")
     assert "yaw [deg]" in text
     assert "steps 0 .. 0 rad/s per period" in text
-    assert "197 periods at the unconstrained optimum, no QP; 3 by piqp-multistage" in text
+    assert "197 periods" in text
+    assert "3 by piqp-multistage" in text
 
 
 @pytest.mark.parametrize(

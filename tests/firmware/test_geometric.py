@@ -159,7 +159,7 @@ def test_without_an_answer_the_contract_flies(run: Run) -> None:
 
 def test_other_commands_and_room_for_rows_are_refused() -> None:
     scenario = quadsim.load("autopilot").replace({"controller": {"type": "geometric", "commands": "attitude"}})
-    with pytest.raises(ExportError, match='it is \'geometric\' with commands = "attitude"; exported is "rates"'):
+    with pytest.raises(ExportError, match=r'"attitude".*"rates"'):
         c_controller(scenario)
-    with pytest.raises(ParameterError, match="--rows must be left out: a geometric controller solves no problem"):
+    with pytest.raises(ParameterError, match="--rows"):
         c_controller(scenario_of("plain"), rows=10)

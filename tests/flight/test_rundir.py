@@ -50,7 +50,7 @@ def test_damaged_and_missing_files_are_found(copied: Path) -> None:
     with (copied / "scenario.toml").open("a") as file:
         file.write("#")
     assert sorted(rundir.damaged_files(copied, summary)) == ["scenario.toml", "timing.parquet"]
-    with pytest.raises(FileError, match=r"is not a run directory: it has no summary\.json"):
+    with pytest.raises(FileError, match="run directory"):
         rundir.read_summary(copied.parent)
 
 

@@ -70,7 +70,7 @@ def test_inputs_without_bounds_are_refused() -> None:
     problem = paper_problem()
     assert problem.bounds is not None
     endless = replace(problem.bounds, u_max=np.full(4, math.inf))
-    with pytest.raises(ParameterError, match=r"controller\.u_min must be finite and below a finite u_max"):
+    with pytest.raises(ParameterError, match=r"controller\.u_min"):
         ActuatorBounds.of_problem(replace(problem, bounds=endless))
 
 

@@ -202,9 +202,9 @@ def test_solvers_that_need_equal_rows_refuse_varying_ones(problem: Problem) -> N
     among = space(PILLAR)
     normals, bounds = among.half_spaces(np.zeros(N), np.zeros((N, 3)))
     constrained = replace(problem, constraints=among.constraints(normals, bounds, 12))
-    with pytest.raises(ValueError, match="same at all steps"):
+    with pytest.raises(ValueError, match="steps"):
         Condensed(constrained)
-    with pytest.raises(ParameterError, match=r"must be a QP solver .* for this problem: .*the same at all steps"):
+    with pytest.raises(ParameterError, match="QP solver"):
         make_solver("core", constrained)
 
 

@@ -124,7 +124,7 @@ def test_the_axes_of_a_quadrotor_stay_apart() -> None:
 @pytest.mark.parametrize("weights", ["{z=1.0}", "{y=1.0, z=1.0, yaw=1.0}", "{x=1.0, y=1.0, z=1.0}"])
 def test_a_state_that_costs_nothing_and_does_not_come_to_rest_is_refused(weights: str) -> None:
     problem = paper_problem("paper-constrained", f"controller.output_weights={weights}")
-    with pytest.raises(ParameterError, match=r"controller\.terminal must be left out, or weights on all of x, y, z"):
+    with pytest.raises(ParameterError, match=r"controller\.terminal"):
         lqr_terminal_weight(problem.model, problem.objective)
 
 

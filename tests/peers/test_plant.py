@@ -63,5 +63,5 @@ def test_the_adapter_lands_where_rotorpys_own_step_does(vehicle: Vehicle) -> Non
 
 
 def test_another_gravity_is_refused(vehicle: Vehicle) -> None:
-    with pytest.raises(ParameterError, match=r"gravity must be 9\.81, which is built into RotorPy"):
+    with pytest.raises(ParameterError, match="gravity"):
         make_multirotor(replace(vehicle, gravity=1.62))

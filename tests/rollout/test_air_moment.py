@@ -153,17 +153,15 @@ def test_linear_mpc_takes_it_through_its_disturbance_also_in_wind() -> None:
 
 
 def test_an_unknown_moment_is_refused() -> None:
-    with pytest.raises(InputError, match=r"controller\.moment must be false, or deadcat with rotor_moment, inflow_m"):
+    with pytest.raises(InputError, match=r"controller\.moment"):
         GeometricController(published("deadcat"), 0.02, Geometric(feedforward=True, moment=True))
-    with pytest.raises(InputError, match="moment must be false where feedforward is not true"):
+    with pytest.raises(InputError, match="moment"):
         Geometric(moment=True)
-    with pytest.raises(InputError, match=r"controller\.moment must be false, or deadcat with rotor_moment, inflow_m"):
+    with pytest.raises(InputError, match=r"controller\.moment"):
         NonlinearMPC(published("deadcat"), period=0.02, settings=Nonlinear(moment=True))
-    with pytest.raises(
-        ValueError, match='moment must be absent where commands = "rates": the autopilot turns the rotors'
-    ):
+    with pytest.raises(ValueError, match="moment"):
         Nonlinear(moment=True, commands="rates")
-    with pytest.raises(InputError, match=r"estimator\.moment must be false, or lopes2011 with"):
+    with pytest.raises(InputError, match=r"estimator\.moment"):
         quadsim.fly(quadsim.load("satellite-navigation").replace({"estimator.moment": True}), progress=False)
 
 

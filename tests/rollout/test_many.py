@@ -231,7 +231,7 @@ def test_a_dask_worker_that_is_killed_costs_nothing_but_time(address: str) -> No
 
 def test_an_address_without_a_scheduler_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(many, "_CONNECT_S", 0.3)
-    with pytest.raises(ClusterError, match=r"the scheduler at tcp://127\.0\.0\.1:9 does not answer"):
+    with pytest.raises(ClusterError, match=r"127\.0\.0\.1:9"):
         list(fly_many(CALM, fly, cluster="tcp://127.0.0.1:9"))
 
 

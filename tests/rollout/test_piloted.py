@@ -182,7 +182,7 @@ def test_fields_of_rotor_speeds_are_refused(table: str, field: str) -> None:
 @pytest.mark.parametrize("field", OF_TARGETS)
 @pytest.mark.parametrize("kind", sorted({table["type"] for table in TABLES.values()}))
 def test_fields_of_targets_are_refused_where_it_commands_rotors(kind: str, field: str) -> None:
-    with pytest.raises(InputError, match=rf'{field} must be absent where commands = "rotors"'):
+    with pytest.raises(InputError, match=field):
         quadsim.load("hover").replace({**START, "controller": {"type": kind, field: OF_TARGETS[field]}})
 
 
@@ -297,7 +297,7 @@ def test_an_unknown_kind_of_command_is_refused(scenario: quadsim.Scenario, kind:
     class Odd(Rates):
         commands = kind  # type: ignore[assignment]
 
-    with pytest.raises(InputError, match="commands must be one of"):
+    with pytest.raises(InputError, match="commands"):
         quadsim.fly(scenario, controller=Odd, progress=False)
 
 
@@ -373,7 +373,7 @@ def test_a_law_of_targets_takes_over_from_the_law_and_not_from_its_autopilot(sce
 
 
 def test_an_autopilot_of_ones_own_needs_a_controller_of_targets(scenario: quadsim.Scenario) -> None:
-    with pytest.raises(InputError, match="autopilot must be given with a controller that commands thrust"):
+    with pytest.raises(InputError, match="autopilot"):
         quadsim.fly(scenario, autopilot=Counting(quadsim.load_vehicle("hummingbird")), progress=False)
 
 

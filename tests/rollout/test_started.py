@@ -165,13 +165,13 @@ def test_a_controller_built_elsewhere_takes_over_as_one_built_here() -> None:
 def test_a_flight_refuses_what_it_was_not_started_for() -> None:
     with Rollout(load_scenario("hover")) as started:
         for event in ({"type": "push", "duration": 0.1, "force": [1, 0, 0]}, {"type": "mass", "factor": 1.1}):
-            with pytest.raises(InputError, match=r"event.type must be of a kind that the flight was started for.*live"):
+            with pytest.raises(InputError, match=r"event\.type"):
                 started.apply(event)
-        with pytest.raises(InputError, match="for the wind to push"):
+        with pytest.raises(InputError, match="wind"):
             started.apply({"type": "wind", "velocity": [1, 0, 0]})
-        with pytest.raises(InputError, match=r"events.0.force is missing"):
+        with pytest.raises(InputError, match=r"events\.0\.force"):
             started.apply({"type": "push", "duration": 0.1})
-        with pytest.raises(InputError, match=r"events.0.fields: .*horizon must be a whole number >= 1 .*; got 0"):
+        with pytest.raises(InputError, match=r"events\.0\.fields: .*horizon .* 0"):
             started.apply({"type": "controller", "fields": {"horizon": 0}})
         assert not started.scenario.events
 
@@ -184,10 +184,10 @@ def test_given_commands_fly_instead_of_the_controller() -> None:
         assert sample.velocity[-1, 2] > 0.1  # [m/s] upwards: hover takes less
         with pytest.raises(CommandError):
             started.step(np.full(4, np.nan))
-        with pytest.raises(InputError, match=r"the flight has ended at t = 0\.500 s: the command is not finite"):
+        with pytest.raises(InputError, match=r"0\.500 s"):
             started.step()
         assert started.flight().outcome == "lost"
-    with pytest.raises(InputError, match="the flight is closed"):
+    with pytest.raises(InputError, match="closed"):
         started.step()
 
 
@@ -219,5 +219,5 @@ def test_without_a_record_there_is_no_log() -> None:
     with Rollout(load_scenario("hover"), recorded=False) as started:
         started.step()
         assert set(started.margins()) == {limit.name for limit in started.limits}
-        with pytest.raises(InputError, match="no period of this flight was recorded"):
+        with pytest.raises(InputError, match="recorded"):
             started.flight()

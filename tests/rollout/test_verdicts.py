@@ -142,13 +142,12 @@ def test_a_flight_without_constraints_is_unaudited_run_passes_and_check_fails(
     run = tmp_path / "run"
     assert main(["run", "hover", *settings, "--out", str(run), "--no-video", "--no-recording", "--no-figures"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert "unaudited, no constraint was audited" in shown
-    assert "add an entry" in shown
+    assert UNAUDITED_ADVICE in shown
     junit = tmp_path / "junit.xml"
     assert main(["check", str(run), "--junit", str(junit)]) == 1
     assert main(["check", "hover", *settings]) == 1
     shown = " ".join(capsys.readouterr().out.split())
-    assert shown.count("add an entry") == 2
+    assert shown.count(UNAUDITED_ADVICE) == 2
     assert 'failures="1"' in junit.read_text(encoding="utf-8")
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     assert (summary["verdict"], summary["satisfied"], findings_of(summary)) == ("unaudited", False, ())
@@ -171,7 +170,6 @@ def test_an_unaudited_campaign_supports_no_requirement_on_violations(tmp_path: P
     assert UNAUDITED_ADVICE in violation.sentence
     assert result.exit_status == 1
     assert result.summary["verdicts"]["unaudited"] == 5
-    assert "5 unaudited flights not counted" in result.text()
 
 
 # --- a user's own controller -----------------------------------------------------------------------------------------
@@ -245,13 +243,12 @@ def test_flights_that_are_audited_differently_are_compared_by_margins_until_audi
     assert (a.outcome, b.outcome) == ("satisfied", "violated")
     different = quadsim.compare(a, b)
     first = different.text().splitlines()[0]
-    assert first.startswith("Audited differently: roll: tolerances 0.05 / 0.01 and 0 / 0")
+    assert "roll: tolerances 0.05 / 0.01 and 0 / 0" in first
     alike = quadsim.compare(a, b, constraints=a)
     outcomes = next(row for row in alike.to_json() if row["label"] == "outcome")
     assert set(outcomes["values"].values()) == {"satisfied"}
-    assert alike.text().startswith("All are audited against the constraints of")
     assert not quadsim.compare(a, a).notes
-    with pytest.raises(InputError, match=r"--constraints must be one of what is compared"):
+    with pytest.raises(InputError, match="--constraints"):
         quadsim.compare(a, b, constraints="elsewhere")
 
 
@@ -275,5 +272,5 @@ def test_campaigns_that_are_audited_differently_get_no_test_of_violations(tmp_pa
     (failure, *_) = alike.events
     assert (failure.event, failure.only_a, failure.only_b) == ("failure", 0, 0)
     other = flown("other", [{**entry, "upper": 300.0} if entry["name"] == "speed" else entry for entry in ENTRIES])
-    with pytest.raises(InputError, match=r"margins to its own bounds alone.*speed: upper 250 and 300"):
+    with pytest.raises(InputError, match="speed: upper 250 and 300"):
         quadsim.compare(lenient, other, constraints=lenient)

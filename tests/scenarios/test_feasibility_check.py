@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +39,9 @@ def test_the_papers_course_steps_and_what_its_filter_leaves_is_beyond_the_bound(
     assert finding.jumps == (0.0, 10.0, 20.0, 40.0)
     assert finding.tilt == pytest.approx(20.0, abs=0.1)
     assert [problem.split()[0] for problem in finding.problems] == ["roll", "roll", "pitch", "pitch"]
-    assert finding.sentence == "The course cannot be followed exactly: roll up to 19.07 deg (bound 5) and 3 more."
-    assert finding.advice == "It would fit with a response time of 10.2 s, or at 25 % of its size."
+    assert "19.07 deg" in finding.sentence
+    assert "10.2 s" in finding.advice
+    assert "25 %" in finding.advice
     assert finding.advice == fitting(Assembly(made))
 
 
@@ -69,7 +71,7 @@ def test_a_circle_requires_the_tilt_of_the_closed_form(vehicle: Vehicle) -> None
     assert finding.tilt == pytest.approx(math.degrees(math.atan(1.0 / (3.0 * vehicle.gravity))), rel=1e-3)
     assert finding.velocity == pytest.approx(1.0, rel=1e-3)
     assert finding.problems == ()
-    assert "roll up to" in found(circle | {"speed": 3.0, "turns": 9.0}, vehicle).problems[0]
+    assert found(circle | {"speed": 3.0, "turns": 9.0}, vehicle).problems[0].startswith("roll ")
 
 
 def test_a_filter_lowers_what_is_required(vehicle: Vehicle) -> None:
@@ -120,11 +122,11 @@ def test_bounds_are_those_of_the_controller(vehicle: Vehicle) -> None:
     narrow = table | {"output_bounds": {"vx": [-0.5, 2.0], "yaw_rate": [-1.0, 1.0], "pitch": [-1.5, 1.5]}}
     problems = found(circle, vehicle, controller=narrow).problems
     assert [problem.split()[0] for problem in problems] == ["vx", "pitch", "pitch"]
-    assert problems[0] == "vx down to -0.9999 m/s (bound -0.5)"
+    assert "-0.9999 m/s" in problems[0]
     free = {"type": "unconstrained", **{k: table[k] for k in ("horizon", "output_weights", "input_weights")}}
     assert found(circle | {"speed": 3.0, "turns": 9.0}, vehicle, controller=free).problems == ()
     slow = table | {"input_bounds": {"speed": [0.0, 192.0], "slew": [-10.0, 5.0]}}
-    assert "rotor speed up to 192.9 rad/s (bound 192)" in found(circle, vehicle, controller=slow).problems
+    assert any("192.9 rad/s" in problem for problem in found(circle, vehicle, controller=slow).problems)
 
 
 TIGHT = {
@@ -146,9 +148,10 @@ def test_a_course_within_the_bounds_but_not_within_the_tightened_ones_is_reporte
     assert loose.problems == ()
     problems = found(circle, vehicle, controller=TIGHT).problems
     assert len(problems) == 4
-    assert problems[0].startswith("roll up to 4.9 deg (bound 5, tightened to 4.83")
+    assert "4.9 deg" in problems[0]
+    assert "4.83" in problems[0]
     tight = scenario(circle, controller=TIGHT)
-    assert fitting(Assembly(tight, vehicle)) == "It would fit at 99 % of its speed, or at 98 % of its size."
+    assert re.findall(r"\d+ %", fitting(Assembly(tight, vehicle))) == ["99 %", "98 %"]
 
 
 def test_the_speed_at_which_a_course_fits_is_that_of_the_closed_form(vehicle: Vehicle) -> None:
@@ -156,10 +159,8 @@ def test_the_speed_at_which_a_course_fits_is_that_of_the_closed_form(vehicle: Ve
     circle = {"type": "circle", "radius": 3.0, "speed": 3.0, "turns": 9.0, "ramp": 10.0}
     made = scenario(circle)
     share = math.tan(math.radians(5.0)) * 3.0 * vehicle.gravity / 3.0**2
-    assert fitting(Assembly(made, vehicle)) == (
-        f"It would fit at {math.floor(100 * math.sqrt(share))} % of its speed, or at "
-        f"{math.floor(100 * share)} % of its size."
-    )
+    expected = [f"{math.floor(100 * math.sqrt(share))} %", f"{math.floor(100 * share)} %"]
+    assert re.findall(r"\d+ %", fitting(Assembly(made, vehicle))) == expected
     assert fitting(Assembly(scenario(circle | {"speed": 1.0, "turns": 2.0}), vehicle)) == ""
 
 
@@ -168,7 +169,6 @@ def test_filtered_steps_would_fit_with_a_slower_filter_or_smaller(vehicle: Vehic
     steps = {"response_time": 3.0, "y": [{"start": 1.0, "stop": 15.0, "value": 2.0}]}
     advice = fitting(Assembly(scenario(steps), vehicle))
     time = 3.0 * math.sqrt(2.0 / (vehicle.gravity * math.tan(math.radians(5.0))))
-    assert advice.startswith("It would fit with a response time of ")
     assert float(advice.partition(" s,")[0].rpartition(" ")[2]) == pytest.approx(time, rel=0.06)
 
 
@@ -182,15 +182,15 @@ def test_what_a_set_point_leaves_of_the_course_is_counted(vehicle: Vehicle) -> N
     assert (turned.jumps, turned.yaw) == ((2.0,), pytest.approx(10.0))
     assert "lasts" not in turned.sentence
     fast = found(circle | {"speed": 3.0, "turns": 9.0}, vehicle, duration=44.0, events=[turn])
-    assert fast.problems[0].startswith("roll up to ")
-    assert fast.advice.startswith("It would fit at ")
+    assert fast.problems[0].startswith("roll ")
+    assert fast.advice
 
 
 def test_a_course_is_followed_until_each_axis_that_moves_has_a_set_point(vehicle: Vehicle) -> None:
     circle = {"type": "circle", "radius": 3.0, "speed": 1.0, "turns": 1.0, "ramp": 4.0}
     events = [{"type": "setpoint", "at": 2.0, "x": 0.0}, {"type": "setpoint", "at": 6.0, "y": 1.0, "z": 0.5}]
     sentence = found(circle, vehicle, duration=20.0, events=events).sentence
-    assert sentence.endswith("the flight follows it for 6 s.")
+    assert sentence.endswith(" 6 s.")
     assert "lasts" not in found(circle, vehicle, duration=23.0, events=events[:1]).sentence
 
 
@@ -199,4 +199,4 @@ def test_a_filtered_set_point_requires_what_the_filter_leaves_of_it(vehicle: Veh
     still, step = {"response_time": 3.0}, [{"type": "setpoint", "at": 1.0, "y": 1.0}]
     required = math.degrees(math.atan(1.0 / vehicle.gravity))
     assert found(still, vehicle, events=step).tilt == pytest.approx(required, rel=0.1)
-    assert found({"response_time": 1.0}, vehicle, events=step).problems[0].startswith("roll up to 34.25 deg (bound 5)")
+    assert found({"response_time": 1.0}, vehicle, events=step).problems[0].startswith("roll up to 34.25 deg")

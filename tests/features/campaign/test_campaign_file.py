@@ -166,9 +166,9 @@ def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=rule):
             load_plan(path, [setting])
-    with pytest.raises(FileError, match="no such campaign file"):
+    with pytest.raises(FileError, match="campaign"):
         load_plan(str(tmp_path / "gone.toml"))
-    with pytest.raises(UnknownNameError, match="no campaign named 'paper-robustnes'; did you mean 'paper-robustness'"):
+    with pytest.raises(UnknownNameError, match="'paper-robustnes'"):
         campaign_path("paper-robustnes")
 
 

@@ -140,7 +140,7 @@ def test_a_delay_margin_is_where_a_simulated_loop_begins_to_grow() -> None:
 
 def test_a_vehicle_with_nothing_in_reserve_is_refused_and_one_with_little_is_not() -> None:
     vehicle = next(each for each in ALL if each.name == "hummingbird")
-    with pytest.raises(ParameterError, match=r"vehicle.speed_max must be further from its hover speed, 453.2 rad/s"):
+    with pytest.raises(ParameterError, match=r"vehicle\.speed_max"):
         design_for(replace(vehicle, speed_max=vehicle.hover_speed))
     little = design_for(replace(vehicle, speed_max=1.02 * vehicle.hover_speed))
     assert little.tilt == pytest.approx(little.authority.steady_tilt / 3.0)

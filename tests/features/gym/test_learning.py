@@ -115,14 +115,14 @@ def test_an_action_that_is_not_finite_is_not_flown() -> None:
 
 
 def test_what_cannot_be_filtered_is_refused() -> None:
-    with pytest.raises(ParameterError, match="an environment of quadsim"):
+    with pytest.raises(ParameterError, match="environment"):
         quadsim.gym.MPCSafetyFilter(gymnasium.make("Pendulum-v1"))
-    with pytest.raises(ParameterError, match="deviations or speeds"):
+    with pytest.raises(ParameterError, match="deviations"):
         quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("robust", action="rates"))
-    with pytest.raises(ParameterError, match=r"controller.type must be robust"):
+    with pytest.raises(ParameterError, match=r"controller\.type"):
         quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("paper-constrained"))
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("forest"))
-    with pytest.raises(ParameterError, match="no half-spaces"):
+    with pytest.raises(ParameterError, match="half-spaces"):
         env.reset()
 
 

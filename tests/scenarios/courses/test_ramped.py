@@ -66,7 +66,7 @@ def test_a_flight_without_a_duration_ends_with_its_course(fields: dict[str, floa
 def test_turns_end_a_flight_too() -> None:
     eight = load_scenario("hummingbird-figure-eight").replace({"duration": None, "reference.response_time": 0.0})
     assert abs(eight.duration - Assembly(eight).course.end) <= eight.control_period
-    with pytest.raises(ScenarioError, match=r"duration must be <= 86400\.0; the course takes"):
+    with pytest.raises(ScenarioError, match="duration"):
         eight.replace({"duration": None, "reference.turns": 1e5, "control_period": 0.05, "plant.timestep": 0.01})
 
 

@@ -172,7 +172,5 @@ def test_a_table_is_found_beside_its_scenario_and_stored_by_its_whole_path_and_h
 def test_a_table_that_changed_after_the_scenario_was_resolved_is_refused(tmp_path: Path) -> None:
     made = load_scenario(str(beside(tmp_path)))
     (tmp_path / "course.csv").write_text(TABLE.replace("5,-2", "6,-2"))
-    with pytest.raises(
-        FileError, match=r"course\.csv: is not the file of the scenario: its SHA-256 is not [0-9a-f]{64}$"
-    ):
+    with pytest.raises(FileError, match=r"course\.csv"):
         _ = Assembly(made).course

@@ -201,12 +201,12 @@ def test_times_of_iterations_are_those_of_the_solver_that_answers(
     if message is None:
         assembly.controller()
         return
-    with pytest.raises(ParameterError, match=rf"computation\.per_iteration must be .*{message}"):
+    with pytest.raises(ParameterError, match=r"computation\.per_iteration"):
         assembly.controller()
 
 
 def test_a_time_of_iterations_without_a_solver_is_refused() -> None:
-    with pytest.raises(InputError, match=r"computation\.per_iteration must be a table"):
+    with pytest.raises(InputError, match=r"computation\.per_iteration"):
         load_scenario("robust", ["computation.per_iteration=1e-3"])
 
 

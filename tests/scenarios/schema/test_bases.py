@@ -79,7 +79,7 @@ def test_lists_without_names_are_replaced() -> None:
 def test_circular_bases_are_reported(tmp_path: Path) -> None:
     write(tmp_path, "a.toml", 'base = "b.toml"\n')
     write(tmp_path, "b.toml", 'base = "a.toml"\n')
-    with pytest.raises(FileError, match=r"is its own base: a\.toml -> b\.toml -> a\.toml"):
+    with pytest.raises(FileError, match=r"a\.toml -> b\.toml -> a\.toml"):
         load_scenario(str(tmp_path / "a.toml"))
 
 
