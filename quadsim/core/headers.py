@@ -174,7 +174,7 @@ class _Reader:
         return code
 
     def _directive(self, path: Path, number: int, line: str, holds: list[bool | None]) -> None:
-        word, *others = line.strip().removeprefix("#").split(None, 1)
+        word, *others = line.strip().removeprefix("#").split(None, 1) or [""]
         rest = others[0].strip() if others else ""
         if word in ("ifdef", "ifndef"):
             holds.append((rest in self._macros) == (word == "ifdef"))

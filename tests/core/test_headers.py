@@ -133,6 +133,8 @@ def test_enumerators_structs_and_functions_are_read(tmp_path: Path) -> None:
         ("#if SIZE > 3\nenum { A };\n#endif", 2, "a declaration under #if"),
         ('#include "absent.h"', 1, "absent.h is not among"),
         ("#warning now", 1, "#warning is not known"),
+        ("#", 1, "# is not known"),
+        ("#ifdef ONE\n#endif\n#else", 3, "#else without #if"),
         ("/* one\n * two */ int x;", 2, "'int x;' is not known here"),
     ],
 )
