@@ -32,6 +32,7 @@ from quadsim.flight.audit import (
 from quadsim.flight.log import FlightLog, PlantLog, columns_of
 from quadsim.flight.parquet import FORMAT, log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
+from quadsim.interrupts import current_hold
 from quadsim.outputs import absolute, adding, amend, to_json, writing
 from quadsim.plausibility import implausible
 from quadsim.rollout.flight_events import story
@@ -369,6 +370,7 @@ class Flight(Result):
             write(overwrite=True)
             return False
         try:
+            current_hold().release()
             if self._explanation is not None:
                 diagnosis = self.diagnosis  # which flies the changes that it advises
                 amend(absolute(directory), {"diagnosis": diagnosis})
