@@ -11,7 +11,7 @@ from typing import Any, Final, Self
 STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Hold:
+class SignalHold:
     """A block in which a flight is flown and written, and in which no signal can lose it in between.
 
     Signals go to their handlers before the flight and in it, where they end it in order.  From its end on they wait,
@@ -57,11 +57,11 @@ class Hold:
             self._handlers[number](number, frame)
 
 
-def current_hold() -> Hold:
+def current_hold() -> SignalHold:
     """Return the hold whose block this thread is in; one without effect where it is in none."""
     if threading.current_thread() is threading.main_thread():
         for stop in STOPS:
             receiver = getattr(signal.getsignal(stop), "__self__", None)
-            if isinstance(receiver, Hold):
+            if isinstance(receiver, SignalHold):
                 return receiver
-    return Hold()
+    return SignalHold()

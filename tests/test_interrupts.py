@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from quadsim.interrupts import STOPS, Hold, current_hold
+from quadsim.interrupts import STOPS, SignalHold, current_hold
 
 
 @pytest.fixture(autouse=True)
@@ -22,12 +22,12 @@ def listening() -> Iterator[None]:
 
 
 def test_before_and_in_the_flight_a_signal_acts_at_once() -> None:
-    with Hold(), pytest.raises(KeyboardInterrupt):
+    with SignalHold(), pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
 
 
 def test_from_its_end_on_a_signal_waits_until_the_tables_are_written() -> None:
-    with Hold() as hold:
+    with SignalHold() as hold:
         hold.flown = True
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
@@ -41,7 +41,7 @@ def test_from_its_end_on_a_signal_waits_until_the_tables_are_written() -> None:
 
 
 def interrupted() -> None:
-    with Hold() as hold:
+    with SignalHold() as hold:
         hold.flown = True
         signal.raise_signal(signal.SIGINT)
 
@@ -52,7 +52,7 @@ def test_a_signal_that_waits_acts_where_the_block_ends() -> None:
 
 
 def test_a_hold_within_another_hands_its_signal_on() -> None:
-    with Hold() as outer:
+    with SignalHold() as outer:
         outer.flown = True
         interrupted()
         with pytest.raises(KeyboardInterrupt):

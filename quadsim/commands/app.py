@@ -299,7 +299,7 @@ def run(
         ('satisfied', 'run')
     """
     from quadsim.console.progress import reporting
-    from quadsim.interrupts import Hold
+    from quadsim.interrupts import SignalHold
     from quadsim.outputs import run_directory
     from quadsim.rollout.flown import require_film, write_run
     from quadsim.rollout.rollout import Rollout
@@ -311,7 +311,7 @@ def run(
     products = {"video": video, "recording": recording, "figures": figures}
     for note in notes(parts[0]):
         _log.info(note)
-    with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory, Hold():
+    with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory, SignalHold():
         with reporting(progress) as report:
             flight = replace(Rollout(*parts).fly(report), directory=directory)
         write_run(flight, directory, products, overwrite=overwrite, fps=fps, progress=progress, flown=flown)

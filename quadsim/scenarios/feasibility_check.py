@@ -222,7 +222,7 @@ def _tightened(assembly: Assembly) -> dict[str, Range]:
         margins = spec.margins(assembly.vehicle, assembly.scenario.control_period)
     if margins is None:
         return {}
-    tightened = {}
+    tightened: dict[str, Range] = {}
     names = [name for name in STATE_NAMES if name in spec.output_bounds]
     for name, margin in zip(names, margins[-1].tolist(), strict=True):
         lower, upper = assembly.bounds[name]

@@ -232,7 +232,7 @@ def replay(
     """
     from quadsim.console.progress import reporting
     from quadsim.features.campaign.campaign import compare_replay, recorded_flight
-    from quadsim.interrupts import Hold
+    from quadsim.interrupts import SignalHold
     from quadsim.outputs import run_directory
     from quadsim.rollout.flown import require_film, write_run
     from quadsim.rollout.rollout import Rollout
@@ -245,7 +245,7 @@ def replay(
     for note in recorded.notes:
         _log.info(note)
     products = {"video": video, "recording": recording, "figures": figures}
-    with run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory, Hold():
+    with run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory, SignalHold():
         with reporting(progress) as report:
             again = replace(Rollout(recorded.scenario).fly(report), directory=directory)
         write_run(again, directory, products, overwrite=overwrite, progress=progress, flown=flown)

@@ -17,8 +17,6 @@ from http.client import HTTPConnection, HTTPException
 from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
-import websockets.asyncio.server
-
 from quadsim.errors import InputError
 from quadsim.features.live.look import ADMISSION
 
@@ -66,6 +64,8 @@ class Guard:
     @contextlib.contextmanager
     def installed(self, dress: Callable[[str], str]) -> Iterator[None]:
         """Make a server of `websockets` that is started in this block check its requests, and change its page."""
+        import websockets.asyncio.server  # of the extra `live`, as viser
+
         library: Any = websockets.asyncio.server
         serve = library.serve
 

@@ -22,7 +22,7 @@ from quadsim.errors import MissingPackageError, ParameterError
 from quadsim.features.live.guard import LOOPBACK
 from quadsim.features.live.pace import Pace
 from quadsim.features.live.session import Session, read_script
-from quadsim.interrupts import Hold
+from quadsim.interrupts import SignalHold
 from quadsim.outputs import run_directory
 from quadsim.rollout.flown import Flight
 from quadsim.scenarios.catalogue import scenario_names
@@ -53,7 +53,7 @@ def fly_live(
     with (
         run_directory(f"{scenario.name}-live", out, overwrite=overwrite) as directory,
         closing(Session(scenario, against)) as session,
-        Hold() as hold,
+        SignalHold() as hold,
     ):
         replaced, refused, one = overwrite, list[str](), threading.Lock()
 
