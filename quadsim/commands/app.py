@@ -298,6 +298,7 @@ def run(
         ('satisfied', 'run')
     """
     from quadsim.console.progress import reporting
+    from quadsim.interrupts import SignalHold
     from quadsim.outputs import run_directory
     from quadsim.rollout.flown import require_film, write_run
     from quadsim.rollout.rollout import Rollout
@@ -309,7 +310,7 @@ def run(
     products = {"video": video, "recording": recording, "figures": figures}
     for note in notes(parts[0]):
         _log.info(note)
-    with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory:
+    with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory, SignalHold():
         with reporting(progress) as report:
             flight = Rollout(*parts).fly(report)
         return write_run(flight, directory, products, overwrite=overwrite, fps=fps, progress=progress, flown=flown)

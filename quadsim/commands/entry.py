@@ -14,7 +14,8 @@ import sys
 from types import FrameType
 from typing import Final
 
-_STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+from quadsim.interrupts import STOPS
+
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _RENDERERS: Final = ("", "egl", "osmesa", "glfw", "disable")
 
@@ -58,7 +59,7 @@ class _Stops:
     """Whether a signal raises `KeyboardInterrupt`; afterwards it is remembered only."""
 
     def __init__(self) -> None:
-        self._heard = [stop for stop in _STOPS if signal.getsignal(stop) is not signal.SIG_IGN]
+        self._heard = [stop for stop in STOPS if signal.getsignal(stop) is not signal.SIG_IGN]
 
     def hear(self) -> None:
         for stop in self._heard:

@@ -146,14 +146,14 @@ def assess(
     Args:
         needed: the demands.
         vehicle: its rotor limits count.
-        bounds: lower and upper bounds by name: a state of `quadsim.state` in SI, `speed` [rad/s] of the rotors or
-            `slew` [rad/s per period].
+        bounds: lower and upper bounds by name, in file units: a state of `quadsim.state`, `speed` [rad/s] of the rotors
+            or `slew` [rad/s per period].
         tightened: the bounds on states after tightening at the end of the horizon; checked if the bounds themselves
             hold.
         jumps: times [s] at which the course jumps.
     """
     bounds = bounds or {}
-    tilts = [math.degrees(abs(side)) for name in ("roll", "pitch") if name in bounds for side in bounds[name]]
+    tilts = [abs(side) for name in ("roll", "pitch") if name in bounds for side in bounds[name]]
     peaks = {
         "tilt": math.degrees(float(tilt(needed.state).max())),
         "velocity": float(np.linalg.norm(needed.state[:, VELOCITY], axis=1).max()),
@@ -202,10 +202,9 @@ def _problems(
         else:
             unit, scale = shown_unit(STATE_UNITS[INDEX[name]])
             values = scale * needed.state[:, INDEX[name]]
-            beyond = _beyond(name, unit, values, (scale * lower, scale * upper), "bound")
+            beyond = _beyond(name, unit, values, (lower, upper), "bound")
             if not beyond and name in tightened:
-                left = (scale * tightened[name][0], scale * tightened[name][1])
-                beyond = _beyond(name, unit, values, left, f"bound {scale * upper:.4g}, tightened to")
+                beyond = _beyond(name, unit, values, tightened[name], f"bound {upper:.4g}, tightened to")
             problems += beyond
     return tuple(problems)
 

@@ -34,6 +34,7 @@ from quadsim.flight.audit import (
 from quadsim.flight.log import FlightLog, PlantLog, columns_of
 from quadsim.flight.parquet import FORMAT, log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
+from quadsim.interrupts import current_hold
 from quadsim.outputs import absolute, adding, amend, file_hashes, to_json, writing
 from quadsim.plausibility import implausible
 from quadsim.rollout.flight_events import story
@@ -415,6 +416,7 @@ class Flight(Result):
         except KeyboardInterrupt:
             return write(overwrite=True), False
         try:
+            current_hold().release()
             if self._explanation is not None:
                 diagnosis = self.diagnosis  # which flies the changes that it advises
                 amend(target, {"diagnosis": diagnosis})

@@ -453,17 +453,16 @@ class Assembly:
 
     @cached_property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """The controller's bounds on signals of the audit, see `quadsim.mpc.bounded.ControllerTable.audited`."""
-        return self.scenario.controller.audited(self.vehicle)
+        """The controller's bounds on signals of the audit, in file units; of those on speeds, what the rotors can do.
+
+        See `quadsim.mpc.bounded.ControllerTable.audited`.  Audit, notes and feasibility all take these.
+        """
+        return flyable(self.scenario.controller.audited(self.vehicle), self.actual)
 
     @cached_property
     def limits(self) -> tuple[Limit, ...]:
         """The limits of the audit: constraints, controller bounds, polytopes, obstacles and regions."""
-        return (*signal_limits(self.scenario, self._flyable), *sum_limits(self.scenario), *self.space_limits)
-
-    @property
-    def _flyable(self) -> dict[str, tuple[float, float]]:
-        return flyable(self.bounds, self.actual)
+        return (*signal_limits(self.scenario, self.bounds), *sum_limits(self.scenario), *self.space_limits)
 
     @property
     def space_limits(self) -> tuple[SpaceLimit, ...]:
@@ -476,7 +475,7 @@ class Assembly:
     @property
     def with_bounds(self) -> Scenario:
         """The scenario with its controller's bounds as constraints, to apply them to another controller."""
-        return self.scenario.altered(constraints=signal_limits(self.scenario, self._flyable))
+        return self.scenario.altered(constraints=signal_limits(self.scenario, self.bounds))
 
     def with_law_bounds(self, controller: Controller) -> Assembly:
         """Return the assembly with the bounds of a user's controller as constraints of its scenario."""
@@ -486,7 +485,7 @@ class Assembly:
     @property
     def audit_notes(self) -> list[str]:
         """Notes on the audit, see `quadsim.scenarios.limits.audit_notes`."""
-        return audit_notes(self.scenario, self.vehicle, self._flyable, audited=bool(self.limits))
+        return audit_notes(self.scenario, self.vehicle, self.bounds, audited=bool(self.limits))
 
     def computation(self, spec: AnyController | None = None) -> Computation | None:
         """Return the computation time of a controller, the scenario's by default; None if commands take no time."""

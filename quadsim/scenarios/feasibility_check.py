@@ -14,15 +14,15 @@ from numpy.typing import ArrayLike
 from quadsim.errors import ParameterError
 from quadsim.flight.audit import Mask
 from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
-from quadsim.mpc.bounded import Bounded
+from quadsim.mpc.bounded import Bounded, Range
 from quadsim.mpc.robust.settings import Robust
 from quadsim.scenarios.courses.course import Course
 from quadsim.scenarios.courses.csv_course import Csv
 from quadsim.scenarios.courses.smoothing import within_rounding
 from quadsim.scenarios.schema.events import SetpointEvent, first_period
 from quadsim.sim.effects.load import Load, mass_properties
-from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
-from quadsim.vehicle import Vehicle, span
+from quadsim.state import INDEX, REFERENCE_NAMES, STATE_NAMES, STATE_UNITS, Array, shown_unit
+from quadsim.vehicle import span
 
 if TYPE_CHECKING:
     from quadsim.scenarios.assembly import Assembly
@@ -193,8 +193,8 @@ def _required(course: Course, assembly: Assembly, *, duration: float, pace: floa
     channels = zip(poses.T, course.resolution, strict=True)
     smooth = np.column_stack([within_rounding(values, unit, jumped | kinked) for values, unit in channels])
     needed = demand(smooth, period, vehicle, jumps=jumped, kinks=kinked)
-    bounds, tightened = _bounds(scenario, vehicle)
-    return assess(needed, vehicle, bounds=bounds, tightened=tightened, jumps=jumps)
+    bounds = assembly.bounds if isinstance(scenario.controller, Bounded) else {}
+    return assess(needed, vehicle, bounds=bounds, tightened=_tightened(assembly), jumps=jumps)
 
 
 def _touched(t: Array, instants: ArrayLike) -> Mask:
@@ -212,22 +212,20 @@ def _isolated(kinks: Sequence[float], period: float) -> Array:
     return at[np.maximum(gaps[1:], gaps[:-1])[: at.size] > period * (1.0 + 1e-6)]
 
 
-_Bounds = dict[str, tuple[float, float]]
-
-
-def _bounds(scenario: Scenario, vehicle: Vehicle) -> tuple[_Bounds, _Bounds]:
-    """Return the controller's bounds, and those on outputs after tightening at the end of the horizon; SI."""
-    spec = scenario.controller
-    if not isinstance(spec, Bounded):
-        return {}, {}
-    bounds, names = spec.bounds(), [name for name in STATE_NAMES if name in spec.output_bounds]
-    (u_min, u_max), (delta_min, delta_max) = spec.input_bounds.speed, spec.input_bounds.slew
-    whole = dict(zip(names, zip(bounds.y_min.tolist(), bounds.y_max.tolist(), strict=True), strict=True))
-    inputs = {"speed": (u_min, u_max), "slew": (delta_min, delta_max)}
+def _tightened(assembly: Assembly) -> dict[str, Range]:
+    """Return the controller's bounds on outputs after tightening at the end of the horizon, in file units."""
+    spec = assembly.scenario.controller
+    if not isinstance(spec, Robust):
+        return {}
     margins = None
     with contextlib.suppress(ParameterError):  # reported when the controller is built
-        margins = spec.margins(vehicle, scenario.control_period) if isinstance(spec, Robust) else None
+        margins = spec.margins(assembly.vehicle, assembly.scenario.control_period)
     if margins is None:
-        return whole | inputs, {}
-    last = dict(zip(names, margins[-1].tolist(), strict=True))
-    return whole | inputs, {name: (low + last[name], high - last[name]) for name, (low, high) in whole.items()}
+        return {}
+    tightened: dict[str, Range] = {}
+    names = [name for name in STATE_NAMES if name in spec.output_bounds]
+    for name, margin in zip(names, margins[-1].tolist(), strict=True):
+        lower, upper = assembly.bounds[name]
+        _, scale = shown_unit(STATE_UNITS[INDEX[name]])
+        tightened[name] = (lower + scale * margin, upper - scale * margin)
+    return tightened

@@ -51,7 +51,7 @@ def audit_notes(scenario: Scenario, vehicle: Vehicle, bounds: Mapping[str, Range
     Args:
         scenario: the scenario.
         vehicle: the modelled vehicle.
-        bounds: the controller's, see `flyable`.
+        bounds: the controller's, see `Assembly.bounds`.
         audited: whether anything is audited at all.
     """
     unnamed = [limit.name for limit in _unnamed(scenario, bounds)]

@@ -33,6 +33,7 @@ from quadsim.core.structs import InnerStruct
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError, described
 from quadsim.flight.log import FlightLog, LoggedSignals
 from quadsim.flight.phase import check_loss
+from quadsim.interrupts import current_hold
 from quadsim.motion import Motion
 from quadsim.sim.computation import Computation, physics_steps
 from quadsim.sim.physics import Observation, Period, flight_log, inner_steps, physics_to_state
@@ -438,6 +439,7 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
     Whatever happens in flight ends up in its log: a typed flight error or Ctrl-C ends it early, with its reason and
     everything up to it.  `progress` is called with the number of periods flown, after each.
     """
+    hold = current_hold()
     gc.freeze()  # a pass of the collector over all imported modules takes up to 30 ms, as long as a control period
     try:
         while loop.k < periods:
@@ -447,8 +449,10 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
     except FlightError:
         pass  # the loop has noted it
     except KeyboardInterrupt:
+        hold.flown = True  # before any call, in which the next signal would come
         loop.interrupt()
     finally:
+        hold.flown = True
         gc.unfreeze()
 
 

@@ -179,6 +179,10 @@ sys.exit(main())
 @pytest.mark.parametrize(
     ("place", "caught"),
     [
+        ("quadsim.sim.loop.flight_log", ""),
+        pytest.param("quadsim.rollout.rollout.audit", "", marks=pytest.mark.witness("process")),
+        ("quadsim.rollout.rollout.audit", "caught"),
+        ("quadsim.rollout.flown.summarise", ""),
         ("quadsim.rollout.flown.write_log", ""),
         ("quadsim.report.recording.write_recording", ""),
         ("quadsim.report.flight_figures.write_figures", ""),

@@ -119,7 +119,7 @@ def test_a_kink_requires_a_tilt_but_no_torque(vehicle: Vehicle) -> None:
 
 def test_a_course_within_all_limits_is_reported_feasible(vehicle: Vehicle) -> None:
     _, needed = demanded(vehicle, lambda t: (0.2 * np.cos(t), 0.2 * np.sin(t), 0.0 * t, 0.0 * t))
-    result = assess(needed, vehicle, bounds={"roll": (-0.1, 0.1), "speed": (0.0, 250.0), "slew": (-10.0, 5.0)})
+    result = assess(needed, vehicle, bounds={"roll": (-5.73, 5.73), "speed": (0.0, 250.0), "slew": (-10.0, 5.0)})
     assert result.problems == ()
     assert [each in result.sentence for each in ("1.17 deg", "5.73 deg", "0.2 m/s", "192.8")] == [True] * 4
     assert result.thrust_to_weight == pytest.approx(math.hypot(1.0, 0.2 / vehicle.gravity), rel=1e-5)
@@ -129,7 +129,7 @@ def test_a_course_within_all_limits_is_reported_feasible(vehicle: Vehicle) -> No
 
 def test_every_limit_and_bound_that_is_left_is_named(vehicle: Vehicle) -> None:
     _, needed = demanded(vehicle, lambda t: (np.sin(2.0 * t), 0.0 * t, np.sin(2.0 * t) * 0.5, 3.0 * t), seconds=6.0)
-    bounds = {"roll": (-0.2, 0.2), "vx": (-1.0, 5.0), "yaw_rate": (-1.0, 1.0), "speed": (180.0, 260.0)}
+    bounds = {"roll": (-11.46, 11.46), "vx": (-1.0, 5.0), "yaw_rate": (-57.3, 57.3), "speed": (180.0, 260.0)}
     result = assess(needed, replace(vehicle, speed_max=200.0), bounds={**bounds, "slew": (-0.1, 0.1)}, jumps=(1.0,))
     names = [problem.rsplit(" (", 1) for problem in result.problems]
     assert [(text.split(" up")[0].split(" down")[0], kind) for text, kind in names] == [

@@ -16,6 +16,7 @@ from quadsim.features.live.session import Session
 from quadsim.flight.audit import UNAUDITED_ADVICE, Limit
 from quadsim.rollout.reaudit import reaudit
 from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.feasibility_check import hover_notes
 from quadsim.scenarios.limits import flyable
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.schema.scenario import Scenario
@@ -189,6 +190,14 @@ def test_a_bound_on_speed_is_what_the_rotors_can_do_of_it() -> None:
     assert flyable({"speed": (0.0, 300.0), **roll}, vehicle) == {"speed": (50.0, 250.0), **roll}
     assert flyable({"speed": (60.0, 200.0)}, vehicle) == {"speed": (60.0, 200.0)}
     assert flyable({"speed": (300.0, 400.0)}, vehicle) == {"speed": (50.0, 250.0)}
+
+
+def test_what_the_rotors_can_do_is_the_bound_of_audit_notes_and_feasibility() -> None:
+    assembly = Assembly(hover(constraints=[], actual={"speed_max": 200.0}, effects={"load": {"mass_factor": 1.1}}))
+    assert assembly.bounds["speed"] == (0.0, 200.0)
+    assert [(limit.lower, limit.upper) for limit in assembly.limits if limit.signal == "speed"] == [(0.0, 200.0)]
+    (note,) = hover_notes(assembly)
+    assert note == "hover needs 202.2 rad/s, the bound is 200: no controller can hold altitude"
 
 
 def test_a_difference_is_noted_from_when_it_is_there() -> None:

@@ -22,12 +22,12 @@ from quadsim.errors import InputError
 from quadsim.features.campaign.events import parse_event
 from quadsim.fields import Number, Positive, Seconds
 from quadsim.input_limits import MOST_ENTRIES
-from quadsim.scenarios.schema.base import LARGEST_SEED
+from quadsim.scenarios.schema.base import LARGEST_WHOLE
 from quadsim.scenarios.schema.writing import to_toml
 from quadsim.state import Array
 
-WholeNumber = Annotated[int, Ge(-LARGEST_SEED), Le(LARGEST_SEED)]
-Seed = Annotated[int, Ge(0), Le(LARGEST_SEED)]
+WholeNumber = Annotated[int, Ge(-LARGEST_WHOLE), Le(LARGEST_WHOLE)]
+Seed = Annotated[int, Ge(0), Le(LARGEST_WHOLE)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$"), MaxLen(60)]
 Unit = Annotated[str, MaxLen(20), doc("of the values, for tables and plots")]
 Value = bool | WholeNumber | Number | str | list[Number]

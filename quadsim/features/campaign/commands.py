@@ -232,6 +232,7 @@ def replay(
     """
     from quadsim.console.progress import reporting
     from quadsim.features.campaign.campaign import compare_replay, recorded_flight
+    from quadsim.interrupts import SignalHold
     from quadsim.outputs import run_directory
     from quadsim.rollout.flown import require_film, write_run
     from quadsim.rollout.rollout import Rollout
@@ -244,7 +245,7 @@ def replay(
     for note in recorded.notes:
         _log.info(note)
     products = {"video": video, "recording": recording, "figures": figures}
-    with run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
+    with run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory, SignalHold():
         with reporting(progress) as report:
             again = Rollout(recorded.scenario).fly(report)
         again = write_run(again, directory, products, overwrite=overwrite, progress=progress, flown=flown)

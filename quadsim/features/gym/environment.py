@@ -26,7 +26,7 @@ from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly, preferring_core
 from quadsim.scenarios.catalogue import scenario_names
 from quadsim.scenarios.loading import load_scenario
-from quadsim.scenarios.schema.base import LARGEST_SEED
+from quadsim.scenarios.schema.base import LARGEST_WHOLE
 from quadsim.scenarios.schema.bases import read_scenario
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.physics import Observation, one_period
@@ -173,8 +173,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             ClosedEnvironmentError: `close` has been called.
         """
         self._require_open()
-        if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed <= LARGEST_SEED):
-            raise ParameterError("", "seed", seed, f"from 0 to {LARGEST_SEED}")
+        if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed <= LARGEST_WHOLE):
+            raise ParameterError("", "seed", seed, f"from 0 to {LARGEST_WHOLE}")
         if seed is None and self._flight is None:
             seed = self._base.seed
         super().reset(seed=seed)

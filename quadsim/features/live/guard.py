@@ -1,18 +1,34 @@
-"""Who may open the page of a live session: whoever has its address."""
+"""Who may open the page of a live session: whoever has its address.
+
+Viser has no hook for this, and a second server in front of it would leave its own port open to every page that finds
+it.  So the guard stands where viser's server is made, in the function `serve` of the public module
+`websockets.asyncio.server`, which checks each request before viser sees it.  A viser that makes its server in another
+way would be unguarded: `Guard.require_closed` therefore tries the door before anything is shown, and refuses.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import ipaddress
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
+from http.client import HTTPConnection, HTTPException
 from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
+from quadsim.errors import InputError
 from quadsim.features.live.look import ADMISSION
 
 _HOW_TO_OPEN: Final = "Open the whole address that quadsim live printed, with ?token= and what follows."
+_UPGRADE: Final = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+}
+"""What makes of a request one for a WebSocket."""
+_PATIENCE: Final = 10.0  # [s] for an answer of this process
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
@@ -47,10 +63,10 @@ class Guard:
 
     @contextlib.contextmanager
     def installed(self, dress: Callable[[str], str]) -> Iterator[None]:
-        """Make a server that viser starts in this block check its requests, and change its page."""
-        from viser.infra import _infra
+        """Make a server of `websockets` that is started in this block check its requests, and change its page."""
+        import websockets.asyncio.server  # of the extra `live`, as viser
 
-        library = _infra.websockets.asyncio.server
+        library: Any = websockets.asyncio.server
         serve = library.serve
 
         def guarded(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
@@ -81,6 +97,21 @@ class Guard:
         finally:
             library.serve = serve
 
+    def require_closed(self, port: int) -> None:
+        """Try the door of the server on this port without the token: with a request for the page, and by WebSocket.
+
+        Raises:
+            InputError: it does not refuse both, so whoever finds the port could fly.
+        """
+        address = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._host, self._host)
+        answers = [_status(address, port, headers) for headers in ({}, _UPGRADE)]
+        if answers != [HTTPStatus.FORBIDDEN] * 2:
+            said = " and ".join(str(answer or "nothing") for answer in answers)
+            raise InputError(
+                f"quadsim live needs a viser whose server can be guarded: without the token, this one answers {said} "
+                f"in place of {HTTPStatus.FORBIDDEN:d}; install another version of viser or websockets"
+            )
+
     def _is_ours(self, netloc: str, port: int) -> bool:
         """Whether `HOST:PORT` is this server."""
         try:
@@ -100,3 +131,15 @@ def _values(headers: Any, name: str) -> list[str]:
     if hasattr(headers, "get_all"):
         return list(headers.get_all(name))
     return [headers[name]] if name in headers else []
+
+
+def _status(address: str, port: int, headers: Mapping[str, str]) -> int | None:
+    """Return how the server at an address answers a request for its page, or None without an answer."""
+    connection = HTTPConnection(address, port, timeout=_PATIENCE)
+    try:
+        connection.request("GET", "/", headers=headers)
+        return connection.getresponse().status
+    except (OSError, HTTPException):
+        return None
+    finally:
+        connection.close()

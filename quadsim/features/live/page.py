@@ -101,6 +101,11 @@ class Page:
         if port not in (0, listening):
             self.close()
             raise ParameterError("", "--port", port, "a port that is free")
+        try:
+            guard.require_closed(listening)
+        except InputError:
+            self.close()
+            raise
         for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel that any client may open
             self._server._websock_server.unregister_handler(message)
         self._driver: int | None = None

@@ -21,6 +21,7 @@ from quadsim.errors import MissingPackageError, ParameterError
 from quadsim.features.live.guard import LOOPBACK
 from quadsim.features.live.pace import Pace
 from quadsim.features.live.session import Session, read_script
+from quadsim.interrupts import SignalHold
 from quadsim.mpc.laws import law_name
 from quadsim.outputs import run_directory
 from quadsim.rollout.flown import Flight
@@ -52,6 +53,7 @@ def fly_live(
     with (
         run_directory(f"{scenario.name}-live", out, overwrite=overwrite) as directory,
         closing(Session(scenario, against)) as session,
+        SignalHold() as hold,
     ):
         replaced, refused, one = overwrite, list[str](), threading.Lock()
 
@@ -75,6 +77,7 @@ def fly_live(
         except KeyboardInterrupt:
             print(file=sys.stderr)
         finally:  # what was flown is saved, whatever ended it
+            hold.flown = True
             flight = None
             if session.k:
                 flight = session.flight()

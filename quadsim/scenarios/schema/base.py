@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from quadsim.fields import Number
 
 PairList = Annotated[list[Number], Len(2, 2)]
-LARGEST_SEED: Final = 2**63 - 1  # the largest whole number that every reader of TOML takes
+LARGEST_WHOLE: Final = 2**63 - 1  # that every reader of TOML takes
 
 STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 

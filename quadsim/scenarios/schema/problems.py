@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import difflib
 import functools
-import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,10 +16,11 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, cast, get_arg
 from annotated_types import GroupedMetadata
 from pydantic import Tag, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
-from pydantic_core import ErrorDetails, core_schema
+from pydantic_core import ErrorDetails, SchemaValidator, core_schema
 
+from quadsim.assets import DEEPEST
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from quadsim.scenarios.schema.base import STRICT, fields_of, is_table
+from quadsim.scenarios.schema.base import LARGEST_WHOLE, STRICT, fields_of, is_table
 from quadsim.vehicle import MEANT
 
 TableType = TypeVar("TableType")
@@ -36,6 +36,10 @@ _REASONS: Final = {
     "models and gains of the others are for rotor speeds",
 }
 """Reasons why a controller lacks a field that a reader may expect."""
+_WRITTEN_OTHERWISE: Final = ("dataclass", "tuple", "enum")
+"""Pydantic's types that a file does not have: it has a table, a list or a text instead."""
+_NO_SCHEMA: Final = ("default", "metadata", "expected")
+"""Parts of pydantic's schemas that are values, not schemas."""
 _KNOWN: Final = frozenset(get_args(core_schema.ErrorType))  # pydantic's kinds of error; a custom one states its rule
 
 
@@ -158,7 +162,7 @@ def find(path: Sequence[int | str], data: Any, root: type[Any]) -> FilePlace:
         if isinstance(part, int):
             data = data[part]
             name = data.get("name") if isinstance(data, Mapping) else None
-            names.append(name if name and isinstance(name, str) else str(part))
+            names.append(name if isinstance(name, str) and name else str(part))
             kinds = tuple(entry for kind in kinds for entry in kind.entries)
         elif len(kinds) > 1 and named:
             kinds = named
@@ -210,11 +214,37 @@ def parse_table(kind: type[TableType], data: Mapping[str, Any], source: str, *, 
         ScenarioError: the message starts with `source` and names every invalid field.
     """
     try:
-        table: TableType = adapter(cast(Any, kind)).validate_json(json.dumps(data, default=lambda _: math.inf))
+        tables = _in_types_of_files(data)
+        not_unicode = [*_not_unicode(tables)]
+    except RecursionError:
+        raise ScenarioError(source, [f"must nest tables and lists at most {DEEPEST} deep"]) from None
+    if not_unicode:
+        raise ScenarioError(source, not_unicode)
+    try:
+        table: TableType = _validator(cast(Any, kind)).validate_python(tables)
     except ValidationError as error:
-        lines = [*_not_unicode(data)] or describe_all(error, data, kind, file=file)
-        raise ScenarioError(source, lines) from error
+        raise ScenarioError(source, describe_all(error, data, kind, file=file)) from error
     return table
+
+
+def _in_types_of_files(value: Any) -> Any:
+    """Return a copy of nested tables in the types of files, which no later change of the caller's tables reaches.
+
+    What no file holds, as a number of 65 bits, and no field takes, as a date, becomes infinity, which all refuse.
+    """
+    if isinstance(value, dict):
+        return {str(key): _in_types_of_files(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_in_types_of_files(entry) for entry in value]
+    if value is None or isinstance(value, bool):
+        return value
+    if isinstance(value, int) and abs(value) <= LARGEST_WHOLE:
+        return int(value)
+    if isinstance(value, float):
+        return float(value)
+    if isinstance(value, str):
+        return str(value)
+    return math.inf
 
 
 def _not_unicode(data: Any, names: tuple[str, ...] = ()) -> Iterator[str]:
@@ -231,6 +261,27 @@ def adapter(kind: Any) -> TypeAdapter[Any]:
     """Return the strict parser of a table class, which refuses unknown fields."""
     kind.__pydantic_config__ = STRICT  # of tables within, too
     return TypeAdapter(kind)
+
+
+@functools.cache
+def _validator(kind: Any) -> SchemaValidator:
+    """Return what makes a table class of nested dicts and lists."""
+    return SchemaValidator(_of_dicts_and_lists(adapter(kind).core_schema))
+
+
+def _of_dicts_and_lists(schema: Any) -> Any:
+    """Return pydantic's schema with tables that may be dicts, and tuples that may be lists.
+
+    Everything within stays strict: as in a file, 1 is a number, but true and "1" are none.
+    """
+    if isinstance(schema, list):
+        return [_of_dicts_and_lists(entry) for entry in schema]
+    if not isinstance(schema, dict):
+        return schema
+    relaxed = {name: entry if name in _NO_SCHEMA else _of_dicts_and_lists(entry) for name, entry in schema.items()}
+    if relaxed.get("type") in _WRITTEN_OTHERWISE:
+        relaxed["strict"] = False
+    return relaxed
 
 
 def describe_all(
@@ -318,7 +369,9 @@ def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
 
 
 def _guess(given: object, allowed: Iterable[str]) -> str:
+    if not isinstance(given, str):
+        return ""
     allowed = [*allowed]
-    meant = MEANT.get(str(given), ())
-    near = meant if meant and {*meant} <= {*allowed} else difflib.get_close_matches(str(given), allowed, n=1)
+    meant = MEANT.get(given, ())
+    near = meant if meant and {*meant} <= {*allowed} else difflib.get_close_matches(given, allowed, n=1)
     return f"; did you mean {' and '.join(map(repr, near))}?" if near else ""

@@ -211,7 +211,10 @@ def field_text(value: Any) -> str:
     """Return a value on one line, numbers to six digits; None is an absent field."""
     if value is None:
         return "absent"
-    text = f"{value:.6g}" if isinstance(value, float) else json.dumps(value, default=str)
+    try:
+        text = f"{value:.6g}" if isinstance(value, float) else json.dumps(value, default=str)
+    except ValueError:  # Python does not write out very long whole numbers
+        return "..."
     text = text.replace("; ", ", ")
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 

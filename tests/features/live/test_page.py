@@ -7,12 +7,13 @@ import math
 import re
 import shutil
 import signal
+import socket
 import threading
 import time as clock
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,6 +25,7 @@ import msgspec
 import numpy as np
 import pytest
 import viser
+import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -31,6 +33,7 @@ from websockets.typing import Subprotocol
 
 from quadsim.commands.cli import main
 from quadsim.console.results import EXIT_DONE, EXIT_WRONG_INPUT
+from quadsim.errors import InputError
 from quadsim.features.live import serving
 from quadsim.features.live.guard import Guard
 from quadsim.features.live.incoming import offers
@@ -103,6 +106,29 @@ def test_cookies_of_other_programs_on_this_host_lock_nobody_out(others: str) -> 
     assert refusal(f"{others};{ours}") is None
     assert refusal(others) is not None
     assert refusal(ours, hosts=("127.0.0.1:8080", "evil.example")) == "a header is there twice"
+
+
+@pytest.mark.witness("live")
+def test_a_server_that_is_made_past_the_guard_is_not_served(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As by a version of viser that does not look `serve` up where it is replaced."""
+    library: Any = websockets.asyncio.server
+    serve = library.serve
+    server_class = viser.ViserServer
+    made: list[viser.ViserServer] = []
+
+    def past_the_guard(**options: Any) -> viser.ViserServer:
+        library.serve = serve  # which the guard puts back itself
+        made.append(server_class(**options))
+        return made[0]
+
+    monkeypatch.setattr(viser, "ViserServer", past_the_guard)
+    rule = "without the token, this one answers 200 and 101 in place of 403"
+    session = Session(load_scenario("hover", ["controller.horizon=10"]))
+    with closing(session), pytest.raises(InputError, match=rule):
+        Page(session, Pace(waiting=True), save=lambda flight: "", others={})
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", made[0].get_port()), timeout=PATIENCE)
+    assert library.serve is serve
 
 
 @dataclass

@@ -14,6 +14,7 @@ from quadsim.errors import UnknownNameError
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import FLIGHTS
 from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.schema.initial import Initial
 from quadsim.scenarios.schema.problems import ScenarioError
 from quadsim.scenarios.schema.scenario import Scenario
 
@@ -122,3 +123,40 @@ def test_a_number_of_a_list_is_set_by_its_index() -> None:
         load_scenario(
             "hover", ["initial.position=[0.0, 0.0, 1.0]", "initial.euler=[0.0, 0.0, 0.0]", "initial.euler.3=1"]
         )
+
+
+# --- tables in memory ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "rule"),
+    [
+        ("vehicle.mass", True, "a finite number"),
+        ("vehicle.mass", "4.0", "a finite number"),
+        ("controller.horizon", 10.0, "a whole number"),
+        ("controller.compiled", 1, "true or false"),
+        pytest.param("controller.kkt_every", 10**5000, "a whole number >= 1; got a whole number of", id="digits"),
+        ("initial.position", {1.0, 2.0, 3.0}, "a list of 3 numbers"),
+        ("initial", Initial(), "a table"),
+    ],
+)
+def test_values_in_memory_are_as_strict_as_those_of_a_file(path: str, value: object, rule: str) -> None:
+    hover = load_scenario("hover")
+    with pytest.raises(ScenarioError) as refused:
+        hover.replace({path: value})
+    assert any(line.startswith(f"{path} must be {rule}") for line in refused.value.problems)
+
+
+def test_a_change_of_the_tables_afterwards_reaches_no_scenario() -> None:
+    table = scenario_table() | {"constraints": [{"name": "a", "signal": "sum", "terms": {"x": 1}, "lower": 1}]}
+    scenario = parse_scenario(table)
+    table["constraints"][0]["terms"]["x"] = 2
+    assert scenario.constraints[0].terms == {"x": 1.0}
+    assert isinstance(scenario.constraints[0].lower, float)
+
+
+def test_tables_within_themselves_are_refused() -> None:
+    table = scenario_table()
+    table["controller"]["within"] = table
+    with pytest.raises(ScenarioError, match="must nest tables and lists at most"):
+        Scenario.parse(table)
