@@ -284,5 +284,5 @@ def test_a_folder_does_not_hide_a_scenario(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "hover").rmdir()
     (tmp_path / "run").rename(tmp_path / "hover")
     checked = quadsim.check("hover", progress=False)
-    assert checked.rate == 200.0
+    assert checked.directory == Path("hover"), "read, not flown"
     assert read_whole(tmp_path / "hover" / "scenario.toml")["duration"] == 0.1
