@@ -9,7 +9,6 @@ import threading
 import webbrowser
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from quadsim.features.live.session import Session, read_script
 from quadsim.interrupts import SignalHold
 from quadsim.mpc.laws import law_name
 from quadsim.outputs import run_directory
-from quadsim.rollout.flown import Flight
+from quadsim.rollout.flown import Flight, write_run
 from quadsim.scenarios.catalogue import scenario_names
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.schema.controllers import AnyController
@@ -56,11 +55,13 @@ def fly_live(
         SignalHold() as hold,
     ):
         replaced, refused, one = overwrite, list[str](), threading.Lock()
+        saved: Flight | None = None
 
         def save(flight: Flight) -> str:
-            nonlocal replaced
-            with one, reporting(True) as report:  # one at a time
-                flight.save(directory, overwrite=replaced, video=video, progress=report)
+            nonlocal replaced, saved
+            products = {"video": video, "recording": None, "figures": None}
+            with one:  # one at a time
+                saved = write_run(flight, directory, products, overwrite=replaced, progress=True, flown=None)
                 replaced = True  # the next time it is this session's own
             return console.short_path(directory)
 
@@ -78,14 +79,11 @@ def fly_live(
             print(file=sys.stderr)
         finally:  # what was flown is saved, whatever ended it
             hold.flown = True
-            flight = None
             if session.k:
-                flight = session.flight()
-                save(flight)
+                save(session.flight())
         text, seconds = "", session.k * session.period
-        if flight is not None:
-            flight = replace(flight, directory=directory)
-            text = "".join(f"{line}\n" for line in (next(iter(flight.shown())), *flight.outputs()))
+        if saved is not None:
+            text = "".join(f"{line}\n" for line in (next(iter(saved.shown())), *saved.outputs()))
         status = EXIT_DONE if session.reason is None and not refused else EXIT_FAILED
         facts = {"directory": str(directory), "duration": seconds, "reason": session.reason, "refused": refused}
         return Document(text, facts, status)
