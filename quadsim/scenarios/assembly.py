@@ -25,7 +25,6 @@ from quadsim.mpc.bounded import Bounded, Weighted
 from quadsim.mpc.builders import build, stated
 from quadsim.mpc.flatness import motion_along
 from quadsim.mpc.pilot import Pilot
-from quadsim.mpc.solvers import ALIASES
 from quadsim.rotation import body_to_euler_rates
 from quadsim.scenarios.courses.course import Course, repeated
 from quadsim.scenarios.courses.csv_course import Csv
@@ -38,7 +37,7 @@ from quadsim.scenarios.schema.problems import parse_table
 from quadsim.scenarios.schema.writing import plain
 from quadsim.sim.airframe import outline
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings, built_in_lags, identify_lags
-from quadsim.sim.computation import Computation, ComputationTime, Stall, check_measured
+from quadsim.sim.computation import Computation, ComputationTime, Stall, check_measured, times_by_solver
 from quadsim.sim.effects import Change, Effects, Force, Push, push_changes
 from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss, efficiency_changes
 from quadsim.sim.effects.wind import Air, Gust, WindChange, WindField
@@ -496,7 +495,7 @@ class Assembly:
         fallback = (self.scenario.controller if spec is None else spec).fallback
         guarded = fallback is not None and fallback.enabled  # within the fallback contract
         stated = filled(settings or ComputationTime(), plan=guarded)
-        per_iteration = {ALIASES.get(name, name): seconds for name, seconds in stated.per_iteration.items()}
+        per_iteration = times_by_solver(stated.per_iteration)
         return Computation(**vars(replace(stated, per_iteration=per_iteration)), stalls=stalls)
 
     # --- plant -------------------------------------------------------------------------------------------------------

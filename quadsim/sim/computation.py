@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, doc
 
-from quadsim.controller import Command, Iterating
-from quadsim.errors import ParameterError
+from quadsim.controller import LAW, Command, Iterating
+from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import Instant, Seconds
 from quadsim.mpc.pilot import Pilot
-from quadsim.mpc.solvers import ALIASES
+from quadsim.mpc.solvers import ALIASES, find_solver, solver_entries
+
+_COUNT_THEMSELVES: Final = ("nonlinear", LAW)
+"""Laws that count iterations without a solver of `quadsim list`: the nonlinear one, and a controller of one's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +112,30 @@ class Computation(ComputationTime):
         return self.per_iteration[solver]
 
 
+def times_by_solver(per_iteration: Mapping[str, float]) -> dict[str, float]:
+    """Return times per iteration [s] by the solvers' own names, for which aliases may stand.
+
+    Raises:
+        ParameterError: a name is no solver, or two names are of one solver.
+    """
+    times: dict[str, float] = {}
+    for name, seconds in per_iteration.items():
+        if name not in _COUNT_THEMSELVES:
+            try:
+                find_solver(name)
+            except UnknownNameError as error:
+                known = ", ".join(sorted({*_COUNT_THEMSELVES, *ALIASES, *solver_entries()}))
+                raise ParameterError(
+                    "computation.per_iteration", name, seconds, f"absent, or one of {known}"
+                ) from error
+        own_name = ALIASES.get(name, name)
+        if own_name in times:
+            rule = f"given once: {own_name} is another name of the same solver"
+            raise ParameterError("computation.per_iteration", name, seconds, rule)
+        times[own_name] = seconds
+    return times
+
+
 def not_measured(missing: Collection[str], measured: Collection[str]) -> ParameterError:
     """Return the error of a law whose iterations are not those that were measured."""
     rule = f"given for every solver that may answer for this controller, so also for {', '.join(sorted(missing))}"
@@ -124,7 +151,7 @@ def check_measured(settings: ComputationTime | None, controller: object) -> None
     if settings is None or not settings.per_iteration:
         return
     law = controller.law if isinstance(controller, Pilot) else controller
-    named = frozenset(ALIASES.get(name, name) for name in settings.per_iteration)
+    named = times_by_solver(settings.per_iteration).keys()
     iterates = law.iterates if isinstance(law, Iterating) else frozenset()
     if not iterates:
         rule = "absent with a controller that counts no iterations"

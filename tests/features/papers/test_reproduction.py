@@ -124,7 +124,7 @@ def test_a_flight_that_ends_early_reproduces_nothing(tmp_path: Path) -> None:
     path.write_text(
         path.read_text().replace(
             "duration = 0.5",
-            "duration = 0.5, lost = { depth = 1e-9 }, initial = "
+            "duration = 0.5, lost = { depth = 1e-6 }, initial = "
             "{ position = [0.0, 0.0, 1.0], euler = [20.0, 0.0, 0.0] }",
         )
     )

@@ -192,6 +192,12 @@ def test_computation_takes_its_times_and_stalls() -> None:
         ("paper-unconstrained", ["computation.per_iteration.piqp=1e-3"], "no iterations"),
         ("nonlinear", ["computation.per_iteration.core=1e-5"], "also for nonlinear"),
         ("nonlinear", ["computation.per_iteration.nonlinear=1e-5"], None),
+        ("robust", ["computation.per_iteration={core=1e-5, piqp=1e-3, piqqp=1e-3}"], "piqqp must be absent, or one of"),
+        (
+            "robust",
+            ["computation.per_iteration={core=1e-5, piqp=1e-3, piqp-multistage=2e-3}"],
+            "given once: piqp-multistage is another name",
+        ),
     ],
 )
 def test_times_of_iterations_are_those_of_the_solver_that_answers(
@@ -201,7 +207,7 @@ def test_times_of_iterations_are_those_of_the_solver_that_answers(
     if message is None:
         assembly.controller()
         return
-    with pytest.raises(ParameterError, match=r"computation\.per_iteration"):
+    with pytest.raises(ParameterError, match=message):
         assembly.controller()
 
 
