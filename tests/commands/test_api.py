@@ -355,8 +355,8 @@ def test_a_comparison_says_first_in_which_fields_the_controllers_differ(tmp_path
     free, bounded = (quadsim.load(name, brief) for name in ("paper-unconstrained", "paper-constrained"))
     sentence = (
         "The controllers of paper-unconstrained and paper-constrained: "
-        "differ in type (unconstrained, constrained), horizon (100, 50), desired_rates (zero, reference), "
-        "output_weights, input_weights; "
+        "differ in type (unconstrained, constrained), horizon (100, 50), output_weights, "
+        "desired_rates (zero, reference), input_weights; "
         "only that of paper-constrained has "
     )
     flights = (quadsim.fly(free, progress=False), quadsim.fly(bounded, progress=False))
