@@ -143,10 +143,13 @@ def compile_library(root: Path = ROOT) -> Path:
     units = [str(file) for file in sources(root) if file.suffix == ".c"]
     command = [*compiler(), *FLAGS, *include(root), f'-DQUADSIM_SOURCES="{stamp(root)}"', *units]
     try:
-        with tempfile.TemporaryDirectory(dir=library.parent, prefix=f"{library.name}.") as scratch:
+        with (
+            tempfile.TemporaryDirectory() as generated,  # not in the package, whose C files others may be hashing
+            tempfile.TemporaryDirectory(dir=library.parent, prefix=f"{library.name}.") as scratch,
+        ):
             partial = Path(scratch) / library.name
-            command += [str(write_layout(root, Path(scratch))), "-lm", "-o", str(partial)]
-            environment = {"ZIG_GLOBAL_CACHE_DIR": scratch, **os.environ}  # which is 70 MB
+            command += [str(write_layout(root, Path(generated))), "-lm", "-o", str(partial)]
+            environment = {"ZIG_GLOBAL_CACHE_DIR": generated, **os.environ}  # which is 70 MB
             done = subprocess.run(command, env=environment, capture_output=True, text=True)
             if done.returncode:
                 raise CompilationError(f"{shlex.join(command[:1])} fails:\n{done.stderr}")

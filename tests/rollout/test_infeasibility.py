@@ -505,7 +505,8 @@ def test_nobody_but_the_summary_of_one_flight_pays_for_advice(monkeypatch: pytes
     sweep = quadsim.sweep(tilted, {"vehicle.mass": [4.0, 4.1]}, progress=False)
     assert len(sweep.table) == 2
     assert not asked
-    assert not flight.write_tables(tmp_path / "run")
+    _, products_may_follow = flight.write_tables(tmp_path / "run")
+    assert not products_may_follow
     assert asked == [1]
     read = quadsim.read(tmp_path / "run")
     assert read.diagnosis is not None
