@@ -26,9 +26,12 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+import qpsolvers
 from flown_logs import fly_eight, write_log
+from rich.console import Console
 from support import draw_nothing, fly_here
 
+from quadsim.commands.app import app
 from quadsim.commands.cli import main
 
 STORED: Final = Path(__file__).resolve().parent / "snapshots"
@@ -287,7 +290,9 @@ def play(session: Session, folder: Path) -> dict[str, str]:
         (folder / name).write_text(text, encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        patch.setattr(app, "console", Console(width=int(COLUMNS)))  # that of help, which is made once a process
         patch.setenv("COLUMNS", COLUMNS)
+        patch.setattr(qpsolvers, "available_solvers", ["clarabel"])  # those of set-up, whatever peers added
         patch.delenv("DISPLAY", raising=False)
         patch.delenv("WAYLAND_DISPLAY", raising=False)
         fly_here(patch)
