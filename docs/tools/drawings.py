@@ -98,7 +98,7 @@ def floors() -> str:
         y = 10 + i * (height + 6)
         parts.append(box(left, y, width, height, FORWARD if i == 0 else INK))
         parts.append(text(left + 12, y + 22, folders.replace("`", ""), "start", FORWARD))
-        parts.append(text(left + 180, y + 22, has.strip(" |"), "start"))
+        parts.append(text(left + 150, y + 22, has.strip(" |"), "start"))
     bottom = 10 + len(rows) * (height + 6)
     parts.append(arrow(14, 14, 14, bottom - 8))
     parts.append(f'<g transform="rotate(-90 8 {bottom / 2:.1f})">{text(8, bottom / 2 + 1, "imports")}</g>')
