@@ -49,6 +49,7 @@ PARTS: Final = {
 EVERY: Final = tuple(PARTS)
 USING: Final = {
     "mpc/core/test_law.py": ("export",),
+    "mpc/laws/test_one_list_of_laws.py": ("design",),
     "test_palette.py": ("live",),
     "test_plausibility.py": ("design",),
     "features/gym/test_environment.py": ("campaign",),
