@@ -20,8 +20,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from quadsim.mpc.nonlinear.rigidbody import N_BODY, RigidBody
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem.ocp import Problem
+from quadsim.mpc.problem.rigidbody import N_BODY, RigidBody
 from quadsim.state import Array
 
 FOLDER: Final = Path(sys.prefix) / "acados"

@@ -28,7 +28,7 @@ ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}  # statuses whose command is applied
 MISSED: Final = "missed"
 """Status: the command arrived after the start of the next period, so the one before stayed in force."""
 GAIN: Final = "gain"  # source of a command: the unconstrained optimum, a product with constant gains
-CORE: Final = "core"  # the exact optimum of `quadsim.mpc.core`, compiled
+CORE: Final = "core"  # the exact optimum of `quadsim.mpc.solvers.core`, compiled
 LAW: Final = "law"  # a law without a solver
 FALLBACK: Final = "fallback"  # an earlier plan or command, or the fallback contract
 STOPPED: Final = "stopped"  # no source: the rotors are off

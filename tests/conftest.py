@@ -43,10 +43,15 @@ LONG = (
     *("scenarios/test_library.py", "rollout/test_many.py", "features/campaign/test_campaign.py"),
     *("features/design/test_first_flights.py", "commands/test_api.py", "rollout/test_infeasibility.py"),
     *("report/film/test_video.py", "test_documents.py", "commands/test_process.py", "test_refusals.py"),
-    *("rollout/test_nothing_lost.py", "mpc/robust/test_robust.py", "features/papers/test_reproduction.py"),
-    *("rollout/test_any_scenario.py", "mpc/test_partial_condensing.py"),
+    *("rollout/test_nothing_lost.py", "mpc/laws/test_robust.py", "features/papers/test_reproduction.py"),
+    *("rollout/test_any_scenario.py", "mpc/forms/test_partial_condensing.py"),
     *("rollout/test_run.py", "commands/test_cli.py", "rollout/test_reaudit.py", "test_packaging.py"),
-    *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/core/test_core.py", "mpc/nonlinear/test_rates.py"),
+    *(
+        "rollout/test_conflicts.py",
+        "mpc/problem/test_tightening.py",
+        "mpc/solvers/test_core.py",
+        "mpc/laws/test_rates.py",
+    ),
     *("test_spine.py", "test_rooms.py", "sim/test_autopilot.py", "sim/estimation/test_estimator.py"),
     *(
         "rollout/test_piloted.py",

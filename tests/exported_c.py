@@ -14,7 +14,7 @@ import numpy as np
 from quadsim.controller import Phase
 from quadsim.features.export.exporter import c_controller
 from quadsim.features.export.record import Recording
-from quadsim.mpc.codegen.ctext import Precision
+from quadsim.mpc.export.ctext import Precision
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
 

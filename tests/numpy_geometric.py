@@ -9,9 +9,6 @@ import numpy as np
 
 from quadsim.controller import ROTORS
 from quadsim.motion import Motion
-from quadsim.mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured
-from quadsim.mpc.baselines.bandwidths import YAW_SHARE
-from quadsim.mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, Target, differentiator
 from quadsim.mpc.laws.geometric import (
     NO_LAG,
     UNDISTURBED,
@@ -21,7 +18,10 @@ from quadsim.mpc.laws.geometric import (
     Integrals,
     geometric_gains,
 )
-from quadsim.mpc.nonlinear.rigidbody import rotation
+from quadsim.mpc.laws.parts.attitude import LEAST_THRUST_SHARE, Measured
+from quadsim.mpc.laws.parts.bandwidths import YAW_SHARE
+from quadsim.mpc.laws.parts.preview import MOTION_DEGREE, MOTION_SAMPLES, Target, differentiator
+from quadsim.mpc.problem.rigidbody import rotation
 from quadsim.rotation import multiply
 from quadsim.state import Array, wrapped
 from quadsim.vehicle import Vehicle

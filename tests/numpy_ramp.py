@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from quadsim.mpc.disturbance import (
+from quadsim.mpc.estimate.disturbance import (
     FITTED_FROM,
     FORCE_SHARE,
     LARGEST_CHANGE,
@@ -19,7 +19,7 @@ from quadsim.vehicle import Vehicle
 
 
 class NumpyRamp:
-    """Filters of force and torque with default bandwidths; see `quadsim.mpc.disturbance`."""
+    """Filters of force and torque with default bandwidths; see `quadsim.mpc.estimate.disturbance`."""
 
     def __init__(
         self,

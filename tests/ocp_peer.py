@@ -1,8 +1,8 @@
 """The optimum of an optimal control problem from its definition alone: rolled out, probed, and solved as a dense QP.
 
-Nothing of `quadsim.mpc.qp`, `quadsim.mpc.partial_condensing` or `quadsim.mpc.paper` that builds matrices is used:
-states by recursion, and every matrix by what unit inputs do.  A plan may have axes in front of its own two: many plans
-are then rolled out at once.
+Nothing of `quadsim.mpc.problem.qp`, `quadsim.mpc.forms.partial_condensing` or `quadsim.mpc.problem.paper` that builds
+matrices is used: states by recursion, and every matrix by what unit inputs do.  A plan may have axes in front of its
+own two: many plans are then rolled out at once.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import scipy.linalg
 from polish import polish
 from scipy.optimize import linprog
 
-from quadsim.mpc.constraints import Constraint
-from quadsim.mpc.ocp import Equilibrium, Problem, Query
-from quadsim.mpc.qp import QP, Solution, kkt_residuals
+from quadsim.mpc.problem.constraints import Constraint
+from quadsim.mpc.problem.ocp import Equilibrium, Problem, Query
+from quadsim.mpc.problem.qp import QP, Solution, kkt_residuals
 from quadsim.mpc.solvers.daqp import DaqpDense
 from quadsim.state import Array
 

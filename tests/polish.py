@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 from scipy import sparse
 
-from quadsim.mpc.qp import QP, Matrix, Solution
+from quadsim.mpc.problem.qp import QP, Matrix, Solution
 from quadsim.state import Array
 
 FEASIBLE: Final = 1e-9
@@ -43,7 +43,7 @@ def polish(qp: QP, solution: Solution) -> Solution:
 
     Returns:
         The solution with x and all multipliers replaced.  Of a poor start it may not be the optimum:
-        `quadsim.mpc.qp.kkt_residuals` shows.
+        `quadsim.mpc.problem.qp.kkt_residuals` shows.
     """
     n, rows = qp.c.size, qp.h_l.size
     P = _dense(qp.P)

@@ -33,7 +33,7 @@ PARTS: Final = {
     "campaign": ("scenarios/campaigns", "docs/campaigns.md"),
     "design": (),
     "export": (
-        "quadsim/mpc/codegen",
+        "quadsim/mpc/export",
         "tests/features/export",
         "tests/firmware",
         "tests/exported_c.py",
@@ -48,7 +48,7 @@ PARTS: Final = {
 
 EVERY: Final = tuple(PARTS)
 USING: Final = {
-    "mpc/core/test_law.py": ("export",),
+    "mpc/laws/test_law_in_c.py": ("export",),
     "mpc/laws/test_one_list_of_laws.py": ("design",),
     "test_palette.py": ("live",),
     "test_plausibility.py": ("design",),

@@ -11,14 +11,14 @@ import numpy as np
 from support import paper_problem
 
 from quadsim.controller import SOLVED, Command, Statistics, StepInputs
-from quadsim.mpc.answer import ActuatorBounds
-from quadsim.mpc.equilibrium import Trim
-from quadsim.mpc.fallback.contract import Guard
-from quadsim.mpc.heading import advance as advance_from
-from quadsim.mpc.heading import turn
-from quadsim.mpc.model import LinearModel
-from quadsim.mpc.ocp import Problem
-from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.guard.answer import ActuatorBounds
+from quadsim.mpc.guard.contract import Guard
+from quadsim.mpc.pilot.pilot import Pilot
+from quadsim.mpc.problem.equilibrium import Trim
+from quadsim.mpc.problem.heading import advance as advance_from
+from quadsim.mpc.problem.heading import turn
+from quadsim.mpc.problem.model import LinearModel
+from quadsim.mpc.problem.ocp import Problem
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
 from quadsim.state import INDEX, Array

@@ -22,18 +22,18 @@ from quadsim.controller import Controller
 from quadsim.errors import described
 from quadsim.flight.audit import Limit, audit
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
-from quadsim.mpc.constraints import Bounds, Constraint, Penalty
 from quadsim.mpc.laws.constrained import Constrained
-from quadsim.mpc.linear import LinearMPC, NominalPreparation
-from quadsim.mpc.model import LinearModel
-from quadsim.mpc.nonlinear.body import Body
-from quadsim.mpc.nonlinear.model import NonlinearModel, next_state
-from quadsim.mpc.nonlinear.rigidbody import RigidBody
-from quadsim.mpc.ocp import Equilibrium, Objective, Problem, Query
-from quadsim.mpc.robust.controller import RobustPreparation
-from quadsim.mpc.robust.settings import Robust
+from quadsim.mpc.laws.parts.body import Body
+from quadsim.mpc.laws.parts.linear import LinearMPC, NominalPreparation
+from quadsim.mpc.laws.parts.preparation import RobustPreparation
+from quadsim.mpc.problem.constraints import Bounds, Constraint, Penalty
+from quadsim.mpc.problem.model import LinearModel
+from quadsim.mpc.problem.nonlinear_model import NonlinearModel, next_state
+from quadsim.mpc.problem.ocp import Equilibrium, Objective, Problem, Query
+from quadsim.mpc.problem.rigidbody import RigidBody
 from quadsim.mpc.solvers import Solver
 from quadsim.mpc.solvers.by_name import make_solver
+from quadsim.mpc.tables.robust import Robust
 from quadsim.rollout import many
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.many import Row
@@ -246,7 +246,7 @@ def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
 
 
 def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
-    """See `quadsim.mpc.nonlinear.body.Body.linearise`."""
+    """See `quadsim.mpc.laws.parts.body.Body.linearise`."""
     return Body(model).linearise(x, u, frames)
 
 

@@ -178,8 +178,8 @@ def test_every_floor_imports_those_below_alone(imports: list[Import]) -> None:
 
 def test_an_import_of_a_higher_floor_is_seen_even_if_it_is_late_or_for_types_alone() -> None:
     source = "if TYPE_CHECKING:\n    from quadsim.sim.plant import Plant\ndef f():\n    from quadsim.mpc import ocp"
-    found = [*imports_of("quadsim.mpc.qp", source, {*modules()})]
-    assert upwards(found) == ["quadsim.mpc.qp imports quadsim.sim.plant"]
+    found = [*imports_of("quadsim.mpc.problem.qp", source, {*modules()})]
+    assert upwards(found) == ["quadsim.mpc.problem.qp imports quadsim.sim.plant"]
     assert upwards([*imports_of("quadsim.state", "import quadsim", {*modules()})]) == ["quadsim.state imports quadsim"]
 
 
@@ -259,14 +259,14 @@ def circles(imports: list[Import]) -> list[list[str]]:
 
 def test_a_circle_is_seen_even_if_it_closes_late_or_for_types_alone() -> None:
     sources = {
-        "quadsim.mpc.qp": "if TYPE_CHECKING:\n    from quadsim.mpc.paper import Prediction",
-        "quadsim.mpc.paper": "def cost():\n    from quadsim.mpc import ocp",
-        "quadsim.mpc.ocp": "import quadsim.mpc.qp\nimport quadsim.mpc.model",
-        "quadsim.mpc.model": "import quadsim.mpc.model",
+        "quadsim.mpc.problem.qp": "if TYPE_CHECKING:\n    from quadsim.mpc.problem.paper import Prediction",
+        "quadsim.mpc.problem.paper": "def cost():\n    from quadsim.mpc.problem import ocp",
+        "quadsim.mpc.problem.ocp": "import quadsim.mpc.problem.qp\nimport quadsim.mpc.problem.model",
+        "quadsim.mpc.problem.model": "import quadsim.mpc.problem.model",
     }
     ours = {*modules()}
     found = [item for name, source in sources.items() for item in imports_of(name, source, ours)]
-    assert circles(found) == [["quadsim.mpc.ocp", "quadsim.mpc.paper", "quadsim.mpc.qp"]]
+    assert circles(found) == [["quadsim.mpc.problem.ocp", "quadsim.mpc.problem.paper", "quadsim.mpc.problem.qp"]]
 
 
 def test_no_modules_import_in_a_circle(imports: list[Import]) -> None:
@@ -378,7 +378,7 @@ def unwritten(source: str) -> Iterator[str]:
     """Attributes asked for by a literal name of what may lack them: an optional part of a protocol written nowhere.
 
     It counts `getattr` and `hasattr` on `OF_CONTROLLERS`.  Optional parts are protocols of `quadsim.controller` and its
-    like in `mpc`, asked for by `isinstance`, and class attributes of `quadsim.mpc.bounded.ControllerTable`.
+    like in `mpc`, asked for by `isinstance`, and class attributes of `quadsim.mpc.tables.bounded.ControllerTable`.
     """
     for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "hasattr"):

@@ -32,8 +32,8 @@ DATA = (
     "*.j2",
     "*.css",
     "*.js",
-    "codegen/c/*",
-    "core/c/*",
+    "mpc/c/*",
+    "export/c/*",
     "core/*.[ch]",
 )
 

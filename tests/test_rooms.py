@@ -57,7 +57,7 @@ COMMANDS = {word: feature for feature, entry in FEATURES.items() for word in ent
 NAMED = {
     **{f"quadsim.features.{feature}": feature for feature in FEATURES},
     **{f"quadsim.{name}": feature for name, module in quadsim._PUBLIC.items() if (feature := feature_of(module))},
-    **{"quadsim.mpc.codegen": "export", "quadsim.gym": "gym"},
+    **{"quadsim.mpc.export": "export", "quadsim.gym": "gym"},
 }
 """Features by the dotted names that lead into them."""
 

@@ -17,8 +17,8 @@ from quadsim.assets import vehicle_path
 from quadsim.commands.cli import main
 from quadsim.console.results import EXIT_WRONG_INPUT
 from quadsim.errors import FileError, ParameterError
-from quadsim.mpc.allocation import allocate, make_allocation
-from quadsim.mpc.model import continuous_model
+from quadsim.mpc.pilot.allocation import allocate, make_allocation
+from quadsim.mpc.problem.model import continuous_model
 from quadsim.plausibility import implausible
 from quadsim.scenarios.assembly import Assembly
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from quadsim.console.results import Listing, Result
     from quadsim.controller import AutopilotLoop
     from quadsim.flight.feasibility import Feasibility
-    from quadsim.mpc.ocp import Problem
-    from quadsim.mpc.pilot import Pilot
+    from quadsim.mpc.pilot.pilot import Pilot
+    from quadsim.mpc.problem.ocp import Problem
     from quadsim.rollout.flight_plot import Overlay
     from quadsim.rollout.flown import Flight
     from quadsim.rollout.rollout import Rollout

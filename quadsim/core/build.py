@@ -21,7 +21,7 @@ from typing import Final
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 """The folder of the package: a checkout, or `site-packages`."""
-FOLDERS: Final = ("quadsim/core", "quadsim/mpc/core/c")
+FOLDERS: Final = ("quadsim/core", "quadsim/mpc/c")
 """Every C file in them is compiled into the library."""
 LIBRARY: Final = "quadsim/core/_core.so"  # the suffix is free for ctypes; macOS takes .so as well
 _HEADERS: Final = Path(__file__).with_name("headers.py")

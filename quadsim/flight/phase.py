@@ -96,7 +96,7 @@ RISING: Final = 0.05  # vertical speed [m/s] above which a vehicle on the ground
 LEAD_RATE: Final = 1.0  # [m/s] growth of the lead
 LARGEST_LEAD: Final = 10.0  # [m]
 FADING: Final = 0.5  # largest climb after lift-off over which the lead fades [m]
-FADING_TIME: Final = 1.0  # shortest time constant of the fading [s]: that of `quadsim.mpc.observer`'s force by default
+FADING_TIME: Final = 1.0  # shortest time constant of the fading [s]: that of the observer's force by default
 NO_LEAD: Final = 1e-3  # [m]; a smaller lead in the air counts as none
 
 CRITERIA: Final = {

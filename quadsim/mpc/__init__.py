@@ -15,56 +15,60 @@ if __name__ == "mpc":  # through the link at the root of a checkout
 from quadsim import shorthands
 
 if TYPE_CHECKING:
-    from quadsim.mpc.condensing import Condensed as Condensed
-    from quadsim.mpc.constraints import Bounds as Bounds
-    from quadsim.mpc.constraints import Constraint as Constraint
-    from quadsim.mpc.constraints import Penalty as Penalty
+    from quadsim.mpc.forms.condensing import Condensed as Condensed
     from quadsim.mpc.laws.geometric import GeometricController as GeometricController
     from quadsim.mpc.laws.lqr import LQR as LQR
+    from quadsim.mpc.laws.parts.linear import LinearMPC as LinearMPC
+    from quadsim.mpc.laws.parts.linear import NominalPreparation as NominalPreparation
+    from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC as NonlinearMPC
+    from quadsim.mpc.laws.parts.preparation import RobustPreparation as RobustPreparation
     from quadsim.mpc.laws.pid import CascadedPID as CascadedPID
     from quadsim.mpc.laws.unconstrained import UnconstrainedMPC as UnconstrainedMPC
-    from quadsim.mpc.linear import LinearMPC as LinearMPC
-    from quadsim.mpc.linear import NominalPreparation as NominalPreparation
-    from quadsim.mpc.model import LinearModel as LinearModel
-    from quadsim.mpc.model import hover_model as hover_model
-    from quadsim.mpc.nonlinear.controller import NonlinearMPC as NonlinearMPC
-    from quadsim.mpc.nonlinear.settings import Nonlinear as Nonlinear
-    from quadsim.mpc.ocp import CondensedQP as CondensedQP
-    from quadsim.mpc.ocp import InfeasiblePeriod as InfeasiblePeriod
-    from quadsim.mpc.ocp import Objective as Objective
-    from quadsim.mpc.ocp import Problem as Problem
-    from quadsim.mpc.ocp import Query as Query
-    from quadsim.mpc.pilot import Pilot as Pilot
-    from quadsim.mpc.robust.controller import RobustPreparation as RobustPreparation
-    from quadsim.mpc.robust.settings import Robust as Robust
+    from quadsim.mpc.pilot.pilot import Pilot as Pilot
+    from quadsim.mpc.problem.constraints import Bounds as Bounds
+    from quadsim.mpc.problem.constraints import Constraint as Constraint
+    from quadsim.mpc.problem.constraints import Penalty as Penalty
+    from quadsim.mpc.problem.model import LinearModel as LinearModel
+    from quadsim.mpc.problem.model import hover_model as hover_model
+    from quadsim.mpc.problem.ocp import CondensedQP as CondensedQP
+    from quadsim.mpc.problem.ocp import InfeasiblePeriod as InfeasiblePeriod
+    from quadsim.mpc.problem.ocp import Objective as Objective
+    from quadsim.mpc.problem.ocp import Problem as Problem
+    from quadsim.mpc.problem.ocp import Query as Query
     from quadsim.mpc.solvers import QPSolver as QPSolver
+    from quadsim.mpc.tables.nonlinear import Nonlinear as Nonlinear
+    from quadsim.mpc.tables.robust import Robust as Robust
 
 _MODULES = {
     "quadsim.mpc.laws.geometric": ("GeometricController",),
     "quadsim.mpc.laws.lqr": ("LQR",),
     "quadsim.mpc.laws.pid": ("CascadedPID",),
-    "quadsim.mpc.condensing": ("Condensed",),
-    "quadsim.mpc.constraints": ("Bounds", "Constraint", "Penalty"),
-    "quadsim.mpc.linear": ("LinearMPC", "NominalPreparation"),
-    "quadsim.mpc.model": ("LinearModel", "hover_model"),
-    "quadsim.mpc.nonlinear.controller": ("NonlinearMPC",),
-    "quadsim.mpc.nonlinear.settings": ("Nonlinear",),
-    "quadsim.mpc.ocp": ("CondensedQP", "Objective", "Problem", "Query", "InfeasiblePeriod"),
-    "quadsim.mpc.pilot": ("Pilot",),
-    "quadsim.mpc.robust.controller": ("RobustPreparation",),
-    "quadsim.mpc.robust.settings": ("Robust",),
+    "quadsim.mpc.forms.condensing": ("Condensed",),
+    "quadsim.mpc.problem.constraints": ("Bounds", "Constraint", "Penalty"),
+    "quadsim.mpc.laws.parts.linear": ("LinearMPC", "NominalPreparation"),
+    "quadsim.mpc.problem.model": ("LinearModel", "hover_model"),
+    "quadsim.mpc.laws.parts.nonlinear_mpc": ("NonlinearMPC",),
+    "quadsim.mpc.tables.nonlinear": ("Nonlinear",),
+    "quadsim.mpc.problem.ocp": ("CondensedQP", "Objective", "Problem", "Query", "InfeasiblePeriod"),
+    "quadsim.mpc.pilot.pilot": ("Pilot",),
+    "quadsim.mpc.laws.parts.preparation": ("RobustPreparation",),
+    "quadsim.mpc.tables.robust": ("Robust",),
     "quadsim.mpc.solvers": ("QPSolver",),
     "quadsim.mpc.laws.unconstrained": ("UnconstrainedMPC",),
 }
 _PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
-_SUBPACKAGES = ("baselines", "core", "fallback", "laws", "nonlinear", "paper", "robust", "solvers")
+_SUBPACKAGES = {
+    name: f"quadsim.mpc.{name}"
+    for name in ("estimate", "export", "forms", "guard", "laws", "pilot", "problem", "solvers", "space", "tables")
+}
+_SUBPACKAGES["paper"] = "quadsim.mpc.problem.paper"
 __all__ = [*_PUBLIC, *_SUBPACKAGES]
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name or a subpackage on first use."""
     if name in _SUBPACKAGES:
-        return importlib.import_module(f"quadsim.mpc.{name}")
+        return importlib.import_module(_SUBPACKAGES[name])
     if name not in _PUBLIC:
         raise AttributeError(f"module 'quadsim.mpc' has no attribute {name!r}")
     return globals().setdefault(name, getattr(importlib.import_module(_PUBLIC[name]), name))

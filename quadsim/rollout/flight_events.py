@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 
 from quadsim.controller import Controller, Diagnosable
 from quadsim.errors import InputError, ParameterError, printable
-from quadsim.mpc.ocp import InfeasiblePeriod
+from quadsim.mpc.problem.ocp import InfeasiblePeriod
 from quadsim.scenarios.schema.controllers import AnyController, changed_controller
 from quadsim.scenarios.schema.events import (
     MOST_EVENTS,

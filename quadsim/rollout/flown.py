@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from quadsim.flight.audit import FlightVerdict  # only here: Jedi completes no object with a property of a Literal
-    from quadsim.mpc.ocp import InfeasiblePeriod
+    from quadsim.mpc.problem.ocp import InfeasiblePeriod
     from quadsim.report.figure import Figure
     from quadsim.rollout.flight_plot import Overlay
     from quadsim.scenarios.assembly import Assembly

@@ -38,7 +38,7 @@ _PRELOAD: Final = (
     "quadsim",
     "quadsim.features.campaign.plan",
     "quadsim.mpc.laws.constrained",
-    "quadsim.mpc.robust.controller",
+    "quadsim.mpc.laws.parts.preparation",
     "quadsim.mpc.laws.unconstrained",
 )
 """Preloaded by the server that workers are forked from; the first one finds the others by their place."""

@@ -21,10 +21,10 @@ from quadsim.errors import InputError, ParameterError, QuadsimError
 from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
 from quadsim.flight.phase import PhaseMonitor
-from quadsim.mpc.bounded import Bounded, Weighted
-from quadsim.mpc.builders import build, stated
-from quadsim.mpc.flatness import motion_along
-from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.laws.parts.builders import build, stated
+from quadsim.mpc.pilot.pilot import Pilot
+from quadsim.mpc.problem.flatness import motion_along
+from quadsim.mpc.tables.bounded import Bounded, Weighted
 from quadsim.rotation import body_to_euler_rates
 from quadsim.scenarios.courses.course import Course, repeated
 from quadsim.scenarios.courses.csv_course import Csv
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from quadsim.controller import AutopilotLoop, Controller
     from quadsim.flight.audit import Limit, SpaceLimit
     from quadsim.motion import Motion
-    from quadsim.mpc.ocp import Problem
+    from quadsim.mpc.problem.ocp import Problem
     from quadsim.scenarios.schema.controllers import AnyController
     from quadsim.scenarios.schema.scenario import Scenario, VehicleTable
 
@@ -403,7 +403,7 @@ class Assembly:
         return controller, tuple(changed.get(id(event), event) for event in self.scenario.events)
 
     def _stated_law(self, spec: AnyController) -> AnyController:
-        """See `quadsim.mpc.builders.stated`."""
+        """See `quadsim.mpc.laws.parts.builders.stated`."""
         shapes = (*self.scenario.obstacles, *self.regions)
         return stated(spec, self.vehicle, self.scenario.control_period, shapes)
 
@@ -454,7 +454,7 @@ class Assembly:
     def bounds(self) -> dict[str, tuple[float, float]]:
         """The controller's bounds on signals of the audit, in file units; of those on speeds, what the rotors can do.
 
-        See `quadsim.mpc.bounded.ControllerTable.audited`.  Audit, notes and feasibility all take these.
+        See `quadsim.mpc.tables.bounded.ControllerTable.audited`.  Audit, notes and feasibility all take these.
         """
         return flyable(self.scenario.controller.audited(self.vehicle), self.actual)
 

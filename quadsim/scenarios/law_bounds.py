@@ -11,8 +11,8 @@ import numpy as np
 
 from quadsim.errors import InputError
 from quadsim.flight.audit import SUM, TERM_SIGNALS, Limit
-from quadsim.mpc.constraints import Bounds, Constraint
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem.constraints import Bounds, Constraint
+from quadsim.mpc.problem.ocp import Problem
 from quadsim.scenarios.schema.problems import parse_table
 from quadsim.state import N_STATES, STATE_NAMES, STATE_UNITS, Array, shown_unit
 from quadsim.vehicle import N_ROTORS

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 from quadsim.controller import Controller
 from quadsim.flight.audit import SUM, UNAUDITED_ADVICE, Limit, SpaceLimit
-from quadsim.mpc.bounded import Range
-from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.pilot.pilot import Pilot
+from quadsim.mpc.tables.bounded import Range
 from quadsim.report.table import format_number
 from quadsim.scenarios.law_bounds import law_limits
 from quadsim.scenarios.plugin import PluginController

@@ -51,9 +51,9 @@ from quadsim.errors import (
     printable,
 )
 from quadsim.fields import is_plain
-from quadsim.mpc.bounded import ControllerTable, Horizon
 from quadsim.mpc.laws import law_of, laws
-from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.space import Shape
+from quadsim.mpc.tables.bounded import ControllerTable, Horizon
 from quadsim.outputs import digest_of
 from quadsim.sim.effects import Force
 from quadsim.state import Array, State

@@ -13,7 +13,7 @@ import numpy as np
 from quadsim.border import numbers_of, user_code
 from quadsim.controller import AutopilotLoop, Controller
 from quadsim.errors import InputError, ParameterError
-from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.courses.csv_course import LARGEST_NUMBER, tabulated
 from quadsim.scenarios.plugin import import_plugin, make_force, make_law, reason_of, refer_to, require_importable

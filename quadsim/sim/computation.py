@@ -13,7 +13,7 @@ from annotated_types import Ge, Le, doc
 from quadsim.controller import LAW, Command, Iterating
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import Instant, Seconds
-from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.mpc.solvers import ALIASES, find_solver, solver_entries
 
 _COUNT_THEMSELVES: Final = ("nonlinear", LAW)

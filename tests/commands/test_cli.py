@@ -25,8 +25,8 @@ from quadsim.core.build import LIBRARY
 from quadsim.errors import OutputError, RenderingUnavailableError
 from quadsim.features.campaign.plan import read_campaign
 from quadsim.flight import rundir
-from quadsim.mpc.core import solver
 from quadsim.mpc.solvers import SOLVERS, solver_entries
+from quadsim.mpc.solvers import core as solver
 from quadsim.rollout import flown
 from quadsim.scenarios.catalogue import campaign_names, scenario_names, variants
 from quadsim.scenarios.loading import load_scenario

@@ -17,7 +17,7 @@ from quadsim.core.library import load_from, load_library
 from quadsim.core.mirror import check_layout, make_structs
 from quadsim.errors import FileError
 
-ANSWER = "quadsim/mpc/core/c/answer.c"
+ANSWER = "quadsim/mpc/c/answer.c"
 
 
 @pytest.fixture

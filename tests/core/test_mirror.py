@@ -15,12 +15,12 @@ from quadsim.core.headers import Declarations, read_headers
 from quadsim.core.mirror import check_layout, constant, core_library, declare, make_structs, set_members, struct
 from quadsim.core.structs import End, Fate, LoopKind
 from quadsim.errors import FileError
-from quadsim.mpc.baselines.preview import MOTION_SAMPLES
-from quadsim.mpc.fallback.structs import STATUSES
-from quadsim.mpc.nonlinear.law import WIDTH_OF_MOTION
-from quadsim.mpc.nonlinear.model import SUBSTEPS
-from quadsim.mpc.nonlinear.rigidbody import N_BODY
-from quadsim.mpc.nonlinear.sqp import SQPStatus
+from quadsim.mpc.guard.structs import STATUSES
+from quadsim.mpc.laws.parts.nonlinear_law import WIDTH_OF_MOTION
+from quadsim.mpc.laws.parts.preview import MOTION_SAMPLES
+from quadsim.mpc.laws.parts.sqp import SQPStatus
+from quadsim.mpc.problem.nonlinear_model import SUBSTEPS
+from quadsim.mpc.problem.rigidbody import N_BODY
 from quadsim.mpc.solvers import Method
 from quadsim.vehicle import N_ROTORS
 

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from quadsim.features.export.exporter import export
-from quadsim.mpc.codegen.ctext import Precision
-from quadsim.mpc.codegen.targets import TARGETS
+from quadsim.mpc.export.ctext import Precision
+from quadsim.mpc.export.targets import TARGETS
 from quadsim.scenarios.loading import load_scenario
 
 Answer = tuple[str, ...]

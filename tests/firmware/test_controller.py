@@ -13,8 +13,8 @@ from exported_c import HOST, Host, Reply, replay
 
 from quadsim.features.export.exporter import c_controller
 from quadsim.features.export.record import REFUSED, Recording, record
-from quadsim.mpc.codegen.ctext import Precision
-from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.mpc.export.ctext import Precision
+from quadsim.mpc.guard.structs import STATUSES
 from quadsim.scenarios.loading import load_scenario
 from quadsim.state import Array
 

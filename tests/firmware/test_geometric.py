@@ -19,10 +19,10 @@ import quadsim
 from quadsim.errors import ExportError, ParameterError
 from quadsim.features.export.exporter import c_controller, export
 from quadsim.features.export.in_the_loop import fly_exported
-from quadsim.mpc.codegen.ctext import Precision
-from quadsim.mpc.codegen.geometric import CGeometric
-from quadsim.mpc.codegen.targets import TARGETS
-from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.mpc.export.ctext import Precision
+from quadsim.mpc.export.geometric import CGeometric
+from quadsim.mpc.export.targets import TARGETS
+from quadsim.mpc.guard.structs import STATUSES
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import make_state

@@ -15,16 +15,16 @@ import pytest
 from exported_c import PHASES, Host
 
 from quadsim.controller import Command, StepInputs
-from quadsim.mpc.answer import ActuatorBounds
-from quadsim.mpc.builders import guard_of
-from quadsim.mpc.codegen import source
-from quadsim.mpc.equilibrium import Trim
-from quadsim.mpc.fallback.structs import STATUSES
-from quadsim.mpc.heading import advance
-from quadsim.mpc.linear import LinearMPC
-from quadsim.mpc.model import LinearModel
-from quadsim.mpc.nonlinear.controller import NonlinearMPC
-from quadsim.mpc.nonlinear.settings import Nonlinear
+from quadsim.mpc.export import source
+from quadsim.mpc.guard.answer import ActuatorBounds
+from quadsim.mpc.guard.structs import STATUSES
+from quadsim.mpc.laws.parts.builders import guard_of
+from quadsim.mpc.laws.parts.linear import LinearMPC
+from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
+from quadsim.mpc.problem.equilibrium import Trim
+from quadsim.mpc.problem.heading import advance
+from quadsim.mpc.problem.model import LinearModel
+from quadsim.mpc.tables.nonlinear import Nonlinear
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.schema.scenario import Scenario

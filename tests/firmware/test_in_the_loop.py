@@ -12,7 +12,7 @@ import quadsim
 from quadsim.commands.cli import main
 from quadsim.errors import FlightError, MissingProgramError
 from quadsim.features.export.in_the_loop import Frames, Program, SerialMPC, fly_exported, require_programs
-from quadsim.mpc.codegen.targets import TARGETS
+from quadsim.mpc.export.targets import TARGETS
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.loading import load_scenario
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings

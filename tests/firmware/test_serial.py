@@ -17,7 +17,7 @@ from firmware.conftest import Answers, Export, Run
 from quadsim.assets import vehicle_path
 from quadsim.features.export.in_the_loop import Frames, QueryKind, Reply, SerialMPC, make_program
 from quadsim.features.export.record import Recording, record
-from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.mpc.guard.structs import STATUSES
 from quadsim.scenarios.loading import load_scenario
 from quadsim.state import Array
 from quadsim.vehicle import load_vehicle

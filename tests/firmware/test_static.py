@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from firmware.conftest import Export, Run, defines_of, sources_of
 
-from quadsim.mpc.codegen.targets import TARGETS
+from quadsim.mpc.export.targets import TARGETS
 
 WARNINGS = [
     *("-std=c99", "-O3", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Wcast-qual", "-Wvla"),

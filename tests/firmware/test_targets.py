@@ -11,7 +11,7 @@ import pytest
 from firmware.conftest import Answer, Answers, Export, Measured, Run, defines_of, sources_of
 
 from quadsim.features.export.in_the_loop import make_program
-from quadsim.mpc.codegen.targets import INSTRUCTIONS_PER_TICK, TARGETS
+from quadsim.mpc.export.targets import INSTRUCTIONS_PER_TICK, TARGETS
 
 HERE = Path(__file__).parent
 BOARDS = [name for name, target in TARGETS.items() if target.board]

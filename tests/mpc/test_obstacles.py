@@ -12,15 +12,15 @@ from support import paper_problem
 
 from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
-from quadsim.mpc.condensing import Condensed
-from quadsim.mpc.obstacles import AvoidanceSettings, ObstacleQP, Shape, Space
-from quadsim.mpc.ocp import Problem, Query, predicted
-from quadsim.mpc.paper import prediction
-from quadsim.mpc.qp import kkt_residuals
-from quadsim.mpc.robust.tightening import TighteningSettings, position_margins
+from quadsim.mpc.forms.condensing import Condensed
+from quadsim.mpc.problem.ocp import Problem, Query, predicted
+from quadsim.mpc.problem.paper import prediction
+from quadsim.mpc.problem.qp import kkt_residuals
+from quadsim.mpc.problem.tightening import TighteningSettings, position_margins
 from quadsim.mpc.solvers import Answer, QPSolver
 from quadsim.mpc.solvers.by_name import make_solver
 from quadsim.mpc.solvers.piqp import Piqp
+from quadsim.mpc.space import AvoidanceSettings, ObstacleQP, Shape, Space
 from quadsim.space import Capsule, Corridor, Cylinder, Fence, Sphere
 from quadsim.state import INDEX, POSITION, Array
 from quadsim.vehicle import Vehicle

@@ -12,9 +12,9 @@ from peers.qpoases import Qpoases
 from peers.recorded import Query
 
 from quadsim.controller import SOLVED
-from quadsim.mpc.condensing import Condensed
-from quadsim.mpc.ocp import Problem
-from quadsim.mpc.qp import KKTResiduals, kkt_residuals
+from quadsim.mpc.forms.condensing import Condensed
+from quadsim.mpc.problem.ocp import Problem
+from quadsim.mpc.problem.qp import KKTResiduals, kkt_residuals
 from quadsim.mpc.solvers import SOLVERS, find_solver, make_backend
 from quadsim.state import Array
 

@@ -14,7 +14,7 @@ from peers.constrained_qp import ConstrainedQP
 from peers.recorded import Query
 from threadpoolctl import threadpool_limits
 
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem.ocp import Problem
 
 MEASURED = Path(__file__).resolve().parents[2] / "runs" / "numbers" / "peers.json"
 """What docs/tools/remake.py fills the table of docs/evidence.md from."""

@@ -26,7 +26,7 @@ from peers.recorded import Query
 from qpmpc import MPCProblem, Plan, solve_mpc
 
 from quadsim.errors import ParameterError
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem.ocp import Problem
 from quadsim.mpc.solvers import QPSolver
 from quadsim.state import Array
 

@@ -17,7 +17,7 @@ import scipy.linalg
 from peers.checks import Check
 
 from quadsim.mpc.laws.unconstrained import sequence_gains
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem.ocp import Problem
 from quadsim.state import Array
 
 SCENARIO: Final = "paper-unconstrained"

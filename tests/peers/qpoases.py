@@ -13,7 +13,7 @@ import casadi
 import numpy as np
 
 from quadsim.controller import SOLVED, Statistics
-from quadsim.mpc.qp import QP, Solution
+from quadsim.mpc.problem.qp import QP, Solution
 
 SETTINGS: Final[dict[str, Any]] = {
     "printLevel": "none",
@@ -32,16 +32,16 @@ SETTINGS: Final[dict[str, Any]] = {
 
 
 class Qpoases:
-    """A back end for condensed QPs; see `quadsim.mpc.qp.Backend`."""
+    """A back end for condensed QPs; see `quadsim.mpc.problem.qp.Backend`."""
 
     def setup(self, qp: QP) -> None:
-        """See `quadsim.mpc.qp.Backend.setup`."""
+        """See `quadsim.mpc.problem.qp.Backend.setup`."""
         shapes = {"h": casadi.Sparsity.dense(*qp.P.shape), "a": casadi.Sparsity.dense(*qp.G.shape)}
         with contextlib.redirect_stdout(io.StringIO()):  # its copyright notice, whatever the print level
             self._solver = casadi.conic("qp", "qpoases", shapes, SETTINGS)
 
     def solve(self, qp: QP) -> Solution:
-        """See `quadsim.mpc.qp.Backend.solve`."""
+        """See `quadsim.mpc.problem.qp.Backend.solve`."""
         result = self._solver(h=qp.P, g=qp.c, a=qp.G, lba=qp.h_l, uba=qp.h_u, lbx=qp.x_l, ubx=qp.x_u)
         stats = self._solver.stats()
         x, z_box, z = (result[name].full().ravel() for name in ("x", "lam_x", "lam_a"))

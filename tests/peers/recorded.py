@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.mpc import ocp
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem import ocp
+from quadsim.mpc.problem.ocp import Problem
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario

@@ -11,7 +11,7 @@ from peers.checks import Check
 from peers.constrained_qp import ConstrainedQP
 from peers.recorded import Query
 
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem.ocp import Problem
 
 
 @pytest.mark.parametrize("name", agreement.PACKAGES)

@@ -9,7 +9,7 @@ from support import paper_problem, paper_reference
 from quadsim.commands.cli import main
 from quadsim.console.results import EXIT_DONE
 from quadsim.controller import SOLVED
-from quadsim.mpc.ocp import Query
+from quadsim.mpc.problem.ocp import Query
 from quadsim.mpc.solvers import SOLVERS, QPSolver, find_solver, make_backend
 from quadsim.mpc.solvers.qpsolvers import UNSOLVED
 

@@ -11,7 +11,7 @@ from peers.constrained_qp import OURS, ConstrainedQP, QpmpcController
 from peers.recorded import Query
 
 from quadsim.controller import UNCONSTRAINED
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem.ocp import Problem
 from quadsim.mpc.solvers import QPSolver
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from support import paper_problem
 
-from quadsim.mpc.answer import INFEASIBLE, AnswerCheck
-from quadsim.mpc.ocp import Query, predicted
-from quadsim.mpc.qp import KKT_EVERY
+from quadsim.mpc.guard.answer import INFEASIBLE, AnswerCheck
+from quadsim.mpc.problem.ocp import Query, predicted
+from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.solvers import QPSolver
 from quadsim.mpc.solvers.piqp import Piqp
 from quadsim.rollout.flown import summarise

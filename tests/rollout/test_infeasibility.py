@@ -21,9 +21,9 @@ import quadsim
 from quadsim import mpc
 from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import PlanExhaustedError
-from quadsim.mpc.builders import law_of
-from quadsim.mpc.nonlinear.controller import CONVERGED
-from quadsim.mpc.ocp import InfeasiblePeriod
+from quadsim.mpc.laws.parts.builders import law_of
+from quadsim.mpc.laws.parts.nonlinear_mpc import CONVERGED
+from quadsim.mpc.problem.ocp import InfeasiblePeriod
 from quadsim.rollout import infeasibility, remedies
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.infeasibility import diagnose

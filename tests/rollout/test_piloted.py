@@ -12,7 +12,7 @@ import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.controller import StepInputs
 from quadsim.errors import InputError
-from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.rollout.reaudit import reaudit
 from quadsim.rotation import conjugate, multiply
 from quadsim.scenarios.assembly import Assembly

@@ -10,8 +10,8 @@ import pytest
 
 from quadsim.controller import Command, StepInputs
 from quadsim.flight.parquet import read_log, write_log
-from quadsim.mpc.fallback.completion import completed_inputs
-from quadsim.mpc.nonlinear.rigidbody import thrust_axis
+from quadsim.mpc.guard.completion import completed_inputs
+from quadsim.mpc.problem.rigidbody import thrust_axis
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion, quaternion_to_euler

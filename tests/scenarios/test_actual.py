@@ -15,7 +15,7 @@ from support import NO_PRODUCTS
 
 import quadsim
 from quadsim.controller import StepInputs
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem.ocp import Problem
 from quadsim.report.comparison import comparison_rows
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.reaudit import reaudit

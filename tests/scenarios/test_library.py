@@ -18,7 +18,7 @@ from quadsim.controller import FALLBACK, LAW, MISSED, STOPPED
 from quadsim.features.campaign.rows import flown_row
 from quadsim.flight.audit import COMMAND_TOLERANCE, audit, worst_finding, worst_share
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
-from quadsim.mpc.answer import INFEASIBLE
+from quadsim.mpc.guard.answer import INFEASIBLE
 from quadsim.report.comparison import comparison_rows
 from quadsim.rollout.flown import Flight, summarise
 from quadsim.rollout.rollout import Rollout

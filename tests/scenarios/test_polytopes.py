@@ -10,7 +10,7 @@ import pytest
 
 from quadsim.flight.audit import SUM, audit
 from quadsim.flight.rundir import limit_from_json, limit_to_json
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem.ocp import Problem
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.state import INDEX

@@ -9,7 +9,7 @@ import pytest
 import quadsim
 from quadsim.controller import StepInputs
 from quadsim.errors import InputError, ParameterError
-from quadsim.mpc.ocp import CondensedQP
+from quadsim.mpc.problem.ocp import CondensedQP
 from quadsim.state import REFERENCE_NAMES, Array
 
 

@@ -26,8 +26,8 @@ from quadsim.features.design.rules import (
     delay_margin,
     design_for,
 )
-from quadsim.mpc.baselines.bandwidths import lag_to_allow_for
-from quadsim.mpc.model import SHORTEST_LAG
+from quadsim.mpc.laws.parts.bandwidths import lag_to_allow_for
+from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.vehicle import Vehicle, span
 
 if TYPE_CHECKING:

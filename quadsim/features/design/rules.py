@@ -33,7 +33,7 @@ import scipy.linalg
 
 from quadsim.errors import ParameterError
 from quadsim.features.design.authority import Authority, authority
-from quadsim.mpc.model import continuous_model, discretise
+from quadsim.mpc.problem.model import continuous_model, discretise
 from quadsim.state import INDEX, Array
 from quadsim.ties import TIE_SHARE, first_smallest
 from quadsim.vehicle import N_ROTORS, Vehicle

@@ -14,7 +14,7 @@ from quadsim.console.results import Result, Shown
 from quadsim.errors import ParameterError, QuadsimError
 from quadsim.features.design.authority import TorqueRange, authority, torque_ranges
 from quadsim.features.design.rules import delay_margin, design_for
-from quadsim.mpc.model import continuous_model, discretise
+from quadsim.mpc.problem.model import continuous_model, discretise
 from quadsim.plausibility import implausible
 from quadsim.report import vehicle_drawing
 from quadsim.report.figure import Figure

@@ -14,19 +14,19 @@ from quadsim.controller import ROTORS
 from quadsim.core.mirror import core_library
 from quadsim.errors import ExportError, ParameterError
 from quadsim.features.export.record import Recording, record
-from quadsim.mpc.bounded import Weighted
-from quadsim.mpc.codegen.ctext import CText, Precision
-from quadsim.mpc.codegen.geometric import CGeometric
-from quadsim.mpc.codegen.nonlinear import CNonlinear
-from quadsim.mpc.codegen.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
-from quadsim.mpc.codegen.targets import TARGETS, Machine
-from quadsim.mpc.core.numbers import AVOIDS, Exportable, exportable
-from quadsim.mpc.core.solver import CoreProblem, WorkStruct
+from quadsim.mpc.export.ctext import CText, Precision
+from quadsim.mpc.export.geometric import CGeometric
+from quadsim.mpc.export.nonlinear import CNonlinear
+from quadsim.mpc.export.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
+from quadsim.mpc.export.targets import TARGETS, Machine
 from quadsim.mpc.laws.geometric import Geometric
-from quadsim.mpc.nonlinear.rigidbody import N_BODY, P, V
-from quadsim.mpc.nonlinear.settings import Nonlinear
-from quadsim.mpc.nonlinear.sqp import SQPStatus
+from quadsim.mpc.laws.parts.numbers import AVOIDS, Exportable, exportable
+from quadsim.mpc.laws.parts.sqp import SQPStatus
+from quadsim.mpc.problem.rigidbody import N_BODY, P, V
 from quadsim.mpc.solvers import Method
+from quadsim.mpc.solvers.core import CoreProblem, WorkStruct
+from quadsim.mpc.tables.bounded import Weighted
+from quadsim.mpc.tables.nonlinear import Nonlinear
 from quadsim.outputs import absolute, reserving, writing
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario

@@ -1,7 +1,7 @@
 """Processor in the loop: a flight whose controller is an exported one, on its target or in the target's emulator.
 
 The programs of an export are built with its Makefile and run; questions and answers pass the serial line of
-`quadsim/mpc/codegen/c/serial.c`.
+`quadsim/mpc/export/c/serial.c`.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from quadsim.controller import (
 from quadsim.errors import FlightError, MissingProgramError, QuadsimError
 from quadsim.features.export.exporter import c_controller, programs
 from quadsim.flight.audit import COMMAND_SIGNALS, Limit
-from quadsim.mpc.codegen.ctext import Precision
-from quadsim.mpc.codegen.source import CSource
-from quadsim.mpc.codegen.targets import EMULATOR, TARGETS, Machine
-from quadsim.mpc.fallback.structs import STATUSES
-from quadsim.mpc.nonlinear.law import measured_state, reference_rows
-from quadsim.mpc.pilot import Pilot
+from quadsim.mpc.export.ctext import Precision
+from quadsim.mpc.export.source import CSource
+from quadsim.mpc.export.targets import EMULATOR, TARGETS, Machine
+from quadsim.mpc.guard.structs import STATUSES
+from quadsim.mpc.laws.parts.nonlinear_law import measured_state, reference_rows
+from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.outputs import reserving
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout

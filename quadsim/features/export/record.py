@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 from quadsim.controller import ACCEPTED, CORE, GAIN, ROTORS, SOLVED, Command, Phase, StepInputs
 from quadsim.errors import ExportError, PlanExhaustedError
-from quadsim.mpc.bounded import Bounded, Weighted
-from quadsim.mpc.core.solver import Core
-from quadsim.mpc.core.tables import with_constraints
-from quadsim.mpc.fallback.structs import STATUSES
+from quadsim.mpc.guard.structs import STATUSES
 from quadsim.mpc.laws.geometric import GeometricController
+from quadsim.mpc.laws.parts.linear import LinearMPC
+from quadsim.mpc.laws.parts.nonlinear_law import measured_state, reference_rows
+from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.laws.unconstrained import UnconstrainedMPC
-from quadsim.mpc.linear import LinearMPC
-from quadsim.mpc.nonlinear.controller import NonlinearMPC
-from quadsim.mpc.nonlinear.law import measured_state, reference_rows
-from quadsim.mpc.ocp import Query
+from quadsim.mpc.problem.ocp import Query
 from quadsim.mpc.solvers import Method
+from quadsim.mpc.solvers.core import Core
+from quadsim.mpc.solvers.core_tables import with_constraints
+from quadsim.mpc.tables.bounded import Bounded, Weighted
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.schema.scenario import Scenario

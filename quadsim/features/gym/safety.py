@@ -13,15 +13,17 @@ from quadsim.controller import UNCONSTRAINED
 from quadsim.errors import ParameterError
 from quadsim.features.gym.environment import QuadrotorEnv
 from quadsim.features.gym.spaces import Action
-from quadsim.mpc.builders import guard_of
-from quadsim.mpc.pilot import Pilot
-from quadsim.mpc.robust.filter import safety_filter
-from quadsim.mpc.robust.settings import Robust
+from quadsim.mpc.laws.parts.builders import guard_of
+from quadsim.mpc.laws.parts.safety_filter import safety_filter
+from quadsim.mpc.pilot.pilot import Pilot
+from quadsim.mpc.tables.robust import Robust
 from quadsim.vehicle import Vehicle
 
 
 class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
-    """Passes an action, or the nearest one after which the constraints can be satisfied; see `robust.filter`.
+    """Passes an action, or the nearest one after which the constraints can be satisfied.
+
+    See `quadsim.mpc.laws.parts.safety_filter`.
 
     An action that is not finite is never flown: the fallback's command is, until the next one.
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from quadsim.controller import Command
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.flight.log import ControlLog, columns_of
-from quadsim.mpc.answer import ActuatorBounds
-from quadsim.mpc.bounded import Bounded
+from quadsim.mpc.guard.answer import ActuatorBounds
+from quadsim.mpc.tables.bounded import Bounded
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, Array

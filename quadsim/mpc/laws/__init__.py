@@ -1,7 +1,7 @@
 """The control laws by name: a file each, with the law, its table `[controller]` and its builder.
 
-`register` says what else is known of a law; a module of this folder needs no line elsewhere.  The laws `robust` and
-`nonlinear` have folders of their own, and here only their registration.
+`register` says what else is known of a law; a module of this folder needs no line elsewhere.  What laws are made of is
+in `parts`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from types import MappingProxyType
 from typing import Final, TypeVar
 
 from quadsim.controller import Controller
-from quadsim.mpc.bounded import ControllerTable
-from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.space import Shape
+from quadsim.mpc.tables.bounded import ControllerTable
 from quadsim.vehicle import Vehicle
 
 AnyBuilder = TypeVar("AnyBuilder", bound=Callable[..., Controller])
@@ -81,7 +81,7 @@ def law_name(recorded: str) -> str:
 
 @singledispatch
 def law_of(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    """Return the law of a table, in Python, for a control `period` [s]; see `quadsim.mpc.builders.build`."""
+    """Return the law of a table, in Python, for a control `period` [s]; see `quadsim.mpc.laws.parts.builders.build`."""
     laws()  # the builder of this table has not been imported yet
     builder = law_of.dispatch(type(table))
     if builder is law_of.dispatch(object):

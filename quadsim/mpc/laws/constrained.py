@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from annotated_types import doc
 
-from quadsim.mpc.bounded import Bounded
-from quadsim.mpc.fallback.settings import FallbackSettings
+from quadsim.mpc.guard.settings import FallbackSettings
 from quadsim.mpc.laws import register
-from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.space import Shape
+from quadsim.mpc.tables.bounded import Bounded
 from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from quadsim.mpc.linear import LinearMPC
+    from quadsim.mpc.laws.parts.linear import LinearMPC
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class Constrained(Bounded):
     place=2,
 )
 def _law(table: Constrained, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
-    from quadsim.mpc.linear import NominalPreparation, linear_law
+    from quadsim.mpc.laws.parts.linear import NominalPreparation, linear_law
 
     problem = table.problem(vehicle, period)
     space = table.space(shapes, vehicle, period)

@@ -20,19 +20,19 @@ from quadsim.core.mirror import Struct, core_library, set_members, struct
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.motion import Motion
-from quadsim.mpc.allocation import allocate, make_allocation
-from quadsim.mpc.answer import ActuatorBounds
-from quadsim.mpc.baselines.attitude import LEAST_THRUST_SHARE, Measured
-from quadsim.mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
-from quadsim.mpc.baselines.law import FeedbackLaw, Tuned
-from quadsim.mpc.baselines.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIEW_DEGREE, Target, differentiator
-from quadsim.mpc.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, require_lags, require_space
-from quadsim.mpc.disturbance import RampObserver, RampSettings
-from quadsim.mpc.indi import INDISettings, TorqueIncrement, require_one_scale
+from quadsim.mpc.estimate.disturbance import RampObserver, RampSettings
+from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.laws import register
-from quadsim.mpc.model import target_model
-from quadsim.mpc.nonlinear.model import zero
-from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.laws.parts.attitude import LEAST_THRUST_SHARE, Measured
+from quadsim.mpc.laws.parts.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
+from quadsim.mpc.laws.parts.feedback import FeedbackLaw, Tuned
+from quadsim.mpc.laws.parts.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIEW_DEGREE, Target, differentiator
+from quadsim.mpc.pilot.allocation import allocate, make_allocation
+from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement, require_one_scale
+from quadsim.mpc.problem.model import target_model
+from quadsim.mpc.problem.nonlinear_model import zero
+from quadsim.mpc.space import Shape
+from quadsim.mpc.tables.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, require_lags, require_space
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -430,15 +430,15 @@ class Geometric(Tuned):
             raise ParameterError("", "horizon", self.horizon, rule)
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
-        """See `quadsim.mpc.bounded.ControllerTable.audited`."""
+        """See `quadsim.mpc.tables.bounded.ControllerTable.audited`."""
         return super().audited(vehicle) if self.commands == "rotors" else self.target_bounds.audited(vehicle)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
-        """See `quadsim.mpc.baselines.law.Baseline.actuators`; of targets where it commands these."""
+        """See `quadsim.mpc.laws.parts.feedback.Baseline.actuators`; of targets where it commands these."""
         return super().actuators(vehicle) if self.commands == ROTORS else self.target_bounds.actuators(vehicle)
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
-        """See `quadsim.mpc.bounded.ControllerTable.inner_loop`."""
+        """See `quadsim.mpc.tables.bounded.ControllerTable.inner_loop`."""
         return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
 
 

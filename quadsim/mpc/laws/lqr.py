@@ -13,15 +13,15 @@ from annotated_types import Ge, Le, Len, doc
 from quadsim.controller import Command, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
-from quadsim.mpc.allocation import allocate, make_allocation
-from quadsim.mpc.baselines.law import Baseline, FeedbackLaw
-from quadsim.mpc.bounded import InputWeights, objective_of, require_states
-from quadsim.mpc.heading import turn_horizontally
 from quadsim.mpc.laws import register
-from quadsim.mpc.model import LinearModel, continuous_model, discretise, hover_model
-from quadsim.mpc.obstacles import Shape
-from quadsim.mpc.ocp import Objective
-from quadsim.mpc.regulator import stabilising
+from quadsim.mpc.laws.parts.feedback import Baseline, FeedbackLaw
+from quadsim.mpc.pilot.allocation import allocate, make_allocation
+from quadsim.mpc.problem.heading import turn_horizontally
+from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model
+from quadsim.mpc.problem.ocp import Objective
+from quadsim.mpc.problem.regulator import stabilising
+from quadsim.mpc.space import Shape
+from quadsim.mpc.tables.bounded import InputWeights, objective_of, require_states
 from quadsim.state import INDEX, N_STATES, REFERENCE_RATES, REFERENCE_STATES, STATE_NAMES, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 

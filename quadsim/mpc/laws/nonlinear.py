@@ -1,4 +1,4 @@
-"""`[controller] type = "nonlinear"`: the law of the table `quadsim.mpc.nonlinear.settings.Nonlinear`."""
+"""`[controller] type = "nonlinear"`: the law of the table `quadsim.mpc.tables.nonlinear.Nonlinear`."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from quadsim.controller import ROTORS
-from quadsim.mpc.bounded import require_lags
 from quadsim.mpc.laws import register
-from quadsim.mpc.nonlinear.settings import Nonlinear
-from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.space import Shape
+from quadsim.mpc.tables.bounded import require_lags
+from quadsim.mpc.tables.nonlinear import Nonlinear
 from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from quadsim.mpc.nonlinear.controller import NonlinearMPC
+    from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 
 
 @register(
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     place=4,
 )
 def _law(table: Nonlinear, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> NonlinearMPC:
-    from quadsim.mpc.nonlinear.controller import NonlinearMPC
+    from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 
     if table.commands != ROTORS:
         require_lags(table.inner_lag)

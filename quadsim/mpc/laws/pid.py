@@ -15,8 +15,8 @@ from annotated_types import doc
 
 from quadsim.controller import Command, Phase, StepInputs
 from quadsim.fields import Positive
-from quadsim.mpc.allocation import allocate, make_allocation, thrust_to_command
-from quadsim.mpc.baselines.attitude import (
+from quadsim.mpc.laws import register
+from quadsim.mpc.laws.parts.attitude import (
     LEAST_THRUST_SHARE,
     Measured,
     attitude_for,
@@ -24,11 +24,11 @@ from quadsim.mpc.baselines.attitude import (
     motion_of,
     prioritised_error,
 )
-from quadsim.mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
-from quadsim.mpc.baselines.law import FeedbackLaw, Tuned
-from quadsim.mpc.baselines.preview import Target, target_of
-from quadsim.mpc.laws import register
-from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.laws.parts.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
+from quadsim.mpc.laws.parts.feedback import FeedbackLaw, Tuned
+from quadsim.mpc.laws.parts.preview import Target, target_of
+from quadsim.mpc.pilot.allocation import allocate, make_allocation, thrust_to_command
+from quadsim.mpc.space import Shape
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

@@ -1,4 +1,4 @@
-"""`[controller] type = "robust"`: the law of the table `quadsim.mpc.robust.settings.Robust`."""
+"""`[controller] type = "robust"`: the law of the table `quadsim.mpc.tables.robust.Robust`."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from quadsim.mpc.laws import register
-from quadsim.mpc.obstacles import Shape
-from quadsim.mpc.robust.settings import Robust
+from quadsim.mpc.space import Shape
+from quadsim.mpc.tables.robust import Robust
 from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from quadsim.mpc.linear import LinearMPC
+    from quadsim.mpc.laws.parts.linear import LinearMPC
 
 
 @register(
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     place=3,
 )
 def _law(table: Robust, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
-    from quadsim.mpc.linear import linear_law
-    from quadsim.mpc.robust.controller import RobustPreparation
+    from quadsim.mpc.laws.parts.linear import linear_law
+    from quadsim.mpc.laws.parts.preparation import RobustPreparation
 
     problem = table.problem(vehicle, period)
     space = table.space(shapes, vehicle, period)

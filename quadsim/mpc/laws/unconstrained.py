@@ -12,12 +12,12 @@ import scipy.linalg
 from annotated_types import doc
 
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Statistics, StepInputs, stopped
-from quadsim.mpc.bounded import Weighted
-from quadsim.mpc.condensing import condensed_cost
+from quadsim.mpc.forms.condensing import condensed_cost
 from quadsim.mpc.laws import register
-from quadsim.mpc.obstacles import Shape
-from quadsim.mpc.ocp import Problem
-from quadsim.mpc.paper import prediction, rollout
+from quadsim.mpc.problem.ocp import Problem
+from quadsim.mpc.problem.paper import prediction, rollout
+from quadsim.mpc.space import Shape
+from quadsim.mpc.tables.bounded import Weighted
 from quadsim.state import INDEX, Array, ReferenceTurns
 from quadsim.vehicle import Vehicle
 

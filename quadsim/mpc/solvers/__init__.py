@@ -14,10 +14,10 @@ import numpy as np
 
 from quadsim.controller import CORE, GAIN, NO_STATISTICS, Statistics
 from quadsim.errors import MissingPackageError, UnknownNameError
-from quadsim.mpc.condensing import Condensed, FreeOptimum
-from quadsim.mpc.ocp import Problem, Query
-from quadsim.mpc.partial_condensing import PartiallyCondensed
-from quadsim.mpc.qp import QP, Backend, Solution
+from quadsim.mpc.forms.condensing import Condensed, FreeOptimum
+from quadsim.mpc.forms.partial_condensing import PartiallyCondensed
+from quadsim.mpc.problem.ocp import Problem, Query
+from quadsim.mpc.problem.qp import QP, Backend, Solution
 from quadsim.state import Array
 
 Formulation: TypeAlias = Condensed | PartiallyCondensed
@@ -70,7 +70,7 @@ SOLVERS: Final = {
 
 COMPILED: Final = SolverEntry(
     description="the compiled core: the exact optimum where matrices are fixed; PIQP answers what it gives up",
-    package="quadsim.mpc.core",
+    package="quadsim.core",
 )
 
 CORES_SECOND: Final = "piqp-multistage"
@@ -149,7 +149,7 @@ class Answer(NamedTuple):
     slacks: Array  # (N, m_s) violations of soft rows
     status: str  # `solved`, `unconstrained`, or the reason of a failure
     answered_by: str  # `gain`, `core` or the QP solver's name; see `quadsim.controller.Command`
-    stats: Statistics = NO_STATISTICS  # of the solver that answered, completed by `quadsim.mpc.answer.AnswerCheck`
+    stats: Statistics = NO_STATISTICS  # of the solver that answered, completed by `AnswerCheck`
     method: Method = Method.WHOLE  # the part of the QP that had to be solved
     certificate: Callable[[], tuple[QP, Solution]] | None = None  # the QP and its solution; None for invalid data
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from quadsim.controller import CORE
 from quadsim.errors import ParameterError
-from quadsim.mpc.ocp import Problem
+from quadsim.mpc.problem.ocp import Problem
 from quadsim.mpc.solvers import QPSolver, Solver
 
 
@@ -17,7 +17,7 @@ def make_solver(name: str, problem: Problem) -> Solver:
     """
     if name != CORE:
         return QPSolver(name, problem, free_first=True)
-    from quadsim.mpc.core.solver import Core  # late: the folder `core` imports `solvers`
+    from quadsim.mpc.solvers.core import Core  # late: the folder `core` imports `solvers`
 
     try:
         return Core(problem)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 
 from quadsim.controller import SOLVED, Statistics
-from quadsim.mpc.qp import QP, Matrix, Solution
+from quadsim.mpc.problem.qp import QP, Matrix, Solution
 from quadsim.state import Array
 
 DAQP_SETTINGS: Final = {
@@ -35,10 +35,10 @@ DAQP_STATUS: Final = {
 
 
 class DaqpDense:
-    """Back end for dense QPs; see `quadsim.mpc.qp.Backend`."""
+    """Back end for dense QPs; see `quadsim.mpc.problem.qp.Backend`."""
 
     def setup(self, qp: QP) -> None:
-        """See `quadsim.mpc.qp.Backend.setup`."""
+        """See `quadsim.mpc.problem.qp.Backend.setup`."""
         self._qp = qp
         self._model = daqp.Model()
         self._model.settings = DAQP_SETTINGS
@@ -49,7 +49,7 @@ class DaqpDense:
         self._model.setup(_dense(qp.P), qp.c.copy(), rows, *bounds, sense)
 
     def solve(self, qp: QP) -> Solution:
-        """See `quadsim.mpc.qp.Backend.solve`."""
+        """See `quadsim.mpc.problem.qp.Backend.solve`."""
         started = clock.perf_counter()
         upper, lower = _bounds(qp)
         same = qp.P is self._qp.P and qp.A is self._qp.A and qp.G is self._qp.G

@@ -10,7 +10,7 @@ import piqp
 from numpy.typing import NDArray
 
 from quadsim.controller import SOLVED, Statistics
-from quadsim.mpc.qp import QP, Solution
+from quadsim.mpc.problem.qp import QP, Solution
 
 MAX_ITERATIONS: Final = 100  # limit for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 8 to 23
 
@@ -43,7 +43,7 @@ CHANGING_SCALINGS: Final = 3
 
 
 class Piqp:
-    """See `quadsim.mpc.qp.Backend`; multistage, for block-banded QPs with the variables in stage order, or `dense`.
+    """See `Backend`; multistage, for block-banded QPs with the variables in stage order, or `dense`.
 
     `changing`: whether the matrices' values change from period to period.
     """
@@ -62,7 +62,7 @@ class Piqp:
             settings.eps_rel = settings.eps_duality_gap_rel = 0.1 * CHANGING_TOLERANCE
 
     def setup(self, qp: QP) -> None:
-        """See `quadsim.mpc.qp.Backend.setup`; PIQP must receive every vector that is updated later.
+        """See `quadsim.mpc.problem.qp.Backend.setup`; PIQP must receive every vector that is updated later.
 
         Rows without a finite side are left out: PIQP would set them to zero in `G` for good.
         """

@@ -14,7 +14,7 @@ import qpsolvers
 from scipy.sparse import csc_matrix
 
 from quadsim.controller import SOLVED, Statistics
-from quadsim.mpc.qp import QP, Solution
+from quadsim.mpc.problem.qp import QP, Solution
 
 ACTIVE_MULTIPLIER: Final = 1e-5
 """Multiplier from which a constraint counts as active; at the paper's optima they reach 1e3."""
@@ -30,7 +30,7 @@ SETTINGS: Final[dict[str, dict[str, Any]]] = {
 
 
 class AnyOfQpsolvers:
-    """A back end, by its name in `qpsolvers.available_solvers`; see `quadsim.mpc.qp.Backend`."""
+    """A back end, by its name in `qpsolvers.available_solvers`; see `quadsim.mpc.problem.qp.Backend`."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -40,7 +40,7 @@ class AnyOfQpsolvers:
         """Do nothing: each QP is set up anew."""
 
     def solve(self, qp: QP) -> Solution:
-        """See `quadsim.mpc.qp.Backend.solve`; a two-sided row or box entry becomes two, without infinite sides."""
+        """See `Backend.solve`; a two-sided row or box entry becomes two, without infinite sides."""
         started = clock.perf_counter()
         rows = np.concatenate([np.eye(qp.c.size), qp.G])
         lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])

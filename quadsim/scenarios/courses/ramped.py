@@ -16,7 +16,7 @@ from annotated_types import doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Metres
-from quadsim.mpc.flatness import attitudes
+from quadsim.mpc.problem.flatness import attitudes
 from quadsim.rotation import quaternion_to_euler
 from quadsim.scenarios.courses.course import Path, Speed, Started, Time
 from quadsim.state import Array

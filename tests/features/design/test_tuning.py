@@ -14,8 +14,8 @@ from quadsim.errors import ParameterError
 from quadsim.features.design.authority import authority
 from quadsim.features.design.first_scenario import SHARE, first_scenario, largest_eight
 from quadsim.features.design.rules import FASTEST_LOOP, PERIOD_SHARE, delay_margin, design_for, gain, is_stable
-from quadsim.mpc.builders import build
-from quadsim.mpc.model import continuous_model, discretise
+from quadsim.mpc.laws.parts.builders import build
+from quadsim.mpc.problem.model import continuous_model, discretise
 from quadsim.scenarios.loading import parse_scenario
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.wind import Air

@@ -19,7 +19,7 @@ from quadsim.console.results import EXIT_DONE, EXIT_WRONG_INPUT
 from quadsim.errors import InputError
 from quadsim.features.design.authority import torque_ranges
 from quadsim.features.design.vehicle_report import make_sheet
-from quadsim.mpc.model import continuous_model, hover_model
+from quadsim.mpc.problem.model import continuous_model, hover_model
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
 from quadsim.state import INDEX

@@ -15,15 +15,15 @@ from quadsim.commands.cli import main
 from quadsim.errors import ExportError, OutputError, ParameterError
 from quadsim.features.export.exporter import FACTS, c_controller, export, exported_law, room_sentence
 from quadsim.features.export.record import record
-from quadsim.mpc.codegen.ctext import CText
-from quadsim.mpc.codegen.geometric import CGeometric
-from quadsim.mpc.codegen.nonlinear import FILES as NONLINEAR_FILES
-from quadsim.mpc.codegen.source import BODY_FILES, CORE_FILES, DATA
-from quadsim.mpc.condensing import Condensed
-from quadsim.mpc.core.solver import Core
-from quadsim.mpc.core.tables import AxisTables, tables
-from quadsim.mpc.ocp import Query
+from quadsim.mpc.export.ctext import CText
+from quadsim.mpc.export.geometric import CGeometric
+from quadsim.mpc.export.nonlinear import FILES as NONLINEAR_FILES
+from quadsim.mpc.export.source import BODY_FILES, CORE_FILES, DATA
+from quadsim.mpc.forms.condensing import Condensed
+from quadsim.mpc.problem.ocp import Query
 from quadsim.mpc.solvers import Method
+from quadsim.mpc.solvers.core import Core
+from quadsim.mpc.solvers.core_tables import AxisTables, tables
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import read_catalogue
 from quadsim.scenarios.loading import load_scenario
@@ -139,7 +139,7 @@ def test_an_export_is_complete_and_replaces_an_earlier_one_on_request(tmp_path: 
 
 def test_the_licence_is_the_project_s() -> None:
     root = Path(__file__).parents[3]
-    assert (root / "quadsim/mpc/codegen/c/LICENSE").read_text() == (root / "LICENSE").read_text()
+    assert (root / "quadsim/mpc/export/c/LICENSE").read_text() == (root / "LICENSE").read_text()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from support import constrained_mpc, paper_problem, paper_reference
 
 from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import PlanExhaustedError
-from quadsim.mpc.ocp import Query
+from quadsim.mpc.problem.ocp import Query
 from quadsim.mpc.solvers import INVALID_DATA, Answer, QPSolver
 
 STATE = np.zeros(12)

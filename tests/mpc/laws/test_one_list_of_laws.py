@@ -15,8 +15,8 @@ import pytest
 from quadsim.controller import ROTORS
 from quadsim.core.library import load_library
 from quadsim.mpc import laws as package
-from quadsim.mpc.baselines.law import Baseline
 from quadsim.mpc.laws import LawEntry, law_name, law_of, laws, register
+from quadsim.mpc.laws.parts.feedback import Baseline
 from quadsim.mpc.laws.pid import PID
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.plugin import Plugin
@@ -37,9 +37,9 @@ import numpy as np
 from annotated_types import Gt, Le, doc
 
 from quadsim.controller import Command, StepInputs
-from quadsim.mpc.baselines.law import Baseline, FeedbackLaw
+from quadsim.mpc.laws.parts.feedback import Baseline, FeedbackLaw
 from quadsim.mpc.laws import register
-from quadsim.mpc.obstacles import Shape
+from quadsim.mpc.space import Shape
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from quadsim.motion import Motion
-from quadsim.mpc.flatness import attitudes, motion_along
+from quadsim.mpc.problem.flatness import attitudes, motion_along
 from quadsim.rotation import quaternion_to_euler
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario

@@ -1,1 +1,0 @@
-"""What feedback laws share, to compare with MPC: a period of a law, attitudes, bandwidths, previews."""

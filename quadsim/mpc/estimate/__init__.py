@@ -1,0 +1,1 @@
+"""Estimates of what the model omits: disturbances from the measured motion."""

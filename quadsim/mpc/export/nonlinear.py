@@ -1,0 +1,132 @@
+"""The C files of a nonlinear controller."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from quadsim.controller import ROTORS
+from quadsim.errors import ExportError
+from quadsim.mpc.export.ctext import CText
+from quadsim.mpc.export.follower import CFollower
+from quadsim.mpc.export.source import CHANGES, SHARED_FILES
+from quadsim.mpc.laws.parts.body import ProblemStruct
+from quadsim.mpc.laws.parts.nonlinear_law import memory_of
+from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
+from quadsim.mpc.laws.parts.numbers import fallback_numbers
+from quadsim.mpc.problem.model import LinearModel, hover_model, target_model
+from quadsim.mpc.solvers.core_tables import NO_BOUND
+from quadsim.mpc.tables.nonlinear import Nonlinear
+
+FILES: Final = (
+    *SHARED_FILES,
+    *("quadsim_ramp.h", "quadsim_ramp.c", "quadsim_nmpc.h", "quadsim_nmpc_math.h", "quadsim_nmpc.c"),
+    *("quadsim_nmpc_model.c", "quadsim_nmpc_qp.c", "quadsim_nonlinear.h", "quadsim_nonlinear.c"),
+)
+"""Files of `quadsim/mpc/c` to export verbatim."""
+ROWS_PER_NODE: Final = 2.0
+"""Capacity for active rows, per node."""
+FEWEST_ROWS: Final = 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class CNonlinear(CFollower):
+    """A nonlinear controller as C source, with room for 2 active rows per node, and at least 32.
+
+    Raises:
+        ExportError: it cannot be exported.
+    """
+
+    table: Nonlinear
+
+    law_name = "quadsim_nonlinear"
+    law_files = FILES
+    motion_row = "position, quaternion, velocity, body rates, thrusts of the rotors"
+
+    def __post_init__(self) -> None:
+        if self.table.indi is not None:
+            raise ExportError("its rotor speeds are corrected at each physics step: leave out controller.indi")
+        if self.table.time_limit is not None:
+            raise ExportError("its steps end by a clock, which the C has not: leave out controller.time_limit")
+
+    @cached_property
+    def law(self) -> NonlinearMPC:
+        """The controller, of whose numbers these are."""
+        table, vehicle = self.table, self.vehicle
+        return NonlinearMPC(
+            vehicle,
+            period=self.control_period,
+            settings=table,
+            bounds=table.actuators(vehicle),
+            constraints=table.constraints(),
+        )
+
+    @property
+    def tolerances(self) -> tuple[str, str]:
+        """See `CSource`; of thrust [N] and rates [rad/s] as well."""
+        return "1e-9", "2.0" if self.commands == ROTORS else "0.05"
+
+    @property
+    def defines(self) -> str:
+        """See `CSource`: with its sizes, of which alone the kernel then has code."""
+        struct = self.law._sqp.struct
+        return f"{super().defines} -DQUADSIM_SIZES={struct.actuators},{int(struct.moves > 0)}".strip()
+
+    @property
+    def rows(self) -> int:
+        """See `CSource`."""
+        sqp = self.law._sqp
+        usual = max(FEWEST_ROWS, math.ceil(ROWS_PER_NODE * sqp.horizon))
+        return min(sqp.most_rows, usual if self.asked is None else self.asked)
+
+    @property
+    def _memory(self) -> tuple[int, int]:
+        struct = ProblemStruct.from_buffer_copy(self.law._sqp.struct)
+        struct.room = self.rows + 1
+        return memory_of(self.law._law.numbers, struct)
+
+    @property
+    def reals(self) -> int:
+        """See `CSource`."""
+        return self._memory[0]
+
+    @property
+    def ints(self) -> int:
+        """See `CSource`."""
+        return self._memory[1]
+
+    def _model(self) -> LinearModel:
+        """The model of level hover."""
+        if self.table.commands == ROTORS:
+            return hover_model(self.vehicle, self.control_period)
+        assert self.table.inner_lag is not None
+        return target_model(self.vehicle, self.control_period, self.table.inner_lag)
+
+    def numbers(self, text: CText) -> list[str]:
+        """See `CSource`."""
+        law, sqp, of_law = self.law, self.law._sqp, self.law._law
+        fallback = fallback_numbers(self._model(), self.bounds, self.table.fallback.within({}), self.horizon)
+        prefix, blocks = text.prefix, []
+        pointers = {"terms": f"{prefix}terms"}
+        for name, array in sqp.pointed.items():
+            blocks.append(text.array(name, np.clip(array, -NO_BOUND, NO_BOUND) if array.dtype == np.double else array))
+            pointers[name] = f"{prefix}{name}"
+        blocks.append(text.structs("quadsim_nmpc_term", "terms", sqp.terms if sqp.struct.rows else ()))
+        members = text.mirrored(sqp.struct, pointers, room=self.rows + 1, changes=CHANGES)
+        blocks.append(text.struct("quadsim_nmpc_problem", f"{prefix}problem", **members))
+        for name, body in (("period", law._of_period), ("unlagged", law._without_lag)):
+            blocks.append(text.array(f"left_{name}", body.left))
+            members = text.mirrored(body.struct, {"left": f"{prefix}left_{name}"})
+            blocks.append(text.struct("quadsim_nmpc_problem", f"{prefix}{name}", **members))
+        values = {name: text.value(value) for name, value in fallback.items()}
+        blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **values))
+        addresses = {name: f"&{prefix}{name}" for name in ("problem", "period", "unlagged", "fallback")}
+        if of_law.ramp is not None:
+            blocks.append(text.struct("quadsim_ramp_numbers", f"{prefix}ramp", **text.mirrored(of_law.ramp.numbers)))
+            addresses["ramp"] = f"&{prefix}ramp"
+        members = text.mirrored(of_law.numbers, addresses, motion=int(self.motion))
+        return [*blocks, text.struct("quadsim_nonlinear_numbers", "QUADSIM_CONTROLLER", **members)]

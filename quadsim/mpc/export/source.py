@@ -1,0 +1,255 @@
+"""The C files of a controller: the core's sources, verbatim, and one file of its numbers."""
+
+from __future__ import annotations
+
+import abc
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from typing import ClassVar, Final
+
+from quadsim.controller import ROTORS
+from quadsim.mpc.export.ctext import CText, Precision
+from quadsim.mpc.guard.answer import ActuatorBounds
+from quadsim.mpc.laws.parts.numbers import Exportable, controller_numbers, fallback_numbers, robust_numbers
+from quadsim.mpc.problem.model import hover_model
+from quadsim.mpc.solvers.core import core_problem
+from quadsim.mpc.solvers.core_tables import Tables, members
+from quadsim.mpc.tables.robust import split_delay
+from quadsim.state import N_STATES, REFERENCE_STATES
+from quadsim.vehicle import N_ROTORS
+
+SHARED_FILES: Final = ("quadsim_core.h", "quadsim_math.h", "quadsim_guard.h", "quadsim_guard.c")
+"""Files of `quadsim/mpc/c` that every law takes."""
+CORE_FILES: Final = (*SHARED_FILES, "quadsim_core.c", "quadsim_mpc.h", "quadsim_mpc.c")
+"""Those of the linear laws."""
+BODY_FILES: Final = ("quadsim_rigid.h",)
+"""Files of `quadsim/core` to export verbatim, for every law."""
+DATA: Final = "quadsim_data.h"
+"""The generated file."""
+CHANGES: Final = 500
+"""Limit of active-set changes in a search."""
+ROWS_PER_STEP: Final = 2.56
+"""Capacity for active rows, per step of the horizon."""
+LEAST_ROWS: Final = 64
+
+
+def part(name: str, package: str = "quadsim.mpc.export") -> str:
+    """Return a hand-written C source of a package."""
+    return (resources.files(package) / "c" / name).read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CSource(abc.ABC):
+    """A controller as C source: the files of its law, verbatim, and one of its numbers."""
+
+    precision: Precision = "double"  # of all numbers
+    title: str = ""  # a line that identifies it, in ASCII
+    asked: int | None = None  # active rows with room; None for a number that usually suffices
+
+    law_name: ClassVar[str]
+    """Header of its law, and first word of its functions."""
+    law_files: ClassVar[tuple[str, ...]]
+    """Files of `quadsim/mpc/c` to export verbatim."""
+    state: ClassVar[int] = N_STATES
+    """Numbers of a measured state."""
+    plan: ClassVar[str] = "law->work.plan"
+    changes: ClassVar[str] = "law->work.changes"
+
+    @property
+    @abc.abstractmethod
+    def period(self) -> float:
+        """The control period [s]."""
+
+    @property
+    @abc.abstractmethod
+    def horizon(self) -> int:
+        """Periods of the plan."""
+
+    @property
+    @abc.abstractmethod
+    def bounds(self) -> ActuatorBounds | None:
+        """Bounds on its commands; None for none."""
+
+    @property
+    def tolerances(self) -> tuple[str, str]:
+        """Of recorded commands, in doubles and in floats."""
+        return "1e-8", "6e-2"
+
+    @property
+    def commands(self) -> str:
+        """What it commands: rotor speeds, or the targets of an autopilot by name."""
+        return ROTORS
+
+    @property
+    def motion_rows(self) -> int:
+        """Samples of a motion that are its reference; 0 of a preview."""
+        return 0
+
+    @property
+    def reference(self) -> tuple[int, int, str]:
+        """Rows of a reference, numbers of a row, and what they are."""
+        return self.horizon, len(REFERENCE_STATES), "x y z yaw"
+
+    @property
+    @abc.abstractmethod
+    def rows(self) -> int:
+        """Capacity for active rows."""
+
+    @property
+    @abc.abstractmethod
+    def reals(self) -> int:
+        """Numbers of memory needed."""
+
+    @property
+    def ints(self) -> int:
+        """Integers of memory needed."""
+        return 0
+
+    @property
+    def real_bytes(self) -> int:
+        """Size of a number in bytes."""
+        return 8 if self.precision == "double" else 4
+
+    @property
+    def memory_bytes(self) -> int:
+        """Memory needed, in bytes."""
+        return self.reals * self.real_bytes + 4 * self.ints
+
+    @abc.abstractmethod
+    def numbers(self, text: CText) -> list[str]:
+        """Return the generated numbers, with `QUADSIM_CONTROLLER` last."""
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """Its C files, by name."""
+        body = {name: (resources.files("quadsim.core") / name).read_text(encoding="utf-8") for name in BODY_FILES}
+        return {name: part(name, "quadsim.mpc") for name in self.law_files} | body | {DATA: self.filled(part(DATA))}
+
+    @property
+    def defines(self) -> str:
+        """Flags of a compiler that its files take."""
+        return "-DQUADSIM_FLOAT" if self.precision == "float" else ""
+
+    @property
+    def objects(self) -> str:
+        """Its object files, as the Makefile lists them."""
+        return " ".join(sorted(name.replace(".c", ".o") for name in self.law_files if name.endswith(".c")))
+
+    def filled(self, template: str) -> str:
+        """Fill in the names between @ of a C file."""
+        count, width, what = self.reference
+        name, ints = self.law_name, self.ints
+        fits = f"{name}_reals(&QUADSIM_CONTROLLER) == QUADSIM_MEMORY"
+        values = {
+            "LAW": name,
+            "TITLE": self.title,
+            "PERIOD": f"{self.period:g}",
+            "IFN": "ifdef" if self.precision == "double" else "ifndef",
+            "PRECISION": self.precision,
+            "HORIZON": self.horizon,
+            "STATE": self.state,
+            "ROWS": count,
+            "ROW": width,
+            "REFERENCE": what,
+            "MEMORY": self.reals,
+            "INTS": f"    int ints[{ints}];\n" if ints else "",
+            "MORE": ", memory->ints" if ints else "",
+            "FITS": f"{fits} && {name}_ints(&QUADSIM_CONTROLLER) == {ints}" if ints else fits,
+            "PLAN": self.plan,
+            "CHANGES": self.changes,
+            "DOUBLE_TOLERANCE": self.tolerances[0],
+            "FLOAT_TOLERANCE": self.tolerances[1],
+        }
+        if "@NUMBERS@" in template:
+            numbers = self.numbers(CText(self.precision, "quadsim_data_"))
+            template = template.replace("@NUMBERS@\n", "\n".join(numbers))
+        for key, value in values.items():
+            template = template.replace(f"@{key}@", str(value))
+        return template
+
+
+@dataclass(frozen=True, kw_only=True)
+class CController(CSource):
+    """A linear controller as C source, with room for 2.56 active rows per step of the horizon, and at least 64."""
+
+    law: Exportable  # the law to export
+
+    law_name = "quadsim_mpc"
+    law_files = CORE_FILES
+
+    @property
+    def period(self) -> float:
+        """See `CSource`."""
+        return self.law.problem.model.period
+
+    @property
+    def horizon(self) -> int:
+        """See `CSource`."""
+        return self.law.problem.horizon
+
+    @property
+    def bounds(self) -> ActuatorBounds | None:
+        """See `CSource`."""
+        problem = self.law.problem
+        return ActuatorBounds.of_problem(problem) if problem.every_constraint else None
+
+    @cached_property
+    def tables(self) -> Tables:
+        """The numbers of its problem."""
+        return core_problem(self.law.problem).tables
+
+    @property
+    def rows(self) -> int:
+        """See `CSource`."""
+        usual = max(LEAST_ROWS, math.ceil(ROWS_PER_STEP * self.horizon))
+        return min(self.horizon * len(self.tables.rows), usual if self.asked is None else self.asked)
+
+    @property
+    def reals(self) -> int:
+        """See `CSource`: as counted by `quadsim_mpc_reals`."""
+        N, problem, room = self.horizon, self.tables.problem, self.rows + 1
+        rows = N * len(self.tables.rows)
+        packed = 4 * room + 3 * rows  # bytes of integers
+        widest = max(len(axis.B) for axis in self.tables.axes)
+        work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + room * (room - 1) // 2
+        settings, period = self.law.settings, self.law.problem.model.period
+        sent = 0 if settings is None else N_ROTORS * split_delay(settings.delay, period)[0]
+        return work + packed // self.real_bytes + 1 + N * (len(problem.objective.C_r) + N_ROTORS) + sent
+
+    def numbers(self, text: CText) -> list[str]:
+        """See `CSource`."""
+        optimisation = problem_data(text, self.tables, self.rows + 1)
+        return [*optimisation, *_controller(text, self.law, self.bounds, self.tables)]
+
+
+def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
+    """Return the optimisation's numbers, with its `quadsim_problem` last."""
+    blocks, entries = text.members(members(tables, room=room, changes=CHANGES))
+    return [*blocks, text.struct("quadsim_problem", f"{text.prefix}problem", **entries)]
+
+
+def _controller(text: CText, law: Exportable, bounds: ActuatorBounds | None, tables: Tables) -> list[str]:
+    """Return the numbers apart from those of the optimisation, with the `quadsim_controller` last."""
+    numbers, robust = controller_numbers(law), "NULL"
+    problem = law.problem
+    model = hover_model(law.vehicle, problem.model.period)
+    members = fallback_numbers(model, bounds, law.fallback, problem.horizon)
+    fallback = {name: text.value(value) for name, value in members.items()}
+    blocks = [
+        text.array("C_r", problem.objective.C_r),
+        text.struct("quadsim_fallback", f"{text.prefix}fallback", **fallback),
+    ]
+    if law.settings is not None:
+        values = {name: text.value(value) for name, value in robust_numbers(law, tables.modes).items()}
+        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **values))
+        robust = f"&{text.prefix}robust"
+    addresses = {
+        "problem": f"&{text.prefix}problem",
+        "robust": robust,
+        "fallback": f"&{text.prefix}fallback",
+        "C_r": f"{text.prefix}C_r",
+    }
+    limits = {name: text.value(value) for name, value in numbers.items()}
+    return [*blocks, text.struct("quadsim_controller", "QUADSIM_CONTROLLER", **addresses, **limits)]

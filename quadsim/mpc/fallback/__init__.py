@@ -1,1 +1,0 @@
-"""The commands flown when a controller has no usable answer."""

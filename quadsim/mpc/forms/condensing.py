@@ -1,0 +1,251 @@
+"""The paper's condensed QP in the inputs alone, for any optimal control problem.  Eqs. (27)-(29).
+
+For the paper's problem the matrices are those of Eqs. (7)-(20) as printed, with pairs of rows as two-sided rows.
+Further cost terms add to them, further constraints add rows, and soft rows add slacks after the inputs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final, TypeAlias
+
+import numpy as np
+import scipy.linalg
+from scipy.linalg import lapack
+
+from quadsim.controller import UNCONSTRAINED, Statistics
+from quadsim.mpc.problem.constraints import Bounds
+from quadsim.mpc.problem.ocp import CondensedQP, Equilibrium, Problem, Query, check_shape, predicted
+from quadsim.mpc.problem.paper import Prediction, cost, prediction, slew_matrix
+from quadsim.mpc.problem.qp import QP, PeriodQP, QPRows, Solution
+from quadsim.state import N_STATES, REFERENCE_STATES, Array
+
+RowFlags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+LARGEST_QP: Final = 2**20
+"""Largest size of the QP's matrices [entries] for which trying the unconstrained optimum first saves time."""
+LARGEST_CONDITION: Final = 1e10
+"""Largest condition number of a Hessian, in the 1-norm, for which its factor gives the unconstrained optimum: then
+rounding moves the optimum by some 1e-6 of its size at most.  The library's are below 1e7, so that no machine's rounding
+decides who answers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CondensedCost:
+    """J = 1/2 v' H v + [F_x dx + F_y dy + F_d du]' v + const, for deviations from an equilibrium (x_s, u_s).
+
+    With v = u - u_s the sequence of inputs, dx = x(k) - x_s, dy = y_d - C_r x_s and du = u(k-1) - u_s.
+    """
+
+    H: Array  # (N nu, N nu) symmetric positive definite. Eq. (7)
+    F_x: Array  # (N nu, n). Eq. (8)
+    F_y: Array  # (N nu, N n_r). Eq. (9)
+    F_d: Array  # (N nu, nu), zero without a weight on input changes
+
+
+def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
+    """Return the cost of a problem from its prediction map."""
+    objective, N, n, nu = problem.objective, problem.horizon, problem.model.n, problem.model.nu
+    terms = cost(maps, objective)
+    H, F_x, F_y, F_d = terms.H, terms.F1, terms.F2, np.zeros((N * nu, nu))
+    if objective.Q_d is not None:
+        steps = slew_matrix(N, nu)
+        H = H + 2.0 * steps.T @ np.kron(np.eye(N), objective.Q_d) @ steps
+        F_d[:nu] = -2.0 * objective.Q_d
+    if objective.P is not None:
+        (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
+        last, free = maps.Psi[-n:], maps.Phi[-n:]
+        H, F_x, F_y = H + 2.0 * last.T @ (Q_end - Q) @ last, F_x + 2.0 * last.T @ (Q_end - Q) @ free, F_y.copy()
+        F_y[:, -W.shape[1] :] -= 2.0 * last.T @ (W_end - W)
+    return CondensedCost(H=0.5 * (H + H.T), F_x=F_x, F_y=F_y, F_d=F_d)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowMaps:
+    """Values (N, m) of rows: of_inputs v + of_state dx + of_rest, before E du is subtracted from the first."""
+
+    of_inputs: Array  # (N, m, N nu) slopes in v = u - u_s
+    of_state: Array  # (N, m, n) in dx = x(k) - x_s
+
+
+def states_rows(C: Array, of_states: RowFlags, maps: Prediction, N: int) -> RowMaps:
+    """Return rows C (m, n) at x(k+1) .. x(k+N) if they depend on states alone, otherwise at x(k) .. x(k+N-1)."""
+    n, columns = C.shape[1], maps.Psi.shape[1]
+    Psi = np.concatenate([np.zeros((1, n, columns)), maps.Psi.reshape(N, n, columns)])
+    Phi = np.concatenate([np.eye(n)[None], maps.Phi.reshape(N, n, n)])
+    return RowMaps(of_inputs=_on_states(C, of_states, Psi), of_state=_on_states(C, of_states, Phi))
+
+
+def row_maps(rows: QPRows, maps: Prediction) -> RowMaps:
+    """Return the rows' values as functions of inputs and state.  Eqs. (14), (16)-(19), for any rows."""
+    if rows.C.ndim == 3:
+        raise ValueError("a condensed QP needs rows that are the same at all steps; partial condensing takes any")
+    values = states_rows(rows.C, rows.of_states, maps, len(rows.lower))
+    return replace(values, of_inputs=_with_inputs(values.of_inputs, rows))
+
+
+def _on_states(C: Array, of_states: RowFlags, S: Array) -> Array:
+    """Return (N, m, columns): rows C applied to the slopes S (N + 1, n, columns) of x(k) .. x(k+N)."""
+    return np.asarray((C * of_states[:, None]) @ S[1:] + (C * ~of_states[:, None]) @ S[:-1])
+
+
+def _with_inputs(values: Array, rows: QPRows) -> Array:
+    """Return the rows' slopes (N, m, N nu) with the direct terms D u + E du added."""
+    N, nu = len(values), rows.D.shape[1]
+    by_step = values.reshape(N, len(rows.D), N, nu)
+    by_step[range(N), :, range(N)] += rows.D + rows.E
+    by_step[range(1, N), :, range(N - 1)] -= rows.E
+    return by_step.reshape(values.shape)
+
+
+class Condensed:
+    """min 1/2 x' P x + c' x over x = [u(k); ...; u(k+N-1); e], with e (N, m_s) the slacks of soft rows.
+
+    `qp` is the QP for xi(k) = 0, y_d = 0 and u(k-1) = u_bar, its rows ordered by time; `cost` covers the inputs alone.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem, self._rows = problem, QPRows(problem)
+        model, N, nu = problem.model, problem.horizon, problem.model.nu
+        maps = prediction(model, N)
+        self.cost, self._values = condensed_cost(problem, maps), row_maps(self._rows, maps)
+        rows = self._rows
+        self._inputs, m_s = N * nu, rows.slack.shape[1]
+        soft = problem.rows.slacks
+        l1, l2 = np.tile(problem.rows.l1[soft], N), np.tile(problem.rows.l2[soft], N)
+        self._linear = np.concatenate([np.zeros(self._inputs), l1])
+        G = np.zeros((N, len(rows.C), self._inputs + N * m_s))
+        G[:, :, : self._inputs] = self._values.of_inputs
+        for i in range(N if m_s else 0):
+            G[i, :, self._inputs + i * m_s : self._inputs + (i + 1) * m_s] = rows.slack
+        self._of_rest = self._values.of_inputs.reshape(N, len(rows.C), N, nu).sum(axis=2)  # constant input u_s
+        self._pull = self.cost.H.reshape(N * nu, N, nu).sum(axis=1)  # constant input u_s
+        size = self._inputs + N * m_s
+        self._blank = QP(
+            P=np.asfortranarray(scipy.linalg.block_diag(self.cost.H, 2.0 * np.diag(l2)) if m_s else self.cost.H),
+            c=np.zeros(size),
+            A=np.zeros((0, size)),
+            b=np.zeros(0),
+            G=np.asfortranarray(G.reshape(-1, size)),
+            h_l=np.zeros(rows.lower.size),
+            h_u=np.zeros(rows.lower.size),
+            x_l=np.concatenate([rows.u_min.ravel(), np.zeros(N * m_s)]),
+            x_u=np.concatenate([rows.u_max.ravel(), np.full(N * m_s, np.inf)]),
+        )
+        nothing = np.zeros((N, problem.objective.C_r.shape[0]))
+        self.qp = self.assemble(Query(np.zeros(model.n), nothing, model.u_bar)).qp
+
+    @classmethod
+    def of(cls, problem: Problem) -> Condensed:
+        """Return the condensed QP of any problem; one without constraints has infinite bounds on its inputs."""
+        if problem.every_constraint:
+            return cls(problem)
+        none, anything = np.zeros(0), np.full(problem.model.nu, math.inf)
+        free = Bounds(
+            C_c=np.zeros((0, problem.model.n)),
+            y_min=none,
+            y_max=none,
+            delta_min=-anything,
+            delta_max=anything,
+            u_min=-anything,
+            u_max=anything,
+        )
+        return cls(replace(problem, bounds=free))
+
+    def period(
+        self, state: Array, reference: Array, u_before: Array, equilibrium: Equilibrium | None = None
+    ) -> CondensedQP:
+        """Return the QP of one period as new arrays; see `quadsim.mpc.problem.ocp.Problem.qp`.
+
+        Raises:
+            ParameterError: an array has another shape.
+        """
+        problem = self._problem
+        state, reference, u_before = (np.asarray(array, float) for array in (state, reference, u_before))
+        n, u_bar = problem.model.n, problem.model.u_bar
+        check_shape("u_before", u_before, u_bar.shape)
+        if state.shape == (N_STATES,):
+            state = np.concatenate([state, u_before])[:n]
+        check_shape("state", state, (n,))
+        check_shape("reference", reference, (problem.horizon, len(REFERENCE_STATES)))
+        hover = Equilibrium(np.concatenate([np.zeros(N_STATES), u_bar])[:n], u_bar)
+        query = Query(state, problem.desired(reference), u_before, equilibrium or hover)
+        qp = self.assemble(query).qp
+        return CondensedQP(*map(np.array, (qp.P, qp.c, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)))
+
+    def assemble(self, query: Query) -> PeriodQP:
+        """Return the QP of a period; its matrices are those of `qp` itself."""
+        terms, values, rows = self.cost, self._values, self._rows
+        state, desired, u_before = query[:3]
+        x_s, u_s = query.equilibrium or self._problem.equilibrium
+        dx, dy, du = state - x_s, desired - self._problem.objective.C_r @ x_s, u_before - u_s
+        c = self._linear.copy()
+        c[: self._inputs] += terms.F_x @ dx + terms.F_y @ dy.ravel() + terms.F_d @ du - self._pull @ u_s
+        # Rows refer to absolute inputs u = u_s + v and states x_s + dx(v).
+        shift = rows.C @ x_s + rows.D @ u_s + values.of_state @ dx - self._of_rest @ u_s
+        shift[0] += rows.E @ (u_s - u_before)
+        qp = replace(self._blank, c=c, h_l=(rows.lower - shift).ravel(), h_u=(rows.upper - shift).ravel())
+        return PeriodQP(qp, lambda x: predicted(self._problem, query, self.inputs(x)))
+
+    def inputs(self, x: Array) -> Array:
+        """Return (N, nu) the planned inputs [rad/s] of a primal point."""
+        return x[: self._inputs].reshape(self._problem.horizon, -1)
+
+    def slacks(self, x: Array) -> Array:
+        """Return (N, m_s) the slacks of a primal point, in the constraints' units."""
+        return x[self._inputs :].reshape(self._problem.horizon, -1) / self._problem.rows.slack_scale
+
+    def multipliers(self, solution: Solution) -> Array:
+        """Return (N, m) the multipliers of the problem's rows (`constraints.Rows`), signed as in `Solution`."""
+        return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
+
+    def solution(self, plan: Array, slacks: Array, multipliers: Array) -> Solution:
+        """Return this QP's solution for a plan (N, nu), slacks (N, m_s) and row multipliers (N, m).
+
+        Multipliers are positive at upper bounds and negative at lower ones.
+        """
+        (z, z_box), x, rows = self._rows.split(multipliers), plan.ravel(), self._problem.rows
+        if rows.soft.size:
+            l1, l2 = rows.l1[rows.slacks], rows.l2[rows.slacks]
+            slacks = slacks * rows.slack_scale
+            normalised = multipliers[:, rows.soft] / rows.scale[rows.soft]
+            prices = np.abs(normalised) @ (rows.slack[rows.soft][:, None] == np.arange(l1.size))
+            # Stationarity of a slack: l1 + 2 l2 e - sum |z| + z_box = 0.
+            z_slacks = np.minimum(prices - l1 - 2.0 * l2 * slacks, 0.0)
+            x, z_box = np.concatenate((x, slacks.ravel())), np.concatenate((z_box, z_slacks.ravel()))
+        return Solution(x, self._blank.b, z, z_box)
+
+
+class FreeOptimum:
+    """The unconstrained optimum, which is the optimum of the QP if it satisfies every constraint.  Eq. (22).
+
+    The Hessian is factorised once.
+    """
+
+    def __init__(self, form: Condensed) -> None:
+        self.form = form
+        H = form.cost.H
+        self._inputs = len(H)
+        self._factor, failed = lapack.dpotrf(H)
+        small = form.qp.P.size + form.qp.G.size <= LARGEST_QP
+        self._usable = small and not failed and self._condition(H) <= LARGEST_CONDITION
+
+    def _condition(self, H: Array) -> float:
+        """Return the condition number of the Hessian in the 1-norm, estimated from its factor (LAPACK's dpocon)."""
+        reciprocal, _ = lapack.dpocon(self._factor, float(np.abs(H).sum(axis=0).max()))
+        return 1.0 / reciprocal if reciprocal > 0.0 else math.inf
+
+    def __call__(self, qp: QP) -> Solution | None:
+        """Return the optimum of a QP; None if it violates a constraint."""
+        if not self._usable:
+            return None
+        m, x = self._inputs, np.zeros(qp.c.size)
+        x[:m], failed = lapack.dpotrs(self._factor, -qp.c[:m])
+        values = np.concatenate([x, qp.G @ x])
+        lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
+        if failed or not ((lower <= values) & (values <= upper)).all():
+            return None
+        z_box = np.concatenate([np.zeros(m), -qp.c[m:]])
+        no_solver = Statistics(solve_s=0.0)
+        return Solution(x, np.zeros(0), np.zeros(qp.h_l.size), z_box, status=UNCONSTRAINED, stats=no_solver)

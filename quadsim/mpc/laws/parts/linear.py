@@ -1,0 +1,270 @@
+"""The linear MPC: in every period the optimum of Eq. (27), from a query that a preparation makes of the measurement."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+
+from quadsim.controller import GROUNDED, Command, StepInputs, stopped
+from quadsim.errors import PlanExhaustedError
+from quadsim.mpc.estimate.observer import disturbance_of
+from quadsim.mpc.guard.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection, resized, shifted
+from quadsim.mpc.problem.equilibrium import Trim
+from quadsim.mpc.problem.ocp import InfeasiblePeriod, Problem, Query
+from quadsim.mpc.problem.paper import rollout
+from quadsim.mpc.problem.qp import KKT_EVERY
+from quadsim.mpc.solvers import INVALID_DATA, Answer, Solver
+from quadsim.mpc.space import SOLVER as SPACE_SOLVER
+from quadsim.mpc.space import ObstacleQP, Space
+from quadsim.state import INDEX, Array, ReferenceTurns
+
+if TYPE_CHECKING:
+    from quadsim.mpc.tables.bounded import Bounded
+
+
+class Remembered(NamedTuple):
+    """What a preparation remembers of its vehicle, for another one to take over in flight."""
+
+    delay: float  # [s] from t_k to the instant of x(k)
+    rotors: Array  # (4,) speeds when the next command takes over [rad/s]
+    turning: Array  # (4,) and when the last one sent does
+    sent: tuple[Array, ...]  # the last commands sent (4,), oldest first [rad/s]
+    ahead: Array | None  # (12,) state there; None if it is not known
+    called_at: float  # [s] time of the last call
+    measured: float  # [s] and of the last measured state
+    estimate: Array | None  # (6,) of `quadsim.mpc.estimate.observer.DisturbanceObserver`; None without one
+
+
+class Preparation(Protocol):
+    """From the measurements of a period to the query of its optimisation; what it remembers is from periods before."""
+
+    @property
+    def problem(self) -> Problem:
+        """The optimal control problem that queries refer to."""
+        ...
+
+    @property
+    def delay(self) -> float:
+        """Time from t_k to the instant of x(k) [s]."""
+        ...
+
+    @property
+    def yaw(self) -> float:
+        """Angle by which the axes of the last query are turned about world z [rad]."""
+        ...
+
+    @property
+    def trim(self) -> Trim | None:
+        """The equilibrium under the estimated disturbance; None where none is estimated."""
+        ...
+
+    @property
+    def disturbance(self) -> Array | None:
+        """(6,) its estimate, accelerations [m/s^2] and angular ones [rad/s^2]; None where there is no such estimate."""
+        ...
+
+    def reset(self, speeds: Array) -> None:
+        """Restart after the command u(-1) (4,) [rad/s]."""
+        ...
+
+    @property
+    def memory(self) -> Remembered | None:
+        """What another preparation may take over; None for nothing."""
+        ...
+
+    def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
+        """Take over what the previous law has learnt: its preparation's memory, if any, and its `disturbance`."""
+        ...
+
+    def stand(self, now: StepInputs, acting: Array) -> None:
+        """Pass a period on the ground, with the command `acting` (4,) in force [rad/s]."""
+        ...
+
+    def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query | None:
+        """Return the query of a period in the air, to call once per period; None if its numbers are out of range.
+
+        Args:
+            now: time, and inputs besides the state.
+            state: (12,) measured.
+            reference: (N, 4) x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.
+            acting: (4,) the command in force, u(k-1) [rad/s].
+        """
+        ...
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        ...
+
+
+class NominalPreparation:
+    """The paper's query: the measured state, and the reference on the turn of its yaw, about hover."""
+
+    delay = yaw = 0.0
+    trim = disturbance = memory = None
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self._turns = problem, ReferenceTurns()
+
+    def reset(self, speeds: Array) -> None:
+        """Forget the turn of the heading, its only state."""
+        self._turns.reset()
+
+    def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
+        """Take over nothing: there is no estimate."""
+
+    def stand(self, now: StepInputs, acting: Array) -> None:
+        """Change nothing."""
+
+    def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query:
+        """See `Preparation.prepare`; solvers refuse numbers that are not finite."""
+        reference = self._turns.follow(reference, float(state[INDEX["yaw"]]))
+        return Query(state, self.problem.desired(reference), acting)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return rollout(self.problem.model, states, plans)
+
+
+class LinearMPC:
+    """The MPC of Eq. (27): it solves for the optimal plan in each period and sends the plan's first input.
+
+    If the unconstrained optimum satisfies every constraint, it is the solution and no QP is solved; the status is then
+    `unconstrained`.  The controller uses an answer only if it is solved and finite, its first input is within the hard
+    bounds, and its plan satisfies the problem's rows (`AnswerCheck`).  Otherwise it reports the
+    status with the command in force, for a fallback to act on; or, if it `holds` plans, it flies the previous one,
+    shifted by one step (fallback level 1), for as long as that lasts, and then ends the flight.
+
+    States, units and frames: `docs/conventions.md`.
+
+    Attributes:
+        preparation: what makes the queries.
+        problem: the optimal control problem.
+        infeasible_period: the first period since `reset` whose QP had no answer; None if there was none.
+        answer: the answer of the last period that solved a QP; None before the first.
+    """
+
+    answer: Answer | None = None
+
+    def __init__(
+        self,
+        preparation: Preparation,
+        solver: Solver,
+        *,
+        name: str,
+        holds: bool = False,
+        space: Space | None = None,
+        kkt_every: int = KKT_EVERY,
+    ) -> None:
+        """Set up at rest.
+
+        Args:
+            preparation: makes the query of each period.
+            solver: the problem's (`quadsim.mpc.solvers.make_solver`).
+            name: of the law, in summaries.
+            holds: whether the last plan is held where a QP has no answer.
+            space: the obstacles to avoid; None for none.
+            kkt_every: interval of KKT checks [periods].
+        """
+        self.preparation, self.problem = preparation, preparation.problem
+        self.name, self.solver, self.horizon = name, solver.name, self.problem.horizon
+        self._solver, self._holds = solver, holds
+        self._obstacles = None if space is None else ObstacleQP(self.problem, solver, space)
+        self._bounds, self._check = ActuatorBounds.of_problem(self.problem), AnswerCheck(self.problem, kkt_every)
+        self.reset(self.problem.model.u_bar)
+
+    def reset(self, speeds: Array) -> None:
+        """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
+        self._acting = np.array(speeds, float)
+        self._plan: Array | None = None  # the last accepted one, if it holds plans
+        self._held = 0  # periods for which it has been held
+        self.infeasible_period: InfeasiblePeriod | None = None
+        self.preparation.reset(self._acting)
+        self._solver.reset()
+        self._check.reset()
+        if self._obstacles is not None:
+            self._obstacles.reset()
+
+    def adopt(self, previous: object) -> None:
+        """Take over what the previous law has learnt, and its plan, to hold if a QP has no answer."""
+        law = previous if isinstance(previous, LinearMPC) else None
+        if law is not None and law._plan is not None and self._holds:
+            self._plan, self._held = resized(law._plan, self.horizon), law._held
+        self.preparation.adopt(None if law is None else law.preparation.memory, disturbance_of(previous))
+
+    @property
+    def iterates(self) -> frozenset[str]:
+        """See `quadsim.controller.Iterating`."""
+        return self._solver.iterates | frozenset({SPACE_SOLVER} if self._obstacles is not None else ())
+
+    @property
+    def trim(self) -> Trim | None:
+        """See `Preparation.trim`."""
+        return self.preparation.trim
+
+    @property
+    def disturbance(self) -> Array | None:
+        """See `Preparation.disturbance`."""
+        return self.preparation.disturbance
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # values out of range are rejected, not warned of
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
+        """See `quadsim.controller.Controller.step`.
+
+        While landed, the rotors slow down to their lowest speed as fast as their bounds allow.  Numbers that the
+        preparation rejects give the status `invalid_data`.
+
+        Raises:
+            PlanExhaustedError: the solver failed, and the plan that is held has no step left.
+        """
+        if now.acting is not None:
+            self._acting = np.array(now.acting, float)
+        if now.phase in GROUNDED:
+            self.preparation.stand(now, self._acting)
+            self._acting, self._plan, self._held = self._bounds.reach(self._acting)[0], None, 0
+            return stopped(self._acting.copy(), self.horizon, now.phase)
+        query = self.preparation.prepare(now, state, reference, self._acting)
+        if query is None:
+            return refused(self._acting, self.horizon, INVALID_DATA)
+        answer, problem = self._solved(now.time + self.preparation.delay, query)
+        reason = rejection(answer.status, answer.plan[0], answer.plan, self._bounds, self._acting)
+        answer, reason = self._check(problem, query, answer, reason)
+        self.answer = answer
+        if reason is None:
+            self._plan, self._held = answer.plan if self._holds else None, 0
+            self._acting = self._bounds.clip(answer.plan[0], self._acting)
+            return command_of(self._acting, answer.plan, answer.status, answer)
+        if reason != INVALID_DATA and self.infeasible_period is None:
+            self.infeasible_period = InfeasiblePeriod(
+                problem=problem, query=query, status=reason, time=now.time, delay=self.preparation.delay
+            )
+        if not self._holds:
+            return refused(self._acting, self.horizon, reason, answer)
+        if self._plan is None or self._held + 1 >= self.horizon:
+            held = f"after holding the last plan for {self._held} periods" if self._held else "with no plan to hold"
+            raise PlanExhaustedError(f"the solver answered {reason!r} {held}", time=now.time)
+        self._held += 1
+        self._acting = self._bounds.clip(self._plan[self._held], self._acting)
+        return command_of(self._acting, shifted(self._plan, self._held), reason, answer, fallback=1)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return self.preparation.predict(states, plans)
+
+    def _solved(self, time: float, query: Query) -> tuple[Answer, Problem]:
+        """Return the optimum of a query whose x(k) is at a time [s], and the problem solved."""
+        if self._obstacles is None:
+            return self._solver.solve(query), self.problem
+        return self._obstacles.solve(time, query, self.preparation.yaw)
+
+
+def linear_law(table: Bounded, preparation: Preparation, solver: Solver, space: Space | None = None) -> LinearMPC:
+    """Return the law of a table with the parts that it is made of; see `LinearMPC`."""
+    return LinearMPC(
+        preparation,
+        solver,
+        name=table.type,
+        holds=table.holds_plans,
+        space=space,
+        kkt_every=table.kkt_every,
+    )

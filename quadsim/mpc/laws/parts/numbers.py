@@ -1,0 +1,179 @@
+"""The numbers of a law in C except those of its problem: members of the structs of quadsim_mpc.h, in their order."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from quadsim.controller import LARGEST_SPEED
+from quadsim.errors import ExportError
+from quadsim.mpc.estimate.observer import UPRIGHT, DisturbanceObserver
+from quadsim.mpc.guard.answer import ActuatorBounds
+from quadsim.mpc.guard.completion import (
+    NOISE,
+    PLAUSIBLE,
+    PLAUSIBLE_REFERENCE,
+    UNKNOWN,
+    UNMOVED,
+    acceleration_noise,
+)
+from quadsim.mpc.guard.hover import LARGEST_CLIMB, LARGEST_TURN, HoverLaw
+from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
+from quadsim.mpc.problem.equilibrium import LEAST_LIFT
+from quadsim.mpc.problem.heading import slope
+from quadsim.mpc.problem.model import LinearModel, hover_model
+from quadsim.mpc.problem.nonlinear_model import SUBSTEPS, nonlinear_model
+from quadsim.mpc.problem.ocp import Problem
+from quadsim.mpc.solvers.core_tables import NO_BOUND
+from quadsim.mpc.space import Shape
+from quadsim.mpc.tables.bounded import Bounded, Weighted, resolved_lag
+from quadsim.mpc.tables.robust import LONGEST_SPAN, Robust, split_delay
+from quadsim.state import EULER, POSITION, REFERENCE_STATES, Array
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+AVOIDS: Final = "its half-spaces around obstacles are others in each period: leave out controller.avoidance"
+"""Why a controller that avoids obstacles is not exported."""
+MOST_PERIODS: Final = 2**30 - 1
+"""Most periods that a time of the fallback contract has in C."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exportable:
+    """The data of a law in C."""
+
+    name: str
+    problem: Problem
+    vehicle: Vehicle  # the modelled vehicle
+    settings: Robust | None = None  # the table of the robust controller; None for the paper's controllers
+    fallback: FallbackSettings = USUAL_FALLBACK  # with the tilt that its bounds leave
+
+
+def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
+    """Return the data of a table's law in C.
+
+    Raises:
+        ExportError: the controller cannot be exported.
+        InputError: no controller can be built from these numbers.
+    """
+    if isinstance(table, Bounded) and table.avoidance is not None and shapes:
+        raise ExportError(AVOIDS)
+    return Exportable(
+        name=table.type,
+        problem=table.problem(vehicle, period),
+        vehicle=vehicle,
+        settings=table if isinstance(table, Robust) else None,
+        fallback=(table.fallback or USUAL_FALLBACK).within(table.output_bounds),
+    )
+
+
+def controller_numbers(law: Exportable) -> dict[str, float | Array]:
+    """Return the members of a `quadsim_controller` that are numbers; it also points to C_r."""
+    model, objective = law.problem.model, law.problem.objective
+    return {"hover": model.u_bar, "follows_rates": int(objective.needs_rates), "period": model.period}
+
+
+def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
+    """Return the members of a `quadsim_robust`; `modes` (4, 4) as in `quadsim.mpc.solvers.core_tables.Tables`."""
+    settings, vehicle, period = law.settings, law.vehicle, law.problem.model.period
+    assert settings is not None
+    lag, (whole, late) = resolved_lag(settings.rotor_lag, vehicle), split_delay(settings.delay, period)
+    model = nonlinear_model(vehicle, period, rotor_lag=lag or None)
+    observing = settings.offset_free
+    observer = None if observing is None else DisturbanceObserver(observing, period)
+    instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
+
+    def decay(time: Array | float) -> Array:
+        """Return the share of a deviation of rotor speeds that is left after a time [s]."""
+        return np.asarray(np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time)), float)
+
+    return {
+        "observes": int(observer is not None),
+        "heading": int(settings.heading),
+        "under_way": whole,
+        "gravity": model.gravity,
+        "least_lift": LEAST_LIFT,
+        "upright": UPRIGHT,
+        "period": period,
+        "delay": late,
+        "delayed_share": late / period,
+        "rest_of_period": period - late,
+        "spun_period": float(decay(period)),
+        "spun_delay": float(decay(late)),
+        "spun_before": float(decay(period - late)),
+        "largest_turn": math.radians(settings.largest_turn),
+        "effectiveness": np.asarray(model.effectiveness, float),
+        "allocation": np.asarray(model.allocation, float),
+        "gyration": np.asarray(model.gyration, float),
+        "slope_inverse": np.asarray(np.linalg.inv(slope(hover_model(vehicle, period))), float),
+        "modes": modes,
+        "gain": np.zeros(6) if observer is None else observer.gain,
+        "largest": np.zeros(6) if observer is None else observer.largest,
+        "decay_before": decay(instants * (period - late)),
+        "decay_delay": decay(instants * late),
+        "decay_period": decay(instants * period),
+        "plausible_state": PLAUSIBLE,
+        "plausible_reference": PLAUSIBLE[list(REFERENCE_STATES)],
+    }
+
+
+def fallback_numbers(
+    model: LinearModel, bounds: ActuatorBounds | None, settings: FallbackSettings, horizon: int
+) -> dict[str, int | float | Array]:
+    """Return the members of a `quadsim_fallback`; see `quadsim.mpc.guard.contract.Guard`, which compares times [s].
+
+    Args:
+        model: of level hover.
+        bounds: on commands; None for none.
+        settings: the table, with the tilt that its law's bounds leave.
+        horizon: N of the law's plans.
+    """
+    period, free = model.period, np.full(N_ROTORS, NO_BOUND)
+    assert settings.tilt is not None
+    hover, Q = HoverLaw(model, tilt=math.radians(settings.tilt)), acceleration_noise(period)
+    pairs = [Q[first : first + 2, first : first + 2][np.triu_indices(2)] for first in (POSITION[0], EULER[0])]
+    sides = (-free, free, -free, free)
+    if bounds is not None:
+        sides = bounds.u_min, bounds.u_max, bounds.delta_min, bounds.delta_max
+    least, most, step_least, step_most = (np.clip(side, -NO_BOUND, NO_BOUND) for side in sides)
+
+    def periods(time: float) -> int:
+        """Return the most periods that last no longer than a time [s]."""
+        count = math.floor(time / period)
+        return min(next(n for n in (count + 1, count, count - 1) if n * period <= time), MOST_PERIODS)
+
+    return {
+        "targets": int(model.targets),
+        "plan_age": min(periods(settings.plan_age + 1e-9), horizon - 1),
+        "hover_periods": min(math.ceil((settings.hover - 1e-9) / period), MOST_PERIODS),
+        "unseen": periods(settings.unseen),
+        "compared": periods(LONGEST_SPAN + 1e-6),
+        "sink": settings.sink,
+        "sunk": settings.sink * period,
+        "settled": settings.settled,
+        "tilt": hover.tilt,
+        "climb": LARGEST_CLIMB,
+        "turn": LARGEST_TURN,
+        "largest_command": LARGEST_SPEED,
+        "largest_reference": PLAUSIBLE_REFERENCE,
+        "distance": settings.distance,
+        "plausible": PLAUSIBLE,
+        "unmoved": UNMOVED,
+        "noise": NOISE**2,
+        "unknown": UNKNOWN**2,
+        "process": np.concatenate(pairs),
+        "hover": model.u_bar,
+        "least": least,
+        "most": most,
+        "step_least": step_least,
+        "step_most": step_most,
+        "A": model.A,
+        "B": model.B,
+        "gain": hover.gain,
+        "lean": hover.lean,
+        "slope": hover.slope[0],
+        "inverse": hover.inverse,
+    }

@@ -1,1 +1,0 @@
-"""The rigid body at any attitude, and its exact derivatives."""

@@ -1,0 +1,162 @@
+"""What flies a vehicle: a law, the fallback contract that guards it, and the faster loop that flies its commands."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from quadsim.controller import (
+    GROUNDED,
+    ROTORS,
+    Adopting,
+    AutopilotLoop,
+    Command,
+    Commanding,
+    Controller,
+    Diagnosable,
+    Predicting,
+    Settling,
+    StepInputs,
+    stopped,
+    takes_targets,
+)
+from quadsim.core.inner import CompiledLoop
+from quadsim.core.mirror import Struct
+from quadsim.mpc.guard.contract import Guard
+from quadsim.mpc.pilot.indi import TorqueIncrement
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+
+class Pilot:
+    """A law, with or without the fallback contract around it, and with or without an inner loop.
+
+    An inner loop corrects the rotor speeds that the law commands (`quadsim.mpc.pilot.indi.TorqueIncrement`), or is an
+    autopilot. The law then commands targets: `speeds` a row, thrust [N] and body rates [rad/s] (4,), perhaps with an
+    attitude (8,), `plan` such rows; `now.acting` and `reset` give it the target in force. To the flight the pilot is
+    the inner loop then: it passes calls on to the autopilot, and so knows the target in force whenever commands come
+    late.
+
+    Attributes:
+        law: the law.
+        guard: the fallback contract; None for none.
+        inner: the inner loop; None where the rotors hold each command.
+    """
+
+    def __init__(
+        self,
+        law: Controller,
+        vehicle: Vehicle,
+        *,
+        guard: Guard | None = None,
+        inner: TorqueIncrement | AutopilotLoop | None = None,
+    ) -> None:
+        self.law, self.guard, self.inner = law, guard, inner
+        self.takes_targets, self.rate = takes_targets(inner), 0.0 if inner is None else inner.rate
+        self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
+        self._slowest = np.full(4, vehicle.speed_min)
+        self._target, self._fresh = self._hover, True  # the target in force; whether the autopilot is to be reset
+        # Body rates at which it starts then, with the rotors as they turn [rad/s]; None from the ground: as at hover.
+        self._rates: Array | None = np.zeros(3)
+
+    @property
+    def name(self) -> str:
+        """Short name of the law."""
+        return self.law.name
+
+    @property
+    def solver(self) -> str:
+        """Name of the law's QP solver; empty for a closed form."""
+        return self.law.solver
+
+    @property
+    def horizon(self) -> int:
+        """N of the law."""
+        return self.law.horizon
+
+    @property
+    def commands(self) -> str:
+        """What the law commands: rotor speeds, or the targets of an autopilot by name."""
+        return self.law.commands if isinstance(self.law, Commanding) else ROTORS
+
+    @property
+    def infeasible_period(self) -> object:
+        """The law's first period since `reset` whose QP had no answer; None if there is none."""
+        return self.law.infeasible_period if isinstance(self.law, Diagnosable) else None
+
+    def reset(self, speeds: Array) -> None:
+        """Restart after the command u(-1) (4,) [rad/s], at rest unless `begin` follows.
+
+        The target before the first is hover.
+        """
+        self._target, self._fresh, self._rates = self._hover, True, np.zeros(3)
+        before = self._hover.copy() if self.takes_targets else speeds
+        if self.guard is not None:
+            before = self.guard.reset(before)
+        self.law.reset(before)
+        if isinstance(self.inner, TorqueIncrement):
+            self.inner.reset()
+
+    def begin(self, rates: Array) -> None:
+        """Let the autopilot start, after a reset, on a vehicle that turns at body rates (3,) [rad/s]."""
+        self._rates = rates.copy()
+
+    def adopt(self, previous: object) -> None:
+        """Take over what the previous pilot's law, contract and inner loop know; a vehicle has one autopilot."""
+        before = previous if isinstance(previous, Pilot) else None
+        if isinstance(self.law, Adopting):
+            self.law.adopt(previous if before is None else before.law)
+        if before is None:
+            return
+        if self.guard is not None and before.guard is not None:
+            self.guard.adopt(before.guard, self.horizon)
+        if isinstance(self.inner, TorqueIncrement):
+            if isinstance(before.inner, TorqueIncrement):
+                self.inner.adopt(before.inner)
+        elif self.inner is not None and isinstance(before.inner, type(self.inner)):
+            self.inner, self._target, self._fresh = before.inner, before._target, before._fresh
+
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
+        """Return the law's or the contract's command, with its inner loop; that is off on the ground."""
+        if self.takes_targets:
+            now = replace(now, acting=self._target)
+        if self.guard is None:
+            command = self.law.step(now, state, reference)
+        else:
+            command = self.guard.step(self.law, now, state, reference)
+        if self.inner is None:
+            return command
+        if now.phase not in GROUNDED:
+            return replace(command, inner=self if self.takes_targets else self.inner)
+        if isinstance(self.inner, TorqueIncrement):
+            self.inner.reset()
+            return command
+        self._target, self._fresh, self._rates = self._hover, True, None
+        return stopped(self._slowest.copy(), self.horizon, now.phase)
+
+    def engage(self, command: Array, rotors: Array) -> Struct | None:
+        """Let a target fly from now on, at rotor speeds (4,) [rad/s]; the autopilot is reset before its first.
+
+        Returns:
+            the autopilot's struct, where the core answers for it; None: `speeds` is to be asked.
+        """
+        assert self.inner is not None
+        if self._fresh:
+            self.inner.reset()
+            if self._rates is not None and isinstance(self.inner, Settling):
+                self.inner.settle(self._rates, rotors)
+        self._target, self._fresh = command, False
+        return self.inner.engage(command, rotors) if isinstance(self.inner, CompiledLoop) else None
+
+    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
+        """See `quadsim.controller.InnerLoop`."""
+        self.engage(commanded, rotors)
+        assert self.inner is not None
+        return self.inner.speeds(time, commanded, rates, rotors, attitude)
+
+    def predict(self, states: Array, plans: Array) -> Array | None:
+        """See `quadsim.controller.Predicting`."""
+        if self.guard is not None:
+            return self.guard.predict(self.law, states, plans)
+        return self.law.predict(states, plans) if isinstance(self.law, Predicting) else None

@@ -1,0 +1,373 @@
+"""The optimal control problem of an MPC as a value: the only definition of what is solved.
+
+Over N steps of a linear model, from x(k) and after the input u(k-1), the MPC minimises
+
+    sum_i |C_r x(k+i) - y_d(i)|^2_Qy + |u(k+i-1) - u_s|^2_Qu + |u(k+i-1) - u(k+i-2)|^2_Qd,    i = 1 .. N,
+
+where the last state may have its own weight P, about the equilibrium x_s (`Equilibrium`), subject to a tuple of
+constraints. Every formulation is built from the stacked rows of all constraints, whatever their kind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quadsim import shorthands
+from quadsim.errors import ParameterError
+from quadsim.mpc.problem.constraints import Bounds, Constraint, Rows, renumbered, row_scale
+from quadsim.mpc.problem.model import LinearModel
+from quadsim.mpc.problem.regulator import stabilising
+from quadsim.state import REFERENCE_RATES, REFERENCE_STATES, Array, Indices
+
+
+class Equilibrium(NamedTuple):
+    """An equilibrium of the model, x_s = A x_s + B (u_s - u_bar); u_s is also the target of the inputs."""
+
+    x: Array  # (n,) x_s
+    u: Array  # (nu,) u_s [rad/s]; (N, nu) if it differs from step to step, with a model that changes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Objective:
+    """The cost of Eq. (5), with two further terms."""
+
+    C_r: Array  # (n_r, n) regulated outputs y_r = C_r xi. Eq. (4), where the paper prints n_r x n_r
+    Q_y: Array  # (n_r, n_r) weight of the output error, symmetric positive definite
+    Q_u: Array  # (nu, nu) weight of u - u_bar, symmetric positive definite
+    # (nu, nu) weight of input changes from step to step, symmetric positive semidefinite; None for none
+    Q_d: Array | None = None
+    # (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), replaces Q_y there; symmetric
+    # positive semidefinite; None for none
+    P: Array | None = None
+    follows_rates: bool = True  # whether desired velocities and yaw rate are the reference's; otherwise they are 0
+
+    def __post_init__(self) -> None:
+        for name in ("Q_y", "Q_u"):
+            _check_definite(name, getattr(self, name), least=0.0)
+        for name in ("Q_d", "P"):
+            if getattr(self, name) is not None:
+                _check_definite(name, getattr(self, name), least=-1e-12)
+        if self.C_r.ndim != 2 or self.Q_y.shape[0] != self.C_r.shape[0]:
+            raise ParameterError("controller", "C_r", self.C_r.shape, f"of shape ({self.Q_y.shape[0]}, n)")
+
+    @cached_property
+    def needs_rates(self) -> bool:
+        """Whether a desired output of a linear model depends on the reference's velocities or its yaw rate."""
+        return self.follows_rates and bool(self.C_r[:, REFERENCE_RATES].any())
+
+    def desired(self, reference: Array, rates: Array | None = None) -> Array:
+        """Return the desired outputs y_r^d (N, n_r) of a linear model; roll, pitch and their rates are desired at 0.
+
+        Args:
+            reference: (N, 4) x, y, z [m], yaw [rad].
+            rates: (N, 4) their rates of change (`reference_rates`); None where it `needs_rates` not.
+
+        Raises:
+            ParameterError: an output depends on the rates, which are absent.
+        """
+        desired: Array = np.dot(reference, self.C_r[:, REFERENCE_STATES].T)
+        if not self.needs_rates:
+            return desired
+        if rates is None:
+            rule = "given where a velocity or the yaw rate has a weight: Problem.desired computes them"
+            raise ParameterError("controller", "rates", None, rule)
+        return np.asarray(desired + np.dot(rates, self.C_r[:, REFERENCE_RATES].T))
+
+    @cached_property
+    def weights(self) -> tuple[Array, Array]:
+        """Q (n, n) and W (n, n_r) of the state cost x' Q x - 2 x' W y_d, up to a constant."""
+        W = self.C_r.T @ self.Q_y
+        return W @ self.C_r, W
+
+    @cached_property
+    def terminal_weights(self) -> tuple[Array, Array]:
+        """The same for the last state, with x_s as the origin."""
+        return self.weights if self.P is None else (self.P, self.P @ np.linalg.pinv(self.C_r))
+
+    @property
+    def move_weight(self) -> Array:
+        """Q_d (nu, nu), zeros if there is none."""
+        return np.zeros_like(self.Q_u) if self.Q_d is None else self.Q_d
+
+
+def reference_rates(reference: Array, period: float) -> Array:
+    """Return the velocities [m/s] and the yaw rate [rad/s] (N, 4) of a reference (N, 4), from its steps.
+
+    They are the mean of the steps before and after a row, and at both ends those of the parabola through three rows:
+    exact where the acceleration is constant.  Of two rows they are the one step.
+
+    Args:
+        reference: x, y, z [m], yaw [rad], the yaw without jumps of a turn (`quadsim.state.ReferenceTurns`).
+        period: time from row to row [s].
+
+    Raises:
+        ParameterError: there is only one row.
+    """
+    if len(reference) < 2:
+        rule = "at least 2 where a velocity or the yaw rate has a weight: it is desired as the reference changes"
+        raise ParameterError("controller", "horizon", len(reference), rule)
+    steps = (reference[1:] - reference[:-1]) / period
+    rates = np.empty_like(reference)
+    rates[1:-1] = 0.5 * (steps[:-1] + steps[1:])
+    second = min(1, len(steps) - 1)
+    rates[0] = 1.5 * steps[0] - 0.5 * steps[second]
+    rates[-1] = 1.5 * steps[-1] - 0.5 * steps[-1 - second]
+    return rates
+
+
+def lqr_terminal_weight(model: LinearModel, objective: Objective, states: Sequence[str] | None = None) -> Array:
+    """Return P (n, n) of the DARE: the unconstrained cost of bringing a state to rest over an infinite horizon.
+
+    With it, the unconstrained optimum over N steps is that over an infinite horizon, except for the weight of input
+    changes, which the DARE omits.  `states` names those of the model, unless they are a vehicle's.
+
+    Raises:
+        ParameterError: some states would not come to rest, for example because an undamped state has no weight.
+    """
+    try:
+        P, _ = stabilising(model.A, model.B, objective.C_r, objective.Q_y, objective.Q_u, states)
+    except ValueError as error:
+        rule = f"left out, or weights on all of x, y, z and yaw: {error}"
+        raise ParameterError("controller", "terminal", "lqr", rule) from error
+    return np.asarray(0.5 * (P + P.T))
+
+
+class CondensedQP(NamedTuple):
+    """min 1/2 x' H x + f' x  subject to  lower <= A x <= upper,  x_min <= x <= x_max; see `Problem.qp`."""
+
+    H: Array
+    f: Array
+    A: Array
+    lower: Array  # may be -inf
+    upper: Array  # may be inf
+    x_min: Array  # likewise
+    x_max: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """A complete definition of a controller, apart from how its optimum is computed."""
+
+    model: LinearModel  # the prediction model
+    horizon: int  # N, steps
+    objective: Objective  # the cost to minimise
+    bounds: Bounds | None = None  # the paper's constraints; None for none
+    constraints: tuple[Constraint, ...] = ()  # further constraints
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.horizon, int) or self.horizon < 1:
+            raise ParameterError("controller", "horizon", self.horizon, "a whole number >= 1")
+        n, nu = self.model.n, self.model.nu
+        check_shape("C_r", self.objective.C_r, (self.objective.C_r.shape[0], n))
+        check_shape("Q_u", self.objective.Q_u, (nu, nu))
+        for name, matrix, shape in (("Q_d", self.objective.Q_d, (nu, nu)), ("P", self.objective.P, (n, n))):
+            if matrix is not None:
+                check_shape(name, matrix, shape)
+        for constraint in self.every_constraint:
+            m = constraint.lower.shape[-1]
+            for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
+                if matrix is not None:
+                    steps = (self.horizon,) if matrix.ndim == 3 else ()
+                    check_shape(f"{constraint.name}.{name}", matrix, (*steps, m, columns))
+            if constraint.lower.ndim == 2:
+                check_shape(f"{constraint.name}.lower", constraint.lower, (self.horizon, m))
+
+    @property
+    def equilibrium(self) -> Equilibrium:
+        """The equilibrium of the linearisation, at the origin."""
+        return Equilibrium(np.zeros(self.model.n), self.model.u_bar)
+
+    @property
+    def every_constraint(self) -> tuple[Constraint, ...]:
+        """The paper's constraints, in the order of `Bounds.constraints`, then the others."""
+        return (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
+
+    def rates(self, reference: Array) -> Array | None:
+        """Return the `reference_rates` of a preview (N, 4); None if no desired output depends on them."""
+        return reference_rates(reference, self.model.period) if self.objective.needs_rates else None
+
+    def desired(self, reference: Array) -> Array:
+        """Return the desired outputs (N, n_r) of a preview (N, 4) x, y, z [m], yaw [rad], and of its rates."""
+        return self.objective.desired(reference, self.rates(reference))
+
+    def condensed(self) -> Any:
+        """The QP in the inputs alone: its parts that are the same in all periods.
+
+        Returns:
+            A `quadsim.mpc.Condensed`: `cost` has H (N nu, N nu) of Eq. (7), F_x (N nu, n) of Eq. (8) and F_y (N nu, N
+            n_r) of Eq. (9); `qp.G` has the rows, time by time; `inputs(x)` takes a solution to the plan (N, nu)
+            [rad/s].
+
+        Examples:
+            >>> import quadsim
+            >>> form = quadsim.problem("paper-constrained").condensed()
+            >>> form.cost.H.shape, form.cost.F_x.shape
+            ((200, 200), (200, 12))
+        """
+        return self._condensed
+
+    @cached_property
+    def _condensed(self) -> Any:
+        return shorthands.condensed_form(self)
+
+    def qp(
+        self, state: Array, reference: Array, u_before: Array, equilibrium: Equilibrium | None = None
+    ) -> CondensedQP:
+        """The condensed QP of one period, as new numpy arrays for any solver.  Eqs. (27)-(29).
+
+        The variables x are the inputs u(k), ..., u(k+N-1) [rad/s], so x[:4] is the command, and then the slacks of
+        soft rows.  Tightened bounds are in `lower` and `upper`.  Rows and slacks are those of the constraints times
+        `rows.scale`, a power of two that is 1 for bounds on single states.
+
+        Args:
+            state: (12,) x(k) [m, m/s, rad, rad/s].  A model with rotor lag has the rotor speeds [rad/s] as well, (16,);
+                (12,) then stands for rotors at `u_before`.
+            reference: (N, 4) x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.
+            u_before: (4,) u(k-1) [rad/s].
+            equilibrium: where the model rests against a disturbance; absent for hover.
+
+        Raises:
+            ParameterError: an array has another shape.
+
+        Examples:
+            >>> import numpy as np
+            >>> import quadsim
+            >>> problem = quadsim.problem("paper-unconstrained")
+            >>> H, f, A, lower, upper, x_min, x_max = problem.qp(np.zeros(12), np.zeros((50, 4)), np.full(4, 200.0))
+            >>> bool(np.allclose(np.linalg.solve(H, -f)[:4], problem.model.u_bar))
+            True
+        """
+        return self._condensed.period(state, reference, u_before, equilibrium)
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The rows of all constraints, normalised."""
+        constraints = self.every_constraint
+        if not constraints:
+            raise ValueError("a constrained MPC needs a problem with bounds")
+        N, n, nu = self.horizon, self.model.n, self.model.nu
+        parts = [(part, part.lower.shape[-1]) for part in constraints]
+        differing = (N,) if any(part.C is not None and part.C.ndim == 3 for part in constraints) else ()
+
+        def stacked(name: str, columns: int, steps: tuple[int, ...] = ()) -> Array:
+            matrices = [(0.0 if getattr(part, name) is None else getattr(part, name), m) for part, m in parts]
+            return np.concatenate([np.broadcast_to(M, (*steps, m, columns)) for M, m in matrices], axis=-2)
+
+        C, D, E = stacked("C", n, differing), stacked("D", nu), stacked("E", nu)
+        lower = np.concatenate([np.broadcast_to(part.lower, (N, m)) for part, m in parts], axis=1)
+        upper = np.concatenate([np.broadcast_to(part.upper, (N, m)) for part, m in parts], axis=1)
+        l1 = np.concatenate([np.full(m, math.inf) if part.penalty is None else part.penalty.l1 for part, m in parts])
+        l2 = np.concatenate([np.zeros(m) if part.penalty is None else part.penalty.l2 for part, m in parts])
+        names = [part.name for part, m in parts for _ in range(m)]
+        first = np.cumsum([0, *(m for _, m in parts)])
+        slack = np.concatenate(
+            [
+                np.full(m, -1) if part.penalty is None else k + (0 if part.penalty.largest else 1) * np.arange(m)
+                for (part, m), k in zip(parts, first, strict=False)
+            ]
+        )
+        scale = row_scale(_largest_coefficients(C, D, E))
+        for first_row in np.unique(slack[slack >= 0]):
+            shared = slack == first_row
+            scale[shared] = scale[shared].min()
+        C, D, E = C * scale[:, None], D * scale[:, None], E * scale[:, None]
+        lower, upper = lower * scale, upper * scale
+        l1, l2 = l1 / scale, l2 / scale**2
+        of_states = C.any(axis=-1) if C.ndim == 2 else C.any(axis=(0, 2))
+
+        def alone(of: Array, other: Array) -> Indices:
+            single = (
+                ~of_states & ~other.any(1) & (np.count_nonzero(of, axis=1) == 1) & (of.max(axis=1, initial=0.0) == 1.0)
+            )
+            return np.where(np.isinf(l1) & single, np.argmax(of, axis=1), -1)
+
+        bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
+        return Rows(
+            scale=scale[bounded],
+            C=C[..., bounded, :],
+            D=D[bounded],
+            E=E[bounded],
+            lower=lower[:, bounded],
+            upper=upper[:, bounded],
+            l1=l1[bounded],
+            l2=l2[bounded],
+            slack=renumbered(slack[bounded]),
+            of_states=np.asarray(~D[bounded].any(axis=1) & ~E[bounded].any(axis=1)).reshape(bounded.size),
+            input=alone(D, E)[bounded],
+            step=alone(E, D)[bounded],
+            names=tuple(names[i] for i in bounded),
+        )
+
+
+def _largest_coefficients(C: Array, D: Array, E: Array) -> Array:
+    """Return (m,) the largest magnitude of a row's coefficients in C (m, n) or (N, m, n), D and E (m, nu)."""
+    of_states = np.abs(C).max(axis=-1, initial=0.0)
+    if C.ndim == 3:
+        of_states = of_states.max(axis=0)
+    of_inputs = np.maximum(np.abs(D).max(axis=1, initial=0.0), np.abs(E).max(axis=1, initial=0.0))
+    return np.asarray(np.maximum(of_states, of_inputs))
+
+
+class Query(NamedTuple):
+    """The data of one period: the arguments of the problem."""
+
+    state: Array  # (n,) x(k)
+    desired: Array  # (N, n_r) y_d for x(k+1) .. x(k+N)
+    u_before: Array  # (nu,) u(k-1) [rad/s]
+    equilibrium: Equilibrium | None = None  # None for the problem's own
+    # A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's model
+    steps: tuple[Array, Array, Array] | None = None
+
+
+def predicted(problem: Problem, query: Query, plan: Array) -> Array:
+    """(N, n) the predicted states of a plan (N, nu)."""
+    states, state = np.empty((len(plan), query.state.size)), query.state
+    if query.steps is not None:
+        for i, (A, B, c, u) in enumerate(zip(*query.steps, plan, strict=True)):
+            states[i] = state = A @ state + B @ u + c
+        return states
+    model, (x_s, u_s) = problem.model, query.equilibrium or problem.equilibrium
+    state = state - x_s
+    for i, push in enumerate((plan - u_s) @ model.B.T):
+        states[i] = state = model.A @ state + push
+    return states + x_s
+
+
+@dataclass(frozen=True, kw_only=True)
+class InfeasiblePeriod:
+    """The first period of a flight without an answer, or whose SQP did not converge."""
+
+    problem: Problem  # the problem
+    query: Query  # the state and reference without a solution; state and input are copied
+    status: str  # why the answer was rejected
+    time: float  # t_k, start of the period [s]
+    delay: float = 0.0  # from t_k to the instant of x(k) [s]
+    converges: Callable[[int], bool] | None = None  # if the SQP did not converge: whether it does within n iterations
+
+    def __post_init__(self) -> None:
+        query = self.query
+        object.__setattr__(self, "query", query._replace(state=query.state.copy(), u_before=query.u_before.copy()))
+
+
+def check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
+    """Raise `ParameterError` unless an array of `[controller]` has a shape."""
+    if value.shape != shape:
+        raise ParameterError("controller", name, value.shape, f"of shape {shape}")
+
+
+def _check_definite(name: str, matrix: Array, *, least: float) -> None:
+    """Reject a matrix that is not symmetric, or with an eigenvalue of at most `least` (times the largest entry)."""
+    symmetric = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix.T)
+    strict = least == 0.0
+    if symmetric and np.all(np.isfinite(matrix)):
+        smallest, limit = np.linalg.eigvalsh(matrix).min(initial=math.inf), least * np.abs(matrix).max(initial=0.0)
+        if smallest > limit or (not strict and smallest >= limit):
+            return
+    kind = "definite" if strict else "semidefinite"
+    raise ParameterError("controller", name, matrix.tolist(), f"symmetric and positive {kind}")

@@ -1,0 +1,192 @@
+"""The rigid body with a quaternion: any attitude, no singularity, exact derivatives of all nodes in one pass.
+
+The states are position p (world), quaternion q = (w, x, y, z) (Hamilton, body to world), velocity v (world) and body
+rates omega: 13. With rotor lag, the four rotors' thrusts or speeds are four further states that follow the inputs,
+
+    p' = v,    q' = 1/2 q (0, omega),    v' = T R(q) e_z - g e_z + R(q) d(R(q)' v) + a,
+    omega' = I^-1 (tau + tau_a - omega x I omega) + alpha,    d(v_b) = -(D_1 v_b + D_2 |v_b| v_b) / m, by components.
+
+With `moment`, tau_a = (m_x W v_y, -m_y W v_x, 0) - D omega (`Vehicle.air_moment`), with v_b and the sum W of the
+rotors' speeds: roots of thrusts, but below a share of 1 % a parabola, as the root has no derivative at 0.
+
+R(q) is polynomial and not divided by |q|^2, so the derivatives are valid for a q of any length.  Inputs u are the
+rotors' thrusts or speeds as shares of the largest, held between nodes; T = thrust / m and I^-1 tau are known exactly at
+every instant.  The classical Runge-Kutta method integrates the body.
+
+With `Inputs.RATES`, the inputs are targets of an inner loop, which follows each of them with a first-order lag. T is
+the only further state then, and omega has no torque in its equation:
+
+    omega' = (omega_c - omega) / tau_omega,    T' = (T_c - T) / tau_T.
+
+Both are known exactly at every instant; only p, q and v are integrated, so that a lag may be short, or 0.
+
+All terms but drag are quadratic in (q, omega), for given T and I^-1 tau: with F the Jacobian of that part, linear in
+(q, omega, T q), its value is F x / 2. So derivatives and value are the columns of one matrix that passes through the
+Runge-Kutta stages.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cached_property, partial
+from typing import Final
+
+import numpy as np
+
+from quadsim.mpc.problem.nonlinear_model import zero
+from quadsim.state import Array, read_only
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+N_BODY: Final = 13
+"""States of the body; rotor states follow."""
+P, Q, V, W = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
+_TURNING: Final = 10
+"""Rows and columns of (q, v, omega), on which the derivatives depend."""
+RATE_SCALE: Final = 1.5
+"""The body rate [rad/s] that is a share of 1, where inputs are targets, beside the weight as thrust.  Shares of the
+largest would be penalised too little: where noise reaches the controller, rates then move by hundreds of deg/s, for
+which the mixer raises the thrust."""
+_q, _v, _w = slice(0, 4), slice(4, 7), slice(7, 10)
+# R(q), row by row: 1 - 2 (yy + zz), 2 (xy - wz), 2 (xz + wy), ..., by the places of its products in q q'.
+_FIRST, _SECOND = np.array([10, 6, 7, 6, 5, 11, 7, 11, 5]), np.array([15, 3, 2, 3, 15, 1, 2, 1, 10])
+_SIGN: Final = np.array([1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
+_EYE: Final = np.eye(3).ravel()
+_OUTER: Final = 1.0 - 2.0 * _EYE
+
+
+def _zeros(columns: int) -> Array:
+    return read_only(np.zeros((3, columns)))
+
+
+class Inputs(StrEnum):
+    """The physical quantity of the inputs, as shares of the largest."""
+
+    THRUST = "thrust"
+    SPEED = "speed"
+    RATES = "rates"
+    """Collective thrust, as a share of the weight, and body rates, as shares of `RATE_SCALE`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigidBody:
+    """x(k+1) = f(x(k), u(k)) between nodes; see the module.  `dataclasses.replace` sets another disturbance."""
+
+    effectiveness: Array  # (4, 4) maps rotor thrusts [N] to T [m/s^2] and I^-1 tau [rad/s^2]
+    largest_thrust: float  # of a rotor [N]
+    inertia: Array  # (3,) [kg m^2]
+    mass: float  # [kg]
+    gravity: float  # [m/s^2]
+    step: float  # time between nodes [s]
+    substeps: int = 1  # Runge-Kutta steps in it
+    inputs: Inputs = Inputs.THRUST
+    rotor_lag: float | None = None  # time constant of thrusts or speeds [s]; None for none
+    lag: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # time constants of collective thrust, p, q, r behind targets [s]
+    thrust_scale: float = 1.0  # thrust that acts per thrust of the inputs
+    drag: Array = field(default_factory=zero)  # (3,) D_1, linear, body axes [N s/m]
+    quadratic_drag: Array = field(default_factory=zero)  # (3,) D_2, body axes [N s^2/m^2]
+    moment: Array = field(default_factory=partial(_zeros, 2))  # (3, 2) maps v_x, v_y [m/s] to I^-1 tau_a per share of W
+    inflow: Array = field(default_factory=partial(_zeros, 2))  # (3, 2) maps v_x v_z, v_y v_z [m^2/s^2] to I^-1 tau_a
+    damping: Array = field(default_factory=partial(_zeros, 3))  # (3, 3) I^-1 D [1/s]; neither with targets
+    acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
+    angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha, body frame [rad/s^2]; none with targets
+
+    @cached_property
+    def drags(self) -> bool:
+        """Whether there is drag."""
+        return bool(np.any(self.drag) or np.any(self.quadratic_drag))
+
+    @cached_property
+    def moments(self) -> bool:
+        """Whether the air turns the body."""
+        return any(map(np.any, (self.moment, self.inflow, self.damping)))
+
+    @property
+    def targets(self) -> bool:
+        """Whether the inputs are targets of an inner loop."""
+        return self.inputs is Inputs.RATES
+
+    @property
+    def actuators(self) -> int:
+        """Number of actuator states: four rotors, the collective thrust, or none."""
+        if self.targets:
+            return 1
+        return 0 if self.rotor_lag is None else N_ROTORS
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return N_BODY + self.actuators
+
+    @property
+    def scale(self) -> Array:
+        """(4,) the target [N], [rad/s] that is a share of 1."""
+        return np.array([self.mass * self.gravity, RATE_SCALE, RATE_SCALE, RATE_SCALE])
+
+    @property
+    def lags(self) -> tuple[float, ...]:
+        """(4,) time constants of what follows the inputs [s], 0 for none."""
+        return self.lag if self.targets else (self.rotor_lag or 0.0,) * N_ROTORS
+
+    @property
+    def effect(self) -> Array:
+        """(4, 4) maps shares of inputs to T [m/s^2] and I^-1 tau [rad/s^2]; of targets, to T and body rates [rad/s]."""
+        if self.targets:
+            return np.diag(self.scale / [self.mass, 1.0, 1.0, 1.0])
+        return self.effectiveness * self.largest_thrust
+
+    def thrusts(self, shares: Array) -> Array:
+        """Return the rotor thrusts [N] for inputs, or for the rotors' states."""
+        return self.largest_thrust * (np.square(shares) if self.inputs is Inputs.SPEED else shares)
+
+    def shares(self, thrusts: Array) -> Array:
+        """Return the inputs for rotor thrusts [N]; negative ones count as zero if inputs are speeds."""
+        shares = np.asarray(thrusts) / self.largest_thrust
+        return shares if self.inputs is Inputs.THRUST else np.sqrt(np.maximum(shares, 0.0))
+
+
+def rigid_body(vehicle: Vehicle, step: float, *, moment: bool = False, **others: object) -> RigidBody:
+    """Return the vehicle's model, undisturbed, with `moment` also in the air's torque; `others` sets other fields."""
+    if moment:
+        still, units = np.zeros(3), np.eye(3)
+        across = [vehicle.air_moment(vehicle.speed_max, unit, still) for unit in units[:2]]
+        climbing = [vehicle.air_moment(0.0, unit + units[2], still) for unit in units[:2]]
+        damped = [vehicle.air_moment(0.0, still, unit) for unit in units]
+        others["moment"] = read_only(vehicle.angular_acceleration(np.array(across)).T)
+        others["inflow"] = read_only(vehicle.angular_acceleration(np.array(climbing)).T)
+        others["damping"] = read_only(-vehicle.angular_acceleration(np.array(damped)).T)
+    return RigidBody(
+        effectiveness=read_only(vehicle.accelerations(vehicle.allocation / vehicle.mean_coefficient)),
+        largest_thrust=vehicle.mean_coefficient * vehicle.speed_max**2,
+        inertia=read_only(np.array(vehicle.inertia)),
+        mass=vehicle.mass,
+        gravity=vehicle.gravity,
+        step=step,
+        **others,  # type: ignore[arg-type]
+    )
+
+
+def thrust_axis(q: Array) -> Array:
+    """R(q) e_z (..., 3) of quaternions (..., 4) of any length."""
+    w, x, y, z = (q[..., i] for i in range(4))
+    axis = np.empty((*q.shape[:-1], 3))
+    axis[..., 0], axis[..., 1], axis[..., 2] = (
+        2.0 * (x * z + w * y),
+        2.0 * (y * z - w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    )
+    return axis
+
+
+def rotation(q: Array) -> Array:
+    """R(q) (..., 3, 3), polynomial, of quaternions (..., 4) of any length."""
+    products = (q[..., :, None] * (2.0 * q[..., None, :])).reshape(*q.shape[:-1], 16)
+    sums = products.take(_FIRST, -1) + _SIGN * products.take(_SECOND, -1)
+    return (_EYE + _OUTER * sums).reshape(*q.shape[:-1], 3, 3)
+
+
+def drag_acceleration(model: RigidBody, R: Array, v: Array) -> Array:
+    """(..., 3) acceleration by drag, world [m/s^2], for attitudes (..., 3, 3) and velocities (..., 3) [m/s]."""
+    air = (np.swapaxes(R, -1, -2) @ v[..., None])[..., 0]
+    pull = -(model.drag * air + model.quadratic_drag * np.abs(air) * air) / model.mass
+    return np.asarray((R @ pull[..., None])[..., 0])

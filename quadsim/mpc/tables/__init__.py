@@ -1,0 +1,1 @@
+"""The tables `[controller]` of scenario files: their fields, limits and messages."""

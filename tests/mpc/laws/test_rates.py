@@ -1,0 +1,472 @@
+"""Targets of an inner loop as inputs, thrust and body rates: the model, flights, bounds, fallback and refusals."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from support import advance_nodes, frame, linearise_nodes
+
+from quadsim.assets import vehicle_path
+from quadsim.controller import NOT_CONVERGED, Command, Controller, Phase, StepInputs
+from quadsim.errors import FlightError, ParameterError
+from quadsim.mpc.estimate.disturbance import RampSettings
+from quadsim.mpc.estimate.observer import ObserverSettings
+from quadsim.mpc.guard.contract import FallbackSettings
+from quadsim.mpc.guard.hover import HoverLaw
+from quadsim.mpc.laws.parts.builders import build
+from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
+from quadsim.mpc.pilot.indi import INDISettings
+from quadsim.mpc.problem.constraints import Constraint
+from quadsim.mpc.problem.model import target_model
+from quadsim.mpc.problem.rigidbody import (
+    N_BODY,
+    RATE_SCALE,
+    Inputs,
+    P,
+    Q,
+    RigidBody,
+    V,
+    W,
+    rigid_body,
+    rotation,
+    thrust_axis,
+)
+from quadsim.mpc.tables.bounded import Avoidance, Polytope, Soft, TargetBounds
+from quadsim.mpc.tables.nonlinear import Nonlinear, Weights
+from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
+from quadsim.space import Sphere
+from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array
+from quadsim.vehicle import load_vehicle
+
+VEHICLE = load_vehicle(vehicle_path("hummingbird"))
+LAG = (0.02, 0.035, 0.035, 0.1)
+LAGS = [LAG, (0.0, 0.035, 0.0, 0.1), (0.072, 0.0, 0.01, 0.0), (0.0, 0.0, 0.0, 0.0)]
+OTHERS: list[dict[str, Any]] = [
+    {},
+    {"drag": np.array([0.3, 0.2, 0.1]), "quadratic_drag": np.array([0.08, 0.05, 0.02]), "thrust_scale": 0.8},
+    {"acceleration": np.array([0.3, -0.2, 0.5])},
+]
+
+
+def model_of(step: float = 0.05, lag: tuple[float, ...] = LAG, **others: Any) -> RigidBody:
+    return rigid_body(VEHICLE, step, inputs=Inputs.RATES, lag=lag, **others)
+
+
+def points(count: int = 6) -> tuple[Array, Array]:
+    """States (count, 14) at any attitude, and targets as shares (count, 4)."""
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(count, 14)), 0.2 * rng.normal(size=(count, 4))
+    x[:, Q] /= np.linalg.norm(x[:, Q], axis=1, keepdims=True)
+    x[:, N_BODY], u[:, 0] = rng.uniform(0.1, 0.9, (2, count))
+    return x, u
+
+
+# --- the model -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("lag", "substeps", "others"), [*itertools.product(LAGS, (1, 3), OTHERS)])
+def test_derivatives_are_those_of_finite_differences(
+    lag: tuple[float, ...], substeps: int, others: dict[str, Any]
+) -> None:
+    model = model_of(0.1, lag, substeps=substeps, **others)
+    x, u = points()
+    A, B, end = linearise_nodes(model, x, u)
+    np.testing.assert_allclose(end, advance_nodes(model, x, u), rtol=1e-12, atol=1e-12)
+    for result, width in ((A, 14), (B, 4)):
+        for j in range(width):
+            d = 1e-5 * np.eye(width)[j]
+            pairs = ((x + d, u), (x - d, u)) if width == 14 else ((x, u + d), (x, u - d))
+            above, below = (advance_nodes(model, *pair) for pair in pairs)
+            expected = (above - below) / 2e-5
+            np.testing.assert_allclose(result[:, :, j], expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+
+def test_derivatives_in_frames_are_those_of_multiplied_quaternions() -> None:
+    model, (x, u) = model_of(), points(3)
+    frames = np.random.default_rng(1).normal(size=(4, 4))
+    frames /= np.linalg.norm(frames, axis=1, keepdims=True)
+    (A, B, end), (plain, inputs, same) = linearise_nodes(model, x, u, frames), linearise_nodes(model, x, u)
+    np.testing.assert_array_equal(end, same)
+    for i in range(3):
+        before, after = np.eye(14), np.eye(14)
+        before[Q, Q], after[Q, Q] = frame(frames[i]), frame(frames[i + 1])
+        np.testing.assert_allclose(A[i], after @ plain[i] @ before.T, atol=1e-12)
+        np.testing.assert_allclose(B[i], after @ inputs[i], atol=1e-12)
+
+
+@pytest.mark.parametrize("step", [1e-3, 0.05, 1.0, 30.0])
+def test_rates_and_thrust_follow_exactly_whatever_the_step(step: float) -> None:
+    """A Runge-Kutta step of more than 2.8 time constants would diverge."""
+    x, u = points()
+    end = advance_nodes(model_of(step), x, u)
+    left = np.exp(-step / np.array(LAG))
+    np.testing.assert_allclose(end[:, W], RATE_SCALE * u[:, 1:] + left[1:] * (x[:, W] - RATE_SCALE * u[:, 1:]))
+    np.testing.assert_allclose(end[:, N_BODY], u[:, 0] + left[0] * (x[:, N_BODY] - u[:, 0]))
+
+
+@pytest.mark.parametrize("others", OTHERS)
+def test_it_moves_by_the_equations_of_the_rigid_body_and_four_lags(others: dict[str, Any]) -> None:
+    """A variable-step integrator of the equations as they are written; lags of 0 act at once."""
+    (x, u), model = points(1), model_of(0.05, substeps=50, **others)
+    target = model.scale * u[0]
+
+    def slopes(_: float, y: Array) -> Array:
+        q, v, omega, T = y[Q], y[V], y[W], y[N_BODY]
+        R, (w, *vector) = rotation(q), q
+        air = R.T @ v
+        drag = -(model.drag + model.quadratic_drag * np.abs(air)) * air
+        force = np.array([0.0, 0.0, model.thrust_scale * T]) + drag
+        turn = 0.5 * np.array([-np.dot(vector, omega), *(w * omega + np.cross(vector, omega))])
+        v_slope = R @ force / VEHICLE.mass + model.acceleration - [0.0, 0.0, VEHICLE.gravity]
+        return np.concatenate([v, turn, v_slope, (target[1:] - omega) / LAG[1:], [(target[0] - T) / LAG[0]]])
+
+    start = x[0] * np.array([*[1.0] * N_BODY, model.scale[0]])
+    end = solve_ivp(slopes, (0.0, 0.05), start, rtol=1e-11, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(advance_nodes(model, x, u)[0, :N_BODY], end[:N_BODY], atol=1e-7)
+
+
+# --- the controller ------------------------------------------------------------------------------------------------
+
+WEIGHTS = Weights(position=20.0, attitude=(1.0, 1.0, 2.0), velocity=1.0, body_rates=0.02, input=0.1, move=0.04)
+LEVEL = np.array([VEHICLE.mass * VEHICLE.gravity, 0.0, 0.0, 0.0])
+Course = Callable[[float], tuple[float, ...]]
+
+
+def table(**fields: Any) -> Nonlinear:
+    usual = {"horizon": 40, "node": 0.04, "terminal": "lqr", "weights": WEIGHTS}
+    return Nonlinear(**{"commands": "rates", "inner_lag": LAG, **usual, **fields})
+
+
+def at_rest(**plant: Any) -> Array:
+    """(14,) hover, with the thrust that the plant needs."""
+    x = np.zeros(14)
+    x[3], x[N_BODY] = 1.0, LEVEL[0] / model_of().scale[0] / plant.get("thrust_scale", 1.0)
+    return x
+
+
+def step_of(*target: float, at: float = 0.5) -> Course:
+    return lambda time: target if time >= at - 1e-9 else (0.0, 0.0, 0.0, 0.0)
+
+
+def fly(
+    controller: Controller, period: float, seconds: float, course: Course, x: Array | None = None, **plant: Any
+) -> tuple[Array, list[Command]]:
+    """States (K, 14) every 5 ms above an inner loop of exact lags, and the commands."""
+    model = model_of(5e-3, **{"lag": LAG, **plant})
+    x, states, commands = at_rest(**plant) if x is None else x, [], []
+    for k in range(round(seconds / period)):
+        state, euler = np.zeros(N_STATES), quaternion_to_euler(x[Q])
+        state[POSITIONS], state[VELOCITIES], state[ANGLES] = x[P], x[V], euler
+        state[ANGLE_RATES] = body_to_euler_rates(euler, x[W])
+        preview = np.array([course((k + 1 + i) * period) for i in range(controller.horizon)])
+        now = StepInputs(time=k * period, attitude=x[Q].copy(), body_rates=x[W].copy())
+        commands.append(controller.step(now, state, preview))
+        for _ in range(round(200.0 * period)):
+            x = advance_nodes(model, x, commands[-1].speeds / model.scale)
+            x[Q] /= np.linalg.norm(x[Q])
+            states.append(x)
+    return np.array(states), commands
+
+
+def tilts(states: Array) -> Array:
+    """(K,) angles of the thrust axis from the vertical [deg]."""
+    return np.degrees(np.arccos(np.clip(thrust_axis(states[:, Q])[:, 2], -1.0, 1.0)))
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_it_follows_a_previewed_step_quickly_with_small_overshoot(axis: int) -> None:
+    target = np.zeros(4)
+    target[axis] = 1.0
+    states, commands = fly(build(table(), VEHICLE, 0.02), 0.02, 2.5, step_of(*target))
+    way = states[:, axis]
+    assert 5e-3 * np.argmax(way > 0.9) - 0.5 < 0.3
+    assert way.max() < 1.06
+    np.testing.assert_allclose(states[-1, P], target[:3], atol=5e-3)
+    bounds = TargetBounds().actuators(VEHICLE)
+    rows = np.array([command.speeds for command in commands])
+    assert np.all((rows >= bounds.u_min) & (rows <= bounds.u_max))
+    assert {command.fallback for command in commands} == {0}
+
+
+@pytest.mark.slow("nonlinear")
+@pytest.mark.parametrize(("period", "node", "horizon"), [(0.02, 0.04, 40), (0.05, 0.05, 20)])
+@pytest.mark.parametrize(("tilt", "linear"), [(20.0, 200.0), (20.0, 600.0), (30.0, 2000.0)])
+def test_a_stiff_soft_tilt_does_not_turn_it_over(
+    period: float, node: float, horizon: int, tilt: float, linear: float
+) -> None:
+    """On an unfiltered step in all directions; with single SQP steps alone, some of these flights turned over."""
+    soft = Soft(linear=linear, quadratic=10.0)
+    made = table(horizon=horizon, node=node, tilt=tilt, soft=soft)
+    states, _ = fly(build(made, VEHICLE, period), period, 3.5, step_of(1.0, 1.0, 1.0, math.radians(45.0)))
+    assert tilts(states).max() < tilt + 0.5
+    np.testing.assert_allclose(states[-1, P], 1.0, atol=0.02)
+
+
+@pytest.mark.witness("nonlinear")
+def test_targets_and_body_rates_hold_their_bounds() -> None:
+    bounds = TargetBounds(thrust=(3.5, 8.0), body_rate=(120.0, 90.0, 60.0))
+    made = table(target_bounds=bounds, body_rate=100.0, soft=Soft(linear=1e4, quadratic=10.0))
+    states, commands = fly(build(made, VEHICLE, 0.02), 0.02, 2.5, step_of(1.0, 1.0, 1.0, math.radians(45.0)))
+    rows = np.array([command.speeds for command in commands])
+    largest = np.radians([120.0, 90.0, 60.0])
+    assert rows[:, 0].min() >= 3.5
+    assert rows[:, 0].max() == pytest.approx(8.0)
+    assert np.abs(rows[:, 2]).max() == pytest.approx(largest[1])
+    assert np.all(np.abs(rows[:, 1:]) <= largest + 1e-12)
+    assert np.abs(np.degrees(states[:, W])).max() < 101.0
+    sides = made.audited(VEHICLE)
+    assert sides["thrust"] == (3.5, 8.0)
+    assert [sides[f"body_rate_{axis}"][1] for axis in "xyz"] == [100.0, 90.0, 60.0]
+    assert not {"speed", "slew"} & set(sides)
+
+
+def test_bounds_of_targets_follow_the_vehicle() -> None:
+    largest, least = 4.0 * VEHICLE.thrust_coefficient * VEHICLE.speed_max**2, 0.5 * VEHICLE.mass * VEHICLE.gravity
+    bounds = TargetBounds().actuators(VEHICLE)
+    np.testing.assert_allclose(bounds.u_min, [least, *np.radians([-300.0, -300.0, -90.0])])
+    np.testing.assert_allclose(bounds.u_max, [0.9 * largest, *np.radians([300.0, 300.0, 90.0])])
+    assert np.isinf(bounds.delta_max).all()
+    np.testing.assert_allclose(bounds.lowest(LEVEL), [least, 0.0, 0.0, 0.0])
+
+
+def test_grounded_it_turns_nowhere_with_the_least_thrust() -> None:
+    made = build(table(), VEHICLE, 0.02)
+    least = [TargetBounds().actuators(VEHICLE).u_min[0], 0.0, 0.0, 0.0]
+    for controller in (made, made.law):  # type: ignore[attr-defined]
+        now = StepInputs(phase=Phase.LANDED)
+        np.testing.assert_allclose(
+            controller.step(now, np.zeros(N_STATES), np.zeros((controller.horizon, 4))).speeds, least
+        )
+
+
+@pytest.mark.slow("nonlinear")
+def test_offset_free_it_finds_the_thrust_that_holds_the_height() -> None:
+    weak = {"thrust_scale": 0.8}
+    still: Course = step_of(0.0, 0.0, 0.0, 0.0)
+    coarse = {"horizon": 20, "node": 0.05}
+    sagging, _ = fly(build(table(**coarse), VEHICLE, 0.05), 0.05, 3.0, still, **weak)
+    made = table(offset_free=ObserverSettings(), **coarse)
+    states, commands = fly(build(made, VEHICLE, 0.05), 0.05, 6.0, still, **weak)
+    assert sagging[-1, 2] < -0.03
+    assert abs(states[-1, 2]) < 1e-3
+    assert commands[-1].speeds[0] == pytest.approx(LEVEL[0] / 0.8, rel=1e-3)
+
+
+@pytest.mark.slow("nonlinear")
+@pytest.mark.parametrize("scaled", [pytest.param(True, marks=pytest.mark.witness("nonlinear")), False])
+def test_the_observer_of_forces_finds_the_thrust_that_holds_the_height(scaled: bool) -> None:
+    made = table(disturbance=RampSettings(thrust_scale=scaled), horizon=20, node=0.05)
+    controller = build(made, VEHICLE, 0.05)
+    states, commands = fly(controller, 0.05, 4.0, step_of(0.0, 0.0, 0.0, 0.0), thrust_scale=0.8)
+    world = controller.law._law.struct.world  # type: ignore[attr-defined]
+    np.testing.assert_allclose(states[-1, P], 0.0, atol=2e-3)
+    assert commands[-1].speeds[0] == pytest.approx(LEVEL[0] / 0.8, rel=2e-3)
+    assert world.thrust_scale == pytest.approx(0.8 if scaled else 1.0, abs=2e-3)
+    assert world.acceleration[2] == pytest.approx(0.0 if scaled else -0.2 * LEVEL[0] / 0.8 / VEHICLE.mass, abs=0.05)
+    np.testing.assert_array_equal(np.array(world.angular), 0.0)
+    controller.step(StepInputs(phase=Phase.LANDED), np.zeros(N_STATES), np.zeros((controller.horizon, 4)))
+    assert world.thrust_scale == 1.0
+
+
+def test_a_law_of_rotor_speeds_divides_by_the_thrust_scale_too() -> None:
+    made = Nonlinear(disturbance=RampSettings(thrust_scale=True), inputs="speed", horizon=20, terminal="lqr")
+    controller = build(made, VEHICLE, 0.05)
+    model, x = rigid_body(VEHICLE, 0.05, inputs=Inputs.SPEED, thrust_scale=0.8), np.zeros(N_BODY)
+    x[3] = 1.0
+    for k in range(80):
+        state = np.zeros(N_STATES)
+        state[POSITIONS], state[VELOCITIES] = x[P], x[V]
+        now = StepInputs(time=0.05 * k, attitude=x[Q].copy(), body_rates=x[W].copy())
+        command = controller.step(now, state, np.zeros((20, 4)))
+        x = advance_nodes(model, x, command.speeds / VEHICLE.speed_max)
+    assert abs(x[2]) < 2e-3
+    np.testing.assert_allclose(command.speeds, VEHICLE.hover_speed / math.sqrt(0.8), rtol=1e-3)
+    assert controller.law._law.struct.world.thrust_scale == pytest.approx(0.8, abs=2e-3)  # type: ignore[attr-defined]
+
+
+def test_it_predicts_its_own_flight() -> None:
+    controller = build(table(fallback=FallbackSettings(enabled=False)), VEHICLE, 0.02)
+    x = at_rest()
+    x[W] = 0.3, -0.2, 0.1
+    states, commands = fly(controller, 0.02, 0.02, step_of(0.2, 0.1, 0.3, 0.0, at=0.0), x)
+    start = np.zeros((1, N_STATES))
+    start[:, ANGLE_RATES] = x[W]
+    predicted = controller.predict(start, commands[0].plan[None])[0]
+    np.testing.assert_allclose(predicted[0, POSITIONS], states[-1, P], atol=5e-3)
+    np.testing.assert_allclose(predicted[0, ANGLES], quaternion_to_euler(states[-1, Q]), atol=1e-4)
+    np.testing.assert_allclose(predicted[0, ANGLE_RATES], states[-1, W], atol=5e-3)
+
+
+def test_it_takes_over_from_a_law_that_commands_rotors_without_a_jump() -> None:
+    rotors = build(Nonlinear(offset_free=ObserverSettings()), VEHICLE, 0.02)
+    rotors.law._law.learn(np.array([0.3, 0.0, 0.5, 1.0, 0.0, 0.0]))  # type: ignore[attr-defined]
+    rotors.step(StepInputs(), np.zeros(N_STATES), np.zeros((rotors.horizon, 4)))
+    rates = build(table(offset_free=ObserverSettings()), VEHICLE, 0.02)
+    for law, previous, row in ((rates, rotors, LEVEL), (rotors, rates, np.full(4, VEHICLE.hover_speed))):
+        law.reset(row)
+        law.adopt(previous)  # type: ignore[attr-defined]
+        np.testing.assert_allclose(law.law.disturbance[:3], [0.3, 0.0, 0.5])  # type: ignore[attr-defined]
+        np.testing.assert_allclose(law.law._acting, row)  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(rates.law.disturbance[3:], 0.0)  # type: ignore[attr-defined]
+    command = rates.step(StepInputs(), np.zeros(N_STATES), np.zeros((rates.horizon, 4)))
+    assert command.fallback == 0
+    assert command.speeds[0] == pytest.approx(LEVEL[0] * (1.0 - 0.5 / VEHICLE.gravity), rel=0.05)
+
+
+def test_it_goes_around_an_obstacle() -> None:
+    ball = Sphere(name="ball", position=(0.0, 0.8, 0.05), radius=0.2)
+    made = table(avoidance=Avoidance(soft=Soft()), horizon=20, node=0.05)
+    states, commands = fly(build(made, VEHICLE, 0.05, (ball,)), 0.05, 3.5, step_of(0.0, 1.6, 0.0, 0.0))
+    clearance = np.linalg.norm(states[:, P] - np.array(ball.position), axis=1) - ball.radius
+    assert clearance.min() > VEHICLE.enclosing_radius - 0.01
+    np.testing.assert_allclose(states[-1, P], [0.0, 1.6, 0.0], atol=0.02)
+    assert {command.fallback for command in commands} == {0}
+
+
+def test_it_keeps_the_first_period_that_its_steps_did_not_make_converge() -> None:
+    controller = build(table(horizon=20, node=0.05, fallback=FallbackSettings(enabled=False)), VEHICLE, 0.05)
+    state = np.zeros(N_STATES)
+    upside_down = StepInputs(attitude=np.array([0.0, 1.0, 0.0, 0.0]))
+    command = controller.step(upside_down, state, np.zeros((controller.horizon, 4)))
+    period = controller.infeasible_period  # type: ignore[attr-defined]
+    assert command.status == NOT_CONVERGED == period.status
+    assert period.converges(1) is False
+    law = controller.law  # type: ignore[attr-defined]
+    states, inputs = law._sqp.plan  # what is kept follows the model, from the measured state
+    np.testing.assert_allclose(states[1:], advance_nodes(law._model, states[:-1], inputs), atol=1e-12)
+    np.testing.assert_array_equal(states[0, Q], upside_down.attitude)
+
+
+def test_upside_down_it_comes_back_though_its_steps_do_not_converge() -> None:
+    """Each period starts from the cheaper rollout: of the last plan, or of a geometric law."""
+    controller = build(table(horizon=20, node=0.05, fallback=FallbackSettings(enabled=False)), VEHICLE, 0.05)
+    model, x = model_of(0.05), np.zeros(N_BODY + 1)
+    x[4], x[N_BODY] = 1.0, 1.0
+    unconverged = 0
+    for k in range(80):
+        state = np.zeros(N_STATES)
+        state[POSITIONS], state[VELOCITIES] = x[P], x[V]
+        given = StepInputs(time=0.05 * k, attitude=x[Q], body_rates=x[W])
+        command = controller.step(given, state, np.zeros((controller.horizon, 4)))
+        unconverged += command.status == NOT_CONVERGED
+        x = advance_nodes(model, x, command.speeds / model.scale)
+        x[Q] /= np.linalg.norm(x[Q])
+    assert unconverged > 0
+    assert np.linalg.norm(x[P]) < 0.05
+    assert thrust_axis(x[Q])[2] > 0.999
+
+
+# --- the fallback --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow("nonlinear")
+@pytest.mark.parametrize("period", [0.02, 0.05])
+@pytest.mark.parametrize("lag", [LAG, (0.072, 0.072, 0.072, 0.15), (0.0, 0.0, 0.0, 0.0)])
+def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tuple[float, ...]) -> None:
+    model = target_model(VEHICLE, period, lag)
+    law = HoverLaw(model, tilt=math.radians(10.0))
+    assert np.abs(np.linalg.eigvals(model.A - model.B @ np.linalg.solve(law.slope, law.gain))).max() < 1.0
+    made = build(table(inner_lag=lag, horizon=1, node=None), VEHICLE, period)
+    made.law.step = _fails  # type: ignore[attr-defined]
+    x = at_rest()
+    x[Q] = euler_to_quaternion(np.radians([20.0, -8.0, 0.0]))
+    states, commands = fly(made, period, 5.0, step_of(0.0, 0.0, 0.0, 0.0), x, lag=lag)
+    assert {command.fallback for command in commands} == {2}
+    assert {command.status for command in commands} == {"flight_error"}
+    assert tilts(states).max() < 22.0
+    assert tilts(states[-1:])[0] < 1.0
+    assert np.linalg.norm(states[-1, V]) < 0.1
+
+
+@pytest.mark.slow("nonlinear")
+@pytest.mark.parametrize("known", [True, False])
+def test_level_hover_holds_its_height_by_the_thrust_scale_that_is_estimated(known: bool) -> None:
+    made = build(table(), VEHICLE, 0.02)
+    if known:
+        made.law._law.struct.trim.commands[0] /= 0.7  # type: ignore[attr-defined]
+    made.law.step = _fails  # type: ignore[attr-defined]
+    states, commands = fly(made, 0.02, 4.0, step_of(0.0, 0.0, 0.0, 0.0), thrust_scale=0.7)
+    assert {command.fallback for command in commands} == {2}
+    assert bool(abs(states[:, 2]).max() < 0.02) is known
+
+
+def _fails(*_: object) -> Command:
+    raise FlightError("no answer", time=0.0)
+
+
+def test_the_target_model_is_that_of_small_motions() -> None:
+    model, x = target_model(VEHICLE, 0.02, LAG), at_rest()
+    states = 1e-4 * np.random.default_rng(5).normal(size=N_STATES)
+    x[P], x[V], x[W] = states[POSITIONS], states[VELOCITIES], states[ANGLE_RATES]
+    x[Q] = euler_to_quaternion(states[ANGLES])
+    u = LEVEL + np.array([0.0, 1e-4, -2e-4, 3e-4])
+    end = advance_nodes(model_of(0.02, substeps=20), x, u / model_of().scale)
+    expected = model.A @ states + model.B @ (u - model.u_bar)
+    np.testing.assert_allclose(expected[POSITIONS], end[P], atol=1e-9)
+    np.testing.assert_allclose(expected[VELOCITIES], end[V], atol=1e-7)
+    np.testing.assert_allclose(expected[ANGLE_RATES], end[W], atol=1e-7)
+
+
+# --- refusals ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fields", "rule"),
+    [
+        ({"inputs": "speed"}, "inputs must be absent"),
+        ({"rotor_lag": 0.02}, "rotor_lag must be absent"),
+        ({"inner_lag": (1e-5, 0.0, 0.0, 0.0)}, "inner_lag must be 0, or at least 0.0001 s"),
+        (
+            {"polytopes": (Polytope(name="total", of=("speed_1", "speed_2"), rows=((1.0, 1.0),), upper=(300.0,)),)},
+            "polytopes must be without rotor speeds",
+        ),
+    ],
+)
+def test_it_refuses_fields_of_the_other_space_of_commands(fields: dict[str, Any], rule: str) -> None:
+    with pytest.raises(ValueError, match=rule):
+        table(**fields)
+
+
+def test_it_is_not_built_without_the_lag_of_its_inner_loop() -> None:
+    with pytest.raises(ParameterError, match="inner_lag"):
+        build(table(inner_lag=None), VEHICLE, 0.02)
+
+
+@pytest.mark.parametrize("thrust", [(5.0, 4.0), (-1.0, 4.0)])
+def test_it_refuses_bounds_on_thrust(thrust: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="thrust"):
+        TargetBounds(thrust=thrust)
+
+
+@pytest.mark.parametrize("thrust", [(0.0, 1.0), (100.0, 200.0)])
+def test_bounds_on_thrust_hold_the_weight(thrust: tuple[float, float]) -> None:
+    with pytest.raises(ParameterError, match=r"target_bounds\.thrust"):
+        TargetBounds(thrust=thrust).actuators(VEHICLE)
+
+
+@pytest.mark.parametrize("ratio", [1.1, 1.5, 3.5, 14.0])
+def test_default_bounds_on_thrust_leave_room_around_the_weight(ratio: float) -> None:
+    weight = VEHICLE.mass * VEHICLE.gravity
+    speed = math.sqrt(ratio * weight / (4.0 * VEHICLE.thrust_coefficient))
+    lower, upper = TargetBounds().audited(replace(VEHICLE, speed_max=speed))["thrust"]
+    assert lower == 0.5 * weight
+    assert weight + 0.5 * (ratio - 1.0) * weight == pytest.approx(min(upper, 0.5 * (1.0 + ratio) * weight))
+    assert upper < ratio * weight
+
+
+def test_a_thrust_scale_excludes_indi() -> None:
+    with pytest.raises(ValueError, match="thrust_scale"):
+        Nonlinear(indi=INDISettings(), disturbance=RampSettings(thrust_scale=True))
+
+
+def test_rows_over_rotor_speeds_have_no_meaning_for_targets() -> None:
+    row = Constraint(name="total", lower=np.zeros(1), upper=np.ones(1), D=np.ones((1, 4)))
+    with pytest.raises(ParameterError, match="rotor speeds"):
+        NonlinearMPC(VEHICLE, period=0.02, settings=table(), constraints=(row,))
