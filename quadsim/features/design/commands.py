@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -97,6 +98,8 @@ def vehicle_report(
     *,
     template: Flag = False,
     thrust_stand: File | None = None,
+    rotors: Whole | None = None,
+    diameter: float | None = None,
     scenario: ScenarioName | None = None,
     out: File | None = None,
     overwrite: Flag = False,
@@ -106,10 +109,13 @@ def vehicle_report(
     Args:
         name: shipped vehicle's name, or path to a TOML file.
         template: print a commented vehicle file to fill in instead.
-        thrust_stand: CSV table of one rotor on a stand (rpm or throttle, thrust [N], torque [N m]): print the vehicle's
-            file, or the template, with the numbers that it gives, and the fit.
+        thrust_stand: CSV table of a stand, as it is sold (rpm, speed or throttle; thrust; torque), or of a propeller's
+            CT and CP by rpm: print the vehicle's file, or the template, with the numbers that it gives, and the fit.
+        rotors: how many rotors the table of the stand is of, 1 or 4 (default: 1, where that leaves no doubt).
+        diameter: of the propeller [m], for a table of CT and CP.
         scenario: scenario whose bounds the vehicle may be unable to meet; they are listed.
-        out: PDF, SVG or PNG file for a drawing from above: numbers, spins, places and arms of the rotors, front, axes.
+        out: PDF, SVG or PNG file for a drawing from above: numbers, spins, places and arms of the rotors, front, axes;
+            with a stand, TOML file for the vehicle.
         overwrite: replace an existing file.
 
     Returns:
@@ -139,15 +145,14 @@ def vehicle_report(
 
     blank = Path(__file__).with_name("vehicle_template.toml")
     if thrust_stand is not None:
-        for option, value in {"--template": template, "--scenario": scenario, "--out": out}.items():
+        for option, value in {"--template": template, "--scenario": scenario}.items():
             if value:
                 raise ParameterError("", "--thrust-stand", str(thrust_stand), f"given without {option}")
         start = blank if name is None else vehicle_path(str(name))
-        if name is not None:
-            load_vehicle(start)
-        from quadsim.features.design.thrust_stand import stand_vehicle_text
-
-        return results.Document(*stand_vehicle_text(Path(thrust_stand), start.read_text(encoding="utf-8-sig")))
+        return _by_stand(Path(thrust_stand), start, rotors, diameter, out, overwrite=overwrite)
+    for option, number in {"--rotors": rotors, "--diameter": diameter}.items():
+        if number is not None:
+            raise ParameterError("", option, number, "given with --thrust-stand alone")
     if template:
         return results.Document(blank.read_text(encoding="utf-8"))
     if name is None:
@@ -172,3 +177,29 @@ def vehicle_report(
     with results.after(report, picture):
         vehicle_drawing.write_drawing(loaded, picture, overwrite=overwrite)
     return replace(report, picture=picture)
+
+
+def _by_stand(
+    stand: Path, start: Path, rotors: int | None, diameter: float | None, out: File | None, *, overwrite: bool
+) -> Document:
+    """Return the vehicle file of a thrust stand, and write it to `out`; see `vehicle_report`."""
+    from quadsim.console import results
+    from quadsim.features.design.thrust_stand import stand_vehicle_text
+    from quadsim.outputs import require_file, writing_file
+    from quadsim.vehicle import N_ROTORS, load_vehicle
+
+    if rotors not in {None, 1, N_ROTORS}:
+        raise ParameterError("", "--rotors", rotors, f"1 or {N_ROTORS}")
+    if diameter is not None and not 0.0 < diameter < math.inf:
+        raise ParameterError("", "--diameter", diameter, "above 0, in m")
+    if start.name != "vehicle_template.toml":
+        load_vehicle(start)
+    if out is not None and Path(out).suffix != ".toml":
+        raise ParameterError("", "--out", str(out), "a .toml file with --thrust-stand")
+    target = None if out is None else require_file(out, overwrite=overwrite)
+    text, numbers = stand_vehicle_text(stand, start.read_text(encoding="utf-8-sig"), rotors=rotors, diameter=diameter)
+    if target is None:
+        return results.Document(text, numbers)
+    with writing_file(target, overwrite=overwrite) as new:
+        new.write_text(text, encoding="utf-8")
+    return results.Document(f"written to {target}\n", numbers)

@@ -13,10 +13,15 @@ from uneven import FILES
 import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.commands.cli import main
+from quadsim.errors import FileError
+from quadsim.features.design.thrust_stand import fit_stand
 from quadsim.vehicle import load_vehicle, vehicle_sources
 
 B, RATIO = 1.1e-5, 0.016
 SPEEDS = np.linspace(150.0, 800.0, 12)
+SHARES = np.linspace(0.0, 1.0, 12)
+LIFT = 2.0 * SHARES + 5.0 * SHARES**2  # [N]
+GRAM = 9.80665e-3  # [N]
 
 
 def stand(path: Path, head: str, *columns: np.ndarray) -> Path:
@@ -52,20 +57,112 @@ def test_speeds_give_both_coefficients(tmp_path: Path) -> None:
     np.testing.assert_allclose([float(row[3]) for row in table], B * SPEEDS**2, rtol=0.01)
 
 
-def test_throttle_alone_gives_its_curve_and_a_coefficient_for_the_speed_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_throttle_alone_gives_the_vehicles_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The map of a file is replaced by the table's, and no coefficient is made of a speed that nobody measured."""
     u = np.linspace(0.1, 1.0, 10)
     path = stand(tmp_path / "stand.csv", "throttle,thrust [N]", u, 7.0 * (0.3 * u + 0.7 * u**2))
     assert main(["vehicle", "hummingbird", "--thrust-stand", str(path), "--json"]) == 0
     numbers = json.loads(capsys.readouterr().out)
-    np.testing.assert_allclose(numbers["throttle_curve"], (0.3, 0.7), rtol=1e-9)
-    full = load_vehicle(vehicle_path("hummingbird")).speed_max
-    assert numbers["thrust_coefficient"] == pytest.approx(7.0 / full**2)
-    assert main(["vehicle", "--thrust-stand", str(path)]) == 0
-    printed = capsys.readouterr().out
-    assert "0.3 u + 0.7 u^2" in printed
-    assert "750 rad/s" in printed
+    np.testing.assert_allclose(numbers["thrust_of_throttle"], (2.1, 4.9), rtol=1e-9)
+    assert "thrust_coefficient" not in numbers
+    mine = tmp_path / "mine.toml"
+    assert main(["vehicle", "hummingbird", "--thrust-stand", str(path), "--out", str(mine)]) == 0
+    assert load_vehicle(mine).thrust_of_throttle == pytest.approx((2.1, 4.9))
+    assert load_vehicle(mine).thrust_coefficient is None
+    again = stand(tmp_path / "again.csv", "throttle,thrust [N]", u, 5.0 * (0.5 * u + 0.5 * u**2))
+    text = quadsim.vehicle_report(mine, thrust_stand=again).content
+    mine.write_text(text, encoding="utf-8")
+    assert load_vehicle(mine).thrust_of_throttle == pytest.approx((2.5, 2.5))
+
+
+@pytest.mark.parametrize(
+    ("head", "columns"),
+    [
+        ("ESC signal (\u00b5s),Thrust (gf)", (1000.0 + 1000.0 * SHARES, LIFT / GRAM)),
+        ("esc signal [\u03bcs],Thrust [kgf]", (1000.0 + 1000.0 * SHARES, 1e-3 * LIFT / GRAM)),
+        ("throttle [us],thrust [g]", (1000.0 + 1000.0 * SHARES, LIFT / GRAM)),
+        ("PWM (%),Thrust (lbf)", (100.0 * SHARES, LIFT / 4.4482216)),
+        ("Throttle,Thrust (mN)", (SHARES, 1e3 * LIFT)),
+    ],
+)
+def test_headers_as_stands_write_them(tmp_path: Path, head: str, columns: tuple[np.ndarray, ...]) -> None:
+    fit = fit_stand(stand(tmp_path / "stand.csv", head, *columns))
+    assert fit.thrust_of_throttle == pytest.approx((2.0, 5.0), rel=1e-6)
+
+
+@pytest.mark.parametrize("unit", ["N m", "N*m", "N\u00b7m", "N-m", "Nm"])
+def test_units_of_torque(tmp_path: Path, unit: str) -> None:
+    columns = SPEEDS * 60.0 / math.tau, B * SPEEDS**2, RATIO * B * SPEEDS**2
+    fit = fit_stand(stand(tmp_path / "stand.csv", f"Average RPM,Thrust (N),Torque ({unit})", *columns))
+    assert fit.drag_to_thrust == pytest.approx(RATIO, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "map_of_throttle"),
+    [
+        ("throttle;thrust [N]\n0;0\n50%;2,25\n75%;4,3125\n100%;7\n", (2.0, 5.0)),
+        ("throttle\tthrust [N]\n0\t0\n0.5\t2.25\n0.75\t4.3125\n1\t7\n", (2.0, 5.0)),
+    ],
+)
+def test_cells_as_stands_write_them(tmp_path: Path, text: str, map_of_throttle: tuple[float, float]) -> None:
+    path = tmp_path / "stand.csv"
+    path.write_text(text, encoding="utf-8")
+    assert fit_stand(path).thrust_of_throttle == pytest.approx(map_of_throttle)
+
+
+def test_a_propellers_coefficients_with_its_diameter(tmp_path: Path) -> None:
+    """T = CT rho n^2 D^4 and Q = CP rho n^2 D^5 / (2 pi), n in turns per second."""
+    turns = np.linspace(30.0, 120.0, 8)
+    path = tmp_path / "prop.txt"
+    rows = "\n".join(f"{60.0 * n:.1f}   0.11   0.045" for n in turns)
+    path.write_text(f"RPM  CT  CP\n{rows}\n", encoding="utf-8")
+    fit = fit_stand(path, diameter=0.254)
+    assert fit.thrust_coefficient == pytest.approx(0.11 * 1.225 * 0.254**4 / math.tau**2, rel=1e-6)
+    assert fit.drag_to_thrust == pytest.approx(0.045 / 0.11 * 0.254 / math.tau, rel=1e-6)
+    with pytest.raises(FileError, match="--diameter"):
+        fit_stand(path)
+
+
+def test_a_tare_below_zero_stays_and_saturated_rows_are_left_out(tmp_path: Path) -> None:
+    thrust = LIFT.copy()
+    thrust[0] = -0.01
+    u = np.append(SHARES, [0.0])
+    fit = fit_stand(stand(tmp_path / "tare.csv", "throttle,thrust [N]", u, np.append(thrust, [-0.02])))
+    assert fit.thrust_of_throttle == pytest.approx((2.0, 5.0), rel=0.02)
+    flat = np.minimum(LIFT, LIFT[-3])
+    saturated = fit_stand(stand(tmp_path / "flat.csv", "throttle,thrust [N]", SHARES, flat))
+    assert saturated.thrust_of_throttle == pytest.approx((2.0, 5.0), rel=1e-6)
+    assert saturated.notes == ("left out as saturated, thrust no longer rises with the throttle: row 12, 13",)
+
+
+def test_of_two_speeds_the_one_that_shows_the_rotor_is_taken(tmp_path: Path) -> None:
+    rpm = SPEEDS * 60.0 / math.tau
+    head = "Motor Electrical Speed (RPM),Motor Optical Speed (RPM),Thrust (N)"
+    dead = fit_stand(stand(tmp_path / "dead.csv", head, rpm, 0.0 * rpm, B * SPEEDS**2))
+    assert dead.thrust_coefficient == pytest.approx(B)
+    assert "which is 0 throughout" in dead.notes[0]
+    both = fit_stand(stand(tmp_path / "both.csv", head, 7.0 * rpm, rpm, B * SPEEDS**2))
+    assert both.thrust_coefficient == pytest.approx(B)
+    assert "which differs by up to 600%" in both.notes[0]
+
+
+def test_one_rotor_or_four_is_asked_where_thrust_leaves_a_doubt(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The Hummingbird's four rotors together, as a stand under the whole vehicle shows them."""
+    full = 1.1e-5 * 4.0 * SPEEDS**2
+    path, mine = stand(tmp_path / "all.csv", "speed [rad/s],thrust [N]", SPEEDS, full), tmp_path / "mine.toml"
+    assert main(["vehicle", "hummingbird", "--thrust-stand", str(path), "--out", str(mine)]) == 2
+    printed = capsys.readouterr()
+    assert "--rotors must be stated, 1 or 4" in printed.err
+    assert not mine.exists()
+    for rotors, coefficient in (("4", 1.1e-5), ("1", 4.4e-5)):
+        one = tmp_path / f"{rotors}.toml"
+        command = ["vehicle", "hummingbird", "--thrust-stand", str(path), "--rotors", rotors, "--out", str(one)]
+        assert main(command) == 0
+        assert load_vehicle(one).thrust_coefficient == pytest.approx(coefficient, rel=1e-3)
+    assert main(["vehicle", "hummingbird", "--rotors", "4"]) == 2
+    assert main(["vehicle", "hummingbird", "--thrust-stand", str(path), "--rotors", "3"]) == 2
 
 
 def test_its_coefficient_takes_the_place_of_a_map(tmp_path: Path) -> None:
@@ -88,16 +185,15 @@ def test_a_stand_that_stops_below_full_throttle_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("head", "change", "message"),
     [
-        ("rpm,thrust", lambda rows: rows, "column 'thrust' must state its unit: thrust [N] or thrust [g]"),
-        ("rpm,lift [N]", lambda rows: rows, "needs thrust [N] and rpm, speed [rad/s] or throttle; it has rpm"),
-        ("rpm,speed [rad/s],thrust [N]", lambda rows: rows[:, [0, 0, 1]], "has two columns of speed; keep one"),
+        ("rpm,thrust", lambda rows: rows, "column 'thrust' must state its unit, one of thrust [N], thrust [mN]"),
+        ("rpm,lift [N]", lambda rows: rows, "needs thrust [N] and rpm, speed [rad/s] or throttle, or a propeller"),
         ("rpm,thrust [N]", lambda rows: rows[:2], "needs 3 rows or more with the rotor turning; got 2"),
         ("rpm,thrust [N]", lambda rows: 0.0 * rows, "needs 3 rows or more with the rotor turning; got 12"),
-        ("rpm,thrust [N]", lambda rows: rows * [1.0, -1.0], "row 2: thrust must be a number, 0 or above; got '-0"),
-        ("throttle,thrust [N]", lambda rows: rows, "throttle must be a share, 0 to 1, or throttle [%]; got 800"),
+        ("rpm,thrust [N]", lambda rows: rows * [1.0, -1.0], "row 13: thrust must be 0 or above but for a tare;"),
+        ("throttle,thrust [N]", lambda rows: rows, "throttle must be a share, 0 to 1, throttle [%], or [us]"),
         ("rpm,thrust [N]", lambda rows: rows + np.array([0.0, 5.0]), "thrust does not follow b w^2: 25%"),
         ("throttle,thrust [N]", lambda rows: rows / 1000.0, "throttle must reach 95% where no speed is measured"),
-        ("rpm,thrust [N]", lambda rows: rows * np.nan, "row 2: speed must be a number, 0 or above; got 'nan'"),
+        ("rpm,thrust [N]", lambda rows: rows * np.nan, "row 2: speed must be a number; got 'nan'"),
     ],
 )  # fmt: skip
 def test_tables_that_cannot_be_used(
