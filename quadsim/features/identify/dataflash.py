@@ -29,7 +29,13 @@ _NAMES: Final = (
     logged_as("voltage", "BAT.Volt"),
     NamedQuantity(quantity="flying", columns=("ARM.ArmState",)),
 )
-_ADVICE: Final = "set the bits 0 and 18 of LOG_BITMASK, fast attitude and fast IMU"
+_ADVICE: Final = (
+    "set the bits 0 and 18 of LOG_BITMASK, fast attitude and fast IMU, and LOG_FILE_RATEMAX to 0; ArduCopter logs the "
+    "outputs, RCOU, at 10 Hz whatever these say, so let the speed controllers report RPM (bidirectional DShot or ESC "
+    "telemetry): it is logged as ESC"
+)
+_CLOCKS: Final = {"TimeUS": 1e-6, "TimeMS": 1e-3}
+"""Fields with the time, and their units [s]; logs from before ArduPilot 3.3 have milliseconds."""
 _FIRST_BYTES: Final = b"\xa3\x95"
 _FIRST_MOTOR: Final = 33  # of SERVOn_FUNCTION
 _OUTPUTS: Final = 16
@@ -56,7 +62,8 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
                 raise FileError(path, "is not a readable dataflash log: it does not begin with a message")
         with Reader(str(path), zero_time_base=True) as log:
             while (message := log.recv_match(type=[*used, "PARM"])) is not None:
-                if (kind := message.get_type()) in used and "TimeUS" in message.get_fieldnames():
+                clock = next((name for name in _CLOCKS if name in message.get_fieldnames()), None)
+                if (kind := message.get_type()) in used and clock is not None:
                     of, row = message.fmt.instance_field, message.to_dict()
                     name = f"{kind}[{row[of]}]" if of and row[of] else kind
                     fields.setdefault(name, [key for key, value in row.items() if isinstance(value, int | float)])
@@ -64,7 +71,8 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
             parameters = {**log.params}
     for name, of in fields.items():
         table = {f"{name}.{field}": values for field, values in zip(of, np.array(rows[name], float).T, strict=True)}
-        columns |= on_one_clock(table[f"{name}.TimeUS"] * 1e-6, table)
+        clock = next(clock for clock in _CLOCKS if f"{name}.{clock}" in table)
+        columns |= on_one_clock(table[f"{name}.{clock}"] * _CLOCKS[clock], table)
     turns = [columns[name].t.size if name in columns else 0 for name in ("XKQ.Q1", "ATT.Roll")]
     if turns[0] < turns[1]:
         columns = {name: column for name, column in columns.items() if not name.startswith("XKQ")}

@@ -48,7 +48,9 @@ LOGGED: Final = {
     "t": Quantity(1, {"s": (0.0, 1.0), "ms": (0.0, 1e-3), "us": (0.0, 1e-6), "ns": (0.0, 1e-9)}),
     "position": Quantity(3, _LENGTHS, _WORLDS),
     "velocity": Quantity(3, {f"{unit}/s": of for unit, of in _LENGTHS.items()} | {"km/h": (0.0, 1 / 3.6)}, _WORLDS),
-    "specific_force": Quantity(3, {"m/s^2": (0.0, 1.0), "g": (0.0, 9.80665)}, _BODIES),
+    "specific_force": Quantity(
+        3, {"m/s^2": (0.0, 1.0), "g": (0.0, 9.80665), "g/2048": (0.0, 9.80665 / 2048)}, _BODIES
+    ),
     "attitude": Quantity(4, {"-": (0.0, 1.0)}, _BOTH),
     "euler": Quantity(3, {"rad": (0.0, 1.0), "deg": (0.0, _DEGREE)}, _BOTH),
     "rates": Quantity(3, {"rad/s": (0.0, 1.0), "deg/s": (0.0, _DEGREE)}, _BODIES),
@@ -61,6 +63,8 @@ LOGGED: Final = {
     "voltage": Quantity(1, {"V": (0.0, 1.0), "mV": (0.0, 1e-3), "cV": (0.0, 0.01)}),
 }  # fmt: skip
 """Every quantity, its usual unit first."""
+MAPPED: Final = f"; --columns MAP.toml says which columns of a log are which of {', '.join(LOGGED)}"
+"""What a message about missing columns ends with."""
 _NEEDED: Final = {
     "velocity": ("velocity", "position", "specific_force"),
     "attitude": ("attitude", "euler", "specific_force"),
@@ -68,8 +72,10 @@ _NEEDED: Final = {
     "rotor commands or speeds": ("commands", "throttle", "speeds", "erpm"),
 }
 """What a log needs: one of each."""
+THROTTLE_EXCESS: Final = 0.02
+"""A throttle may be so far beyond its ends, as mixers and rounding make it; it is taken for the end."""
 RANGES: Final = {
-    "throttle": (0.0, 1.0 + 1e-6, "throttle1..4 must be shares of full throttle, 0 to 1"),
+    "throttle": (-THROTTLE_EXCESS, 1.0 + THROTTLE_EXCESS, "throttle1..4 must be shares of full throttle, 0 to 1"),
     "commands": (0.0, math.inf, "u1..4 must be rotor speeds in rad/s, 0 or above"),
     "speeds": (0.0, math.inf, "rotor speeds must be 0 or above, whichever way a rotor turns"),
     "euler": (-math.pi, math.pi, "roll and pitch must be in rad"),
@@ -177,7 +183,7 @@ def to_series(
             ways = ways or {quantity: f"[{quantity}] of the map" for quantity in needed}
             columns = " or ".join(ways[quantity] for quantity in needed if quantity in ways)
             more = "".join(f"; {text}" for text in (log.advice, *log.notes) if text)
-            raise FileError(path, f"lacks {what}: columns {columns}; it has {listed(log.columns)}{more}")
+            raise FileError(path, f"lacks {what}: columns {columns}; it has {listed(log.columns)}{more}{MAPPED}")
     name = path.name
     for one in known.values():
         _check_samples(name, log.columns, one)
@@ -198,6 +204,8 @@ def to_series(
             rows = series[quantity].values[:, : 2 if quantity == "euler" else None]
             if not (low <= np.nanmin(rows, initial=0.0) and np.nanmax(rows, initial=0.0) <= high):
                 raise InputError(f"{name}: {rule}; got {np.nanmin(rows):.4g} to {np.nanmax(rows):.4g}")
+    if "throttle" in series:
+        series["throttle"] = series["throttle"]._replace(values=np.clip(series["throttle"].values, 0.0, 1.0))
     if (euler := series.pop("euler", None)) is not None and "attitude" not in series:
         series["attitude"] = Column(t=euler.t, values=euler_to_quaternion(euler.values))
         known["attitude"] = known["euler"]

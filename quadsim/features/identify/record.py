@@ -29,7 +29,9 @@ SLOWEST_COMMANDS: Final = 20.0  # [Hz] at which the rotors' outputs must be logg
 FASTEST_RATE: Final = 250.0  # [Hz] above which samples are averaged: none of the parameters is as fast
 SLOWEST_VELOCITY: Final = 0.04  # period [s] of a velocity above which an accelerometer knows it better
 LONGEST_PAUSE: Final = 600.0  # [s] between two samples of one flight
+MOST_TIMES_REPEATED: Final = 0.5  # share of rows whose repeated time is that of a row to drop, not of a coarse clock
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
+_LFS_POINTER: Final = b"version https://git-lfs"
 INPUTS: Final = ("commands", "throttle", "speeds")
 
 
@@ -125,6 +127,8 @@ def _format_of(file: Path) -> LogFormat:
             first = opened.read(64)
     except OSError as error:
         raise FileError(file, f"cannot be read ({error})") from error
+    if first.startswith(_LFS_POINTER):
+        raise FileError(file, "is a pointer of Git LFS, not the log itself: git lfs pull fetches it")
     by_bytes = (of for of in FORMATS if first.startswith(of.first_bytes))
     by_suffix = (of for of in FORMATS if file.suffix.lower() in of.suffixes)
     if (found := next(by_bytes, None) or next(by_suffix, None)) is None:
@@ -141,22 +145,22 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     """
     voltage, flying = series.get("voltage"), series.get("flying")
     series = {field: samples for field, samples in series.items() if field not in ("voltage", "flying")}
+    series, notes = _without_repeated_times(name, series)
     for field, samples in series.items():
         _check_clock(name, field, samples.t)
     force = series.pop("specific_force", None)
     optional = ("position", *INPUTS)
     series = {f: s for f, s in series.items() if f not in optional or np.isfinite(s.values).all(axis=1).any()}
-    notes: tuple[str, ...] = ()
     inertial = not {"velocity", "position"} & {*series}
     if inertial:
         assert force is not None
         series = {**series, "velocity": force}
-        notes = (f"{name}: no velocity is logged; the accelerometer stands in for it",)
+        notes = (*notes, f"{name}: no velocity is logged; the accelerometer stands in for it")
     elif "velocity" not in series:
         place = series["position"]
         slope = np.gradient(place.values, place.t, axis=0)
         series = {**series, "velocity": Column(t=place.t, values=slope)}
-        notes = (f"{name}: no velocity is logged; it is the central difference of the position",)
+        notes = (*notes, f"{name}: no velocity is logged; it is the central difference of the position")
     if "attitude" not in series:
         assert force is not None
         gyro = series["rates"]
@@ -198,6 +202,28 @@ def _thinned(grid: Array, values: Mapping[str, Array], size: int) -> tuple[Array
     return grid[half : half + count * size : size], means
 
 
+def _without_repeated_times(name: str, series: Mapping[str, Column]) -> tuple[dict[str, Column], tuple[str, ...]]:
+    """Return the series without rows that repeat a time, and a note of each clock; not where most rows do."""
+    kept: dict[int, tuple[Array, NDArray[np.bool_]]] = {}
+    notes = []
+    result = dict(series)
+    for field, samples in series.items():
+        clock = id(samples.t)
+        if clock not in kept:
+            first = np.append(True, np.diff(samples.t) != 0.0)
+            repeats = np.count_nonzero(~first)
+            few = 0 < repeats <= MOST_TIMES_REPEATED * samples.t.size
+            kept[clock] = (samples.t[first], first) if few else (samples.t, np.ones(samples.t.size, bool))
+            if few:
+                row = int(np.argmin(first))
+                where = f"the first at row {row}, t = {samples.t[row]:.6g} s"
+                notes.append(f"{name}: {repeats} rows of {field} repeat a time, {where}: left out")
+        t, first = kept[clock]
+        if t is not samples.t:
+            result[field] = Column(t=t, values=samples.values[first])
+    return result, tuple(notes)
+
+
 def _check_clock(name: str, field: str, t: Array) -> None:
     steps = np.diff(t)
     if t.size < 2 or not np.isfinite(t).all():
@@ -212,7 +238,7 @@ def _check_clock(name: str, field: str, t: Array) -> None:
         row = int(np.argmax(steps == 0.0)) + 1
         raise InputError(
             f"{name}: the time of {field} stands still in {np.count_nonzero(steps == 0.0)} rows, first at row {row}, "
-            f"t = {t[row]:.6g} s; drop rows that repeat a time, or log it with more digits"
+            f"t = {t[row]:.6g} s; log it with more digits"
         )
 
 

@@ -8,12 +8,12 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from quadsim.console.results import Result, Shown, after
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import InputError, MissingPackageError, ParameterError
 from quadsim.features.identify.border import judging
 from quadsim.features.identify.checks import check_log, spans
 from quadsim.features.identify.estimate import Identification, ParameterEstimate
@@ -35,7 +35,7 @@ from quadsim.features.identify.prediction import (
     predict,
 )
 from quadsim.features.identify.quantities import NamedQuantity
-from quadsim.features.identify.record import read_record
+from quadsim.features.identify.record import Record, read_record
 from quadsim.features.identify.vehicle_file import interval_text, rounded, vehicle_text, verdict
 from quadsim.outputs import require_file, writing_file
 from quadsim.report.page import Section, render_page
@@ -187,6 +187,14 @@ class IdentifiedVehicle(Result):
         return {name: _plain(value) for name, value in data.items()}
 
 
+class _Usable(NamedTuple):
+    """A log that can be used."""
+
+    record: Record
+    spans: list[slice]  # in the air
+    notes: tuple[str, ...]
+
+
 def identify_logs(
     logs: Sequence[Path],
     start: Path,
@@ -200,23 +208,25 @@ def identify_logs(
     wind: bool = False,
     anyway: bool = False,
 ) -> IdentifiedVehicle:
-    """Identify a vehicle from logs, given a start file; see `quadsim.identify`."""
+    """Identify a vehicle from logs, given a start file; see `quadsim.identify`.
+
+    A log that cannot be used is left out, and `notes` says so; the error is raised where none is left.
+    """
     places = {name: None if path is None else require_file(path, overwrite=overwrite)
               for name, path in (("file", out), ("page", page))}  # fmt: skip
     vehicle = load_vehicle(start)
-    records, tested = ([read_record(path, poles=poles, columns=columns) for path in paths] for paths in (logs, test))
-    for one, other in itertools.combinations([*records, *tested], 2):
+    usable, notes = _usable(logs, vehicle, poles, columns)
+    usable_tests, test_notes = _usable(test, vehicle, poles, columns)
+    both = [*usable, *usable_tests]
+    for one, other in itertools.combinations([log.record for log in both], 2):
         if np.array_equal(one.rates, other.rates):
             raise InputError(f"{one.name} and {other.name} are the same flight: name it once")
+    records = [log.record for log in usable]
+    tested = [log.record for log in usable_tests]
+    fitted = [log.spans for log in usable]
+    held = [log.spans for log in usable_tests]
     names = tuple(record.name for record in records)
     with judging(", ".join(names)):
-        airborne = [spans(record, vehicle) for record in [*records, *tested]]
-        notes = [
-            note
-            for record, parts in zip([*records, *tested], airborne, strict=True)
-            for note in check_log(record, vehicle, parts)
-        ]
-        fitted, held = airborne[: len(records)], airborne[len(records) :]
         if not tested:
             fitted, held = map(list, zip(*map(hold_out, records, fitted), strict=True))
         try:
@@ -232,7 +242,7 @@ def identify_logs(
     result = IdentifiedVehicle(
         identification=identification,
         prediction=prediction,
-        notes=tuple(notes),
+        notes=(*notes, *test_notes, *(note for log in both for note in log.notes)),
         logs=names,
         test=tuple(record.name for record in tested),
         content=vehicle_text(identification, start, names),
@@ -248,6 +258,33 @@ def identify_logs(
         with after(replace(result, page=None), result.page), writing_file(result.page, overwrite=overwrite) as new:
             new.write_text(_render(result), encoding="utf-8")
     return result
+
+
+def _usable(
+    paths: Sequence[Path], vehicle: Vehicle, poles: int | None, columns: Sequence[NamedQuantity]
+) -> tuple[list[_Usable], list[str]]:
+    """Return the logs that can be used, and a line for each that is left out.
+
+    Raises:
+        InputError: none can be used, or a file is missing.
+    """
+    usable: list[_Usable] = []
+    errors: list[InputError] = []
+    for path in paths:
+        try:
+            record = read_record(path, poles=poles, columns=columns)
+            with judging(record.name):
+                airborne = spans(record, vehicle)
+                notes = check_log(record, vehicle, airborne)
+        except InputError as error:
+            if isinstance(error, MissingPackageError) or not path.exists():
+                raise
+            errors.append(error)
+            continue
+        usable.append(_Usable(record, airborne, notes))
+    if errors and not usable:
+        raise errors[0]
+    return usable, [f"left out: {error}" for error in errors]
 
 
 def _render(result: IdentifiedVehicle) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -11,7 +12,7 @@ import pyarrow as pa
 import pyarrow.csv
 
 from quadsim.errors import FileError
-from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, listed, logged_as
+from quadsim.features.identify.quantities import MAPPED, LoggedColumns, NamedQuantity, listed, logged_as
 from quadsim.features.identify.series import Column
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, read_parquet
 from quadsim.rotation import euler_to_body_rates
@@ -36,6 +37,7 @@ _TIMES: Final = (
     *(logged_as("t", name) for name in ("t", "t_s", "time_s")),
     *(logged_as("t", name, unit="ms") for name in ("t_ms", "time_ms", "timestamp_ms")),
     *(logged_as("t", name, unit="us") for name in ("t_us", "time_us", "timestamp_us")),
+    replace(logged_as("t", "t_us", unit="us"), columns=("time (us)",)),  # as blackbox_decode writes it
 )
 _TIMES_OF_ANY_UNIT: Final = ("time", "timestamp")
 """Columns of time in s, ms or us: their step tells which, as a log has 10 to 1000 samples per second."""
@@ -101,7 +103,7 @@ def _time(path: Path, columns: Mapping[str, pa.ChunkedArray], given: Sequence[Na
     name = next((name for name in _TIMES_OF_ANY_UNIT if name in columns), None)
     if name is None:
         allowed = ", ".join((*(one.columns[0] for one in _TIMES), *_TIMES_OF_ANY_UNIT))
-        raise FileError(path, f"lacks a column of time: one of {allowed}; it has {listed(columns)}")
+        raise FileError(path, f"lacks a column of time: one of {allowed}; it has {listed(columns)}{MAPPED}")
     t = _numbers(path, name, columns[name])
     step = float(np.median(np.abs(np.diff(t)))) if t.size > 1 else 1.0
     return t * (1.0 if step < 0.5 else 1e-3 if step < 200.0 else 1e-6)

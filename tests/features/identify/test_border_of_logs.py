@@ -16,6 +16,7 @@ from quadsim.assets import vehicle_path
 from quadsim.errors import FileError, InputError
 from quadsim.features.identify.border import between, judging, reading, stated_number
 from quadsim.features.identify.checks import spans
+from quadsim.features.identify.quantities import read_map
 from quadsim.features.identify.record import read_record
 from quadsim.features.identify.report import identify_logs
 from quadsim.features.identify.rotors import lagging
@@ -176,18 +177,102 @@ def test_rest_is_not_repeated_rows(eight: Array, tmp_path: Path, rest: Callable[
     assert spans(read_record(path), load_vehicle(vehicle_path("hummingbird")))
 
 
-@pytest.mark.parametrize("times", [2, 3, 10, 150])
-@pytest.mark.parametrize("rounded", [False, True])
-def test_rows_that_a_radio_holds_are(eight: Array, tmp_path: Path, times: int, rounded: bool) -> None:
-    """For two samples or for more than a second, as what follows has moved once and is held again."""
+def held_by_a_radio(path: Path, eight: Array, times: int, *, rounded: bool) -> Path:
     rows = eight.copy()
     rows[:, 1:14] = np.repeat(eight[::times, 1:14], times, axis=0)[: len(rows)]
     if rounded:
         with_rounding(rows)
-    path = tmp_path / "radio.csv"
     np.savetxt(path, rows, fmt="%.17g", delimiter=",", header=COLUMNS, comments="")
+    return path
+
+
+@pytest.mark.parametrize("times", [2, 3, 10, 150])
+@pytest.mark.parametrize("rounded", [False, True])
+def test_rows_that_a_radio_holds_are(eight: Array, tmp_path: Path, times: int, rounded: bool) -> None:
+    """For two samples or for more than a second, as what follows has moved once and is held again."""
+    path = held_by_a_radio(tmp_path / "radio.csv", eight, times, rounded=rounded)
     with pytest.raises(InputError, match=r"radio\.csv: [4-9]\d% "):
         spans(read_record(path), load_vehicle(vehicle_path("hummingbird")))
+
+
+def test_rows_that_repeat_a_time_are_left_out(eight: Array, tmp_path: Path) -> None:
+    whole = read_record(table(tmp_path / "whole.csv", eight))
+    twice = np.insert(eight, [200, 500], eight[[199, 499]], axis=0)
+    read = read_record(table(tmp_path / "twice.csv", twice))
+    np.testing.assert_array_equal(read.rates, whole.rates)
+    assert any("2 rows of" in note and "repeat a time, the first at row 200" in note for note in read.notes)
+
+
+# Logs among others, and files that are none
+
+
+def test_a_log_that_cannot_be_used_is_left_out_with_a_line(eight: Array, tmp_path: Path) -> None:
+    """Of several; where none is left, its error is the end."""
+    good = table(tmp_path / "good.csv", eight)
+    still = eight.copy()
+    still[:, NAMES.index("u1") :] = 400.0
+    bad = table(tmp_path / "bad.csv", still)
+    start = vehicle_path("hummingbird")
+    result = identify_logs([good, bad], start)
+    assert result.logs == ("good.csv",)
+    assert result.notes[0].startswith("left out: bad.csv: the motors never run")
+    alone = identify_logs([good], start)
+    assert [one.value for one in result.identification.estimates] == [
+        one.value for one in alone.identification.estimates
+    ]
+    with pytest.raises(InputError, match="the motors never run"):
+        identify_logs([bad], start)
+    with pytest.raises(FileError, match="is missing"):
+        identify_logs([good, tmp_path / "none.csv"], start)
+
+
+def test_a_pointer_of_git_lfs_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    with pytest.raises(FileError, match="git lfs pull"):
+        read_record(path)
+
+
+@pytest.mark.parametrize(("excess", "read"), [(0.001, True), (0.05, False)])
+def test_a_throttle_a_little_above_full_is_full(eight: Array, tmp_path: Path, excess: float, read: bool) -> None:
+    rows = eight.copy()
+    first = NAMES.index("u1")
+    rows[:, first : first + 4] /= rows[:, first : first + 4].max() / (1.0 + excess)
+    header = COLUMNS.replace("u1,u2,u3,u4", "throttle1,throttle2,throttle3,throttle4")
+    path = tmp_path / "throttle.csv"
+    np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=header, comments="")
+    if not read:
+        with pytest.raises(InputError, match="0 to 1"):
+            read_record(path)
+        return
+    throttle = read_record(path).throttle
+    assert throttle is not None
+    assert throttle.max() == 1.0
+
+
+def test_a_table_of_blackbox_decode(eight: Array, tmp_path: Path) -> None:
+    """Its time is in microseconds by its name; its accelerometer counts 2048 to the g."""
+    names = COLUMNS.replace("t,", "time (us),", 1)
+    rows = eight.copy()
+    rows[:, 0] *= 1e6
+    counts = np.tile([0.0, 0.0, 2048.0], (len(rows), 1))
+    path = tmp_path / "decoded.csv"
+    header = names + ",accSmooth[0],accSmooth[1],accSmooth[2]"
+    np.savetxt(path, np.hstack([rows, counts]), fmt="%.9g", delimiter=",", header=header, comments="")
+    assert read_record(path).period == pytest.approx(0.01, rel=1e-3)
+    meaning = tmp_path / "map.toml"
+    meaning.write_text(
+        '[specific_force]\ncolumns = ["accSmooth[0]", "accSmooth[1]", "accSmooth[2]"]\nunit = "g/2048"\n'
+    )
+    (force,) = read_map(meaning)
+    assert 2048.0 * force.scale == pytest.approx(9.80665)
+
+
+def test_the_first_error_names_the_map_and_what_it_knows(eight: Array, tmp_path: Path) -> None:
+    path = tmp_path / "other.csv"
+    np.savetxt(path, eight, fmt="%.9g", delimiter=",", header=COLUMNS.replace("wx", "omega"), comments="")
+    with pytest.raises(FileError, match=r"--columns.*position, velocity, specific_force"):
+        read_record(path)
 
 
 # Lags

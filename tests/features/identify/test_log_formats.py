@@ -75,15 +75,16 @@ class Message:
     instances: tuple[int, ...] = ()  # of each row, in the column after the time
 
 
-STRUCT = {"Q": "Q", "B": "B", "f": "f", "h": "h", "H": "H", "c": "h", "C": "H", "N": "16s"}
+STRUCT = {"Q": "Q", "I": "I", "B": "B", "f": "f", "h": "h", "H": "H", "c": "h", "C": "H", "N": "16s"}
 
 
-def dataflash(path: Path, messages: list[Message], parameters: dict[str, float]) -> Path:
+def dataflash(path: Path, messages: list[Message], parameters: dict[str, float], clock: str = "TimeUS") -> Path:
     """Write a `.bin`: FMT of every message, the FMTU that tells instances, PARM, and the rows in order of time."""
+    stamp, ticks = {"TimeUS": ("Q", 1e6), "TimeMS": ("I", 1e3)}[clock]
     head = b"\xa3\x95"
     types = {name: 129 + i for i, name in enumerate(["PARM", "FMTU", *(message.name for message in messages)])}
     formats = {"PARM": ("QNff", "TimeUS,Name,Value,Default"), "FMTU": ("QBNN", "TimeUS,FmtType,UnitIds,MultIds")}
-    formats |= {message.name: (f"Q{message.letters}", f"TimeUS,{message.columns}") for message in messages}
+    formats |= {message.name: (f"{stamp}{message.letters}", f"{clock},{message.columns}") for message in messages}
     parts = [
         head + b"\x80" + struct.pack("<BB4s16s64s", 0x80, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
     ]
@@ -103,7 +104,7 @@ def dataflash(path: Path, messages: list[Message], parameters: dict[str, float])
         for i, (t, row) in enumerate(zip(message.t, message.rows, strict=True)):
             values = [*message.instances[i : i + 1], *row.tolist()]
             whole = [v if letter == "f" else round(v) for v, letter in zip(values, message.letters, strict=True)]
-            packed = packers[message.name].pack(round(1e6 * t), *whole)
+            packed = packers[message.name].pack(round(ticks * t), *whole)
             rows.append((t, head + bytes([types[message.name]]) + packed))
     path.write_bytes(b"".join(parts + [row for _, row in sorted(rows, key=lambda row: row[0])]))
     return path
@@ -140,6 +141,12 @@ def test_dataflash(tmp_path: Path, eight: Record) -> None:
     assert read.voltage == pytest.approx(11.1, abs=1e-6)
     assert read.flying is not None
     np.testing.assert_array_equal(read.flying, read.t >= 0.3)
+
+
+def test_dataflash_from_before_3_3_has_milliseconds(tmp_path: Path, eight: Record) -> None:
+    pytest.importorskip("pymavlink", reason="the extra logs is not installed")
+    read = read_record(dataflash(tmp_path / "old.bin", ardupilot(eight), SERVOS, "TimeMS"))
+    check_flight(read, eight, exact=0.02)
 
 
 def test_dataflash_of_another_kind_or_torn(tmp_path: Path, eight: Record, capfd: pytest.CaptureFixture[str]) -> None:
