@@ -1,26 +1,22 @@
-"""The control laws by name: a file each, with the law, its table `[controller]` and its builder.
+"""The control laws by name: a file each, with the table `[controller]`, whose method `law` builds the law.
 
-`register` says what else is known of a law; a module of this folder needs no line elsewhere.  What laws are made of is
-in `parts`.
+`register` says what else is known of a law; a module of this folder needs no line elsewhere.  The law itself is in the
+same file, or in `parts`, as all that laws are made of.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache, singledispatch
+from functools import cache
 from types import MappingProxyType
 from typing import Final, TypeVar
 
-from quadsim.controller import Controller
-from quadsim.mpc.space import Shape
 from quadsim.mpc.tables.bounded import ControllerTable
-from quadsim.vehicle import Vehicle
 
-AnyBuilder = TypeVar("AnyBuilder", bound=Callable[..., Controller])
-"""A function of a table, a vehicle, a control period [s], and obstacles and regions; see `law_of`."""
+TableClass = TypeVar("TableClass", bound=type[ControllerTable])
 _LAST: Final = 100
 
 
@@ -42,22 +38,19 @@ class LawEntry:
 _registered: Final[dict[str, LawEntry]] = {}
 
 
-def register(
-    table: type[ControllerTable], *, title: str, description: str, place: int = _LAST
-) -> Callable[[AnyBuilder], AnyBuilder]:
-    """Register a law by its builder, which this decorates; the arguments are the fields of `LawEntry`.
+def register(*, title: str, description: str, place: int = _LAST) -> Callable[[TableClass], TableClass]:
+    """Register the table of a law, a class that this decorates; the arguments are the fields of `LawEntry`.
 
     Raises:
         ValueError: another table has that name.
     """
-    law = LawEntry(table=table, title=title, description=description, place=place)
-    known = _registered.setdefault(law.name, law)
-    if known.table is not table:
-        raise ValueError(f"two laws have the name {law.name!r}: {known.table.__module__} and {table.__module__}")
 
-    def registered(builder: AnyBuilder) -> AnyBuilder:
-        law_of.register(table)(builder)
-        return builder
+    def registered(table: TableClass) -> TableClass:
+        law = LawEntry(table=table, title=title, description=description, place=place)
+        known = _registered.setdefault(law.name, law)
+        if known.table is not table:
+            raise ValueError(f"two laws have the name {law.name!r}: {known.table.__module__} and {table.__module__}")
+        return table
 
     return registered
 
@@ -77,13 +70,3 @@ def law_name(recorded: str) -> str:
     if law is None:
         return recorded
     return law.title
-
-
-@singledispatch
-def law_of(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    """Return the law of a table, in Python, for a control `period` [s]; see `quadsim.mpc.laws.parts.builders.build`."""
-    laws()  # the builder of this table has not been imported yet
-    builder = law_of.dispatch(type(table))
-    if builder is law_of.dispatch(object):
-        raise NotImplementedError(f"no law is registered for the table {type(table).__name__}")
-    return builder(table, vehicle, period, shapes)

@@ -389,6 +389,11 @@ def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gain
     return numbers
 
 
+@register(
+    title="geometric control",
+    description="geometric tracking control on SE(3)",
+    place=7,
+)
 @dataclass(frozen=True, kw_only=True)
 class Geometric(Tuned):
     """Geometric tracking on SE(3)."""
@@ -441,12 +446,6 @@ class Geometric(Tuned):
         """See `quadsim.mpc.tables.bounded.ControllerTable.inner_loop`."""
         return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
 
-
-@register(
-    Geometric,
-    title="geometric control",
-    description="geometric tracking control on SE(3)",
-    place=7,
-)
-def _law(table: Geometric, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> GeometricController:
-    return GeometricController(vehicle, period, table)
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> GeometricController:
+        """See `quadsim.mpc.tables.bounded.ControllerTable.law`."""
+        return GeometricController(vehicle, period, self)

@@ -156,6 +156,11 @@ class LQR(FeedbackLaw):
         return allocate(self._allocation, self._allocation.wrench(speeds), lower, upper)
 
 
+@register(
+    title="LQR",
+    description="infinite-horizon LQR on the hover model, following the reference's velocity",
+    place=5,
+)
 @dataclass(frozen=True, kw_only=True)
 class LQRTable(Baseline):
     """LQR over an infinite horizon on the hover model."""
@@ -186,12 +191,6 @@ class LQRTable(Baseline):
             return bryson_objective(vehicle, period)
         return objective_of(self.output_weights, self.input_weights)
 
-
-@register(
-    LQRTable,
-    title="LQR",
-    description="infinite-horizon LQR on the hover model, following the reference's velocity",
-    place=5,
-)
-def _law(table: LQRTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LQR:
-    return LQR(vehicle, period, table)
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LQR:
+        """See `quadsim.mpc.tables.bounded.ControllerTable.law`."""
+        return LQR(vehicle, period, self)

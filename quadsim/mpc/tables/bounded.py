@@ -10,12 +10,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, Len, MaxLen, doc
 
-from quadsim.controller import CORE, ROTORS
+from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number, Pair, Positive, Weight
 from quadsim.input_limits import MOST_ENTRIES
@@ -24,7 +24,7 @@ from quadsim.mpc.guard.settings import FallbackSettings
 from quadsim.mpc.pilot.allocation import thrust_to_command
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement
 from quadsim.mpc.problem.constraints import Bounds, Constraint, Origin, Penalty
-from quadsim.mpc.problem.model import SHORTEST_LAG, hover_model
+from quadsim.mpc.problem.model import SHORTEST_LAG, LinearModel, hover_model
 from quadsim.mpc.problem.ocp import Objective, Problem, lqr_terminal_weight
 from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.solvers import ALIASES, SOLVERS, Solver, find_solver
@@ -41,6 +41,9 @@ from quadsim.state import (
     shown_unit,
 )
 from quadsim.vehicle import N_ROTORS, Vehicle
+
+if TYPE_CHECKING:
+    from quadsim.mpc.guard.contract import Guard
 
 IN_DEGREES: Final = frozenset(
     name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad")
@@ -69,7 +72,7 @@ Law = Annotated[str, doc("the control law, by its name in `quadsim list`")]
 
 
 class ControllerTable:
-    """A table `[controller]`, from which `mpc.builders` builds a controller; what it has no field for is absent."""
+    """A table `[controller]`, which builds its law, the guard around it and an inner loop; all else is a default."""
 
     any_attitude: ClassVar = False  # whether the controller reads attitudes as quaternions
     type: str
@@ -81,6 +84,35 @@ class ControllerTable:
     fallback: FallbackSettings | None = None
     iterations: int = 1
     output_bounds: Mapping[str, Sequence[float]] = MappingProxyType({})
+
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """Return the law in Python for a control `period` [s], with obstacles and regions `shapes`.
+
+        Raises:
+            InputError: no controller can be built from these numbers.
+        """
+        raise NotImplementedError(f"the table {type(self).__name__} has no method `law`")
+
+    def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
+        """Return the fallback contract around the law; None without one."""
+        fallback = self.fallback
+        if fallback is None or not fallback.enabled:
+            return None
+        from quadsim.mpc.guard.contract import Guard
+
+        return Guard(
+            self.level_hover(vehicle, period),
+            bounds=self.actuators(vehicle),
+            settings=fallback.within(self.output_bounds),
+        )
+
+    def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
+        """Return the linear model at level hover of what the law commands."""
+        return hover_model(vehicle, period)
+
+    def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
+        """Return the bounds on what the law commands."""
+        return ActuatorBounds.of_vehicle(vehicle)
 
     @property
     def holds_speeds(self) -> bool:
@@ -451,6 +483,10 @@ class Bounded(Weighted):
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `ControllerTable.audited`."""
         return ranges(self.output_bounds) | self.input_bounds.audited(vehicle)
+
+    def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
+        """See `ControllerTable.actuators`."""
+        return self.input_bounds.actuators(vehicle)
 
     def bounds(self) -> Bounds:
         """Return the bounds in SI units."""

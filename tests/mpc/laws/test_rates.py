@@ -20,6 +20,7 @@ from quadsim.mpc.estimate.disturbance import RampSettings
 from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.contract import FallbackSettings
 from quadsim.mpc.guard.hover import HoverLaw
+from quadsim.mpc.laws.nonlinear import Nonlinear, Weights
 from quadsim.mpc.laws.parts.builders import build
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.pilot.indi import INDISettings
@@ -39,7 +40,6 @@ from quadsim.mpc.problem.rigidbody import (
     thrust_axis,
 )
 from quadsim.mpc.tables.bounded import Avoidance, Polytope, Soft, TargetBounds
-from quadsim.mpc.tables.nonlinear import Nonlinear, Weights
 from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
 from quadsim.space import Sphere
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array

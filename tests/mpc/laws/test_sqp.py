@@ -17,6 +17,7 @@ from quadsim.controller import ACCEPTED, OPTIMAL, SOLVED, UNCONSTRAINED, Command
 from quadsim.errors import ParameterError
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.structs import STATUSES
+from quadsim.mpc.laws.nonlinear import Nonlinear, Weights
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.laws.parts.sqp import OWN_NAMES, SQP
 from quadsim.mpc.problem.constraints import Constraint
@@ -26,7 +27,6 @@ from quadsim.mpc.problem.rigidbody import N_BODY, P, Q, V, W
 from quadsim.mpc.solvers.daqp import DaqpDense
 from quadsim.mpc.space import AvoidanceSettings, Space
 from quadsim.mpc.tables.bounded import Polytope, Soft
-from quadsim.mpc.tables.nonlinear import Nonlinear, Weights
 from quadsim.space import Sphere
 from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import load_vehicle

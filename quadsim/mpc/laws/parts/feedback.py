@@ -96,8 +96,10 @@ class Baseline(ControllerTable):
         return {} if self.input_bounds is None else self.input_bounds.audited(vehicle)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
-        """Return the limits of the commands."""
-        return ActuatorBounds.of_vehicle(vehicle) if self.input_bounds is None else self.input_bounds.actuators(vehicle)
+        """See `quadsim.mpc.tables.bounded.ControllerTable.actuators`."""
+        if self.input_bounds is None:
+            return ActuatorBounds.of_vehicle(vehicle)
+        return self.input_bounds.actuators(vehicle)
 
 
 @dataclass(frozen=True, kw_only=True)
