@@ -397,7 +397,7 @@ def unwritten(source: str) -> Iterator[str]:
     """Attributes asked for by a literal name of what may lack them: an optional part of a protocol written nowhere.
 
     It counts `getattr` and `hasattr` on `OF_CONTROLLERS`.  Optional parts are protocols of `quadsim.controller` and its
-    like in `mpc`, asked for by `isinstance`, and class attributes of `quadsim.mpc.tables.bounded.ControllerTable`.
+    like in `mpc`, asked for by `isinstance`, and class attributes of `quadsim.mpc.tables.controller.ControllerTable`.
     """
     for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "hasattr"):

@@ -53,7 +53,7 @@ from quadsim.errors import (
 from quadsim.fields import is_plain
 from quadsim.mpc.laws import laws
 from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import ControllerTable, Horizon
+from quadsim.mpc.tables.controller import ControllerTable, Horizon
 from quadsim.outputs import digest_of
 from quadsim.sim.effects import Force
 from quadsim.state import Array, State
@@ -98,7 +98,7 @@ class Plugin(ControllerTable, _Code):
         _check_code(self.type, self.settings, ("vehicle", "period", "horizon"))
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.law`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
         return make_law(import_plugin(self), self, vehicle, period)
 
 

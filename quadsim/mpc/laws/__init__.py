@@ -14,7 +14,7 @@ from functools import cache
 from types import MappingProxyType
 from typing import Final, TypeVar
 
-from quadsim.mpc.tables.bounded import ControllerTable
+from quadsim.mpc.tables.controller import ControllerTable
 
 TableClass = TypeVar("TableClass", bound=type[ControllerTable])
 _LAST: Final = 100

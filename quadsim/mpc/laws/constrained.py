@@ -36,7 +36,7 @@ class Constrained(Bounded):
     ] = None
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.law`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
         from quadsim.mpc.laws.parts.linear import NominalPreparation, linear_law
 
         problem = self.problem(vehicle, period)

@@ -18,10 +18,11 @@ from quadsim.mpc.laws.parts.feedback import Baseline, FeedbackLaw
 from quadsim.mpc.pilot.allocation import allocate, make_allocation
 from quadsim.mpc.problem.heading import turn_horizontally
 from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model
-from quadsim.mpc.problem.ocp import Objective
+from quadsim.mpc.problem.ocp import Objective, objective_of
 from quadsim.mpc.problem.regulator import stabilising
 from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import InputWeights, objective_of, require_states
+from quadsim.mpc.tables.bounded import require_states
+from quadsim.mpc.tables.commands import InputWeights
 from quadsim.state import INDEX, N_STATES, REFERENCE_RATES, REFERENCE_STATES, STATE_NAMES, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -189,8 +190,8 @@ class LQRTable(Baseline):
         """Return the weights of one period."""
         if self.output_weights is None or self.input_weights is None:
             return bryson_objective(vehicle, period)
-        return objective_of(self.output_weights, self.input_weights)
+        return objective_of(self.output_weights, self.input_weights.speed)
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LQR:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.law`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
         return LQR(vehicle, period, self)

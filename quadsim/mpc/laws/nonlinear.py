@@ -21,33 +21,15 @@ from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws import register
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement, require_one_scale
-from quadsim.mpc.problem.constraints import Constraint, origin_of_state
+from quadsim.mpc.problem.constraints import Constraint, Soft, origin_of_state, selection
 from quadsim.mpc.problem.model import LinearModel, hover_model, target_model
+from quadsim.mpc.problem.polytope import Polytope, rows_of
 from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.problem.rigidbody import RATE_SCALE
-from quadsim.mpc.space import Shape, Space
-from quadsim.mpc.tables.bounded import (
-    USUAL_TARGETS,
-    Avoidance,
-    ControllerTable,
-    Horizon,
-    KktEvery,
-    Lag,
-    LagSeconds,
-    Polytope,
-    Range,
-    Rates,
-    RotorBounds,
-    Soft,
-    TargetBounds,
-    ranges,
-    require_lag,
-    require_lags,
-    require_ordered,
-    require_space,
-    rows_of,
-    selection,
-)
+from quadsim.mpc.space import Avoidance, Shape, Space
+from quadsim.mpc.tables.commands import USUAL_TARGETS, Rates, RotorBounds, TargetBounds, require_space
+from quadsim.mpc.tables.controller import ControllerTable, Horizon, KktEvery, Range, ranges, require_ordered
+from quadsim.mpc.tables.lags import Lag, LagSeconds, require_lag, require_lags
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
@@ -228,7 +210,7 @@ class Nonlinear(ControllerTable):
             )
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.law`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
         if self.commands != ROTORS:
             require_lags(self.inner_lag)
         law: Controller = shorthands.nonlinear_mpc(
@@ -243,13 +225,13 @@ class Nonlinear(ControllerTable):
         return law
 
     def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.level_hover`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.level_hover`."""
         if self.commands == ROTORS:
             return hover_model(vehicle, period)
         return target_model(vehicle, period, require_lags(self.inner_lag))
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.audited`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
         bounds = ranges(self.output_bounds)
         if self.tilt is not None:
             bounds["tilt"] = (-math.inf, self.tilt)
@@ -271,11 +253,11 @@ class Nonlinear(ControllerTable):
         return self.avoidance.space(shapes, vehicle, period=step, horizon=nodes, positions=(0, 1, 2), largest=True)
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.inner_loop`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.inner_loop`."""
         return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.actuators`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
         bounds = self.input_bounds if self.commands == ROTORS else self.target_bounds
         return bounds.actuators(vehicle)
 

@@ -199,5 +199,5 @@ class PID(Tuned):
     velocity: Annotated[Positive, doc("[m/s] largest velocity commanded")] = 12.0
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> CascadedPID:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.law`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
         return CascadedPID(vehicle, period, self)

@@ -15,11 +15,13 @@ from quadsim.fields import Weight
 from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws import register
+from quadsim.mpc.problem.constraints import Soft
 from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model
 from quadsim.mpc.problem.ocp import Problem, lqr_terminal_weight
 from quadsim.mpc.problem.tightening import TighteningSettings, margins, position_margins
 from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import Bounded, Lag, LagSeconds, Soft, require_lag, resolved_lag
+from quadsim.mpc.tables.bounded import Bounded
+from quadsim.mpc.tables.lags import Lag, LagSeconds, require_lag, resolved_lag
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -84,7 +86,7 @@ class Robust(Bounded):
                     )
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.law`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
         from quadsim.mpc.laws.parts.linear import linear_law
 
         problem = self.problem(vehicle, period)

@@ -92,5 +92,5 @@ class Unconstrained(Weighted):
     type: Annotated[Literal["unconstrained"], doc("the control law, by its name in `quadsim list`")] = "unconstrained"
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> UnconstrainedMPC:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.law`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
         return UnconstrainedMPC(self.problem(vehicle, period))

@@ -69,7 +69,7 @@ class OneSpeedTable(Baseline):
     share: Annotated[float, Gt(0.0), Le(2.0), doc("[-] of the hover speed")] = 1.0
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> OneSpeed:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.law`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
         return OneSpeed(vehicle, period, self)
 '''
 COMMANDS = """

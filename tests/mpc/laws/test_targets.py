@@ -21,7 +21,7 @@ from quadsim.mpc.laws.parts.attitude import motion_of
 from quadsim.mpc.laws.parts.builders import build
 from quadsim.mpc.laws.parts.preview import Target
 from quadsim.mpc.problem.model import continuous_model
-from quadsim.mpc.tables.bounded import TargetBounds
+from quadsim.mpc.tables.commands import TargetBounds
 from quadsim.rotation import body_to_euler_rates
 from quadsim.state import EULER_RATE, INDEX, VELOCITY, Array, make_state
 from quadsim.vehicle import Vehicle

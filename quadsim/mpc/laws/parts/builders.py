@@ -13,7 +13,8 @@ from quadsim.errors import ExportError, InputError, ParameterError
 from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import USUAL_SOLVER, Bounded, ControllerTable, Weighted
+from quadsim.mpc.tables.bounded import USUAL_SOLVER, Bounded, Weighted
+from quadsim.mpc.tables.controller import ControllerTable
 from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:

@@ -66,7 +66,7 @@ from quadsim.mpc.problem.rigidbody import (
 )
 from quadsim.mpc.solvers import INVALID_DATA, Answer, Method
 from quadsim.mpc.space import HALF_SPACE_ROUNDING, SETTLED, Space, distances
-from quadsim.mpc.tables.bounded import resolved_lag
+from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.rotation import (
     body_to_euler_rates,
     euler_to_body_rates,

@@ -31,7 +31,8 @@ from quadsim.mpc.problem.nonlinear_model import SUBSTEPS, nonlinear_model
 from quadsim.mpc.problem.ocp import Problem
 from quadsim.mpc.solvers.core_tables import NO_BOUND
 from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import Bounded, Weighted, resolved_lag
+from quadsim.mpc.tables.bounded import Bounded, Weighted
+from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.state import EULER, POSITION, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 

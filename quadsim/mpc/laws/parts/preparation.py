@@ -37,7 +37,7 @@ from quadsim.mpc.problem.heading import (
 from quadsim.mpc.problem.model import hover_model, split_delay
 from quadsim.mpc.problem.nonlinear_model import Triple, advance_disturbed, nonlinear_model, spun
 from quadsim.mpc.problem.ocp import Equilibrium, Problem, Query
-from quadsim.mpc.tables.bounded import resolved_lag
+from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, ReferenceTurns, all_true
 from quadsim.vehicle import Vehicle
 
