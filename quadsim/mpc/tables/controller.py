@@ -32,8 +32,11 @@ Law = Annotated[str, doc("the control law, by its name in `quadsim list`")]
 class ControllerTable:
     """A table `[controller]`, which builds its law, the guard around it and an inner loop; all else is a default."""
 
+    title: ClassVar[str]  # the law's display name; this and the next two come from `quadsim.mpc.laws.register`
+    description: ClassVar[str]  # its line in `quadsim list`
+    place: ClassVar[int]  # in lists; laws of one place are in the order of their names
     any_attitude: ClassVar = False  # whether the controller reads attitudes as quaternions
-    type: str
+    type: str  # the law's name, as files state and flights record it
     horizon: int
     polytopes: tuple[Polytope, ...] = ()
     commands: str = ROTORS

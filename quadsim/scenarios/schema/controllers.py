@@ -35,10 +35,7 @@ class _OrName:
 
 LAWS: Final = tuple(laws())
 """The names of built-in controllers."""
-TABLES: Final[Mapping[str, type[ControllerTable]]] = {
-    **{name: law.table for name, law in laws().items()},
-    FORM: Plugin,
-}
+TABLES: Final[Mapping[str, type[ControllerTable]]] = {**laws(), FORM: Plugin}
 """The tables of all controllers by name; that of users' controllers by the form of their names."""
 
 if TYPE_CHECKING:
