@@ -25,10 +25,10 @@ import quadsim
 from quadsim.commands.app import load
 from quadsim.console.progress import Progress
 from quadsim.errors import FlightError
+from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.laws.parts.sqp import SQP, SQPStatus
 from quadsim.mpc.pilot.pilot import Pilot
-from quadsim.mpc.tables.nonlinear import Nonlinear
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array

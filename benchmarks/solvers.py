@@ -21,7 +21,7 @@ from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import FlightError, InputError, MissingPackageError
 from quadsim.flight.log import ControlLog
 from quadsim.mpc.laws.constrained import Constrained
-from quadsim.mpc.tables.robust import Robust
+from quadsim.mpc.laws.robust import Robust
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import read_catalogue

@@ -15,3 +15,7 @@ scenario_as_html: Callable[[Any], str]
 """How a notebook shows a scenario; `quadsim/__init__.py` puts `quadsim.scenario_html` here."""
 condensed_form: Callable[[Any], Any]
 """`Problem.condensed`; `quadsim/mpc/__init__.py` puts `quadsim.mpc.Condensed.of` here."""
+nonlinear_mpc: Callable[..., Any]
+"""For `Nonlinear.law`, the table that it reads; `quadsim/mpc/__init__.py` puts `quadsim.mpc.NonlinearMPC` here."""
+robust_preparation: Callable[..., Any]
+"""For `Robust.law`, likewise; `quadsim/mpc/__init__.py` puts `quadsim.mpc.RobustPreparation` here."""

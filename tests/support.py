@@ -26,6 +26,7 @@ from quadsim.mpc.laws.constrained import Constrained
 from quadsim.mpc.laws.parts.body import Body
 from quadsim.mpc.laws.parts.linear import LinearMPC, NominalPreparation
 from quadsim.mpc.laws.parts.preparation import RobustPreparation
+from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.constraints import Bounds, Constraint, Penalty
 from quadsim.mpc.problem.model import LinearModel
 from quadsim.mpc.problem.nonlinear_model import NonlinearModel, next_state
@@ -33,7 +34,6 @@ from quadsim.mpc.problem.ocp import Equilibrium, Objective, Problem, Query
 from quadsim.mpc.problem.rigidbody import RigidBody
 from quadsim.mpc.solvers import Solver
 from quadsim.mpc.solvers.by_name import make_solver
-from quadsim.mpc.tables.robust import Robust
 from quadsim.rollout import many
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.many import Row

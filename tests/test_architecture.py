@@ -183,6 +183,25 @@ def test_an_import_of_a_higher_floor_is_seen_even_if_it_is_late_or_for_types_alo
     assert upwards([*imports_of("quadsim.state", "import quadsim", {*modules()})]) == ["quadsim.state imports quadsim"]
 
 
+def within_mpc() -> list[str]:
+    """The parts of `quadsim/mpc` in the list of docs/architecture.md, from the lowest on."""
+    listed = PAGE.read_text(encoding="utf-8").partition("Inside `mpc/`")[2].partition("No modules import")[0]
+    return re.findall(r"^- `(\w+)(?:/|\.py)`:", listed, re.MULTILINE)
+
+
+def test_every_part_of_mpc_imports_those_before_it_in_the_list(imports: list[Import]) -> None:
+    parts = within_mpc()
+    inside = re.compile(r"quadsim\.mpc\.(\w+)")
+    upward = []
+    for item in imports:
+        importer = inside.match(item.importer)
+        imported = inside.match(item.imported)
+        if importer and imported and parts.index(importer[1]) < parts.index(imported[1]):
+            upward.append(f"{item.importer} imports {item.imported}")
+    assert {*parts} - {"c"} == {match[1] for match in map(inside.match, modules()) if match}
+    assert upward == []
+
+
 def test_controllers_know_vehicle_state_errors_and_protocol_alone(imports: list[Import]) -> None:
     named = {i.imported for i in imports if f"{i.importer}.".startswith("quadsim.mpc.")}
     others = {name for name in named if name.startswith("quadsim") and not name.startswith("quadsim.mpc")}
@@ -378,7 +397,7 @@ def unwritten(source: str) -> Iterator[str]:
     """Attributes asked for by a literal name of what may lack them: an optional part of a protocol written nowhere.
 
     It counts `getattr` and `hasattr` on `OF_CONTROLLERS`.  Optional parts are protocols of `quadsim.controller` and its
-    like in `mpc`, asked for by `isinstance`, and class attributes of `quadsim.mpc.tables.bounded.ControllerTable`.
+    like in `mpc`, asked for by `isinstance`, and class attributes of `quadsim.mpc.tables.controller.ControllerTable`.
     """
     for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "hasattr"):

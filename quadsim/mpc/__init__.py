@@ -18,11 +18,13 @@ if TYPE_CHECKING:
     from quadsim.mpc.forms.condensing import Condensed as Condensed
     from quadsim.mpc.laws.geometric import GeometricController as GeometricController
     from quadsim.mpc.laws.lqr import LQR as LQR
+    from quadsim.mpc.laws.nonlinear import Nonlinear as Nonlinear
     from quadsim.mpc.laws.parts.linear import LinearMPC as LinearMPC
     from quadsim.mpc.laws.parts.linear import NominalPreparation as NominalPreparation
     from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC as NonlinearMPC
     from quadsim.mpc.laws.parts.preparation import RobustPreparation as RobustPreparation
     from quadsim.mpc.laws.pid import CascadedPID as CascadedPID
+    from quadsim.mpc.laws.robust import Robust as Robust
     from quadsim.mpc.laws.unconstrained import UnconstrainedMPC as UnconstrainedMPC
     from quadsim.mpc.pilot.pilot import Pilot as Pilot
     from quadsim.mpc.problem.constraints import Bounds as Bounds
@@ -36,8 +38,6 @@ if TYPE_CHECKING:
     from quadsim.mpc.problem.ocp import Problem as Problem
     from quadsim.mpc.problem.ocp import Query as Query
     from quadsim.mpc.solvers import QPSolver as QPSolver
-    from quadsim.mpc.tables.nonlinear import Nonlinear as Nonlinear
-    from quadsim.mpc.tables.robust import Robust as Robust
 
 _MODULES = {
     "quadsim.mpc.laws.geometric": ("GeometricController",),
@@ -48,11 +48,11 @@ _MODULES = {
     "quadsim.mpc.laws.parts.linear": ("LinearMPC", "NominalPreparation"),
     "quadsim.mpc.problem.model": ("LinearModel", "hover_model"),
     "quadsim.mpc.laws.parts.nonlinear_mpc": ("NonlinearMPC",),
-    "quadsim.mpc.tables.nonlinear": ("Nonlinear",),
+    "quadsim.mpc.laws.nonlinear": ("Nonlinear",),
     "quadsim.mpc.problem.ocp": ("CondensedQP", "Objective", "Problem", "Query", "InfeasiblePeriod"),
     "quadsim.mpc.pilot.pilot": ("Pilot",),
     "quadsim.mpc.laws.parts.preparation": ("RobustPreparation",),
-    "quadsim.mpc.tables.robust": ("Robust",),
+    "quadsim.mpc.laws.robust": ("Robust",),
     "quadsim.mpc.solvers": ("QPSolver",),
     "quadsim.mpc.laws.unconstrained": ("UnconstrainedMPC",),
 }
@@ -75,6 +75,8 @@ def __getattr__(name: str) -> Any:
 
 
 shorthands.condensed_form = lambda problem: __getattr__("Condensed").of(problem)
+shorthands.nonlinear_mpc = lambda *given, **named: __getattr__("NonlinearMPC")(*given, **named)
+shorthands.robust_preparation = lambda *given: __getattr__("RobustPreparation")(*given)
 
 
 def __dir__() -> list[str]:

@@ -29,12 +29,13 @@ from annotated_types import Ge, Le, doc
 from quadsim.controller import ACCEPTED
 from quadsim.fields import NonNegative
 from quadsim.mpc.forms.partial_condensing import PartiallyCondensed
-from quadsim.mpc.problem.constraints import Constraint, Origin, Penalty
+from quadsim.mpc.problem.constraints import Constraint, Origin, Penalty, Soft
 from quadsim.mpc.problem.ocp import Problem, Query, predicted
 from quadsim.mpc.solvers import Answer, Solver
 from quadsim.mpc.solvers.piqp import Piqp
 from quadsim.space import AnyObstacle, Corridor, Fence, Obstacle, Solids
 from quadsim.state import POSITION, Array
+from quadsim.vehicle import Vehicle
 
 Shape: TypeAlias = AnyObstacle | Corridor | Fence
 
@@ -50,8 +51,8 @@ SETTLED: Final = 1e-2
 
 
 @dataclass(frozen=True, kw_only=True)
-class AvoidanceSettings:
-    """How obstacles, corridors and fences are enforced."""
+class Avoidance:
+    """Half-spaces that keep the vehicle clear of obstacles and inside corridors and the fence."""
 
     margin: Annotated[NonNegative, doc("[m] added clearance: planes change from instant to instant")] = 0.05
     rows: Annotated[
@@ -66,6 +67,33 @@ class AvoidanceSettings:
         Le(50),
         doc("[-] most QPs per period, each built along the plan of the one before"),
     ] = 3
+    soft: Annotated[Soft | None, doc("[1/m, 1/m^2] cost of violating a constraint; absent: hard")] = None
+
+    def space(
+        self,
+        shapes: Sequence[Shape],
+        vehicle: Vehicle,
+        *,
+        period: float,
+        horizon: int,
+        margins: Array | None = None,
+        positions: Sequence[int] = POSITION,
+        largest: bool = False,
+    ) -> Space | None:
+        """Return the half-spaces of obstacles and regions (`Space`); None without any."""
+        if not shapes:
+            return None
+        return Space(
+            shapes,
+            radius=vehicle.enclosing_radius,
+            period=period,
+            horizon=horizon,
+            settings=self,
+            margins=margins,
+            penalty=None if self.soft is None else (self.soft.linear, self.soft.quadratic),
+            positions=positions,
+            largest=largest,
+        )
 
 
 class Space:
@@ -90,7 +118,7 @@ class Space:
         radius: float,
         period: float,
         horizon: int,
-        settings: AvoidanceSettings,
+        settings: Avoidance,
         margins: Array | None = None,
         penalty: tuple[float, float] | None = None,
         positions: Sequence[int] = POSITION,

@@ -18,11 +18,11 @@ from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import InputError
 from quadsim.mpc.laws.constrained import Constrained
 from quadsim.mpc.laws.parts.builders import build
+from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.constraints import Origin
 from quadsim.mpc.problem.ocp import InfeasiblePeriod
 from quadsim.mpc.space import SOFT_SPACE
 from quadsim.mpc.tables.bounded import Bounded
-from quadsim.mpc.tables.robust import Robust
 from quadsim.rollout.conflicts import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
 from quadsim.scenarios.schema.base import fields_of
 from quadsim.scenarios.schema.scenario import Scenario

@@ -15,8 +15,8 @@ import numpy as np
 from quadsim.errors import InputError
 from quadsim.flight.metrics import unrecovered
 from quadsim.mpc.laws.constrained import Constrained
+from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.model import SHORTEST_LAG
-from quadsim.mpc.tables.robust import Robust
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.infeasibility import Settings, change_text, changed_scenario
 from quadsim.scenarios.assembly import Assembly

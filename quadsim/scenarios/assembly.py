@@ -454,7 +454,7 @@ class Assembly:
     def bounds(self) -> dict[str, tuple[float, float]]:
         """The controller's bounds on signals of the audit, in file units; of those on speeds, what the rotors can do.
 
-        See `quadsim.mpc.tables.bounded.ControllerTable.audited`.  Audit, notes and feasibility all take these.
+        See `quadsim.mpc.tables.controller.ControllerTable.audited`.  Audit, notes and feasibility all take these.
         """
         return flyable(self.scenario.controller.audited(self.vehicle), self.actual)
 

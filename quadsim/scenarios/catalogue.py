@@ -188,7 +188,7 @@ def read_catalogue() -> Catalogue:
         scenarios=scenarios,
         campaigns={name: read_toml(campaign_path(name))["description"] for name in campaign_names()},
         vehicles={name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
-        controllers={name: law.description for name, law in laws().items()},
+        controllers={name: table.description for name, table in laws().items()},
         papers={name: read_toml(paper_path(name))["title"] for name in paper_names()},
         solvers={name: entry.line for name, entry in solver_entries().items()},
     )

@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike
 from quadsim.errors import ParameterError
 from quadsim.flight.audit import Mask
 from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
-from quadsim.mpc.tables.bounded import Bounded, Range
-from quadsim.mpc.tables.robust import Robust
+from quadsim.mpc.laws.robust import Robust
+from quadsim.mpc.tables.bounded import Bounded
+from quadsim.mpc.tables.controller import Range
 from quadsim.scenarios.courses.course import Course
 from quadsim.scenarios.courses.csv_course import Csv
 from quadsim.scenarios.courses.smoothing import within_rounding

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from quadsim.controller import Controller
 from quadsim.flight.audit import SUM, UNAUDITED_ADVICE, Limit, SpaceLimit
 from quadsim.mpc.pilot.pilot import Pilot
-from quadsim.mpc.tables.bounded import Range
+from quadsim.mpc.tables.controller import Range
 from quadsim.report.table import format_number
 from quadsim.scenarios.law_bounds import law_limits
 from quadsim.scenarios.plugin import PluginController

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from quadsim.controller import ROTORS
+from quadsim.mpc.laws.nonlinear import Nonlinear
+from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.model import SHORTEST_LAG
-from quadsim.mpc.tables.bounded import Weighted, resolved_lag
-from quadsim.mpc.tables.nonlinear import Nonlinear
-from quadsim.mpc.tables.robust import Robust
+from quadsim.mpc.tables.bounded import Weighted
+from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.schema.controllers import AnyController
 from quadsim.sim.effects.rotors import RotorDynamics

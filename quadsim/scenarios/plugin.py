@@ -51,9 +51,9 @@ from quadsim.errors import (
     printable,
 )
 from quadsim.fields import is_plain
-from quadsim.mpc.laws import law_of, laws
+from quadsim.mpc.laws import laws
 from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import ControllerTable, Horizon
+from quadsim.mpc.tables.controller import ControllerTable, Horizon
 from quadsim.outputs import digest_of
 from quadsim.sim.effects import Force
 from quadsim.state import Array, State
@@ -96,6 +96,10 @@ class Plugin(ControllerTable, _Code):
 
     def __post_init__(self) -> None:
         _check_code(self.type, self.settings, ("vehicle", "period", "horizon"))
+
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
+        return make_law(import_plugin(self), self, vehicle, period)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,11 +261,6 @@ def _numbers(numbers: Any, shape: tuple[int, ...], name: str) -> Array:
     if array.shape != shape:
         raise InputError(f"{name} must have shape {shape}; got {array.shape}")
     return array
-
-
-@law_of.register(Plugin)
-def _imported_law(spec: Plugin, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    return make_law(import_plugin(spec), spec, vehicle, period)
 
 
 def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginController:

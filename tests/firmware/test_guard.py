@@ -18,13 +18,12 @@ from quadsim.controller import Command, StepInputs
 from quadsim.mpc.export import source
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.structs import STATUSES
-from quadsim.mpc.laws.parts.builders import guard_of
+from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.linear import LinearMPC
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.problem.equilibrium import Trim
 from quadsim.mpc.problem.heading import advance
 from quadsim.mpc.problem.model import LinearModel
-from quadsim.mpc.tables.nonlinear import Nonlinear
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.schema.scenario import Scenario
@@ -104,7 +103,7 @@ def flown(scenario: Scenario, host: Host, seed: int = 0) -> tuple[list[Command],
     table, period = scenario.controller, scenario.control_period
     linear = not isinstance(table, Nonlinear)
     pilot = Assembly(scenario.replace({"controller.compiled": True} if linear else {})).controller()
-    guard = guard_of(table, Assembly(scenario).vehicle, period)
+    guard = table.guard(Assembly(scenario).vehicle, period)
     assert guard is not None
     assert isinstance(pilot.law, LinearMPC | NonlinearMPC)
     vehicle = Vehicle(guard.hover.model, seed)
@@ -181,7 +180,7 @@ def test_both_have_the_same_bounds(name: str) -> None:
     """Python's contract has those of the table, the C those of the problem."""
     scenario = load_scenario(name).replace({"controller.fallback": {}})
     assembly = Assembly(scenario)
-    guard = guard_of(scenario.controller, assembly.vehicle, scenario.control_period)
+    guard = scenario.controller.guard(assembly.vehicle, scenario.control_period)
     assert guard is not None
     bounds = ActuatorBounds.of_problem(assembly.problem())
     for side in ("u_min", "u_max", "delta_min", "delta_max"):

@@ -20,7 +20,7 @@ from quadsim.mpc.problem.tightening import TighteningSettings, position_margins
 from quadsim.mpc.solvers import Answer, QPSolver
 from quadsim.mpc.solvers.by_name import make_solver
 from quadsim.mpc.solvers.piqp import Piqp
-from quadsim.mpc.space import AvoidanceSettings, ObstacleQP, Shape, Space
+from quadsim.mpc.space import Avoidance, ObstacleQP, Shape, Space
 from quadsim.space import Capsule, Corridor, Cylinder, Fence, Sphere
 from quadsim.state import INDEX, POSITION, Array
 from quadsim.vehicle import Vehicle
@@ -39,7 +39,7 @@ def problem() -> Problem:
 
 
 def space(*shapes: Shape, soft: bool = False, horizon: int = N, **given: float) -> Space:
-    settings = AvoidanceSettings(**{"margin": 0.0, "rows": 3, "iterations": 1} | given)  # type: ignore[arg-type]
+    settings = Avoidance(**{"margin": 0.0, "rows": 3, "iterations": 1} | given)  # type: ignore[arg-type]
     penalty = (1e5, 1e3) if soft else None
     return Space(shapes, radius=RADIUS, period=PERIOD, horizon=horizon, settings=settings, penalty=penalty)
 
@@ -216,9 +216,7 @@ def test_margins_grow_with_the_stated_disturbance(vehicle: Vehicle) -> None:
     assert (np.diff(small, axis=0) >= 0.0).all()
     assert (large >= small).all()
     assert large[-1, 0] > 1.3 * small[-1, 0]
-    tight = Space(
-        [PILLAR], radius=RADIUS, period=PERIOD, horizon=N, settings=AvoidanceSettings(margin=0.0), margins=large
-    )
+    tight = Space([PILLAR], radius=RADIUS, period=PERIOD, horizon=N, settings=Avoidance(margin=0.0), margins=large)
     at = np.tile([-1.0, 0.45, 0.0], (N, 1))
     more = tight.half_spaces(np.zeros(N), at)[1] - space(PILLAR).half_spaces(np.zeros(N), at)[1]
     np.testing.assert_allclose(more[0], large[:, 0], atol=1e-9)

@@ -17,13 +17,12 @@ from ocp_peer import Optimum, Period
 from support import paper_problem, random_problem, random_rows, robust_mpc, robust_table
 
 from quadsim.controller import CORE, SOLVED, UNCONSTRAINED, StepInputs
-from quadsim.mpc.problem.constraints import Constraint, Penalty, tightened
+from quadsim.mpc.laws.robust import Robust
+from quadsim.mpc.problem.constraints import Constraint, Penalty, Soft, tightened
 from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise
 from quadsim.mpc.problem.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
 from quadsim.mpc.solvers import SOLVERS, Method, QPSolver, find_solver, solver_entries
 from quadsim.mpc.solvers.by_name import make_solver
-from quadsim.mpc.tables.bounded import Soft
-from quadsim.mpc.tables.robust import Robust
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 

@@ -15,9 +15,9 @@ from peers.do_mpc_ocp import DoMPC
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.motion import Motion
 from quadsim.mpc.guard.answer import ActuatorBounds
+from quadsim.mpc.laws.nonlinear import Nonlinear, Weights
 from quadsim.mpc.laws.parts.nonlinear_mpc import STEP_TOLERANCE, NonlinearMPC
-from quadsim.mpc.tables.bounded import Soft
-from quadsim.mpc.tables.nonlinear import Nonlinear, Weights
+from quadsim.mpc.problem.constraints import Soft
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
 from quadsim.state import N_STATES, POSITIONS, VELOCITIES, Array

@@ -16,10 +16,10 @@ import quadsim
 from quadsim.errors import InputError
 from quadsim.flight.log import FlightLog
 from quadsim.mpc.laws.geometric import Geometric, GeometricController, Integrals
+from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.attitude import motion_of
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.laws.parts.preview import Target
-from quadsim.mpc.tables.nonlinear import Nonlinear
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
 from quadsim.rotation import euler_to_body_rates

@@ -21,7 +21,6 @@ import quadsim
 from quadsim import mpc
 from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import PlanExhaustedError
-from quadsim.mpc.laws.parts.builders import law_of
 from quadsim.mpc.laws.parts.nonlinear_mpc import CONVERGED
 from quadsim.mpc.problem.ocp import InfeasiblePeriod
 from quadsim.rollout import infeasibility, remedies
@@ -342,7 +341,7 @@ class Keeping:
     """A controller of one's own that keeps the problem that it could not solve."""
 
     def __init__(self, vehicle: Vehicle, period: float, horizon: int, largest: float = 2.0) -> None:
-        law = law_of(load_scenario("paper-constrained").controller, vehicle, period)
+        law = load_scenario("paper-constrained").controller.law(vehicle, period)
         assert isinstance(law, mpc.LinearMPC)
         roll = mpc.Bounds(
             C_c=np.eye(12)[[INDEX["roll"]]],

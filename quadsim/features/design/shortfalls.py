@@ -7,8 +7,9 @@ from typing import Final
 
 from quadsim.features.design.authority import Authority, authority
 from quadsim.mpc.laws.parts.feedback import Baseline
-from quadsim.mpc.tables.bounded import Bounded, InputBounds
-from quadsim.mpc.tables.robust import Robust
+from quadsim.mpc.laws.robust import Robust
+from quadsim.mpc.tables.bounded import Bounded
+from quadsim.mpc.tables.commands import InputBounds
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.feasibility_check import report
 from quadsim.scenarios.schema.scenario import Scenario

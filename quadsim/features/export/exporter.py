@@ -20,13 +20,13 @@ from quadsim.mpc.export.nonlinear import CNonlinear
 from quadsim.mpc.export.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
 from quadsim.mpc.export.targets import TARGETS, Machine
 from quadsim.mpc.laws.geometric import Geometric
+from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.numbers import AVOIDS, Exportable, exportable
 from quadsim.mpc.laws.parts.sqp import SQPStatus
 from quadsim.mpc.problem.rigidbody import N_BODY, P, V
 from quadsim.mpc.solvers import Method
 from quadsim.mpc.solvers.core import CoreProblem, WorkStruct
 from quadsim.mpc.tables.bounded import Weighted
-from quadsim.mpc.tables.nonlinear import Nonlinear
 from quadsim.outputs import absolute, reserving, writing
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario

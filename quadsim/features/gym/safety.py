@@ -13,10 +13,9 @@ from quadsim.controller import UNCONSTRAINED
 from quadsim.errors import ParameterError
 from quadsim.features.gym.environment import QuadrotorEnv
 from quadsim.features.gym.spaces import Action
-from quadsim.mpc.laws.parts.builders import guard_of
 from quadsim.mpc.laws.parts.safety_filter import safety_filter
+from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.pilot.pilot import Pilot
-from quadsim.mpc.tables.robust import Robust
 from quadsim.vehicle import Vehicle
 
 
@@ -82,7 +81,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         if started.vehicle != self._vehicle:
             vehicle, period = started.vehicle, started.scenario.control_period
             self._filter = safety_filter(self._spec, vehicle, period)
-            self._law = Pilot(self._filter, vehicle, guard=guard_of(self._spec, vehicle, period))
+            self._law = Pilot(self._filter, vehicle, guard=self._spec.guard(vehicle, period))
             self._vehicle = started.vehicle
         acting = started.observation.moment.acting
         assert acting is not None

@@ -9,9 +9,9 @@ from typing import ClassVar
 from quadsim.mpc.export.source import CSource
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.laws.geometric import Geometric, GeometricController
+from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.nonlinear_law import WIDTH_OF_MOTION
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
-from quadsim.mpc.tables.nonlinear import Nonlinear
 from quadsim.state import N_STATES
 from quadsim.vehicle import Vehicle
 

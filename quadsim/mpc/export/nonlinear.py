@@ -14,13 +14,13 @@ from quadsim.errors import ExportError
 from quadsim.mpc.export.ctext import CText
 from quadsim.mpc.export.follower import CFollower
 from quadsim.mpc.export.source import CHANGES, SHARED_FILES
+from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.body import ProblemStruct
 from quadsim.mpc.laws.parts.nonlinear_law import memory_of
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.laws.parts.numbers import fallback_numbers
 from quadsim.mpc.problem.model import LinearModel, hover_model, target_model
 from quadsim.mpc.solvers.core_tables import NO_BOUND
-from quadsim.mpc.tables.nonlinear import Nonlinear
 
 FILES: Final = (
     *SHARED_FILES,

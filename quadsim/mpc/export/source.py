@@ -13,10 +13,9 @@ from quadsim.controller import ROTORS
 from quadsim.mpc.export.ctext import CText, Precision
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.laws.parts.numbers import Exportable, controller_numbers, fallback_numbers, robust_numbers
-from quadsim.mpc.problem.model import hover_model
+from quadsim.mpc.problem.model import hover_model, split_delay
 from quadsim.mpc.solvers.core import core_problem
 from quadsim.mpc.solvers.core_tables import Tables, members
-from quadsim.mpc.tables.robust import split_delay
 from quadsim.state import N_STATES, REFERENCE_STATES
 from quadsim.vehicle import N_ROTORS
 

@@ -1,89 +1,56 @@
-"""The control laws by name: a file each, with the law, its table `[controller]` and its builder.
+"""The control laws by name: a file each, with the table `[controller]`, whose method `law` builds the law.
 
-`register` says what else is known of a law; a module of this folder needs no line elsewhere.  What laws are made of is
-in `parts`.
+`register` says what else is known of a law; a module of this folder needs no line elsewhere.  The law itself is in the
+same file, or in `parts`, as all that laws are made of.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache, singledispatch
+from collections.abc import Callable, Mapping
+from functools import cache
 from types import MappingProxyType
 from typing import Final, TypeVar
 
-from quadsim.controller import Controller
-from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import ControllerTable
-from quadsim.vehicle import Vehicle
+from quadsim.mpc.tables.controller import ControllerTable
 
-AnyBuilder = TypeVar("AnyBuilder", bound=Callable[..., Controller])
-"""A function of a table, a vehicle, a control period [s], and obstacles and regions; see `law_of`."""
+TableClass = TypeVar("TableClass", bound=type[ControllerTable])
 _LAST: Final = 100
+_registered: Final[dict[str, type[ControllerTable]]] = {}
 
 
-@dataclass(frozen=True, kw_only=True)
-class LawEntry:
-    """What is known of a control law without building it."""
-
-    table: type[ControllerTable]  # a dataclass, whose field `type` is the law's name
-    title: str  # its display name
-    description: str  # its line in `quadsim list`
-    place: int  # in lists; laws of one place are in the order of their names
-
-    @property
-    def name(self) -> str:
-        """Its name, as files state and flights record it."""
-        return self.table.type
-
-
-_registered: Final[dict[str, LawEntry]] = {}
-
-
-def register(
-    table: type[ControllerTable], *, title: str, description: str, place: int = _LAST
-) -> Callable[[AnyBuilder], AnyBuilder]:
-    """Register a law by its builder, which this decorates; the arguments are the fields of `LawEntry`.
+def register(*, title: str, description: str, place: int = _LAST) -> Callable[[TableClass], TableClass]:
+    """Register the table of a law, a dataclass that this decorates; see `ControllerTable` for the arguments.
 
     Raises:
         ValueError: another table has that name.
     """
-    law = LawEntry(table=table, title=title, description=description, place=place)
-    known = _registered.setdefault(law.name, law)
-    if known.table is not table:
-        raise ValueError(f"two laws have the name {law.name!r}: {known.table.__module__} and {table.__module__}")
 
-    def registered(builder: AnyBuilder) -> AnyBuilder:
-        law_of.register(table)(builder)
-        return builder
+    def registered(table: TableClass) -> TableClass:
+        known = _registered.setdefault(table.type, table)
+        if known is not table:
+            raise ValueError(f"two laws have the name {table.type!r}: {known.__module__} and {table.__module__}")
+        table.title = title
+        table.description = description
+        table.place = place
+        return table
 
     return registered
 
 
 @cache
-def laws() -> Mapping[str, LawEntry]:
-    """Return the laws by name; the first call imports every module of this folder."""
+def laws() -> Mapping[str, type[ControllerTable]]:
+    """Return the tables of the laws by name; the first call imports every module of this folder."""
     for module in pkgutil.iter_modules(__path__):
         importlib.import_module(f"{__name__}.{module.name}")
-    ordered = sorted(_registered.values(), key=lambda law: (law.place, law.name))
-    return MappingProxyType({law.name: law for law in ordered})
+    ordered = sorted(_registered.values(), key=lambda table: (table.place, table.type))
+    return MappingProxyType({table.type: table for table in ordered})
 
 
 def law_name(recorded: str) -> str:
     """Return the display name of a controller from the name in a run's summary; a user's is shown by that name."""
-    law = laws().get(recorded)
-    if law is None:
+    table = laws().get(recorded)
+    if table is None:
         return recorded
-    return law.title
-
-
-@singledispatch
-def law_of(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-    """Return the law of a table, in Python, for a control `period` [s]; see `quadsim.mpc.laws.parts.builders.build`."""
-    laws()  # the builder of this table has not been imported yet
-    builder = law_of.dispatch(type(table))
-    if builder is law_of.dispatch(object):
-        raise NotImplementedError(f"no law is registered for the table {type(table).__name__}")
-    return builder(table, vehicle, period, shapes)
+    return table.title

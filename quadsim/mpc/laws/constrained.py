@@ -18,6 +18,11 @@ if TYPE_CHECKING:
     from quadsim.mpc.laws.parts.linear import LinearMPC
 
 
+@register(
+    title="constrained MPC",
+    description="the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
+    place=2,
+)
 @dataclass(frozen=True, kw_only=True)
 class Constrained(Bounded):
     """The paper's constrained MPC, the optimum of a QP in every period (Sec. 5)."""
@@ -30,17 +35,11 @@ class Constrained(Bounded):
         doc("absent: the last plan is held, shifted, and then the flight ends"),
     ] = None
 
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
+        from quadsim.mpc.laws.parts.linear import NominalPreparation, linear_law
 
-@register(
-    Constrained,
-    title="constrained MPC",
-    description="the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
-    place=2,
-)
-def _law(table: Constrained, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
-    from quadsim.mpc.laws.parts.linear import NominalPreparation, linear_law
-
-    problem = table.problem(vehicle, period)
-    space = table.space(shapes, vehicle, period)
-    solver = table.make_solver(problem, space)
-    return linear_law(table, NominalPreparation(problem), solver, space)
+        problem = self.problem(vehicle, period)
+        space = self.space(shapes, vehicle, period)
+        solver = self.make_solver(problem, space)
+        return linear_law(self, NominalPreparation(problem), solver, space)

@@ -32,7 +32,9 @@ from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement, require_one_sc
 from quadsim.mpc.problem.model import target_model
 from quadsim.mpc.problem.nonlinear_model import zero
 from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, require_lags, require_space
+from quadsim.mpc.tables.commands import USUAL_TARGETS, TargetBounds, require_space
+from quadsim.mpc.tables.controller import Range
+from quadsim.mpc.tables.lags import LagSeconds, require_lags
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -389,6 +391,11 @@ def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gain
     return numbers
 
 
+@register(
+    title="geometric control",
+    description="geometric tracking control on SE(3)",
+    place=7,
+)
 @dataclass(frozen=True, kw_only=True)
 class Geometric(Tuned):
     """Geometric tracking on SE(3)."""
@@ -430,7 +437,7 @@ class Geometric(Tuned):
             raise ParameterError("", "horizon", self.horizon, rule)
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.audited`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
         return super().audited(vehicle) if self.commands == "rotors" else self.target_bounds.audited(vehicle)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
@@ -438,15 +445,9 @@ class Geometric(Tuned):
         return super().actuators(vehicle) if self.commands == ROTORS else self.target_bounds.actuators(vehicle)
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.inner_loop`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.inner_loop`."""
         return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
 
-
-@register(
-    Geometric,
-    title="geometric control",
-    description="geometric tracking control on SE(3)",
-    place=7,
-)
-def _law(table: Geometric, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> GeometricController:
-    return GeometricController(vehicle, period, table)
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> GeometricController:
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
+        return GeometricController(vehicle, period, self)

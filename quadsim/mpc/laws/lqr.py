@@ -18,10 +18,11 @@ from quadsim.mpc.laws.parts.feedback import Baseline, FeedbackLaw
 from quadsim.mpc.pilot.allocation import allocate, make_allocation
 from quadsim.mpc.problem.heading import turn_horizontally
 from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model
-from quadsim.mpc.problem.ocp import Objective
+from quadsim.mpc.problem.ocp import Objective, objective_of
 from quadsim.mpc.problem.regulator import stabilising
 from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import InputWeights, objective_of, require_states
+from quadsim.mpc.tables.bounded import require_states
+from quadsim.mpc.tables.commands import InputWeights
 from quadsim.state import INDEX, N_STATES, REFERENCE_RATES, REFERENCE_STATES, STATE_NAMES, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -156,6 +157,11 @@ class LQR(FeedbackLaw):
         return allocate(self._allocation, self._allocation.wrench(speeds), lower, upper)
 
 
+@register(
+    title="LQR",
+    description="infinite-horizon LQR on the hover model, following the reference's velocity",
+    place=5,
+)
 @dataclass(frozen=True, kw_only=True)
 class LQRTable(Baseline):
     """LQR over an infinite horizon on the hover model."""
@@ -184,14 +190,8 @@ class LQRTable(Baseline):
         """Return the weights of one period."""
         if self.output_weights is None or self.input_weights is None:
             return bryson_objective(vehicle, period)
-        return objective_of(self.output_weights, self.input_weights)
+        return objective_of(self.output_weights, self.input_weights.speed)
 
-
-@register(
-    LQRTable,
-    title="LQR",
-    description="infinite-horizon LQR on the hover model, following the reference's velocity",
-    place=5,
-)
-def _law(table: LQRTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LQR:
-    return LQR(vehicle, period, table)
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LQR:
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
+        return LQR(vehicle, period, self)

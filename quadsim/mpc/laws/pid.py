@@ -186,6 +186,11 @@ def force_within(force: Array, *, weight: float, largest: float, tilt: float) ->
     return np.array([share * upright[0], share * upright[1], upward])
 
 
+@register(
+    title="PID",
+    description="cascaded PID, as autopilots fly it",
+    place=6,
+)
 @dataclass(frozen=True, kw_only=True)
 class PID(Tuned):
     """Cascaded PID as autopilots fly it."""
@@ -193,12 +198,6 @@ class PID(Tuned):
     type: Annotated[Literal["pid"], doc("the control law, by its name in `quadsim list`")] = "pid"
     velocity: Annotated[Positive, doc("[m/s] largest velocity commanded")] = 12.0
 
-
-@register(
-    PID,
-    title="PID",
-    description="cascaded PID, as autopilots fly it",
-    place=6,
-)
-def _law(table: PID, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> CascadedPID:
-    return CascadedPID(vehicle, period, table)
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> CascadedPID:
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
+        return CascadedPID(vehicle, period, self)

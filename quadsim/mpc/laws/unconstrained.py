@@ -80,18 +80,17 @@ class UnconstrainedMPC:
         return rollout(self.problem.model, states, plans)
 
 
+@register(
+    title="unconstrained MPC",
+    description="the paper's Sec. 4: a constant gain from the unconstrained optimum",
+    place=1,
+)
 @dataclass(frozen=True, kw_only=True)
 class Unconstrained(Weighted):
     """The paper's unconstrained MPC, a constant gain (Sec. 4)."""
 
     type: Annotated[Literal["unconstrained"], doc("the control law, by its name in `quadsim list`")] = "unconstrained"
 
-
-@register(
-    Unconstrained,
-    title="unconstrained MPC",
-    description="the paper's Sec. 4: a constant gain from the unconstrained optimum",
-    place=1,
-)
-def _law(table: Unconstrained, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> UnconstrainedMPC:
-    return UnconstrainedMPC(table.problem(vehicle, period))
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> UnconstrainedMPC:
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
+        return UnconstrainedMPC(self.problem(vehicle, period))

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
+from annotated_types import Ge, Le, doc
 
 from quadsim.errors import ParameterError
-from quadsim.state import N_STATES, STATE_NAMES, STATE_UNITS, Array, Indices, shown_unit
+from quadsim.state import INDEX, N_STATES, STATE_NAMES, STATE_UNITS, Array, Indices, shown_unit
 
 _INPUTS: Final = "controller.input_bounds"
+Price = Annotated[float, Ge(0.0), Le(1e12)]
 
 
 class Origin(NamedTuple):
@@ -52,6 +55,25 @@ class Penalty:
                 raise ParameterError("controller", name, value, "one finite number >= 0 per constrained output")
             if self.largest and (value != value[:1]).any():
                 raise ParameterError("controller", name, value, "the same number for all rows that share a slack")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Soft:
+    """The cost of violating a soft bound by e: l1 e + l2 e^2."""
+
+    linear: Annotated[
+        Price,
+        doc(
+            "[1/unit; rad for angles of output_bounds, the row's unit of a polytope] l1: exact if larger than the "
+            "multipliers of hard bounds, as 1e8 nearly always is; but a nearly hard bound reacts to model errors like "
+            "a hard one"
+        ),
+    ] = 2e5
+    quadratic: Annotated[Price, doc("[1/unit^2] l2")] = 1e4
+
+    def penalty(self, rows: int) -> Penalty:
+        """Return the penalty for `rows` rows."""
+        return Penalty(l1=np.full(rows, self.linear), l2=np.full(rows, self.quadratic))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,6 +184,11 @@ class Bounds:
         if states.size != 1 or self.C_c[i, states[0]] != 1.0 or states[0] >= N_STATES:
             return Origin(f"row {i} of C_c")
         return origin_of_state(int(states[0]))
+
+
+def selection(names: Sequence[str]) -> Array:
+    """Return the rows of the identity that select states by name."""
+    return np.eye(N_STATES)[[INDEX[name] for name in names]]
 
 
 def origin_of_state(index: int) -> Origin:

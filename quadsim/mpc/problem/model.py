@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -96,3 +97,12 @@ def target_model(vehicle: Vehicle, period: float, lag: Sequence[float]) -> Linea
     u_bar = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
     A, B = discretise(A, B, period)
     return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(u_bar), period=period, targets=True)
+
+
+def split_delay(delay: float, period: float) -> tuple[int, float]:
+    """Split a delay [s] into n whole periods and the rest, which is at most a period and zero only without delay.
+
+    At t_k the commands u(k-n) .. u(k-1) are under way, and u(k-1-n) is in force for that rest.
+    """
+    whole = max(math.ceil(delay / period - 1e-9) - 1, 0)
+    return whole, delay - whole * period

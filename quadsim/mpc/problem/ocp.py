@@ -11,7 +11,7 @@ constraints. Every formulation is built from the stacked rows of all constraints
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -20,10 +20,11 @@ import numpy as np
 
 from quadsim import shorthands
 from quadsim.errors import ParameterError
-from quadsim.mpc.problem.constraints import Bounds, Constraint, Rows, renumbered, row_scale
+from quadsim.mpc.problem.constraints import Bounds, Constraint, Rows, renumbered, row_scale, selection
 from quadsim.mpc.problem.model import LinearModel
 from quadsim.mpc.problem.regulator import stabilising
-from quadsim.state import REFERENCE_RATES, REFERENCE_STATES, Array, Indices
+from quadsim.state import REFERENCE_RATES, REFERENCE_STATES, STATE_NAMES, Array, Indices
+from quadsim.vehicle import N_ROTORS
 
 
 class Equilibrium(NamedTuple):
@@ -94,6 +95,16 @@ class Objective:
     def move_weight(self) -> Array:
         """Q_d (nu, nu), zeros if there is none."""
         return np.zeros_like(self.Q_u) if self.Q_d is None else self.Q_d
+
+
+def objective_of(output_weights: Mapping[str, float], speed_weights: float | Sequence[float]) -> Objective:
+    """Return C_r, Q_y and Q_u for weights of states by name, and one of all rotor speeds or one per rotor."""
+    regulated = [name for name in STATE_NAMES if name in output_weights]
+    return Objective(
+        C_r=selection(regulated),
+        Q_y=np.diag([output_weights[name] for name in regulated]),
+        Q_u=np.diag(np.broadcast_to(np.asarray(speed_weights, float), N_ROTORS)),
+    )
 
 
 def reference_rates(reference: Array, period: float) -> Array:

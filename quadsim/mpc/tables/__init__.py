@@ -1,1 +1,1 @@
-"""The tables `[controller]` of scenario files: their fields, limits and messages."""
+"""Fields, limits and messages that several tables `[controller]` of scenario files share."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias, Union
 from pydantic import Discriminator, Tag
 
 from quadsim.mpc.laws import laws
-from quadsim.mpc.tables.bounded import ControllerTable
+from quadsim.mpc.tables.controller import ControllerTable
 from quadsim.scenarios.plugin import FORM, Plugin, is_plugin
 from quadsim.scenarios.schema.problems import parse_table
 from quadsim.scenarios.schema.settings import set_field
@@ -35,10 +35,7 @@ class _OrName:
 
 LAWS: Final = tuple(laws())
 """The names of built-in controllers."""
-TABLES: Final[Mapping[str, type[ControllerTable]]] = {
-    **{name: law.table for name, law in laws().items()},
-    FORM: Plugin,
-}
+TABLES: Final[Mapping[str, type[ControllerTable]]] = {**laws(), FORM: Plugin}
 """The tables of all controllers by name; that of users' controllers by the form of their names."""
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from quadsim.errors import InputError, ParameterError
 from quadsim.fields import FLOORS, Metres, Positive
 from quadsim.flight.audit import FlightVerdict, Limit
 from quadsim.input_limits import MOST_ENTRIES, MOST_STEPS
-from quadsim.mpc.tables.bounded import Polytope
+from quadsim.mpc.problem.polytope import Polytope
 from quadsim.scenarios.catalogue import Group
 from quadsim.scenarios.courses.table import ReferenceTable
 from quadsim.scenarios.plugin import PluginForce

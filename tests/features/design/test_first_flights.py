@@ -26,7 +26,7 @@ from quadsim.features.design.first_scenario import (
     first_scenario,
 )
 from quadsim.mpc.laws.lqr import bryson_objective
-from quadsim.mpc.tables.robust import Robust
+from quadsim.mpc.laws.robust import Robust
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import parse_scenario
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle

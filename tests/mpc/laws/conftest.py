@@ -14,7 +14,6 @@ from quadsim.controller import Controller
 from quadsim.flight.log import FlightLog
 from quadsim.mpc.laws.geometric import Geometric
 from quadsim.mpc.laws.lqr import LQRTable
-from quadsim.mpc.laws.parts.builders import law_of
 from quadsim.mpc.laws.pid import PID
 from quadsim.sim.effects import Effects
 from quadsim.sim.loop import fly
@@ -45,7 +44,7 @@ def build() -> Build:
     """A law by name for a vehicle, with the defaults of its table but for some fields."""
 
     def build_law(law: str, vehicle: Vehicle, **others: Any) -> Any:
-        return law_of(TABLES[law](**others), vehicle, PERIOD)
+        return TABLES[law](**others).law(vehicle, PERIOD)
 
     return build_law
 

@@ -17,7 +17,7 @@ from quadsim.mpc.laws.geometric import Geometric, GeometricController, Integrals
 from quadsim.mpc.laws.parts.attitude import Measured, motion_of
 from quadsim.mpc.laws.parts.preview import Target, differentiator, target_of
 from quadsim.mpc.problem.flatness import motion_along
-from quadsim.mpc.tables.bounded import TargetBounds
+from quadsim.mpc.tables.commands import TargetBounds
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import EULER, Array
 from quadsim.vehicle import Vehicle

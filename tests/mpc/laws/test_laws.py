@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from quadsim.controller import Phase, StepInputs
 from quadsim.errors import CommandError
-from quadsim.mpc.tables.bounded import InputBounds
+from quadsim.mpc.tables.commands import InputBounds
 from quadsim.state import INDEX, make_state
 from quadsim.vehicle import Vehicle
 

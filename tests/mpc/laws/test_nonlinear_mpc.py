@@ -17,11 +17,11 @@ from quadsim.errors import ParameterError
 from quadsim.motion import Motion
 from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.answer import ActuatorBounds
+from quadsim.mpc.laws.nonlinear import Nonlinear, Weights
 from quadsim.mpc.laws.parts.nonlinear_law import WIDTH_OF_MOTION, put_motion
 from quadsim.mpc.laws.parts.nonlinear_mpc import CONVERGED, STEP_TOLERANCE, NonlinearMPC
 from quadsim.mpc.problem.constraints import Constraint
 from quadsim.mpc.problem.rigidbody import N_BODY, Inputs, P, Q, V, W, rigid_body, thrust_axis
-from quadsim.mpc.tables.nonlinear import Nonlinear, Weights
 from quadsim.rollout.conflicts import find_conflict
 from quadsim.rotation import multiply, quaternion_to_euler
 from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array

@@ -7,20 +7,23 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from quadsim.controller import ROTORS
 from quadsim.core.library import load_library
 from quadsim.mpc import laws as package
-from quadsim.mpc.laws import LawEntry, law_name, law_of, laws, register
+from quadsim.mpc.laws import law_name, laws, register
 from quadsim.mpc.laws.parts.feedback import Baseline
 from quadsim.mpc.laws.pid import PID
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.plugin import Plugin
 from quadsim.scenarios.schema.controllers import LAWS
+from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.vehicle import Vehicle
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -57,6 +60,7 @@ class OneSpeed(FeedbackLaw):
         return self._held_for_a_period(np.array(self._speed))
 
 
+@register(title="a single speed", description="hover's rotor speed, times a share")
 @dataclass(frozen=True, kw_only=True)
 class OneSpeedTable(Baseline):
     """One speed."""
@@ -64,10 +68,9 @@ class OneSpeedTable(Baseline):
     type: Annotated[Literal["one-speed"], doc("the control law, by its name in `quadsim list`")] = "one-speed"
     share: Annotated[float, Gt(0.0), Le(2.0), doc("[-] of the hover speed")] = 1.0
 
-
-@register(OneSpeedTable, title="a single speed", description="hover's rotor speed, times a share")
-def _law(table: OneSpeedTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> OneSpeed:
-    return OneSpeed(vehicle, period, table)
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> OneSpeed:
+        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
+        return OneSpeed(vehicle, period, self)
 '''
 COMMANDS = """
 import contextlib, io, json, sys
@@ -168,7 +171,7 @@ def test_a_wrong_value_field_or_name_is_refused(answers: dict[str, Any]) -> None
 def test_every_file_of_the_folder_registers_one_law() -> None:
     files = {path.stem for path in Path(package.__file__).parent.glob("*.py")} - {"__init__"}
     assert {*laws()} == {*LAWS} == files
-    assert all(name == law.name == law.table.type for name, law in laws().items())
+    assert all(name == table.type for name, table in laws().items())
 
 
 def test_two_laws_cannot_have_one_name() -> None:
@@ -176,23 +179,52 @@ def test_two_laws_cannot_have_one_name() -> None:
         type = "pid"
 
     with pytest.raises(ValueError, match=r"^two laws have the name 'pid': quadsim\.mpc\.laws\.pid and "):
-        register(Other, title="another", description="another PID")
-    assert laws()["pid"] == LawEntry(table=PID, title="PID", description="cascaded PID, as autopilots fly it", place=6)
+        register(title="another", description="another PID")(Other)
+    assert laws()["pid"] is PID
+    assert (PID.title, PID.description, PID.place) == ("PID", "cascaded PID, as autopilots fly it", 6)
 
 
 def test_a_table_without_a_law_is_refused(vehicle: Vehicle) -> None:
-    with pytest.raises(NotImplementedError, match=r"^no law is registered for the table Baseline$"):
-        law_of(Baseline(), vehicle, 0.05)
+    with pytest.raises(NotImplementedError, match=r"^the table Baseline has no method `law`$"):
+        Baseline().law(vehicle, 0.05)
 
 
 def test_names_that_flights_recorded() -> None:
     assert (law_name("pid"), law_name("my_law")) == ("PID", "my_law")
 
 
+def flight_with(name: str) -> Scenario:
+    """A scenario that flies the law of a name."""
+    library = {"unconstrained": "paper-unconstrained", "constrained": "paper-constrained", "robust": "robust"}
+    return load_scenario(library.get(name, "hover"), [] if name in library else [f"controller={name}"])
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_table_builds_its_law_and_the_guard_around_it(name: str, vehicle: Vehicle) -> None:
+    table = flight_with(name).controller
+    law = table.law(vehicle, 0.05)
+    assert (law.name, law.horizon) == (name, table.horizon)
+    guard = table.guard(vehicle, 0.05)
+    assert (guard is not None) == (name in ("robust", "nonlinear"))
+    if guard is not None:
+        without = replace(table, fallback=replace(table.fallback, enabled=False))
+        assert without.guard(vehicle, 0.05) is None
+
+
+def test_the_guard_of_targets_has_their_model_and_bounds(vehicle: Vehicle) -> None:
+    lags = {"controller.commands": "rates", "controller.inner_lag": [0.05, 0.04, 0.04, 0.1]}
+    table = flight_with("nonlinear").replace(lags).controller
+    guard = table.guard(vehicle, 0.05)
+    assert guard is not None
+    assert guard.hover.model.targets
+    assert table.actuators(vehicle).targets
+    weight = vehicle.mass * vehicle.gravity
+    np.testing.assert_allclose(guard.hover.model.u_bar, [weight, 0.0, 0.0, 0.0])
+
+
 @pytest.mark.parametrize("name", LAWS)
 def test_speeds_are_held_unless_an_inner_loop_or_an_autopilot_changes_them(name: str) -> None:
-    library = {"unconstrained": "paper-unconstrained", "constrained": "paper-constrained", "robust": "robust"}
-    scenario = load_scenario(library.get(name, "hover"), [] if name in library else [f"controller={name}"])
+    scenario = flight_with(name)
     assert scenario.controller.holds_speeds
     if name in ("nonlinear", "geometric"):
         assert scenario.controller.commands == ROTORS

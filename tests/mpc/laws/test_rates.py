@@ -20,11 +20,13 @@ from quadsim.mpc.estimate.disturbance import RampSettings
 from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.contract import FallbackSettings
 from quadsim.mpc.guard.hover import HoverLaw
+from quadsim.mpc.laws.nonlinear import Nonlinear, Weights
 from quadsim.mpc.laws.parts.builders import build
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.pilot.indi import INDISettings
-from quadsim.mpc.problem.constraints import Constraint
+from quadsim.mpc.problem.constraints import Constraint, Soft
 from quadsim.mpc.problem.model import target_model
+from quadsim.mpc.problem.polytope import Polytope
 from quadsim.mpc.problem.rigidbody import (
     N_BODY,
     RATE_SCALE,
@@ -38,8 +40,8 @@ from quadsim.mpc.problem.rigidbody import (
     rotation,
     thrust_axis,
 )
-from quadsim.mpc.tables.bounded import Avoidance, Polytope, Soft, TargetBounds
-from quadsim.mpc.tables.nonlinear import Nonlinear, Weights
+from quadsim.mpc.space import Avoidance
+from quadsim.mpc.tables.commands import TargetBounds
 from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
 from quadsim.space import Sphere
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array

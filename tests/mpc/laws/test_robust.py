@@ -16,9 +16,10 @@ from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Phase, StepInput
 from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.laws.parts.linear import LinearMPC
 from quadsim.mpc.laws.parts.preparation import RobustPreparation
+from quadsim.mpc.problem.constraints import Soft
 from quadsim.mpc.problem.heading import turn_horizontally
 from quadsim.mpc.problem.nonlinear_model import NonlinearModel, next_state, nonlinear_model
-from quadsim.mpc.tables.bounded import InputWeights, Soft
+from quadsim.mpc.tables.commands import InputWeights
 from quadsim.rollout.flown import Flight
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state

@@ -15,8 +15,9 @@ from quadsim.mpc.laws.parts.preparation import RobustPreparation
 from quadsim.mpc.laws.parts.safety_filter import TERMINAL_TOLERANCE, SafetyFilter, _Nearest
 from quadsim.mpc.problem.constraints import Bounds
 from quadsim.mpc.problem.ocp import Objective, Query
+from quadsim.mpc.problem.polytope import Polytope
 from quadsim.mpc.solvers import Answer, make_backend
-from quadsim.mpc.tables.bounded import InputBounds, Polytope
+from quadsim.mpc.tables.commands import InputBounds
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
 from quadsim.state import INDEX, Array

@@ -17,16 +17,16 @@ from quadsim.controller import ACCEPTED, OPTIMAL, SOLVED, UNCONSTRAINED, Command
 from quadsim.errors import ParameterError
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.structs import STATUSES
+from quadsim.mpc.laws.nonlinear import Nonlinear, Weights
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.laws.parts.sqp import OWN_NAMES, SQP
-from quadsim.mpc.problem.constraints import Constraint
+from quadsim.mpc.problem.constraints import Constraint, Soft
 from quadsim.mpc.problem.ocp import Query
+from quadsim.mpc.problem.polytope import Polytope
 from quadsim.mpc.problem.qp import kkt_residuals
 from quadsim.mpc.problem.rigidbody import N_BODY, P, Q, V, W
 from quadsim.mpc.solvers.daqp import DaqpDense
-from quadsim.mpc.space import AvoidanceSettings, Space
-from quadsim.mpc.tables.bounded import Polytope, Soft
-from quadsim.mpc.tables.nonlinear import Nonlinear, Weights
+from quadsim.mpc.space import Avoidance, Space
 from quadsim.space import Sphere
 from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import load_vehicle
@@ -161,7 +161,7 @@ def test_half_spaces_are_rows_of_the_program() -> None:
     pillar = Sphere(name="pillar", position=(0.6, 0.05, 0.0), radius=0.2)
     for penalty in (None, (50.0, 10.0)):
         space = Space(
-            [pillar], radius=0.1, period=PERIOD, horizon=12, settings=AvoidanceSettings(), penalty=penalty,
+            [pillar], radius=0.1, period=PERIOD, horizon=12, settings=Avoidance(), penalty=penalty,
             positions=(0, 1, 2), largest=True,
         )  # fmt: skip
         controller, reference = law(space, tilt=20.0, soft=Soft(linear=1e3)), np.zeros((12, 4))

@@ -18,10 +18,10 @@ from quadsim.flight.log import FlightLog
 from quadsim.mpc.estimate.disturbance import RampSettings
 from quadsim.mpc.laws.geometric import Geometric, GeometricController, Integrals
 from quadsim.mpc.laws.parts.attitude import motion_of
-from quadsim.mpc.laws.parts.builders import build, law_of
+from quadsim.mpc.laws.parts.builders import build
 from quadsim.mpc.laws.parts.preview import Target
 from quadsim.mpc.problem.model import continuous_model
-from quadsim.mpc.tables.bounded import TargetBounds
+from quadsim.mpc.tables.commands import TargetBounds
 from quadsim.rotation import body_to_euler_rates
 from quadsim.state import EULER_RATE, INDEX, VELOCITY, Array, make_state
 from quadsim.vehicle import Vehicle
@@ -264,7 +264,7 @@ def test_on_the_ground_it_asks_for_the_least_thrust_and_no_rates(vehicle: Vehicl
 
 def test_the_table_builds_the_law_and_audits_its_targets(vehicle: Vehicle) -> None:
     table = Geometric(commands="rates", inner_lag=SLOW, target_bounds=TargetBounds(body_rate=100.0), lag=0.05)
-    law = law_of(table, vehicle, PERIOD)
+    law = table.law(vehicle, PERIOD)
     assert isinstance(law, GeometricController)
     assert law.gains.k_attitude[0] == pytest.approx(1.0 / 0.18)
     np.testing.assert_allclose(law.bounds.u_max[1:], math.radians(100.0))

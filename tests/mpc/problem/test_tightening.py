@@ -17,8 +17,8 @@ from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.laws.parts.linear import LinearMPC
-from quadsim.mpc.problem.constraints import Bounds
-from quadsim.mpc.problem.model import discretise
+from quadsim.mpc.problem.constraints import Bounds, Soft
+from quadsim.mpc.problem.model import SHORTEST_LAG, discretise
 from quadsim.mpc.problem.nonlinear_model import next_state, nonlinear_model
 from quadsim.mpc.problem.regulator import observed
 from quadsim.mpc.problem.tightening import (
@@ -31,7 +31,7 @@ from quadsim.mpc.problem.tightening import (
     growth,
     margins,
 )
-from quadsim.mpc.tables.bounded import SHORTEST_LAG, InputWeights, Soft
+from quadsim.mpc.tables.commands import InputWeights
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
 from quadsim.state import INDEX, Array

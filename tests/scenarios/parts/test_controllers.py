@@ -19,6 +19,7 @@ from quadsim.mpc.estimate.observer import DisturbanceObserver, ObserverSettings
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.laws.geometric import GeometricController
 from quadsim.mpc.laws.lqr import LQR, bryson_objective
+from quadsim.mpc.laws.nonlinear import Weights
 from quadsim.mpc.laws.parts.linear import LinearMPC
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.laws.parts.preparation import RobustPreparation
@@ -27,7 +28,6 @@ from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.mpc.problem.constraints import Bounds
 from quadsim.mpc.problem.ocp import Objective
 from quadsim.mpc.problem.tightening import TighteningSettings, margins
-from quadsim.mpc.tables.nonlinear import Weights
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.scenarios.schema.json_schema import scenario_schema

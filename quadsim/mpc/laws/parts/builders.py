@@ -8,16 +8,13 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from quadsim.controller import CORE, ROTORS, Controller
+from quadsim.controller import CORE, Controller
 from quadsim.errors import ExportError, InputError, ParameterError
-from quadsim.mpc.guard.contract import Guard
-from quadsim.mpc.laws import law_of
+from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.pilot.pilot import Pilot
-from quadsim.mpc.problem.model import hover_model, target_model
 from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import USUAL_SOLVER, Bounded, ControllerTable, Weighted, require_lags
-from quadsim.mpc.tables.nonlinear import Nonlinear
-from quadsim.mpc.tables.robust import Robust
+from quadsim.mpc.tables.bounded import USUAL_SOLVER, Bounded, Weighted
+from quadsim.mpc.tables.controller import ControllerTable
 from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -36,28 +33,13 @@ def build(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Seque
     """
     try:
         preparation = _in_c(table, vehicle, period, shapes)
-        law = law_of(table, vehicle, period, shapes) if preparation is None else _compiled(table, preparation)
+        law = table.law(vehicle, period, shapes) if preparation is None else _compiled(table, preparation)
     except np.linalg.LinAlgError as error:
         raise InputError(
             "the controller's gain cannot be computed: its weights and the vehicle's numbers are too many orders "
             f"of magnitude apart ({error})"
         ) from error
-    return Pilot(law, vehicle, guard=guard_of(table, vehicle, period), inner=table.inner_loop(vehicle))
-
-
-def guard_of(table: ControllerTable, vehicle: Vehicle, period: float) -> Guard | None:
-    """Return the fallback contract around the law of a table; None without one."""
-    fallback = table.fallback
-    if fallback is None or not fallback.enabled:
-        return None
-    if isinstance(table, Nonlinear):
-        model = hover_model(vehicle, period)
-        if table.commands != ROTORS:
-            model = target_model(vehicle, period, require_lags(table.inner_lag))
-        return Guard(model, bounds=table.actuators(vehicle), settings=fallback)
-    assert isinstance(table, Bounded)
-    bounds, settings = table.input_bounds.actuators(vehicle), fallback.within(table.output_bounds)
-    return Guard(hover_model(vehicle, period), bounds=bounds, settings=settings)
+    return Pilot(law, vehicle, guard=table.guard(vehicle, period), inner=table.inner_loop(vehicle))
 
 
 def stated(table: AnyTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> AnyTable:

@@ -16,7 +16,8 @@ from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.laws.parts.preview import SMALLEST_PREVIEW, differentiator
 from quadsim.mpc.problem.heading import predict_in_heading_frame
 from quadsim.mpc.problem.model import LinearModel, hover_model
-from quadsim.mpc.tables.bounded import LARGEST_HORIZON, ControllerTable, InputBounds, Range
+from quadsim.mpc.tables.commands import InputBounds
+from quadsim.mpc.tables.controller import LARGEST_HORIZON, ControllerTable, Range
 from quadsim.state import INDEX, STATE_NAMES, Array, ReferenceTurns
 from quadsim.vehicle import Vehicle
 
@@ -92,12 +93,14 @@ class Baseline(ControllerTable):
     tilt: Annotated[float, Ge(0.1), Le(80.0), doc("[deg] largest tilt commanded")] = 45.0
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
-        """See `quadsim.mpc.tables.bounded.ControllerTable.audited`."""
+        """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
         return {} if self.input_bounds is None else self.input_bounds.audited(vehicle)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
-        """Return the limits of the commands."""
-        return ActuatorBounds.of_vehicle(vehicle) if self.input_bounds is None else self.input_bounds.actuators(vehicle)
+        """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
+        if self.input_bounds is None:
+            return ActuatorBounds.of_vehicle(vehicle)
+        return self.input_bounds.actuators(vehicle)
 
 
 @dataclass(frozen=True, kw_only=True)

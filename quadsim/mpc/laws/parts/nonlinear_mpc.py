@@ -45,6 +45,7 @@ from quadsim.mpc.estimate.observer import DisturbanceObserver, disturbance_of
 from quadsim.mpc.forms.staged import Staged
 from quadsim.mpc.guard.answer import ActuatorBounds, AnswerCheck, command_of, refused, resized
 from quadsim.mpc.guard.structs import STATUSES
+from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.body import Body
 from quadsim.mpc.laws.parts.nonlinear_law import NonlinearLaw, NumbersStruct
 from quadsim.mpc.laws.parts.sqp import OWN_NAMES, SQP, SQPStatus, slack_groups
@@ -65,8 +66,7 @@ from quadsim.mpc.problem.rigidbody import (
 )
 from quadsim.mpc.solvers import INVALID_DATA, Answer, Method
 from quadsim.mpc.space import HALF_SPACE_ROUNDING, SETTLED, Space, distances
-from quadsim.mpc.tables.bounded import resolved_lag
-from quadsim.mpc.tables.nonlinear import Nonlinear
+from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.rotation import (
     body_to_euler_rates,
     euler_to_body_rates,

@@ -11,7 +11,7 @@ import numpy as np
 
 from quadsim.controller import LARGEST_SPEED
 from quadsim.errors import ExportError
-from quadsim.mpc.estimate.observer import UPRIGHT, DisturbanceObserver
+from quadsim.mpc.estimate.observer import LONGEST_SPAN, UPRIGHT, DisturbanceObserver
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.completion import (
     NOISE,
@@ -23,15 +23,16 @@ from quadsim.mpc.guard.completion import (
 )
 from quadsim.mpc.guard.hover import LARGEST_CLIMB, LARGEST_TURN, HoverLaw
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
+from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.equilibrium import LEAST_LIFT
 from quadsim.mpc.problem.heading import slope
-from quadsim.mpc.problem.model import LinearModel, hover_model
+from quadsim.mpc.problem.model import LinearModel, hover_model, split_delay
 from quadsim.mpc.problem.nonlinear_model import SUBSTEPS, nonlinear_model
 from quadsim.mpc.problem.ocp import Problem
 from quadsim.mpc.solvers.core_tables import NO_BOUND
 from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import Bounded, Weighted, resolved_lag
-from quadsim.mpc.tables.robust import LONGEST_SPAN, Robust, split_delay
+from quadsim.mpc.tables.bounded import Bounded, Weighted
+from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.state import EULER, POSITION, REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 

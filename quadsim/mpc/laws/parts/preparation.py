@@ -21,9 +21,10 @@ from typing import Final
 import numpy as np
 
 from quadsim.controller import Phase, StepInputs
-from quadsim.mpc.estimate.observer import DisturbanceObserver, thrust_axis
+from quadsim.mpc.estimate.observer import LONGEST_SPAN, DisturbanceObserver, thrust_axis
 from quadsim.mpc.guard.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE
 from quadsim.mpc.laws.parts.linear import Remembered
+from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.equilibrium import Trim, equilibrium, twisted
 from quadsim.mpc.problem.heading import (
     predict_in_heading_frame,
@@ -33,11 +34,10 @@ from quadsim.mpc.problem.heading import (
     turned_axes,
     with_limited_yaw,
 )
-from quadsim.mpc.problem.model import hover_model
+from quadsim.mpc.problem.model import hover_model, split_delay
 from quadsim.mpc.problem.nonlinear_model import Triple, advance_disturbed, nonlinear_model, spun
 from quadsim.mpc.problem.ocp import Equilibrium, Problem, Query
-from quadsim.mpc.tables.bounded import resolved_lag
-from quadsim.mpc.tables.robust import LONGEST_SPAN, Robust, split_delay
+from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, ReferenceTurns, all_true
 from quadsim.vehicle import Vehicle
 

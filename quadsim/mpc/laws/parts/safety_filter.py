@@ -28,6 +28,7 @@ from quadsim.errors import ParameterError
 from quadsim.mpc.forms.partial_condensing import PartiallyCondensed
 from quadsim.mpc.guard.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection
 from quadsim.mpc.laws.parts.preparation import RobustPreparation
+from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.constraints import Constraint, Penalty
 from quadsim.mpc.problem.equilibrium import Trim
 from quadsim.mpc.problem.ocp import Objective, Problem, Query
@@ -35,7 +36,6 @@ from quadsim.mpc.problem.qp import KKT_EVERY, QPRows
 from quadsim.mpc.problem.regulator import observed
 from quadsim.mpc.solvers import INVALID_DATA, Answer
 from quadsim.mpc.solvers.piqp import Piqp
-from quadsim.mpc.tables.robust import Robust
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

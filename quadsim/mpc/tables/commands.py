@@ -1,0 +1,133 @@
+"""Weights and bounds of what laws command: rotor speeds, or an autopilot's targets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Final
+
+import numpy as np
+from annotated_types import Len, doc
+
+from quadsim.controller import ROTORS
+from quadsim.errors import ParameterError
+from quadsim.fields import Pair, Positive, Weight
+from quadsim.mpc.guard.answer import ActuatorBounds
+from quadsim.mpc.pilot.allocation import thrust_to_command
+from quadsim.mpc.problem.model import SHORTEST_LAG
+from quadsim.mpc.tables.controller import Range, require_ordered
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+LEAST_THRUST, MOST_THRUST = 0.5, 0.9
+"""Default bounds on a target of collective thrust: shares of the weight, and of the largest; see `TargetBounds`."""
+Rates = Positive | Annotated[tuple[Positive, ...], Len(3, 3)]
+"""One largest magnitude for three body rates, or one per axis."""
+RotorWeights = Weight | Annotated[tuple[Weight, ...], Len(N_ROTORS, N_ROTORS)]
+"""One weight for all rotors, or one per rotor."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputWeights:
+    """Weights on deviations of the rotor speeds from hover."""
+
+    speed: Annotated[RotorWeights, doc("[1/(rad/s)^2] diagonal of Q_u: one weight for all rotors, or a list of four")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotorBounds:
+    """Hard bounds on the rotor speeds and their steps, for every rotor."""
+
+    speed: Annotated[Pair | None, doc("[rad/s] absent: the vehicle's range")] = None
+    slew: Annotated[Pair | None, doc('[rad/s per period] only where inputs = "speed"; absent: no bound')] = None
+
+    def __post_init__(self) -> None:
+        if self.speed is not None:
+            require_ordered("speed", self.speed)
+            if self.speed[0] < 0.0:
+                raise ValueError(f"speed must have a lower bound >= 0 rad/s; got {[*self.speed]}")
+        if self.slew is not None:
+            require_ordered("slew", self.slew)
+            if not self.slew[0] <= 0.0 <= self.slew[1]:
+                raise ValueError(f"slew must allow a speed to be held, so contain 0; got {[*self.slew]}")
+
+    def audited(self, vehicle: Vehicle) -> dict[str, Range]:
+        """Return the bounds on each rotor's speed [rad/s] and step [rad/s per period], where it has any."""
+        pairs = {"speed": self.speed or (vehicle.speed_min, vehicle.speed_max), "slew": self.slew}
+        return {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
+
+    def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
+        """Return the same bounds for the actuators."""
+        return ActuatorBounds.alike(**self.audited(vehicle))
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputBounds(RotorBounds):
+    """Hard bounds on the rotor speeds and their steps, for every rotor."""
+
+    # `field()` makes them required: without it, they would inherit the defaults of `RotorBounds`.
+    speed: Annotated[Pair, doc("[rad/s] u_min, u_max of every rotor.  Eq. (20)")] = field()
+    slew: Annotated[Pair, doc("[rad/s per period] delta_min, delta_max of every rotor.  Eq. (15)")] = field()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetBounds:
+    """Hard bounds on an inner loop's targets: collective thrust and body rates."""
+
+    thrust: Annotated[
+        Pair | None,
+        doc(
+            f"[N] collective, around the weight; absent: {100 * LEAST_THRUST:g} % of the weight to "
+            f"{100 * MOST_THRUST:g} % of the largest, at least half way to it: the rest is for torques"
+        ),
+    ] = None
+    body_rate: Annotated[Rates, doc("[deg/s] largest magnitude, one or about body x, y, z")] = (300.0, 300.0, 90.0)
+
+    def __post_init__(self) -> None:
+        if self.thrust is not None:
+            require_ordered("thrust", self.thrust)
+            if self.thrust[0] < 0.0:
+                raise ValueError(f"thrust must have a lower bound >= 0 N; got {[*self.thrust]}")
+
+    def audited(self, vehicle: Vehicle) -> dict[str, Range]:
+        """Return the bounds on collective thrust [N] and on each body rate [deg/s]."""
+        largest, weight = vehicle.level_thrust(vehicle.speed_max), vehicle.mass * vehicle.gravity
+        lower, upper = self.thrust or (LEAST_THRUST * weight, thrust_to_command(largest, weight, MOST_THRUST))
+        if not lower < weight < upper:
+            rule = f"below and above the weight, {weight:.4g} N"
+            raise ParameterError("controller", "target_bounds.thrust", [lower, upper], rule)
+        rates = np.broadcast_to(np.asarray(self.body_rate, float), 3).tolist()
+        sides = {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", rates, strict=True)}
+        return {"thrust": (lower, upper), **sides}
+
+    def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
+        """Return the same bounds on targets (4,) [N], [rad/s], with unbounded steps."""
+        thrust, *rates = self.audited(vehicle).values()
+        lower, upper = np.array([thrust, *np.radians(rates)]).T
+        steps = np.full(N_ROTORS, math.inf)
+        return ActuatorBounds(u_min=lower, u_max=upper, delta_min=-steps, delta_max=steps, targets=True)
+
+
+USUAL_TARGETS: Final = TargetBounds()
+
+
+def require_space(table: Any, of_rotors: Mapping[str, object]) -> None:
+    """Refuse fields of the other space of commands: those `of_rotors` with an autopilot, of its targets without one.
+
+    `of_rotors` has the names of fields and the values that say nothing; a lag may be 0, or at least `SHORTEST_LAG`.
+
+    Raises:
+        ValueError: a field is given that does not act.
+    """
+    if table.commands == ROTORS:
+        others: Mapping[str, object] = {"inner_lag": None, "target_bounds": USUAL_TARGETS}
+        reason = "rotor speeds pass no autopilot, whose lags and targets these are"
+    else:
+        others, reason = of_rotors, "the autopilot turns the rotors; inner_lag and target_bounds describe it"
+        if table.disturbance is not None and table.disturbance.rotor_lag is not None:
+            raise ValueError(f'disturbance.rotor_lag must be absent where commands = "{table.commands}": {reason}')
+        if any(0.0 < lag < SHORTEST_LAG for lag in table.inner_lag or ()):
+            raise ParameterError("", "inner_lag", table.inner_lag, f"0, or at least {SHORTEST_LAG:g} s, each")
+    for name, usual in others.items():
+        if getattr(table, name) != usual:
+            raise ValueError(f'{name} must be absent where commands = "{table.commands}": {reason}')
