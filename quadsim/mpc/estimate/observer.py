@@ -29,6 +29,8 @@ from quadsim.state import ANGLES, VELOCITIES, Array
 
 UPRIGHT: Final = 0.1
 """Smallest vertical component of the thrust axis at which changes of vertical speed are attributed to thrust."""
+LONGEST_SPAN: Final = 0.25
+"""Longest time between two measured states [s] that it compares; a sensor of 4 Hz."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,9 +29,6 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that depend on the yaw of the axes
 
-LONGEST_SPAN: Final = 0.25
-"""Longest time between two measured states [s] that the observer compares; a sensor of 4 Hz."""
-
 
 def split_delay(delay: float, period: float) -> tuple[int, float]:
     """Split a delay [s] into n whole periods and the rest, which is at most a period and zero only without delay.

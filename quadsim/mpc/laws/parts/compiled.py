@@ -22,6 +22,7 @@ from quadsim.controller import (
     stopped,
 )
 from quadsim.core.mirror import core_library, set_members, struct
+from quadsim.mpc.estimate.observer import LONGEST_SPAN
 from quadsim.mpc.forms.condensing import Condensed
 from quadsim.mpc.guard.structs import STATUSES
 from quadsim.mpc.laws.parts.linear import Remembered
@@ -34,7 +35,6 @@ from quadsim.mpc.problem.paper import rollout
 from quadsim.mpc.solvers import INVALID_DATA, Answer
 from quadsim.mpc.solvers.core import PROBLEMS, Core, Key, Optimum, core_problem
 from quadsim.mpc.solvers.core_tables import with_constraints
-from quadsim.mpc.tables.robust import LONGEST_SPAN
 from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS
 
