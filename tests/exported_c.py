@@ -31,7 +31,8 @@ class Reply:
     fallback: int
     changes: int
     command: Array  # (4,)
-    plan: Array  # (N, 4)
+    plan: Array  # (N, 4) the law's
+    flown_plan: Array  # (N, 4) the guard's, from the command on
 
 
 @functools.cache
@@ -58,7 +59,7 @@ class Host:
         self.rows, width, _ = source.reference
         self.horizon, self.state = source.horizon, source.state
         self.inputs = np.zeros(self.state + 5 + self.rows * width)
-        self.answers = np.zeros(7 + 4 * self.horizon)
+        self.answers = np.zeros(7 + 8 * self.horizon)
 
     def reset(self, before: Array) -> None:
         self._call(self.library.host_reset, np.array(before, float))
@@ -71,7 +72,8 @@ class Host:
         self.inputs[at + 4] = PHASES.index(phase)
         self._call(self.library.host_step, self.inputs, self.answers)
         result = self.answers.copy()
-        return Reply(*(int(number) for number in result[:3]), result[3:7], result[7:].reshape(-1, 4))
+        plans = result[7:].reshape(2, -1, 4)
+        return Reply(*(int(number) for number in result[:3]), result[3:7], plans[0], plans[1])
 
     def _call(self, function: object, *arrays: Array) -> None:
         function(*(ctypes.c_void_p(array.ctypes.data) for array in (self.memory, *arrays)))  # type: ignore[operator]

@@ -12,8 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-import numpy as np
-
 from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import InputError
 from quadsim.mpc.laws.constrained import Constrained
@@ -28,7 +26,7 @@ from quadsim.scenarios.schema.base import fields_of
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.scenarios.schema.settings import get_field, set_field
 from quadsim.scenarios.schema.writing import plain
-from quadsim.state import N_STATES, REFERENCE_STATES
+from quadsim.state import N_STATES
 from quadsim.ties import in_order
 from quadsim.vehicle import Vehicle
 
@@ -225,12 +223,7 @@ class _Case:
         pilot = build(changed, self._vehicle, self._period)
         guard = pilot.guard
         assert guard is not None
-        target = np.zeros(N_STATES)
-        target[[*REFERENCE_STATES]] = query.state[[*REFERENCE_STATES]]
-        bounds = changed.input_bounds.actuators(self._vehicle)
-        plan = guard.hover.plan(
-            query.state[:N_STATES], target, query.u_before, bounds, changed.horizon, guard.trim(pilot.law)
-        )
+        plan = guard.hover(pilot.law, query.state[:N_STATES], query.u_before)
         periods = recovery(self._infeasible_period, plan)
         if periods is not None:
             yield {"settings": settings, "after": round(periods * self._period, 9)}

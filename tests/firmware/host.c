@@ -31,10 +31,12 @@ void host_reset(host *at, const double *before)
     quadsim_law_reset(&at->law, start);
 }
 
-/* Inputs: state, acting [4], phase, reference.  Answered: status, fallback, changes, command [4], plan [N][4]. */
+/* Inputs: state, acting [4], phase, reference.  Answered: status, fallback, changes, command [4], the law's plan [N][4],
+ * the guard's plan [N][4]. */
 void host_step(host *at, const double *inputs, double *answers)
 {
     quadsim_real state[QUADSIM_STATE], acting[4], reference[QUADSIM_ROWS * QUADSIM_ROW], command[4];
+    quadsim_real plan[QUADSIM_HORIZON * 4];
     const double *rest = inputs + QUADSIM_STATE;
     int i;
     convert(state, inputs, QUADSIM_STATE);
@@ -46,7 +48,9 @@ void host_step(host *at, const double *inputs, double *answers)
     for (i = 0; i < 4; i++) {
         answers[3 + i] = (double)command[i];
     }
+    quadsim_guard_plan(&at->law.guard, plan);
     for (i = 0; i < QUADSIM_HORIZON * 4; i++) {
         answers[7 + i] = (double)quadsim_law_plan(&at->law)[i];
+        answers[7 + QUADSIM_HORIZON * 4 + i] = (double)plan[i];
     }
 }

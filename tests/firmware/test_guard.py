@@ -1,22 +1,27 @@
-"""The fallback contract of exported C against `mpc.fallback`: the same failures, the same statuses and commands."""
+"""An exported law against the same law in flight: the same failures, the same statuses, commands and plans.
+
+One contract in C guards both; what surrounds it is C there, and `quadsim.mpc.guard.contract` here.
+"""
 
 from __future__ import annotations
 
 import math
-import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from exported_c import PHASES, Host
+from exported_c import PHASES, Host, Reply
 
-from quadsim.controller import Command, StepInputs
+from quadsim.controller import ACCEPTED, Command, Phase, StepInputs
+from quadsim.core.mirror import constant, core_library
 from quadsim.mpc.export import source
 from quadsim.mpc.guard.answer import ActuatorBounds
+from quadsim.mpc.guard.contract import PHASES as GUARD_PHASES
+from quadsim.mpc.guard.numbers import fallback_numbers
+from quadsim.mpc.guard.settings import USUAL_FALLBACK
 from quadsim.mpc.guard.structs import STATUSES
 from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.linear import LinearMPC
@@ -31,9 +36,8 @@ from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
-HEADER = Path(__file__).parents[2] / "quadsim" / "mpc" / "core" / "c" / "quadsim_guard.h"
 TOLD = ("max_iterations", "no_room")
-"""Failures of the C alone: in Python PIQP answers instead."""
+"""Failures for lack of what the exported law alone is given little of."""
 SHORT = {"controller.fallback": {"unseen": 0.4, "hover": 0.5, "plan_age": 0.5}}
 CEILING = {"name": "ceiling", "of": ["vz"], "rows": [[1.0]], "upper": [0.4]}
 HARD = SHORT | {"controller.soft.linear": 1e8, "controller.polytopes": [CEILING]}
@@ -98,15 +102,15 @@ def over(channels: tuple[int, ...], *spans: range) -> dict[int, tuple[int, ...]]
     return dict.fromkeys((k for span in spans for k in span), channels)
 
 
-def flown(scenario: Scenario, host: Host, seed: int = 0) -> tuple[list[Command], list[tuple[str, int, Array]]]:
-    """Commands of Python and of C to the same measurements, while the vehicle flies Python's."""
+def flown(scenario: Scenario, host: Host, seed: int = 0) -> tuple[list[Command], list[Reply]]:
+    """Commands in flight and of the exported law to the same measurements, while the vehicle flies the former."""
     table, period = scenario.controller, scenario.control_period
     linear = not isinstance(table, Nonlinear)
     pilot = Assembly(scenario.replace({"controller.compiled": True} if linear else {})).controller()
     guard = table.guard(Assembly(scenario).vehicle, period)
     assert guard is not None
     assert isinstance(pilot.law, LinearMPC | NonlinearMPC)
-    vehicle = Vehicle(guard.hover.model, seed)
+    vehicle = Vehicle(guard.model, seed)
     law, everything = Told(pilot.law), tuple(range(12))
     law.reset(guard.reset(vehicle.speeds))
     host.reset(vehicle.speeds)
@@ -116,7 +120,7 @@ def flown(scenario: Scenario, host: Host, seed: int = 0) -> tuple[list[Command],
     path = np.zeros((PERIODS + law.horizon, 4))
     path[62:66, 0], path[125:129, 1], path[110:, 3], path[190:, 2] = 3.0, 2.0, 1.0, 0.3
     path += [0.0, 0.0, 0.0, 0.4]
-    python, c = list[Command](), list[tuple[str, int, Array]]()
+    commands, replies = list[Command](), list[Reply]()
     for k in range(PERIODS):
         if k in (130, 170):
             vehicle.state[[INDEX["vz"], INDEX["vx"]]] += [2.0, 1.0]  # beyond a hard bound: infeasible
@@ -128,11 +132,11 @@ def flown(scenario: Scenario, host: Host, seed: int = 0) -> tuple[list[Command],
         status = STATUSES[reply.status]
         law.failure = status if status in TOLD else None
         command = guard.step(law, StepInputs(time=k * period, phase=phase, acting=acting), seen, reference)
-        python.append(command)
-        c.append((status, reply.fallback, reply.command))
+        commands.append(command)
+        replies.append(reply)
         vehicle.speeds = command.speeds
         vehicle.move()
-    return python, c
+    return commands, replies
 
 
 CASES = {
@@ -148,43 +152,50 @@ CASES = {
 ALWAYS = {"solved", "unconstrained", "state_unknown", "invalid_reference", "landed"}
 
 
+def check_the_same(commands: list[Command], replies: list[Reply], tolerance: float) -> None:
+    """Statuses, levels, and plans, whose first row is the command, within a tolerance [rad/s], or [N] and [rad/s]."""
+    assert [command.status for command in commands] == [STATUSES[reply.status] for reply in replies]
+    assert [command.fallback for command in commands] == [reply.fallback for reply in replies]
+    for command, reply in zip(commands, replies, strict=True):
+        np.testing.assert_array_equal(command.speeds, command.plan[0])
+        np.testing.assert_array_equal(reply.command, reply.flown_plan[0])
+        np.testing.assert_allclose(command.plan, reply.flown_plan, rtol=0.0, atol=tolerance)
+
+
 @pytest.mark.parametrize("case", CASES)
-def test_c_flies_what_python_flies(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exported_law_flies_what_flies_here(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     name, changes, limits, failures = CASES[case]
     monkeypatch.setattr(source, "CHANGES", limits.get("changes", source.CHANGES))
     scenario = load_scenario(name).replace(changes)
-    python, c = flown(scenario, Host(scenario, rows=limits.get("rows", 128)))
-    assert [command.status for command in python] == [status for status, _, _ in c]
-    assert [command.fallback for command in python] == [level for _, level, _ in c]
-    assert {status for status, _, _ in c} >= ALWAYS | failures
-    assert {level for _, level, _ in c} == {0, 1, 2, 3}
-    apart = np.abs(np.array([command.speeds for command in python]) - [speeds for _, _, speeds in c])
-    assert apart.max() <= (1e-4 if "controller" in changes else 1e-12)  # far off, a nonlinear law amplifies it
+    commands, replies = flown(scenario, Host(scenario, rows=limits.get("rows", 128)))
+    check_the_same(commands, replies, 1e-4 if "controller" in changes else 1e-11)  # far off, a nonlinear law amplifies
+    assert {command.status for command in commands} >= ALWAYS | failures
+    assert {command.fallback for command in commands} == {0, 1, 2, 3}
 
 
-def test_statuses_have_the_same_names() -> None:
+def test_statuses_and_phases_are_those_of_the_header() -> None:
     """`solved` is two in C: with rows of states alone active, or with any."""
-    text = HEADER.read_text()
-    enum = re.search(r"enum quadsim_status \{(.*?)\};", text, re.DOTALL)
-    phases = re.search(r"enum quadsim_phase \{(.*?)\};", text, re.DOTALL)
-    assert enum is not None
-    assert phases is not None
-    names = re.findall(r"QUADSIM_(\w+)(?: = QUADSIM_FOUND_\w+)?[ ,\n]", enum[1])
-    assert (*STATUSES[:3], *(name.lower() for name in names[3:])) == STATUSES
-    assert names[:3] == ["FREE", "AXES", "WHOLE"]
-    assert [name.lower() for name in re.findall(r"QUADSIM_PHASE_(\w+)", phases[1])] == [*PHASES]
+    in_c = ("free", "axes", "whole", *STATUSES[3:])
+    assert [constant(f"QUADSIM_{status.upper()}") for status in in_c] == [*range(len(STATUSES))]
+    for phase, code in GUARD_PHASES.items():
+        name = Phase.LANDED if phase is Phase.CRASHED else phase
+        assert code == constant(f"QUADSIM_PHASE_{name.upper()}")
+    assert [GUARD_PHASES[phase] for phase in PHASES] == [0, 1, 2]
+    accepted = [status in ACCEPTED for status in STATUSES]
+    assert [bool(core_library().quadsim_is_flown(code)) for code in range(len(STATUSES))] == accepted
 
 
 @pytest.mark.parametrize("name", ["paper-constrained", "robust", "robust-lag50", "crazyflie-steps"])
-def test_both_have_the_same_bounds(name: str) -> None:
-    """Python's contract has those of the table, the C those of the problem."""
+def test_bounds_of_the_table_are_those_of_the_problem(name: str) -> None:
+    """A contract in flight has those of the table, an exported one those of the problem."""
     scenario = load_scenario(name).replace({"controller.fallback": {}})
     assembly = Assembly(scenario)
     guard = scenario.controller.guard(assembly.vehicle, scenario.control_period)
     assert guard is not None
     bounds = ActuatorBounds.of_problem(assembly.problem())
-    for side in ("u_min", "u_max", "delta_min", "delta_max"):
-        np.testing.assert_array_equal(getattr(guard._bounds, side), getattr(bounds, side))
+    exported = fallback_numbers(guard.model, bounds, USUAL_FALLBACK.within({}))
+    for side in ("least", "most", "step_least", "step_most"):
+        np.testing.assert_array_equal(getattr(guard.numbers, side), exported[side])
 
 
 def test_a_law_without_a_contract_in_flight_has_one_on_a_computer() -> None:
@@ -201,7 +212,8 @@ def test_a_law_without_a_contract_in_flight_has_one_on_a_computer() -> None:
 def test_floats_fly_nearly_the_same(case: str) -> None:
     name, changes, limits, _ = CASES[case]
     scenario = load_scenario(name).replace(changes)
-    python, c = flown(scenario, Host(scenario, "float", rows=limits.get("rows", 128)))
-    assert [command.status for command in python] == [status for status, _, _ in c]
-    assert [command.fallback for command in python] == [level for _, level, _ in c]
-    assert np.abs(np.array([command.speeds for command in python]) - [speeds for _, _, speeds in c]).max() <= 0.02
+    commands, replies = flown(scenario, Host(scenario, "float", rows=limits.get("rows", 128)))
+    assert [command.status for command in commands] == [STATUSES[reply.status] for reply in replies]
+    assert [command.fallback for command in commands] == [reply.fallback for reply in replies]
+    for command, reply in zip(commands, replies, strict=True):
+        np.testing.assert_allclose(command.speeds, reply.command, rtol=0.0, atol=0.02)

@@ -10,7 +10,7 @@ import pytest
 
 from quadsim.controller import Command, StepInputs
 from quadsim.flight.parquet import read_log, write_log
-from quadsim.mpc.guard.completion import completed_inputs
+from quadsim.mpc.guard.contract import completed_inputs
 from quadsim.mpc.problem.rigidbody import thrust_axis
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout

@@ -1,7 +1,26 @@
-/* The fallback contract around the law: what is flown when it has no usable answer, and the state that it is given.
+/* The fallback contract around a law: what is flown when it has no usable answer, and the state that it is given.
  *
  * Each period flies the first of these that there is: the law's optimum; the last one's plan, shifted, with a correction
- * towards the states that it foresaw; level hover; descent.  Statement, sources and twin: quadsim/mpc/guard of quadsim. */
+ * towards the states that it foresaw; level hover; descent.
+ *
+ * Completion.  A channel is missing if it is not finite, implausibly large, or frozen, and is replaced by its conditional
+ * mean.  The hover model, about the equilibrium (x_s, u_s) and in axes turned by the yaw, predicts the state under the
+ * command in force; a Kalman filter corrects it, channel by channel, with those that are measured (Simon, "Optimal State
+ * Estimation", 2006, Secs. 5.1 and 6.1):
+ *
+ *     x = x_s + A (x - x_s) + B (u - u_s)    P = A P A' + Q
+ *     x = x + P_i (y_i - x_i) / (P_ii + r_i)    P = P - P_i P_i' / (P_ii + r_i)    for each measured channel i
+ *
+ * Measured channels pass unchanged.  A group of three is frozen if it repeats the last period's numbers bit by bit though
+ * the prediction has moved away from them: a sensor slower than the controller repeats its numbers between samples.
+ *
+ * Level hover is the LQR of the hover model in axes turned by the yaw, from errors e to accelerations along z and about
+ * x, y, z, which S maps from changes of commands:
+ *
+ *     u = u_s - S^-1 K e    roll and pitch demanded by horizontal errors: -(k_p e_p + k_v e_v) / k_tilt
+ *
+ * The demanded tilt, that at rest included, is bounded: the law is exactly the LQR within the bound, and demands no more
+ * tilt beyond.  Numbers: quadsim/mpc/guard/numbers.py of quadsim. */
 #include "quadsim_guard.h"
 
 #include <string.h>
@@ -30,7 +49,7 @@ static void find_heading(real yaw, real heading[2])
 }
 
 /* Turn positions and velocities about world z by the angle of a sine and a cosine. */
-static void turn(real *state, real sine, real cosine)
+static void turn_horizontally(real *state, real sine, real cosine)
 {
     int i;
     for (i = X; i <= VX; i++) {
@@ -41,33 +60,33 @@ static void turn(real *state, real sine, real cosine)
 }
 
 /* A deviation from rest a period later, by the model in axes turned by the yaw, of changed speeds (4,). */
-static void respond(const quadsim_fallback *f, const real heading[2], const real *changes, real *deviation)
+static void predict_deviation(const quadsim_fallback *f, const real heading[2], const real *changes, real *deviation)
 {
     real before[12];
     int i;
     for (i = 0; i < 12; i++) {
         before[i] = deviation[i];
     }
-    turn(before, -heading[0], heading[1]);
+    turn_horizontally(before, -heading[0], heading[1]);
     for (i = 0; i < 12; i++) {
         deviation[i] = dot(f->A + i * 12, before, 12) + dot(f->B + i * NU, changes, NU);
     }
-    turn(deviation, heading[0], heading[1]);
+    turn_horizontally(deviation, heading[0], heading[1]);
 }
 
 /* A state a period later, of which roll and pitch at rest are level. */
-static void respond_about(const quadsim_fallback *f, const real heading[2], const real level[2], const real *changes,
+static void predict_about(const quadsim_fallback *f, const real heading[2], const real level[2], const real *changes,
                           real *state)
 {
     state[ROLL] -= level[0];
     state[PITCH] -= level[1];
-    respond(f, heading, changes, state);
+    predict_deviation(f, heading, changes, state);
     state[ROLL] += level[0];
     state[PITCH] += level[1];
 }
 
 /* A state a period later under a command, by the model about where the vehicle rests. */
-static void predict(const quadsim_fallback *f, const quadsim_trim *trim, const real heading[2], const real *command,
+static void predict_state(const quadsim_fallback *f, const quadsim_trim *trim, const real heading[2], const real *command,
                     real *state)
 {
     real effect[NU], level[2], lift = R(0.0);
@@ -80,7 +99,7 @@ static void predict(const quadsim_fallback *f, const quadsim_trim *trim, const r
     for (j = 0; j < NU && !f->targets; j++) {
         effect[j] += lift * dot(f->inverse + j * NU + 1, trim->twist, 3);
     }
-    respond_about(f, heading, level, effect, state);
+    predict_about(f, heading, level, effect, state);
 }
 
 /* ---- the state, completed by a Kalman filter --------------------------------------------------------------------- */
@@ -133,7 +152,7 @@ static void drop_frozen(const quadsim_fallback *f, const real *predicted, const 
 }
 
 /* The covariance of the state a period later: F P F' + Q. */
-static void spread(const quadsim_fallback *f, const real heading[2], real *covariance)
+static void predict_covariance(const quadsim_fallback *f, const real heading[2], real *covariance)
 {
     static const real still[NU] = {R(0.0)};
     real line[12] = {R(0.0)};
@@ -142,13 +161,13 @@ static void spread(const quadsim_fallback *f, const real heading[2], real *covar
         for (i = 0; i < 12; i++) {
             line[i] = covariance[i * 12 + j];
         }
-        respond(f, heading, still, line);
+        predict_deviation(f, heading, still, line);
         for (i = 0; i < 12; i++) {
             covariance[i * 12 + j] = line[i];
         }
     }
     for (i = 0; i < 12; i++) {
-        respond(f, heading, still, covariance + i * 12);
+        predict_deviation(f, heading, still, covariance + i * 12);
     }
     for (i = 0; i < 12; i += 2) {
         const real *process = f->process + (i < ROLL ? 0 : 3);
@@ -161,7 +180,7 @@ static void spread(const quadsim_fallback *f, const real heading[2], real *covar
 }
 
 /* Correct a predicted state, and its covariance, by one measured channel. */
-static void correct(const quadsim_fallback *f, int channel, real measured, real *state, real *covariance)
+static void update_by_channel(const quadsim_fallback *f, int channel, real measured, real *state, real *covariance)
 {
     real column[12], innovation = measured - state[channel], sum, share;
     int i, j;
@@ -181,7 +200,7 @@ static void correct(const quadsim_fallback *f, int channel, real measured, real 
     }
 }
 
-static void put_diagonal(real *covariance, const real *variances)
+static void set_diagonal(real *covariance, const real *variances)
 {
     int i;
     memset(covariance, 0, 144 * sizeof(real));
@@ -191,7 +210,7 @@ static void put_diagonal(real *covariance, const real *variances)
 }
 
 /* The whole state now, of what is measured of it, the others predicted under the command in force. */
-static void complete(quadsim_guard *g, const quadsim_trim *trim, const real *measured, int flying)
+static void complete_state(quadsim_guard *g, const quadsim_trim *trim, const real *measured, int flying)
 {
     const quadsim_fallback *f = g->numbers;
     real predicted[12], heading[2];
@@ -204,7 +223,7 @@ static void complete(quadsim_guard *g, const quadsim_trim *trim, const real *mea
     if (!all || (flying && any)) {
         memcpy(predicted, g->state, sizeof(predicted));
         find_heading(g->state[YAW], heading);
-        predict(f, trim, heading, g->in_force, predicted);
+        predict_state(f, trim, heading, g->in_force, predicted);
         if (flying) {
             drop_frozen(f, predicted, measured, repeated, seen);
         }
@@ -214,18 +233,18 @@ static void complete(quadsim_guard *g, const quadsim_trim *trim, const real *mea
     }
     if (all) {
         memcpy(g->state, measured, sizeof(g->state));
-        put_diagonal(g->covariance, f->noise);
+        set_diagonal(g->covariance, f->noise);
         memset(g->unseen, 0, sizeof(g->unseen));
         return;
     }
-    spread(f, heading, g->covariance);
+    predict_covariance(f, heading, g->covariance);
     for (i = 0; i < 12; i++) {
         if (seen[i]) {
-            correct(f, i, measured[i], predicted, g->covariance);
+            update_by_channel(f, i, measured[i], predicted, g->covariance);
         }
     }
     if (!is_finite(g->covariance, 144)) { /* after days without a measurement */
-        put_diagonal(g->covariance, f->unknown);
+        set_diagonal(g->covariance, f->unknown);
     }
     for (i = 0; i < 12; i++) {
         g->state[i] = seen[i] ? measured[i] : clipped(predicted[i], -f->plausible[i], f->plausible[i]);
@@ -239,7 +258,7 @@ static void complete(quadsim_guard *g, const quadsim_trim *trim, const real *mea
 /* ---- level hover by LQR ------------------------------------------------------------------------------------------ */
 
 /* Changes of speeds (4,) that an error in axes turned by the yaw demands, roll and pitch at rest being none. */
-static void demand(const quadsim_fallback *f, const real *error, const real level[2], real *change)
+static void lqr_feedback(const quadsim_fallback *f, const real *error, const real level[2], real *change)
 {
     real lean[2], levelled[12], acceleration[NU], length;
     int i;
@@ -275,8 +294,36 @@ void quadsim_guard_clip(const quadsim_fallback *f, const quadsim_real *wanted, c
     }
 }
 
+/* Move rows [count][4] of a plan within what the bounds leave after the row before, unless they are up to rounding. */
+static void clip_rows(const quadsim_fallback *f, const real *before, int count, real *rows)
+{
+    int i, j, beyond = 0;
+    for (i = 0; i < count; i++) {
+        const real *last = i == 0 ? before : rows + (i - 1) * NU;
+        for (j = 0; j < NU; j++) {
+            const real step = rows[i * NU + j] - last[j];
+            beyond |= f->step_least[j] - step > BOUND_TOLERANCE || step - f->step_most[j] > BOUND_TOLERANCE;
+        }
+    }
+    for (i = 0; i < count; i++) {
+        real *row = rows + i * NU;
+        for (j = 0; j < NU && !beyond; j++) {
+            row[j] = clipped(row[j], f->least[j], f->most[j]);
+        }
+        if (beyond) {
+            quadsim_guard_clip(f, row, i == 0 ? before : row - NU, row);
+        }
+    }
+}
+
+/* Row i of the last plan, whose last row holds on. */
+static const real *kept_row(const quadsim_guard *g, int i)
+{
+    return g->kept + (i < g->horizon ? i : g->horizon - 1) * NU;
+}
+
 /* Leave all fallback levels. */
-static void forget(quadsim_guard *g)
+static void leave_fallback(quadsim_guard *g)
 {
     g->planned = g->foreseeing = g->age = g->hovered = g->targeted = 0;
 }
@@ -295,13 +342,13 @@ static int follow_plan(quadsim_guard *g, int lost, real *command)
         error[i] = g->state[i] - g->foreseen[i];
         near &= is_within(error + i, f->distance[i], 1);
     }
-    g->planned = near && !lost && g->age <= f->plan_age;
+    g->planned = near && !lost && g->age <= f->plan_age && g->age < g->horizon;
     if (!g->planned) {
         return 0;
     }
     find_heading(g->state[YAW], heading);
-    turn(error, -heading[0], heading[1]);
-    demand(f, error, level, command);
+    turn_horizontally(error, -heading[0], heading[1]);
+    lqr_feedback(f, error, level, command);
     for (i = 0; i < NU; i++) {
         command[i] += g->kept[g->age * NU + i];
     }
@@ -309,14 +356,31 @@ static int follow_plan(quadsim_guard *g, int lost, real *command)
     return 1;
 }
 
-/* The command of level hover, or of the descent after it; returns its level. */
+/* The command of level hover towards a target, in axes turned by a heading. */
+static void hover_command(const quadsim_fallback *f, const quadsim_trim *trim, const real heading[2], const real *state,
+                          const real *target, const real *before, real *command)
+{
+    real error[12], level[2];
+    int i;
+    for (i = 0; i < 12; i++) {
+        error[i] = state[i] - target[i];
+    }
+    turn_horizontally(error, -heading[0], heading[1]);
+    lean_of(trim->lift, heading[0], heading[1], &level[0], &level[1]);
+    lqr_feedback(f, error, level, command);
+    for (i = 0; i < NU; i++) {
+        command[i] += trim->commands[i];
+    }
+    quadsim_guard_clip(f, command, before, command);
+}
+
+/* The command of level hover, or of the descent after it, whose target moves; returns its level. */
 static int hover(quadsim_guard *g, const quadsim_trim *trim, real *command)
 {
     const quadsim_fallback *f = g->numbers;
     const real *state = g->state;
     const int sinking = g->hovered >= f->hover_periods;
-    real error[12] = {R(0.0)}, level[2], heading[2];
-    int i;
+    real heading[2];
     if (!g->targeted) {
         g->targeted = 1;
         memset(g->target, 0, sizeof(g->target));
@@ -334,18 +398,26 @@ static int hover(quadsim_guard *g, const quadsim_trim *trim, real *command)
         g->target[Z] -= f->sunk;
     }
     count_up(&g->hovered);
-    for (i = 0; i < 12; i++) {
-        error[i] = state[i] - g->target[i];
-    }
     find_heading(state[YAW], heading);
-    turn(error, -heading[0], heading[1]);
-    lean_of(trim->lift, heading[0], heading[1], &level[0], &level[1]);
-    demand(f, error, level, command);
-    for (i = 0; i < NU; i++) {
-        command[i] += trim->commands[i];
-    }
-    quadsim_guard_clip(f, command, g->in_force, command);
+    hover_command(f, trim, heading, state, g->target, g->in_force, command);
     return sinking ? 3 : 2;
+}
+
+/* The closed loop of level hover, or of the descent, by the model turned by the yaw now, from the period's command on. */
+static void plan_hover(const quadsim_guard *g, real *plan)
+{
+    const quadsim_fallback *f = g->numbers;
+    real state[12], target[12], heading[2];
+    int i;
+    memcpy(state, g->state, sizeof(state));
+    memcpy(target, g->target, sizeof(target));
+    find_heading(state[YAW], heading);
+    for (i = 1; i < g->horizon; i++) {
+        const real *before = plan + (i - 1) * NU;
+        predict_state(f, &g->trim, heading, before, state);
+        target[Z] -= g->level == 3 ? f->sunk : R(0.0);
+        hover_command(f, &g->trim, heading, state, target, before, plan + i * NU);
+    }
 }
 
 /* ---- periods ----------------------------------------------------------------------------------------------------- */
@@ -368,15 +440,37 @@ void quadsim_guard_reset(quadsim_guard *guard, const quadsim_real command[4])
     const quadsim_fallback *f = guard->numbers;
     int i;
     memcpy(guard->before, is_within(command, f->largest_command, NU) ? command : f->hover, sizeof(guard->before));
-    forget(guard);
+    leave_fallback(guard);
     guard->level = guard->learns = 0;
     memset(guard->state, 0, sizeof(guard->state));
-    put_diagonal(guard->covariance, f->unknown);
+    set_diagonal(guard->covariance, f->unknown);
     for (i = 0; i < 12; i++) {
         guard->unseen[i] = NEVER;
         guard->last[i] = guard->last_rates[i % 3] = R(-1e30); /* what no channel repeats */
     }
     guard->since = guard->asked = guard->waiting = NEVER;
+}
+
+void quadsim_guard_adopt(quadsim_guard *guard, const quadsim_guard *previous)
+{
+    int i;
+    memcpy(guard->state, previous->state, sizeof(guard->state));
+    memcpy(guard->covariance, previous->covariance, sizeof(guard->covariance));
+    memcpy(guard->unseen, previous->unseen, sizeof(guard->unseen));
+    memcpy(guard->last, previous->last, sizeof(guard->last));
+    memcpy(guard->last_rates, previous->last_rates, sizeof(guard->last_rates));
+    guard->age = previous->age;
+    guard->hovered = previous->hovered;
+    guard->targeted = previous->targeted;
+    memcpy(guard->target, previous->target, sizeof(guard->target));
+    if (!previous->planned || previous->numbers->targets != guard->numbers->targets) {
+        return;
+    }
+    guard->planned = 1;
+    memcpy(guard->foreseen, previous->foreseen, sizeof(guard->foreseen));
+    for (i = 0; i < guard->horizon; i++) {
+        memcpy(guard->kept + i * NU, kept_row(previous, i), NU * sizeof(real));
+    }
 }
 
 enum quadsim_status quadsim_guard_begin(quadsim_guard *guard, enum quadsim_phase phase, const quadsim_trim *trim,
@@ -386,7 +480,7 @@ enum quadsim_status quadsim_guard_begin(quadsim_guard *guard, enum quadsim_phase
     const quadsim_fallback *f = guard->numbers;
     int i, oldest = 0, moving = 1;
     memcpy(guard->in_force, is_within(acting, f->largest_command, NU) ? acting : guard->before, sizeof(guard->in_force));
-    complete(guard, trim, state, phase == QUADSIM_PHASE_FLYING);
+    complete_state(guard, trim, state, phase == QUADSIM_PHASE_FLYING);
     count_up(&guard->waiting);
     for (i = 0; i < 12; i++) {
         oldest = guard->unseen[i] > oldest ? guard->unseen[i] : oldest;
@@ -437,7 +531,7 @@ int quadsim_guard_foresees(const quadsim_guard *guard, enum quadsim_phase phase,
 
 const quadsim_real *quadsim_guard_row(const quadsim_guard *guard)
 {
-    return guard->kept + (guard->age < guard->horizon ? guard->age : guard->horizon - 1) * NU;
+    return kept_row(guard, guard->age);
 }
 
 void quadsim_guard_foresee(quadsim_guard *guard, int heading, const quadsim_trim *trim, const quadsim_real resting[4])
@@ -454,7 +548,7 @@ void quadsim_guard_foresee(quadsim_guard *guard, int heading, const quadsim_trim
     for (i = 0; i < NU; i++) {
         changes[i] = row[i] - guard->resting[i];
     }
-    respond_about(guard->numbers, guard->heading, guard->level_there, changes, guard->foreseen);
+    predict_about(guard->numbers, guard->heading, guard->level_there, changes, guard->foreseen);
 }
 
 enum quadsim_status quadsim_guard_end(quadsim_guard *guard, enum quadsim_phase phase, const quadsim_trim *trim,
@@ -463,16 +557,17 @@ enum quadsim_status quadsim_guard_end(quadsim_guard *guard, enum quadsim_phase p
     const quadsim_fallback *f = guard->numbers;
     if (phase == QUADSIM_PHASE_LANDED) {
         static const real slowest[NU] = {R(0.0)};
-        forget(guard);
+        leave_fallback(guard);
         guard->level = 0;
         status = QUADSIM_LANDED;
         quadsim_guard_clip(f, slowest, guard->in_force, command);
     } else if (quadsim_is_flown(status)) {
-        forget(guard);
+        leave_fallback(guard);
         guard->level = 0;
         quadsim_guard_clip(f, plan, guard->in_force, command);
         memcpy(guard->kept, plan, (size_t)(guard->horizon * NU) * sizeof(real));
         memcpy(guard->kept, command, NU * sizeof(real));
+        clip_rows(f, command, guard->horizon - 1, guard->kept + NU);
         memcpy(guard->foreseen, guard->state, sizeof(guard->foreseen));
         guard->planned = 1;
     } else {
@@ -483,5 +578,22 @@ enum quadsim_status quadsim_guard_end(quadsim_guard *guard, enum quadsim_phase p
         }
     }
     memcpy(guard->before, command, sizeof(guard->before));
+    guard->trim = *trim;
     return status;
+}
+
+void quadsim_guard_plan(const quadsim_guard *guard, quadsim_real *plan)
+{
+    int i;
+    memcpy(plan, guard->before, sizeof(guard->before));
+    if (guard->level >= 2) {
+        plan_hover(guard, plan);
+        return;
+    }
+    for (i = 1; i < guard->horizon; i++) {
+        memcpy(plan + i * NU, guard->planned ? kept_row(guard, guard->age + i) : guard->before, sizeof(guard->before));
+    }
+    if (guard->level == 1) {
+        clip_rows(guard->numbers, plan, guard->horizon - 1, plan + NU);
+    }
 }

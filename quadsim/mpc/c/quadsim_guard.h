@@ -91,6 +91,7 @@ typedef struct quadsim_guard {
     quadsim_real foreseen[12]; /* the state of the last plan, then where it leads */
     quadsim_real heading[2], level_there[2], resting[4]; /* sine and cosine of its yaw, roll and pitch at rest, commands */
     quadsim_real target[12];
+    quadsim_trim trim; /* of the last step */
 } quadsim_guard;
 
 /* A contract whose plans have room [horizon][4], the caller's; reset it before its first period. */
@@ -98,6 +99,9 @@ void quadsim_guard_start(quadsim_guard *guard, const quadsim_fallback *numbers, 
 
 /* Restart after a command, or after that of hover where it is unusable: guard->before. */
 void quadsim_guard_reset(quadsim_guard *guard, const quadsim_real command[4]);
+
+/* Take over what another contract remembers, its plan where it commands the same; after a reset. */
+void quadsim_guard_adopt(quadsim_guard *guard, const quadsim_guard *previous);
 
 /* Complete the state, of which channels that are not measured are not finite.  QUADSIM_FREE: ask the law; otherwise why
  * it cannot be asked.  The reference is of so many numbers. */
@@ -120,6 +124,10 @@ void quadsim_guard_foresee(quadsim_guard *guard, int heading, const quadsim_trim
  * its plan [horizon][4], or what is flown instead.  Returns the status of the period. */
 enum quadsim_status quadsim_guard_end(quadsim_guard *guard, enum quadsim_phase phase, const quadsim_trim *trim,
                                       enum quadsim_status status, const quadsim_real *plan, quadsim_real command[4]);
+
+/* The plan [horizon][4] of the period that quadsim_guard_end answered last, its command first: the law's plan, what is left
+ * of the last one, that of hover or descent by the model, or on the ground the command, held. */
+void quadsim_guard_plan(const quadsim_guard *guard, quadsim_real *plan);
 
 /* Commands within what the bounds on them and on their steps leave after a command; where these leave nothing, within
  * those on the commands. */

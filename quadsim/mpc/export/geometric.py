@@ -9,9 +9,9 @@ from quadsim.errors import ExportError
 from quadsim.mpc.export.ctext import CText
 from quadsim.mpc.export.follower import CFollower
 from quadsim.mpc.export.source import SHARED_FILES
+from quadsim.mpc.guard.numbers import fallback_numbers
 from quadsim.mpc.guard.settings import USUAL_FALLBACK
 from quadsim.mpc.laws.geometric import Geometric, GeometricController
-from quadsim.mpc.laws.parts.numbers import fallback_numbers
 from quadsim.vehicle import N_ROTORS
 
 
@@ -50,7 +50,7 @@ class CGeometric(CFollower):
         """See `CSource`."""
         law, prefix = self.law, text.prefix
         settings = USUAL_FALLBACK.within({})
-        fallback = fallback_numbers(law.model, law.bounds, settings, self.horizon)
+        fallback = fallback_numbers(law.model, law.bounds, settings)
         blocks = [text.array(name, array) for name, array in law.pointed.items()]
         values = {name: text.value(value) for name, value in fallback.items()}
         blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **values))

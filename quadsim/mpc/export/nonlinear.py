@@ -14,11 +14,11 @@ from quadsim.errors import ExportError
 from quadsim.mpc.export.ctext import CText
 from quadsim.mpc.export.follower import CFollower
 from quadsim.mpc.export.source import CHANGES, SHARED_FILES
+from quadsim.mpc.guard.numbers import fallback_numbers
 from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.body import ProblemStruct
 from quadsim.mpc.laws.parts.nonlinear_law import memory_of
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
-from quadsim.mpc.laws.parts.numbers import fallback_numbers
 from quadsim.mpc.problem.model import LinearModel, hover_model, target_model
 from quadsim.mpc.solvers.core_tables import NO_BOUND
 
@@ -109,7 +109,7 @@ class CNonlinear(CFollower):
     def numbers(self, text: CText) -> list[str]:
         """See `CSource`."""
         law, sqp, of_law = self.law, self.law._sqp, self.law._law
-        fallback = fallback_numbers(self._model(), self.bounds, self.table.fallback.within({}), self.horizon)
+        fallback = fallback_numbers(self._model(), self.bounds, self.table.fallback.within({}))
         prefix, blocks = text.prefix, []
         pointers = {"terms": f"{prefix}terms"}
         for name, array in sqp.pointed.items():

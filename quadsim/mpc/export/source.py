@@ -12,7 +12,8 @@ from typing import ClassVar, Final
 from quadsim.controller import ROTORS
 from quadsim.mpc.export.ctext import CText, Precision
 from quadsim.mpc.guard.answer import ActuatorBounds
-from quadsim.mpc.laws.parts.numbers import Exportable, controller_numbers, fallback_numbers, robust_numbers
+from quadsim.mpc.guard.numbers import fallback_numbers
+from quadsim.mpc.laws.parts.numbers import Exportable, controller_numbers, robust_numbers
 from quadsim.mpc.problem.model import hover_model, split_delay
 from quadsim.mpc.solvers.core import core_problem
 from quadsim.mpc.solvers.core_tables import Tables, members
@@ -234,7 +235,7 @@ def _controller(text: CText, law: Exportable, bounds: ActuatorBounds | None, tab
     numbers, robust = controller_numbers(law), "NULL"
     problem = law.problem
     model = hover_model(law.vehicle, problem.model.period)
-    members = fallback_numbers(model, bounds, law.fallback, problem.horizon)
+    members = fallback_numbers(model, bounds, law.fallback)
     fallback = {name: text.value(value) for name, value in members.items()}
     blocks = [
         text.array("C_r", problem.objective.C_r),

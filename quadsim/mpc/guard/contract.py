@@ -14,8 +14,8 @@ The law is called in every period with a known state, so it resumes automaticall
 that its slew bounds refer to the acting command, and the list of predicted channels
 (`StepInputs.unseen`).
 
-Exported laws have the same contract in C, `quadsim/mpc/c/quadsim_guard.c`; `tests/firmware/test_guard.py` holds
-the two together.
+The contract is `quadsim/mpc/c/quadsim_guard.c`, for exported laws and here: `Guard` calls the law, and gives the C what
+only Python has.
 
 A law that estimates disturbances is `quadsim.mpc.problem.equilibrium.Trimmed`.  Levels 1 to 3, and predictions of
 missing channels, start from its equilibrium; it is held while nothing is measured.
@@ -25,14 +25,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 import numpy as np
 
 from quadsim.controller import (
     ACCEPTED,
+    COMMANDED,
     FALLBACK,
     GROUNDED,
     Command,
@@ -40,23 +41,30 @@ from quadsim.controller import (
     Phase,
     Predicting,
     StepInputs,
-    check_command,
     stopped,
 )
-from quadsim.errors import FlightError
-from quadsim.mpc.guard.answer import ActuatorBounds, rejection, resized, shifted
-from quadsim.mpc.guard.completion import PLAUSIBLE_REFERENCE, StateCompletion, completed_inputs
-from quadsim.mpc.guard.hover import HoverLaw
-from quadsim.mpc.guard.settings import USUAL_FALLBACK, USUAL_TILT, FallbackSettings
+from quadsim.core.mirror import core_library, set_members, struct
+from quadsim.errors import FlightError, ParameterError
+from quadsim.mpc.guard.answer import ActuatorBounds, resized
+from quadsim.mpc.guard.numbers import UPRIGHT, fallback_numbers
+from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
+from quadsim.mpc.guard.structs import STATUSES
 from quadsim.mpc.problem.equilibrium import Trim, Trimmed
 from quadsim.mpc.problem.heading import anchored, predict_in_heading_frame
 from quadsim.mpc.problem.model import LinearModel
-from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, all_true
+from quadsim.mpc.solvers import INVALID_DATA
+from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, REFERENCE_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
 
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """Exceptions of numerics and compiled back ends.  Programming errors (`TypeError`, `KeyError`, ...) end the run."""
 _MISTAKES: Final = (NotImplementedError, RecursionError)  # subclasses of `RuntimeError` that are programming errors
+_ANSWERED: Final = STATUSES.index(COMMANDED)
+_FAILED: Final = STATUSES.index(INVALID_DATA)
+_LOST: Final = STATUSES.index("state_unknown")
+"""What the C has to tell apart: an answer that is flown, none, and none because the state is not known."""
+PHASES: Final[Mapping[Phase, int]] = {Phase.FLYING: 0, Phase.ARMED: 1, Phase.LANDED: 2, Phase.CRASHED: 2}
+"""`enum quadsim_phase` by phase."""
 
 
 class Guard:
@@ -66,43 +74,50 @@ class Guard:
     unchanged; a law may have its own fallback.
 
     Attributes:
-        hover: the law of levels 2 and 3, and of the correction on level 1.
+        model: of level hover.
+        numbers: the `quadsim_fallback` of the contract.
     """
 
     def __init__(
         self, model: LinearModel, *, bounds: ActuatorBounds, settings: FallbackSettings = USUAL_FALLBACK
     ) -> None:
-        self.hover = HoverLaw(model, tilt=math.radians(USUAL_TILT if settings.tilt is None else settings.tilt))
-        self._model, self._bounds, self._settings = model, bounds, settings
-        self._distance = settings.distance
-        self._completion = StateCompletion(model)
+        self.model = model
+        self.numbers = struct("quadsim_fallback")()
+        set_members(self.numbers, **fallback_numbers(model, bounds, settings.within({})))
+        self._library = core_library()
+        self._struct = struct("quadsim_guard")()
+        self._trim = struct("quadsim_trim")()
+        self._kept = np.zeros((1, N_ROTORS))  # memory of the last plan that was flown
+        self._library.quadsim_guard_start(self._struct, self.numbers, 1, self._kept.ctypes.data)
+        self._state = np.ctypeslib.as_array(self._struct.state)
+        self._unseen = np.ctypeslib.as_array(self._struct.unseen)
+        self._in_force = np.ctypeslib.as_array(self._struct.in_force)
+        self._foreseen = np.ctypeslib.as_array(self._struct.foreseen)
+        self._rest_commands = np.ctypeslib.as_array(self._trim.commands)
+        self._rest_lift = np.ctypeslib.as_array(self._trim.lift)
+        self._rest_twist = np.ctypeslib.as_array(self._trim.twist)
+        self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
         self._law: Controller | None = None  # the last that was asked for its trim
         self._trimmed: Trimmed | None = None
-        self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
         self.reset(model.u_bar)
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse: addresses are useless in a copy or another process."""
+        raise TypeError("a fallback contract cannot be copied or pickled: make another")
 
     def reset(self, speeds: Array) -> Array:
         """Restart after the command u(-1) (4,) [rad/s]; return it, or hover's if it is not usable, for the law."""
-        usable = check_command(speeds) is None
-        self._before = np.array(speeds, float) if usable else self._model.u_bar.copy()
-        self._completion.reset()
-        self._forget()
-        return self._before.copy()
-
-    def _forget(self) -> None:
-        """Leave all fallback levels."""
-        self._good: tuple[Array, Array] | None = None  # state (12,) of the last accepted answer, and its plan (N, 4)
-        self._foreseen: Array | None = None
-        self._target: Array | None = None
-        self._age = self._hovered = 0  # periods in fallback, and periods of these on level 2 or 3
+        command = _numbers(speeds, (N_ROTORS,))
+        self._library.quadsim_guard_reset(self._struct, command.ctypes.data)
+        self._predicted: Array | None = None  # (N, 12) where the rest of the last plan leads, once it is asked for
+        self._predicted_at = 0  # the age of the plan then
+        return np.array(self._struct.before)
 
     def adopt(self, previous: Guard, horizon: int) -> None:
         """Take over the previous contract's level, state and plan, for a law of N = `horizon`."""
-        self._completion.adopt(previous._completion)
-        self._age, self._target, self._hovered = previous._age, previous._target, previous._hovered
-        if previous._good is not None and previous._model.targets is self._model.targets:
-            state, plan = previous._good
-            self._good = state, resized(plan, horizon)
+        self._fit(horizon)
+        self._library.quadsim_guard_adopt(self._struct, previous._struct)
+        self._predicted = None
 
     def step(self, law: Controller, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the command of the first available level; see `quadsim.controller.Controller.step`.
@@ -110,31 +125,42 @@ class Guard:
         It catches the `FAILURES` of the law; their names become the status.  While grounded, the rotors slow down to
         their lowest speed as fast as the bounds allow.
         """
-        acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
-        known = self._completion.complete(state, acting, self.trim(law), free=now.phase is Phase.FLYING)
-        completed = completed_inputs(now, acting.copy(), self._completion.unseen.copy(), known)
-        status, answer = self._call(law, completed, known, reference)
+        self._fit(law.horizon)
+        code = self._begin(law, now, state, reference)
+        status, answer, plan = STATUSES[code], None, self._kept
+        if code == 0:
+            status, answer = self._call(law, now, reference)
+            code = _LOST if status == STATUSES[_LOST] else _FAILED
+        if answer is not None and status in ACCEPTED:
+            plan = _plan_of(answer)
+            code = self._library.quadsim_guard_check(self._struct, _ANSWERED, plan.ctypes.data)
+            if code != _ANSWERED:
+                status = STATUSES[code]
+        plan = self._end(law, now.phase, code, plan)
+        speeds = plan[0].copy()
         if now.phase in GROUNDED:
-            self._forget()
-            command = stopped(self._bounds.lowest(acting), law.horizon, now.phase)
-        elif answer is None or status not in ACCEPTED:
-            command = self._fall_back(law, status, answer, known, acting)
-        else:
-            self._forget()
-            # Moved onto its bounds, and so is the rest of the plan, which may act without a call.
-            speeds = self._bounds.clip(answer.speeds, acting)
-            later = self._bounds.clip_plan(answer.plan[1:], speeds) if law.horizon > 1 else answer.plan[1:]
-            command = replace(answer, speeds=speeds, plan=np.concatenate([speeds[None], later]), fallback=0)
-            self._good = known, command.plan
-        self._before = command.speeds.copy()
-        return command
+            return stopped(speeds, law.horizon, now.phase)
+        if answer is not None and code == _ANSWERED:
+            return replace(answer, speeds=speeds, plan=plan, fallback=0)
+        spent = answer or Command(speeds=speeds, plan=plan)
+        stats = spent.stats._replace(active=0, slack=0.0, sqp_defect=math.nan, sqp_step=math.nan)
+        flown = replace(spent, speeds=speeds, plan=plan, stats=stats)
+        return replace(flown, status=status, answered_by=FALLBACK, fallback=self._struct.level)
+
+    def hover(self, law: Controller, state: Array, acting: Array) -> Array:
+        """Restart after the command in force (4,), and return the plan (N, 4) of level hover from a state (12,)."""
+        self.reset(acting)
+        self._fit(law.horizon)
+        level = np.zeros((law.horizon, len(REFERENCE_STATES)))
+        self._begin(law, StepInputs(acting=acting), state, level)
+        return self._end(law, Phase.FLYING, _FAILED, self._kept)
 
     def trim(self, law: Controller) -> Trim:
         """Return the equilibrium that the law estimates; level hover if it estimates none."""
-        trim = _tried(lambda: self._trim(law))
+        trim = _tried(lambda: self._trim_of(law))
         return trim if isinstance(trim, Trim) else self._level
 
-    def _trim(self, law: Controller) -> object:
+    def _trim_of(self, law: Controller) -> object:
         if law is not self._law:  # asked once: a runtime protocol takes as long as ten array operations
             self._law, self._trimmed = law, law if isinstance(law, Trimmed) else None
         return None if self._trimmed is None else self._trimmed.trim
@@ -145,68 +171,104 @@ class Guard:
         if isinstance(predicted, np.ndarray) and predicted.shape == (*plans.shape[:2], N_STATES):
             return predicted
         trim = self.trim(law)
-        return predict_in_heading_frame(anchored(self._model, trim), states, plans, trim)
+        return predict_in_heading_frame(anchored(self.model, trim), states, plans, trim)
 
-    def _call(self, law: Controller, now: StepInputs, known: Array, reference: Array) -> tuple[str, Command | None]:
-        """Return the law's status and, if it gave one, its answer; an accepted answer is safe to fly."""
-        assert now.acting is not None
-        if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:
-            return "state_unknown", None
-        shape = (law.horizon, len(REFERENCE_STATES))
-        if np.shape(reference) != shape or not all_true(np.abs(reference) <= PLAUSIBLE_REFERENCE):
-            return "invalid_reference", None
-        answer: Command | Exception = _tried(lambda: law.step(now, known.copy(), reference))
+    def _fit(self, horizon: int) -> None:
+        """Give plans as much room as a law's horizon."""
+        if horizon == self._struct.horizon:
+            return
+        if horizon < 1:
+            raise ParameterError("controller", "horizon", horizon, "at least 1")
+        self._kept = resized(self._kept, horizon)
+        self._struct.horizon = horizon
+        self._struct.kept = self._kept.ctypes.data
+
+    def _set_trim(self, law: Controller) -> None:
+        trim = self.trim(law)
+        self._rest_commands[:] = trim.speeds
+        self._rest_lift[:] = trim.lift
+        self._rest_twist[:] = trim.twist
+
+    def _begin(self, law: Controller, now: StepInputs, state: Array, reference: Array) -> int:
+        """Complete the state; return the status for which the law is not to be called, or 0."""
+        measured = _numbers(state, (N_STATES,))
+        path = _numbers(reference, (law.horizon, len(REFERENCE_STATES)))
+        acting = _numbers(now.acting, (N_ROTORS,))
+        self._set_trim(law)
+        code: int = self._library.quadsim_guard_begin(
+            self._struct,
+            PHASES[now.phase],
+            self._trim,
+            measured.ctypes.data,
+            path.ctypes.data,
+            path.size,
+            acting.ctypes.data,
+        )
+        return code
+
+    def _call(self, law: Controller, now: StepInputs, reference: Array) -> tuple[str, Command | None]:
+        """Return the law's status and, if it gave one, its answer, of the right shape if it is accepted."""
+        known = self._state.copy()
+        completed = completed_inputs(now, self._in_force.copy(), self._unseen.astype(float), known)
+        answer: Command | Exception = _tried(lambda: law.step(completed, known.copy(), reference))
         if isinstance(answer, Exception):  # e.g. `PlanExhaustedError` as `plan_exhausted_error`
             return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(answer).__name__).lower(), None
         if answer.status in ACCEPTED and (
             np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (law.horizon, N_ROTORS)
         ):
             return "wrong_shape", answer
-        return rejection(answer.status, answer.speeds, answer.plan, self._bounds, now.acting) or answer.status, answer
+        return answer.status, answer
 
-    def _fall_back(self, law: Controller, status: str, answer: Command | None, known: Array, acting: Array) -> Command:
-        self._age += 1
-        plan, level = self._shifted(law, known, acting, lost=status == "state_unknown"), 1
-        if plan is None:
-            plan, level = self._hover(law, known, acting)
-        spent = answer or Command(speeds=plan[0], plan=plan)
-        spent = replace(spent, status=status, answered_by=FALLBACK, fallback=level)
-        stats = spent.stats._replace(active=0, slack=0.0, sqp_defect=math.nan, sqp_step=math.nan)
-        return replace(spent, speeds=plan[0].copy(), plan=plan, stats=stats)
+    def _end(self, law: Controller, phase: Phase, code: int, answered: Array) -> Array:
+        """Return the plan (N, 4) of the period, its command first, of a law's status and perhaps its plan (N, 4)."""
+        if code != _ANSWERED:
+            self._set_trim(law)  # the law's call may have changed it
+        if self._library.quadsim_guard_foresees(self._struct, PHASES[phase], code):
+            self._foresee(law)
+        plan = np.empty_like(self._kept)
+        address = plan.ctypes.data
+        self._library.quadsim_guard_end(self._struct, PHASES[phase], self._trim, code, answered.ctypes.data, address)
+        self._library.quadsim_guard_plan(self._struct, address)
+        if self._struct.level == 0:
+            self._predicted = None
+        return plan
 
-    def _shifted(self, law: Controller, known: Array, acting: Array, *, lost: bool) -> Array | None:
-        """Return the rest of the last good plan (N, 4), corrected; None from when it becomes unusable."""
-        if self._good is None:
-            return None
-        (state, plan), age = self._good, self._age
-        if self._foreseen is None:
-            self._foreseen = self.predict(law, state[None], plan[None])[0]
-        deviation = known - self._foreseen[min(age, law.horizon) - 1]  # row i is the state i + 1 periods later
-        old = age >= law.horizon or age * self._model.period > self._settings.plan_age + 1e-9
-        if lost or old or not (np.abs(deviation) <= self._distance).all():
-            self._good = None
-            return None
-        plan = shifted(plan, age)
-        plan[0] += self.hover.correction(deviation, float(known[INDEX["yaw"]]))
-        return self._bounds.clip_plan(plan, acting)
+    def _foresee(self, law: Controller) -> None:
+        """Move on the state that the last plan leads to."""
+        age = self._struct.age
+        last = len(self._kept) - 1
+        if self._predicted is None:
+            plan = resized(self._kept[min(age, last) :], len(self._kept))
+            self._predicted = self.predict(law, self._foreseen[None].copy(), plan[None])[0]
+            self._predicted_at = age
+        self._foreseen[:] = self._predicted[min(age - self._predicted_at, last)]
 
-    def _hover(self, law: Controller, known: Array, acting: Array) -> tuple[Array, int]:
-        """Return the plan (N, 4) of level hover or descent, and its level."""
-        settings, period = self._settings, self._model.period
-        if self._target is None:
-            self._target = np.zeros(N_STATES)
-            for name in ("x", "y", "z", "yaw"):
-                self._target[INDEX[name]] = known[INDEX[name]]
-        x, y, z = POSITION
-        if math.hypot(known[INDEX["vx"]], known[INDEX["vy"]]) > settings.settled:
-            self._target[[x, y]] = known[[x, y]]
-        sinking = self._hovered * period >= settings.hover - 1e-9
-        if sinking:
-            self._target[INDEX["vz"]] = -settings.sink
-            self._target[z] -= settings.sink * period
-        self._hovered += 1
-        plan = self.hover.plan(known, self._target, acting, self._bounds, law.horizon, self.trim(law))
-        return plan, 3 if sinking else 2
+
+def completed_inputs(now: StepInputs, acting: Array, unseen: Array, known: Array) -> StepInputs:
+    """Return a step's inputs with the command in force (4,), for the state `known` (12,) of ages `unseen` (12,).
+
+    Attitude and body rates are omitted where those of the state are predicted.  Near a pitch of 90 deg, Euler rates are
+    implausibly large, but body rates are not.
+    """
+    attitude = None if unseen[ANGLES].any() else now.attitude
+    turned = unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT
+    rates = None if turned else now.body_rates
+    return replace(now, acting=acting, unseen=unseen, attitude=attitude, body_rates=rates)
+
+
+def _numbers(value: Any, shape: tuple[int, ...]) -> Array:
+    """Return real numbers of a shape as the C takes them; of anything else as many that are none."""
+    if np.shape(value) != shape or np.iscomplexobj(value):
+        return np.full(shape, math.nan)
+    return np.ascontiguousarray(value, float)
+
+
+def _plan_of(answer: Command) -> Array:
+    """Return the plan (N, 4) of an answer with its command first; where that is not finite in the plan it stays so."""
+    plan = np.array(answer.plan, float, order="C")
+    if all_true(np.isfinite(plan[0])):
+        plan[0] = answer.speeds
+    return plan
 
 
 def _tried(call: Callable[[], Any]) -> Any:

@@ -1,4 +1,4 @@
-"""The fallback contract's types in C, `quadsim_guard.h`: in flight it is `quadsim.mpc.guard.contract.Guard`."""
+"""The statuses of `quadsim_guard.h`, in words."""
 
 from __future__ import annotations
 

@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 import piqp
 import pytest
-from scripted_controller import PERIOD, Scripted, advance, call, failing, following, guard, model, random_state
+from scripted_controller import (
+    PERIOD,
+    Scripted,
+    advance,
+    bounds,
+    call,
+    failing,
+    following,
+    guard,
+    model,
+    random_state,
+    vehicle,
+)
 
 from quadsim.controller import ACCEPTED, Phase, StepInputs
-from quadsim.errors import CommandError
-from quadsim.mpc.guard.contract import FallbackSettings
+from quadsim.errors import CommandError, ParameterError
+from quadsim.mpc.guard.contract import FallbackSettings, Guard
+from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.mpc.solvers.piqp import STATUS
 from quadsim.state import INDEX, VELOCITY, Array
 
@@ -69,6 +84,7 @@ def test_a_programmer_s_mistake_is_not_hidden(mistake: type[Exception]) -> None:
     [
         ({"speeds": np.full(4, math.nan)}, "not_finite"),
         ({"plan": np.full((30, 4), math.inf)}, "not_finite"),
+        ({"plan": np.vstack([np.full(4, math.nan), np.full((29, 4), 190.0)])}, "not_finite"),
         ({"speeds": np.full(3, 190.0)}, "wrong_shape"),
         ({"plan": np.full((29, 4), 190.0)}, "wrong_shape"),
         ({"speeds": np.full(4, 251.0)}, "out_of_bounds"),
@@ -79,6 +95,23 @@ def test_an_answer_that_only_claims_to_be_good_is_not_used(answer: dict[str, Arr
     commands = following(guard(Scripted({1: answer})), 2)
     assert (commands[1].status, commands[1].fallback) == (status, 1)
     np.testing.assert_allclose(commands[1].speeds, commands[0].plan[1], atol=1e-9)
+
+
+def test_a_command_need_not_be_its_plan_s_first_row() -> None:
+    speeds = model().u_bar + 1.0
+    inner = Scripted({0: {"speeds": speeds}} | failing([1]))
+    commands = following(guard(inner), 2)
+    assert [command.fallback for command in commands] == [0, 1]
+    np.testing.assert_array_equal(commands[0].plan[0], speeds)
+    np.testing.assert_array_equal(commands[0].speeds, speeds)
+
+
+def test_a_plan_that_is_flown_without_a_call_keeps_its_bounds() -> None:
+    plan = np.tile(model().u_bar, (30, 1))
+    plan[3:, 0] += 12.0  # in three periods of at most 5 rad/s
+    command = call(guard(Scripted({0: {"plan": plan}})))
+    assert command.fallback == 0
+    np.testing.assert_allclose(command.plan[2:7, 0] - model().u_bar[0], [0.0, 5.0, 10.0, 12.0, 12.0])
 
 
 def test_rounding_beyond_the_bounds_is_taken_away() -> None:
@@ -163,7 +196,7 @@ def test_a_missing_measurement_is_replaced_and_then_the_controller_is_not_called
     assert call(guarded).fallback == 0
 
 
-@pytest.mark.parametrize("acting", [np.full(4, math.nan), np.full(3, 190.0), np.full(4, 1e7)])
+@pytest.mark.parametrize("acting", [np.full(4, math.nan), np.full(3, 190.0), np.full(4, 1e7), np.full(4, 190.0 + 1j)])
 def test_an_impossible_command_in_force_is_replaced_by_its_own_last_one(acting: Array) -> None:
     inner = Scripted()
     guarded = guard(inner)
@@ -172,6 +205,57 @@ def test_an_impossible_command_in_force_is_replaced_by_its_own_last_one(acting: 
     np.testing.assert_array_equal(inner.calls[1][0].acting, last)
     guarded.reset(acting)
     np.testing.assert_array_equal(inner.resets[-1], model().u_bar)
+
+
+@pytest.mark.parametrize("horizon", [8, 30, 50])
+def test_a_contract_goes_on_from_another(horizon: int) -> None:
+    """With its plan, cut or extended by its last row, and the periods in fallback, and in hover, so far."""
+    first = guard(Scripted(failing(range(1, 200))))
+    state, commands = np.zeros(12), []
+    for k in range(150):
+        if k in (5, 60):
+            second = guard(Scripted(failing(range(200)), horizon=horizon))
+            second.reset(commands[-1].speeds)
+            second.adopt(first)
+            first = second
+        commands.append(call(first, state))
+        state = advance(state, commands[-1].speeds)
+    last = min(horizon, 30) - 1
+    for i, row in enumerate(commands[5].plan[1:], start=6):
+        np.testing.assert_allclose(row, commands[0].plan[min(i, last)], atol=1e-9)
+    held = min(20, last)
+    assert [command.fallback for command in commands] == [0] + held * [1] + 100 * [2] + (49 - held) * [3]
+
+
+def test_a_plan_of_other_commands_is_not_taken_over() -> None:
+    targets = replace(model(), targets=True)
+    first = guard(Scripted(failing(range(1, 9))))
+    call(first)
+    second = Pilot(Scripted(failing(range(9))), vehicle(), guard=Guard(targets, bounds=bounds()))
+    second.reset(model().u_bar)
+    second.adopt(first)
+    assert call(second).fallback == 2
+
+
+def test_a_law_may_change_its_horizon() -> None:
+    inner = Scripted(failing([1, 3]))
+    guarded = guard(inner)
+    state = np.zeros(12)
+    for horizon in (30, 5, 5, 40):
+        inner.horizon = horizon
+        command = call(guarded, state)
+        assert command.plan.shape == (horizon, 4)
+        state = advance(state, command.speeds)
+    assert command.fallback == 1
+    inner.horizon = 0
+    with pytest.raises(ParameterError, match=r"controller\.horizon must be at least 1; got 0"):
+        call(guarded, state)
+
+
+def test_a_contract_has_addresses_and_is_not_copied() -> None:
+    contract = Guard(model(), bounds=bounds())
+    with pytest.raises(TypeError, match="cannot be copied or pickled"):
+        copy.deepcopy(contract)
 
 
 def test_reset_forgets_plan_and_measurements() -> None:

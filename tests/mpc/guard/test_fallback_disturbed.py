@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from scripted_controller import Pressed, Scripted, advance, at_rest, call, failing, guard, model, pressed
 
-from quadsim.mpc.guard.answer import ActuatorBounds
-from quadsim.mpc.guard.hover import LARGEST_CLIMB, HoverLaw
 from quadsim.state import INDEX
 
 
@@ -28,15 +26,6 @@ def test_every_level_compensates_the_disturbance(yaw: float) -> None:
     assert sorted(set(levels)) == [0, 1, 2, 3]
     assert state[INDEX["vz"]] == pytest.approx(-0.5, abs=1e-3)
     np.testing.assert_allclose(np.delete(state - at_rest(yaw), [INDEX["z"], INDEX["vz"]]), 0.0, atol=1e-3)
-
-
-def test_height_pulls_beside_what_holds_the_vehicle() -> None:
-    """At most by `LARGEST_CLIMB`, whatever rest takes."""
-    law, far = HoverLaw(model(), tilt=0.2), at_rest(0.0)
-    far[INDEX["z"]] = -100.0
-    free = ActuatorBounds(u_min=np.zeros(4), u_max=np.full(4, 1e3), delta_min=[-1e3] * 4, delta_max=[1e3] * 4)
-    pulled = law.plan(far, np.zeros(12), pressed().speeds, free, 1, pressed())[0] - pressed().speeds
-    assert (law.slope @ pulled)[0] == pytest.approx(LARGEST_CLIMB)
 
 
 def test_missing_channels_follow_the_disturbance() -> None:

@@ -19,7 +19,7 @@ from quadsim.errors import FlightError, ParameterError
 from quadsim.mpc.estimate.disturbance import RampSettings
 from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.contract import FallbackSettings
-from quadsim.mpc.guard.hover import HoverLaw
+from quadsim.mpc.guard.numbers import HoverGain
 from quadsim.mpc.laws.nonlinear import Nonlinear, Weights
 from quadsim.mpc.laws.parts.builders import build
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
@@ -373,7 +373,7 @@ def test_upside_down_it_comes_back_though_its_steps_do_not_converge() -> None:
 @pytest.mark.parametrize("lag", [LAG, (0.072, 0.072, 0.072, 0.15), (0.0, 0.0, 0.0, 0.0)])
 def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tuple[float, ...]) -> None:
     model = target_model(VEHICLE, period, lag)
-    law = HoverLaw(model, tilt=math.radians(10.0))
+    law = HoverGain.of_model(model)
     assert np.abs(np.linalg.eigvals(model.A - model.B @ np.linalg.solve(law.slope, law.gain))).max() < 1.0
     made = build(table(inner_lag=lag, horizon=1, node=None), VEHICLE, period)
     made.law.step = _fails  # type: ignore[attr-defined]

@@ -187,7 +187,7 @@ def test_the_fallback_is_on_and_keeps_well_within_the_bounds_on_tilt(
     law = built({**ROBUST, "compiled": False, "output_bounds": bounds, "fallback": given})
     assert law.guard is not None
     preparation_of(law.law)
-    assert law.guard.hover.tilt == pytest.approx(math.radians(tilt), rel=1e-12)
+    assert law.guard.numbers.tilt == pytest.approx(math.radians(tilt), rel=1e-12)
     assert law.name == "robust"
 
 

@@ -9,37 +9,24 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.controller import LARGEST_SPEED
 from quadsim.errors import ExportError
-from quadsim.mpc.estimate.observer import LONGEST_SPAN, UPRIGHT, DisturbanceObserver
-from quadsim.mpc.guard.answer import ActuatorBounds
-from quadsim.mpc.guard.completion import (
-    NOISE,
-    PLAUSIBLE,
-    PLAUSIBLE_REFERENCE,
-    UNKNOWN,
-    UNMOVED,
-    acceleration_noise,
-)
-from quadsim.mpc.guard.hover import LARGEST_CLIMB, LARGEST_TURN, HoverLaw
+from quadsim.mpc.estimate.observer import UPRIGHT, DisturbanceObserver
+from quadsim.mpc.guard.numbers import PLAUSIBLE
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.equilibrium import LEAST_LIFT
 from quadsim.mpc.problem.heading import slope
-from quadsim.mpc.problem.model import LinearModel, hover_model, split_delay
+from quadsim.mpc.problem.model import hover_model, split_delay
 from quadsim.mpc.problem.nonlinear_model import SUBSTEPS, nonlinear_model
 from quadsim.mpc.problem.ocp import Problem
-from quadsim.mpc.solvers.core_tables import NO_BOUND
 from quadsim.mpc.space import Shape
 from quadsim.mpc.tables.bounded import Bounded, Weighted
 from quadsim.mpc.tables.lags import resolved_lag
-from quadsim.state import EULER, POSITION, REFERENCE_STATES, Array
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.state import REFERENCE_STATES, Array
+from quadsim.vehicle import Vehicle
 
 AVOIDS: Final = "its half-spaces around obstacles are others in each period: leave out controller.avoidance"
 """Why a controller that avoids obstacles is not exported."""
-MOST_PERIODS: Final = 2**30 - 1
-"""Most periods that a time of the fallback contract has in C."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,63 +105,4 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
         "decay_period": decay(instants * period),
         "plausible_state": PLAUSIBLE,
         "plausible_reference": PLAUSIBLE[list(REFERENCE_STATES)],
-    }
-
-
-def fallback_numbers(
-    model: LinearModel, bounds: ActuatorBounds | None, settings: FallbackSettings, horizon: int
-) -> dict[str, int | float | Array]:
-    """Return the members of a `quadsim_fallback`; see `quadsim.mpc.guard.contract.Guard`, which compares times [s].
-
-    Args:
-        model: of level hover.
-        bounds: on commands; None for none.
-        settings: the table, with the tilt that its law's bounds leave.
-        horizon: N of the law's plans.
-    """
-    period, free = model.period, np.full(N_ROTORS, NO_BOUND)
-    assert settings.tilt is not None
-    hover, Q = HoverLaw(model, tilt=math.radians(settings.tilt)), acceleration_noise(period)
-    pairs = [Q[first : first + 2, first : first + 2][np.triu_indices(2)] for first in (POSITION[0], EULER[0])]
-    sides = (-free, free, -free, free)
-    if bounds is not None:
-        sides = bounds.u_min, bounds.u_max, bounds.delta_min, bounds.delta_max
-    least, most, step_least, step_most = (np.clip(side, -NO_BOUND, NO_BOUND) for side in sides)
-
-    def periods(time: float) -> int:
-        """Return the most periods that last no longer than a time [s]."""
-        count = math.floor(time / period)
-        return min(next(n for n in (count + 1, count, count - 1) if n * period <= time), MOST_PERIODS)
-
-    return {
-        "targets": int(model.targets),
-        "plan_age": min(periods(settings.plan_age + 1e-9), horizon - 1),
-        "hover_periods": min(math.ceil((settings.hover - 1e-9) / period), MOST_PERIODS),
-        "unseen": periods(settings.unseen),
-        "compared": periods(LONGEST_SPAN + 1e-6),
-        "sink": settings.sink,
-        "sunk": settings.sink * period,
-        "settled": settings.settled,
-        "tilt": hover.tilt,
-        "climb": LARGEST_CLIMB,
-        "turn": LARGEST_TURN,
-        "largest_command": LARGEST_SPEED,
-        "largest_reference": PLAUSIBLE_REFERENCE,
-        "distance": settings.distance,
-        "plausible": PLAUSIBLE,
-        "unmoved": UNMOVED,
-        "noise": NOISE**2,
-        "unknown": UNKNOWN**2,
-        "process": np.concatenate(pairs),
-        "hover": model.u_bar,
-        "least": least,
-        "most": most,
-        "step_least": step_least,
-        "step_most": step_most,
-        "A": model.A,
-        "B": model.B,
-        "gain": hover.gain,
-        "lean": hover.lean,
-        "slope": hover.slope[0],
-        "inverse": hover.inverse,
     }

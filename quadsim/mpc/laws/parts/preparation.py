@@ -22,7 +22,7 @@ import numpy as np
 
 from quadsim.controller import Phase, StepInputs
 from quadsim.mpc.estimate.observer import LONGEST_SPAN, DisturbanceObserver, thrust_axis
-from quadsim.mpc.guard.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE
+from quadsim.mpc.guard.numbers import PLAUSIBLE, PLAUSIBLE_REFERENCE
 from quadsim.mpc.laws.parts.linear import Remembered
 from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.equilibrium import Trim, equilibrium, twisted
@@ -119,7 +119,7 @@ class RobustPreparation:
     def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query | None:
         """See `quadsim.mpc.laws.parts.linear.Preparation.prepare`.
 
-        Numbers that are not finite, exceed `quadsim.mpc.guard.completion.PLAUSIBLE`, or lead to such numbers give
+        Numbers that are not finite, exceed `quadsim.mpc.guard.numbers.PLAUSIBLE`, or lead to such numbers give
         None and do not update the observer.  Nor does a state that is predicted in part (`StepInputs.unseen`), the
         first measured state after more than `LONGEST_SPAN` of such states, or a state after a pause: `now.time` must be
         one period later than last time.
