@@ -216,10 +216,10 @@ def test_the_guard_of_targets_has_their_model_and_bounds(vehicle: Vehicle) -> No
     table = flight_with("nonlinear").replace(lags).controller
     guard = table.guard(vehicle, 0.05)
     assert guard is not None
-    assert guard.hover.model.targets
+    assert guard.model.targets
     assert table.actuators(vehicle).targets
     weight = vehicle.mass * vehicle.gravity
-    np.testing.assert_allclose(guard.hover.model.u_bar, [weight, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(guard.model.u_bar, [weight, 0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("name", LAWS)
