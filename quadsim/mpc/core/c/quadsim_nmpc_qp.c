@@ -6,7 +6,8 @@
  * no other row is near its bound, three ways to the set of held inputs follow one another:
  *
  *  1. that of the last optimum, a node further on, changed by the primal-dual active-set method: a few recursions;
- *  2. that of an interior point method, then 1. again: at most MOST_INNER recursions, whatever the number of bounds;
+ *  2. that of an interior point method, then 1. again: at most MOST_INNER recursions, whatever the number of bounds,
+ *     and once more with a smaller tolerance where that does not settle;
  *  3. the dual active-set method of Goldfarb and Idnani (1983), which adds violated rows one by one, and which takes soft
  *     rows, too.  What a row's multiplier does to all others, its response, is one pass backwards and forwards.
  *
@@ -33,7 +34,9 @@ static const real DEPENDENT = 1e-11;
 static const real NOTHING = 1e-13;
 static const real COMPLEMENTARY_ROWS = 1e-6;
 #endif
-static const real COMPLEMENTARY = R(1e-4); /* mean product of multipliers and distances, where bounds tell */
+static const real COMPLEMENTARY = R(1e-3); /* mean product of multipliers and distances, where bounds tell */
+static const real AGAIN = R(1e-5); /* the same, where what is active at first does not settle */
+static const real LEAST_START = R(3.0); /* multiplier that it starts from */
 static const real HARD = R(1e29), NEVER = R(1e30);
 static const real CURVATURE = R(1e-5); /* of a linear price, in its proportion */
 enum { WARM_ROUNDS = 30, MOST_ROUNDS = 4, MOST_INNER = 30, MOST_INNER_ROWS = 60, MOST_AGAIN = 20 };
@@ -62,12 +65,49 @@ INLINED real left_of(const quadsim_nmpc_problem *p, const int actuators, int a)
     return a < actuators ? p->left[2 * p->substeps * NU + a] : R(0.0);
 }
 
+enum { WIDE = MOST + 1 };
+
+/* Rows from..to of [A B]' P [A B], but for what is right of the block on the diagonal; sizes are constants, so that a
+ * row stays in registers. */
+INLINED void lower_rows(const quadsim_nmpc_work *work, const real *map, real both[MOST][WIDE + 1],
+                        real H[WIDE + 1][WIDE + 1], const int actuators, const int moves, const int from, const int to)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int followers = actuators + (moves ? NU : 0), n = BODY + followers, width = (n + 2) & ~1, first = n - 3;
+    const int past = to < width ? to : width, end = to < n + 1 ? to : n + 1;
+    int j, k, r, a;
+    for (j = from; j < end; j++) {
+        real row[WIDE + 1] = {R(0.0)};
+        for (k = 0; k < W; k++) {
+            const real by = map[k * width + j];
+            for (r = 0; r < past; r++) {
+                row[r] += by * both[k][r];
+            }
+        }
+        for (k = W; (j >= 7 || p->moments) && k < BODY; k++) {
+            const real by = map[k * width + j];
+            for (r = 0; r < past; r++) {
+                row[r] += by * both[k][r];
+            }
+        }
+        for (a = 0; a < followers; a++) {
+            const real left = left_of(p, actuators, a);
+            const real by = j == 10 + a ? left : j == first + followed(actuators, a) ? R(1.0) - left : R(0.0);
+            for (r = 0; by != R(0.0) && r < past; r++) {
+                row[r] += by * both[BODY + a][r];
+            }
+        }
+        for (r = 0; r < past; r++) {
+            H[j][r] = row[r];
+        }
+    }
+}
+
 /* One node backwards: from P of the next state to that of this one, without its own weight, and the gains.  Inputs that
  * are held at a bound do not answer; what they do, by g, is known. */
 INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, const int moves, const real *effort, const int *held,
                           real *cost, real *g)
 {
-    enum { WIDE = MOST + 1 };
     const quadsim_nmpc_problem *p = work->p;
     const int followers = actuators + (moves ? NU : 0), n = BODY + followers, width = (n + 2) & ~1, first = n - 3;
     const real *map = work->map + i * BODY * width;
@@ -104,32 +144,11 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
             both[r][j] = row[j];
         }
     }
-    for (j = 0; j < n + 1; j++) { /* [A B]' P [A B], the lower part */
-        real row[WIDE + 1] = {R(0.0)};
-        const int past = (j + 2) & ~1;
-        for (k = 0; k < (j < 7 ? W : BODY); k++) {
-            const real by = map[k * width + j];
-            for (r = 0; r < past; r++) { /* rows of `both` are set above, whichever columns are */
-                row[r] += by * both[k][r]; /* NOLINT(clang-analyzer-core.UndefinedBinaryOperatorResult) */
-            }
-        }
-        for (k = W; p->moments && j < 7 && k < BODY; k++) {
-            const real by = map[k * width + j];
-            for (r = 0; r < past; r++) {
-                row[r] += by * both[k][r];
-            }
-        }
-        for (a = 0; a < followers; a++) {
-            const real left = left_of(p, actuators, a);
-            const real by = j == 10 + a ? left : j == first + followed(actuators, a) ? R(1.0) - left : R(0.0);
-            for (r = 0; by != R(0.0) && r < past; r++) {
-                row[r] += by * both[BODY + a][r];
-            }
-        }
-        for (r = 0; r < past; r++) {
-            H[j][r] = row[r];
-        }
-    }
+    lower_rows(work, map, both, H, actuators, moves, 0, 6);
+    lower_rows(work, map, both, H, actuators, moves, 6, 10);
+    lower_rows(work, map, both, H, actuators, moves, 10, 14);
+    lower_rows(work, map, both, H, actuators, moves, 14, 18);
+    lower_rows(work, map, both, H, actuators, moves, 18, 22);
     for (a = 0; a < NU; a++) { /* L D L' of R + B' P B, and its inverse */
         for (b = 0; b <= a; b++) {
             real sum = H[first + a][first + b] + (a == b ? effort[a] + (moves ? p->move : R(0.0)) : R(0.0));
@@ -189,10 +208,13 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
         }
     }
     for (r = 0; r < n; r++) { /* A' P A - K' gain, the lower part, then the upper */
+        real less[MOST];
+        for (j = 0; j < n; j++) {
+            less[j] = K[0][r] * gain[j] + K[1][r] * gain[n + j] + K[2][r] * gain[2 * n + j] + K[3][r] * gain[3 * n + j];
+        }
         for (j = 0; j <= r; j++) {
             const real square = r < 3 ? cost[r * n + j] : j < 3 ? both[j][r - 3] : H[r - 3][j - 3];
-            cost[r * n + j] = square - (K[0][r] * gain[j] + K[1][r] * gain[n + j] + K[2][r] * gain[2 * n + j] +
-                                        K[3][r] * gain[3 * n + j]);
+            cost[r * n + j] = square - less[j];
         }
     }
     for (r = 0; r < n; r++) {
@@ -480,19 +502,30 @@ INLINED void cost_at_end(const quadsim_nmpc_work *work, const int n, real *cost,
     }
 }
 
-/* Gains, and the optimum with the held inputs at their bounds and no other bounds. */
-INLINED void optimum_sized(quadsim_nmpc_work *work, const int actuators, const int moves)
+/* Gains, and the optimum with the held inputs at their bounds and no other bounds.  Costs of all nodes' ends but the last
+ * are kept in the responses' memory, [N - 1][n][n + 1], so that the next recursion may start from node `last`: that is
+ * the last node whose held inputs have changed since. */
+INLINED void optimum_sized(quadsim_nmpc_work *work, int last, const int actuators, const int moves)
 {
     const quadsim_nmpc_problem *p = work->p;
-    const int N = p->horizon, n = BODY + actuators + (moves ? NU : 0);
-    real cost[MOST * MOST], g[MOST];
+    const int N = p->horizon, n = BODY + actuators + (moves ? NU : 0), size = n * (n + 1);
+    real *kept = work->response, cost[MOST * MOST], g[MOST];
     int i, j, k;
-    cost_at_end(work, n, cost, g);
-    for (i = N - 1; i >= 0; i--) {
+    if (last < N - 1) {
+        memcpy(cost, kept + last * size, sizeof(real) * (size_t)(n * n));
+        memcpy(g, kept + last * size + n * n, sizeof(real) * (size_t)n);
+    } else {
+        cost_at_end(work, n, cost, g);
+    }
+    for (i = last; i >= 0; i--) {
         real push[NU];
-        for (j = 0; j < n; j++) {
-            for (k = 0; k < BODY; k++) { /* actuators have no offset */
-                g[j] += cost[j * n + k] * work->offset[i * n + k];
+        if (i < last) {
+            memcpy(kept + i * size, cost, sizeof(real) * (size_t)(n * n));
+            memcpy(kept + i * size + n * n, g, sizeof(real) * (size_t)n);
+        }
+        for (k = 0; k < BODY; k++) { /* actuators have no offset */
+            for (j = 0; j < n; j++) {
+                g[j] += cost[k * n + j] * work->offset[i * n + k];
             }
         }
         for (j = 0; j < NU; j++) {
@@ -630,9 +663,9 @@ INLINED void finish_sized(quadsim_nmpc_work *work, const int actuators, const in
     }
 #endif
 
-static void optimum(quadsim_nmpc_work *work)
+static void optimum(quadsim_nmpc_work *work, int last)
 {
-    SIZED(optimum_sized, work)
+    SIZED(optimum_sized, work, last)
 }
 
 static void gradient(quadsim_nmpc_work *work, real *all)
@@ -1060,15 +1093,17 @@ static enum quadsim_nmpc_status search(quadsim_nmpc_work *work)
 /* ---- inputs alone ------------------------------------------------------------------------------------------------ */
 
 /* Hold inputs that leave their bounds, release those whose multipliers have the wrong sign, until there are none: the
- * primal-dual active-set method (Hintermueller, Ito and Kunisch 2002), a Riccati recursion each.  Whether it settled. */
-static int settle(quadsim_nmpc_work *work, int rounds)
+ * primal-dual active-set method (Hintermueller, Ito and Kunisch 2002), a Riccati recursion each, from the last node that
+ * changes.  Where it is `hasty`, it ends as soon as the changes do not get fewer, or are many at first.  Whether it
+ * settled. */
+static int settle(quadsim_nmpc_work *work, int rounds, int hasty)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int size = p->horizon * NU;
-    int i, round;
+    int i, round, last = p->horizon - 1, before = p->horizon + 1;
     for (round = 0; round < rounds; round++) {
-        int changed = 0, any = 0;
-        optimum(work);
+        int changed = 0, any = 0, at = 0;
+        optimum(work, last);
         work->rounds++;
         for (i = 0; i < size; i++) {
             any |= work->held[i];
@@ -1082,16 +1117,23 @@ static int settle(quadsim_nmpc_work *work, int rounds)
             if (side != 0) {
                 if (side > 0 ? work->own[i] > R(0.0) : work->own[i] < R(0.0)) {
                     work->held[i] = 0;
-                    changed = 1;
+                    changed++;
+                    at = i;
                 }
             } else if (input > p->upper[i % NU] + FEASIBLE || input < p->lower[i % NU] - FEASIBLE) {
                 work->held[i] = input > p->upper[i % NU] ? 1 : -1;
-                changed = 1;
+                changed++;
+                at = i;
             }
         }
         if (!changed) {
             return 1;
         }
+        if (hasty && changed >= before) {
+            return 0;
+        }
+        before = changed;
+        last = at / NU;
     }
     return 0;
 }
@@ -1173,13 +1215,6 @@ static void barrier(quadsim_nmpc_work *work, const real *effort, const real *pus
     SIZED(barrier_sized, work, effort, push, factorise, known, v, rows)
 }
 
-/* Steps of a pair of multipliers and of their distances, for a step du of the input towards a centre. */
-static void steps_of(real du, real below, real above, real low, real high, real one, real two, real *dl, real *dh)
-{
-    *dl = (one - low * du) / below - low;
-    *dh = (two + high * du) / above - high;
-}
-
 static real shortened(real share, real now, real step)
 {
     return step < R(0.0) && now < -share * step ? -now / step : share;
@@ -1194,8 +1229,10 @@ static int interior(quadsim_nmpc_work *work, real tolerance, int most)
     const quadsim_nmpc_problem *p = work->p;
     const int size = p->horizon * NU;
     real *u = work->response, *low = u + size, *high = low + size, *effort = high + size, *push = effort + size;
-    real *affine = push + size, *v = affine + size, *known = v + size, mu = NEVER;
-    real start = R(1.0);
+    real *v = push + size, *known = v + size, mu = NEVER;
+    real *below = known + p->horizon * states_of(p), *above = below + size; /* one over distances */
+    real *one = above + size, *two = one + size, *dl = two + size, *dh = dl + size;
+    real start = LEAST_START;
     int i, k, pass;
     for (i = 0; i < size; i++) {
         const real half = work->held[i] != 0 ? R(0.5) * magnitude(work->own[i]) : R(0.0);
@@ -1203,62 +1240,63 @@ static int interior(quadsim_nmpc_work *work, real tolerance, int most)
     }
     for (i = 0; i < size; i++) {
         const real lower = p->lower[i % NU], upper = p->upper[i % NU], gap = upper - lower;
-        u[i] = clipped(work->u[i], lower + R(0.1) * gap, upper - R(0.1) * gap);
+        u[i] = clipped(work->u[i], lower + R(0.3) * gap, upper - R(0.3) * gap);
         low[i] = high[i] = start;
     }
     for (k = 0; k < most && mu > tolerance; k++) {
         real centre = R(0.0), primal = R(1.0), dual = R(1.0), after = R(0.0);
+        mu = R(0.0);
+        for (i = 0; i < size; i++) {
+            const real to_lower = u[i] - p->lower[i % NU], to_upper = p->upper[i % NU] - u[i];
+            mu += to_lower * low[i] + to_upper * high[i];
+            below[i] = R(1.0) / to_lower;
+            above[i] = R(1.0) / to_upper;
+            effort[i] = p->effort[i % NU] + low[i] * below[i] + high[i] * above[i];
+            one[i] = two[i] = R(0.0);
+        }
+        mu /= (real)(2 * size);
         for (pass = 0; pass < 2; pass++) { /* the affine step, then that to the centre, of second order */
-            real *to = pass == 0 ? affine : v;
             for (i = 0; i < size; i++) {
-                const real below = u[i] - p->lower[i % NU], above = p->upper[i % NU] - u[i];
-                real one = R(0.0), two = R(0.0), dl, dh;
-                if (pass == 1) {
-                    const real da = affine[i] - u[i];
-                    steps_of(da, below, above, low[i], high[i], R(0.0), R(0.0), &dl, &dh);
-                    one = centre - da * dl;
-                    two = centre + da * dh;
-                } else {
-                    effort[i] = p->effort[i % NU] + low[i] / below + high[i] / above;
-                }
-                push[i] = -p->effort[i % NU] * work->aim[i] - (effort[i] - p->effort[i % NU]) * u[i] - one / below + two / above;
+                push[i] = -p->effort[i % NU] * work->aim[i] - (effort[i] - p->effort[i % NU]) * u[i] - one[i] * below[i] +
+                          two[i] * above[i];
             }
-            barrier(work, effort, push, pass == 0, known, to, NULL);
+            barrier(work, effort, push, pass == 0, known, v, NULL);
             primal = dual = R(1.0);
             for (i = 0; i < size; i++) {
-                const real below = u[i] - p->lower[i % NU], above = p->upper[i % NU] - u[i], du = to[i] - u[i];
-                real one = R(0.0), two = R(0.0), dl, dh;
-                if (pass == 1) {
-                    const real da = affine[i] - u[i];
-                    steps_of(da, below, above, low[i], high[i], R(0.0), R(0.0), &dl, &dh);
-                    one = centre - da * dl;
-                    two = centre + da * dh;
+                const real du = v[i] - u[i];
+                dl[i] = (one[i] - low[i] * du) * below[i] - low[i];
+                dh[i] = (two[i] + high[i] * du) * above[i] - high[i];
+                /* what steps take of distances and multipliers */
+                primal = -du * below[i] > primal ? -du * below[i] : du * above[i] > primal ? du * above[i] : primal;
+                if (dl[i] < R(0.0) && -dl[i] > dual * low[i]) {
+                    dual = -dl[i] / low[i];
                 }
-                steps_of(du, below, above, low[i], high[i], one, two, &dl, &dh);
-                primal = shortened(shortened(primal, below, du), above, -du);
-                dual = shortened(shortened(dual, low[i], dl), high[i], dh);
-                push[i] = dl;   /* kept for the step */
-                effort[i] = pass == 1 ? dh : effort[i];
+                if (dh[i] < R(0.0) && -dh[i] > dual * high[i]) {
+                    dual = -dh[i] / high[i];
+                }
             }
+            primal = R(1.0) / primal;
+            dual = R(1.0) / dual;
             if (pass == 0) {
-                mu = R(0.0);
                 for (i = 0; i < size; i++) {
-                    const real below = u[i] - p->lower[i % NU], above = p->upper[i % NU] - u[i], du = to[i] - u[i];
-                    real dl, dh;
-                    steps_of(du, below, above, low[i], high[i], R(0.0), R(0.0), &dl, &dh);
-                    mu += below * low[i] + above * high[i];
-                    after += (below + primal * du) * (low[i] + dual * dl) + (above - primal * du) * (high[i] + dual * dh);
+                    const real du = v[i] - u[i];
+                    after += (u[i] - p->lower[i % NU] + primal * du) * (low[i] + dual * dl[i]) +
+                             (p->upper[i % NU] - u[i] - primal * du) * (high[i] + dual * dh[i]);
                 }
-                mu /= (real)(2 * size);
                 after /= (real)(2 * size);
                 centre = (after / mu) * (after / mu) * after;
+                for (i = 0; i < size; i++) {
+                    const real du = v[i] - u[i];
+                    one[i] = centre - du * dl[i];
+                    two[i] = centre + du * dh[i];
+                }
             }
         }
         mu = R(0.0);
         for (i = 0; i < size; i++) {
             u[i] += R(0.995) * primal * (v[i] - u[i]);
-            low[i] += R(0.995) * dual * push[i];
-            high[i] += R(0.995) * dual * effort[i];
+            low[i] += R(0.995) * dual * dl[i];
+            high[i] += R(0.995) * dual * dh[i];
             mu += (u[i] - p->lower[i % NU]) * low[i] + (p->upper[i % NU] - u[i]) * high[i];
         }
         mu /= (real)(2 * size);
@@ -1338,7 +1376,7 @@ static void interior_rows(quadsim_nmpc_work *work)
     real mu = NEVER;
     int i, index, kind, pass, pairs = 0;
     memset(work->held, 0, sizeof(int) * (size_t)(N * NU));
-    optimum(work);
+    optimum(work, work->p->horizon - 1);
     memcpy(next, work->value, sizeof(real) * (size_t)entries);
     memset(weight, 0, sizeof(real) * (size_t)(2 * size));
     memset(own, 0, sizeof(real) * (size_t)(10 * size));
@@ -1448,12 +1486,6 @@ static void interior_rows(quadsim_nmpc_work *work)
     }
 }
 
-/* Whether the responses' memory holds what the interior point method needs. */
-static int lends_room(const quadsim_nmpc_problem *p)
-{
-    return p->room * entries_size(p) >= (long)p->horizon * (7 * NU + states_of(p));
-}
-
 /* Move the active set on by a node. */
 static void shift_active(quadsim_nmpc_work *work)
 {
@@ -1531,7 +1563,7 @@ static enum quadsim_nmpc_status search_held(quadsim_nmpc_work *work)
         for (i = 0; i < size; i++) {
             any |= work->held[i];
         }
-        optimum(work);
+        optimum(work, work->p->horizon - 1);
         work->rounds++;
         status = search(work);
         if (status > QUADSIM_NMPC_BOUNDED) {
@@ -1546,7 +1578,7 @@ static enum quadsim_nmpc_status search_held(quadsim_nmpc_work *work)
         }
     }
     rows_of_held(work);
-    optimum(work);
+    optimum(work, work->p->horizon - 1);
     {
         const enum quadsim_nmpc_status status = search(work);
         if (status == QUADSIM_NMPC_BOUNDED) {
@@ -1560,13 +1592,13 @@ static enum quadsim_nmpc_status search_held(quadsim_nmpc_work *work)
 static int solve_inputs(quadsim_nmpc_work *work)
 {
     real most = FEASIBLE;
-    int settled;
+    int settled, again;
     close_slacks(work);
     add_prices(work);
-    settled = settle(work, MOST_ROUNDS);
-    if (!settled && lends_room(work->p)) {
-        work->inner = interior(work, COMPLEMENTARY, MOST_INNER);
-        settled = settle(work, 2 * MOST_ROUNDS);
+    settled = settle(work, MOST_ROUNDS, 1);
+    for (again = 0; !settled && again < 2; again++) {
+        work->inner += interior(work, again ? AGAIN : COMPLEMENTARY, MOST_INNER);
+        settled = settle(work, 2 * MOST_ROUNDS, 0);
     }
     return settled && worst_row(work, &most) < 0;
 }
