@@ -1,8 +1,9 @@
 /* Sequential quadratic programming: the reference, the start, steps and what is kept of them. */
-#include "quadsim_nmpc_math.h"
+#include "quadsim_nmpc_qp.h"
 
 static const real CONVERGED = R(0.1); /* largest defect of a plan that is kept, with targets */
 static const real SHORTEST = R(0.1);  /* share of a step that Aitken's relaxation takes */
+enum { ROW_INTS = sizeof(quadsim_nmpc_row) / sizeof(int) };
 enum { PATIENCE = 8 }; /* steps without a new shortest one after which the largest share of a step is halved */
 
 /* Memory that is handed out from its start; without reals it is only counted. */
@@ -28,9 +29,8 @@ static long larger_of(long a, long b)
  * numbers of an interior point method. */
 static long responses_size(const quadsim_nmpc_problem *p)
 {
-    const long N = p->horizon, n = states_of(p);
-    const long kept = (N - 1) * n * (n + 1), inner = N * (12 * NU + n);
-    return larger_of(p->room * (N + 1) * entries_of(p), larger_of(kept, inner));
+    const long N = p->horizon, n = states_of(p), kept = (N - 1) * n * (n + 1);
+    return larger_of(p->room * entries_size(p), larger_of(kept, quadsim_nmpc_interior_size(p)));
 }
 
 /* Set a work's arrays of reals. */
@@ -81,7 +81,7 @@ long quadsim_nmpc_reals(const quadsim_nmpc_problem *problem)
 
 long quadsim_nmpc_ints(const quadsim_nmpc_problem *problem)
 {
-    return 2 * problem->room + (problem->slacks + NU) * problem->horizon;
+    return ROW_INTS * problem->room + (problem->slacks + NU) * problem->horizon;
 }
 
 void quadsim_nmpc_start(quadsim_nmpc_work *work, const quadsim_nmpc_problem *problem, quadsim_real *reals, int *ints)
@@ -94,9 +94,8 @@ void quadsim_nmpc_start(quadsim_nmpc_work *work, const quadsim_nmpc_problem *pro
     for (i = 0; i < problem->horizon * problem->faces; i++) {
         work->face[3 * i] = work->face[3 * i + 1] = work->face[3 * i + 2] = work->beyond[i] = R(0.0);
     }
-    work->row = ints;
-    work->slot = work->row + problem->room;
-    work->free = work->slot + problem->room;
+    work->row = (quadsim_nmpc_row *)ints;
+    work->free = ints + ROW_INTS * problem->room;
     work->held = work->free + problem->slacks * problem->horizon;
     quadsim_nmpc_reset(work);
 }
