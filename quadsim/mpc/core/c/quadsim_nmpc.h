@@ -91,7 +91,7 @@ enum quadsim_nmpc_status {
     QUADSIM_NMPC_BOUNDED = 1,     /* the optimum */
     QUADSIM_NMPC_UNCONVERGED = 2, /* an optimum whose plan misses the dynamics by more than it should */
     QUADSIM_NMPC_INFEASIBLE = 3,  /* no plan satisfies all hard bounds */
-    QUADSIM_NMPC_GIVEN_UP = 4,    /* too many changes of the active set */
+    QUADSIM_NMPC_GIVEN_UP = 4,    /* too many changes of the active set, or too much rounding in it */
     QUADSIM_NMPC_NO_ROOM = 5,     /* too many active rows */
     QUADSIM_NMPC_NOT_FINITE = 6
 };

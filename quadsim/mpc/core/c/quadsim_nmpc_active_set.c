@@ -9,7 +9,15 @@
  * its own violation falls by t (a H^-1 a - a H^-1 A' r), and t ends at the first of these: the violation is zero, and the
  * row is active; a multiplier is zero, and its row is dropped; the price of a slack reaches its linear one, and the slack
  * is free.  A free slack adds 1 / q to the products of the rows that share it.  A H^-1 A' is kept as a factor L D L',
- * row by row, of which each change of the set costs O(count^2). */
+ * row by row, of which each change of the set costs O(count^2).
+ *
+ * Where the violation does not fall and no multiplier does, the rows exclude each other, in exact arithmetic.  By rounding
+ * that may only seem so: bounds of inputs alone, for instance, never do.  It is said only with a proof: with the hard rows
+ * of states that take part, and their multipliers y >= 0,
+ *
+ *     sum y (a z - b) > 0  for all inputs within their bounds:  at the present ones, with the gradient in the inputs,
+ *
+ * which holds however y was found. */
 #include "quadsim_nmpc_qp.h"
 
 #ifdef QUADSIM_FLOAT
@@ -173,6 +181,34 @@ static int first_to_open(quadsim_nmpc_work *work, int slack, real multiplier, re
     return opens;
 }
 
+/* Whether the active rows and a violated one, whose multipliers change by -r and 1, exclude each other for all inputs
+ * within their bounds.  The active set is lost. */
+static int is_proven(quadsim_nmpc_work *work, const quadsim_nmpc_row *violated)
+{
+    const quadsim_nmpc_problem *p = work->p;
+    const int size = p->horizon * NU, w = entries_of(p);
+    real least = R(0.0), whole = R(0.0);
+    int i, j;
+    work->row[work->count] = *violated;
+    work->r[work->count] = R(-1.0);
+    work->count++;
+    for (j = 0; j < work->count; j++) {
+        const quadsim_nmpc_row *row = &work->row[j];
+        const int counts = row->kind != QUADSIM_NMPC_INPUT && row->slack < 0 && work->r[j] < R(0.0);
+        work->multiplier[j] = counts ? -work->r[j] : R(0.0);
+        if (counts) {
+            least -= work->r[j] * quadsim_nmpc_violation(work, row, R(0.0));
+            whole -= work->r[j];
+        }
+    }
+    quadsim_nmpc_rows_gradient(work, work->own);
+    for (i = 0; i < size; i++) {
+        const real input = work->value[(long)(i / NU + 1) * w + i % NU], slope = work->own[i];
+        least += slope * ((slope > R(0.0) ? p->lower[i % NU] : p->upper[i % NU]) - input);
+    }
+    return least > FEASIBLE * whole;
+}
+
 /* Make a violated row active, and drop what must go. */
 static enum quadsim_nmpc_status add_row(quadsim_nmpc_work *work, const quadsim_nmpc_row *row)
 {
@@ -207,7 +243,7 @@ static enum quadsim_nmpc_status add_row(quadsim_nmpc_work *work, const quadsim_n
             longest = full;
         }
         if (longest >= NEVER) {
-            return QUADSIM_NMPC_INFEASIBLE;
+            return is_proven(work, row) ? QUADSIM_NMPC_INFEASIBLE : QUADSIM_NMPC_GIVEN_UP;
         }
         multiplier += longest;
         move(work, longest, work->own);

@@ -105,12 +105,16 @@ void quadsim_nmpc_response(quadsim_nmpc_work *work, const quadsim_nmpc_row *row,
 /* The gradient [N][4] in the inputs of the Lagrangian at the optimum, with the active rows' multipliers. */
 void quadsim_nmpc_gradient(quadsim_nmpc_work *work, quadsim_real *gradient);
 
+/* That of the active rows alone, with their multipliers. */
+void quadsim_nmpc_rows_gradient(const quadsim_nmpc_work *work, quadsim_real *gradient);
+
 /* One step of an interior point method, all inputs free; with `factorise` it has new w, else only new c. */
 void quadsim_nmpc_weighted_optimum(quadsim_nmpc_work *work, const quadsim_nmpc_weights *weights, int factorise);
 
 /* ---- quadsim_nmpc_active_set.c ----------------------------------------------------------------------------------- */
 
-/* The optimum from the active set that is there, beside what quadsim_nmpc_optimum has found. */
+/* The optimum from the active set that is there, beside what quadsim_nmpc_optimum has found.  Where it says that there is
+ * none, that is proven for all inputs within their bounds, held or not. */
 enum quadsim_nmpc_status quadsim_nmpc_search(quadsim_nmpc_work *work);
 
 /* ---- quadsim_nmpc_interior.c ------------------------------------------------------------------------------------- */

@@ -46,8 +46,8 @@ INLINED void lower_rows(const quadsim_nmpc_work *work, const real *map, real bot
         real row[WIDE + 1] = {R(0.0)};
         for (k = 0; k < W; k++) {
             const real by = map[k * width + j];
-            for (r = 0; r < past; r++) {
-                row[r] += by * both[k][r];
+            for (r = 0; r < past; r++) { /* rows of `both` are set, whichever columns are */
+                row[r] += by * both[k][r]; /* NOLINT(clang-analyzer-core.UndefinedBinaryOperatorResult) */
             }
         }
         for (k = W; (j >= 7 || p->moments) && k < BODY; k++) {
@@ -174,7 +174,7 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
         }
     }
     for (r = 0; r < n; r++) { /* A' P A - K' gain, the lower part, then the upper */
-        real less[MOST];
+        real less[MOST] = {R(0.0)};
         for (j = 0; j < n; j++) {
             less[j] = K[0][r] * gain[j] + K[1][r] * gain[n + j] + K[2][r] * gain[2 * n + j] + K[3][r] * gain[3 * n + j];
         }
@@ -397,6 +397,25 @@ INLINED void gradient_sized(quadsim_nmpc_work *work, real *gradient, const int a
     }
 }
 
+/* The gradient [N][4] in the inputs of the active rows alone, with their multipliers. */
+INLINED void rows_gradient_sized(const quadsim_nmpc_work *work, real *gradient, const int actuators, const int moves)
+{
+    const int n = BODY + actuators + (moves ? NU : 0);
+    real g[MOST] = {R(0.0)};
+    int i, j;
+    for (i = work->p->horizon - 1; i >= 0; i--) {
+        real sum[MOST + 2] = {R(0.0)}, push[NU] = {R(0.0)};
+        quadsim_nmpc_add_active_gradients(work, i, push, g);
+        carry_back(work, i, actuators, moves, g, sum);
+        for (j = 0; j < NU; j++) {
+            gradient[i * NU + j] = sum[n - 3 + j] + push[j];
+        }
+        for (j = 0; j < n - 3; j++) {
+            g[3 + j] = sum[j];
+        }
+    }
+}
+
 /* The optimum with the active rows' multipliers. */
 INLINED void add_multipliers_sized(quadsim_nmpc_work *work, const int actuators, const int moves)
 {
@@ -544,6 +563,11 @@ void quadsim_nmpc_response(quadsim_nmpc_work *work, const quadsim_nmpc_row *row,
 void quadsim_nmpc_gradient(quadsim_nmpc_work *work, quadsim_real *gradient)
 {
     SIZED(gradient_sized, work, gradient)
+}
+
+void quadsim_nmpc_rows_gradient(const quadsim_nmpc_work *work, quadsim_real *gradient)
+{
+    SIZED(rows_gradient_sized, work, gradient)
 }
 
 void quadsim_nmpc_weighted_optimum(quadsim_nmpc_work *work, const quadsim_nmpc_weights *weights, int factorise)

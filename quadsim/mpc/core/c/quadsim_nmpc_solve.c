@@ -151,7 +151,7 @@ static enum quadsim_nmpc_status search_held(quadsim_nmpc_work *work)
         work->rounds++;
         status = quadsim_nmpc_search(work);
         if (status > QUADSIM_NMPC_BOUNDED) {
-            if (!any) {
+            if (!any || status == QUADSIM_NMPC_INFEASIBLE) {
                 return status;
             }
             break; /* perhaps of the held inputs */
