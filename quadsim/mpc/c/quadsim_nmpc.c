@@ -1,90 +1,101 @@
 /* Sequential quadratic programming: the reference, the start, steps and what is kept of them. */
-#include "quadsim_nmpc_math.h"
+#include "quadsim_nmpc_qp.h"
 
 static const real CONVERGED = R(0.1); /* largest defect of a plan that is kept, with targets */
 static const real SHORTEST = R(0.1);  /* share of a step that Aitken's relaxation takes */
+enum { ROW_INTS = sizeof(quadsim_nmpc_row) / sizeof(int) };
 enum { PATIENCE = 8 }; /* steps without a new shortest one after which the largest share of a step is halved */
 
-/* Sizes of a work's arrays of reals, in the order of its pointers. */
-enum { ARRAYS = 31 };
+/* Memory that is handed out from its start; without reals it is only counted. */
+typedef struct memory {
+    real *reals;
+    long count;
+} memory;
 
-static void sizes_of(const quadsim_nmpc_problem *p, long sizes[ARRAYS])
+static void take(memory *from, real **array, long size)
+{
+    if (from->reals != NULL) {
+        *array = from->reals + from->count;
+    }
+    from->count += size;
+}
+
+static long larger_of(long a, long b)
+{
+    return a > b ? a : b;
+}
+
+/* Reals that the responses' memory has room for: the responses of all rows, the costs that a recursion keeps, or the
+ * numbers of an interior point method. */
+static long responses_size(const quadsim_nmpc_problem *p)
+{
+    const long N = p->horizon, n = states_of(p), kept = (N - 1) * n * (n + 1);
+    return larger_of(p->room * entries_size(p), larger_of(kept, quadsim_nmpc_interior_size(p)));
+}
+
+/* Set a work's arrays of reals. */
+static void take_arrays(const quadsim_nmpc_problem *p, quadsim_nmpc_work *work, memory *from)
 {
     const long N = p->horizon, n = states_of(p), room = p->room, w = entries_of(p), width = columns_of((int)n);
     const int iterates = p->iterations > 1 || p->targets;
-    const long all[ARRAYS] = {(N + 1) * n,
-                              N * NU,
-                              (N + 1) * 4,
-                              (N + 1) * n,
-                              N * NU,
-                              N * p->faces * 3,
-                              N * p->faces,
-                              N * BODY * width,
-                              N * n,
-                              N * n,
-                              p->tilts ? N * 8 : 0,
-                              p->tilts ? N * 2 : 0,
-                              N * NU * n,
-                              N * NU * NU,
-                              N * NU,
-                              N * NU,
-                              (N + 1) * n,
-                              N * NU,
-                              (N + 1) * w,
-                              (N + 1) * w,
-                              room * (N + 1) * w,
-                              room * (room + 1) / 2,
-                              room,
-                              room,
-                              room,
-                              N * p->slacks,
-                              N * p->slacks,
-                              N * p->slacks,
-                              iterates ? (N + 1) * n : 0,
-                              iterates ? N * NU : 0,
-                              iterates ? N * NU : 0};
-    memcpy(sizes, all, sizeof all);
+    take(from, &work->x, (N + 1) * n);
+    take(from, &work->u, N * NU);
+    take(from, &work->frame, (N + 1) * 4);
+    take(from, &work->goal, (N + 1) * n);
+    take(from, &work->aim, N * NU);
+    take(from, &work->face, N * p->faces * 3);
+    take(from, &work->beyond, N * p->faces);
+    take(from, &work->map, N * BODY * width);
+    take(from, &work->offset, N * n);
+    take(from, &work->end, N * n);
+    take(from, &work->axis, p->tilts ? N * 8 : 0);
+    take(from, &work->known, p->tilts ? N * 2 : 0);
+    take(from, &work->gain, N * NU * n);
+    take(from, &work->inverse, N * NU * NU);
+    take(from, &work->feed, N * NU);
+    take(from, &work->more, N * NU);
+    take(from, &work->s, (N + 1) * n);
+    take(from, &work->v, N * NU);
+    take(from, &work->value, (N + 1) * w);
+    take(from, &work->own, (N + 1) * w);
+    take(from, &work->response, responses_size(p));
+    take(from, &work->factor, room * (room + 1) / 2);
+    take(from, &work->multiplier, room);
+    take(from, &work->r, room);
+    take(from, &work->d, room);
+    take(from, &work->price, N * p->slacks);
+    take(from, &work->rate, N * p->slacks);
+    take(from, &work->origin, N * p->slacks);
+    take(from, &work->x_before, iterates ? (N + 1) * n : 0);
+    take(from, &work->u_before, iterates ? N * NU : 0);
+    take(from, &work->last, iterates ? N * NU : 0);
 }
 
 long quadsim_nmpc_reals(const quadsim_nmpc_problem *problem)
 {
-    long sizes[ARRAYS], sum = 0;
-    int i;
-    sizes_of(problem, sizes);
-    for (i = 0; i < ARRAYS; i++) {
-        sum += sizes[i];
-    }
-    return sum;
+    memory counted = {NULL, 0};
+    quadsim_nmpc_work unused;
+    take_arrays(problem, &unused, &counted);
+    return counted.count;
 }
 
 long quadsim_nmpc_ints(const quadsim_nmpc_problem *problem)
 {
-    return 2 * problem->room + (problem->slacks + NU) * problem->horizon;
+    return ROW_INTS * problem->room + (problem->slacks + NU) * problem->horizon;
 }
 
 void quadsim_nmpc_start(quadsim_nmpc_work *work, const quadsim_nmpc_problem *problem, quadsim_real *reals, int *ints)
 {
-    quadsim_real **const arrays[ARRAYS] = {
-        &work->x,        &work->u,       &work->frame, &work->goal,   &work->aim,        &work->face,
-        &work->beyond,   &work->map,     &work->offset, &work->end,   &work->axis,       &work->known,
-        &work->gain,     &work->inverse, &work->feed,  &work->more,   &work->s,          &work->v,
-        &work->value,    &work->own,     &work->response, &work->factor, &work->multiplier, &work->r,
-        &work->d,        &work->price,   &work->rate,  &work->origin, &work->x_before, &work->u_before, &work->last};
-    long sizes[ARRAYS];
+    memory from = {reals, 0};
     int i;
     memset(work, 0, sizeof *work);
     work->p = problem;
-    sizes_of(problem, sizes);
-    for (i = 0; i < ARRAYS; i++) {
-        *arrays[i] = reals;
-        reals += sizes[i];
-    }
+    take_arrays(problem, work, &from);
     for (i = 0; i < problem->horizon * problem->faces; i++) {
         work->face[3 * i] = work->face[3 * i + 1] = work->face[3 * i + 2] = work->beyond[i] = R(0.0);
     }
-    work->row = ints;
-    work->slot = work->row + problem->room;
-    work->free = work->slot + problem->room;
+    work->row = (quadsim_nmpc_row *)ints;
+    work->free = ints + ROW_INTS * problem->room;
     work->held = work->free + problem->slacks * problem->horizon;
     quadsim_nmpc_reset(work);
 }

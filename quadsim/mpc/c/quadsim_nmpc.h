@@ -91,10 +91,29 @@ enum quadsim_nmpc_status {
     QUADSIM_NMPC_BOUNDED = 1,     /* the optimum */
     QUADSIM_NMPC_UNCONVERGED = 2, /* an optimum whose plan misses the dynamics by more than it should */
     QUADSIM_NMPC_INFEASIBLE = 3,  /* no plan satisfies all hard bounds */
-    QUADSIM_NMPC_GIVEN_UP = 4,    /* too many changes of the active set */
+    QUADSIM_NMPC_GIVEN_UP = 4,    /* too many changes of the active set, or too much rounding in it */
     QUADSIM_NMPC_NO_ROOM = 5,     /* too many active rows */
     QUADSIM_NMPC_NOT_FINITE = 6
 };
+
+/* What a row bounds. */
+enum quadsim_nmpc_kind {
+    QUADSIM_NMPC_INPUT,
+    QUADSIM_NMPC_TILT,   /* the thrust axis, by a side of the polygon */
+    QUADSIM_NMPC_RATE,   /* body rates */
+    QUADSIM_NMPC_STATED, /* what the caller states */
+    QUADSIM_NMPC_FACE,   /* a position, by a half-space */
+    QUADSIM_NMPC_SLACK   /* at least zero */
+};
+
+/* A row of a program. */
+typedef struct quadsim_nmpc_row {
+    int node;
+    int kind;  /* of enum quadsim_nmpc_kind */
+    int index; /* of the input, side, axis, stated row, half-space or slack */
+    int sign;  /* 1: an upper bound; -1: a lower one */
+    int slack; /* which one it has of all nodes' [N][slacks]; -1: none */
+} quadsim_nmpc_row;
 
 typedef struct quadsim_nmpc_work {
     const quadsim_nmpc_problem *p;
@@ -122,11 +141,13 @@ typedef struct quadsim_nmpc_work {
     quadsim_real *gain, *inverse, *feed, *more; /* [N][4][n], [N][16], [N][4], [N][4] */
     quadsim_real *s, *v;                   /* the optimum [N+1][n], [N][4]; quaternions in their frames */
     quadsim_real *value;                   /* [N+1][w] of entries at the present multipliers, those before first */
-    quadsim_real *own, *response;          /* [N+1][w]; [room][N+1][w] */
+    quadsim_real *own, *response;          /* [N+1][w]; [room][N+1][w], or what the recursion and the interior point
+                                            * method keep there */
     quadsim_real *factor, *multiplier, *r, *d; /* L D L' of the active rows, row by row; [room] each */
     quadsim_real *price, *rate, *origin;   /* [N][slacks] sums of multipliers, and of their slopes; see the search */
     quadsim_real *x_before, *u_before, *last; /* the plan before a step, and [N][4] the step before; or candidates */
-    int *row, *slot, *free;                /* [room] each; [N][slacks] whether a slack may be positive */
+    quadsim_nmpc_row *row;                 /* [room] active rows */
+    int *free;                             /* [N][slacks] whether a slack may be positive */
     int *held;                             /* [N][4] inputs at bounds: 1 above, -1 below */
 } quadsim_nmpc_work;
 

@@ -25,7 +25,9 @@ from quadsim.mpc.solvers.core_tables import NO_BOUND
 FILES: Final = (
     *SHARED_FILES,
     *("quadsim_ramp.h", "quadsim_ramp.c", "quadsim_nmpc.h", "quadsim_nmpc_math.h", "quadsim_nmpc.c"),
-    *("quadsim_nmpc_model.c", "quadsim_nmpc_qp.c", "quadsim_nonlinear.h", "quadsim_nonlinear.c"),
+    *("quadsim_nmpc_model.c", "quadsim_nmpc_qp.h", "quadsim_nmpc_rows.c", "quadsim_nmpc_riccati.c"),
+    *("quadsim_nmpc_active_set.c", "quadsim_nmpc_interior.c", "quadsim_nmpc_solve.c"),
+    *("quadsim_nonlinear.h", "quadsim_nonlinear.c"),
 )
 """Files of `quadsim/mpc/c` to export verbatim."""
 ROWS_PER_NODE: Final = 2.0

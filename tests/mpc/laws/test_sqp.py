@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -254,6 +255,33 @@ def test_an_infeasible_program_is_refused_and_stated() -> None:
     backend.setup(qp)
     assert backend.solve(qp).status != SOLVED
     assert call(controller, at_rest(), PERIOD).status in OPTIMAL
+
+
+def test_bounds_of_inputs_alone_are_never_infeasible() -> None:
+    """Far off, a plan may diverge so that its program is lost in rounding: then the search is given up."""
+    rng, statuses = np.random.default_rng(0), Counter[str]()
+    controller = NonlinearMPC(VEHICLE, period=0.1, settings=Nonlinear(horizon=10))
+    for k in range(100):
+        statuses[call(controller, thrown(rng, 10.0), 0.1 * k).status] += 1
+    assert statuses.keys() <= {*ACCEPTED, "max_iterations", "invalid_data"}
+    assert statuses["not_converged"] > 50
+
+
+def test_infeasible_programs_have_no_solution_for_another_solver() -> None:
+    """Beyond hard bounds, near and far: rows that only seem to exclude each other are no reason."""
+    backend, refused = DaqpDense(), 0
+    for settings in (MANY["polytopes"], MANY["drag"]):
+        rng, controller = np.random.default_rng(0), law(**settings)
+        for k in range(40):
+            if call(controller, thrown(rng, 1.0 + k % 3), k * PERIOD).status != "primal_infeasible":
+                continue
+            kept = controller.infeasible_period
+            assert kept is not None
+            qp = dense_qp(kept.problem, _period(kept.query))
+            backend.setup(qp)
+            assert backend.solve(qp).status != SOLVED
+            refused += 1
+    assert refused > 10
 
 
 def _period(query: Query) -> Period:

@@ -27,7 +27,16 @@ _CURVATURE: Final = 1e-5
 """Curvature of a price without one, about the optimum that the core iterates for, per l1."""
 _OWN_SLACKS: Final = {"tilt": 0, "body_rates": 1, "space": 2}
 """Slacks of a node by the constraints that have them; those of all others follow."""
-_TILT_SIDES: Final = constant("QUADSIM_NMPC_SIDES")
+_NAMES: Final = {
+    constant("QUADSIM_NMPC_INPUT"): "inputs",
+    constant("QUADSIM_NMPC_TILT"): "tilt",
+    constant("QUADSIM_NMPC_RATE"): "body_rates",
+}
+"""The constraint of a row by its kind in the core."""
+_STATED: Final = constant("QUADSIM_NMPC_STATED")
+_FACE: Final = constant("QUADSIM_NMPC_FACE")
+_ROW_MEMBERS: Final = 5
+"""Integers of a row in the core: node, kind, index, sign and slack."""
 OWN_NAMES: Final = ("inputs", "tilt", "body_rates")
 """Constraints whose rows the core has by themselves."""
 
@@ -182,7 +191,7 @@ class SQP:
         self._origin = self._view("origin", N, p.slacks)
         self._price, self._own = self._view("price", N, p.slacks), self._view("own", N, N_ROTORS)
         self._multiplier = self._view("multiplier", p.room)
-        self._row = self._view("row", p.room, kind=ctypes.c_int)
+        self._row = self._view("row", p.room, _ROW_MEMBERS, kind=ctypes.c_int)
         self._free = self._view("free", N, p.slacks, kind=ctypes.c_int)
         self._held = self._view("held", N, N_ROTORS, kind=ctypes.c_int)
         self._measured, self._before = arrays[:2]
@@ -346,24 +355,17 @@ class SQP:
 
         Those of half-spaces begin at column `faces_from`.
         """
-        p, found = self.struct, np.zeros((self.horizon, rows))
-        stated = 2 * N_ROTORS + _TILT_SIDES + 6
-        kinds = stated + p.rows + p.faces + p.slacks
+        found = np.zeros((self.horizon, rows))
         starts = self._numbers
         for row, by in zip(self._row[: self._work.count].tolist(), self._multiplier.tolist(), strict=False):
-            node, kind = divmod(row, kinds)
-            if kind < 2 * N_ROTORS:
-                found[node, starts["inputs"] + kind % N_ROTORS] += by if kind < N_ROTORS else -by
-            elif kind < 2 * N_ROTORS + _TILT_SIDES:
-                found[node, starts["tilt"] + kind - 2 * N_ROTORS] += by
-            elif kind < stated:
-                turn = kind - 2 * N_ROTORS - _TILT_SIDES
-                found[node, starts["body_rates"] + turn % 3] += by if turn < 3 else -by
-            elif kind < stated + p.rows:
-                index, side = self._rows[kind - stated].of
-                found[node, index] += side * by * self._scale[index]
-            elif kind < stated + p.rows + p.faces and faces_from is not None:
-                found[node, faces_from + kind - stated - p.rows] -= by
+            node, kind, index, sign, _ = row
+            if kind in _NAMES:
+                found[node, starts[_NAMES[kind]] + index] += sign * by
+            elif kind == _STATED:
+                number, side = self._rows[index].of
+                found[node, number] += side * by * self._scale[number]
+            elif kind == _FACE and faces_from is not None:
+                found[node, faces_from + index] -= by
         at = starts["inputs"]
         found[:, at : at + N_ROTORS] -= np.where(self._held != 0, self._own, 0.0)
         return 2.0 * found  # of the cost, of which the core minimises half
