@@ -1,4 +1,4 @@
-/* Steps of a controller from arbitrary bytes, for libFuzzer: for any input, the command is finite and within every
+/* Steps of a controller from arbitrary bytes, for libFuzzer: for any input, command and plan are finite and within every
  * bound, the status and the fallback level belong together, and the active set changes no more often than it may. */
 #include <stdint.h>
 #include <stdio.h>
@@ -61,6 +61,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     quadsim_law *law = malloc(sizeof *law); /* on the heap, where the sanitizer sees both of its ends */
     quadsim_memory *memory = malloc(sizeof *memory);
     real *reference = malloc(sizeof(real) * QUADSIM_ROWS * QUADSIM_ROW);
+    real *plan = malloc(sizeof(real) * QUADSIM_HORIZON * 4);
     real command[4];
     int i, j;
     if (!registered) {
@@ -115,7 +116,19 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
                         "bounds on steps of speeds");
             }
         }
+        quadsim_guard_plan(&law->guard, plan);
+        require(is_finite(plan, QUADSIM_HORIZON * 4), "a finite plan");
+        for (j = 0; j < QUADSIM_HORIZON * 4; j++) {
+            const int input = j % 4;
+            const real last = j < 4 ? command[input] : plan[j - 4]; /* the plan begins with the command */
+            const real step = plan[j] - last, rounding = R(0.1);
+            require(j >= 4 || is_equal(step, R(0.0)), "a plan of the command");
+            require(plan[j] >= fallback->least[input] && plan[j] <= fallback->most[input], "bounds on planned speeds");
+            require(step >= fallback->step_least[input] - rounding && step <= fallback->step_most[input] + rounding,
+                    "bounds on planned steps of speeds");
+        }
     }
+    free(plan);
     free(reference);
     free(memory);
     free(law);

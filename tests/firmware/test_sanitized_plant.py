@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,7 +17,12 @@ MOTION_CAPTURE = {
     **{"sensors.position.rate": 100.0, "sensors.position.noise": 0.01},
     **{"sensors.attitude.rate": 100.0, "sensors.attitude.noise": 0.26, "estimator.type": "error_state"},
 }
-FLIGHTS = {
+LOST = [
+    {"type": "sensor_fault", "sensor": "position", "fault": "nan", "at": 0.5, "duration": 2.0},
+    {"type": "controller", "at": 0.6, "fields": {"horizon": 20}},
+    {"type": "controller", "at": 1.5, "fields": {"horizon": 60}},
+]
+FLIGHTS: dict[str, dict[str, Any]] = {
     "paper-constrained": {"controller.compiled": True, "duration": 2.0},
     "robust": {"controller.compiled": True, "duration": 2.0, **NEAR_GROUND},
     "autopilot": {"duration": 1.0, **MOTION_CAPTURE},
@@ -29,9 +35,11 @@ FLIGHTS = {
     "inverted-start": {"controller.iterations": 3, "duration": 1.0},
     "corridor": {"duration": 7.0},
     "torrente-loop8-all": {"duration": 1.0},
+    "robust-heavy": {"duration": 3.0, "controller.fallback": {"unseen": 0.3, "hover": 0.5}, "events": LOST},
 }
 """Among them every effect, both integrators, the autopilot, INDI, the filter, sensor faults and obstacles that move; of
-nonlinear MPC targets and rotors, lag, moves, slews, soft rows, half-spaces and drag."""
+nonlinear MPC targets and rotors, lag, moves, slews, soft rows, half-spaces and drag; and a fallback that is handed
+over."""
 FLY = """
 import ctypes, sys
 import quadsim.core.library as core

@@ -360,7 +360,7 @@ static int follow_plan(quadsim_guard *g, int lost, real *command)
 static void hover_command(const quadsim_fallback *f, const quadsim_trim *trim, const real heading[2], const real *state,
                           const real *target, const real *before, real *command)
 {
-    real error[12], level[2];
+    real error[12] = {R(0.0)}, level[2];
     int i;
     for (i = 0; i < 12; i++) {
         error[i] = state[i] - target[i];

@@ -59,6 +59,7 @@ from quadsim.vehicle import N_ROTORS
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """Exceptions of numerics and compiled back ends.  Programming errors (`TypeError`, `KeyError`, ...) end the run."""
 _MISTAKES: Final = (NotImplementedError, RecursionError)  # subclasses of `RuntimeError` that are programming errors
+_CALLED: Final = 0  # QUADSIM_FREE, by which the C wants the law to be called
 _ANSWERED: Final = STATUSES.index(COMMANDED)
 _FAILED: Final = STATUSES.index(INVALID_DATA)
 _LOST: Final = STATUSES.index("state_unknown")
@@ -127,8 +128,10 @@ class Guard:
         """
         self._fit(law.horizon)
         code = self._begin(law, now, state, reference)
-        status, answer, plan = STATUSES[code], None, self._kept
-        if code == 0:
+        status = STATUSES[code]
+        answer: Command | None = None
+        plan = self._kept
+        if code == _CALLED:
             status, answer = self._call(law, now, reference)
             code = _LOST if status == STATUSES[_LOST] else _FAILED
         if answer is not None and status in ACCEPTED:
@@ -190,7 +193,7 @@ class Guard:
         self._rest_twist[:] = trim.twist
 
     def _begin(self, law: Controller, now: StepInputs, state: Array, reference: Array) -> int:
-        """Complete the state; return the status for which the law is not to be called, or 0."""
+        """Complete the state; return the status for which the law is not to be called, or `_CALLED`."""
         measured = _numbers(state, (N_STATES,))
         path = _numbers(reference, (law.horizon, len(REFERENCE_STATES)))
         acting = _numbers(now.acting, (N_ROTORS,))
