@@ -23,15 +23,15 @@ static const real INSIDE = R(0.3);   /* share of an input's range from its bound
 /* Numbers of each row; those of inputs are first, upper ones [N][4], then lower ones [N][4], those of states
  * [N][quadsim_nmpc_state_rows] follow.  A row of states that is not bounded has t = 0. */
 typedef struct inner {
-    int inputs, rows, count; /* N 4; rows of states; all */
-    real *t, *by;            /* distance, and multiplier */
-    real *inverse;           /* 1 / t */
-    real *aim;               /* m - p */
-    real *dt, *dby;
-    /* of rows of states: */
-    real *e, *nu;            /* slack, and its multiplier; 0 of a hard row */
-    real *aim_slack;         /* m - r */
-    real *de, *dnu;
+    int inputs, rows, count; /* N 4; rows of states; rows of both */
+    int pairs;               /* of distances, or slacks, and their multipliers */
+    real *t, *by;            /* [count] distance, and multiplier */
+    real *inverse;           /* [count] 1 / t */
+    real *aim;               /* [count] m - p */
+    real *dt, *dby;          /* [count] steps */
+    real *e, *nu;            /* [rows] slack, and its multiplier; 0 of a hard row */
+    real *aim_slack;         /* [rows] m - r */
+    real *de, *dnu;          /* [rows] steps */
     quadsim_nmpc_weights weights;
 } inner;
 
@@ -112,14 +112,17 @@ static void start_inputs(const quadsim_nmpc_work *work, inner *at)
         at->t[size + i] = input - lower;
         at->by[i] = at->by[size + i] = start;
     }
+    memset(at->dt, 0, sizeof(real) * (size_t)(2 * size));
+    memset(at->dby, 0, sizeof(real) * (size_t)(2 * size));
+    at->pairs = 2 * size;
 }
 
-/* Rows of states start from the present entries; returns how many pairs of distances and multipliers they have. */
-static int start_states(const quadsim_nmpc_work *work, inner *at)
+/* Rows of states start from the present entries. */
+static void start_states(const quadsim_nmpc_work *work, inner *at)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int kinds = quadsim_nmpc_state_rows(p), first = 2 * at->inputs;
-    int node, k, i = 0, pairs = 0;
+    int node, k, i = 0;
     for (node = 0; at->rows > 0 && node < p->horizon; node++) {
         for (k = 0; k < kinds; k++, i++) {
             real *t = at->t + first + i, *by = at->by + first + i, most, least, beyond;
@@ -135,19 +138,18 @@ static int start_states(const quadsim_nmpc_work *work, inner *at)
             }
             beyond = quadsim_nmpc_product(work, &row, work->value) - most;
             *by = R(1.0);
-            pairs++;
+            at->pairs++;
             if (row.slack >= 0) {
                 const real l = quadsim_nmpc_linear_price(work, row.slack);
                 *by = l < R(2.0) ? R(0.5) * l : R(1.0);
                 at->e[i] = beyond > R(0.0) ? beyond + least : least;
                 at->nu[i] = l + quadsim_nmpc_quadratic_price(p, row.slack) * at->e[i] - *by;
                 beyond -= at->e[i];
-                pairs++;
+                at->pairs++;
             }
             *t = beyond < -least ? -beyond : least;
         }
     }
-    return pairs;
 }
 
 /* The weights with which the next step leads towards the aims. */
@@ -178,7 +180,8 @@ static void set_weights(const quadsim_nmpc_work *work, const inner *at)
             slope = at->aim[j] * at->inverse[j] + at->by[j] - weight * quadsim_nmpc_bound(work, &row);
             if (row.slack >= 0) {
                 const real curvature = quadsim_nmpc_quadratic_price(p, row.slack) + at->nu[i] / at->e[i];
-                const real from = at->aim_slack[i] / at->e[i] + at->nu[i] - quadsim_nmpc_linear_price(work, row.slack);
+                const real l = quadsim_nmpc_linear_price(work, row.slack);
+                const real from = at->aim_slack[i] / at->e[i] + at->nu[i] - l;
                 const real share = R(1.0) / (R(1.0) + weight / curvature);
                 slope = (slope - weight * from / curvature) * share;
                 weight *= share;
@@ -216,7 +219,8 @@ static void find_steps(const quadsim_nmpc_work *work, const inner *at)
             z = quadsim_nmpc_product(work, &row, weights->entries);
             by = weights->weight[i] * z + weights->slope[i];
             if (row.slack >= 0) {
-                const real l = quadsim_nmpc_linear_price(work, row.slack), q = quadsim_nmpc_quadratic_price(p, row.slack);
+                const real l = quadsim_nmpc_linear_price(work, row.slack);
+                const real q = quadsim_nmpc_quadratic_price(p, row.slack);
                 const real from = at->aim_slack[i] / at->e[i] + at->nu[i] - l;
                 e = (from + by) / (q + at->nu[i] / at->e[i]);
                 at->de[i] = e - at->e[i];
@@ -240,15 +244,18 @@ static real longest(real share, const real *numbers, const real *steps, int coun
     return share;
 }
 
-/* The sum of the products of numbers after shares of their steps. */
-static real products(const real *a, const real *da, real share_a, const real *b, const real *db, real share_b, int count)
+/* The mean product of distances and slacks and their multipliers, after these shares of their steps. */
+static real mean_product(const inner *at, real primal, real dual)
 {
-    real sum = R(0.0);
+    real sum = R(0.0), of_slacks = R(0.0);
     int i;
-    for (i = 0; i < count; i++) {
-        sum += (a[i] + share_a * da[i]) * (b[i] + share_b * db[i]);
+    for (i = 0; i < at->count; i++) {
+        sum += (at->t[i] + primal * at->dt[i]) * (at->by[i] + dual * at->dby[i]);
     }
-    return sum;
+    for (i = 0; i < at->rows; i++) {
+        of_slacks += (at->e[i] + primal * at->de[i]) * (at->nu[i] + dual * at->dnu[i]);
+    }
+    return (sum + of_slacks) / (real)at->pairs;
 }
 
 static void move_by(real *numbers, real share, const real *steps, int count)
@@ -289,12 +296,11 @@ int quadsim_nmpc_interior(quadsim_nmpc_work *work, int of_states, quadsim_real t
 {
     inner at = lay_out(work, of_states);
     const int count = at.count, rows = at.rows;
-    int i, k, pass, pairs;
+    int i, k, pass;
     real mu;
     start_inputs(work, &at);
-    pairs = 2 * at.inputs + start_states(work, &at);
-    mu = products(at.t, at.t, R(0.0), at.by, at.by, R(0.0), count) + products(at.e, at.e, R(0.0), at.nu, at.nu, R(0.0), rows);
-    mu /= (real)pairs;
+    start_states(work, &at);
+    mu = mean_product(&at, R(0.0), R(0.0));
     for (k = 0; k < most && mu > tolerance; k++) {
         real primal = R(1.0), dual = R(1.0), after, centre;
         for (i = 0; i < count; i++) {
@@ -313,9 +319,7 @@ int quadsim_nmpc_interior(quadsim_nmpc_work *work, int of_states, quadsim_real t
             if (pass > 0) {
                 break;
             }
-            after = products(at.t, at.dt, primal, at.by, at.dby, dual, count) +
-                    products(at.e, at.de, primal, at.nu, at.dnu, dual, rows);
-            after /= (real)pairs;
+            after = mean_product(&at, primal, dual);
             centre = (after / mu) * (after / mu) * after;
             for (i = 0; i < count; i++) {
                 at.aim[i] = centre - at.dt[i] * at.dby[i];
@@ -330,8 +334,7 @@ int quadsim_nmpc_interior(quadsim_nmpc_work *work, int of_states, quadsim_real t
         move_by(at.by, dual, at.dby, count);
         move_by(at.e, primal, at.de, rows);
         move_by(at.nu, dual, at.dnu, rows);
-        mu = products(at.t, at.t, R(0.0), at.by, at.by, R(0.0), count) + products(at.e, at.e, R(0.0), at.nu, at.nu, R(0.0), rows);
-        mu /= (real)pairs;
+        mu = mean_product(&at, R(0.0), R(0.0));
     }
     keep_active(work, &at);
     return k;

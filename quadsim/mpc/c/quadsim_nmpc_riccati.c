@@ -71,8 +71,8 @@ INLINED void lower_rows(const quadsim_nmpc_work *work, const real *map, real bot
 
 /* One node backwards: from P of the next state to that of this one, without its own weight, and the gains.  Inputs that
  * are held at a bound do not answer; what they do, by g, is known. */
-INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, const int moves, const real *effort, const int *held,
-                          real *cost, real *g)
+INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, const int moves, const real *effort,
+                          const int *held, real *cost, real *g)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int followers = actuators + (moves ? NU : 0), n = BODY + followers, width = (n + 2) & ~1, first = n - 3;
@@ -211,8 +211,8 @@ INLINED void carry_back(const quadsim_nmpc_work *work, int i, const int actuator
 }
 
 /* The feed of a node from the gradient g of the next state and push of the inputs; then that of this state. */
-INLINED void backward_node(const quadsim_nmpc_work *work, int i, const int actuators, const int moves, const real *push, real *g,
-                           real *feed)
+INLINED void backward_node(const quadsim_nmpc_work *work, int i, const int actuators, const int moves,
+                           const real *push, real *g, real *feed)
 {
     const int n = BODY + actuators + (moves ? NU : 0);
     const real *gain = work->gain + i * NU * n, *inverse = work->inverse + i * NU * NU;
@@ -342,7 +342,8 @@ INLINED void optimum_sized(quadsim_nmpc_work *work, int last, const int actuator
 }
 
 /* The response [N+1][w] of all entries to a row: H^-1 a. */
-INLINED void response_sized(quadsim_nmpc_work *work, const quadsim_nmpc_row *row, real *response, const int actuators, const int moves)
+INLINED void response_sized(quadsim_nmpc_work *work, const quadsim_nmpc_row *row, real *response, const int actuators,
+                            const int moves)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int N = p->horizon, n = BODY + actuators + (moves ? NU : 0), node = row->node;
@@ -439,8 +440,8 @@ INLINED void add_multipliers_sized(quadsim_nmpc_work *work, const int actuators,
 }
 
 /* Add the weights of the rows of states to the cost of the state at a node's end. */
-INLINED void weigh_rows(const quadsim_nmpc_work *work, int i, const int n, const quadsim_nmpc_weights *weights, int factorise,
-                        real *cost, real *g)
+INLINED void weigh_rows(const quadsim_nmpc_work *work, int i, const int n, const quadsim_nmpc_weights *weights,
+                        int factorise, real *cost, real *g)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int rows = quadsim_nmpc_state_rows(p);

@@ -198,7 +198,8 @@ static enum quadsim_nmpc_status solve_again(quadsim_nmpc_work *work)
         real changed = R(0.0);
         for (i = 0; i < p->horizon * p->slacks; i++) {
             if (!(p->quadratic[i % p->slacks] > R(0.0))) {
-                const real slack = quadsim_nmpc_slack_value(work, i), change = CURVATURE * magnitude(slack - work->origin[i]);
+                const real slack = quadsim_nmpc_slack_value(work, i);
+                const real change = CURVATURE * magnitude(slack - work->origin[i]);
                 work->origin[i] = slack;
                 changed = change > changed ? change : changed;
             }
