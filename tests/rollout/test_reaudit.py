@@ -203,6 +203,7 @@ def test_a_run_of_a_solver_that_was_removed_says_so(runs: Path, capsys: pytest.C
     text = scenario.read_text()
     assert text.count('# solver = "piqp"') == 1
     scenario.write_text(text.replace('# solver = "piqp"', 'solver = "piqp-multistage-1"'))
+    rehash(runs / "good", rundir.SCENARIO_FILE)
     message = "controller.solver: the solver 'piqp-multistage-1' was removed: use 'piqp-multistage'"
     with pytest.raises(InputError, match=message):
         quadsim.read(runs / "good")
