@@ -6,6 +6,7 @@ import importlib.util
 import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,6 +96,30 @@ def test_the_unconstrained_optimum_is_tried_first_unless_size_or_rounding_forbid
     assert kkt_residuals(*answer.certificate()).worst < 1e-5
     np.testing.assert_allclose(answer.plan[0], whole.plan[0], atol=1e-3)
     assert answer.stats.solve_s > 0.0
+
+
+def test_a_period_assembles_the_qp_that_is_solved_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The unconstrained optimum is tried without a QP, which its certificate alone needs."""
+    problem = paper_problem()
+    solver = make_solver("piqp", problem)
+    assembled: list[str] = []
+    for form in (Condensed, Staged):
+
+        def counted(self: Any, query: Query, assemble: Any = form.assemble) -> QP:
+            assembled.append(type(self).__name__)
+            return assemble(self, query)
+
+        monkeypatch.setattr(form, "assemble", counted)
+    near, far = (Query(np.zeros(12), np.full((50, 4), by), problem.model.u_bar) for by in (1e-3, 5.0))
+    answer = solver.solve(far)
+    assert answer.answered_by == "piqp-multistage"
+    assert assembled == ["Staged"]
+    answer = solver.solve(near)
+    assert answer.answered_by == GAIN
+    assert assembled == ["Staged"]
+    assert answer.certificate is not None
+    assert kkt_residuals(*answer.certificate()).worst < 1e-5
+    assert assembled == ["Staged", "Condensed"]
 
 
 def test_equality_rows_and_multipliers() -> None:
