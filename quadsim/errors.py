@@ -82,11 +82,23 @@ class ExportError(InputError):
 class UnknownNameError(InputError):
     """A name outside a known set.
 
-    The message lists the set and the closest name, or those in `meant`: other spellings of the same thing.
+    The message lists the set and the closest name, or those in `meant`: other spellings of the same thing.  Of a name
+    that an earlier version had, it tells the `successor`.
     """
 
-    def __init__(self, kind: str, name: str, allowed: Iterable[str], hint: str = "", meant: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        kind: str,
+        name: str,
+        allowed: Iterable[str],
+        hint: str = "",
+        meant: Sequence[str] = (),
+        successor: str | None = None,
+    ) -> None:
         self.kind, self.name, self.allowed = kind, name, tuple(sorted(allowed))
+        if successor is not None:
+            super().__init__(f"the {kind} {name!r} was removed: use {successor!r}")
+            return
         near = meant or difflib.get_close_matches(name, self.allowed, n=1)
         guess = f"; did you mean {' and '.join(map(repr, near))}?" if near else ""
         tail = f"; {hint}" if hint else ""

@@ -44,7 +44,7 @@ LONG = (
     *("features/design/test_first_flights.py", "commands/test_api.py", "rollout/test_infeasibility.py"),
     *("report/film/test_video.py", "test_documents.py", "commands/test_process.py", "test_refusals.py"),
     *("rollout/test_nothing_lost.py", "mpc/laws/test_robust.py", "features/papers/test_reproduction.py"),
-    *("rollout/test_any_scenario.py", "mpc/forms/test_partial_condensing.py"),
+    *("rollout/test_any_scenario.py", "mpc/forms/test_staged.py"),
     *("rollout/test_run.py", "commands/test_cli.py", "rollout/test_reaudit.py", "test_packaging.py"),
     *(
         "rollout/test_conflicts.py",

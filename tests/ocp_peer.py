@@ -1,6 +1,6 @@
 """The optimum of an optimal control problem from its definition alone: rolled out, probed, and solved as a dense QP.
 
-Nothing of `quadsim.mpc.problem.qp`, `quadsim.mpc.forms.partial_condensing` or `quadsim.mpc.problem.paper` that builds
+Nothing of `quadsim.mpc.problem.qp`, `quadsim.mpc.forms.staged` or `quadsim.mpc.problem.paper` that builds
 matrices is used: states by recursion, and every matrix by what unit inputs do.  A plan may have axes in front of its
 own two: many plans are then rolled out at once.
 """

@@ -340,6 +340,9 @@ MISTAKES = {
     "controller.horizn=3": "controller.horizn is not a field of the scenario file; did you mean 'horizon'?@",
     "controller=lqt": f"controller.type must be one of {LAWS}; got 'lqt'; did you mean 'lqr'?",
     "controller.solver=clarabell": "controller.solver: no solver named 'clarabell'; did you mean 'clarabel'?@",
+    "controller.solver=piqp-multistage-1": "controller.solver: the solver 'piqp-multistage-1' was removed: use "
+    "'piqp-multistage'",
+    "controller.solver=core-or-piqp": "controller.solver: the solver 'core-or-piqp' was removed: use 'core'",
     "vehicle.file=lopes": "no vehicle named 'lopes'; did you mean 'lopes2011'?@",
     "vehicle.mass=40": "vehicle.speed_max must be no lower than its hover speed, 609.687 rad/s, or it cannot hover (@",
     "vehicle.inertia=[0.03, 0.03, 0.07]": "vehicle.inertia must be such that no moment exceeds the sum of the @",

@@ -53,7 +53,7 @@ FIGURES: Final = {
 }
 """Pictures of docs/, and the files that they are copies of."""
 COLOURS: Final = 128
-SOLVERS: Final = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "core", "clarabel")
+SOLVERS: Final = ("piqp-multistage", "piqp-dense", "daqp", "core", "clarabel")
 """The solvers that `make setup` installs."""
 DRAWN: Final = ("drawings.py", "live_picture.py", "figures.py", "film.py", "gallery.py thumbnails")
 WITHOUT_SOLVER: Final = ("film", "nonlinear")

@@ -28,7 +28,7 @@ from annotated_types import Ge, Le, doc
 
 from quadsim.controller import ACCEPTED
 from quadsim.fields import NonNegative
-from quadsim.mpc.forms.partial_condensing import PartiallyCondensed
+from quadsim.mpc.forms.staged import Staged
 from quadsim.mpc.problem.constraints import Constraint, Origin, Penalty, Soft
 from quadsim.mpc.problem.ocp import Problem, Query, predicted
 from quadsim.mpc.solvers import Answer, Solver
@@ -195,7 +195,7 @@ class ObstacleQP:
 
     def reset(self) -> None:
         """Forget the last plan."""
-        self._forms: dict[int, tuple[PartiallyCondensed, Piqp]] = {}
+        self._forms: dict[int, tuple[Staged, Piqp]] = {}
         self._last: Array | None = None
 
     def solve(self, time: float, query: Query, yaw: float = 0.0) -> tuple[Answer, Problem]:
@@ -248,7 +248,7 @@ class ObstacleQP:
             at = np.argsort(inside, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
             problem = self._with_half_spaces(normals[at] @ turn.T, bounds[at])
             form, backend = self._form(len(at[0]))
-            qp = form.assemble(query, problem).qp
+            qp = form.assemble(query, problem)
             answer = Answer.of(form, qp, backend.solve(qp), SOLVER)
             if answer.status not in ACCEPTED:
                 return answer, problem, np.empty(0)
@@ -261,11 +261,11 @@ class ObstacleQP:
             inside[at] = -SWITCHED_OFF  # what was there stays
             count *= 2
 
-    def _form(self, count: int) -> tuple[PartiallyCondensed, Piqp]:
+    def _form(self, count: int) -> tuple[Staged, Piqp]:
         """The QP with so many half-spaces at each instant, and what solves it."""
         if count not in self._forms:
             normals = np.full((count, self.problem.horizon, 3), 3.0**-0.5)  # in general position
-            form = PartiallyCondensed(self._with_half_spaces(normals, np.zeros(normals.shape[:2])))
+            form = Staged(self._with_half_spaces(normals, np.zeros(normals.shape[:2])))
             backend = Piqp(changing=True)
             backend.setup(form.qp)
             self._forms[count] = form, backend

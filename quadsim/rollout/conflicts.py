@@ -141,8 +141,8 @@ def _set_up(problem: Problem, query: Query) -> Callable[[Query], bool]:
         solver = QPSolver(DIAGNOSIS_SOLVER, problem)
         return lambda query: solver.solve(query).status == SOLVED
     form, backend = Staged(problem), Piqp()
-    backend.setup(form.assemble(query).qp)
-    return lambda query: backend.solve(form.assemble(query).qp).status == SOLVED
+    backend.setup(form.assemble(query))
+    return lambda query: backend.solve(form.assemble(query)).status == SOLVED
 
 
 class _Relaxed(NamedTuple):
@@ -223,7 +223,7 @@ def _relaxed(
     slack = Penalty(l1=np.ones(1), l2=np.zeros(1))
     rows = tuple(replace(one, penalty=slack if side in elastic else None) for side, one in sides.items())
     form = Staged(replace(problem, bounds=None, constraints=rows))
-    qp = form.assemble(query).qp
+    qp = form.assemble(query)
     named = [side for side in sides if side in elastic]
     columns, scale = form.slack_columns, form.slack_scale
     basis, cost, box = sparse.identity(qp.c.size, format="csc"), np.zeros(qp.c.size), np.stack([qp.x_l, qp.x_u], 1)

@@ -14,7 +14,7 @@ from quadsim.controller import LAW, Command, Iterating
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import Instant, Seconds
 from quadsim.mpc.pilot.pilot import Pilot
-from quadsim.mpc.solvers import ALIASES, find_solver, solver_entries
+from quadsim.mpc.solvers import ALIASES, SUCCESSORS, find_solver, solver_entries
 
 _COUNT_THEMSELVES: Final = ("nonlinear", LAW)
 """Laws that count iterations without a solver of `quadsim list`: the nonlinear one, and a controller of one's own."""
@@ -125,9 +125,8 @@ def times_by_solver(per_iteration: Mapping[str, float]) -> dict[str, float]:
                 find_solver(name)
             except UnknownNameError as error:
                 known = ", ".join(sorted({*_COUNT_THEMSELVES, *ALIASES, *solver_entries()}))
-                raise ParameterError(
-                    "computation.per_iteration", name, seconds, f"absent, or one of {known}"
-                ) from error
+                rule = f"absent: {error}" if name in SUCCESSORS else f"absent, or one of {known}"
+                raise ParameterError("computation.per_iteration", name, seconds, rule) from error
         own_name = ALIASES.get(name, name)
         if own_name in times:
             rule = f"given once: {own_name} is another name of the same solver"

@@ -74,7 +74,7 @@ def positions(problem: Problem, posed: Query, answer: Answer) -> Array:
 def by_dense_qp(problem: Problem, posed: Query, normals: Array, bounds: Array) -> Array:
     """The plan (N, nu) of the condensed QP with hard half-spaces (S, N, 3), (S, N) as rows of its own."""
     form, maps = Condensed(problem), prediction(problem.model, N)
-    qp = form.assemble(Query(*posed[:3])).qp
+    qp = form.assemble(Query(*posed[:3]))
     chosen = np.zeros((len(bounds), N, N * 12))
     for i in range(N):
         chosen[:, i, 12 * i + np.array(POSITION)] = normals[:, i]

@@ -81,7 +81,7 @@ def measure(name: str, problem: Problem, queries: Sequence[Query], reference: Ar
     queried, expected_inputs = queries[::every], reference[::every]
     differences, residuals = [], []
     for query, expected in zip(queried, expected_inputs, strict=True):
-        qp = form.assemble(query.posed).qp
+        qp = form.assemble(query.posed)
         solution = backend.solve(qp)
         if solution.status != SOLVED:
             continue

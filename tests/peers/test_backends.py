@@ -36,7 +36,7 @@ def test_nothing_in_a_first_solve_is_printed(name: str, capfd: pytest.CaptureFix
     formulation, backend = find_solver(name).formulate(problem), make_backend(name)
     backend.setup(formulation.qp)
     desired = problem.desired(paper_reference(51)[1:])
-    solution = backend.solve(formulation.assemble(Query(np.zeros(12), desired, problem.model.u_bar)).qp)
+    solution = backend.solve(formulation.assemble(Query(np.zeros(12), desired, problem.model.u_bar)))
     assert solution.status in {SOLVED, UNSOLVED}
     assert solution.stats.solve_s > 0.0
     assert solution.stats.iterations >= 0

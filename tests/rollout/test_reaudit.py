@@ -19,7 +19,7 @@ import pytest
 import quadsim
 from quadsim.commands.cli import main
 from quadsim.console.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
-from quadsim.errors import FileError
+from quadsim.errors import FileError, InputError
 from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.rollout.flown import Flight
@@ -196,6 +196,21 @@ def test_a_changed_file_is_reported(flown: Path, tmp_path: Path, name: str, caps
     (run / name).write_bytes((run / name).read_bytes() + b"#")
     assert main(["check", str(run)]) == EXIT_WRONG_INPUT
     assert f"{name} is not the file that was written" in capsys.readouterr().err
+
+
+def test_a_run_of_a_solver_that_was_removed_says_so(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = runs / "good" / rundir.SCENARIO_FILE
+    text = scenario.read_text()
+    assert text.count('# solver = "piqp"') == 1
+    scenario.write_text(text.replace('# solver = "piqp"', 'solver = "piqp-multistage-1"'))
+    rehash(runs / "good", rundir.SCENARIO_FILE)
+    message = "controller.solver: the solver 'piqp-multistage-1' was removed: use 'piqp-multistage'"
+    with pytest.raises(InputError, match=message):
+        quadsim.read(runs / "good")
+    for command in ("check", "plot"):
+        capsys.readouterr()
+        assert main([command, str(runs / "good")]) == EXIT_WRONG_INPUT
+        assert message in capsys.readouterr().err
 
 
 def test_a_plant_that_goes_further_than_the_recorded_margin_shows(runs: Path) -> None:

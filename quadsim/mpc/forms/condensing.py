@@ -14,11 +14,11 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg import lapack
 
-from quadsim.controller import UNCONSTRAINED, Statistics
+from quadsim.controller import UNCONSTRAINED
 from quadsim.mpc.problem.constraints import Bounds
-from quadsim.mpc.problem.ocp import CondensedQP, Equilibrium, Problem, Query, check_shape, predicted
+from quadsim.mpc.problem.ocp import CondensedQP, Equilibrium, Problem, Query, check_shape
 from quadsim.mpc.problem.paper import Prediction, cost, prediction, slew_matrix
-from quadsim.mpc.problem.qp import QP, PeriodQP, QPRows, Solution
+from quadsim.mpc.problem.qp import QP, QPRows, Solution
 from quadsim.state import N_STATES, REFERENCE_STATES, Array
 
 RowFlags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
@@ -80,7 +80,7 @@ def states_rows(C: Array, of_states: RowFlags, maps: Prediction, N: int) -> RowM
 def row_maps(rows: QPRows, maps: Prediction) -> RowMaps:
     """Return the rows' values as functions of inputs and state.  Eqs. (14), (16)-(19), for any rows."""
     if rows.C.ndim == 3:
-        raise ValueError("a condensed QP needs rows that are the same at all steps; partial condensing takes any")
+        raise ValueError("a condensed QP needs rows that are the same at all steps; the staged one takes any")
     values = states_rows(rows.C, rows.of_states, maps, len(rows.lower))
     return replace(values, of_inputs=_with_inputs(values.of_inputs, rows))
 
@@ -134,7 +134,7 @@ class Condensed:
             x_u=np.concatenate([rows.u_max.ravel(), np.full(N * m_s, np.inf)]),
         )
         nothing = np.zeros((N, problem.objective.C_r.shape[0]))
-        self.qp = self.assemble(Query(np.zeros(model.n), nothing, model.u_bar)).qp
+        self.qp = self.assemble(Query(np.zeros(model.n), nothing, model.u_bar))
 
     @classmethod
     def of(cls, problem: Problem) -> Condensed:
@@ -171,22 +171,32 @@ class Condensed:
         check_shape("reference", reference, (problem.horizon, len(REFERENCE_STATES)))
         hover = Equilibrium(np.concatenate([np.zeros(N_STATES), u_bar])[:n], u_bar)
         query = Query(state, problem.desired(reference), u_before, equilibrium or hover)
-        qp = self.assemble(query).qp
+        qp = self.assemble(query)
         return CondensedQP(*map(np.array, (qp.P, qp.c, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)))
 
-    def assemble(self, query: Query) -> PeriodQP:
+    def assemble(self, query: Query) -> QP:
         """Return the QP of a period; its matrices are those of `qp` itself."""
-        terms, values, rows = self.cost, self._values, self._rows
-        state, desired, u_before = query[:3]
+        h_l, h_u = self.row_bounds(query)
+        return replace(self._blank, c=self.gradient(query), h_l=h_l, h_u=h_u)
+
+    def gradient(self, query: Query) -> Array:
+        """Return the linear term c of the cost."""
+        terms, C_r = self.cost, self._problem.objective.C_r
         x_s, u_s = query.equilibrium or self._problem.equilibrium
-        dx, dy, du = state - x_s, desired - self._problem.objective.C_r @ x_s, u_before - u_s
+        of_state = terms.F_x @ (query.state - x_s)
+        of_desired = terms.F_y @ (query.desired - C_r @ x_s).ravel()
+        of_before = terms.F_d @ (query.u_before - u_s)
         c = self._linear.copy()
-        c[: self._inputs] += terms.F_x @ dx + terms.F_y @ dy.ravel() + terms.F_d @ du - self._pull @ u_s
-        # Rows refer to absolute inputs u = u_s + v and states x_s + dx(v).
-        shift = rows.C @ x_s + rows.D @ u_s + values.of_state @ dx - self._of_rest @ u_s
-        shift[0] += rows.E @ (u_s - u_before)
-        qp = replace(self._blank, c=c, h_l=(rows.lower - shift).ravel(), h_u=(rows.upper - shift).ravel())
-        return PeriodQP(qp, lambda x: predicted(self._problem, query, self.inputs(x)))
+        c[: self._inputs] += of_state + of_desired + of_before - self._pull @ u_s
+        return c
+
+    def row_bounds(self, query: Query) -> tuple[Array, Array]:
+        """Return h_l and h_u: rows refer to absolute inputs u = u_s + v and states x_s + dx(v)."""
+        values, rows = self._values, self._rows
+        x_s, u_s = query.equilibrium or self._problem.equilibrium
+        shift = rows.C @ x_s + rows.D @ u_s + values.of_state @ (query.state - x_s) - self._of_rest @ u_s
+        shift[0] += rows.E @ (u_s - query.u_before)
+        return (rows.lower - shift).ravel(), (rows.upper - shift).ravel()
 
     def inputs(self, x: Array) -> Array:
         """Return (N, nu) the planned inputs [rad/s] of a primal point."""
@@ -218,34 +228,44 @@ class Condensed:
 
 
 class FreeOptimum:
-    """The unconstrained optimum, which is the optimum of the QP if it satisfies every constraint.  Eq. (22).
+    """The unconstrained optimum, which is the optimum if it satisfies every constraint.  Eq. (22).
 
-    The Hessian is factorised once.
+    The Hessian is factorised once, and no QP is assembled to try it.
     """
 
     def __init__(self, form: Condensed) -> None:
         self.form = form
-        H = form.cost.H
-        self._inputs = len(H)
-        self._factor, failed = lapack.dpotrf(H)
-        small = form.qp.P.size + form.qp.G.size <= LARGEST_QP
-        self._usable = small and not failed and self._condition(H) <= LARGEST_CONDITION
+        self._factor, failed = lapack.dpotrf(form.cost.H)
+        self.condition = math.inf if failed else self._condition()
 
-    def _condition(self, H: Array) -> float:
+    @classmethod
+    def of(cls, problem: Problem, form: Condensed | None = None) -> FreeOptimum | None:
+        """Return a problem's unconstrained optimum; None where it saves no time, or rounding would move it.
+
+        `form` is the problem's condensed QP, if there is one already.
+        """
+        rows = QPRows(problem)
+        size = problem.horizon * (problem.model.nu + rows.slack.shape[1])
+        if size * (size + rows.lower.size) > LARGEST_QP:
+            return None
+        optimum = cls(form or Condensed(problem))
+        return optimum if optimum.condition <= LARGEST_CONDITION else None
+
+    def _condition(self) -> float:
         """Return the condition number of the Hessian in the 1-norm, estimated from its factor (LAPACK's dpocon)."""
-        reciprocal, _ = lapack.dpocon(self._factor, float(np.abs(H).sum(axis=0).max()))
+        reciprocal, _ = lapack.dpocon(self._factor, float(np.abs(self.form.cost.H).sum(axis=0).max()))
         return 1.0 / reciprocal if reciprocal > 0.0 else math.inf
 
-    def __call__(self, qp: QP) -> Solution | None:
-        """Return the optimum of a QP; None if it violates a constraint."""
-        if not self._usable:
+    def solve(self, query: Query) -> Solution | None:
+        """Return the condensed QP's solution without constraints; None if it violates one."""
+        qp, c = self.form.qp, self.form.gradient(query)
+        x, m = np.zeros(c.size), len(self._factor)
+        x[:m], failed = lapack.dpotrs(self._factor, -c[:m])
+        if failed or not ((qp.x_l <= x) & (x <= qp.x_u)).all():
             return None
-        m, x = self._inputs, np.zeros(qp.c.size)
-        x[:m], failed = lapack.dpotrs(self._factor, -qp.c[:m])
-        values = np.concatenate([x, qp.G @ x])
-        lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
-        if failed or not ((lower <= values) & (values <= upper)).all():
+        values = qp.G @ x
+        h_l, h_u = self.form.row_bounds(query)
+        if not ((h_l <= values) & (values <= h_u)).all():
             return None
-        z_box = np.concatenate([np.zeros(m), -qp.c[m:]])
-        no_solver = Statistics(solve_s=0.0)
-        return Solution(x, np.zeros(0), np.zeros(qp.h_l.size), z_box, status=UNCONSTRAINED, stats=no_solver)
+        z_box = np.concatenate([np.zeros(m), -c[m:]])
+        return Solution(x, np.zeros(0), np.zeros(values.size), z_box, status=UNCONSTRAINED)

@@ -1,21 +1,58 @@
-"""The QP with all states as variables: of any model, sparse, for certificates and diagnosis.
+"""The QP with all states as variables: sparse, in stages of one step, of any model and any rows.
 
-The variables, in the order of steps, are u(k), e_0, x(k+1) | u(k+1), e_1, x(k+2) | ..., with the slacks e of soft
-rows.  Its equality rows are x(k+i+1) = A_i x(k+i) + B_i u(k+i) + c_i.  It is slow to assemble, and states what is
-solved without algebra of its own: controllers solve other forms.
+The variables, in the order of steps, are e_0, u(k), x(k+1) | e_1, u(k+1), x(k+2) | ..., with the slacks e of soft
+rows.  Its equality rows are x(k+i+1) = A_i x(k+i) + B_i u(k+i) + c_i.  All matrices are block banded, which a
+multistage factorisation exploits: its cost grows linearly with the horizon.
+
+The matrices of a problem and its own model are made once.  Those of a query's `steps`, or of other numbers in a
+problem's rows, are made for that period alone.
 """
 
 from __future__ import annotations
 
 import math
-from functools import partial
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse import csc_matrix
 
 from quadsim.mpc.problem.ocp import Problem, Query, predicted
-from quadsim.mpc.problem.qp import QP, PeriodQP, QPRows, Solution
+from quadsim.mpc.problem.qp import QP, QPRows, Solution
 from quadsim.state import Array, Indices
+
+
+class Block(NamedTuple):
+    """Blocks of a matrix, one for each of N steps."""
+
+    rows: Indices  # (N, r)
+    columns: Indices  # (N, c)
+    values: Array  # (N, r, c), or (r, c) for the same at all steps
+
+
+class Pattern:
+    """The places of a sparse matrix, from its first blocks; entries that are zero in these are left out for good."""
+
+    def __init__(self, blocks: Sequence[Block], shape: tuple[int, int]) -> None:
+        values = _entries(blocks)
+        rows = np.concatenate([np.repeat(block.rows, block.columns.shape[1], axis=1).ravel() for block in blocks])
+        columns = np.concatenate([np.tile(block.columns, block.rows.shape[1]).ravel() for block in blocks])
+        kept = np.flatnonzero(values)
+        places = csc_matrix((kept, (rows[kept], columns[kept])), shape=shape)
+        self._order, self._rows, self._starts = places.data, places.indices, places.indptr
+        self._shape = shape
+
+    def matrix(self, blocks: Sequence[Block]) -> csc_matrix:
+        """Return the matrix with these blocks at the same places."""
+        return csc_matrix((_entries(blocks)[self._order], self._rows, self._starts), shape=self._shape)
+
+
+def _entries(blocks: Sequence[Block]) -> Array:
+    """Return all values of some blocks."""
+    shapes = [(len(block.rows), block.rows.shape[1], block.columns.shape[1]) for block in blocks]
+    pairs = zip(blocks, shapes, strict=True)
+    return np.concatenate([np.broadcast_to(block.values, shape).ravel() for block, shape in pairs])
 
 
 def steps_of(problem: Problem, query: Query) -> tuple[Array, Array, Array]:
@@ -24,74 +61,128 @@ def steps_of(problem: Problem, query: Query) -> tuple[Array, Array, Array]:
         return query.steps
     model, N, (x_s, u_s) = problem.model, problem.horizon, query.equilibrium or problem.equilibrium
     A, B, c = model.A, model.B, x_s - model.A @ x_s - model.B @ u_s
-    return np.tile(A, (N, 1, 1)), np.tile(B, (N, 1, 1)), np.tile(c, (N, 1))
+    return np.broadcast_to(A, (N, *A.shape)), np.broadcast_to(B, (N, *B.shape)), np.broadcast_to(c, (N, *c.shape))
 
 
 class Staged:
     """The QP of a problem with constraints, in the variables of the module."""
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self._rows = problem, QPRows(problem)
-        N, n, nu, slacks = problem.horizon, problem.model.n, problem.model.nu, self._rows.slack.shape[1]
-        at = np.arange(N)[:, None] * (nu + slacks + n)
-        self._u, self._e, self._x = at + np.arange(nu), at + nu + np.arange(slacks), at + nu + slacks + np.arange(n)
-        self._size = N * (nu + slacks + n)
+        self._problem = problem
+        self._rows = rows = QPRows(problem)
+        N, n, nu, slacks = problem.horizon, problem.model.n, problem.model.nu, rows.slack.shape[1]
+        starts = np.arange(N)[:, None] * (slacks + nu + n)
+        self._e = starts + np.arange(slacks)
+        self._u = starts + slacks + np.arange(nu)
+        self._x = starts + slacks + nu + np.arange(n)
+        self._size = N * (slacks + nu + n)
+        costs = self._costs()
+        self._P = Pattern(costs, (self._size, self._size)).matrix(costs)
+        inequalities = self._inequalities(rows)
+        self._inequality = Pattern(inequalities, (rows.lower.size, self._size))
+        self._G = self._inequality.matrix(inequalities)
+        self._x_l, self._x_u = np.full(self._size, -math.inf), np.full(self._size, math.inf)
+        self._x_l[self._u], self._x_u[self._u] = rows.u_min, rows.u_max
+        self._x_l[self._e] = 0.0
 
-    def assemble(self, query: Query) -> PeriodQP:
-        """Return the QP of a period."""
-        problem, rows, size = self._problem, self._rows, self._size
-        N, objective, soft = problem.horizon, problem.objective, problem.rows.slacks
-        (A, B, c), (x_s, u_s) = steps_of(problem, query), query.equilibrium or problem.equilibrium
-        (Q, W), (Q_end, W_end), move = objective.weights, objective.terminal_weights, objective.move_weight
-        blocks = [
-            (self._x[:-1], self._x[:-1], 2.0 * Q),
-            (self._x[-1:], self._x[-1:], 2.0 * Q_end),
-            (self._u[:-1], self._u[:-1], 2.0 * (objective.Q_u + 2.0 * move)),
-            (self._u[-1:], self._u[-1:], 2.0 * (objective.Q_u + move)),
-            (self._u[:-1], self._u[1:], -2.0 * move),
-            (self._u[1:], self._u[:-1], -2.0 * move),
-            (self._e, self._e, 2.0 * np.diag(problem.rows.l2[soft])),
+    @cached_property
+    def qp(self) -> QP:
+        """The QP for xi(k) = 0, y_d = 0 and u(k-1) = u_bar."""
+        return self.assemble(self._at_rest)
+
+    @property
+    def _at_rest(self) -> Query:
+        model, objective = self._problem.model, self._problem.objective
+        return Query(np.zeros(model.n), np.zeros((self._problem.horizon, len(objective.C_r))), model.u_bar)
+
+    @cached_property
+    def _A(self) -> csc_matrix:
+        """Equality rows of the problem's own model."""
+        A, B, _ = steps_of(self._problem, self._at_rest)
+        return self._equalities(A, B)
+
+    def assemble(self, query: Query, problem: Problem | None = None) -> QP:
+        """Return the QP of a period; `problem` may differ in the numbers of its rows, apart from bounds on inputs."""
+        rows, G = self._rows, self._G
+        if problem is not None:
+            rows = QPRows(problem)
+            G = self._inequality.matrix(self._inequalities(rows))
+        first = rows.C if rows.C.ndim == 2 else rows.C[0]
+        known = np.zeros(rows.lower.shape)
+        known[0] = (first * ~rows.of_states[:, None]) @ query.state - rows.E @ query.u_before
+        A, B, c = steps_of(self._problem, query)
+        b = c.copy()
+        b[0] += A[0] @ query.state
+        return QP(
+            P=self._P,
+            c=self._gradient(query),
+            A=self._A if query.steps is None else self._equalities(A, B),
+            b=b.ravel(),
+            G=G,
+            h_l=(rows.lower - known).ravel(),
+            h_u=(rows.upper - known).ravel(),
+            x_l=self._x_l,
+            x_u=self._x_u,
+        )
+
+    def _costs(self) -> list[Block]:
+        """Return the blocks of P."""
+        objective, rows = self._problem.objective, self._problem.rows
+        (Q, _), (Q_end, _), move = objective.weights, objective.terminal_weights, objective.move_weight
+        return [
+            Block(self._x[:-1], self._x[:-1], 2.0 * Q),
+            Block(self._x[-1:], self._x[-1:], 2.0 * Q_end),
+            Block(self._u[:-1], self._u[:-1], 2.0 * (objective.Q_u + 2.0 * move)),
+            Block(self._u[-1:], self._u[-1:], 2.0 * (objective.Q_u + move)),
+            Block(self._u[:-1], self._u[1:], -2.0 * move),
+            Block(self._u[1:], self._u[:-1], -2.0 * move),
+            Block(self._e, self._e, 2.0 * np.diag(rows.l2[rows.slacks])),
         ]
-        gradient = np.zeros(size)
+
+    def _gradient(self, query: Query) -> Array:
+        """Return the cost's linear term."""
+        objective, rows = self._problem.objective, self._problem.rows
+        (_, W), (Q_end, W_end), move = objective.weights, objective.terminal_weights, objective.move_weight
+        x_s, u_s = query.equilibrium or self._problem.equilibrium
+        gradient = np.zeros(self._size)
         gradient[self._x[:-1]] = -2.0 * query.desired[:-1] @ W.T
+        # The last state's target is C_r^+ (y_d - C_r x_s) from x_s; if Q_y weighs it, x_s drops out.
         gradient[self._x[-1]] = -2.0 * (W_end @ (query.desired[-1] - objective.C_r @ x_s) + Q_end @ x_s)
         gradient[self._u] = -2.0 * u_s @ objective.Q_u
         gradient[self._u[0]] -= 2.0 * move @ query.u_before
-        gradient[self._e] = problem.rows.l1[soft]
-        ends = np.arange(N * problem.model.n).reshape(N, -1)
-        dynamics = [(ends, self._x, np.eye(problem.model.n)), (ends[1:], self._x[:-1], -A[1:]), (ends, self._u, -B)]
-        b = c.copy()
-        b[0] += A[0] @ query.state
-        numbers = np.arange(rows.lower.size).reshape(N, -1)
-        of_ends, of_starts = rows.C * rows.of_states[:, None], rows.C * ~rows.of_states[:, None]
-        later = of_starts if of_starts.ndim == 2 else of_starts[1:]
-        inequalities = [
-            (numbers, self._x, of_ends),
-            (numbers[1:], self._x[:-1], later),
-            (numbers, self._u, rows.D + rows.E),
-            (numbers[1:], self._u[:-1], -rows.E),
-            (numbers, self._e, rows.slack),
+        gradient[self._e] = rows.l1[rows.slacks]
+        return gradient
+
+    def _equalities(self, A: Array, B: Array) -> csc_matrix:
+        """Return the rows of the dynamics A (N, n, n), B (N, n, nu)."""
+        n = self._problem.model.n
+        ends = np.arange(self._x.size).reshape(self._x.shape)
+        blocks = [
+            Block(ends, self._x, np.eye(n)),
+            Block(ends[1:], self._x[:-1], -A[1:]),
+            Block(ends, self._u, -B),
         ]
-        known = np.zeros(rows.lower.shape)
-        known[0] = (of_starts if of_starts.ndim == 2 else of_starts[0]) @ query.state - rows.E @ query.u_before
-        x_l, x_u = np.full(size, -math.inf), np.full(size, math.inf)
-        x_l[self._u], x_u[self._u], x_l[self._e] = rows.u_min, rows.u_max, 0.0
-        qp = QP(
-            P=_sparse(blocks, (size, size)),
-            c=gradient,
-            A=_sparse(dynamics, (ends.size, size)),
-            b=b.ravel(),
-            G=_sparse(inequalities, (numbers.size, size)),
-            h_l=(rows.lower - known).ravel(),
-            h_u=(rows.upper - known).ravel(),
-            x_l=x_l,
-            x_u=x_u,
-        )
-        return PeriodQP(qp, partial(np.take, indices=self._x))
+        return Pattern(blocks, (ends.size, self._size)).matrix(blocks)
+
+    def _inequalities(self, rows: QPRows) -> list[Block]:
+        """Return the blocks of G."""
+        numbers = np.arange(rows.lower.size).reshape(rows.lower.shape)
+        of_ends, of_starts = rows.C * rows.of_states[:, None], rows.C * ~rows.of_states[:, None]
+        return [
+            Block(numbers, self._x, of_ends),
+            Block(numbers[1:], self._x[:-1], of_starts if of_starts.ndim == 2 else of_starts[1:]),
+            Block(numbers, self._u, rows.D + rows.E),
+            Block(numbers[1:], self._u[:-1], -rows.E),
+            Block(numbers, self._e, rows.slack),
+        ]
 
     def inputs(self, x: Array) -> Array:
         """Return (N, nu) the planned inputs of a primal point."""
         return x[self._u]
+
+    def states(self, x: Array) -> Array:
+        """Return (N, n) the predicted states of a primal point."""
+        return x[self._x]
 
     def slacks(self, x: Array) -> Array:
         """Return (N, m_s) the slacks of a primal point, in the constraints' units."""
@@ -127,12 +218,3 @@ class Staged:
         for i in range(len(y) - 2, -1, -1):
             y[i] += A[i + 1].T @ y[i + 1]
         return Solution(x, y.ravel(), z, z_box)
-
-
-def _sparse(blocks: list[tuple[Indices, Indices, Array]], shape: tuple[int, int]) -> csc_matrix:
-    """Return the sum of blocks (N, rows, columns), or one for all, at rows (N, rows) and columns (N, columns)."""
-    entries = [(np.broadcast_to(block, (len(i), i.shape[1], j.shape[1])), i, j) for i, j, block in blocks]
-    values = np.concatenate([block.ravel() for block, _, _ in entries])
-    rows = np.concatenate([np.broadcast_to(i[:, :, None], block.shape).ravel() for block, i, _ in entries])
-    columns = np.concatenate([np.broadcast_to(j[:, None, :], block.shape).ravel() for block, _, j in entries])
-    return coo_matrix((values, (rows, columns)), shape=shape).tocsc()

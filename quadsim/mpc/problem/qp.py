@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
@@ -105,13 +104,6 @@ class Solution(NamedTuple):
     status: str = SOLVED  # `solved`, or the solver's name for the failure
     stats: Statistics = NO_STATISTICS
     """Of the solver; `active` counts inequality rows and box entries, `solve_s` includes updates."""
-
-
-class PeriodQP(NamedTuple):
-    """The QP of one period."""
-
-    qp: QP
-    states: Callable[[Array], Array]  # maps a primal point to the predicted states (N, n)
 
 
 class Backend(Protocol):

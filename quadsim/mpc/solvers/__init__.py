@@ -15,12 +15,12 @@ import numpy as np
 from quadsim.controller import CORE, GAIN, NO_STATISTICS, Statistics
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.mpc.forms.condensing import Condensed, FreeOptimum
-from quadsim.mpc.forms.partial_condensing import PartiallyCondensed
+from quadsim.mpc.forms.staged import Staged
 from quadsim.mpc.problem.ocp import Problem, Query
 from quadsim.mpc.problem.qp import QP, Backend, Solution
 from quadsim.state import Array
 
-Formulation: TypeAlias = Condensed | PartiallyCondensed
+Formulation: TypeAlias = Condensed | Staged
 """The QP formulations of an optimal control problem."""
 
 
@@ -31,14 +31,11 @@ class SolverEntry:
     description: str  # one line
     package: str  # import name
     dense: bool = True  # whether it takes the condensed QP instead of the staged one
-    steps_per_stage: int | None = None  # of the staged QP; None for a choice by the number of inputs
     extra: str = ""  # quadsim's extra that installs the package; empty if it is always installed
 
     def formulate(self, problem: Problem) -> Formulation:
         """Return the form of the problem that it takes."""
-        if self.dense:
-            return Condensed(problem)
-        return PartiallyCondensed(problem, steps_per_stage=self.steps_per_stage)
+        return Condensed(problem) if self.dense else Staged(problem)
 
     @property
     def installed(self) -> bool:
@@ -58,10 +55,7 @@ class SolverEntry:
 
 SOLVERS: Final = {
     "piqp-multistage": SolverEntry(
-        description="PIQP, multistage, partially condensed (default)", package="piqp", dense=False
-    ),
-    "piqp-multistage-1": SolverEntry(
-        description="PIQP, multistage, one stage per step", package="piqp", dense=False, steps_per_stage=1
+        description="PIQP, multistage, all states as variables (default)", package="piqp", dense=False
     ),
     "piqp-dense": SolverEntry(description="PIQP, dense Cholesky, on the paper's condensed matrices", package="piqp"),
     "daqp": SolverEntry(description="DAQP, dual active set, condensed, warm-started", package="daqp", extra="daqp"),
@@ -77,6 +71,8 @@ CORES_SECOND: Final = "piqp-multistage"
 """What answers the problems that the core gives up."""
 
 ALIASES: Final = {"piqp": "piqp-multistage"}
+SUCCESSORS: Final = {"piqp-multistage-1": "piqp-multistage", "core-or-piqp": CORE}
+"""What to use for solvers of earlier versions."""
 
 INVALID_DATA: Final = "invalid_data"
 """Status of a query with numbers that no back end receives."""
@@ -90,7 +86,7 @@ def find_solver(name: str) -> SolverEntry:
     entries = solver_entries()
     if name not in entries:
         hint = "" if len(entries) > len(SOLVERS) + 1 else "pip install 'quadsim[solvers]' adds those of qpsolvers"
-        raise UnknownNameError("solver", name, entries, hint)
+        raise UnknownNameError("solver", name, entries, hint, successor=SUCCESSORS.get(name))
     return entries[name]
 
 
@@ -200,8 +196,8 @@ class QPSolver:
         self.formulation = find_solver(name).formulate(problem)
         self._free: FreeOptimum | None = None
         if free_first:
-            form = self.formulation if isinstance(self.formulation, Condensed) else Condensed(problem)
-            self._free = FreeOptimum(form)
+            condensed = self.formulation if isinstance(self.formulation, Condensed) else None
+            self._free = FreeOptimum.of(problem, condensed)
         self.reset()
 
     @property
@@ -219,21 +215,32 @@ class QPSolver:
 
         Data that is not finite gives the status `invalid_data`, since back ends may not notice it.
         """
-        form, by, method, spent_s = self.formulation, self.name, Method.WHOLE, 0.0
         state, desired, u_before = query[:3]
+        form = self.formulation
         if not math.isfinite(state.sum() + desired.sum() + u_before.sum()):
             nowhere = np.full_like(form.qp.c, math.nan)
             return Answer(form.inputs(nowhere), form.slacks(nowhere), INVALID_DATA, self.name)
-        period_qp, solution = None, None
-        if self._free is not None:
-            started, period_qp = clock.perf_counter(), self._free.form.assemble(query)
-            solution, spent_s = self._free(period_qp.qp), clock.perf_counter() - started
-            if solution is not None:
-                form, by, method = self._free.form, GAIN, Method.FREE
-            elif self._free.form is not form:
-                period_qp = None
-        period_qp = form.assemble(query) if period_qp is None else period_qp
-        solution = self._backend.solve(period_qp.qp) if solution is None else solution
-        answer = Answer.of(form, period_qp.qp, solution, by)
-        stats = solution.stats._replace(solve_s=spent_s + solution.stats.solve_s)
-        return answer._replace(method=method, stats=stats)
+        started = clock.perf_counter()
+        answer = None if self._free is None else _free_answer(self._free, query)
+        spent_s = clock.perf_counter() - started
+        if answer is None:
+            qp = form.assemble(query)
+            answer = Answer.of(form, qp, self._backend.solve(qp), self.name)
+            spent_s += answer.stats.solve_s
+        return answer._replace(stats=answer.stats._replace(solve_s=spent_s))
+
+
+def _free_answer(free: FreeOptimum, query: Query) -> Answer | None:
+    """Return the unconstrained optimum; None if it violates a constraint.  Only its certificate needs a QP."""
+    solution = free.solve(query)
+    if solution is None:
+        return None
+    form = free.form
+    return Answer(
+        form.inputs(solution.x),
+        form.slacks(solution.x),
+        solution.status,
+        GAIN,
+        method=Method.FREE,
+        certificate=lambda: (form.assemble(query), solution),
+    )

@@ -158,7 +158,7 @@ class Optimum:
     def _certificate(self, query: Query, plan: Array, slacks: Array, multipliers: Array) -> tuple[QP, Solution]:
         """Return the condensed QP of a query, and a plan as its solution."""
         form = self._shared.condensed
-        return form.assemble(query).qp, form.solution(plan, slacks, multipliers)
+        return form.assemble(query), form.solution(plan, slacks, multipliers)
 
     def _by_piqp(self, query: Query, started: float) -> Answer:
         if self._piqp is None:

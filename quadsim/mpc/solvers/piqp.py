@@ -28,8 +28,8 @@ STATUS: Final = {
 
 TOLERANCE: Final = 1e-9
 """Absolute tolerance; PIQP's default is 1e-8. Next to a barely active constraint, the inputs converge only as its
-square root: over the paper's flight, at 1e-8 and 3e-9 one form of the QP has a first input 1e-3 rad/s from the optimum;
-at 1e-9 all are within 4e-4, for one more iteration."""
+square root: over the paper's flight, the staged QP's first inputs are within 4e-4 rad/s of the optimum at 1e-8, and
+within 2e-4 at 1e-9, for one more iteration."""
 
 GAP: Final = 1e-10
 """Tolerance of the duality gap.  With PIQP's default of 1e-8, a bound that is just touched puts the first input of one

@@ -86,7 +86,7 @@ def test_an_unsafe_one_becomes_the_nearest_whose_plan_keeps_the_bounds(wanted: l
     P[:4, :4] += 2.0 * np.eye(4)
     level = state.copy()
     level[INDEX["yaw"]] = 0.0
-    qp = form.assemble(Query(level, np.zeros((HORIZON, 4)), HOVER)).qp
+    qp = form.assemble(Query(level, np.zeros((HORIZON, 4)), HOVER))
     qp.c[:4] -= 2.0 * (HOVER + wanted)
     backend = make_backend("piqp-dense")
     qp = replace(qp, P=np.asfortranarray(P))

@@ -122,7 +122,7 @@ def test_rows_are_the_printed_inequalities(horizon: int) -> None:
     bounds, model = problem.bounds, problem.model
     assert bounds is not None
     state, before, plan = rng.normal(size=3), rng.normal(size=2), rng.normal(size=(horizon, 2))
-    qp = Condensed(problem).assemble(Query(state, np.zeros((horizon, problem.objective.C_r.shape[0])), before)).qp
+    qp = Condensed(problem).assemble(Query(state, np.zeros((horizon, problem.objective.C_r.shape[0])), before))
     maps, steps = prediction(model, horizon), slew_matrix(horizon, 2)
     of_outputs = np.kron(np.eye(horizon), bounds.C_c)
     first = np.concatenate([before, np.zeros(2 * (horizon - 1))])

@@ -13,7 +13,7 @@ from support import paper_problem
 from quadsim.errors import ParameterError
 from quadsim.mpc.forms.condensing import LARGEST_CONDITION, Condensed, FreeOptimum
 from quadsim.mpc.laws.lqr import lqr_gain
-from quadsim.mpc.problem.ocp import Problem, lqr_terminal_weight
+from quadsim.mpc.problem.ocp import Problem, Query, lqr_terminal_weight
 from quadsim.mpc.problem.regulator import stabilising, undetected
 from quadsim.state import STATE_NAMES, Array
 
@@ -119,9 +119,11 @@ def test_the_condition_number_decides_whether_the_free_optimum_answers(weight: f
     problem = replace(problem, objective=objective)
     condition = np.linalg.cond(Condensed.of(problem).cost.H, 1)
     assert (condition < 0.1 * LARGEST_CONDITION) if usable else (condition > 10.0 * LARGEST_CONDITION)
+    at_rest = Query(np.zeros(12), np.zeros((50, 4)), problem.model.u_bar)
     for other in (problem, *nudged(problem, 8)):
-        form = Condensed.of(other)
-        assert (FreeOptimum(form)(form.qp) is not None) == usable
+        free = FreeOptimum.of(other)
+        assert (free is not None) == usable
+        assert free is None or free.solve(at_rest) is not None
 
 
 def test_every_condition_of_the_library_is_far_from_the_limit() -> None:

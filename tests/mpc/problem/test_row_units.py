@@ -19,7 +19,7 @@ from quadsim.mpc.solvers.by_name import make_solver
 from quadsim.rollout.conflicts import Side, smallest_widening
 from quadsim.state import INDEX, Array
 
-SOLVERS = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "clarabel", "core")
+SOLVERS = ("piqp-multistage", "piqp-dense", "daqp", "clarabel", "core")
 FACTORS = (1e-8, 1e-6, 1e-5, 1e-4, 1e-2, 1e2, 1e4, 1e8)
 HORIZON = 12
 CLIMB = 30.0

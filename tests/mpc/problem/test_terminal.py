@@ -12,7 +12,7 @@ from support import paper_problem, random_problem
 
 from quadsim.errors import ParameterError
 from quadsim.mpc.forms.condensing import Condensed
-from quadsim.mpc.forms.partial_condensing import PartiallyCondensed
+from quadsim.mpc.forms.staged import Staged
 from quadsim.mpc.problem.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
 from quadsim.mpc.solvers import Formulation, Method, QPSolver
 from quadsim.mpc.solvers.core_axes import axes
@@ -52,11 +52,11 @@ def first_inputs(problem: Problem, query: tuple[Array, Array, Array, Equilibrium
     answer = QPSolver("piqp-multistage", problem, free_first=True).solve(Query(*query))
     assert answer.method is Method.FREE
     result = {"free": answer.plan[0]}
-    forms: tuple[Formulation, ...] = (Condensed(problem), PartiallyCondensed(problem, steps_per_stage=3))
+    forms: tuple[Formulation, ...] = (Condensed(problem), Staged(problem))
     for form in forms:
         backend = Piqp(dense=True) if isinstance(form, Condensed) else Piqp()
         backend.setup(form.qp)
-        qp = form.assemble(Query(*query)).qp
+        qp = form.assemble(Query(*query))
         result[type(form).__name__] = form.inputs(polish(qp, backend.solve(qp)).x)[0]
     return result
 

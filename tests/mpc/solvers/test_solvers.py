@@ -6,6 +6,7 @@ import importlib.util
 import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from support import constrained_mpc, flight_queries, paper_problem, paper_refere
 from quadsim.controller import CORE, GAIN, SOLVED, StepInputs
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
 from quadsim.mpc.forms.condensing import Condensed
-from quadsim.mpc.forms.partial_condensing import PartiallyCondensed
+from quadsim.mpc.forms.staged import Staged
 from quadsim.mpc.problem.constraints import Penalty
 from quadsim.mpc.problem.ocp import Query
 from quadsim.mpc.problem.qp import QP, kkt_residuals
@@ -28,7 +29,7 @@ from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.loading import load_scenario
 
-ALWAYS = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "clarabel")
+ALWAYS = ("piqp-multistage", "piqp-dense", "daqp", "clarabel")
 """What `make setup` installs."""
 
 
@@ -97,6 +98,30 @@ def test_the_unconstrained_optimum_is_tried_first_unless_size_or_rounding_forbid
     assert answer.stats.solve_s > 0.0
 
 
+def test_a_period_assembles_the_qp_that_is_solved_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The unconstrained optimum is tried without a QP, which its certificate alone needs."""
+    problem = paper_problem()
+    solver = make_solver("piqp", problem)
+    assembled: list[str] = []
+    for form in (Condensed, Staged):
+
+        def counted(self: Any, query: Query, assemble: Any = form.assemble) -> QP:
+            assembled.append(type(self).__name__)
+            return assemble(self, query)
+
+        monkeypatch.setattr(form, "assemble", counted)
+    near, far = (Query(np.zeros(12), np.full((50, 4), by), problem.model.u_bar) for by in (1e-3, 5.0))
+    answer = solver.solve(far)
+    assert answer.answered_by == "piqp-multistage"
+    assert assembled == ["Staged"]
+    answer = solver.solve(near)
+    assert answer.answered_by == GAIN
+    assert assembled == ["Staged"]
+    assert answer.certificate is not None
+    assert kkt_residuals(*answer.certificate()).worst < 1e-5
+    assert assembled == ["Staged", "Condensed"]
+
+
 def test_equality_rows_and_multipliers() -> None:
     """On the stages' QP, which has equalities and free variables, and on the condensed one: KKT, and one optimum."""
     rng = np.random.default_rng(5)
@@ -104,12 +129,12 @@ def test_equality_rows_and_multipliers() -> None:
         problem = random_problem(rng, horizon=6, n=3, nu=2, n_c=1)
         query = (0.1 * rng.normal(size=3), rng.normal(size=(6, 3)), problem.model.u_bar)
         plans = []
-        for formulation in (PartiallyCondensed(problem, steps_per_stage=2), Condensed(problem)):
+        for formulation in (Staged(problem), Condensed(problem)):
             backend, peer = DaqpDense(), Piqp(dense=True)
-            qp = formulation.assemble(Query(*query)).qp
+            qp = formulation.assemble(Query(*query))
             backend.setup(formulation.qp)
             peer.setup(Condensed(problem).qp)
-            expected = peer.solve(Condensed(problem).assemble(Query(*query)).qp)
+            expected = peer.solve(Condensed(problem).assemble(Query(*query)))
             solution = backend.solve(qp)
             assert solution.status == expected.status
             if solution.status != SOLVED:
@@ -126,7 +151,7 @@ def small_qp(rng: np.random.Generator, name: str) -> QP:
     n, inf = 5, math.inf
     root = rng.normal(size=(n, n))
     entry = find_solver(name)
-    matrix = csc_matrix if entry.formulate(paper_problem()).__class__ is PartiallyCondensed else np.asarray
+    matrix = csc_matrix if isinstance(entry.formulate(paper_problem()), Staged) else np.asarray
     return QP(
         P=matrix(root @ root.T + np.eye(n)),
         c=10.0 * rng.normal(size=n),
@@ -185,6 +210,8 @@ def test_unknown_solver_lists_those_there_are() -> None:
         QPSolver("piqp-dens", paper_problem())
     with pytest.raises(UnknownNameError, match="'core'"):
         QPSolver(CORE, paper_problem())
+    with pytest.raises(UnknownNameError, match="'piqp-multistage-1' was removed: use 'piqp-multistage'"):
+        QPSolver("piqp-multistage-1", paper_problem())
     assert {"clarabel", "quadprog"} & {*solver_entries()} <= {*qpsolvers.available_solvers}
 
 

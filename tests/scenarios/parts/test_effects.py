@@ -193,6 +193,7 @@ def test_computation_takes_its_times_and_stalls() -> None:
         ("nonlinear", ["computation.per_iteration.core=1e-5"], "also for nonlinear"),
         ("nonlinear", ["computation.per_iteration.nonlinear=1e-5"], None),
         ("robust", ["computation.per_iteration={core=1e-5, piqp=1e-3, piqqp=1e-3}"], "piqqp must be absent, or one of"),
+        ("robust", ["computation.per_iteration={piqp-multistage-1=1e-3}"], "was removed: use 'piqp-multistage'"),
         (
             "robust",
             ["computation.per_iteration={core=1e-5, piqp=1e-3, piqp-multistage=2e-3}"],

@@ -510,7 +510,7 @@ class NonlinearMPC:
         """Return the last step's program, and its optimum with multipliers."""
         problem, query, sqp = self._rows(), self._query(), self._sqp
         form = self._form if problem is self.problem else Staged(problem)
-        qp = form.assemble(query).qp
+        qp = form.assemble(query)
         groups = self._groups if problem is self.problem else slack_groups(problem)
         multipliers = sqp.multipliers(len(problem.rows.names), len(self.problem.rows.names))
         return qp, form.solution(query, qp, sqp.inputs, sqp.slacks(groups), multipliers)

@@ -25,7 +25,7 @@ import scipy.linalg
 
 from quadsim.controller import ACCEPTED, GROUNDED, UNCONSTRAINED, Command, StepInputs, stopped
 from quadsim.errors import ParameterError
-from quadsim.mpc.forms.partial_condensing import PartiallyCondensed
+from quadsim.mpc.forms.staged import Staged
 from quadsim.mpc.guard.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection
 from quadsim.mpc.laws.parts.preparation import RobustPreparation
 from quadsim.mpc.laws.robust import Robust
@@ -138,7 +138,7 @@ class _Nearest:
     """The QP of a problem whose first input should be close to a request."""
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self._form = problem, PartiallyCondensed(problem)
+        self._problem, self._form = problem, Staged(problem)
         self.check, form = AnswerCheck(problem, KKT_EVERY), self._form
         self._first = form.inputs(np.arange(form.qp.c.size, dtype=np.float64))[0].astype(np.intp)
         self._P = form.qp.P.copy()
@@ -164,7 +164,7 @@ class _Nearest:
 
     def solve(self, query: Query, requested: Array) -> Answer:
         """Return the plan whose first input is closest to `requested` (4,) [rad/s]."""
-        qp = replace(self._form.assemble(query).qp, P=self._P)
+        qp = replace(self._form.assemble(query), P=self._P)
         qp.c[self._first] -= 2.0 * requested
         if query.equilibrium is not None:  # a state of predicted rotors is far from zero there, so all rows move
             for side in (qp.h_l, qp.h_u):
