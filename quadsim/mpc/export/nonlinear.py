@@ -12,7 +12,7 @@ import numpy as np
 from quadsim.controller import ROTORS
 from quadsim.errors import ExportError
 from quadsim.mpc.export.ctext import CText
-from quadsim.mpc.export.follower import CFollower
+from quadsim.mpc.export.follower import BODY_AHEAD_FILES, CFollower
 from quadsim.mpc.export.source import CHANGES, SHARED_FILES
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.laws.parts.numbers import fallback_numbers
@@ -22,8 +22,9 @@ from quadsim.mpc.tables.nonlinear import Nonlinear
 
 FILES: Final = (
     *SHARED_FILES,
-    *("quadsim_ramp.h", "quadsim_ramp.c", "quadsim_nmpc.h", "quadsim_nmpc_math.h", "quadsim_nmpc.c"),
-    *("quadsim_nmpc_model.c", "quadsim_nmpc_qp.c", "quadsim_nonlinear.h", "quadsim_nonlinear.c"),
+    *BODY_AHEAD_FILES,
+    *("quadsim_ramp.h", "quadsim_ramp.c", "quadsim_nmpc.c", "quadsim_nmpc_qp.c"),
+    *("quadsim_nonlinear.h", "quadsim_nonlinear.c"),
 )
 """Files of `quadsim/mpc/c` to export verbatim."""
 ROWS_PER_NODE: Final = 2.0
@@ -110,13 +111,13 @@ class CNonlinear(CFollower):
         blocks.append(text.structs("quadsim_nmpc_term", "terms", program.terms if program.struct.rows else ()))
         members = text.mirrored(program.struct, pointers, room=self.rows + 1, changes=CHANGES)
         blocks.append(text.struct("quadsim_nmpc_problem", f"{prefix}problem", **members))
-        for name, (body, left) in law.bodies.items():
-            blocks.append(text.array(f"left_{name}", left))
-            members = text.mirrored(body, {"left": f"{prefix}left_{name}"})
-            blocks.append(text.struct("quadsim_nmpc_problem", f"{prefix}{name}", **members))
+        blocks += self.body_blocks(text, law.bodies)
         values = {name: text.value(value) for name, value in fallback.items()}
         blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **values))
         addresses = {name: f"&{prefix}{name}" for name in ("problem", *law.bodies, "fallback")}
+        if law.delay is not None:
+            blocks += self.delay_blocks(text, law.delay, law.delay_bodies)
+            addresses["delay"] = f"&{prefix}delay"
         if law.ramp is not None:
             blocks.append(text.struct("quadsim_ramp_numbers", f"{prefix}ramp", **text.mirrored(law.ramp.numbers)))
             addresses["ramp"] = f"&{prefix}ramp"

@@ -42,6 +42,17 @@ def split_delay(delay: float, period: float) -> tuple[int, float]:
     return whole, delay - whole * period
 
 
+def require_delay(delay: float, period: float, periods: int) -> None:
+    """Reject a delay [s] of more than so many control periods.
+
+    Raises:
+        ParameterError: it is longer.
+    """
+    if delay > periods * period * (1.0 + 1e-9):
+        rule = f"at most {periods} control periods, {periods * period:g} s"
+        raise ParameterError("controller", "delay", delay, rule)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Robust(Bounded):
     """The robust MPC: soft bounds, rotor lag, delay, disturbances, heading and more, each switched on separately."""

@@ -38,12 +38,14 @@ from quadsim.controller import (
     stopped,
 )
 from quadsim.core.mirror import Struct, core_library, set_members, struct
+from quadsim.errors import ParameterError
 from quadsim.mpc.estimate.disturbance import RampObserver
 from quadsim.mpc.estimate.observer import DisturbanceObserver, disturbance_of
 from quadsim.mpc.forms.staged import Staged
 from quadsim.mpc.guard.answer import ActuatorBounds, AnswerCheck, command_of, refused, resized
 from quadsim.mpc.guard.structs import STATUSES
-from quadsim.mpc.laws.parts.body import body_of, next_states, unpacked, width_of
+from quadsim.mpc.laws.parts.body import next_states, unpacked, width_of
+from quadsim.mpc.laws.parts.delay import Bodies, adopt_sent, delay_numbers, make_bodies
 from quadsim.mpc.laws.parts.nonlinear_law import WIDTH_OF_MOTION, put_motion
 from quadsim.mpc.laws.parts.nonlinear_problem import (
     commands_to_inputs,
@@ -60,7 +62,8 @@ from quadsim.mpc.problem.qp import KKT_EVERY, QP, Solution
 from quadsim.mpc.problem.rigidbody import N_BODY, P, Q, V, W, thrust_axis
 from quadsim.mpc.solvers import INVALID_DATA, Answer, Method
 from quadsim.mpc.space import HALF_SPACE_ROUNDING, SETTLED, Space, distances
-from quadsim.mpc.tables.nonlinear import Nonlinear
+from quadsim.mpc.tables.nonlinear import MOST_LATE, Nonlinear
+from quadsim.mpc.tables.robust import require_delay, split_delay
 from quadsim.rotation import (
     body_to_euler_rates,
     euler_to_body_rates,
@@ -109,6 +112,8 @@ class NonlinearMPC:
         numbers: the law's own, for the core.
         bodies: the numbers of the body over a control period, `period`, and of the same without lag of thrusts,
             `unlagged`, each with the array that it points to.
+        delay: how late commands act, for the core; None for at once.
+        delay_bodies: the bodies that it points to.
         ramp: what follows changing forces; None for nothing.
         struct: what the law remembers, in C.
         plan: (N, 4) its view of the commands of the last optimum.
@@ -157,11 +162,18 @@ class NonlinearMPC:
             faces=0 if space is None else space.count,
             price=None if space is None else space.penalty,
         )
+        self.delay, self.delay_bodies = None, Bodies()
+        if settings.delay:
+            require_delay(settings.delay, period, min(settings.horizon, MOST_LATE))
+            if self.model.targets and settings.delay >= period:
+                rule = f'below the control period of {period:g} s where commands = "rates"'
+                raise ParameterError("controller", "delay", settings.delay, rule)
+            self.delay, self.delay_bodies = delay_numbers(settings.delay, self.model, vehicle, period)
         self.clock: Callable[[], float] = clock.perf_counter
         # The same body over a control period: from measurement to measurement, and for other plans, without rotor lag.
         body = replace(self.model, step=period)
         without_lag = replace(body, rotor_lag=None, lag=(0.0, *self.model.lag[1:]), substeps=1)
-        self.bodies = {"period": body_of(body), "unlagged": body_of(without_lag)}
+        self.bodies = make_bodies(period=body, unlagged=without_lag)
         self._lag = self.model.lags[0]  # of actuator states [s]
         observing = settings.offset_free
         self._observer = None if observing is None else DisturbanceObserver(observing, period)
@@ -188,6 +200,7 @@ class NonlinearMPC:
             quadratic_drag=model.quadratic_drag / model.mass,
             moment=settings.moment,
             thrust_lag=self._lag if model.targets else None,
+            late=split_delay(settings.delay, self._period)[1],
         )
 
     def _make_numbers(self, stride: int) -> Struct:
@@ -205,6 +218,8 @@ class NonlinearMPC:
         )
         for name, (body, _) in self.bodies.items():
             setattr(numbers, name, ctypes.addressof(body))
+        if self.delay is not None:
+            numbers.delay = ctypes.addressof(self.delay)
         if self.ramp is not None:
             numbers.ramp = ctypes.addressof(self.ramp.numbers)
         lifts = vehicle.mass * vehicle.gravity * vehicle.thrust_shares
@@ -270,8 +285,8 @@ class NonlinearMPC:
 
     @property
     def motion_rows(self) -> int:
-        """Samples that it takes of a course's motion."""
-        return self.horizon + 1
+        """Samples that it takes of a course's motion: one more than there are until the last node's instant."""
+        return self.horizon + 1 + (0 if self.delay is None else self.delay.under_way + 1)
 
     def _shares(self, commands: Array) -> Array:
         """Return the inputs for commands (..., 4): rotor speeds [rad/s] or targets [N], [rad/s]."""
@@ -308,6 +323,7 @@ class NonlinearMPC:
                     rotors = self._shares(inputs_to_commands(law.model, law._vehicle, rotors))
                 set_members(mine, **{name: rotors})
             mine.learns, mine.last[:N_BODY] = its.learns, its.last[:N_BODY]
+            adopt_sent(mine.delay, self.delay, its.delay, law.delay)
         plan = law.stored_plan
         if plan is not None and alike and self.model.n == law.model.n and self.model.step == law.model.step:
             self.stored_plan = resized(plan[0], self._nodes + 1), resized(plan[1], self._nodes)
@@ -336,7 +352,7 @@ class NonlinearMPC:
             self.ramp.log(now)
         first = self.infeasible_period
         last_plan = self.stored_plan if first is None else None
-        answer, code = self._iterate(now.time)
+        answer, code = self._iterate(now.time + self.settings.delay)
         status = STATUSES[code]
         answer, reason = self._checked(answer, None if status in ACCEPTED else status)
         if reason is not None:
@@ -344,7 +360,7 @@ class NonlinearMPC:
                 self.infeasible_period = self._kept_period(now.time, reason)
             return replace(refused(self._acting, self.horizon, reason, answer), iterations_by=self.name)
         if status == NOT_CONVERGED and first is None:
-            start = _Start(last_plan, self._world.copy(), now.time, self.asked)
+            start = _Start(last_plan, self._world.copy(), now.time + self.settings.delay, self.asked)
             converges = partial(_converges, self._again, self.settings, start)
             self.infeasible_period = replace(self._kept_period(now.time, status), converges=converges)
         speeds = self.plan.copy()
@@ -399,9 +415,10 @@ class NonlinearMPC:
 
     @property
     def asked(self) -> tuple[Array, ...]:
-        """The last query: the state (n,) and the inputs in force (4,), reference states (N + 1, 13) and thrusts (N, 4).
+        """The last query: the state (n,) from which the command acts, and the inputs before (4,); then the reference.
 
-        States are position, quaternion, velocity, body rates and actuators; thrusts [N] hold the reference.
+        The reference is states (N + 1, 13) and the rotors' thrusts (N, 4) [N] that hold them.  States are position,
+        quaternion, velocity, body rates and, of the measured one, actuators.
         """
         return tuple(array.copy() for array in self._asked)
 
@@ -578,7 +595,8 @@ class NonlinearMPC:
 
     def _kept_period(self, time: float, status: str) -> InfeasiblePeriod:
         """Return the last program as the data of a period without an answer."""
-        return InfeasiblePeriod(problem=self._named(), query=self._query(), status=status, time=time)
+        delay = self.settings.delay
+        return InfeasiblePeriod(problem=self._named(), query=self._query(), status=status, time=time, delay=delay)
 
     def _named(self) -> Problem:
         """The last program with the half-spaces of each obstacle by its name."""

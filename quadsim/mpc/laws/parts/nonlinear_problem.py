@@ -14,7 +14,7 @@ from quadsim.controller import ROTORS
 from quadsim.errors import ParameterError
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.laws.parts.body import linearise
-from quadsim.mpc.laws.parts.sqp import OWN_NAMES
+from quadsim.mpc.laws.parts.sqp import OWN_NAMES, TILT_SIDES
 from quadsim.mpc.problem.constraints import Constraint, Penalty
 from quadsim.mpc.problem.model import LinearModel
 from quadsim.mpc.problem.ocp import Objective, Problem, lqr_terminal_weight
@@ -24,9 +24,6 @@ from quadsim.mpc.tables.nonlinear import Nonlinear
 from quadsim.state import EULER, EULER_RATE, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-TILT_SIDES: Final = 12
-"""Sides of the polygon that a tilt bound imposes on the thrust axis's horizontal part, inside the circle; it costs up
-to 3.4 % of the bound's sine."""
 _HOVER_STATES: Final = (
     *("x", "y", "z", "attitude x", "attitude y", "attitude z", "vx", "vy", "vz"),
     *("body rate x", "body rate y", "body rate z", "rotor 1", "rotor 2", "rotor 3", "rotor 4"),

@@ -27,7 +27,9 @@ _CURVATURE: Final = 1e-5
 """Curvature of a price without one, about the optimum that the core iterates for, per l1."""
 _OWN_SLACKS: Final = {"tilt": 0, "body_rates": 1, "space": 2}
 """Slacks of a node by the constraints that have them; those of all others follow."""
-_TILT_SIDES: Final = constant("QUADSIM_NMPC_SIDES")
+TILT_SIDES: Final = constant("QUADSIM_NMPC_SIDES")
+"""Sides of the polygon that a tilt bound imposes on the thrust axis's horizontal part, inside the circle; it costs up
+to 3.4 % of the bound's sine."""
 OWN_NAMES: Final = ("inputs", "tilt", "body_rates")
 """Constraints whose rows the core has by themselves."""
 
@@ -203,17 +205,17 @@ def multipliers(program: SQPProgram, work: Struct, rows: int, faces_from: int | 
     """
     p = program.struct
     multiplier = np.zeros((p.horizon, rows))
-    stated = 2 * N_ROTORS + _TILT_SIDES + 6
+    stated = 2 * N_ROTORS + TILT_SIDES + 6
     kinds = stated + p.rows + p.faces + p.slacks
     of_row = core_view(work.row, p.room, kind=ctypes.c_int)[: work.count].tolist()
     for row, by in zip(of_row, core_view(work.multiplier, p.room).tolist(), strict=False):
         node, kind = divmod(row, kinds)
         if kind < 2 * N_ROTORS:
             multiplier[node, program.first["inputs"] + kind % N_ROTORS] += by if kind < N_ROTORS else -by
-        elif kind < 2 * N_ROTORS + _TILT_SIDES:
+        elif kind < 2 * N_ROTORS + TILT_SIDES:
             multiplier[node, program.first["tilt"] + kind - 2 * N_ROTORS] += by
         elif kind < stated:
-            turn = kind - 2 * N_ROTORS - _TILT_SIDES
+            turn = kind - 2 * N_ROTORS - TILT_SIDES
             multiplier[node, program.first["body_rates"] + turn % 3] += by if turn < 3 else -by
         elif kind < stated + p.rows:
             index, side = program.stated[kind - stated].of
