@@ -1,4 +1,4 @@
-"""acados' real-time iteration with HPIPM on the problem of an `SQP`: the peer of `benchmarks/nonlinear.py`.
+"""acados' real-time iteration with HPIPM on the problem of a `NonlinearMPC`: the peer of `benchmarks/nonlinear.py`.
 
 `make peers` installs its wheel in .venv/acados, apart from quadsim's packages, and without the CasADi that it carries.
 """

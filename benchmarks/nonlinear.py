@@ -27,7 +27,7 @@ from quadsim.console.progress import Progress
 from quadsim.errors import FlightError
 from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
-from quadsim.mpc.laws.parts.sqp import SQP, SQPStatus
+from quadsim.mpc.laws.parts.sqp import SQPStatus
 from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.schema.scenario import Scenario
@@ -60,7 +60,7 @@ OPTIMAL: Final = {SQPStatus.FREE, SQPStatus.BOUNDED, SQPStatus.UNCONVERGED}
 
 
 class Replay:
-    """Solves each period of a law's `SQP` several times from the same memory.
+    """Solves each period of a law several times from the same memory.
 
     Attributes:
         ms: the least processor time of each period.
@@ -69,29 +69,30 @@ class Replay:
     """
 
     def __init__(self, law: NonlinearMPC, repeats: int) -> None:
-        self._sqp, self._step, self._repeats = law._sqp, law._sqp.step, repeats
-        self._memory: tuple[Any, ...] = law._law._memory
+        self._law, self._solve, self._repeats = law, law.solve, repeats
+        self._memory: tuple[Any, ...] = law._memory
         self.ms: list[float] = []
         self.active: list[int] = []
         self.iterations: list[int] = []
 
-    def step(self) -> SQPStatus:
-        """See `SQP.step`."""
-        sqp, spent = self._sqp, []
+    def solve(self) -> SQPStatus:
+        """See `NonlinearMPC.solve`."""
+        law, spent = self._law, []
+        work_now = law.struct.work
         memory: list[Any] = [part.copy() for part in self._memory]
-        work = bytes(sqp._work)
-        status = self._step()
+        work = bytes(work_now)
+        status = self._solve()
         for _ in range(self._repeats):
             for part, before in zip(self._memory, memory, strict=True):
                 np.copyto(part, before)
-            ctypes.memmove(ctypes.byref(sqp._work), work, len(work))
+            ctypes.memmove(ctypes.byref(work_now), work, len(work))
             started = clock.thread_time()
-            again = sqp._library.quadsim_nmpc_step(*sqp._arguments)
+            again = law._library.quadsim_nmpc_step(*law._arguments)
             spent.append(clock.thread_time() - started)
             assert again == status
         self.ms.append(1e3 * min(spent))
-        self.active.append(sqp.active)
-        self.iterations.append(sqp.iterations)
+        self.active.append(law.active)
+        self.iterations.append(law.changes)
         return status
 
 
@@ -109,7 +110,7 @@ def replayed(scenario: Scenario, repeats: int) -> Record:
     with Rollout(scenario.replace({"controller.kkt_every": 1})) as flight:
         law = law_of(flight)
         replay = Replay(law, repeats)
-        law._sqp.step = replay.step  # type: ignore[assignment, method-assign]
+        law.solve = replay.solve  # type: ignore[assignment, method-assign]
         try:
             while not flight.done:
                 stats = flight.loop.step().command.stats
@@ -118,7 +119,7 @@ def replayed(scenario: Scenario, repeats: int) -> Record:
         except FlightError:
             pass
         return {
-            "nodes": law._sqp.horizon,
+            "nodes": law.problem.horizon,
             "periods": len(replay.ms),
             "most_active": max(replay.active),
             "most_iterations": max(replay.iterations),
@@ -147,21 +148,26 @@ def of_flights(quick: bool, report: Progress) -> Iterator[Record]:
 
 
 class CoreRTI:
-    """An `SQP` about one state at rest, timed as `acados_rti.AcadosRTI` is."""
+    """A law about one state at rest, timed as `acados_rti.AcadosRTI` is."""
 
-    def __init__(self, sqp: SQP, rest: Array, hover: Array, thrusts: Array) -> None:
-        self._sqp, self.reset = sqp, sqp.reset
-        self._hover, self._reference = hover, (np.tile(rest, (sqp.horizon + 1, 1)), np.tile(thrusts, (sqp.horizon, 1)))
+    def __init__(self, law: NonlinearMPC, rest: Array, hover: Array, thrusts: Array) -> None:
+        self._law, self._hover, nodes = law, hover, law.problem.horizon
+        self._reference = np.tile(rest, (nodes + 1, 1)), np.tile(thrusts, (nodes, 1))
+
+    def reset(self) -> None:
+        """Forget the plan and the active set."""
+        self._law.stored_plan = None
 
     def step(self, measured: Array) -> tuple[float, Array]:
         """Plan from a measured state (13,); return the processor time of the call [s], and the first input (4,)."""
-        sqp = self._sqp
-        sqp._ask((measured, self._hover, *self._reference))
+        law = self._law
+        for array, value in zip(law._asked, (measured, self._hover, *self._reference), strict=True):
+            array[:] = value
         started = clock.thread_time()
-        status = sqp._library.quadsim_nmpc_step(*sqp._arguments)
+        status = law._library.quadsim_nmpc_step(*law._arguments)
         spent = clock.thread_time() - started
         assert status in OPTIMAL
-        return spent, sqp._u[0].copy()
+        return spent, law._u[0].copy()
 
     def thrown(self, rest: Array, distance: float) -> Iterator[Array]:
         """Yield measured states (13,): `rest` thrown off, then always what is planned from the last."""
@@ -173,7 +179,7 @@ class CoreRTI:
                 state[:3] += distance * rng.standard_normal(3)
             yield state
             self.step(state)
-            state = self._sqp._x[1].copy()
+            state = self._law._x[1].copy()
 
 
 def beside_acados(quick: bool, report: Progress) -> Iterator[Record]:
@@ -186,8 +192,8 @@ def beside_acados(quick: bool, report: Progress) -> Iterator[Record]:
         settings = Nonlinear(horizon=N, attitude_error="difference", terminal=1.0, shift=False)
         law = NonlinearMPC(vehicle, period=PEER_NODES[N], settings=settings)
         hover, thrusts = law.problem.model.u_bar, np.full(4, vehicle.mass * vehicle.gravity / 4.0)
-        core = CoreRTI(law._sqp, rest, hover, thrusts)
-        with acados_rti.acados(law._model, law.problem, rest) as peers:
+        core = CoreRTI(law, rest, hover, thrusts)
+        with acados_rti.acados(law.model, law.problem, rest) as peers:
             for distance in DISTANCES:
                 record = compared({"C": core, **peers}, [*core.thrown(rest, distance)], 2 if quick else 7)
                 yield {"case": f"N = {N}, {distance:g} m off", **record}

@@ -23,7 +23,7 @@ from quadsim.errors import described
 from quadsim.flight.audit import Limit, audit
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.mpc.laws.constrained import Constrained
-from quadsim.mpc.laws.parts.body import Body
+from quadsim.mpc.laws.parts.body import body_of, linearise, next_states, world_of
 from quadsim.mpc.laws.parts.linear import LinearMPC, NominalPreparation
 from quadsim.mpc.laws.parts.preparation import RobustPreparation
 from quadsim.mpc.laws.robust import Robust
@@ -242,12 +242,13 @@ def changing_period(rng: np.random.Generator, problem: Problem) -> Period:
 
 def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
     """(..., n) the states one step after states x (..., n) under inputs u (..., 4)."""
-    return Body(model).advance(x, u)
+    body, _left = body_of(model)
+    return next_states(body, world_of(model), x, u)
 
 
 def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
-    """See `quadsim.mpc.laws.parts.body.Body.linearise`."""
-    return Body(model).linearise(x, u, frames)
+    """See `quadsim.mpc.laws.parts.body.linearise`."""
+    return linearise(model, x, u, frames)
 
 
 def frame(q_r: Array) -> Array:

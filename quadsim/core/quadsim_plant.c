@@ -30,7 +30,7 @@ static double clip(double number, double low, double high) /* what is no number 
 /* ---- rotors ------------------------------------------------------------------------------------------------------ */
 
 /* A speed and its slope a time `t` after a command: a straight line, then an exponential. */
-static double respond(const quadsim_vehicle *v, double speed, double target, double t, double *slope)
+static double follow_target(const quadsim_vehicle *v, double speed, double target, double t, double *slope)
 {
     const double gap = target - speed, distance = fabs(gap), sign = gap > 0.0 ? 1.0 : gap < 0.0 ? -1.0 : 0.0;
     const double lag = gap >= 0.0 ? v->rise : v->fall, steepest = v->acceleration;
@@ -59,9 +59,9 @@ static void turn(quadsim_vehicle *v, double *at_start, double *midway, double *s
             continue;
         }
         const double speed = v->speeds[i], target = v->target[i];
-        at_start[i] = respond(v, speed, target, 0.0, &unused);
-        midway[i] = respond(v, speed, target, 0.5 * v->timestep, &slope[i]);
-        v->speeds[i] = respond(v, speed, target, v->timestep, &unused);
+        at_start[i] = follow_target(v, speed, target, 0.0, &unused);
+        midway[i] = follow_target(v, speed, target, 0.5 * v->timestep, &slope[i]);
+        v->speeds[i] = follow_target(v, speed, target, v->timestep, &unused);
     }
 }
 

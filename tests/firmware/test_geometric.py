@@ -29,9 +29,15 @@ from quadsim.state import make_state
 
 FED_FORWARD = {"feedforward": True, "disturbance": {}, "drag": [0.3, 0.2, 0.1], "integral": True}
 """With the autopilot scenario's motion as its reference."""
-LAWS: dict[str, dict[str, Any]] = {"plain": {}, "observing": {"disturbance": {}}, "fed forward": FED_FORWARD}
+LATE = {**FED_FORWARD, "delay": 0.013}
+LAWS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "observing": {"disturbance": {}},
+    "fed forward": FED_FORWARD,
+    "late": LATE,
+}
 SOURCES = tuple(name for name in CGeometric.law_files if name.endswith(".c"))
-OWN = ("quadsim_ramp.c", "quadsim_geometric.c")
+OWN = ("quadsim_delay.c", "quadsim_ramp.c", "quadsim_geometric.c")
 PRECISIONS = pytest.mark.parametrize("precision", ["double", "float"])
 
 Exported = Callable[..., Path]

@@ -100,16 +100,17 @@ class LinearSearch:
 def nonlinear_search(controller: CNonlinear, room: int, changes: int) -> Solves:
     """Return the same of a nonlinear controller's first programs, along a reference at rest."""
     law = replace(controller).law
-    sqp, hover, N = law._sqp, law.problem.model.u_bar, law._sqp.horizon
-    sqp.resize(room or sqp.struct.room, changes or sqp.struct.changes)
-    states, thrusts = np.zeros((N + 1, N_BODY)), np.tile(np.array(law._law.numbers.lifts), (N, 1))
+    program, hover = law.program.struct, law.problem.model.u_bar
+    law.resize(room or program.room, changes or program.changes)
+    states = np.zeros((program.horizon + 1, N_BODY))
+    thrusts = np.tile(np.array(law.numbers.lifts), (program.horizon, 1))
     states[:, 3] = 1.0
 
     def solves(offset: Array) -> bool:
-        measured = np.concatenate([states[0], hover[: sqp.struct.actuators]])
+        measured = np.concatenate([states[0], hover[: program.actuators]])
         measured[P], measured[V] = offset[:3], offset[3:]
-        sqp.reset()
-        return sqp.step(measured, hover, states, thrusts) <= SQPStatus.UNCONVERGED
+        law.stored_plan = None
+        return law.solve(measured, hover, states, thrusts) <= SQPStatus.UNCONVERGED
 
     return solves
 

@@ -3,7 +3,7 @@
 
 #include <string.h>
 
-#include "quadsim_math.h"
+#include "quadsim_nmpc_math.h"
 
 typedef quadsim_geometric_numbers numbers_of_law;
 typedef quadsim_geometric_motion motion_now;
@@ -23,7 +23,7 @@ static real length_of(const real *vector)
 /* ---- what is measured, and what is wanted ------------------------------------------------------------------------ */
 
 /* The attitude of Euler angles, body to world. */
-static void put_attitude(const real *state, real attitude[9])
+static void attitude_of_angles(const real *state, real attitude[9])
 {
     real s[3], c[3];
     sines_of(state, s, c);
@@ -50,7 +50,7 @@ void quadsim_geometric_measure(const quadsim_real state[12], const quadsim_real 
     if (quaternion != NULL) {
         attitude_of(quaternion, motion->attitude);
     } else {
-        put_attitude(state, motion->attitude);
+        attitude_of_angles(state, motion->attitude);
     }
     if (rates != NULL) {
         memcpy(motion->rates, rates, sizeof(motion->rates));
@@ -481,8 +481,9 @@ void quadsim_geometric_integrate(quadsim_geometric *law, const motion_now *motio
     }
 }
 
-/* The disturbance in the middle of the period that starts now, and the thrust scale; none until the vehicle flies. */
-static void observe(quadsim_geometric *law, int flying, int follows, const motion_now *motion, const real *acting,
+/* The disturbance in the middle of the period for which this command acts, and the thrust scale; none until the vehicle
+ * flies. */
+static void estimate_disturbance(quadsim_geometric *law, int flying, int follows, const motion_now *motion, const real *acting,
                     disturbance_now *d)
 {
     const numbers_of_law *n = law->numbers;
@@ -496,18 +497,52 @@ static void observe(quadsim_geometric *law, int flying, int follows, const motio
         return;
     }
     quadsim_ramp_update(&law->ramp, n->ramp, follows, motion->velocity, motion->attitude, motion->rates, acting);
-    quadsim_ramp_foreseen(&law->ramp, n->ramp, R(0.5) * n->period, d->force, d->change, d->torque);
+    quadsim_ramp_foreseen(&law->ramp, n->ramp, R(0.5) * n->period + (n->delay == NULL ? R(0.0) : n->delay->delay), d->force,
+                          d->change, d->torque);
     law->thrust_scale = quadsim_ramp_scale(&law->ramp, n->ramp);
 }
 
+/* Move what is measured on to when this period's command takes over. */
+static void predict_motion(const quadsim_geometric *law, const disturbance_now *d, motion_now *motion)
+{
+    const numbers_of_law *n = law->numbers;
+    quadsim_nmpc_world world;
+    real state[MOST], length;
+    int i;
+    memset(&world, 0, sizeof(world));
+    for (i = 0; i < 3; i++) {
+        world.acceleration[i] = d->force[i] - n->delay->delay * d->change[i]; /* in the period that starts now */
+        world.angular[i] = d->torque[i];
+        world.drag[i] = n->drag[i];
+    }
+    world.thrust_scale = law->thrust_scale;
+    memcpy(state + P, motion->position, sizeof(motion->position));
+    memcpy(state + V, motion->velocity, sizeof(motion->velocity));
+    memcpy(state + W, motion->rates, sizeof(motion->rates));
+    quaternion_of(motion->attitude, state + Q);
+    quadsim_delay_predict(&law->delay, n->delay, &world, state, state);
+    length = square_root(dot(state + Q, state + Q, 4));
+    for (i = 0; i < 4; i++) {
+        state[Q + i] /= length;
+    }
+    memcpy(motion->position, state + P, sizeof(motion->position));
+    memcpy(motion->velocity, state + V, sizeof(motion->velocity));
+    memcpy(motion->rates, state + W, sizeof(motion->rates));
+    attitude_of(state + Q, motion->attitude);
+    motion->yaw = direction_of(motion->attitude[3], motion->attitude[0]);
+}
+
 /* Drop the integrals and all that is estimated. */
-static void forget(quadsim_geometric *law, const real *acting)
+static void reset_integrals(quadsim_geometric *law, const real *acting)
 {
     memset(law->translation, 0, sizeof(law->translation));
     memset(law->rotation, 0, sizeof(law->rotation));
     law->learns = 0;
     if (law->numbers->ramp != NULL) {
         quadsim_ramp_reset(&law->ramp, law->numbers->ramp, acting);
+    }
+    if (law->numbers->delay != NULL) {
+        quadsim_delay_reset(&law->delay, law->numbers->delay, acting);
     }
 }
 
@@ -516,38 +551,55 @@ long quadsim_geometric_reals(const numbers_of_law *n)
     return 2L * n->horizon * NU;
 }
 
+/* The command after which a law starts: the thrust of the weight or, of rotors, rotors at rest. */
+static void find_first_command(const numbers_of_law *n, real command[NU])
+{
+    memset(command, 0, NU * sizeof(real));
+    if (n->commands != QUADSIM_GEOMETRIC_ROTORS) {
+        command[0] = n->mass * n->gravity;
+    }
+}
+
 void quadsim_geometric_start(quadsim_geometric *law, const numbers_of_law *n, quadsim_real *memory)
 {
-    real hover[NU] = {R(0.0)};
+    real first[NU];
     memset(law, 0, sizeof(*law));
     law->numbers = n;
     law->plan = memory;
-    if (n->commands != QUADSIM_GEOMETRIC_ROTORS) {
-        hover[0] = n->mass * n->gravity;
-    }
+    find_first_command(n, first);
     if (n->fallback != NULL) {
         quadsim_guard_start(&law->guard, n->fallback, n->horizon, memory + n->horizon * NU);
     }
-    quadsim_geometric_reset(law, hover);
+    quadsim_geometric_reset(law, first);
 }
 
 void quadsim_geometric_reset(quadsim_geometric *law, const quadsim_real acting[4])
 {
-    const real *usable = acting;
+    real first[NU];
+    const real *usable = is_finite(acting, NU) ? acting : first;
+    find_first_command(law->numbers, first);
     if (law->numbers->fallback != NULL) {
         quadsim_guard_reset(&law->guard, acting);
         usable = law->guard.before;
     }
-    forget(law, usable);
+    reset_integrals(law, usable);
 }
 
-void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, const motion_now *motion,
+void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, quadsim_geometric_motion *motion,
                              const target_now *target, const quadsim_real acting[4])
 {
     const numbers_of_law *n = law->numbers;
+    const real *in_force = acting;
     disturbance_now d;
     int i, attained = 1;
-    observe(law, flying, follows, motion, acting, &d);
+    if (n->delay != NULL) {
+        quadsim_delay_send(&law->delay, n->delay, 1, acting);
+        in_force = law->delay.sent[0];
+    }
+    estimate_disturbance(law, flying, follows, motion, in_force, &d);
+    if (n->delay != NULL) {
+        predict_motion(law, &d, motion);
+    }
     if (n->commands == QUADSIM_GEOMETRIC_ROTORS) { /* rotors give a share of torques too */
         quadsim_geometric_wrench(law, motion, target, &d, law->command);
         for (i = 0; i < NU; i++) {
@@ -571,7 +623,7 @@ void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, co
 /* ---- with the fallback contract ------------------------------------------------------------------------------------ */
 
 /* The law's answer to the guard's state, as law->plan. */
-static void answer(quadsim_geometric *law, int flying, const real *measured, const real *reference)
+static void plan_commands(quadsim_geometric *law, int flying, const real *measured, const real *reference)
 {
     const numbers_of_law *n = law->numbers;
     const quadsim_guard *guard = &law->guard;
@@ -586,7 +638,7 @@ static void answer(quadsim_geometric *law, int flying, const real *measured, con
     int i;
     quadsim_geometric_measure(guard->state, attitude, rates, &motion);
     if (n->motion) {
-        quadsim_geometric_course(n, QUADSIM_GEOMETRIC_SAMPLES, QUADSIM_GEOMETRIC_ROW, reference, &target);
+        quadsim_geometric_course(n, QUADSIM_GEOMETRIC_SAMPLES, QUADSIM_MOTION, reference, &target);
     } else {
         quadsim_geometric_preview(n, reference, &target);
     }
@@ -600,21 +652,21 @@ static void answer(quadsim_geometric *law, int flying, const real *measured, con
 }
 
 enum quadsim_status quadsim_geometric_step(quadsim_geometric *law, enum quadsim_phase phase,
-                                           const quadsim_real state[QUADSIM_GEOMETRIC_STATE],
+                                           const quadsim_real state[QUADSIM_MEASURED],
                                            const quadsim_real *reference, const quadsim_real acting[4],
                                            quadsim_real command[4])
 {
     const numbers_of_law *n = law->numbers;
-    const int count = n->motion ? QUADSIM_GEOMETRIC_SAMPLES * QUADSIM_GEOMETRIC_ROW : n->horizon * 4;
+    const int count = n->motion ? QUADSIM_GEOMETRIC_SAMPLES * QUADSIM_MOTION : n->horizon * 4;
     quadsim_guard *guard = &law->guard;
     quadsim_trim trim = {{R(0.0)}, {R(0.0), R(0.0), R(1.0)}, {R(0.0)}};
     enum quadsim_status status;
     memcpy(trim.commands, n->fallback->hover, sizeof(trim.commands));
     status = quadsim_guard_begin(guard, phase, &trim, state, reference, count, acting);
     if (status == QUADSIM_FREE && phase == QUADSIM_PHASE_LANDED) {
-        forget(law, guard->in_force);
+        reset_integrals(law, guard->in_force);
     } else if (status == QUADSIM_FREE) {
-        answer(law, phase == QUADSIM_PHASE_FLYING, state, reference);
+        plan_commands(law, phase == QUADSIM_PHASE_FLYING, state, reference);
         status = quadsim_guard_check(guard, QUADSIM_COMMANDED, law->plan);
     }
     if (quadsim_guard_foresees(guard, phase, status)) {

@@ -17,6 +17,7 @@
 #ifndef QUADSIM_GEOMETRIC_H
 #define QUADSIM_GEOMETRIC_H
 
+#include "quadsim_delay.h"
 #include "quadsim_guard.h"
 #include "quadsim_ramp.h"
 
@@ -34,9 +35,7 @@ enum { QUADSIM_GEOMETRIC_ROTORS, QUADSIM_GEOMETRIC_RATES, QUADSIM_GEOMETRIC_ATTI
 enum {
     QUADSIM_GEOMETRIC_ORDERS = 5,  /* derivatives of a position from 0 to snap */
     QUADSIM_GEOMETRIC_SAMPLES = 7, /* of a course, at most */
-    QUADSIM_GEOMETRIC_DEGREE = 5,  /* of the polynomial through them */
-    QUADSIM_GEOMETRIC_STATE = 19,  /* numbers of a state, and */
-    QUADSIM_GEOMETRIC_ROW = 17     /* of a sample, for quadsim_geometric_step */
+    QUADSIM_GEOMETRIC_DEGREE = 5   /* of the polynomial through them */
 };
 
 /* Matrices are row by row.  Axes of vectors: world of forces, body of rates and torques. */
@@ -58,8 +57,10 @@ typedef struct quadsim_geometric_numbers {
     quadsim_real inertia[9];        /* J [kg m^2] */
     quadsim_real across[2], inflow[2], damping[3], turning; /* the air's moment, see quadsim_ramp.h; speeds of all rotors [rad/s] */
     quadsim_real least[4], most[4]; /* of targets */
-    const quadsim_real *preview;    /* [orders][N] from samples one period on, two, ... to value and derivatives now */
+    const quadsim_real *preview;    /* [orders][N] from samples one period on, two, ... to value and derivatives when the
+                                     * command takes over, */
     const quadsim_real *course;     /* [min(K, 6)][K] from samples now, one period on, ..., for K = 1, then 2, ... 7 */
+    const quadsim_delay_numbers *delay; /* which is so much later; NULL where commands act at once */
     const quadsim_ramp_numbers *ramp; /* NULL where no disturbance is observed */
     const quadsim_fallback *fallback; /* NULL where quadsim guards the law: quadsim_geometric_step is not for it */
 } quadsim_geometric_numbers;
@@ -96,6 +97,7 @@ typedef struct quadsim_geometric {
     quadsim_real command[8], thrust_scale;
     quadsim_geometric_attitude desired;
     quadsim_ramp ramp;  /* of disturbances */
+    quadsim_delay delay; /* commands under way */
     quadsim_real *plan; /* [N][4] the command, then hover */
     int learns;         /* whether the state of the last period was measured */
     quadsim_guard guard;
@@ -106,7 +108,7 @@ long quadsim_geometric_reals(const quadsim_geometric_numbers *numbers);
 /* A law in memory of the caller's, after the thrust of the weight or, of rotors, with rotors at rest. */
 void quadsim_geometric_start(quadsim_geometric *law, const quadsim_geometric_numbers *numbers, quadsim_real *memory);
 
-/* Restart after a command: targets, or rotor speeds [rad/s]. */
+/* Restart after a command, targets or rotor speeds [rad/s]; after that of the start where it is not finite. */
 void quadsim_geometric_reset(quadsim_geometric *law, const quadsim_real acting[4]);
 
 /* The motion of a state, with the quaternion wxyz and the body rates that are measured; NULL: those of the state. */
@@ -139,17 +141,18 @@ void quadsim_geometric_targets(quadsim_geometric *law, const quadsim_geometric_m
 void quadsim_geometric_integrate(quadsim_geometric *law, const quadsim_geometric_motion *motion,
                                  const quadsim_geometric_target *target);
 
-/* law->command for the period that starts now: targets within their bounds, or a wrench.  The integrals hold unless the
+/* law->command for the period that starts now: targets within their bounds, or a wrench.  The motion is moved on to when
+ * it takes over, and the target is for then; `acting` is the command that was sent last.  The integrals hold unless the
  * vehicle is flying and the targets that matter to it are within; of a wrench that rotors can give, the caller calls
  * quadsim_geometric_integrate.  `follows`: whether the last call was one period ago. */
-void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, const quadsim_geometric_motion *motion,
+void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, quadsim_geometric_motion *motion,
                              const quadsim_geometric_target *target, const quadsim_real acting[4]);
 
 /* The command of the period that starts now, always finite and within its bounds: the law's, or what the fallback
  * contract flies instead (quadsim_guard.h).  Not for a law of rotors.  Channels of the state that are not measured are not
  * finite. */
 enum quadsim_status quadsim_geometric_step(quadsim_geometric *law, enum quadsim_phase phase,
-                                           const quadsim_real state[QUADSIM_GEOMETRIC_STATE],
+                                           const quadsim_real state[QUADSIM_MEASURED],
                                            const quadsim_real *reference, const quadsim_real acting[4],
                                            quadsim_real command[4]);
 

@@ -179,6 +179,18 @@ static inline real angle_of(real y, real x)
     return y < R(0.0) ? -arc_tangent(-y / x) : arc_tangent(y / x);
 }
 
+/* The angle whose tangent is y / x, of any quadrant [rad]. */
+static inline real direction_of(real y, real x)
+{
+    if (x > R(0.0)) {
+        return angle_of(y, x);
+    }
+    if (x < R(0.0)) {
+        return angle_of(y, -x) * R(-1.0) + (y < R(0.0) ? -R(2.0) * HALF_PI : R(2.0) * HALF_PI);
+    }
+    return y < R(0.0) ? -HALF_PI : (y > R(0.0) ? HALF_PI : R(0.0));
+}
+
 /* The root of a number that is not negative, by Newton's method. */
 static inline real square_root(real number)
 {

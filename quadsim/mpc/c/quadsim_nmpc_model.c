@@ -174,13 +174,11 @@ static void slope_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wo
                      int derive, const real *q, const real *v, const real *w, struct slope *k)
 {
     const real T = drive->thrust, twice = R(2.0) * T;
-    int i;
     quaternion_rate(q, w, k->q);
     thrust_axis(q, k->axis);
-    for (i = 0; i < 3; i++) {
-        k->v[i] = T * k->axis[i] + world->acceleration[i];
-    }
-    k->v[2] -= p->gravity;
+    k->v[0] = T * k->axis[0] + world->acceleration[0];
+    k->v[1] = T * k->axis[1] + world->acceleration[1];
+    k->v[2] = T * k->axis[2] + world->acceleration[2] - p->gravity;
     memcpy(k->w, drive->angular, sizeof k->w);
     add_gyroscopic(p->gyration, w, k->w);
     if (derive) {
@@ -275,14 +273,24 @@ INLINED void pushing_slopes(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
     }
 }
 
-/* Body rates at an instant, where targets make them known. */
-INLINED void set_rates(const quadsim_nmpc_problem *p, const struct drive *drive, real *y, real D[10][TURNING])
+/* Derivatives of what a step leads to: columns that turn the attitude, of quaternion, velocity and body rates, and of the
+ * position; and columns that only push, of velocity and of the position. */
+struct columns {
+    real turning[10][TURNING], moved[3][TURNING];
+    real pushing[3][PUSHING], pushed[3][PUSHING];
+};
+
+/* Body rates at an instant, where targets make them known, and their columns. */
+INLINED void set_rates(const quadsim_nmpc_problem *p, const struct drive *drive, const int derive, real *y,
+                       real D[10][TURNING])
 {
     int i;
     for (i = 0; i < 3; i++) {
         y[7 + i] = drive->rates[i];
-        D[7 + i][4 + i] = drive->left[i + 1];
-        D[7 + i][7 + i] = p->effect[5 * (i + 1)] * (R(1.0) - drive->left[i + 1]);
+        if (derive) {
+            D[7 + i][4 + i] = drive->left[i + 1];
+            D[7 + i][7 + i] = p->effect[5 * (i + 1)] * (R(1.0) - drive->left[i + 1]);
+        }
     }
 }
 
@@ -298,117 +306,122 @@ static void actuators_after(const quadsim_nmpc_problem *p, const real *x, const 
     }
 }
 
-/* One node: m turning columns, padded, with targets or not, so many actuators, and with the air's torque or not. */
-INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
-                            const real *frame, const real *next, const int m, const int targets, const int actuators,
-                            const int moments, int n, real *map, real *end)
+/* Runge-Kutta's classical method over a step with held inputs: it moves y, the quaternion, velocity and body rates [10],
+ * and adds to `place` how far the position went; and, where `derive`, moves the columns: m that turn, padded, with targets
+ * or not, so many actuators, and with the air's torque or not. */
+INLINED void integrate(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
+                       const int derive, const int m, const int targets, const int actuators, const int moments, real *y,
+                       real *place, struct columns *columns)
 {
-    static const real UNITS[4][4] = {{R(1.0)}, {R(0.0), R(1.0)}, {R(0.0), R(0.0), R(1.0)}, {R(0.0), R(0.0), R(0.0), R(1.0)}};
     const real h = p->step / (real)p->substeps, part[4] = {R(0.0), R(0.5) * h, R(0.5) * h, h};
-    const int width = columns_of(n), turning = targets ? 10 : 11 + actuators, befores = n - BODY - actuators;
     const int air = meets_air(p, world);
-    real D[10][TURNING] = {{R(0.0)}}, E[3][PUSHING] = {{R(0.0)}}, moved[3][TURNING] = {{R(0.0)}};
-    real pushed[3][PUSHING] = {{R(0.0)}}, K[10][TURNING], L[3][PUSHING], y[10], travelled[3], by_share[5][NU];
+    real K[10][TURNING], L[3][PUSHING], by_share[5][NU];
     struct drive drive;
     struct slope k;
     int s, stage, i, c;
-    memset(K, 0, sizeof K);
-    memcpy(y, x + Q, sizeof y);
-    for (i = 0; i < 4; i++) { /* the quaternion starts at F' of the frame's units */
-        real column[4];
-        from_frame(frame, UNITS[i], column);
-        for (c = 0; c < 4; c++) {
-            D[c][i] = column[c];
-        }
-    }
-    for (i = 0; i < 3; i++) {
-        D[7 + i][4 + i] = E[i][i] = R(1.0);
-        if (moments) {
-            D[4 + i][turning + i] = R(1.0);
-        }
-        travelled[i] = R(0.0);
+    if (derive) {
+        memset(K, 0, sizeof K);
     }
     for (s = 0; s < p->substeps; s++) {
         real Ds[10][TURNING], Es[3][PUSHING], ys[10], sum[10][TURNING], push[3][PUSHING], value[10] = {R(0.0)};
         for (stage = 0; stage < 4; stage++) {
-            const real twice = stage == 1 || stage == 2 ? R(2.0) : R(1.0);
+            const real twice = stage == 1 || stage == 2 ? R(2.0) : R(1.0), by = part[stage];
             if (stage == 0) {
-                memcpy(Ds, D, sizeof D);
-                memcpy(Es, E, sizeof E);
-                memcpy(ys, y, sizeof y);
+                memcpy(ys, y, sizeof ys);
             } else {
-                const real by = part[stage];
-                for (i = 0; i < 10; i++) {
-                    for (c = 0; c < m; c++) {
-                        Ds[i][c] = D[i][c] + by * K[i][c];
-                    }
-                }
                 for (i = 0; i < 3; i++) {
-                    for (c = 0; c < PUSHING; c++) {
-                        Es[i][c] = E[i][c] + by * L[i][c];
-                    }
                     ys[i] = y[i] + by * k.q[i];
                     ys[4 + i] = y[4 + i] + by * k.v[i];
                     ys[7 + i] = y[7 + i] + by * k.w[i];
                 }
                 ys[3] = y[3] + by * k.q[3];
             }
+            for (i = 0; derive && i < 10; i++) {
+                for (c = 0; c < m; c++) {
+                    Ds[i][c] = stage == 0 ? columns->turning[i][c] : columns->turning[i][c] + by * K[i][c];
+                }
+            }
+            for (i = 0; derive && i < 3; i++) {
+                for (c = 0; c < PUSHING; c++) {
+                    Es[i][c] = stage == 0 ? columns->pushing[i][c] : columns->pushing[i][c] + by * L[i][c];
+                }
+            }
             drive = drive_at(p, world, x, u, 2 * s + (stage + 1) / 2, by_share);
             if (targets) {
-                set_rates(p, &drive, ys, Ds);
+                set_rates(p, &drive, derive, ys, Ds);
             }
-            slope_at(p, world, &drive, air, 1, ys, ys + 4, ys + 7, &k);
+            slope_at(p, world, &drive, air, derive, ys, ys + 4, ys + 7, &k);
+            for (i = 0; i < 3; i++) { /* the position's slope is the velocity */
+                place[i] += stage < 3 ? h * h / R(6.0) * k.v[i] : h * y[4 + i];
+            }
+            for (i = 0; i < 10; i++) {
+                value[i] += twice * (i < 4 ? k.q[i] : i < 7 ? k.v[i - 4] : k.w[i - 7]);
+            }
+            if (!derive) {
+                continue;
+            }
             turning_slopes(p, &k, ys, ys + 7, air, by_share, m, targets, actuators, moments, &drive, Ds, K);
             pushing_slopes(p, world, &k, &drive, air, targets, Es, L);
-            if (stage == 3) { /* of the position, whose slope is the velocity */
-                for (i = 0; i < 3; i++) {
-                    for (c = 0; c < m; c++) {
-                        moved[i][c] += h * D[4 + i][c];
-                    }
-                    for (c = 0; c < PUSHING; c++) {
-                        pushed[i][c] += h * E[i][c];
-                    }
-                    travelled[i] += h * y[4 + i];
+            for (i = 0; i < 3; i++) {
+                const real share = h * h / R(6.0);
+                for (c = 0; c < m; c++) {
+                    columns->moved[i][c] += stage < 3 ? share * K[4 + i][c] : h * columns->turning[4 + i][c];
+                }
+                for (c = 0; c < PUSHING; c++) {
+                    columns->pushed[i][c] += stage < 3 ? share * L[i][c] : h * columns->pushing[i][c];
+                    push[i][c] = stage == 0 ? L[i][c] : push[i][c] + twice * L[i][c];
                 }
             }
             for (i = 0; i < 10; i++) {
                 for (c = 0; c < m; c++) {
                     sum[i][c] = stage == 0 ? K[i][c] : sum[i][c] + twice * K[i][c];
                 }
-                value[i] = (stage == 0 ? R(0.0) : value[i]) + twice * (i < 4 ? k.q[i] : i < 7 ? k.v[i - 4] : k.w[i - 7]);
-            }
-            for (i = 0; i < 3; i++) {
-                const real by = h * h / R(6.0);
-                for (c = 0; c < PUSHING; c++) {
-                    push[i][c] = stage == 0 ? L[i][c] : push[i][c] + twice * L[i][c];
-                }
-                if (stage < 3) {
-                    for (c = 0; c < m; c++) {
-                        moved[i][c] += by * K[4 + i][c];
-                    }
-                    for (c = 0; c < PUSHING; c++) {
-                        pushed[i][c] += by * L[i][c];
-                    }
-                    travelled[i] += by * k.v[i];
-                }
             }
         }
         for (i = 0; i < 10; i++) {
-            for (c = 0; c < m; c++) {
-                D[i][c] += h / R(6.0) * sum[i][c];
+            for (c = 0; derive && c < m; c++) {
+                columns->turning[i][c] += h / R(6.0) * sum[i][c];
             }
             y[i] += h / R(6.0) * value[i];
         }
-        for (i = 0; i < 3; i++) {
+        for (i = 0; derive && i < 3; i++) {
             for (c = 0; c < PUSHING; c++) {
-                E[i][c] += h / R(6.0) * push[i][c];
+                columns->pushing[i][c] += h / R(6.0) * push[i][c];
             }
         }
     }
     if (targets) {
         drive = drive_at(p, world, x, u, 2 * p->substeps, by_share);
-        set_rates(p, &drive, y, D);
+        set_rates(p, &drive, derive, y, derive ? columns->turning : NULL);
     }
+}
+
+/* One node: m turning columns, padded, with targets or not, so many actuators, and with the air's torque or not. */
+INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
+                            const real *frame, const real *next, const int m, const int targets, const int actuators,
+                            const int moments, int n, real *map, real *end)
+{
+    static const real UNITS[4][4] = {{R(1.0)}, {R(0.0), R(1.0)}, {R(0.0), R(0.0), R(1.0)}, {R(0.0), R(0.0), R(0.0), R(1.0)}};
+    const int width = columns_of(n), turning = targets ? 10 : 11 + actuators, befores = n - BODY - actuators;
+    struct columns d;
+    real y[10], travelled[3] = {R(0.0)};
+    int i, c;
+    memset(&d, 0, sizeof d);
+    memcpy(y, x + Q, sizeof y);
+    for (i = 0; i < 4; i++) { /* the quaternion starts at F' of the frame's units */
+        real column[4];
+        from_frame(frame, UNITS[i], column);
+        for (c = 0; c < 4; c++) {
+            d.turning[c][i] = column[c];
+        }
+    }
+    for (i = 0; i < 3; i++) {
+        d.turning[7 + i][4 + i] = d.pushing[i][i] = R(1.0);
+        if (moments) {
+            d.turning[4 + i][turning + i] = R(1.0);
+        }
+    }
+    integrate(p, world, x, u, 1, m, targets, actuators, moments, y, travelled, &d);
     /* The map's columns: quaternion, velocity, body rates, actuators, inputs. */
     memset(map, 0, sizeof(real) * (size_t)(BODY * width));
     for (c = 0; c < turning + (moments ? 3 : 0); c++) {
@@ -417,13 +430,13 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
         const int at = c < turning ? of_turning + (of_input ? befores : 0) : 4 + c - turning;
         real q[4], turned[4];
         for (i = 0; i < 4; i++) {
-            q[i] = D[i][c];
+            q[i] = d.turning[i][c];
         }
         into_frame(next, q, turned);
         for (i = 0; i < 3; i++) {
-            map[i * width + at] = moved[i][c];
-            map[(V + i) * width + at] = D[4 + i][c];
-            map[(W + i) * width + at] = D[7 + i][c];
+            map[i * width + at] = d.moved[i][c];
+            map[(V + i) * width + at] = d.turning[4 + i][c];
+            map[(W + i) * width + at] = d.turning[7 + i][c];
         }
         for (i = 0; i < 4; i++) {
             map[(Q + i) * width + at] = turned[i];
@@ -432,8 +445,8 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
     for (c = moments ? 3 : 0; c < (targets ? 5 : 3); c++) {
         const int at = c < 3 ? 4 + c : 7 + c + (c == 4 ? befores : 0);
         for (i = 0; i < 3; i++) {
-            map[i * width + at] = pushed[i][c];
-            map[(V + i) * width + at] = E[i][c];
+            map[i * width + at] = d.pushed[i][c];
+            map[(V + i) * width + at] = d.pushing[i][c];
         }
     }
     for (i = 0; i < 3; i++) {
@@ -516,43 +529,13 @@ void quadsim_nmpc_linearise(quadsim_nmpc_work *work, const quadsim_nmpc_world *w
 }
 
 /* The next state, without derivatives. */
-static void advance(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u, real *end)
+static void predict_state(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
+                          real *end)
 {
-    const int air = meets_air(p, world);
-    const real h = p->step / (real)p->substeps, part[4] = {R(0.0), R(0.5) * h, R(0.5) * h, h};
-    real y[10], by_share[5][NU];
-    struct drive drive;
-    int s, stage, i;
+    real y[10];
     memcpy(y, x + Q, sizeof y);
     memcpy(end, x, sizeof(real) * 3);
-    for (s = 0; s < p->substeps; s++) {
-        real sum[10] = {R(0.0)}, ys[10];
-        struct slope k;
-        memcpy(ys, y, sizeof y);
-        for (stage = 0; stage < 4; stage++) {
-            const real twice = stage == 1 || stage == 2 ? R(2.0) : R(1.0);
-            drive = drive_at(p, world, x, u, 2 * s + (stage + 1) / 2, by_share);
-            for (i = 0; p->targets && i < 3; i++) {
-                ys[7 + i] = drive.rates[i];
-            }
-            slope_at(p, world, &drive, air, 0, ys, ys + 4, ys + 7, &k);
-            for (i = 0; i < 3; i++) {
-                end[i] += stage < 3 ? h * h / R(6.0) * k.v[i] : h * y[4 + i];
-            }
-            for (i = 0; i < 10; i++) {
-                const real slope = i < 4 ? k.q[i] : i < 7 ? k.v[i - 4] : k.w[i - 7];
-                sum[i] += twice * slope;
-                ys[i] = stage < 3 ? y[i] + part[stage + 1] * slope : R(0.0);
-            }
-        }
-        for (i = 0; i < 10; i++) {
-            y[i] += h / R(6.0) * sum[i];
-        }
-    }
-    if (p->targets) {
-        drive = drive_at(p, world, x, u, 2 * p->substeps, by_share);
-        memcpy(y + 7, drive.rates, sizeof drive.rates);
-    }
+    integrate(p, world, x, u, 0, 0, p->targets, p->actuators, p->moments, y, end, NULL);
     memcpy(end + Q, y, sizeof y);
     actuators_after(p, x, u, end);
 }
@@ -563,7 +546,7 @@ void quadsim_nmpc_advance(const quadsim_nmpc_problem *p, const quadsim_nmpc_worl
     const int n = states_of(p);
     int i;
     for (i = 0; i < count; i++) {
-        advance(p, world, states + i * n, inputs + i * NU, ends + i * n);
+        predict_state(p, world, states + i * n, inputs + i * NU, ends + i * n);
     }
 }
 
@@ -575,7 +558,7 @@ real quadsim_nmpc_defect(const quadsim_nmpc_work *work, const quadsim_nmpc_world
     real largest = R(0.0), end[MOST];
     int i, j;
     for (i = 0; i < p->horizon; i++) {
-        advance(p, world, work->x + i * n, work->u + i * NU, end);
+        predict_state(p, world, work->x + i * n, work->u + i * NU, end);
         for (j = 0; j < n; j++) {
             const real miss = magnitude(work->x[(i + 1) * n + j] - end[j]);
             largest = miss > largest ? miss : largest;

@@ -13,7 +13,6 @@ static const real OUTSIDE = 1e-3F; /* tolerance of bounds on inputs, as a share 
 #else
 static const real OUTSIDE = 1e-6;
 #endif
-enum { LONG_AGO = 64 }; /* periods after which actuators have reached their command */
 
 /* Periods of the reference and of the plan. */
 static int rows_of(const quadsim_nonlinear_numbers *numbers)
@@ -21,10 +20,17 @@ static int rows_of(const quadsim_nonlinear_numbers *numbers)
     return numbers->problem->horizon * numbers->stride;
 }
 
-/* Numbers of a reference. */
+/* Whole periods for which commands are under way. */
+static int under_way_of(const quadsim_nonlinear_numbers *numbers)
+{
+    return numbers->delay == NULL ? 0 : numbers->delay->under_way;
+}
+
+/* Numbers of a reference; a motion goes on until the last node, by the delay later, and to the sample after it. */
 static int count_of(const quadsim_nonlinear_numbers *numbers, int motion)
 {
-    return motion ? (rows_of(numbers) + 1) * QUADSIM_MOTION : rows_of(numbers) * QUADSIM_PREVIEW;
+    const int later = numbers->delay == NULL ? 0 : numbers->delay->under_way + 1;
+    return motion ? (rows_of(numbers) + 1 + later) * QUADSIM_MOTION : rows_of(numbers) * QUADSIM_PREVIEW;
 }
 
 static int actuators_of(const quadsim_nonlinear_numbers *numbers)
@@ -37,13 +43,7 @@ static int actuators_of(const quadsim_nonlinear_numbers *numbers)
 /* Shares of the largest inputs for commands (4,). */
 static void put_shares(const quadsim_nonlinear_numbers *numbers, const real *commands, real *shares)
 {
-    const quadsim_nmpc_problem *p = numbers->problem;
-    int j;
-    for (j = 0; j < NU; j++) {
-        const real thrust = numbers->coefficient * commands[j] * commands[j] / p->largest;
-        const real rotor = p->speeds ? square_root(thrust) : thrust;
-        shares[j] = p->targets ? commands[j] / numbers->scale[j] : rotor;
-    }
+    commands_to_shares(numbers->problem, numbers->coefficient, numbers->scale, commands, shares);
 }
 
 /* Commands (4,) for shares, moved onto their bounds. */
@@ -68,6 +68,11 @@ static void take_motion(quadsim_nonlinear *law, const real *reference)
     int i;
     for (i = 0; i <= N; i++) {
         const real *row = reference + i * numbers->stride * QUADSIM_MOTION;
+        real later[QUADSIM_MOTION];
+        if (numbers->delay != NULL) {
+            quadsim_delay_sample(numbers->delay, numbers->control_period, reference, i * numbers->stride, later);
+            row = later;
+        }
         memcpy(law->states + i * BODY, row, BODY * sizeof(real));
         if (i < N) {
             memcpy(law->thrusts + i * NU, row + BODY, NU * sizeof(real));
@@ -89,6 +94,27 @@ static void put_node(quadsim_nonlinear *law, int node, const real *place, const 
     }
 }
 
+/* Row k of a preview as it is the delay later, its yaw without turns: `turns` are those of the row read before, and become
+ * those of this one.  Past the end the last row is held. */
+static void read_row(const quadsim_nonlinear_numbers *numbers, const real *reference, int k, real *turns, real row[4])
+{
+    const int last = rows_of(numbers) - 1, at = k + under_way_of(numbers), now = at < last ? at : last;
+    int i;
+    for (i = k == 0 ? 1 : at; i <= now; i++) {
+        *turns = next_turns(reference, i, *turns);
+    }
+    memcpy(row, reference + now * 4, 4 * sizeof(real));
+    row[3] -= TURN * *turns;
+    if (numbers->delay != NULL && now < last) {
+        const real *next = reference + (now + 1) * 4, share = numbers->delay->share;
+        const real heading = next[3] - TURN * next_turns(reference, now + 1, *turns);
+        for (i = 0; i < 3; i++) {
+            row[i] += share * (next[i] - row[i]);
+        }
+        row[3] += share * (heading - row[3]);
+    }
+}
+
 /* Nodes of a preview: velocities by differences, level, thrusts of hover.  The first node, which has no cost, is
  * extrapolated from the first two rows. */
 static void take_preview(quadsim_nonlinear *law, const real *reference, real yaw)
@@ -98,14 +124,11 @@ static void take_preview(quadsim_nonlinear *law, const real *reference, real yaw
     real turns = first_turns(&law->headed, &law->heading, reference, yaw);
     real place[4], next[4], step[4] = {R(0.0)}, rates[4];
     int k, j;
-    memcpy(place, reference, sizeof(place));
-    place[3] -= TURN * turns;
+    read_row(numbers, reference, 0, &turns, place);
     for (k = 1; k <= rows; k++) { /* the k-th row, k periods from now */
         memcpy(next, place, sizeof(next));
         if (k < rows) {
-            turns = next_turns(reference, k, turns);
-            memcpy(next, reference + k * 4, sizeof(next));
-            next[3] -= TURN * turns;
+            read_row(numbers, reference, k, &turns, next);
         }
         for (j = 0; j < 4; j++) {
             const real ahead = k < rows ? next[j] - place[j] : step[j];
@@ -158,7 +181,7 @@ static void find_trim(quadsim_nonlinear *law)
 }
 
 /* Predict with the observer's estimate from now on. */
-static void believe(quadsim_nonlinear *law)
+static void apply_estimate(quadsim_nonlinear *law)
 {
     memcpy(law->world.acceleration, law->estimate, sizeof(law->world.acceleration));
     memset(law->world.angular, 0, sizeof(law->world.angular));
@@ -169,19 +192,23 @@ static void believe(quadsim_nonlinear *law)
 }
 
 /* Take note of how the measured state differs from the one that the last and the command in force lead to. */
-static void observe(quadsim_nonlinear *law)
+static void update_estimate(quadsim_nonlinear *law)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     real expected[QUADSIM_NMPC_MOST];
     int i;
     memcpy(law->last + BODY, law->rotors_before, (size_t)actuators_of(numbers) * sizeof(real));
-    quadsim_nmpc_advance(numbers->period, &law->world, 1, law->last, law->before, expected);
+    if (numbers->delay != NULL) {
+        quadsim_delay_expect(&law->delay, numbers->delay, &law->world, law->last, expected);
+    } else {
+        quadsim_nmpc_advance(numbers->period, &law->world, 1, law->last, law->before, expected);
+    }
     for (i = 0; i < 6; i++) {
         const int at = i < 3 ? V + i : W + i - 3;
         const real surprise = i >= 3 && numbers->problem->targets ? R(0.0) : law->measured[at] - expected[at];
         law->estimate[i] = clipped(law->estimate[i] + numbers->gain[i] * surprise, -numbers->largest[i], numbers->largest[i]);
     }
-    believe(law);
+    apply_estimate(law);
 }
 
 /* Turn a quaternion by the least rotation that takes a unit vector to the direction of another, (1 + a . b, a x b) up to
@@ -205,7 +232,7 @@ static void turn_least(const real *unit, const real *to, real size, real *q)
 }
 
 /* Add to the reference what balances air and disturbance: thrust turned by the least rotation, and torque. */
-static void balance(quadsim_nonlinear *law)
+static void balance_reference(quadsim_nonlinear *law)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     const quadsim_nmpc_world *world = &law->world;
@@ -269,11 +296,18 @@ static void follow_force(quadsim_nonlinear *law, int follows, const real *acting
 
 /* ---- periods ------------------------------------------------------------------------------------------------------ */
 
-/* Let actuators follow the command in force, since the call before. */
-static void spin(quadsim_nonlinear *law, int periods)
+/* Let actuators follow the commands in force, since the call before; `acting` is the last one that was sent. */
+static void update_actuators(quadsim_nonlinear *law, int periods, const real *acting)
 {
     const real left = law->numbers->left;
     int i, j;
+    if (law->numbers->delay != NULL) {
+        quadsim_delay_send(&law->delay, law->numbers->delay, law->called ? periods : 0, acting);
+        memcpy(law->rotors, law->delay.rotors, sizeof(law->rotors));
+        memcpy(law->rotors_before, law->delay.rotors_before, sizeof(law->rotors_before));
+        law->called = 1;
+        return;
+    }
     memcpy(law->rotors_before, law->rotors, sizeof(law->rotors));
     if (law->called && left > R(0.0)) {
         for (j = 0; j < NU; j++) {
@@ -288,7 +322,7 @@ static void spin(quadsim_nonlinear *law, int periods)
 }
 
 /* Drop the plan, and assume no disturbance. */
-static void forget(quadsim_nonlinear *law, const real *acting)
+static void reset_estimates(quadsim_nonlinear *law, const real *acting)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     quadsim_nmpc_reset(&law->work);
@@ -302,41 +336,7 @@ static void forget(quadsim_nonlinear *law, const real *acting)
     memcpy(law->world.drag, numbers->drag, sizeof(law->world.drag));
     memcpy(law->world.square_drag, numbers->square_drag, sizeof(law->world.square_drag));
     memset(law->estimate, 0, sizeof(law->estimate));
-    believe(law);
-}
-
-/* The attitude that Euler angles stand for. */
-static void put_attitude(const real *state, real q[4])
-{
-    real s[3], c[3];
-    int i;
-    for (i = 0; i < 3; i++) {
-        sin_cos(R(0.5) * state[ROLL + 2 * i], &s[i], &c[i]);
-    }
-    q[0] = c[0] * c[1] * c[2] + s[0] * s[1] * s[2];
-    q[1] = s[0] * c[1] * c[2] - c[0] * s[1] * s[2];
-    q[2] = c[0] * s[1] * c[2] + s[0] * c[1] * s[2];
-    q[3] = c[0] * c[1] * s[2] - s[0] * s[1] * c[2];
-}
-
-/* A body (13,) of a state, and of attitude and body rates where these are known. */
-static void put_body(const real *state, const real *attitude, const real *rates, real *body)
-{
-    int i;
-    for (i = 0; i < 3; i++) {
-        body[P + i] = state[2 * i];
-        body[V + i] = state[2 * i + 1];
-    }
-    if (attitude != NULL && is_finite(attitude, 4)) {
-        memcpy(body + Q, attitude, 4 * sizeof(real));
-    } else {
-        put_attitude(state, body + Q);
-    }
-    if (rates != NULL && is_finite(rates, 3)) {
-        memcpy(body + W, rates, 3 * sizeof(real));
-    } else {
-        body_rates(state, body + W);
-    }
+    apply_estimate(law);
 }
 
 /* q and -q are one attitude: the one near the last measured, and of the reference's, whose turns count, the nearer one
@@ -402,7 +402,10 @@ void quadsim_nonlinear_reset(quadsim_nonlinear *law, const quadsim_real command[
     put_shares(law->numbers, usable, law->rotors);
     memcpy(law->rotors_before, law->rotors, sizeof(law->rotors));
     memcpy(law->before, law->rotors, sizeof(law->before));
-    forget(law, usable);
+    if (law->numbers->delay != NULL) {
+        quadsim_delay_reset(&law->delay, law->numbers->delay, usable);
+    }
+    reset_estimates(law, usable);
 }
 
 void quadsim_nonlinear_learn(quadsim_nonlinear *law, const quadsim_real estimate[6])
@@ -415,14 +418,14 @@ void quadsim_nonlinear_learn(quadsim_nonlinear *law, const quadsim_real estimate
     for (i = 0; i < 6; i++) {
         law->estimate[i] = clipped(estimate[i], -numbers->largest[i], numbers->largest[i]);
     }
-    believe(law);
+    apply_estimate(law);
 }
 
 void quadsim_nonlinear_stand(quadsim_nonlinear *law, int periods, const quadsim_real acting[4])
 {
     put_shares(law->numbers, acting, law->before);
-    spin(law, periods);
-    forget(law, acting);
+    update_actuators(law, periods, acting);
+    reset_estimates(law, acting);
 }
 
 int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int motion, const quadsim_real state[12],
@@ -433,7 +436,7 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int
     const int actuators = actuators_of(numbers), learns = law->learns && periods == 1;
     law->learns = 0;
     put_shares(numbers, acting, law->before);
-    spin(law, periods);
+    update_actuators(law, periods, acting);
     if (!is_within(state, PLAUSIBLE, 12) || !is_within(reference, PLAUSIBLE, count_of(numbers, motion)) ||
         !is_finite(law->before, NU)) {
         return 0;
@@ -451,15 +454,19 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int
     choose_sides(law);
     if (flying) {
         if (numbers->observes && learns) {
-            observe(law);
+            update_estimate(law);
         }
         if (numbers->ramp != NULL) {
-            follow_force(law, learns, acting);
+            follow_force(law, learns, numbers->delay == NULL ? acting : law->delay.sent[0]);
         }
         law->learns = 1;
         memcpy(law->last, law->measured, sizeof(law->last));
     }
-    balance(law);
+    balance_reference(law);
+    if (numbers->delay != NULL) {
+        quadsim_delay_predict(&law->delay, numbers->delay, &law->world, law->measured, law->measured);
+        return is_within(law->measured, PLAUSIBLE, BODY + actuators);
+    }
     return 1;
 }
 
@@ -497,18 +504,6 @@ enum quadsim_status quadsim_nonlinear_end(quadsim_nonlinear *law, enum quadsim_n
 
 /* ---- with the fallback contract ------------------------------------------------------------------------------------ */
 
-/* The angle whose tangent is y / x, of any quadrant [rad]. */
-static real direction_of(real y, real x)
-{
-    if (x > R(0.0)) {
-        return angle_of(y, x);
-    }
-    if (x < R(0.0)) {
-        return angle_of(y, -x) * R(-1.0) + (y < R(0.0) ? -R(2.0) * HALF_PI : R(2.0) * HALF_PI);
-    }
-    return y < R(0.0) ? -HALF_PI : (y > R(0.0) ? HALF_PI : R(0.0));
-}
-
 /* The state (12,) of a body, its yaw on the turn nearest to that of the state before. */
 static void put_state(const real *body, real *state)
 {
@@ -533,7 +528,7 @@ static void put_state(const real *body, real *state)
 }
 
 /* Move the state that the guard foresees on by a period, under its plan. */
-static void foresee(quadsim_nonlinear *law)
+static void predict_fallback(quadsim_nonlinear *law)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     quadsim_guard *guard = &law->guard;
@@ -556,7 +551,7 @@ static void foresee(quadsim_nonlinear *law)
 }
 
 enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_phase phase,
-                                           const quadsim_real state[QUADSIM_NONLINEAR_STATE],
+                                           const quadsim_real state[QUADSIM_MEASURED],
                                            const quadsim_real *reference, const quadsim_real acting[4],
                                            quadsim_real command[4])
 {
@@ -582,7 +577,7 @@ enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_
         status = quadsim_guard_check(guard, status, law->plan);
     }
     if (quadsim_guard_foresees(guard, phase, status)) {
-        foresee(law);
+        predict_fallback(law);
     }
     return quadsim_guard_end(guard, phase, &law->trim, status, law->plan, command);
 }

@@ -7,7 +7,8 @@
  *                   their rates where it is not finite
  * reference         previews [rows][4]: x y z yaw [m, rad], where to be one period from now, two, ... N periods from now;
  *                   whole turns of yaw make no difference.  Motions [rows + 1][17], now and then the same: position,
- *                   quaternion, velocity, body rates, and thrusts of the rotors [N]
+ *                   quaternion, velocity, body rates, and thrusts of the rotors [N]; with a delay of n periods and a part
+ *                   of one, n + 1 rows more
  * acting [4]        the command before, in force up to now
  * command [4]       rotor speeds [rad/s], or targets of an inner loop: thrust [N] and body rates [rad/s]
  *
@@ -17,6 +18,7 @@
 #ifndef QUADSIM_NONLINEAR_H
 #define QUADSIM_NONLINEAR_H
 
+#include "quadsim_delay.h"
 #include "quadsim_guard.h"
 #include "quadsim_nmpc.h"
 #include "quadsim_ramp.h"
@@ -25,13 +27,14 @@
 extern "C" {
 #endif
 
-enum { QUADSIM_NONLINEAR_STATE = 19, QUADSIM_PREVIEW = 4, QUADSIM_MOTION = 17 };
+enum { QUADSIM_PREVIEW = 4 };
 
 typedef struct quadsim_nonlinear_numbers {
     const quadsim_nmpc_problem *problem;  /* the program */
     const quadsim_nmpc_problem *period;   /* its body over a control period: sizes, step, substeps and lags count */
     const quadsim_nmpc_problem *unlagged; /* the same without lag of thrusts, for plans */
     const quadsim_fallback *fallback;     /* NULL where quadsim guards the law: quadsim_nonlinear_step is not for it */
+    const quadsim_delay_numbers *delay;   /* NULL where commands act at once */
     const quadsim_ramp_numbers *ramp;     /* NULL where no changing force is followed */
     int stride;                           /* control periods from node to node */
     int motion;                           /* whether references are motions */
@@ -70,6 +73,7 @@ typedef struct quadsim_nonlinear {
     quadsim_real last[QUADSIM_NMPC_MOST];
     quadsim_real estimate[6];         /* disturbance: world [m/s^2], body [rad/s^2] */
     quadsim_ramp ramp;                /* one that changes */
+    quadsim_delay delay;              /* commands under way; then `measured` is the state when the next one takes over */
     quadsim_real ahead[QUADSIM_NMPC_BODY + 1]; /* where the guard's plan leads, */
     quadsim_nmpc_world then;          /* in the world as it was known when the plan was first needed */
 } quadsim_nonlinear;
@@ -105,7 +109,7 @@ enum quadsim_status quadsim_nonlinear_end(quadsim_nonlinear *law, enum quadsim_n
 /* The command of the period that starts now, always finite and within its bounds: the law's, or without one what the
  * fallback contract flies instead (quadsim_guard.h).  Channels of the state that are not measured are not finite. */
 enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_phase phase,
-                                           const quadsim_real state[QUADSIM_NONLINEAR_STATE],
+                                           const quadsim_real state[QUADSIM_MEASURED],
                                            const quadsim_real *reference, const quadsim_real acting[4],
                                            quadsim_real command[4]);
 

@@ -11,31 +11,50 @@ void quadsim_ramp_reset(quadsim_ramp *ramp, const ramp_numbers *n, const quadsim
 {
     memset(ramp, 0, sizeof(*ramp));
     memcpy(ramp->acting, acting, (n->targets ? 1 : NU) * sizeof(real));
+    memcpy(ramp->command, ramp->acting, sizeof(ramp->command));
 }
 
-/* The mean thrust [N], before its scale, and torque [N m] of a period with this command; the actuators follow it. */
-static void mean_wrench(quadsim_ramp *ramp, const ramp_numbers *n, const real *command, real *thrust, real torque[3])
+/* Add what a command gives over a share of the period: its part of the means of squared speeds, or of the thrust [N], and
+ * of the change of the rotors' momentum; the actuators follow it. */
+static void add_command(quadsim_ramp *ramp, const ramp_numbers *n, const real *command, real share, real left,
+                        real means[NU], real *spun)
 {
-    const real scale = quadsim_ramp_scale(ramp, n), lost = R(1.0) - n->left;
-    real squares[NU] = {R(0.0)}, spun = R(0.0);
+    const real lost = R(1.0) - left;
     int i;
-    memset(torque, 0, 3 * sizeof(real));
     if (n->targets) {
         const real away = ramp->acting[0] - command[0];
-        *thrust = command[0] + n->lag * lost * away;
-        ramp->acting[0] = command[0] + n->left * away;
+        means[0] += share * command[0] + n->lag * lost * away;
+        ramp->acting[0] = command[0] + left * away;
         return;
     }
     for (i = 0; i < NU; i++) { /* speeds tend to the command exponentially */
         const real away = ramp->acting[i] - command[i];
-        squares[i] = command[i] * command[i] + R(2.0) * n->lag * lost * command[i] * away +
-                     R(0.5) * n->lag * (R(1.0) - n->left * n->left) * away * away;
-        ramp->acting[i] = command[i] + n->left * away;
-        spun -= n->momentum[i] * lost * away;
+        means[i] += share * command[i] * command[i] + R(2.0) * n->lag * lost * command[i] * away +
+                    R(0.5) * n->lag * (R(1.0) - left * left) * away * away;
+        ramp->acting[i] = command[i] + left * away;
+        *spun -= n->momentum[i] * lost * away;
     }
-    *thrust = dot(n->allocation, squares, NU);
+}
+
+/* The mean thrust [N], before its scale, and torque [N m] of a period with this command, or with the one before and it. */
+static void mean_wrench(quadsim_ramp *ramp, const ramp_numbers *n, const real *command, real *thrust, real torque[3])
+{
+    const real scale = quadsim_ramp_scale(ramp, n);
+    real means[NU] = {R(0.0)}, spun = R(0.0);
+    int i;
+    memset(torque, 0, 3 * sizeof(real));
+    if (n->share > R(0.0)) {
+        add_command(ramp, n, ramp->command, n->share, n->left_before, means, &spun);
+    }
+    add_command(ramp, n, command, R(1.0) - n->share, n->left, means, &spun);
+    memcpy(ramp->command, command, (n->targets ? 1 : NU) * sizeof(real));
+    if (n->targets) {
+        *thrust = means[0];
+        return;
+    }
+    *thrust = dot(n->allocation, means, NU);
     for (i = 0; i < 3; i++) {
-        torque[i] = scale * dot(n->allocation + NU * (i + 1), squares, NU);
+        torque[i] = scale * dot(n->allocation + NU * (i + 1), means, NU);
     }
     torque[2] -= spun / n->period;
 }
@@ -71,7 +90,7 @@ static void resisting_torque(const quadsim_ramp *ramp, const ramp_numbers *n, co
 }
 
 /* Take a mean of the period that the model misses into the filters; whether the thrust scale, if there is one, moved. */
-static int learn(quadsim_ramp *ramp, const ramp_numbers *n, const real lift[3], real missed[6])
+static int update_filters(quadsim_ramp *ramp, const ramp_numbers *n, const real lift[3], real missed[6])
 {
     const int holds = n->scaled && lift[2] < n->least_lift;
     int i;
@@ -139,7 +158,7 @@ void quadsim_ramp_update(quadsim_ramp *ramp, const ramp_numbers *n, int follows,
     for (i = 0; i < 3; i++) {
         missed[3 + i] = (rates[i] - last.rates[i]) / period - turned[i];
     }
-    if (learn(ramp, n, lift, missed)) {
+    if (update_filters(ramp, n, lift, missed)) {
         fit_drag(ramp, n, attitude, v_b);
     }
 }

@@ -4,7 +4,8 @@
  * velocity [3]      world axes [m/s]
  * attitude [3][3]   body to world, row by row
  * rates [3]         body axes [rad/s]
- * command [4]       held over the period that ends now: rotor speeds [rad/s]; of targets only command[0], thrust [N]
+ * command [4]       in force now, over the period that ends, or from `share` of it on, up to which the one before was:
+ *                   rotor speeds [rad/s]; of targets only command[0], thrust [N]
  *
  * The numbers are read only, and may be shared; all that is remembered is in a quadsim_ramp of the caller's. */
 #ifndef QUADSIM_RAMP_H
@@ -32,7 +33,9 @@ typedef struct quadsim_ramp_numbers {
     quadsim_real inertia[9], inverse[9]; /* J [kg m^2] and its inverse */
     quadsim_real allocation[16];    /* from squared rotor speeds to thrust and torques */
     quadsim_real momentum[4];       /* of each rotor about body z, per speed [kg m^2]; 0 where rotors do not lag */
-    quadsim_real lag, left;         /* of rotors, or of the thrust: over the period; what a period leaves of a distance */
+    quadsim_real share;             /* of a period, after which the command of the one before takes over; 0 without delay */
+    quadsim_real lag;               /* of rotors, or of the thrust, over the period */
+    quadsim_real left, left_before; /* what is left of a distance after a period's rest, and after that share */
     quadsim_real drag[3], square_drag[3]; /* that the model knows, body axes [1/s], [1/m] */
     quadsim_real across[2], inflow[2], damping[3]; /* the air's moment: of all rotors [N m s^2/(m rad)], of the whole
                                            * [N m s^2/m^2] and [N m s/rad] */
@@ -44,6 +47,7 @@ typedef struct quadsim_ramp {
     quadsim_real value[6], change[6];  /* estimates in the middle of the last period, and their rates of change */
     quadsim_real products[3], squares[3]; /* of the fitted drag */
     quadsim_real acting[4];            /* rotor speeds [rad/s], or of targets the thrust [N] */
+    quadsim_real command[4];           /* in force at the last measurement */
     quadsim_real velocity[3], rates[3];   /* the last measurement, and at it: */
     quadsim_real axis[3], turning[3];     /* body z and its rate of change, world axes */
     quadsim_real pull[3], resisting[3];   /* known drag [m/s^2], world axes; torque that turns momentum, less the air's */

@@ -106,7 +106,7 @@ class RampObserver:
 
     Commands are rotor speeds, or with `thrust_lag` [s] collective thrusts [N] that act with this lag; no torque is
     estimated then. The model knows `drag` (3,) [1/s] and `quadratic_drag` (3,) [1/m], of the square of each component,
-    in body axes, and with `moment` the vehicle's `air_moment`.
+    in body axes, and with `moment` the vehicle's `air_moment`. A command takes over `late` [s] after an update.
 
     The core computes it, `quadsim_ramp.c`; a law in C calls it there, with the addresses of both attributes.
 
@@ -125,10 +125,11 @@ class RampObserver:
         quadratic_drag: ArrayLike = (0.0, 0.0, 0.0),
         moment: bool = False,
         thrust_lag: float | None = None,
+        late: float = 0.0,
     ) -> None:
         self._library, self._period = core_library(), period
         self.numbers = RampNumbers()
-        _fill(self.numbers, settings, vehicle, period, thrust_lag)
+        _fill(self.numbers, settings, vehicle, period, thrust_lag, late)
         self.numbers.moment = moment
         set_members(self.numbers, drag=np.array(drag, float), square_drag=np.array(quadratic_drag, float))
         self.bind(RampState())
@@ -154,12 +155,13 @@ class RampObserver:
         """Take over the state of another observer, as far as it estimates the same."""
         same_commands = self.numbers.targets == other.numbers.targets
         shared = np.array([True, True, self.numbers.scaled == other.numbers.scaled, *[same_commands] * 3])
-        largest, acting = np.array(self.numbers.largest), self._acting.copy()
+        largest, acting, command = np.array(self.numbers.largest), self._acting.copy(), np.array(self.state.command)
         ctypes.memmove(ctypes.byref(self.state), ctypes.byref(other.state), ctypes.sizeof(RampState))
         self._value[:] = np.where(shared, np.clip(self._value, -largest, largest), 0.0)
         self._change[:] = np.where(shared, self._change, 0.0)
         if not same_commands:
             self._acting[:] = acting
+            set_members(self.state, command=command)
         self._time = other._time
 
     def update(self, time: float, velocity: Array, attitude: Array, rates: Array, command: Array | float) -> None:
@@ -207,7 +209,9 @@ class RampObserver:
         return drag
 
 
-def _fill(numbers: Struct, settings: RampSettings, vehicle: Vehicle, period: float, thrust_lag: float | None) -> None:
+def _fill(
+    numbers: Struct, settings: RampSettings, vehicle: Vehicle, period: float, thrust_lag: float | None, late: float
+) -> None:
     """Fill in all numbers but what the model knows of the air."""
     bandwidths = settings.force or FORCE_SHARE / period, settings.torque or TORQUE_SHARE / period
     pole = np.exp(-period * np.repeat(bandwidths, 3))
@@ -222,7 +226,11 @@ def _fill(numbers: Struct, settings: RampSettings, vehicle: Vehicle, period: flo
     numbers.period, numbers.mass, numbers.gravity = period, vehicle.mass, vehicle.gravity
     numbers.least_lift = OBSERVABLE_THRUST * vehicle.gravity
     lag = (settings.rotor_lag or 0.0) if thrust_lag is None else thrust_lag
-    numbers.lag, numbers.left = lag / period, math.exp(-period / lag) if lag else 0.0
+    numbers.lag = lag / period
+    numbers.share = late / period
+    if lag:
+        numbers.left = math.exp(-(period - late) / lag)
+        numbers.left_before = math.exp(-late / lag)
     rotor_inertia = (vehicle.rotor_inertia or 0.0) if lag else 0.0
     set_members(
         numbers,

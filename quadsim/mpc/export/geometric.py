@@ -7,7 +7,7 @@ from functools import cached_property
 
 from quadsim.errors import ExportError
 from quadsim.mpc.export.ctext import CText
-from quadsim.mpc.export.follower import CFollower
+from quadsim.mpc.export.follower import BODY_AHEAD_FILES, CFollower
 from quadsim.mpc.export.source import SHARED_FILES
 from quadsim.mpc.guard.numbers import fallback_numbers
 from quadsim.mpc.guard.settings import USUAL_FALLBACK
@@ -26,7 +26,10 @@ class CGeometric(CFollower):
     table: Geometric
 
     law_name = "quadsim_geometric"
-    law_files = (*SHARED_FILES, "quadsim_ramp.h", "quadsim_ramp.c", "quadsim_geometric.h", "quadsim_geometric.c")
+    law_files = (
+        *(*SHARED_FILES, *BODY_AHEAD_FILES),
+        *("quadsim_ramp.h", "quadsim_ramp.c", "quadsim_geometric.h", "quadsim_geometric.c"),
+    )
     motion_row = "position, quaternion, and ten that do not count"
     tolerances = ("1e-9", "5e-2")  # in floats, positions show a snap of several m/s^4 that is none
     changes = "(void)law, 0"
@@ -55,6 +58,9 @@ class CGeometric(CFollower):
         values = {name: text.value(value) for name, value in fallback.items()}
         blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **values))
         addresses = {name: f"{prefix}{name}" for name in law.pointed} | {"fallback": f"&{prefix}fallback"}
+        if law.delay is not None:
+            blocks += self.delay_blocks(text, law.delay, law.delay_bodies)
+            addresses["delay"] = f"&{prefix}delay"
         if law.observer is not None:
             blocks.append(text.struct("quadsim_ramp_numbers", f"{prefix}ramp", **text.mirrored(law.observer.numbers)))
             addresses["ramp"] = f"&{prefix}ramp"

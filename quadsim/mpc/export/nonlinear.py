@@ -12,21 +12,19 @@ import numpy as np
 from quadsim.controller import ROTORS
 from quadsim.errors import ExportError
 from quadsim.mpc.export.ctext import CText
-from quadsim.mpc.export.follower import CFollower
+from quadsim.mpc.export.follower import BODY_AHEAD_FILES, CFollower
 from quadsim.mpc.export.source import CHANGES, SHARED_FILES
 from quadsim.mpc.guard.numbers import fallback_numbers
 from quadsim.mpc.laws.nonlinear import Nonlinear
-from quadsim.mpc.laws.parts.body import ProblemStruct
-from quadsim.mpc.laws.parts.nonlinear_law import memory_of
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.problem.model import LinearModel, hover_model, target_model
 from quadsim.mpc.solvers.core_tables import NO_BOUND
 
 FILES: Final = (
     *SHARED_FILES,
-    *("quadsim_ramp.h", "quadsim_ramp.c", "quadsim_nmpc.h", "quadsim_nmpc_math.h", "quadsim_nmpc.c"),
-    *("quadsim_nmpc_model.c", "quadsim_nmpc_qp.h", "quadsim_nmpc_rows.c", "quadsim_nmpc_riccati.c"),
-    *("quadsim_nmpc_active_set.c", "quadsim_nmpc_interior.c", "quadsim_nmpc_solve.c"),
+    *BODY_AHEAD_FILES,
+    *("quadsim_ramp.h", "quadsim_ramp.c", "quadsim_nmpc.c", "quadsim_nmpc_qp.h", "quadsim_nmpc_rows.c"),
+    *("quadsim_nmpc_riccati.c", "quadsim_nmpc_active_set.c", "quadsim_nmpc_interior.c", "quadsim_nmpc_solve.c"),
     *("quadsim_nonlinear.h", "quadsim_nonlinear.c"),
 )
 """Files of `quadsim/mpc/c` to export verbatim."""
@@ -75,31 +73,25 @@ class CNonlinear(CFollower):
     @property
     def defines(self) -> str:
         """See `CSource`: with its sizes, of which alone the kernel then has code."""
-        struct = self.law._sqp.struct
+        struct = self.law.program.struct
         return f"{super().defines} -DQUADSIM_SIZES={struct.actuators},{int(struct.moves > 0)}".strip()
 
     @property
     def rows(self) -> int:
         """See `CSource`."""
-        sqp = self.law._sqp
-        usual = max(FEWEST_ROWS, math.ceil(ROWS_PER_NODE * sqp.horizon))
-        return min(sqp.most_rows, usual if self.asked is None else self.asked)
-
-    @property
-    def _memory(self) -> tuple[int, int]:
-        struct = ProblemStruct.from_buffer_copy(self.law._sqp.struct)
-        struct.room = self.rows + 1
-        return memory_of(self.law._law.numbers, struct)
+        program = self.law.program
+        usual = max(FEWEST_ROWS, math.ceil(ROWS_PER_NODE * program.struct.horizon))
+        return min(program.most_rows, usual if self.asked is None else self.asked)
 
     @property
     def reals(self) -> int:
         """See `CSource`."""
-        return self._memory[0]
+        return self.law.memory(self.rows + 1)[0]
 
     @property
     def ints(self) -> int:
         """See `CSource`."""
-        return self._memory[1]
+        return self.law.memory(self.rows + 1)[1]
 
     def _model(self) -> LinearModel:
         """The model of level hover."""
@@ -110,25 +102,25 @@ class CNonlinear(CFollower):
 
     def numbers(self, text: CText) -> list[str]:
         """See `CSource`."""
-        law, sqp, of_law = self.law, self.law._sqp, self.law._law
+        law, program = self.law, self.law.program
         fallback = fallback_numbers(self._model(), self.bounds, self.table.fallback.within({}))
         prefix, blocks = text.prefix, []
         pointers = {"terms": f"{prefix}terms"}
-        for name, array in sqp.pointed.items():
+        for name, array in program.pointed.items():
             blocks.append(text.array(name, np.clip(array, -NO_BOUND, NO_BOUND) if array.dtype == np.double else array))
             pointers[name] = f"{prefix}{name}"
-        blocks.append(text.structs("quadsim_nmpc_term", "terms", sqp.terms if sqp.struct.rows else ()))
-        members = text.mirrored(sqp.struct, pointers, room=self.rows + 1, changes=CHANGES)
+        blocks.append(text.structs("quadsim_nmpc_term", "terms", program.terms if program.struct.rows else ()))
+        members = text.mirrored(program.struct, pointers, room=self.rows + 1, changes=CHANGES)
         blocks.append(text.struct("quadsim_nmpc_problem", f"{prefix}problem", **members))
-        for name, body in (("period", law._of_period), ("unlagged", law._without_lag)):
-            blocks.append(text.array(f"left_{name}", body.left))
-            members = text.mirrored(body.struct, {"left": f"{prefix}left_{name}"})
-            blocks.append(text.struct("quadsim_nmpc_problem", f"{prefix}{name}", **members))
+        blocks += self.body_blocks(text, law.bodies)
         values = {name: text.value(value) for name, value in fallback.items()}
         blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **values))
-        addresses = {name: f"&{prefix}{name}" for name in ("problem", "period", "unlagged", "fallback")}
-        if of_law.ramp is not None:
-            blocks.append(text.struct("quadsim_ramp_numbers", f"{prefix}ramp", **text.mirrored(of_law.ramp.numbers)))
+        addresses = {name: f"&{prefix}{name}" for name in ("problem", *law.bodies, "fallback")}
+        if law.delay is not None:
+            blocks += self.delay_blocks(text, law.delay, law.delay_bodies)
+            addresses["delay"] = f"&{prefix}delay"
+        if law.ramp is not None:
+            blocks.append(text.struct("quadsim_ramp_numbers", f"{prefix}ramp", **text.mirrored(law.ramp.numbers)))
             addresses["ramp"] = f"&{prefix}ramp"
-        members = text.mirrored(of_law.numbers, addresses, motion=int(self.motion))
+        members = text.mirrored(law.numbers, addresses, motion=int(self.motion))
         return [*blocks, text.struct("quadsim_nonlinear_numbers", "QUADSIM_CONTROLLER", **members)]

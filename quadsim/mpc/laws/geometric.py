@@ -25,12 +25,14 @@ from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.laws import register
 from quadsim.mpc.laws.parts.attitude import LEAST_THRUST_SHARE, Measured
 from quadsim.mpc.laws.parts.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
+from quadsim.mpc.laws.parts.delay import Bodies, adopt_sent, delay_numbers
 from quadsim.mpc.laws.parts.feedback import FeedbackLaw, Tuned
 from quadsim.mpc.laws.parts.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIEW_DEGREE, Target, differentiator
 from quadsim.mpc.pilot.allocation import allocate, make_allocation
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement, require_one_scale
-from quadsim.mpc.problem.model import target_model
-from quadsim.mpc.problem.nonlinear_model import zero
+from quadsim.mpc.problem.model import require_delay, split_delay, target_model
+from quadsim.mpc.problem.nonlinear_model import SUBSTEPS, zero
+from quadsim.mpc.problem.rigidbody import Inputs, rigid_body
 from quadsim.mpc.space import Shape
 from quadsim.mpc.tables.commands import USUAL_TARGETS, TargetBounds, require_space
 from quadsim.mpc.tables.controller import Range
@@ -145,6 +147,8 @@ class GeometricController(FeedbackLaw):
         gains: of its errors.
         numbers: all that does not change, for C.
         pointed: the arrays that it points to, by name.
+        delay: how late commands act, for C; None for at once.
+        delay_bodies: the bodies that it points to.
         observer: of disturbances; None for none.
         k_R: (3,) gains of the attitude error about body x, y, z [1/s^2].
         k_Omega: (3,) gains of the rate error [1/s].
@@ -162,7 +166,13 @@ class GeometricController(FeedbackLaw):
         if settings.disturbance is not None:
             lag = lags[0] if self._targets else None
             self.observer = RampObserver(
-                settings.disturbance, vehicle, period, drag=settings.drag, moment=settings.moment, thrust_lag=lag
+                settings.disturbance,
+                vehicle,
+                period,
+                drag=settings.drag,
+                moment=settings.moment,
+                thrust_lag=lag,
+                late=split_delay(settings.delay, period)[1],
             )
         self.k_R = gains.k_R * np.array([1.0, 1.0, YAW_SHARE**2])
         self.k_Omega = gains.k_Omega * np.array([1.0, 1.0, YAW_SHARE])
@@ -172,6 +182,10 @@ class GeometricController(FeedbackLaw):
         self.numbers = geometric_numbers(vehicle, period, settings, gains)
         set_members(self.numbers, k_R=self.k_R, k_Omega=self.k_Omega)
         self.numbers.preview, self.numbers.course = (array.ctypes.data for array in self.pointed.values())
+        self.delay, self.delay_bodies = None, Bodies()
+        if settings.delay:
+            self.delay, self.delay_bodies = _delay_of(settings, vehicle, period)
+            self.numbers.delay = ctypes.addressof(self.delay)
         self._law = GeometricStruct()
         self._motion = MotionStruct()
         self._target = TargetStruct()
@@ -190,6 +204,8 @@ class GeometricController(FeedbackLaw):
         """Take over the integrals and the observer of the previous law."""
         if isinstance(previous, GeometricController):
             set_members(self._law, **vars(previous.integrals))
+            if self._targets is previous._targets:
+                adopt_sent(self._law.delay, self.delay, previous._law.delay, previous.delay)
             if self.observer is not None and previous.observer is not None:
                 self.observer.adopt(previous.observer)
 
@@ -353,12 +369,40 @@ def _structs(motion: Measured, target: Target) -> tuple[Struct, Struct]:
     return measured, wanted
 
 
+def _delay_of(settings: Geometric, vehicle: Vehicle, period: float) -> tuple[Struct, Bodies]:
+    """Return the numbers of a delay for C, and the bodies that they point to.
+
+    Raises:
+        ParameterError: the delay is too long.
+    """
+    require_delay(settings.delay, period, min(settings.horizon, MOTION_SAMPLES - 1))
+    targets = settings.commands != ROTORS
+    if targets and settings.delay >= period:
+        rule = f"below the control period of {period:g} s where an autopilot flies the commands"
+        raise ParameterError("controller", "delay", settings.delay, rule)
+    model = rigid_body(
+        vehicle,
+        period,
+        substeps=SUBSTEPS,
+        inputs=Inputs.RATES if targets else Inputs.SPEED,
+        rotor_lag=None if targets else vehicle.rotor_rise or None,
+        lag=settings.inner_lag or NO_LAG,
+    )
+    return delay_numbers(settings.delay, model, vehicle, period)
+
+
 def previews(settings: Geometric, period: float) -> dict[str, Array]:
-    """Return the differentiators of a `preview`, and of 1, 2, ... `MOTION_SAMPLES` samples of a `course` in a row."""
+    """Return the differentiators of a `preview`, and of 1, 2, ... `MOTION_SAMPLES` samples of a `course` in a row.
+
+    They give values and derivatives when the command takes over.
+    """
     degree = PREVIEW_DEGREE if settings.feedforward else 2
-    counts = range(1, MOTION_SAMPLES + 1)
-    course = [differentiator(count, period, degree=min(MOTION_DEGREE, count - 1), first=0).ravel() for count in counts]
-    preview = differentiator(settings.horizon, period, degree=degree)
+    late = settings.delay / period  # periods
+    course = []
+    for count in range(1, MOTION_SAMPLES + 1):  # near the end the last sample is held
+        first = 0.0 - min(late, count - 1.0)
+        course.append(differentiator(count, period, degree=min(MOTION_DEGREE, count - 1), first=first).ravel())
+    preview = differentiator(settings.horizon, period, degree=degree, first=1.0 - late)
     return {"preview": np.ascontiguousarray(preview), "course": np.concatenate(course)}
 
 
@@ -415,6 +459,14 @@ class Geometric(Tuned):
         doc("whether feedforward balances rotor_moment, inflow_moment and rate_damping, at the reference's motion"),
     ] = False
     disturbance: Annotated[RampSettings | None, doc("absent: no disturbance observer")] = None
+    delay: Annotated[
+        LagSeconds,
+        doc(
+            "[s] known delay from measurement to command, bridged by prediction, with the vehicle's rotor_rise or the "
+            f"inner_lag; at most the horizon and {MOTION_SAMPLES - 1} control periods; to an autopilot below one, and "
+            "none with attitudes"
+        ),
+    ] = 0.0
     indi: Annotated[INDISettings | None, doc("absent: rotors hold each command for a period")] = None
     commands: Annotated[
         Commands, doc("rotor speeds, or to an autopilot thrust and body rates, or thrust and attitude")
@@ -428,6 +480,9 @@ class Geometric(Tuned):
     def __post_init__(self) -> None:
         require_space(self, {"input_bounds": None, "indi": None})
         require_one_scale(self.indi, self.disturbance)
+        if self.delay and self.commands == "attitude":
+            rule = 'zero where commands = "attitude", whose rates the autopilot decides'
+            raise ParameterError("", "delay", self.delay, rule)
         if any(self.drag) and not self.feedforward:
             raise ParameterError("", "drag", [*self.drag], "zero where feedforward is not true")
         if self.moment and (not self.feedforward or self.commands != ROTORS):

@@ -12,6 +12,7 @@ from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 
 from quadsim import shorthands
 from quadsim.controller import ROTORS, Controller
+from quadsim.core.mirror import constant
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Seconds, Weight
 from quadsim.input_limits import MOST_ENTRIES
@@ -33,6 +34,8 @@ from quadsim.mpc.tables.lags import Lag, LagSeconds, require_lag, require_lags
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
+MOST_LATE: Final = constant("QUADSIM_MOST_LATE")
+"""Most control periods of a delay."""
 LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states in which the quaternion model is linear, too
 VEHICLES_SPEEDS: Final = RotorBounds()
 Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
@@ -138,6 +141,13 @@ class Nonlinear(ControllerTable):
     rotor_lag: Annotated[
         Lag,
         doc('[s] rotor time constant in the prediction, 0 for none; "vehicle": its rotor_rise'),
+    ] = 0.0
+    delay: Annotated[
+        LagSeconds,
+        doc(
+            f"[s] known delay from measurement to command, bridged by prediction; at most the horizon and {MOST_LATE} "
+            "control periods; targets of an autopilot: below one"
+        ),
     ] = 0.0
     drag: Annotated[Drag, doc("[N s/m] linear drag in the prediction, along body x, y, z")] = (0.0, 0.0, 0.0)
     quadratic_drag: Annotated[Drag, doc("[N s^2/m^2] drag on the square of each component")] = (

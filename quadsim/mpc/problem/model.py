@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
+from quadsim.errors import ParameterError
 from quadsim.state import EULER_RATE, INDEX, N_STATES, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -106,3 +107,14 @@ def split_delay(delay: float, period: float) -> tuple[int, float]:
     """
     whole = max(math.ceil(delay / period - 1e-9) - 1, 0)
     return whole, delay - whole * period
+
+
+def require_delay(delay: float, period: float, periods: int) -> None:
+    """Reject a delay [s] of more than so many control periods.
+
+    Raises:
+        ParameterError: it is longer.
+    """
+    if delay > periods * period * (1.0 + 1e-9):
+        rule = f"at most {periods} control periods, {periods * period:g} s"
+        raise ParameterError("controller", "delay", delay, rule)

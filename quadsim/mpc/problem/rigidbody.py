@@ -1,4 +1,4 @@
-"""The rigid body with a quaternion: any attitude, no singularity, exact derivatives of all nodes in one pass.
+"""The rigid body with a quaternion: any attitude, no singularity; its equations and its numbers.
 
 The states are position p (world), quaternion q = (w, x, y, z) (Hamilton, body to world), velocity v (world) and body
 rates omega: 13. With rotor lag, the four rotors' thrusts or speeds are four further states that follow the inputs,
@@ -20,9 +20,7 @@ the only further state then, and omega has no torque in its equation:
 
 Both are known exactly at every instant; only p, q and v are integrated, so that a lag may be short, or 0.
 
-All terms but drag are quadratic in (q, omega), for given T and I^-1 tau: with F the Jacobian of that part, linear in
-(q, omega, T q), its value is F x / 2. So derivatives and value are the columns of one matrix that passes through the
-Runge-Kutta stages.
+The motion and its exact derivatives are computed in C, `quadsim_nmpc_model.c`.
 """
 
 from __future__ import annotations
@@ -41,13 +39,10 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 N_BODY: Final = 13
 """States of the body; rotor states follow."""
 P, Q, V, W = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
-_TURNING: Final = 10
-"""Rows and columns of (q, v, omega), on which the derivatives depend."""
 RATE_SCALE: Final = 1.5
 """The body rate [rad/s] that is a share of 1, where inputs are targets, beside the weight as thrust.  Shares of the
 largest would be penalised too little: where noise reaches the controller, rates then move by hundreds of deg/s, for
 which the mixer raises the thrust."""
-_q, _v, _w = slice(0, 4), slice(4, 7), slice(7, 10)
 # R(q), row by row: 1 - 2 (yy + zz), 2 (xy - wz), 2 (xz + wy), ..., by the places of its products in q q'.
 _FIRST, _SECOND = np.array([10, 6, 7, 6, 5, 11, 7, 11, 5]), np.array([15, 3, 2, 3, 15, 1, 2, 1, 10])
 _SIGN: Final = np.array([1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
@@ -183,10 +178,3 @@ def rotation(q: Array) -> Array:
     products = (q[..., :, None] * (2.0 * q[..., None, :])).reshape(*q.shape[:-1], 16)
     sums = products.take(_FIRST, -1) + _SIGN * products.take(_SECOND, -1)
     return (_EYE + _OUTER * sums).reshape(*q.shape[:-1], 3, 3)
-
-
-def drag_acceleration(model: RigidBody, R: Array, v: Array) -> Array:
-    """(..., 3) acceleration by drag, world [m/s^2], for attitudes (..., 3, 3) and velocities (..., 3) [m/s]."""
-    air = (np.swapaxes(R, -1, -2) @ v[..., None])[..., 0]
-    pull = -(model.drag * air + model.quadratic_drag * np.abs(air) * air) / model.mass
-    return np.asarray((R @ pull[..., None])[..., 0])

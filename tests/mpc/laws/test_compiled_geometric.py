@@ -172,3 +172,15 @@ def test_a_law_of_rates_is_its_parts_period_by_period(vehicle: Vehicle, quaterni
         np.testing.assert_allclose(law.integrals.translation, integrals.translation, atol=1e-9)
     assert 0 < held < 55
     assert integrals.translation.any()
+
+
+@pytest.mark.parametrize("commands", ["rotors", "rates"])
+def test_a_restart_after_no_number_is_one_after_the_first_command(vehicle: Vehicle, commands: Any) -> None:
+    """Without the fallback contract, too: otherwise the observer would never have a number again."""
+    lags = (0.02, 0.02, 0.02, 0.05) if commands == "rates" else None
+    settings = Geometric(commands=commands, inner_lag=lags, disturbance=RampSettings())
+    controller = GeometricController(vehicle, 0.02, settings)
+    assert controller.observer is not None
+    controller.reset(np.full(4, np.nan))
+    first = vehicle.mass * vehicle.gravity if commands == "rates" else 0.0
+    np.testing.assert_array_equal(controller.observer.state.acting, [first, 0.0, 0.0, 0.0])

@@ -20,6 +20,7 @@ from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.laws.nonlinear import Nonlinear, Weights
 from quadsim.mpc.laws.parts.nonlinear_law import WIDTH_OF_MOTION, put_motion
 from quadsim.mpc.laws.parts.nonlinear_mpc import CONVERGED, STEP_TOLERANCE, NonlinearMPC
+from quadsim.mpc.laws.parts.nonlinear_problem import inputs_to_commands
 from quadsim.mpc.problem.constraints import Constraint
 from quadsim.mpc.problem.rigidbody import N_BODY, Inputs, P, Q, V, W, rigid_body, thrust_axis
 from quadsim.rollout.conflicts import find_conflict
@@ -92,12 +93,12 @@ def test_its_residual_is_that_of_the_plan_that_is_commanded() -> None:
     """States predicted by the QP against the model rolled out from each, which one step from hover does not follow."""
     controller, x0 = law(horizon=20), at_rest((0.0, 1.0, 0.0, 0.0))
     command = call(controller, x0)
-    plan = controller._sqp.plan
+    plan = controller.stored_plan
     assert plan is not None
     states, inputs = plan
-    np.testing.assert_allclose(controller._speeds(inputs)[0], command.plan[0])
+    np.testing.assert_allclose(inputs_to_commands(controller.model, VEHICLE, inputs)[0], command.plan[0])
     np.testing.assert_array_equal(states[0], x0)
-    result = np.abs(states[1:] - advance_nodes(controller._model, states[:-1], inputs)).max()
+    result = np.abs(states[1:] - advance_nodes(controller.model, states[:-1], inputs)).max()
     assert command.stats.sqp_defect == pytest.approx(result, rel=1e-9)
     assert command.stats.sqp_defect > CONVERGED
     assert command.stats.sqp_step > 1.0
@@ -258,7 +259,7 @@ def test_nodes_of_a_preview_have_its_velocity_and_its_yaw() -> None:
     controller = law(horizon=4)
     rows = np.arange(1, 9)[:, None] * [0.1, 0.0, -0.05, 0.2]
     call(controller, at_rest(), reference=rows)
-    _, _, states, thrusts = controller._law.query
+    _, _, states, thrusts = controller.asked
     np.testing.assert_allclose(states[:, 0], [0.0, 0.2, 0.4, 0.6, 0.8], atol=1e-12)
     np.testing.assert_allclose(states[:, V], np.tile([5.0, 0.0, -2.5], (5, 1)), atol=1e-9)
     np.testing.assert_allclose(states[:, 12], 10.0)

@@ -267,7 +267,7 @@ def test_the_observer_of_forces_finds_the_thrust_that_holds_the_height(scaled: b
     made = table(disturbance=RampSettings(thrust_scale=scaled), horizon=20, node=0.05)
     controller = build(made, VEHICLE, 0.05)
     states, commands = fly(controller, 0.05, 4.0, step_of(0.0, 0.0, 0.0, 0.0), thrust_scale=0.8)
-    world = controller.law._law.struct.world  # type: ignore[attr-defined]
+    world = controller.law.struct.world  # type: ignore[attr-defined]
     np.testing.assert_allclose(states[-1, P], 0.0, atol=2e-3)
     assert commands[-1].speeds[0] == pytest.approx(LEVEL[0] / 0.8, rel=2e-3)
     assert world.thrust_scale == pytest.approx(0.8 if scaled else 1.0, abs=2e-3)
@@ -290,7 +290,7 @@ def test_a_law_of_rotor_speeds_divides_by_the_thrust_scale_too() -> None:
         x = advance_nodes(model, x, command.speeds / VEHICLE.speed_max)
     assert abs(x[2]) < 2e-3
     np.testing.assert_allclose(command.speeds, VEHICLE.hover_speed / math.sqrt(0.8), rtol=1e-3)
-    assert controller.law._law.struct.world.thrust_scale == pytest.approx(0.8, abs=2e-3)  # type: ignore[attr-defined]
+    assert controller.law.struct.world.thrust_scale == pytest.approx(0.8, abs=2e-3)  # type: ignore[attr-defined]
 
 
 def test_it_predicts_its_own_flight() -> None:
@@ -308,7 +308,7 @@ def test_it_predicts_its_own_flight() -> None:
 
 def test_it_takes_over_from_a_law_that_commands_rotors_without_a_jump() -> None:
     rotors = build(Nonlinear(offset_free=ObserverSettings()), VEHICLE, 0.02)
-    rotors.law._law.learn(np.array([0.3, 0.0, 0.5, 1.0, 0.0, 0.0]))  # type: ignore[attr-defined]
+    rotors.law.learn(np.array([0.3, 0.0, 0.5, 1.0, 0.0, 0.0]))  # type: ignore[attr-defined]
     rotors.step(StepInputs(), np.zeros(N_STATES), np.zeros((rotors.horizon, 4)))
     rates = build(table(offset_free=ObserverSettings()), VEHICLE, 0.02)
     for law, previous, row in ((rates, rotors, LEVEL), (rotors, rates, np.full(4, VEHICLE.hover_speed))):
@@ -341,8 +341,8 @@ def test_it_keeps_the_first_period_that_its_steps_did_not_make_converge() -> Non
     assert command.status == NOT_CONVERGED == period.status
     assert period.converges(1) is False
     law = controller.law  # type: ignore[attr-defined]
-    states, inputs = law._sqp.plan  # what is kept follows the model, from the measured state
-    np.testing.assert_allclose(states[1:], advance_nodes(law._model, states[:-1], inputs), atol=1e-12)
+    states, inputs = law.stored_plan  # what is kept follows the model, from the measured state
+    np.testing.assert_allclose(states[1:], advance_nodes(law.model, states[:-1], inputs), atol=1e-12)
     np.testing.assert_array_equal(states[0, Q], upside_down.attitude)
 
 
@@ -392,7 +392,7 @@ def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tup
 def test_level_hover_holds_its_height_by_the_thrust_scale_that_is_estimated(known: bool) -> None:
     made = build(table(), VEHICLE, 0.02)
     if known:
-        made.law._law.struct.trim.commands[0] /= 0.7  # type: ignore[attr-defined]
+        made.law.struct.trim.commands[0] /= 0.7  # type: ignore[attr-defined]
     made.law.step = _fails  # type: ignore[attr-defined]
     states, commands = fly(made, 0.02, 4.0, step_of(0.0, 0.0, 0.0, 0.0), thrust_scale=0.7)
     assert {command.fallback for command in commands} == {2}

@@ -20,7 +20,7 @@ from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.structs import STATUSES
 from quadsim.mpc.laws.nonlinear import Nonlinear, Weights
 from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
-from quadsim.mpc.laws.parts.sqp import OWN_NAMES, SQP
+from quadsim.mpc.laws.parts.sqp import OWN_NAMES
 from quadsim.mpc.problem.constraints import Constraint, Soft
 from quadsim.mpc.problem.ocp import Query
 from quadsim.mpc.problem.polytope import Polytope
@@ -102,15 +102,15 @@ def checked(controller: NonlinearMPC, share: float = 1e-8) -> int:
     size = max(1.0, *(float(np.abs(part).max(initial=0.0)) for part in (ours.z, ours.z_box, ours.y)))
     assert kkt_residuals(qp, ours).worst < share * size
     if controller._space is not None:
-        return controller._sqp.active  # the peer has the same rows at all steps
+        return controller.active  # the peer has the same rows at all steps
     dense = dense_qp(controller._rows(), _period(controller._query()))
     backend = DaqpDense()
     backend.setup(dense)
     peer = backend.solve(dense)
-    plan = controller._sqp.inputs
+    plan = controller.inputs
     if peer.status == SOLVED:
         np.testing.assert_allclose(peer.x[: plan.size], plan.ravel(), atol=2e-5)
-    return controller._sqp.active
+    return controller.active
 
 
 @pytest.mark.parametrize("case", MANY)
@@ -119,7 +119,7 @@ def test_answers_are_optima(case: str) -> None:
     active, answered = 0, 0
     for seed, size in itertools.product(range(3), (0.1, 0.5, 1.0)):
         rng, controller = np.random.default_rng(seed), law(**MANY[case])
-        controller.reset(HOVER if controller.commands == "rotors" else controller._level)
+        controller.reset(HOVER if controller.commands == "rotors" else np.array(controller.numbers.level))
         for k in range(3):
             command = call(controller, thrown(rng, size), k * PERIOD)
             if command.status in ACCEPTED:
@@ -155,7 +155,7 @@ MANY_ACTIVE: dict[str, dict[str, Any]] = {
 def test_many_active_rows_are_found_by_the_interior_point_method(case: str) -> None:
     """Metres off, the dual search alone would exchange rows hundreds of times, and give up at times."""
     rng, controller = np.random.default_rng(0), law(horizon=40, **MANY_ACTIVE[case])
-    work, found = controller._sqp._work, 0
+    work, found = controller.struct.work, 0
     for k in range(12):
         x = at_rest()
         x[P] = 4.0 * rng.normal(size=3)
@@ -184,8 +184,8 @@ def test_half_spaces_are_rows_of_the_program() -> None:
         command = call(controller, start, reference=reference)
         assert command.status in ACCEPTED
         assert checked(controller) > 0
-        normals, bounds = controller._sqp.half_spaces
-        inside = (normals * controller._sqp.positions).sum(axis=2) - bounds
+        normals, bounds = controller.half_spaces
+        inside = (normals * controller.positions).sum(axis=2) - bounds
         assert inside.min() == pytest.approx(0.0, abs=1e-7) or penalty is not None
         assert (command.stats.slack > 0.0) == (penalty is not None and inside.min() < -1e-9)
 
@@ -215,7 +215,7 @@ def test_bounds_that_differ_from_step_to_step_hold(case: str) -> None:
     for k in range(6):
         command = call(controller, at_rest(), 0.05 * k, reference)
         assert command.status == SOLVED
-        heights = controller._sqp.positions[:, 2]
+        heights = controller.positions[:, 2]
         assert (heights <= upper[:, 0] + 1e-8).all()
         assert command.stats.infeasibility < 1e-8
         assert command.stats.kkt_stationarity < 1e-6
@@ -246,9 +246,9 @@ def test_a_wrong_answer_of_the_core_is_refused(monkeypatch: pytest.MonkeyPatch) 
     reference[:, 2] = 1.0
     controller = below(ceiling(np.full((20, 1), 0.2)))
     assert call(controller, at_rest(), 0.0, reference).status == SOLVED
-    right = SQP.inputs.fget
+    right = NonlinearMPC.inputs.fget
     assert right is not None
-    monkeypatch.setattr(SQP, "inputs", property(lambda sqp: right(sqp) + 0.05))
+    monkeypatch.setattr(NonlinearMPC, "inputs", property(lambda law: right(law) + 0.05))
     command = call(controller, at_rest(), 0.05, reference)
     assert command.status == "infeasible_answer"
     assert command.stats.infeasibility > 1e-2
@@ -313,8 +313,8 @@ def test_the_start_makes_no_difference() -> None:
         for _ in range(2):
             call(warm, thrown(rng, 1.0))
         first = call(cold, x)
-        warm._sqp.plan = None  # the program is that of the reference, too, but the active set stays
-        work = warm._sqp._work
+        warm.stored_plan = None  # the program is that of the reference, too, but the active set stays
+        work = warm.struct.work
         work.planned = 0
         np.testing.assert_allclose(call(warm, x, PERIOD).plan, first.plan, atol=1e-6)
 
@@ -328,12 +328,12 @@ def test_steps_end_with_the_time_and_keep_the_plan(settings: dict[str, Any]) -> 
         law(**settings, iterations=iterations, time_limit=limit)
         for iterations, limit in ((8, None), (3, None), (8, 2.5))
     )
-    limited._sqp.clock = partial(next, itertools.count(1.0))
+    limited.clock = partial(next, itertools.count(1.0))
     plans = [call(controller, x).plan for controller in (whole, three, limited)]
-    assert [controller._sqp._work.iterations for controller in (whole, three, limited)] == [8, 3, 3]
+    assert [controller.struct.work.iterations for controller in (whole, three, limited)] == [8, 3, 3]
     np.testing.assert_array_equal(plans[1], plans[2])
     assert np.abs(plans[0] - plans[2]).max() > 0.0
-    again, same = limited._sqp.plan, three._sqp.plan
+    again, same = limited.stored_plan, three.stored_plan
     assert again is not None
     assert same is not None
     np.testing.assert_array_equal(again[0], same[0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 from typing import Final
 
@@ -19,30 +18,25 @@ ProblemStruct: Final = struct("quadsim_nmpc_problem")
 WorldStruct: Final = struct("quadsim_nmpc_world")
 
 
-class World:
-    """What a model knows of its surroundings, in the core's layout.
+def world_of(model: RigidBody) -> Struct:
+    """Return what a model knows of its surroundings, in the core's layout."""
+    world = WorldStruct()
+    world.thrust_scale = model.thrust_scale
+    set_members(
+        world,
+        acceleration=model.acceleration,
+        angular=model.angular_acceleration,
+        drag=model.drag / model.mass,
+        square_drag=model.quadratic_drag / model.mass,
+    )
+    return world
 
-    Attributes:
-        struct: that layout.
-        numbers: (13,) its view: acceleration, angular acceleration, drag, quadratic drag over the mass, thrust scale.
-    """
 
-    def __init__(self, struct: Struct) -> None:
-        self.struct = struct
-        self.numbers = np.ctypeslib.as_array((ctypes.c_double * 13).from_buffer(struct))
-
-    @classmethod
-    def of(cls, model: RigidBody) -> World:
-        """Return that of a model."""
-        world = cls(WorldStruct())
-        world.set(model)
-        return world
-
-    def set(self, model: RigidBody) -> None:
-        """Take another disturbance, drag and thrust scale."""
-        numbers, mass = self.numbers, model.mass
-        numbers[0:3], numbers[3:6] = model.acceleration, model.angular_acceleration
-        numbers[6:9], numbers[9:12], numbers[12] = model.drag / mass, model.quadratic_drag / mass, model.thrust_scale
+def body_of(model: RigidBody) -> tuple[Struct, Array]:
+    """Return a rigid body's numbers in the core's layout, and (2 substeps + 1, 4) the array that they point to."""
+    numbers = ProblemStruct()
+    left = body_numbers(model, numbers)
+    return numbers, left
 
 
 def body_numbers(model: RigidBody, p: Struct) -> Array:
@@ -61,56 +55,42 @@ def body_numbers(model: RigidBody, p: Struct) -> Array:
     return left
 
 
-class Body:
-    """The motion of a rigid body over one step of its model.
+def next_states(body: Struct, world: Struct, x: Array, u: Array) -> Array:
+    """Return the states (..., n) one step of a body after states x (..., n) under inputs u (..., 4)."""
+    x = np.ascontiguousarray(x)
+    u = np.ascontiguousarray(u)
+    assert x.shape == (*u.shape[:-1], N_BODY + body.actuators)
+    assert u.shape[-1] == N_ROTORS
+    end = np.empty(x.shape)
+    count = math.prod(x.shape[:-1])
+    core_library().quadsim_nmpc_advance(body, world, count, x.ctypes.data, u.ctypes.data, end.ctypes.data)
+    return end
 
-    Args:
-        model: the rigid body; `set_world` changes its disturbance, drag and thrust scale.
 
-    Attributes:
-        world: what it knows of its surroundings; another one may be shared with others.
-        struct: its numbers in the core's layout.
-        left: what `struct.left` points to.
+def linearise(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
+    """Linearise the step of a model from states x (M, n) under inputs u (M, 4), as a horizon's nodes: A, B and x(k+1).
+
+    With `frames` (M + 1, 4), reference quaternions q_r, A and B refer to states with q_r* q in place of q: the
+    first M at the start of the steps, the last M at the end.
+
+    Returns:
+        (M, n, n), (M, n, 4) and (M, n): exact derivatives of the Runge-Kutta map; x(k+1) itself is in no frame.
     """
-
-    def __init__(self, model: RigidBody) -> None:
-        self.struct, self._n, self._library = ProblemStruct(), model.n, core_library()
-        self.left = body_numbers(model, self.struct)
-        self.world = World.of(model)
-
-    def set_world(self, model: RigidBody) -> None:
-        """Take the disturbance, drag and thrust scale of another model."""
-        self.world.set(model)
-
-    def advance(self, x: Array, u: Array) -> Array:
-        """Return the states (..., n) one step after states x (..., n) under inputs u (..., 4)."""
-        x, u, end = np.ascontiguousarray(x), np.ascontiguousarray(u), np.empty(x.shape)
-        assert x.shape == (*u.shape[:-1], self._n)
-        assert u.shape[-1] == N_ROTORS
-        count = math.prod(x.shape[:-1])
-        arrays = (array.ctypes.data for array in (x, u, end))
-        self._library.quadsim_nmpc_advance(self.struct, self.world.struct, count, *arrays)
-        return end
-
-    def linearise(self, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
-        """Linearise the step from states x (M, n) under inputs u (M, 4), as a horizon's nodes: A, B and x(k+1).
-
-        With `frames` (M + 1, 4), reference quaternions q_r, A and B refer to states with q_r* q in place of q: the
-        first M at the start of the steps, the last M at the end.
-
-        Returns:
-            (M, n, n), (M, n, 4) and (M, n): exact derivatives of the Runge-Kutta map; x(k+1) itself is in no frame.
-        """
-        x, u = np.ascontiguousarray(x), np.ascontiguousarray(u)
-        M, n = x.shape
-        if frames is None:
-            frames = np.tile([1.0, 0.0, 0.0, 0.0], (M + 1, 1))
-        slopes, end, frames = np.empty((M, N_BODY, width_of(n))), np.empty((M, n)), np.ascontiguousarray(frames)
-        for i in range(M):
-            arrays = (x[i], u[i], frames[i : i + 2], slopes[i], end[i])
-            addresses = (array.ctypes.data for array in arrays)
-            self._library.quadsim_nmpc_slopes(self.struct, self.world.struct, *addresses)
-        return *unpacked(slopes, n, 0, self.left[-1]), end
+    body, left = body_of(model)
+    world = world_of(model)
+    x = np.ascontiguousarray(x)
+    u = np.ascontiguousarray(u)
+    M, n = x.shape
+    if frames is None:
+        frames = np.tile([1.0, 0.0, 0.0, 0.0], (M + 1, 1))
+    frames = np.ascontiguousarray(frames)
+    slopes = np.empty((M, N_BODY, width_of(n)))
+    end = np.empty((M, n))
+    for i in range(M):
+        arrays = (x[i], u[i], frames[i : i + 2], slopes[i], end[i])
+        addresses = (array.ctypes.data for array in arrays)
+        core_library().quadsim_nmpc_slopes(body, world, *addresses)
+    return *unpacked(slopes, n, 0, left[-1]), end
 
 
 def width_of(n: int) -> int:

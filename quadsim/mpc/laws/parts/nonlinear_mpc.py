@@ -12,15 +12,15 @@ the stored state.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, NoReturn
 
 import numpy as np
-import scipy.linalg
 
 from quadsim.controller import (
     ACCEPTED,
@@ -29,7 +29,6 @@ from quadsim.controller import (
     GROUNDED,
     NOT_CONVERGED,
     OPTIMAL,
-    ROTORS,
     SOLVED,
     UNCONSTRAINED,
     Command,
@@ -38,35 +37,33 @@ from quadsim.controller import (
     StepInputs,
     stopped,
 )
-from quadsim.core.mirror import Struct, set_members
+from quadsim.core.mirror import Struct, core_library, set_members, struct
 from quadsim.errors import ParameterError
 from quadsim.mpc.estimate.disturbance import RampObserver
 from quadsim.mpc.estimate.observer import DisturbanceObserver, disturbance_of
 from quadsim.mpc.forms.staged import Staged
 from quadsim.mpc.guard.answer import ActuatorBounds, AnswerCheck, command_of, refused, resized
 from quadsim.mpc.guard.structs import STATUSES
-from quadsim.mpc.laws.nonlinear import Nonlinear
-from quadsim.mpc.laws.parts.body import Body
-from quadsim.mpc.laws.parts.nonlinear_law import NonlinearLaw, NumbersStruct
-from quadsim.mpc.laws.parts.sqp import OWN_NAMES, SQP, SQPStatus, slack_groups
-from quadsim.mpc.problem.constraints import Constraint, Penalty
-from quadsim.mpc.problem.equilibrium import LEAST_LIFT, Trim
-from quadsim.mpc.problem.model import LinearModel
-from quadsim.mpc.problem.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
-from quadsim.mpc.problem.qp import KKT_EVERY, QP, Solution
-from quadsim.mpc.problem.rigidbody import (
-    N_BODY,
-    Inputs,
-    P,
-    Q,
-    V,
-    W,
-    rigid_body,
-    thrust_axis,
+from quadsim.mpc.laws.nonlinear import MOST_LATE, Nonlinear
+from quadsim.mpc.laws.parts.body import next_states, unpacked, width_of
+from quadsim.mpc.laws.parts.delay import Bodies, adopt_sent, delay_numbers, make_bodies
+from quadsim.mpc.laws.parts.nonlinear_law import WIDTH_OF_MOTION, put_motion
+from quadsim.mpc.laws.parts.nonlinear_problem import (
+    commands_to_inputs,
+    inputs_to_commands,
+    level_command,
+    nonlinear_problem,
+    prediction_model,
 )
+from quadsim.mpc.laws.parts.sqp import SQPStatus, core_view, multipliers, nonlinear_program, slack_groups
+from quadsim.mpc.problem.constraints import Constraint
+from quadsim.mpc.problem.equilibrium import LEAST_LIFT, Trim
+from quadsim.mpc.problem.model import require_delay, split_delay
+from quadsim.mpc.problem.ocp import Equilibrium, InfeasiblePeriod, Problem, Query
+from quadsim.mpc.problem.qp import KKT_EVERY, QP, Solution
+from quadsim.mpc.problem.rigidbody import N_BODY, P, Q, V, W, thrust_axis
 from quadsim.mpc.solvers import INVALID_DATA, Answer, Method
 from quadsim.mpc.space import HALF_SPACE_ROUNDING, SETTLED, Space, distances
-from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.rotation import (
     body_to_euler_rates,
     euler_to_body_rates,
@@ -76,12 +73,12 @@ from quadsim.rotation import (
 from quadsim.state import (
     ANGLE_RATES,
     ANGLES,
-    EULER,
-    EULER_RATE,
     N_STATES,
     POSITIONS,
+    REFERENCE_STATES,
     VELOCITIES,
     Array,
+    Indices,
 )
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -93,27 +90,40 @@ CORRECTIONS: Final = 2
 """Most further SQP steps in a period whose plan has not `CONVERGED`, where commands are targets; if it still has not,
 the next period starts from the reference. A single step from far away may leave a plan with a full turn in it, which
 further steps keep: that way a stiff soft bound on tilt and unfiltered steps of the reference turned a vehicle over."""
-TILT_SIDES: Final = 12
-"""Sides of the polygon that a tilt bound imposes on the thrust axis's horizontal part, inside the circle; it costs up
-to 3.4 % of the bound's sine."""
-_HOVER_STATES: Final = (
-    *("x", "y", "z", "attitude x", "attitude y", "attitude z", "vx", "vy", "vz"),
-    *("body rate x", "body rate y", "body rate z", "rotor 1", "rotor 2", "rotor 3", "rotor 4"),
-)
-"""States of the model near hover: the quaternion's vector part is the attitude."""
 _OPTIMA: Final = {SQPStatus.FREE, SQPStatus.BOUNDED, SQPStatus.UNCONVERGED}
+_NumbersStruct: Final = struct("quadsim_nonlinear_numbers")
+_LawStruct: Final = struct("quadsim_nonlinear")
+_WORLD: Final = 13
+"""Numbers of a `quadsim_nmpc_world`: acceleration, angular acceleration, drag, quadratic drag, thrust scale."""
 
 
 class NonlinearMPC:
     """One step of sequential quadratic programming per period, or more; see the module.
 
+    The law is in C, `quadsim_nonlinear.c`, around the program of `quadsim_nmpc.h`; exported controllers are the same
+    files.  Here it gets its numbers, its half-spaces and its clock, and its answers are checked.
+
     Attributes:
         settings: its table.
+        commands: what it commands.
+        model: the rigid body from node to node.
+        problem: what it solves in each step, at hover.
+        program: the same for the core.
+        numbers: the law's own, for the core.
+        bodies: the numbers of the body over a control period, `period`, and of the same without lag of thrusts,
+            `unlagged`, each with the array that it points to.
+        delay: how late commands act, for the core; None for at once.
+        delay_bodies: the bodies that it points to.
+        ramp: what follows changing forces; None for nothing.
+        struct: what the law remembers, in C.
+        plan: (N, 4) its view of the commands of the last optimum.
+        clock: returns the time [s].
         infeasible_period: the first period whose QP had no answer or, if there is none, whose SQP did not converge.
     """
 
     name: Final = "nonlinear"
     iterates: Final = frozenset({name})
+    solver: Final = CORE
 
     def __init__(
         self,
@@ -129,92 +139,75 @@ class NonlinearMPC:
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
-        self._stride, self._targets = settings.stride(period), settings.commands != ROTORS
-        self._inputs = Inputs.RATES if self._targets else Inputs(settings.inputs)
-        lags, rotor_lag = settings.inner_lag or (0.0, 0.0, 0.0, 0.0), resolved_lag(settings.rotor_lag, vehicle)
-        self._drag = np.array(settings.drag)
         self.commands: str = settings.commands
+        self.horizon = settings.horizon
         self._bounds = settings.actuators(vehicle) if bounds is None else bounds
-        self._nodes, self.horizon = settings.horizon // self._stride, settings.horizon
-        self._model = rigid_body(
-            vehicle,
-            period * self._stride,
-            substeps=settings.substeps,
-            inputs=self._inputs,
-            rotor_lag=rotor_lag or None,
-            lag=lags,
-            drag=self._drag,
-            quadratic_drag=np.array(settings.quadratic_drag),
-            moment=settings.moment,
-        )
-        if settings.moment:
-            vehicle.require_moment("controller")
-        self._level = vehicle.hover_speeds
-        if self._targets:
-            self._level = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
-        self._lag = lags[0] if self._targets else rotor_lag  # of actuator states [s]
-        self._tilted = settings.tilt is not None
-        self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
-        self.problem = self._problem(constraints)
-        self._check, self._form = AnswerCheck(self.problem, kkt_every), Staged(self.problem)
-        self.solver = CORE
-        self._space, self._groups = (
-            space,
-            slack_groups(self.problem, faces=space is not None and space.penalty is not None),
-        )
-        self._shift = self._stride == 1 if settings.shift is None else settings.shift
-        self._sqp = SQP(
-            self._model,
+        self.model = prediction_model(settings, vehicle, period)
+        self.problem = nonlinear_problem(settings, vehicle, period, self.model, self._bounds, constraints)
+        self._nodes = self.problem.horizon
+        self._check = AnswerCheck(self.problem, kkt_every)
+        self._form = Staged(self.problem)
+        self._space = space
+        self._groups = slack_groups(self.problem, faces=space is not None and space.penalty is not None)
+        stride = settings.stride(period)
+        self.program = nonlinear_program(
+            self.model,
             self.problem,
-            inputs=np.stack([self._lower, self._upper]),
+            inputs=np.stack([self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)]),
             difference=settings.attitude_error == "difference",
-            shift=self._shift,
+            shift=stride == 1 if settings.shift is None else settings.shift,
             iterations=settings.iterations,
-            corrections=CORRECTIONS * self._targets,
+            corrections=CORRECTIONS if self.model.targets else 0,
             tolerance=tolerance,
             faces=0 if space is None else space.count,
             price=None if space is None else space.penalty,
-            time_limit=settings.time_limit,
         )
-        observing, ramp = settings.offset_free, settings.disturbance
-        self._observer = None if observing is None else DisturbanceObserver(observing, period)
-        self._ramp: RampObserver | None = None
-        if ramp is not None:
-            lag = self._lag if ramp.rotor_lag is None else ramp.rotor_lag
-            self._ramp = RampObserver(
-                replace(ramp, rotor_lag=lag),
-                vehicle,
-                period,
-                drag=self._model.drag / vehicle.mass,
-                quadratic_drag=self._model.quadratic_drag / vehicle.mass,
-                moment=settings.moment,
-                thrust_lag=self._lag if self._targets else None,
-            )
+        self.delay, self.delay_bodies = None, Bodies()
+        if settings.delay:
+            require_delay(settings.delay, period, min(settings.horizon, MOST_LATE))
+            if self.model.targets and settings.delay >= period:
+                rule = f'below the control period of {period:g} s where commands = "rates"'
+                raise ParameterError("controller", "delay", settings.delay, rule)
+            self.delay, self.delay_bodies = delay_numbers(settings.delay, self.model, vehicle, period)
+        self.clock: Callable[[], float] = clock.perf_counter
         # The same body over a control period: from measurement to measurement, and for other plans, without rotor lag.
-        period_model = replace(self._model, step=period)
-        self._of_period = Body(period_model)
-        without_lag = replace(period_model, rotor_lag=None, lag=(0.0, *lags[1:]), substeps=1)
-        self._without_lag = Body(without_lag)
-        bodies = self._of_period.struct, self._without_lag.struct
-        self._law = NonlinearLaw(self._law_numbers(), self._sqp, *bodies, self._ramp)
-        self._without_lag.world = self._law.world
-        self.reset(self._level)
+        body = replace(self.model, step=period)
+        without_lag = replace(body, rotor_lag=None, lag=(0.0, *self.model.lag[1:]), substeps=1)
+        self.bodies = make_bodies(period=body, unlagged=without_lag)
+        self._lag = self.model.lags[0]  # of actuator states [s]
+        observing = settings.offset_free
+        self._observer = None if observing is None else DisturbanceObserver(observing, period)
+        self.ramp = self._make_ramp()
+        self.numbers = self._make_numbers(stride)
+        self._library = core_library()
+        self._start()
+        self.reset(level_command(self.model, vehicle))
 
-    @property
-    def motion_rows(self) -> int:
-        """Samples that it takes of a course's motion."""
-        return self.horizon + 1
+    def __reduce__(self) -> NoReturn:
+        """Refuse: addresses are useless in a copy or another process."""
+        raise TypeError("a law in C cannot be copied or pickled: make another")
 
-    def _shares(self, speeds: Array) -> Array:
-        """Return the inputs for commands (..., 4): rotor speeds [rad/s] or targets [N], [rad/s]."""
-        if self._targets:
-            return speeds / self._model.scale
-        return self._model.shares(self._vehicle.mean_coefficient * np.square(speeds))
+    def _make_ramp(self) -> RampObserver | None:
+        settings, model = self.settings, self.model
+        if settings.disturbance is None:
+            return None
+        lag = self._lag if settings.disturbance.rotor_lag is None else settings.disturbance.rotor_lag
+        return RampObserver(
+            replace(settings.disturbance, rotor_lag=lag),
+            self._vehicle,
+            self._period,
+            drag=model.drag / model.mass,
+            quadratic_drag=model.quadratic_drag / model.mass,
+            moment=settings.moment,
+            thrust_lag=self._lag if model.targets else None,
+            late=split_delay(settings.delay, self._period)[1],
+        )
 
-    def _law_numbers(self) -> Struct:
-        vehicle, model, observer = self._vehicle, self._model, self._observer
-        numbers = NumbersStruct(
-            stride=self._stride,
+    def _make_numbers(self, stride: int) -> Struct:
+        vehicle, model, observer = self._vehicle, self.model, self._observer
+        numbers = _NumbersStruct(
+            problem=ctypes.addressof(self.program.struct),
+            stride=stride,
             observes=observer is not None,
             control_period=self._period,
             mass=vehicle.mass,
@@ -223,11 +216,17 @@ class NonlinearMPC:
             least_lift=LEAST_LIFT,
             converged=CONVERGED,
         )
+        for name, (body, _) in self.bodies.items():
+            setattr(numbers, name, ctypes.addressof(body))
+        if self.delay is not None:
+            numbers.delay = ctypes.addressof(self.delay)
+        if self.ramp is not None:
+            numbers.ramp = ctypes.addressof(self.ramp.numbers)
         lifts = vehicle.mass * vehicle.gravity * vehicle.thrust_shares
         set_members(
             numbers,
             scale=model.scale,
-            level=self._level,
+            level=level_command(model, vehicle),
             lifts=lifts * (vehicle.mean_coefficient / vehicle.coefficients),  # of rotors with the mean coefficient
             inverse=np.linalg.inv(model.effectiveness),
             drag=model.drag / vehicle.mass,
@@ -237,183 +236,163 @@ class NonlinearMPC:
             set_members(numbers, gain=observer.gain, largest=observer.largest)
         return numbers
 
-    def _speeds(self, shares: Array) -> Array:
-        """Return the commands of inputs: rotor speeds [rad/s] or targets [N], [rad/s]."""
-        if self._targets:
-            return shares * self._model.scale
-        return np.sqrt(self._model.thrusts(np.maximum(shares, 0.0)) / self._vehicle.mean_coefficient)
+    def _start(self) -> None:
+        """Start a law in new memory, with views of what Python reads and writes there."""
+        p, N = self.program.struct, self._nodes
+        reals, ints = self.memory()
+        self._memory = np.zeros(reals), np.zeros(ints, np.intc)
+        self.struct = law = _LawStruct()
+        self._library.quadsim_nonlinear_start(law, self.numbers, *(part.ctypes.data for part in self._memory))
+        if self.ramp is not None:
+            self.ramp.bind(law.ramp)
+        self._work = work = law.work
+        self._world = np.ctypeslib.as_array((ctypes.c_double * _WORLD).from_buffer(law.world))
+        self.plan = core_view(law.plan, self.horizon, N_ROTORS)
+        measured = np.ctypeslib.as_array(law.measured)[: self.model.n]
+        before = np.ctypeslib.as_array(law.before)
+        self._asked = measured, before, core_view(law.states, N + 1, N_BODY), core_view(law.thrusts, N, N_ROTORS)
+        self._arguments = work, law.world, *(array.ctypes.data for array in self._asked)
+        size = self.model.n + N_ROTORS * bool(p.moves)
+        self._x, self._u = core_view(work.x, N + 1, size), core_view(work.u, N, N_ROTORS)
+        self._s, self._v = core_view(work.s, N + 1, size), core_view(work.v, N, N_ROTORS)
+        self._goal, self._aim = core_view(work.goal, N + 1, size)[:, : self.model.n], core_view(work.aim, N, N_ROTORS)
+        self._face, self._beyond = core_view(work.face, N, p.faces, 3), core_view(work.beyond, N, p.faces)
+        self._map, self._offset = core_view(work.map, N, N_BODY, width_of(size)), core_view(work.offset, N, size)
+        self._axis, self._known = core_view(work.axis, N * p.tilts, 2, 4), core_view(work.known, N * p.tilts, 2)
+        self._origin, self._price = core_view(work.origin, N, p.slacks), core_view(work.price, N, p.slacks)
+        self._free = core_view(work.free, N, p.slacks, kind=ctypes.c_int)
+        self._held = core_view(work.held, N, N_ROTORS, kind=ctypes.c_int)
+        self._state, self._attitude, self._rates, self._acting = (np.zeros(size) for size in (N_STATES, 4, 3, N_ROTORS))
+        self._preview = np.zeros((self.horizon, len(REFERENCE_STATES)))
+        self._motion = np.zeros((self.motion_rows, WIDTH_OF_MOTION))
+        self._given = [array.ctypes.data for array in (self._state, self._attitude, self._rates)]
+        self._references = self._preview.ctypes.data, self._motion.ctypes.data
+        self._command = self._acting.ctypes.data
 
-    def _problem(self, constraints: tuple[Constraint, ...]) -> Problem:
-        settings, model = self.settings, self._model
-        hover, x = self._shares(self._level), np.zeros(model.n)
-        x[3] = 1.0
-        x[N_BODY:] = hover[: model.n - N_BODY]
-        A, B, _ = Body(model).linearise(x[None], hover[None])
-        rows, weights = settings.outputs()
-        objective = Objective(
-            C_r=np.hstack([rows, np.zeros((len(rows), model.n - N_BODY))]),
-            Q_y=np.diag(weights),
-            Q_u=settings.weights.input * np.eye(N_ROTORS),
-            Q_d=settings.weights.move * np.eye(N_ROTORS) if settings.weights.move else None,
-        )
-        linear = LinearModel(A=A[0], B=B[0], u_bar=hover, period=model.step)
-        if settings.terminal == "lqr":
-            P = self._riccati(linear, objective)
-        else:
-            P = (0.0 if settings.terminal == "none" else float(settings.terminal)) * objective.weights[0]
-        if self._tilted:  # two further states: the thrust axis along world x and y
-            none = np.zeros((2, 2))
-            A, B = scipy.linalg.block_diag(linear.A, none), np.vstack([linear.B, np.zeros((2, N_ROTORS))])
-            linear, P = replace(linear, A=A, B=B), scipy.linalg.block_diag(P, none)
-            objective = replace(objective, C_r=np.hstack([objective.C_r, np.zeros((len(rows), 2))]))
-        return Problem(
-            model=linear,
-            horizon=self._nodes,
-            objective=replace(objective, P=P),
-            constraints=(
-                Constraint(name="inputs", lower=self._lower, upper=self._upper, D=np.eye(N_ROTORS)),
-                *self._held(linear.n),
-                *(self._of_states(constraint, linear.n) for constraint in constraints),
-            ),
-        )
+    def memory(self, room: int | None = None) -> tuple[int, int]:
+        """Return the reals and integers of memory that it needs, with room for so many active rows in its program."""
+        numbers = _NumbersStruct.from_buffer_copy(self.numbers)
+        program = type(self.program.struct).from_buffer_copy(self.program.struct)
+        program.room = program.room if room is None else room
+        numbers.problem = ctypes.addressof(program)
+        return self._library.quadsim_nonlinear_reals(numbers), self._library.quadsim_nonlinear_ints(numbers)
 
-    def _held(self, n: int) -> Iterator[Constraint]:
-        """Yield the bounds on slew, tilt and body rates, in a problem with n states."""
-        settings, bounds, largest = self.settings, self._bounds, self._vehicle.speed_max
-        if np.isfinite(bounds.delta_min).any() or np.isfinite(bounds.delta_max).any():
-            if self._inputs is not Inputs.SPEED:
-                rule = 'left out where inputs = "thrust": a step of a speed is not linear in thrusts; inputs = "speed"'
-                raise ParameterError("controller", "input_bounds.slew", bounds.delta_max.tolist(), rule)
-            steps = np.full((self._nodes, 1), float(self._stride))  # periods between nodes,
-            steps[0] = 1.0  # except the first node, which follows the command in force
-            lower, upper = steps * bounds.delta_min / largest, steps * bounds.delta_max / largest
-            yield Constraint(name="slews", lower=lower, upper=upper, E=np.eye(N_ROTORS))
-        if settings.tilt is not None:
-            tilt = math.radians(settings.tilt)
-            angles = math.tau / TILT_SIDES * np.arange(TILT_SIDES)
-            rows = np.zeros((TILT_SIDES, n))
-            rows[:, -2], rows[:, -1] = np.cos(angles), np.sin(angles)
-            upper = np.full(TILT_SIDES, math.sin(tilt) * math.cos(math.pi / TILT_SIDES))
-            penalty = self._penalty(TILT_SIDES, 1.0 / math.cos(tilt))  # in the sine of the tilt
-            yield Constraint(name="tilt", lower=np.full(TILT_SIDES, -math.inf), upper=upper, C=rows, penalty=penalty)
-        rates = settings.largest_rates
-        if np.isfinite(rates).any():
-            rows = np.eye(n)[W]
-            yield Constraint(name="body_rates", lower=-rates, upper=rates, C=rows, penalty=self._penalty(3, 1.0))
+    def resize(self, room: int, changes: int) -> None:
+        """Make room for so many active rows, and allow so many changes of the active set, in new memory."""
+        self.program.struct.room = room
+        self.program.struct.changes = changes
+        self._start()
 
-    def _penalty(self, rows: int, scale: float) -> Penalty | None:
-        soft = self.settings.soft
-        if soft is None:
-            return None
-        l1, l2 = soft.linear, soft.quadratic
-        return Penalty(l1=np.full(rows, l1 * scale), l2=np.full(rows, l2 * scale**2), largest=True)
+    @property
+    def motion_rows(self) -> int:
+        """Samples that it takes of a course's motion: one more than there are until the last node's instant."""
+        return self.horizon + 1 + (0 if self.delay is None else self.delay.under_way + 1)
 
-    def _of_states(self, constraint: Constraint, n: int) -> Constraint:
-        """Convert rows over the 12 states and rotor speeds to the model's; refuse those not linear in its states."""
-        C, D = (np.zeros((constraint.lower.shape[-1], size)) for size in (n, N_ROTORS))
-        if constraint.name in OWN_NAMES:
-            rule = f"named otherwise than {', '.join(OWN_NAMES)}, the law's own bounds"
-            raise ParameterError("controller", constraint.name, "further rows of that name", rule)
-        if constraint.E is not None and constraint.E.any():
-            rule = "without steps of rotor speeds, which input_bounds.slew bounds"
-            raise ParameterError("controller", constraint.name, "of those", rule)
-        if constraint.C is not None:
-            if constraint.C.ndim == 3:
-                rule = "with the same rows at all steps: only the half-spaces of obstacles differ from step to step"
-                raise ParameterError("controller", constraint.name, "of others", rule)
-            if constraint.C[:, [*EULER, *EULER_RATE]].any():
-                rule = "without Euler angles and their rates; tilt and body_rate bound the attitude"
-                raise ParameterError("controller", constraint.name, "of those", rule)
-            C[:, P], C[:, V] = constraint.C[:, POSITIONS], constraint.C[:, VELOCITIES]
-        if constraint.D is not None and constraint.D.any():
-            if self._targets:
-                rule = 'without rotor speeds where commands = "rates": an inner loop commands the rotors'
-                raise ParameterError("controller", constraint.name, "of those", rule)
-            if self._inputs is not Inputs.SPEED:
-                rule = 'without rotor speeds where inputs = "thrust", in which they are not linear: inputs = "speed"'
-                raise ParameterError("controller", constraint.name, "of those", rule)
-            D = constraint.D * self._vehicle.speed_max
-        return replace(constraint, C=C, D=D)
-
-    def _riccati(self, linear: LinearModel, objective: Objective) -> Array:
-        """Return P at hover, where the quaternion's scalar part is constant and has no cost."""
-        others = np.delete(np.arange(linear.n), 3)
-        reduced = replace(objective, C_r=objective.C_r[:, others], P=None)
-        if self.settings.attitude_error == "difference":
-            rows = np.delete(np.arange(len(objective.C_r)), 3)
-            reduced = replace(reduced, C_r=reduced.C_r[rows], Q_y=objective.Q_y[np.ix_(rows, rows)])
-        part = replace(linear, A=linear.A[np.ix_(others, others)], B=linear.B[others])
-        P = np.zeros((linear.n, linear.n))
-        P[np.ix_(others, others)] = lqr_terminal_weight(part, reduced, _HOVER_STATES)
-        return P
+    def _shares(self, commands: Array) -> Array:
+        """Return the inputs for commands (..., 4): rotor speeds [rad/s] or targets [N], [rad/s]."""
+        return commands_to_inputs(self.model, self._vehicle, commands)
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed; or after a target that acts."""
-        self._acting, self._called_at = np.array(speeds, float), math.nan
-        self._law.reset(self._acting)
+        self._acting[:] = speeds
+        self._called_at = math.nan
+        self._library.quadsim_nonlinear_reset(self.struct, self._command)
         self._check.reset()
         self.infeasible_period: InfeasiblePeriod | None = None
 
     def adopt(self, previous: object) -> None:
         """Take over disturbance, rotor speeds and plan of the previous law, these only from one with like commands."""
-        law = previous if isinstance(previous, NonlinearMPC) else None
-        if law is not None:
-            alike, rotors = self._inputs is law._inputs, None
-            if self._targets is law._targets:
-                its = (np.array(law._law.struct.rotors), np.array(law._law.struct.rotors_before))
-                rotors = its if alike else (self._shares(law._speeds(its[0])), self._shares(law._speeds(its[1])))
-            self._called_at = law._called_at
-            self._law.adopt(law._law, rotors)
-            alike = alike and self._model.n == law._model.n and self._model.step == law._model.step
-            plan = law._sqp.plan
-            if plan is not None and alike:
-                self._sqp.plan = resized(plan[0], self._nodes + 1), resized(plan[1], self._nodes)
-            if self._ramp is not None and law._ramp is not None:
-                self._ramp.adopt(law._ramp)
         estimate = disturbance_of(previous)
-        if law is not None and law._observer is not None:
-            estimate = np.array(law._law.struct.estimate)
+        if isinstance(previous, NonlinearMPC):
+            self._adopt_memory(previous)
+            if previous._observer is not None:
+                estimate = np.array(previous.struct.estimate)
         if estimate is not None:
-            self._law.learn(estimate)
+            self.learn(estimate)
+
+    def _adopt_memory(self, law: NonlinearMPC) -> None:
+        mine, its = self.struct, law.struct
+        alike = self.model.inputs is law.model.inputs
+        self._called_at = law._called_at
+        mine.quaternion, mine.turned, mine.side = its.quaternion, its.turned, its.side
+        mine.called = its.called
+        if self.model.targets is law.model.targets:
+            for name in ("rotors", "rotors_before"):
+                rotors = np.array(getattr(its, name))
+                if not alike:
+                    rotors = self._shares(inputs_to_commands(law.model, law._vehicle, rotors))
+                set_members(mine, **{name: rotors})
+            mine.learns, mine.last[:N_BODY] = its.learns, its.last[:N_BODY]
+            adopt_sent(mine.delay, self.delay, its.delay, law.delay)
+        plan = law.stored_plan
+        if plan is not None and alike and self.model.n == law.model.n and self.model.step == law.model.step:
+            self.stored_plan = resized(plan[0], self._nodes + 1), resized(plan[1], self._nodes)
+        if self.ramp is not None and law.ramp is not None:
+            self.ramp.adopt(law.ramp)
+
+    def learn(self, estimate: Array) -> None:
+        """Start from an estimate (6,) of the disturbance; without an observer nothing changes."""
+        estimate = np.array(estimate, float)
+        self._library.quadsim_nonlinear_learn(self.struct, estimate.ctypes.data)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; numbers out of range give the status `invalid_data`."""
         if now.acting is not None:
-            self._acting = np.array(now.acting, float)
-        since, self._called_at = now.time - self._called_at, now.time
-        periods = round(since / self._period) if math.isfinite(since) else 0
+            self._acting[:] = now.acting
+        elapsed = now.time - self._called_at
+        self._called_at = now.time
+        periods = round(elapsed / self._period) if math.isfinite(elapsed) else 0
         if now.phase in GROUNDED:
-            self._law.stand(periods, self._acting)
-            self._acting = self._bounds.lowest(self._acting)
+            self._library.quadsim_nonlinear_stand(self.struct, periods, self._command)
+            self._acting[:] = self._bounds.lowest(self._acting)
             return stopped(self._acting.copy(), self.horizon, now.phase)
-        if not self._law.begin(periods, now.phase is Phase.FLYING, now, state, reference, self._acting):
+        if not self._begin(periods, now, state, reference):
             return refused(self._acting, self.horizon, INVALID_DATA)
-        if self._ramp is not None and now.phase is Phase.FLYING:
-            self._ramp.log(now)
-        last_plan = self._sqp.plan
-        answer, found = self._iterate(now.time)
-        status = STATUSES[found]
-        answer, reason = self._checked(answer, None if status in ACCEPTED else status)
+        if self.ramp is not None and now.phase is Phase.FLYING:
+            self.ramp.log(now)
         first = self.infeasible_period
+        last_plan = self.stored_plan if first is None else None
+        answer, code = self._iterate(now.time + self.settings.delay)
+        status = STATUSES[code]
+        answer, reason = self._checked(answer, None if status in ACCEPTED else status)
         if reason is not None:
             if reason != INVALID_DATA and (first is None or first.converges is not None):
                 self.infeasible_period = self._kept_period(now.time, reason)
             return replace(refused(self._acting, self.horizon, reason, answer), iterations_by=self.name)
         if status == NOT_CONVERGED and first is None:
-            start = _Start(last_plan, self._law.world.numbers.copy(), now.time, self._law.query)
+            start = _Start(last_plan, self._world.copy(), now.time + self.settings.delay, self.asked)
             converges = partial(_converges, self._again, self.settings, start)
             self.infeasible_period = replace(self._kept_period(now.time, status), converges=converges)
-        speeds = self._law.plan.copy()
-        self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
+        speeds = self.plan.copy()
+        speeds[0] = self._bounds.clip(speeds[0], self._acting)
+        self._acting[:] = speeds[0]
         return replace(command_of(speeds[0], speeds, status, answer), iterations_by=self.name)
+
+    def _begin(self, periods: int, now: StepInputs, state: Array, reference: Array) -> bool:
+        """Make the query of a period, so many after the last, from its inputs; False if they are implausible."""
+        self._state[:] = state
+        self._attitude[:] = math.nan if now.attitude is None else now.attitude
+        self._rates[:] = math.nan if now.body_rates is None else now.body_rates
+        moves = now.motion is not None
+        if now.motion is None:
+            self._preview[:] = reference
+        else:
+            put_motion(now.motion, self._motion)
+        flying = now.phase is Phase.FLYING
+        return bool(
+            self._library.quadsim_nonlinear_begin(
+                self.struct, periods, flying, moves, *self._given, self._references[moves], self._command
+            )
+        )
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the latest disturbance estimate, without rotor lag."""
-        n = N_BODY + self._targets
-        x, predicted = np.zeros((len(states), n)), np.empty((*plans.shape[:2], N_STATES))
+        body, _ = self.bodies["unlagged"]
+        x = np.zeros((len(states), N_BODY + body.actuators))
         x[:, :N_BODY] = _body(states)
+        predicted = np.empty((*plans.shape[:2], N_STATES))
         for i in range(plans.shape[1]):
-            x = self._without_lag.advance(x, self._shares(plans[:, i]))
+            x = next_states(body, self.struct.world, x, self._shares(plans[:, i]))
             x[:, Q] /= np.linalg.norm(x[:, Q], axis=1, keepdims=True)
             euler = quaternion_to_euler(x[:, Q])
             predicted[:, i, POSITIONS], predicted[:, i, VELOCITIES] = x[:, P], x[:, V]
@@ -424,42 +403,144 @@ class NonlinearMPC:
     @property
     def disturbance(self) -> Array:
         """(6,) estimated acceleration now, world [m/s^2], and angular acceleration, body [rad/s^2]."""
-        return self._law.world.numbers[:6].copy()
+        return self._world[:6].copy()
 
     @property
     def trim(self) -> Trim | None:
         """The target at rest under the estimated force and thrust scale, for the fallback; None for rotor speeds."""
-        trim = self._law.struct.trim
-        return Trim(speeds=np.array(trim.commands), lift=np.array(trim.lift)) if self._targets else None
+        if not self.model.targets:
+            return None
+        trim = self.struct.trim
+        return Trim(speeds=np.array(trim.commands), lift=np.array(trim.lift))
+
+    @property
+    def asked(self) -> tuple[Array, ...]:
+        """The last query: the state (n,) from which the command acts, and the inputs before (4,); then the reference.
+
+        The reference is states (N + 1, 13) and the rotors' thrusts (N, 4) [N] that hold them.  States are position,
+        quaternion, velocity, body rates and, of the measured one, actuators.
+        """
+        return tuple(array.copy() for array in self._asked)
+
+    @property
+    def stored_plan(self) -> tuple[Array, Array] | None:
+        """States (N + 1, n) and inputs (N, 4) of the plan from which the next step starts; None without one."""
+        if not self._work.planned:
+            return None
+        return self._x[:, : self.model.n].copy(), self._u.copy()
+
+    @stored_plan.setter
+    def stored_plan(self, plan: tuple[Array, Array] | None) -> None:
+        self._work.planned = int(plan is not None)
+        if plan is None:
+            self._library.quadsim_nmpc_reset(self._work)
+            return
+        n, before = self.model.n, self._asked[1]
+        self._x[:, :n], self._u[:] = plan
+        if self._x.shape[1] > n:
+            self._x[0, n:], self._x[1:, n:] = before, self._u
+
+    @property
+    def half_spaces(self) -> tuple[Array, Array]:
+        """Normals (S, N, 3) and bounds (S, N) of normal . p >= bound, for positions, of the present program."""
+        return np.asarray(-self._face.transpose(1, 0, 2)), np.asarray(-self._beyond.T)
+
+    @property
+    def inputs(self) -> Array:
+        """(N, 4) inputs of the last optimum."""
+        return self._v.copy()
+
+    @property
+    def positions(self) -> Array:
+        """(N, 3) positions of the last optimum [m]."""
+        return self._s[1:, P].copy()
+
+    @property
+    def active(self) -> int:
+        """Number of active rows at the last optimum."""
+        return int(self._work.count + np.count_nonzero(self._held))
+
+    @property
+    def changes(self) -> int:
+        """Changes of the active set and recursions of the last program."""
+        return int(self._work.changes + self._work.rounds + self._work.inner)
+
+    def solve(self, *asked: Array) -> SQPStatus:
+        """Take a period's SQP steps for a query like `asked`, by default the present one, without half-spaces."""
+        for array, value in zip(self._asked, asked, strict=False):
+            array[:] = value
+        if self.settings.time_limit is None:
+            return SQPStatus(self._library.quadsim_nmpc_step(*self._arguments))
+        deadline = self.clock() + self.settings.time_limit
+        if not self._library.quadsim_nmpc_begin(*self._arguments):
+            return SQPStatus.NOT_FINITE
+        goes_on = True
+        while goes_on:
+            self._library.quadsim_nmpc_linearise(self._work, self.struct.world)
+            status = SQPStatus(self._library.quadsim_nmpc_solve(self._work))
+            status, goes_on = self._keep(status, deadline)
+        return status
+
+    def _keep(self, status: SQPStatus, deadline: float) -> tuple[SQPStatus, bool]:
+        """Keep the optimum as the plan; return the plan's status, and whether another step should follow."""
+        of_plan = ctypes.c_int(status)
+        self._work.ends = math.isfinite(deadline) and self.clock() >= deadline
+        goes_on = self._library.quadsim_nmpc_keep(self._work, self.struct.world, ctypes.byref(of_plan))
+        return SQPStatus(of_plan.value), bool(goes_on)
+
+    def _among(self, space: Space, time: float) -> SQPStatus:
+        """Take SQP steps among half-spaces: those of a program follow its optimum, a few times at most."""
+        t = time + space.period * np.arange(1.0, self._nodes + 1.0)
+        limit = self.settings.time_limit
+        deadline = math.inf if limit is None else self.clock() + limit
+        if not self._library.quadsim_nmpc_begin(*self._arguments):
+            return SQPStatus.NOT_FINITE
+        goes_on = True
+        while goes_on:
+            self._library.quadsim_nmpc_linearise(self._work, self.struct.world)
+            along = self._x[1:, P].copy()
+            for i in range(space.settings.iterations):
+                normals, bounds = space.half_spaces(t, along)
+                if i and (distances(normals, bounds, along) >= -HALF_SPACE_ROUNDING).all():
+                    break
+                self._face[:], self._beyond[:] = -normals.transpose(1, 0, 2), -bounds.T
+                status = SQPStatus(self._library.quadsim_nmpc_solve(self._work))
+                if status not in _OPTIMA:
+                    break
+                before, along = along, self.positions
+                if np.abs(along - before).max() < SETTLED:
+                    break
+            status, goes_on = self._keep(status, deadline)
+        return status
 
     def _iterate(self, time: float) -> tuple[Answer, int]:
         """Take SQP steps from the stored plan; return the last program's optimum and the plan's status in the core."""
-        sqp, started = self._sqp, clock.perf_counter()
-        status = sqp.step() if self._space is None else self._among(self._space, time)
-        found = self._law.end(status)
+        work, started = self._work, clock.perf_counter()
+        found = self.solve() if self._space is None else self._among(self._space, time)
+        code: int = self._library.quadsim_nonlinear_end(self.struct, found)
         spent_s = clock.perf_counter() - started
-        if status not in _OPTIMA:
+        if found not in _OPTIMA:
             nowhere = np.full((self._nodes, N_ROTORS), math.nan)
-            stats = Statistics(iterations=sqp.iterations, solve_s=spent_s)
-            return Answer(nowhere, np.zeros((self._nodes, 0)), STATUSES[found], CORE, stats=stats), found
-        free, active = status is SQPStatus.FREE, sqp.active
+            stats = Statistics(iterations=self.changes, solve_s=spent_s)
+            return Answer(nowhere, np.zeros((self._nodes, 0)), STATUSES[code], CORE, stats=stats), code
+        free = found is SQPStatus.FREE
         stats = Statistics(
-            iterations=sqp.iterations,
-            active=active,
-            sqp_defect=sqp.defect,
-            sqp_step=sqp.moved,
+            iterations=self.changes,
+            active=self.active,
+            sqp_defect=work.defect,
+            sqp_step=work.moved,
             solve_s=spent_s,
         )
         answer = Answer(
-            sqp.inputs,
-            sqp.slacks(self._groups),
+            self.inputs,
+            self._slacks(self._groups),
             UNCONSTRAINED if free else SOLVED,
             GAIN if free else CORE,
             method=Method.FREE if free else Method.WHOLE,
             stats=stats,
             certificate=self._certificate,
         )
-        return answer, found
+        return answer, code
 
     def _checked(self, answer: Answer, refused: str | None) -> tuple[Answer, str | None]:
         """Check the last program's optimum; see `quadsim.mpc.guard.answer.AnswerCheck`."""
@@ -467,63 +548,61 @@ class NonlinearMPC:
             return answer, refused
         return self._check(self._rows(), self._query(), answer, refused)
 
-    def _among(self, space: Space, time: float) -> SQPStatus:
-        """Take SQP steps among half-spaces: those of a program follow its optimum, a few times at most."""
-        sqp, t = self._sqp, time + space.period * np.arange(1.0, self._nodes + 1.0)
-        if not sqp.begin():
-            return SQPStatus.NOT_FINITE
-        on = True
-        while on:
-            sqp.linearise()
-            along = sqp.planned_positions
-            for i in range(space.settings.iterations):
-                normals, bounds = space.half_spaces(t, along)
-                if i and (distances(normals, bounds, along) >= -HALF_SPACE_ROUNDING).all():
-                    break
-                sqp.half_spaces = normals, bounds
-                status, before = sqp.solve(), along
-                if status not in _OPTIMA:
-                    break
-                along = sqp.positions
-                if np.abs(along - before).max() < SETTLED:
-                    break
-            status, on = sqp.keep(status)
-        return status
+    def _slacks(self, groups: Indices) -> Array:
+        """(N, m) slacks of the last optimum, of chosen groups, in the constraints' units."""
+        program = self.program
+        normalised = self._free * (self._origin + (self._price - program.linear) / program.quadratic)
+        return np.array((normalised / program.slack_scale)[:, groups])
 
     def _rows(self) -> Problem:
         """The program of the last step, with the half-spaces that it had."""
         if self._space is None:
             return self.problem
-        added = self._space.constraint(*self._sqp.half_spaces, self.problem.model.n)
+        added = self._space.constraint(*self.half_spaces, self.problem.model.n)
         return replace(self.problem, constraints=(*self.problem.constraints, added))
 
     def _query(self) -> Query:
         """The data of the last step's program."""
-        sqp, goal, state = self._sqp, self._sqp.goal.copy(), self._sqp.start
-        if self._tilted:
+        goal = self._goal.copy()
+        state = np.array(self._work.start[: self.model.n])
+        if self.program.struct.tilts:
             goal = np.hstack([goal, np.zeros((len(goal), 2))])
-            state = np.append(state, thrust_axis(sqp.measured[Q])[:2])
+            state = np.append(state, thrust_axis(self._asked[0][Q])[:2])
         desired = goal[1:] @ self.problem.objective.C_r.T
-        return Query(state, desired, sqp.before, Equilibrium(goal[-1], sqp.aim.copy()), sqp.steps())
+        equilibrium = Equilibrium(goal[-1], self._aim.copy())
+        return Query(state, desired, self._asked[1].copy(), equilibrium, self._steps())
+
+    def _steps(self) -> tuple[Array, Array, Array]:
+        """A (N, n, n), B (N, n, 4), c (N, n) of the program; under `tilt`, the thrust axis is two further states."""
+        n = self.model.n
+        A, B = unpacked(self._map, n, self._offset.shape[1] - n, self.program.pointed["left"][-1])
+        c = np.array(self._offset[:, :n])
+        if self.program.struct.tilts:
+            axis = self._axis
+            A = np.pad(np.concatenate([A, axis @ A[:, 3:7]], axis=1), ((0, 0), (0, 0), (0, 2)))
+            B = np.concatenate([B, axis @ B[:, 3:7]], axis=1)
+            c = np.concatenate([c, (axis @ c[:, 3:7, None])[:, :, 0] + self._known], axis=1)
+        return A, B, c
 
     def _certificate(self) -> tuple[QP, Solution]:
         """Return the last step's program, and its optimum with multipliers."""
-        problem, query, sqp = self._rows(), self._query(), self._sqp
+        problem, query = self._rows(), self._query()
         form = self._form if problem is self.problem else Staged(problem)
         qp = form.assemble(query)
         groups = self._groups if problem is self.problem else slack_groups(problem)
-        multipliers = sqp.multipliers(len(problem.rows.names), len(self.problem.rows.names))
-        return qp, form.solution(query, qp, sqp.inputs, sqp.slacks(groups), multipliers)
+        of_rows = multipliers(self.program, self._work, len(problem.rows.names), len(self.problem.rows.names))
+        return qp, form.solution(query, qp, self.inputs, self._slacks(groups), of_rows)
 
     def _kept_period(self, time: float, status: str) -> InfeasiblePeriod:
         """Return the last program as the data of a period without an answer."""
-        return InfeasiblePeriod(problem=self._named(), query=self._query(), status=status, time=time)
+        delay = self.settings.delay
+        return InfeasiblePeriod(problem=self._named(), query=self._query(), status=status, time=time, delay=delay)
 
     def _named(self) -> Problem:
         """The last program with the half-spaces of each obstacle by its name."""
         if self._space is None:
             return self.problem
-        named = self._space.constraints(*self._sqp.half_spaces, self.problem.model.n)
+        named = self._space.constraints(*self.half_spaces, self.problem.model.n)
         return replace(self.problem, constraints=(*self.problem.constraints, *named))
 
 
@@ -540,15 +619,17 @@ class _Start(NamedTuple):
     """What a period's plan starts from: data alone, so that a flight can be pickled."""
 
     plan: tuple[Array, Array] | None
-    world: Array  # see `quadsim.mpc.laws.parts.body.World`
+    world: Array  # (13,) what the model knows of its surroundings
     time: float
-    query: tuple[Array, ...]  # see `quadsim.mpc.laws.parts.sqp.SQP.begin`
+    asked: tuple[Array, ...]  # see `NonlinearMPC.asked`
 
 
 def _converges(make: Callable[..., NonlinearMPC], settings: Nonlinear, start: _Start, iterations: int) -> bool:
     """Return whether a period's plan converges within `iterations`."""
     law = make(settings=replace(settings, iterations=iterations, time_limit=None))
-    law._law.ask(start.world, start.query)
-    law._sqp.plan = start.plan
-    _, status = law._iterate(start.time)
-    return STATUSES[status] in OPTIMAL
+    law._world[:] = start.world
+    for array, value in zip(law._asked, start.asked, strict=True):
+        array[:] = value
+    law.stored_plan = start.plan
+    _, code = law._iterate(start.time)
+    return STATUSES[code] in OPTIMAL

@@ -37,7 +37,7 @@ class Target:
 
 
 @lru_cache(maxsize=32)
-def differentiator(samples: int, period: float, *, degree: int = 2, first: int = 1) -> Array:
+def differentiator(samples: int, period: float, *, degree: int = 2, first: float = 1.0) -> Array:
     """(degree + 1, N): value and derivatives at t_k of samples at t_{k + first} .. t_{k + first + N - 1}.
 
     The least-squares polynomial through the samples (Savitzky and Golay, 1964); N = degree + 1 gives ordinary
@@ -52,7 +52,7 @@ def differentiator(samples: int, period: float, *, degree: int = 2, first: int =
         raise ParameterError("controller", "horizon", samples, f"at least {degree + 1}, for {derivative}")
     if not 0.0 < period < math.inf:
         raise ParameterError("controller", "period", period, "positive and finite")
-    t = period * np.arange(first, first + samples)
+    t = period * (first + np.arange(samples))
     fit = np.linalg.pinv(np.vander(t, degree + 1, increasing=True))
     return read_only(fit * np.array([[float(math.factorial(order))] for order in range(degree + 1)]))
 
