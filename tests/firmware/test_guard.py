@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from exported_c import PHASES, Host
 
-from quadsim.controller import Command, StepInputs
+from quadsim.controller import CORE, Command, StepInputs
 from quadsim.mpc.export import source
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.structs import STATUSES
@@ -103,7 +103,7 @@ def flown(scenario: Scenario, host: Host, seed: int = 0) -> tuple[list[Command],
     """Commands of Python and of C to the same measurements, while the vehicle flies Python's."""
     table, period = scenario.controller, scenario.control_period
     linear = not isinstance(table, Nonlinear)
-    pilot = Assembly(scenario.replace({"controller.compiled": True} if linear else {})).controller()
+    pilot = Assembly(scenario.replace({"controller.solver": CORE} if linear else {})).controller()
     guard = guard_of(table, Assembly(scenario).vehicle, period)
     assert guard is not None
     assert isinstance(pilot.law, LinearMPC | NonlinearMPC)

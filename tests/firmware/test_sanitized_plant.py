@@ -17,8 +17,9 @@ MOTION_CAPTURE = {
     **{"sensors.attitude.rate": 100.0, "sensors.attitude.noise": 0.26, "estimator.type": "error_state"},
 }
 FLIGHTS = {
-    "paper-constrained": {"controller.compiled": True, "duration": 2.0},
-    "robust": {"controller.compiled": True, "duration": 2.0, **NEAR_GROUND},
+    "paper-constrained": {"controller.solver": "core", "duration": 2.0},
+    "robust": {"duration": 2.0, **NEAR_GROUND},
+    "robust-lag50": {"controller.delay": 0.12, "computation.delay": 0.12, "controller.solver": "piqp", "duration": 2.0},
     "autopilot": {"duration": 1.0, **MOTION_CAPTURE},
     "landing-by-estimate": {"duration": 3.0},
     "gyro-bias": {"duration": 2.0},

@@ -30,7 +30,7 @@ from quadsim.mpc.laws.parts.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIE
 from quadsim.mpc.pilot.allocation import allocate, make_allocation
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement, require_one_scale
 from quadsim.mpc.problem.model import target_model
-from quadsim.mpc.problem.nonlinear_model import zero
+from quadsim.mpc.problem.rigidbody import zero
 from quadsim.mpc.space import Shape
 from quadsim.mpc.tables.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, require_lags, require_space
 from quadsim.state import Array
