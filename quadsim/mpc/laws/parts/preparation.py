@@ -15,6 +15,7 @@ import numpy as np
 
 from quadsim.controller import Phase, StepInputs
 from quadsim.core.mirror import constant, core_library, set_members, struct
+from quadsim.mpc.estimate.disturbance import SAME_TIME
 from quadsim.mpc.laws.parts.linear import Remembered
 from quadsim.mpc.laws.parts.numbers import controller_numbers, robust_numbers
 from quadsim.mpc.problem.equilibrium import Trim
@@ -27,7 +28,6 @@ from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 _FREE: Final = constant("QUADSIM_FREE")
-_SAME_TIME: Final = 1e-6  # [s]
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 
 
@@ -173,14 +173,14 @@ class RobustPreparation:
 
     def _may_learn(self, now: StepInputs) -> bool:
         """Return whether the observer may compare this period's state with the one that it expected."""
-        if abs(now.time - self._called_at - self.problem.model.period) > _SAME_TIME:
+        if abs(now.time - self._called_at - self.problem.model.period) > SAME_TIME:
             self._measured = -math.inf
         self._called_at = now.time
         if now.unseen is not None and now.unseen[_MOVING].any():
             return False
         span = now.time - self._measured
         self._measured = now.time
-        return bool(span - _SAME_TIME <= LONGEST_SPAN) and now.phase is Phase.FLYING
+        return bool(span - SAME_TIME <= LONGEST_SPAN) and now.phase is Phase.FLYING
 
 
 def _view(address: int, count: int) -> Array:
