@@ -72,7 +72,7 @@ def test_any_horizon_is_exported(horizon: int) -> None:
 def test_the_core_is_exported_byte_for_byte(tmp_path: Path) -> None:
     directory = quadsim.export(quadsim.load("hover", SHORT), tmp_path / "c")
     root = Path(__file__).parents[3]
-    folder = root / "quadsim" / "mpc" / "core" / "c"
+    folder = root / "quadsim" / "mpc" / "c"
     laws = {*CORE_FILES, *NONLINEAR_FILES, *CGeometric.law_files}
     assert {path.name for path in folder.iterdir()} == laws
     for name in CORE_FILES:
