@@ -1,8 +1,8 @@
 """Every installed QP solver on the periods of a flight: set-up, time of the controller step, failures, differences.
 
 A flight is recorded by the controller as its scenario has it.  Its measured states, references and commands before are
-then given to the same controller with each solver, and to the whole law in C.  All answer from the gain where the
-unconstrained optimum is feasible.  Between two answers the plant flies a period, which leaves in the caches what it
+then given to the same controller with each solver.  All answer from the gain where the unconstrained optimum is
+feasible.  Between two answers the plant flies a period, which leaves in the caches what it
 leaves there in a flight.
 """
 
@@ -30,7 +30,6 @@ from quadsim.state import Array, make_state
 
 SEGMENT = 20
 """Consecutive periods that a solver answers before it is the next one's turn."""
-LAW = "whole law in C"
 Answers = dict[int, Command | None]
 """Commands by period; None where there was none."""
 
@@ -64,11 +63,10 @@ class Replayed:
 
 
 def entries(scenario: Scenario, solvers: Sequence[str]) -> dict[str, Scenario]:
-    """The scenario with each solver that is installed, and with its whole law in C."""
-    entries = {name: scenario.replace({"controller.solver": name, "controller.compiled": False}) for name in solvers}
-    entries[LAW] = scenario.replace({"controller.compiled": True})
+    """The scenario with each solver that is installed."""
     usable = {}
-    for name, changed in entries.items():
+    for name in solvers:
+        changed = scenario.replace({"controller.solver": name})
         try:
             Assembly(changed).controller()
         except MissingPackageError:

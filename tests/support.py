@@ -15,6 +15,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from hypothesis import settings
+from numpy_preparation import NonlinearModel, next_state
 from ocp_peer import Period
 from scipy.linalg import block_diag
 
@@ -29,7 +30,6 @@ from quadsim.mpc.laws.parts.preparation import RobustPreparation
 from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.constraints import Bounds, Constraint, Penalty
 from quadsim.mpc.problem.model import LinearModel
-from quadsim.mpc.problem.nonlinear_model import NonlinearModel, next_state
 from quadsim.mpc.problem.ocp import Equilibrium, Objective, Problem, Query
 from quadsim.mpc.problem.rigidbody import RigidBody
 from quadsim.mpc.solvers import Solver

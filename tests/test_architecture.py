@@ -61,7 +61,6 @@ HANDING_OUT = ("quadsim", "quadsim.mpc", "quadsim.gym")
 DEFINED_TWICE = {
     *("Draws", "Flags", "Guard", "LARGEST_RATES", "MOST_ROWS", "NUMBER", "Overlay", "Rows", "Solving", "Steps"),
     *("TARGETS", "UPRIGHT", "WIDTH", "YawTurns", "drawn_flights", "export", "fly", "load_vehicle", "main"),
-    "thrust_axis",
 }
 """Public names that two modules define, for two things or as a function and its command; no name joins them."""
 MOST_FORMULAS_TWICE = 2

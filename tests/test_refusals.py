@@ -339,6 +339,10 @@ DRAGLESS = (
 MISTAKES = {
     "controller.horizn=3": "controller.horizn is not a field of the scenario file; did you mean 'horizon'?@",
     "controller=lqt": f"controller.type must be one of {LAWS}; got 'lqt'; did you mean 'lqr'?",
+    "controller.compiled=true": "controller.compiled must be left out, as it went (C always prepares the queries of "
+    "robust, @; got True",
+    "events=[{type='controller', at=1, fields={compiled=false}}]": "events.0.fields: controller.compiled must be "
+    "left out, as it went (C always @; got False",
     "controller.solver=clarabell": "controller.solver: no solver named 'clarabell'; did you mean 'clarabel'?@",
     "controller.solver=piqp-multistage-1": "controller.solver: the solver 'piqp-multistage-1' was removed: use "
     "'piqp-multistage'",

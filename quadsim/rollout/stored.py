@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from quadsim.console.summary_tables import summary_tables
 from quadsim.errors import FileError, printable
@@ -75,9 +76,20 @@ def stored_scenario(directory: Path) -> Scenario:
     if not path.is_file():
         raise FileError(path, "is missing or no file")
     data = read_whole(path)
+    _drop_gone(data)
     match data.get("controller"):
         case {"type": str(name), **fields} if name not in LAWS and not is_plugin(name):
             data["controller"] = {**fields, "type": "elsewhere:Controller"}
     scenario = parse_scenario(data, source=str(path))
     course = scenario.reference
     return scenario.altered(reference=course.located(directory)) if isinstance(course, Csv) else scenario
+
+
+def _drop_gone(data: dict[str, Any]) -> None:
+    """Leave out, in place, what runs of earlier versions state and no flight depends on any more."""
+    events = data.get("events")
+    tables = [data.get("controller")]
+    tables += [event.get("fields") for event in events if isinstance(event, dict)] if isinstance(events, list) else []
+    for table in tables:
+        if isinstance(table, dict):
+            table.pop("compiled", None)

@@ -384,7 +384,7 @@ class Assembly:
         return self.with_autopilot(pilot)
 
     def _stated_laws(self) -> tuple[AnyController, tuple[Event, ...]]:
-        """Return controller and events with `compiled` and `solver` of each law stated, to fly as without."""
+        """Return controller and events with the `solver` of each law stated, to fly as without."""
         controller = law = self._stated_law(self.scenario.controller)
         changed: dict[int, Event] = {}
         events = [event for event in self.scenario.events if isinstance(event, ControllerEvent)]
@@ -393,13 +393,9 @@ class Assembly:
             before, law = law, self._stated_law(spec)
             if "type" in event.fields:  # a whole table, which states itself as the first does
                 continue
-            differing = {
-                name: getattr(law, name)
-                for name in ("compiled", "solver")
-                if name not in event.fields and getattr(law, name, None) != getattr(before, name, None)
-            }
-            if differing:
-                changed[id(event)] = replace(event, fields=event.fields | differing)
+            solver = _solver_of(law)
+            if "solver" not in event.fields and solver != _solver_of(before):
+                changed[id(event)] = replace(event, fields={**event.fields, "solver": solver})
         return controller, tuple(changed.get(id(event), event) for event in self.scenario.events)
 
     def _stated_law(self, spec: AnyController) -> AnyController:
@@ -638,3 +634,8 @@ def preferring_core(scenario: Scenario) -> Scenario:
     except ParameterError:
         return scenario
     return preferred
+
+
+def _solver_of(controller: AnyController) -> str | None:
+    """Return the solver that a controller's table states; None for none."""
+    return controller.solver if isinstance(controller, Bounded) else None

@@ -19,7 +19,6 @@ from quadsim.mpc.guard.structs import STATUSES
 from quadsim.mpc.laws.parts.nonlinear_law import WIDTH_OF_MOTION
 from quadsim.mpc.laws.parts.preview import MOTION_SAMPLES
 from quadsim.mpc.laws.parts.sqp import SQPStatus
-from quadsim.mpc.problem.nonlinear_model import SUBSTEPS
 from quadsim.mpc.problem.rigidbody import N_BODY
 from quadsim.mpc.solvers import Method
 from quadsim.vehicle import N_ROTORS
@@ -188,4 +187,3 @@ def test_sizes_are_those_of_the_headers() -> None:
     assert constant("QUADSIM_NMPC_BODY") == N_BODY
     assert constant("QUADSIM_MOTION") == WIDTH_OF_MOTION
     assert constant("QUADSIM_GEOMETRIC_SAMPLES") == MOTION_SAMPLES
-    assert constant("QUADSIM_SUBSTEPS") == SUBSTEPS

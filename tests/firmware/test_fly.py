@@ -90,7 +90,7 @@ def test_commands_in_the_page_have_the_bits_of_the_native_ones(tab: Any, name: s
 
 
 def test_the_page_flies_as_quadsim_does(tab: Any) -> None:
-    scenario = load_scenario(CONTROLLERS["constrained"], ["controller.compiled=true"])
+    scenario = load_scenario(CONTROLLERS["constrained"], ['controller.solver="core"'])
     states = np.array(tab.evaluate(FLY, scenario.periods))
     assert np.abs(states - Rollout(scenario).fly().log.control.state[: len(states)]).max() < TOLERANCE
 

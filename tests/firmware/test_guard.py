@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from exported_c import PHASES, Host, Reply
 
-from quadsim.controller import ACCEPTED, Command, Phase, StepInputs
+from quadsim.controller import ACCEPTED, CORE, Command, Phase, StepInputs
 from quadsim.core.mirror import constant, core_library
 from quadsim.mpc.export import source
 from quadsim.mpc.guard.answer import ActuatorBounds
@@ -106,7 +106,7 @@ def flown(scenario: Scenario, host: Host, seed: int = 0) -> tuple[list[Command],
     """Commands in flight and of the exported law to the same measurements, while the vehicle flies the former."""
     table, period = scenario.controller, scenario.control_period
     linear = not isinstance(table, Nonlinear)
-    pilot = Assembly(scenario.replace({"controller.compiled": True} if linear else {})).controller()
+    pilot = Assembly(scenario.replace({"controller.solver": CORE} if linear else {})).controller()
     guard = table.guard(Assembly(scenario).vehicle, period)
     assert guard is not None
     assert isinstance(pilot.law, LinearMPC | NonlinearMPC)

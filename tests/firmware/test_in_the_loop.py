@@ -78,7 +78,7 @@ def test_without_an_answer_the_target_flies_pythons_fallback(failure: str) -> No
     if shutil.which("cc") is None:
         pytest.skip("cc is not installed: make firmware")
     scenario = load_scenario("robust").replace({"duration": 6.0} | FAILURES[failure])
-    desired = Rollout(scenario.replace({"controller.compiled": True})).fly()
+    desired = Rollout(scenario).fly()
     result = fly_exported(scenario, target="posix", progress=False)
     assert max(desired.log.control.fallback) >= 1
     assert [*result.log.control.fallback] == [*desired.log.control.fallback]
@@ -92,7 +92,7 @@ def test_on_the_ground_the_target_estimates_no_disturbance() -> None:
         pytest.skip("cc is not installed: make firmware")
     ground = ["duration=5.0", "initial.position=[0.0, 0.0, 0.0]", "initial.cold=true", "effects.ground.contact=true"]
     scenario = load_scenario("robust", ["actual.mass=4.4", *ground])
-    desired = Rollout(scenario.replace({"controller.compiled": True})).fly()
+    desired = Rollout(scenario).fly()
     result = fly_exported(scenario, target="posix", progress=False)
     assert {"armed", "flying"} <= set(desired.log.control.phase)
     assert np.abs(result.command - desired.command).max() <= 1e-6

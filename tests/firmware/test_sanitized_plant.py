@@ -23,8 +23,9 @@ LOST = [
     {"type": "controller", "at": 1.5, "fields": {"horizon": 60}},
 ]
 FLIGHTS: dict[str, dict[str, Any]] = {
-    "paper-constrained": {"controller.compiled": True, "duration": 2.0},
-    "robust": {"controller.compiled": True, "duration": 2.0, **NEAR_GROUND},
+    "paper-constrained": {"controller.solver": "core", "duration": 2.0},
+    "robust": {"duration": 2.0, **NEAR_GROUND},
+    "robust-lag50": {"controller.delay": 0.12, "computation.delay": 0.12, "controller.solver": "piqp", "duration": 2.0},
     "autopilot": {"duration": 1.0, **MOTION_CAPTURE},
     "landing-by-estimate": {"duration": 3.0},
     "gyro-bias": {"duration": 2.0},

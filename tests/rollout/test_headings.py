@@ -20,14 +20,12 @@ from quadsim.state import INDEX, REFERENCE_NAMES, TURN, Array, make_state
 
 YAW: Final = REFERENCE_NAMES.index("yaw")
 CONTROLLERS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
-    "unconstrained": ("paper-unconstrained", {"controller.compiled": False}),
-    "unconstrained in C": ("paper-unconstrained", {"controller.compiled": True}),
+    "unconstrained": ("paper-unconstrained", {}),
     "constrained": ("hover", {"controller.solver": "piqp"}),
     "constrained by the core": ("hover", {"controller.solver": "core"}),
-    "constrained in C": ("hover", {"controller.compiled": True}),
     "robust": ("robust", {}),
     "robust in world axes": ("robust", {"controller.heading": False}),
-    "robust in C": ("robust", {"controller.compiled": True}),
+    "robust by DAQP": ("robust", {"controller.solver": "daqp"}),
     "nonlinear": ("hover", {"controller": "nonlinear"}),
     "nonlinear, rates": ("hover", {"controller": {"type": "nonlinear", "commands": "rates"}}),
     "lqr": ("hover", {"controller": "lqr"}),

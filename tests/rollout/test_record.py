@@ -15,6 +15,7 @@ from support import NO_PRODUCTS
 
 import quadsim
 from quadsim.commands.cli import main
+from quadsim.errors import InputError
 from quadsim.flight.parquet import read_parquet
 from quadsim.flight.rundir import finding_from_json, limit_from_json, limit_to_json, read_json
 from quadsim.outputs import to_json
@@ -137,3 +138,18 @@ def test_a_comparison_reads_a_directory_once_and_no_flight_that_it_holds(tmp_pat
     calls = counted(lambda: quadsim.compare(*places, progress=False))
     assert calls(read_flight) == 2
     assert calls(read_json) == 4, "whether it is a run of this version, and its form"
+
+
+def test_a_run_of_an_earlier_version_that_states_who_compiles_is_read(tmp_path: Path) -> None:
+    """It flew as it would now; to fly it anew, its file must do without."""
+    event = {"type": "controller", "at": 0.2, "fields": {"horizon": 45}}
+    run("robust", tmp_path / "run", SHORT | {"events": [event]})
+    tables, file = read_flight(tmp_path / "run").scenario.tables, tmp_path / "run" / "scenario.toml"
+    text = file.read_text()
+    stated = text.replace("[controller]\n", "[controller]\ncompiled = true\n", 1)
+    stated = stated.replace("\nhorizon = 45\n", "\nhorizon = 45\ncompiled = false\n", 1)
+    assert stated.count("compiled =") == 2
+    file.write_text(stated)
+    assert read_flight(tmp_path / "run").scenario.tables == tables
+    with pytest.raises(InputError, match=r"controller\.compiled must be left out, as it went \(C .*; got True"):
+        quadsim.load(file)

@@ -28,7 +28,7 @@ LAWS: dict[str, tuple[str, Fields]] = {
     "constrained": ("paper-constrained", {}),
     "robust": ("robust", {}),
     "robust-lag": ("robust", {"controller.rotor_lag": 0.05, "effects.rotors": {"rise": 0.05}}),
-    "robust-compiled": ("robust", {"controller.compiled": True}),
+    "robust-piqp": ("robust", {"controller.solver": "piqp"}),
     "nonlinear": ("nonlinear", {}),
     "nonlinear-observer": ("nonlinear", {"controller.offset_free": {}}),
     "nonlinear-disturbance": ("nonlinear", {"controller.disturbance": {}}),
@@ -45,7 +45,7 @@ LAWS: dict[str, tuple[str, Fields]] = {
     "geometric-rates": ("hover", {"controller": {"type": "geometric", "commands": "rates"}, **PILOTED}),
     "geometric-attitude": ("hover", {"controller": {"type": "geometric", "commands": "attitude"}, **PILOTED}),
 }
-EACH_KIND = ("constrained", "robust-compiled", "nonlinear", "pid", "geometric-attitude")
+EACH_KIND = ("constrained", "robust", "nonlinear", "pid", "geometric-attitude")
 MASS = 4.0  # of the paper's vehicle, as modelled [kg]
 TOLD = 1.0  # the last control instant before the course rises [s]
 QUIET = ("--no-video", "--no-recording", "--no-figures")
@@ -91,7 +91,7 @@ def lead_of(flight: quadsim.Flight) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.nan_to_num(flight.logged[TAKEOFF_LEAD])
 
 
-@pytest.mark.parametrize("law", ["robust-compiled", "pid"])
+@pytest.mark.parametrize("law", ["robust", "pid"])
 def test_a_law_that_learns_takes_over_from_the_lead(law: str) -> None:
     """The lead falls from lift-off on, the vehicle never sinks back, and no error is left."""
     flight = quadsim.fly(from_the_ground(law, 0.3, 0.3))
@@ -121,7 +121,7 @@ def test_rotors_that_saturate_stop_the_lead() -> None:
     """What is too heavy to fly is pushed no further than its rotors follow; without its load it does not shoot up."""
     load = {"effects.load": {"payloads": [{"mass": 4.0, "position": [0.0, 0.0, 0.0]}]}}
     dropped = {"events": [{"type": "payload_drop", "at": 12.0}]}
-    flight = quadsim.fly(from_the_ground("robust-compiled", 0.3, 0.0, **load, **dropped))
+    flight = quadsim.fly(from_the_ground("robust", 0.3, 0.0, **load, **dropped))
     lead, z = lead_of(flight), flight.state["z"]
     assert z[flight.time < 12.0].max() < AIRBORNE
     assert lead.max() < LARGEST_LEAD
@@ -133,7 +133,7 @@ def test_it_takes_off_again_after_a_landing() -> None:
     course = [{"start": 1.0, "stop": 10.0, "value": 0.5}, {"start": 10.0, "stop": 14.0, "value": -0.3}]
     course.append({"start": 14.0, "stop": 100.0, "value": 0.5})
     fields = {"duration": 24.0, "reference": {"type": "steps", "z": course}}
-    flight = quadsim.fly(from_the_ground("robust-compiled", 0.5, 0.11, **fields))
+    flight = quadsim.fly(from_the_ground("robust", 0.5, 0.11, **fields))
     phases = [
         phase for k, phase in enumerate(flight.log.control.phase) if k == 0 or phase != flight.log.control.phase[k - 1]
     ]
@@ -143,7 +143,7 @@ def test_it_takes_off_again_after_a_landing() -> None:
 
 def test_it_takes_off_from_a_tilted_start() -> None:
     tilted = {"initial.position": [0.0, 0.0, 0.04], "initial.euler": [6.0, 0.0, 0.0]}
-    flight = quadsim.fly(from_the_ground("robust-compiled", 0.5, 0.3, **tilted))
+    flight = quadsim.fly(from_the_ground("robust", 0.5, 0.3, **tilted))
     assert never_took_off(flight.log.control) is None
     assert flight.state["z"][-1] == pytest.approx(0.5, abs=0.1)
 
@@ -153,7 +153,7 @@ def test_a_flight_that_never_leaves_the_ground_is_violated_and_says_so(
 ) -> None:
     """Worn rotors that give less than the weight, whatever every constraint says."""
     worn = {"effects.rotors": {"efficiency": [0.5] * 4}}
-    scenario = from_the_ground("robust-compiled", 0.5, 0.0, duration=10.0, **worn)
+    scenario = from_the_ground("robust", 0.5, 0.0, duration=10.0, **worn)
     flight = quadsim.fly(scenario)
     assert flight.outcome == "violated"
     assert all(finding.satisfied for finding in flight.findings)

@@ -21,16 +21,14 @@ BOUNDS = {
     "input_bounds": {"speed": [0.0, 250.0], "slew": [-10.0, 5.0]},
 }
 LAWS: dict[str, dict[str, Any]] = {
-    "unconstrained": {"type": "unconstrained", "compiled": False, **SHARED},
-    "unconstrained in C": {"type": "unconstrained", "compiled": True, **SHARED},
+    "unconstrained": {"type": "unconstrained", **SHARED},
     **{
         f"constrained by {solver}": {"type": "constrained", "solver": solver, **SHARED, **BOUNDS}
         for solver in ("piqp", "piqp-dense", "daqp", "core")
     },
-    "constrained in C": {"type": "constrained", "compiled": True, **SHARED, **BOUNDS},
     "constrained, terminal weight": {"type": "constrained", "terminal": "lqr", **SHARED, **BOUNDS},
-    "robust": {"type": "robust", "compiled": False, "heading": True, **SHARED, **BOUNDS},
-    "robust in C": {"type": "robust", "compiled": True, "heading": True, **SHARED, **BOUNDS},
+    "robust by PIQP": {"type": "robust", "solver": "piqp", "heading": True, **SHARED, **BOUNDS},
+    "robust": {"type": "robust", "heading": True, **SHARED, **BOUNDS},
     "nonlinear": {"type": "nonlinear", "weights": {"velocity": 50.0}},
 }
 
@@ -63,7 +61,7 @@ def test_a_velocity_desired_at_zero_brakes() -> None:
 @pytest.mark.parametrize("delay", [0.0, 0.03, 0.12])
 def test_a_known_delay_is_no_lag(delay: float) -> None:
     late = {"computation.delay": delay, "controller.delay": delay}
-    flight = quadsim.fly(circle(LAWS["robust in C"]).replace(late), progress=False)
+    flight = quadsim.fly(circle(LAWS["robust"]).replace(late), progress=False)
     assert flight.metrics["rmse.x"] < 5e-3
 
 

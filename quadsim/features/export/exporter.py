@@ -84,7 +84,7 @@ class LinearSearch:
         self._memory = np.zeros(self._library.quadsim_work_reals(struct))
         self._library.quadsim_work_start(self._work, struct, self._memory.ctypes.data)
         rest, speeds = np.zeros(problem.model.n), np.array(problem.model.u_bar)
-        rest[N_STATES:] = (self._shared.tables.modes @ speeds)[: rest.size - N_STATES]
+        rest[N_STATES:] = speeds[: rest.size - N_STATES]
         self._query = np.zeros((problem.horizon, len(problem.objective.C_r))), rest, speeds, speeds
 
     def __call__(self, offset: Array) -> bool:

@@ -21,7 +21,7 @@ from quadsim.mpc.problem.ocp import Query
 from quadsim.mpc.solvers import Method
 from quadsim.mpc.solvers.core import Core
 from quadsim.mpc.solvers.core_tables import with_constraints
-from quadsim.mpc.tables.bounded import Bounded, Weighted
+from quadsim.mpc.tables.bounded import Bounded
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.schema.scenario import Scenario
@@ -87,8 +87,6 @@ class Recorder:
 
 def record(scenario: Scenario) -> Recording:
     """Fly a scenario, record each period, and compute the answers of a controller that starts with the first."""
-    if isinstance(scenario.controller, Weighted):
-        scenario = scenario.replace({"controller.compiled": False})
     if isinstance(scenario.controller, Bounded):
         scenario = scenario.replace({"controller.solver": CORE})
     pilot = Assembly(scenario).controller()

@@ -317,6 +317,27 @@ static inline void lean_of(const real lift[3], real sine, real cosine, real *rol
     *pitch = angle_of(forward, lift[2]);
 }
 
+/* ---- a constant disturbance: force along three axes, torque about three --------------------------------------------- */
+
+/* Steady-state Kalman filters of six scalar disturbances, d += L (v - v expected), each within its limit. */
+static inline void update_disturbance(const real gain[6], const real largest[6], const real surprise[6],
+                                      real estimate[6])
+{
+    int i;
+    for (i = 0; i < 6; i++) {
+        estimate[i] = clipped(estimate[i] + gain[i] * surprise[i], -largest[i], largest[i]);
+    }
+}
+
+/* Start from an estimate, within the limits. */
+static inline void put_disturbance(const real largest[6], const real given[6], real estimate[6])
+{
+    int i;
+    for (i = 0; i < 6; i++) {
+        estimate[i] = clipped(given[i], -largest[i], largest[i]);
+    }
+}
+
 /* ---- references: rows x y z yaw ----------------------------------------------------------------------------------- */
 
 /* Turns to be taken off the reference's heading in the next period, so that it starts near a yaw: as it went on

@@ -1,3 +1,22 @@
+/* The query of a linear law, and its optimum.
+ *
+ * The robust law predicts the vehicle from t_k to the instant t_k + d from which its command acts, through the commands
+ * u(k-1-n) .. u(k-1) that act before.  With Z-Y-X Euler angles eta, body rates omega = E(eta) d(eta)/dt and rotor speeds
+ * that follow commands as tau_r dw/dt = u - w,
+ *
+ *     d2(p)/dt2 = U / m R(eta) e_z - g e_z + a,
+ *     d(omega)/dt = I^-1 (tau - omega x I omega) + (U / m) twist,
+ *
+ * where a has two components along world x and y and one along the thrust: a wrong mass scales the thrust in any
+ * direction.  The observer of (a, twist) is quadsim_math.h's update_disturbance, of the velocities and body rates that
+ * were expected a period before (quadsim/mpc/estimate/observer.py).
+ *
+ * The model is linearised where the vehicle rests under that disturbance, with thrust along g e_z - a,
+ *
+ *     x(k+1) = x_s + A (x(k) - x_s) + B (u(k) - u_s),
+ *
+ * and u_s is the target of the inputs: a loop that settles with no bound active has no steady error, whatever the errors
+ * of A and B. */
 #include "quadsim_mpc.h"
 
 #include <stddef.h>
@@ -5,40 +24,25 @@
 
 #include "quadsim_math.h"
 
-/* ---- what is wanted ---------------------------------------------------------------------------------------------- */
+/* ---- desired outputs --------------------------------------------------------------------------------------------- */
 
-/* wanted [N][n_r] = -C_r x_s */
-static void want_rest(quadsim_mpc *mpc, const real *rest)
+/* y_d [n_r] of a row of the reference. */
+static void put_places(const quadsim_problem *p, const real row[4], real *desired)
 {
-    const quadsim_problem *p = mpc->controller->problem;
-    int i, r;
+    int r;
     for (r = 0; r < p->regulated; r++) {
-        const real at_rest = dot(mpc->controller->C_r + r * p->states, rest, p->states);
-        for (i = 0; i < p->horizon; i++) {
-            mpc->wanted[i * p->regulated + r] = -at_rest;
-        }
+        const real *C = p->C_r + r * p->states;
+        desired[r] = C[X] * row[0] + C[Y] * row[1] + C[Z] * row[2] + C[YAW] * row[3];
     }
 }
 
-/* wanted [n_r] += y_d of a row of the reference. */
-static void want(const quadsim_controller *c, const real row[4], real *wanted)
+/* Add that of the velocities and the yaw rate of a row; roll, pitch and their rates are desired at 0. */
+static void add_rates(const quadsim_problem *p, const real rates[4], real *desired)
 {
-    const int n = c->problem->states;
     int r;
-    for (r = 0; r < c->problem->regulated; r++) {
-        const real *C = c->C_r + r * n;
-        wanted[r] += C[X] * row[0] + C[Y] * row[1] + C[Z] * row[2] + C[YAW] * row[3];
-    }
-}
-
-/* wanted [n_r] += y_d of the velocities and the yaw rate of a row; roll, pitch and their rates are wanted at 0. */
-static void want_rates(const quadsim_controller *c, const real rates[4], real *wanted)
-{
-    const int n = c->problem->states;
-    int r;
-    for (r = 0; r < c->problem->regulated; r++) {
-        const real *C = c->C_r + r * n;
-        wanted[r] += C[VX] * rates[0] + C[VY] * rates[1] + C[VZ] * rates[2] + C[YAW + 1] * rates[3];
+    for (r = 0; r < p->regulated; r++) {
+        const real *C = p->C_r + r * p->states;
+        desired[r] += C[VX] * rates[0] + C[VY] * rates[1] + C[VZ] * rates[2] + C[YAW + 1] * rates[3];
     }
 }
 
@@ -83,12 +87,6 @@ static void rest_at(const real *state, real *rest)
     rest[Y] = state[Y];
     rest[Z] = state[Z];
     rest[YAW] = state[YAW];
-}
-
-/* The optimum of the query, as the work's plan, and how it was found. */
-static enum quadsim_status optimise(quadsim_mpc *mpc, const real *acting)
-{
-    return (enum quadsim_status)quadsim_optimise(&mpc->work, mpc->state, mpc->wanted, mpc->rest, mpc->resting, acting);
 }
 
 /* ---- the vehicle's model ----------------------------------------------------------------------------------------- */
@@ -157,8 +155,8 @@ static void find_disturbance(const quadsim_mpc *mpc, const real axis[3], real ac
 
 /* The state some time [s] later under a command, by Runge-Kutta's classical method; decay [SUBSTEPS][4] of the rotors'
  * speeds at its instants. */
-static void advance(const quadsim_mpc *mpc, real time, const real *decay, const real *rotors, const real *command,
-                    real *state)
+static void predict_state(const quadsim_mpc *mpc, real time, const real *decay, const real *rotors, const real *command,
+                          real *state)
 {
     const quadsim_robust *robust = mpc->controller->robust;
     const real step = time / (real)QUADSIM_SUBSTEPS;
@@ -186,11 +184,11 @@ static void advance(const quadsim_mpc *mpc, real time, const real *decay, const 
     }
 }
 
-/* ---- what the model does not explain: steady-state Kalman filters of a force and a torque ------------------------ */
+/* ---- the disturbance, and rest under it -------------------------------------------------------------------------- */
 
 /* Where the vehicle rests against the estimated disturbance: lift (3,), trim (4,), twist (3,) and effectiveness.
  * U / m R(eta) e_z = g e_z - a,    I^-1 tau = -alpha. */
-static void believe(quadsim_mpc *mpc)
+static void update_trim(quadsim_mpc *mpc)
 {
     const quadsim_robust *r = mpc->controller->robust;
     const real x = mpc->estimate[0], y = mpc->estimate[1];
@@ -223,8 +221,23 @@ static void believe(quadsim_mpc *mpc)
     }
 }
 
-/* Take note of a measured state and of the one that was expected. */
-static void observe(quadsim_mpc *mpc, const real *measured, const real *expected)
+/* u_s: speeds at rest that also balance the torque caused by thrust as it is now, which the hover matrices omit. */
+static void update_resting(quadsim_mpc *mpc)
+{
+    const quadsim_robust *r = mpc->controller->robust;
+    const real *rest = mpc->trim.commands;
+    real excess_thrust = R(0.0);
+    int j;
+    for (j = 0; j < NU; j++) {
+        excess_thrust += r->effectiveness[j] * (mpc->turning[j] * mpc->turning[j] - rest[j] * rest[j]);
+    }
+    for (j = 0; j < NU; j++) {
+        mpc->resting[j] = rest[j] - excess_thrust * dot(r->slope_inverse + j * NU + 1, mpc->trim.twist, 3);
+    }
+}
+
+/* Update the disturbance from a measured state and the one that was expected. */
+static void observe_state(quadsim_mpc *mpc, const real *measured, const real *expected)
 {
     const quadsim_robust *r = mpc->controller->robust;
     real axis[3], rates[3], expected_rates[3], surprise[6], upright;
@@ -239,10 +252,8 @@ static void observe(quadsim_mpc *mpc, const real *measured, const real *expected
     for (i = 0; i < 3; i++) {
         surprise[3 + i] = rates[i] - expected_rates[i];
     }
-    for (i = 0; i < 6; i++) {
-        mpc->estimate[i] = clipped(mpc->estimate[i] + r->gain[i] * surprise[i], -r->largest[i], r->largest[i]);
-    }
-    believe(mpc);
+    update_disturbance(r->gain, r->largest, surprise, mpc->estimate);
+    update_trim(mpc);
 }
 
 /* ---- the robust controller --------------------------------------------------------------------------------------- */
@@ -291,9 +302,9 @@ static void turn_axes(real row[4], real sine, real cosine)
     row[1] = cosine * y - sine * x;
 }
 
-/* wanted of the reference [N][4] as the prediction is given it: later by the delay, and where the model is turned by
- * the heading, yaw without jumps, seen from axes turned by it. */
-static void want_seen(quadsim_mpc *mpc, const real *reference, real turns, real yaw, real sine, real cosine)
+/* y_d of the reference [N][4] as the prediction is given it: later by the delay, and where the model is turned by the
+ * heading, yaw without jumps, seen from axes turned by it. */
+static void put_desired(quadsim_mpc *mpc, const real *reference, real turns, real yaw, real sine, real cosine)
 {
     const quadsim_controller *c = mpc->controller;
     const int end = c->problem->horizon - 1, under_way = c->robust->under_way;
@@ -304,6 +315,7 @@ static void want_seen(quadsim_mpc *mpc, const real *reference, real turns, real 
     }
     for (i = 0; i <= end; i++) {
         const int at = i + under_way < end ? i + under_way : end;
+        real *desired = mpc->desired + i * c->problem->regulated;
         if (i + under_way <= end) {
             turns = next_turns(reference, at, turns);
         }
@@ -315,53 +327,43 @@ static void want_seen(quadsim_mpc *mpc, const real *reference, real turns, real 
             turn_axes(row, sine, cosine);
             row[3] = turned - yaw;
         }
-        want(c, row, mpc->wanted + i * c->problem->regulated);
+        put_places(c->problem, row, desired);
         if (c->follows_rates) {
             later_rates(c, reference, at, rates);
             if (c->robust->heading) {
                 turn_axes(rates, sine, cosine);
             }
-            want_rates(c, rates, mpc->wanted + i * c->problem->regulated);
+            add_rates(c->problem, rates, desired);
         }
     }
 }
 
-/* The last states of a state, which stand for the rotors' speeds where these lag. */
-static void put_modes(const quadsim_controller *c, const real *speeds, real *state)
+/* The last states of a state, which are rotor speeds where these lag. */
+static void put_speeds(const quadsim_problem *p, const real *speeds, real *state)
 {
     int j;
-    for (j = 0; j < c->problem->states - 12; j++) {
-        state[12 + j] = dot(c->robust->modes + j * NU, speeds, NU);
+    for (j = 0; j < p->speeds; j++) {
+        state[12 + j] = speeds[j];
     }
 }
 
-/* Where the model rests: x_s at the present place, u_s with what balances the torque that thrust twists now. */
-static void find_rest(quadsim_mpc *mpc, real sine, real cosine)
+/* Where the model rests: x_s at the present place, u_s as it is. */
+static void put_rest(quadsim_mpc *mpc, real sine, real cosine)
 {
-    const quadsim_robust *r = mpc->controller->robust;
-    real *rest = mpc->rest, *speeds = mpc->resting;
-    real excess_thrust = R(0.0);
-    int j;
-    rest_at(mpc->state, rest);
-    lean_of(mpc->trim.lift, sine, cosine, &rest[ROLL], &rest[PITCH]);
-    for (j = 0; j < NU; j++) {
-        const real turning = mpc->turning[j], resting = mpc->trim.commands[j];
-        excess_thrust += r->effectiveness[j] * (turning * turning - resting * resting);
-    }
-    for (j = 0; j < NU; j++) {
-        speeds[j] = mpc->trim.commands[j] - excess_thrust * dot(r->slope_inverse + j * NU + 1, mpc->trim.twist, 3);
-    }
-    put_modes(mpc->controller, speeds, rest);
+    rest_at(mpc->state, mpc->rest);
+    lean_of(mpc->trim.lift, sine, cosine, &mpc->rest[ROLL], &mpc->rest[PITCH]);
+    put_speeds(mpc->controller->problem, mpc->resting, mpc->rest);
 }
 
-/* The optimum from a state at the instant from which the command acts. */
-static enum quadsim_status solve_ahead(quadsim_mpc *mpc, const real *ahead, const real *reference, real turns,
-                                       const real *acting)
+/* The query from a state at the instant from which the command acts. */
+static void put_query(quadsim_mpc *mpc, const real *ahead, const real *reference, real turns)
 {
     const quadsim_controller *c = mpc->controller;
     real *state = mpc->state, sine = R(0.0), cosine = R(1.0);
     memcpy(state, ahead, 12 * sizeof(real));
+    mpc->yaw = R(0.0);
     if (c->robust->heading) {
+        mpc->yaw = ahead[YAW];
         sin_cos(ahead[YAW], &sine, &cosine);
         state[X] = cosine * ahead[X] + sine * ahead[Y];
         state[Y] = cosine * ahead[Y] - sine * ahead[X];
@@ -369,11 +371,9 @@ static enum quadsim_status solve_ahead(quadsim_mpc *mpc, const real *ahead, cons
         state[VY] = cosine * ahead[VY] - sine * ahead[VX];
         state[YAW] = R(0.0);
     }
-    put_modes(c, mpc->turning, state);
-    find_rest(mpc, sine, cosine);
-    want_rest(mpc, mpc->rest);
-    want_seen(mpc, reference, turns, ahead[YAW], sine, cosine);
-    return optimise(mpc, acting);
+    put_speeds(c->problem, mpc->turning, state);
+    put_rest(mpc, sine, cosine);
+    put_desired(mpc, reference, turns, ahead[YAW], sine, cosine);
 }
 
 /* The i-th of the commands that act one after the other until this period's does: in force, under way. */
@@ -392,45 +392,54 @@ static void note_sent(quadsim_mpc *mpc, const real *acting)
     }
 }
 
-/* The optimum of the robust controller, its prediction and its observer brought up to date. */
-static enum quadsim_status solve_robust(quadsim_mpc *mpc, const real *state, const real *reference, const real *acting,
-                                        int usable)
+/* Let the rotors follow their commands up to the instant from which this period's acts.  From a state (12,), NULL where
+ * none is usable, predict the one there, `ahead`, and let the observer compare it with the one expected; returns whether
+ * there is one. */
+static int predict_ahead(quadsim_mpc *mpc, const real *state, int learns, real ahead[12])
 {
     const quadsim_robust *r = mpc->controller->robust;
-    const real *in_force = sent_command(mpc, 0, acting);
-    real before[NU], expected[12], ahead[12];
-    const int known = mpc->known;
+    const real *acting = mpc->acting, *in_force = sent_command(mpc, 0, acting);
+    real before[NU], expected[12];
     int i;
     memcpy(before, mpc->rotors, sizeof(before));
     spin(mpc->rotors, in_force, r->spun_before);
-    mpc->known = 0;
-    if (usable && r->observes && known) {
+    if (state != NULL && r->observes && mpc->known && learns) {
         memcpy(expected, mpc->ahead, sizeof(expected));
-        advance(mpc, r->rest_of_period, r->decay_before, before, in_force, expected);
+        predict_state(mpc, r->rest_of_period, r->decay_before, before, in_force, expected);
         if (is_finite(expected, 12)) {
-            observe(mpc, state, expected);
+            observe_state(mpc, state, expected);
         }
     }
-    if (usable) {
+    if (state != NULL) {
         memcpy(mpc->ahead, state, sizeof(mpc->ahead));
-        advance(mpc, r->delay, r->decay_delay, mpc->rotors, in_force, mpc->ahead);
+        predict_state(mpc, r->delay, r->decay_delay, mpc->rotors, in_force, mpc->ahead);
     }
     spin(mpc->rotors, in_force, r->spun_delay);
-    memcpy(ahead, mpc->ahead, sizeof(ahead));
+    memcpy(ahead, mpc->ahead, sizeof(mpc->ahead));
     memcpy(mpc->turning, mpc->rotors, sizeof(mpc->turning));
     for (i = 1; i <= r->under_way; i++) {
         const real *next = sent_command(mpc, i, acting);
-        if (usable) {
-            advance(mpc, r->period, r->decay_period, mpc->turning, next, ahead);
+        if (state != NULL) {
+            predict_state(mpc, r->period, r->decay_period, mpc->turning, next, ahead);
         }
         spin(mpc->turning, next, r->spun_period);
     }
     note_sent(mpc, acting);
-    mpc->known = usable && is_finite(ahead, 12);
-    if (!mpc->known) {
-        return QUADSIM_INVALID_DATA;
+    update_resting(mpc);
+    mpc->known = state != NULL && is_finite(ahead, 12);
+    return mpc->known;
+}
+
+/* The query of the robust controller; returns whether there is one. */
+static int prepare_robust(quadsim_mpc *mpc, int flying, int learns, const real *state, const real *reference)
+{
+    real ahead[12];
+    const int known = predict_ahead(mpc, state, learns, ahead);
+    mpc->known = known && flying;
+    if (known) {
+        put_query(mpc, ahead, reference, first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]));
     }
-    return solve_ahead(mpc, ahead, reference, first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]), acting);
+    return known;
 }
 
 /* ---- the controllers --------------------------------------------------------------------------------------------- */
@@ -466,8 +475,8 @@ static int is_usable(const quadsim_controller *c, const real *state, const real 
     return is_plausible(state, c->robust->plausible_state, 12);
 }
 
-/* The optimum of the paper's controllers. */
-static enum quadsim_status solve_paper(quadsim_mpc *mpc, const real *state, const real *reference, const real *acting)
+/* The query of the paper's controllers. */
+static void prepare_paper(quadsim_mpc *mpc, const real *state, const real *reference)
 {
     const quadsim_controller *c = mpc->controller;
     real row[4], rates[4], turns = first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]);
@@ -475,18 +484,17 @@ static enum quadsim_status solve_paper(quadsim_mpc *mpc, const real *state, cons
     memcpy(mpc->state, state, 12 * sizeof(real));
     memcpy(mpc->resting, c->hover, sizeof(mpc->resting));
     rest_at(state, mpc->rest); /* hover is an equilibrium anywhere and at any yaw: here there is least to round */
-    want_rest(mpc, mpc->rest);
     for (i = 0; i < c->problem->horizon; i++) {
+        real *desired = mpc->desired + i * c->problem->regulated;
         turns = next_turns(reference, i, turns);
         memcpy(row, reference + i * 4, sizeof(row));
         row[3] -= TURN * turns;
-        want(c, row, mpc->wanted + i * c->problem->regulated);
+        put_places(c->problem, row, desired);
         if (c->follows_rates) {
             rates_at(c, reference, i, rates);
-            want_rates(c, rates, mpc->wanted + i * c->problem->regulated);
+            add_rates(c->problem, rates, desired);
         }
     }
-    return optimise(mpc, acting);
 }
 
 /* Numbers of the commands that are remembered. */
@@ -506,7 +514,7 @@ void quadsim_mpc_start(quadsim_mpc *mpc, const quadsim_controller *controller, r
     const quadsim_problem *p = controller->problem;
     memset(mpc, 0, sizeof(*mpc));
     mpc->controller = controller;
-    mpc->wanted = memory;
+    mpc->desired = memory;
     mpc->kept = memory + p->horizon * p->regulated;
     mpc->sent = mpc->kept + p->horizon * NU;
     quadsim_work_start(&mpc->work, p, mpc->sent + sent_reals(controller));
@@ -536,52 +544,60 @@ void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
     memcpy(mpc->trim.commands, mpc->controller->hover, sizeof(mpc->trim.commands));
     mpc->trim.lift[2] = R(1.0);
     if (mpc->controller->robust != NULL) {
-        believe(mpc);
+        update_trim(mpc);
+        update_resting(mpc);
     }
 }
 
-/* The command in force: the last one where what is given is not finite. */
-static void find_in_force(const quadsim_mpc *mpc, const real *acting, real in_force[NU])
+/* Take note of the command in force: the last one where what is given is not finite. */
+static void put_acting(quadsim_mpc *mpc, const real *acting)
 {
-    memcpy(in_force, is_finite(acting, NU) ? acting : mpc->before, NU * sizeof(real));
+    memcpy(mpc->acting, is_finite(acting, NU) ? acting : mpc->before, sizeof(mpc->acting));
 }
 
 void quadsim_mpc_stand(quadsim_mpc *mpc, const quadsim_real acting[4])
 {
-    real in_force[NU];
-    find_in_force(mpc, acting, in_force);
+    real ahead[12];
+    put_acting(mpc, acting);
     if (mpc->controller->robust != NULL) {
-        (void)solve_robust(mpc, NULL, NULL, in_force, 0);
+        (void)predict_ahead(mpc, NULL, 0, ahead);
         memset(mpc->estimate, 0, sizeof(mpc->estimate));
-        believe(mpc);
+        update_trim(mpc);
+        update_resting(mpc);
     }
-    memcpy(mpc->before, in_force, sizeof(mpc->before));
+    memcpy(mpc->before, mpc->acting, sizeof(mpc->before));
 }
 
 void quadsim_mpc_learn(quadsim_mpc *mpc, const quadsim_real estimate[6])
 {
     const quadsim_robust *r = mpc->controller->robust;
-    int i;
     if (r == NULL || !r->observes || !is_finite(estimate, 6)) {
         return;
     }
-    for (i = 0; i < 6; i++) {
-        mpc->estimate[i] = clipped(estimate[i], -r->largest[i], r->largest[i]);
-    }
-    believe(mpc);
+    put_disturbance(r->largest, estimate, mpc->estimate);
+    update_trim(mpc);
+    update_resting(mpc);
 }
 
-enum quadsim_status quadsim_mpc_solve(quadsim_mpc *mpc, const quadsim_real state[12], const quadsim_real *reference,
-                                      const quadsim_real acting[4])
+enum quadsim_status quadsim_mpc_prepare(quadsim_mpc *mpc, int flying, int learns, const quadsim_real state[12],
+                                        const quadsim_real *reference, const quadsim_real acting[4])
 {
-    const int usable = is_usable(mpc->controller, state, reference, acting);
-    real in_force[NU];
+    const quadsim_controller *c = mpc->controller;
+    int usable = is_usable(c, state, reference, acting);
     mpc->work.changes = 0;
-    find_in_force(mpc, acting, in_force);
-    if (mpc->controller->robust != NULL) {
-        return solve_robust(mpc, state, reference, in_force, usable);
+    put_acting(mpc, acting);
+    if (c->robust != NULL) {
+        usable = prepare_robust(mpc, flying, learns, usable ? state : NULL, reference);
+    } else if (usable) {
+        prepare_paper(mpc, state, reference);
     }
-    return usable ? solve_paper(mpc, state, reference, in_force) : QUADSIM_INVALID_DATA;
+    return usable ? QUADSIM_FREE : QUADSIM_INVALID_DATA;
+}
+
+enum quadsim_status quadsim_mpc_optimise(quadsim_mpc *mpc)
+{
+    return (enum quadsim_status)quadsim_optimise(&mpc->work, mpc->state, mpc->desired, mpc->rest, mpc->resting,
+                                                 mpc->acting);
 }
 
 enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, enum quadsim_phase phase, const quadsim_real state[12],
@@ -596,10 +612,10 @@ enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, enum quadsim_phase phase,
     if (status == QUADSIM_FREE && phase == QUADSIM_PHASE_LANDED) {
         quadsim_mpc_stand(mpc, guard->in_force);
     } else if (status == QUADSIM_FREE) {
-        mpc->known = mpc->known && guard->learns;
-        status = quadsim_mpc_solve(mpc, guard->state, reference, guard->in_force);
-        if (phase != QUADSIM_PHASE_FLYING) { /* the ground holds the vehicle */
-            mpc->known = 0;
+        status = quadsim_mpc_prepare(mpc, phase == QUADSIM_PHASE_FLYING, guard->learns, guard->state, reference,
+                                     guard->in_force);
+        if (status == QUADSIM_FREE) {
+            status = quadsim_mpc_optimise(mpc);
         }
         status = quadsim_guard_check(guard, status, plan);
     }

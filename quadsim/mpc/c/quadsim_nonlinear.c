@@ -195,7 +195,7 @@ static void apply_estimate(quadsim_nonlinear *law)
 static void update_estimate(quadsim_nonlinear *law)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
-    real expected[QUADSIM_NMPC_MOST];
+    real expected[QUADSIM_NMPC_MOST], surprise[6];
     int i;
     memcpy(law->last + BODY, law->rotors_before, (size_t)actuators_of(numbers) * sizeof(real));
     if (numbers->delay != NULL) {
@@ -205,9 +205,9 @@ static void update_estimate(quadsim_nonlinear *law)
     }
     for (i = 0; i < 6; i++) {
         const int at = i < 3 ? V + i : W + i - 3;
-        const real surprise = i >= 3 && numbers->problem->targets ? R(0.0) : law->measured[at] - expected[at];
-        law->estimate[i] = clipped(law->estimate[i] + numbers->gain[i] * surprise, -numbers->largest[i], numbers->largest[i]);
+        surprise[i] = i >= 3 && numbers->problem->targets ? R(0.0) : law->measured[at] - expected[at];
     }
+    update_disturbance(numbers->gain, numbers->largest, surprise, law->estimate);
     apply_estimate(law);
 }
 
@@ -411,13 +411,10 @@ void quadsim_nonlinear_reset(quadsim_nonlinear *law, const quadsim_real command[
 void quadsim_nonlinear_learn(quadsim_nonlinear *law, const quadsim_real estimate[6])
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
-    int i;
     if (!numbers->observes || !is_finite(estimate, 6)) {
         return;
     }
-    for (i = 0; i < 6; i++) {
-        law->estimate[i] = clipped(estimate[i], -numbers->largest[i], numbers->largest[i]);
-    }
+    put_disturbance(numbers->largest, estimate, law->estimate);
     apply_estimate(law);
 }
 

@@ -66,7 +66,8 @@ OBSERVABLE_THRUST: Final = 0.3
 """Vertical thrust as a share of the weight below which the thrust scale holds."""
 LARGEST_CHANGE: Final = 0.7
 """Largest difference of the thrust scale from 1; larger estimates are clipped."""
-_SAME_TIME: Final = 1e-6  # [s]
+SAME_TIME: Final = 1e-6
+"""Difference of two times [s] that counts as rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +178,7 @@ class RampObserver:
     def follows(self, time: float) -> bool:
         """Return whether an update at a time [s] follows the one before by a period, and remember the time."""
         before, self._time = self._time, time
-        return abs(time - before - self._period) <= _SAME_TIME
+        return abs(time - before - self._period) <= SAME_TIME
 
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
         """Predict the disturbance `ahead` [s] after the last measurement: three arrays (3,).

@@ -15,7 +15,6 @@ Predictive Control"; Pannocchia & Rawlings 2003).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final, Protocol, runtime_checkable
 
@@ -24,8 +23,7 @@ import scipy.linalg
 from annotated_types import doc
 
 from quadsim.fields import Positive
-from quadsim.rotation import body_rates_of
-from quadsim.state import ANGLES, VELOCITIES, Array
+from quadsim.state import Array
 
 UPRIGHT: Final = 0.1
 """Smallest vertical component of the thrust axis at which changes of vertical speed are attributed to thrust."""
@@ -80,10 +78,17 @@ def observer_gain(period: float, *, noise: float, walk: float, change: float) ->
 
 
 class DisturbanceObserver:
-    """The six filters, an evolving state.
+    """The numbers of the six filters, which C runs (`update_disturbance` of quadsim_math.h).
 
     Predictions start from the last measurement, so the estimate of v need not be stored. Measurement noise then enters
     twice, with opposite signs, and the gains are those for twice its variance.
+
+    Estimated are accelerations [m/s^2], in a linear law along world x, y and the thrust and in a nonlinear one along
+    world x, y, z, and angular accelerations [rad/s^2] about the body axes.
+
+    Attributes:
+        gain: (6,) per innovation of velocities and body rates [1/s].
+        largest: (6,) magnitudes to which estimates are clipped [m/s^2], [rad/s^2].
     """
 
     def __init__(self, settings: ObserverSettings, period: float) -> None:
@@ -94,38 +99,5 @@ class DisturbanceObserver:
         _, torque = observer_gain(
             period, noise=doubled * settings.rate_noise, walk=settings.rate_walk, change=settings.torque_walk
         )
-        self.gain = np.repeat([force, torque], 3)  # (6,) per innovation of velocities and rates [1/s]
+        self.gain = np.repeat([force, torque], 3)
         self.largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
-        self.reset()
-
-    def reset(self) -> None:
-        """Clear the estimate."""
-        self.estimate = np.zeros(6)
-        """(6,) estimated acceleration along world x, y and along thrust [m/s^2], and angular acceleration, body, at
-        hover thrust [rad/s^2]."""
-
-    def adopt(self, estimate: Array) -> None:
-        """Take over an estimate (6,)."""
-        self.estimate = np.minimum(np.maximum(estimate, -self.largest), self.largest)
-
-    def update(self, measured: Array, predicted: Array) -> None:
-        """Update from a measured state (12,) and its prediction (12,), disturbance included."""
-        now, then = measured.tolist(), predicted.tolist()
-        axis, rates, expected_rates = thrust_axis(now), body_rates_of(now), body_rates_of(then)
-        x, y, z = (a - b for a, b in zip(now[VELOCITIES], then[VELOCITIES], strict=True))
-        along = z / max(axis[2], UPRIGHT)
-        velocity = x - along * axis[0], y - along * axis[1], along
-        self.learn([*velocity, *(a - b for a, b in zip(rates, expected_rates, strict=True))])
-
-    def learn(self, surprise: Sequence[float] | Array) -> None:
-        """Update from the innovations (6,) of three velocities and three body rates."""
-        estimate = self.estimate + self.gain * surprise
-        self.estimate = np.minimum(np.maximum(estimate, -self.largest), self.largest)
-
-
-def thrust_axis(state: Sequence[float]) -> tuple[float, float, float]:
-    """(3,) thrust direction of a state (12,), a unit vector in the world frame."""
-    roll, pitch, yaw = state[ANGLES]
-    ahead, left = math.cos(roll) * math.sin(pitch), -math.sin(roll)
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    return cosine * ahead - sine * left, sine * ahead + cosine * left, math.cos(roll) * math.cos(pitch)

@@ -221,7 +221,7 @@ class CController(CSource):
     def numbers(self, text: CText) -> list[str]:
         """See `CSource`."""
         optimisation = problem_data(text, self.tables, self.rows + 1)
-        return [*optimisation, *_controller(text, self.law, self.bounds, self.tables)]
+        return [*optimisation, *_controller(text, self.law, self.bounds)]
 
 
 def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
@@ -230,26 +230,22 @@ def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
     return [*blocks, text.struct("quadsim_problem", f"{text.prefix}problem", **entries)]
 
 
-def _controller(text: CText, law: Exportable, bounds: ActuatorBounds | None, tables: Tables) -> list[str]:
+def _controller(text: CText, law: Exportable, bounds: ActuatorBounds | None) -> list[str]:
     """Return the numbers apart from those of the optimisation, with the `quadsim_controller` last."""
-    numbers, robust = controller_numbers(law), "NULL"
-    problem = law.problem
+    problem, robust = law.problem, "NULL"
     model = hover_model(law.vehicle, problem.model.period)
     members = fallback_numbers(model, bounds, law.fallback)
     fallback = {name: text.value(value) for name, value in members.items()}
-    blocks = [
-        text.array("C_r", problem.objective.C_r),
-        text.struct("quadsim_fallback", f"{text.prefix}fallback", **fallback),
-    ]
+    blocks = [text.struct("quadsim_fallback", f"{text.prefix}fallback", **fallback)]
     if law.settings is not None:
-        values = {name: text.value(value) for name, value in robust_numbers(law, tables.modes).items()}
+        numbers = robust_numbers(law.settings, law.vehicle, problem.model.period)
+        values = {name: text.value(value) for name, value in numbers.items()}
         blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **values))
         robust = f"&{text.prefix}robust"
     addresses = {
         "problem": f"&{text.prefix}problem",
         "robust": robust,
         "fallback": f"&{text.prefix}fallback",
-        "C_r": f"{text.prefix}C_r",
     }
-    limits = {name: text.value(value) for name, value in numbers.items()}
+    limits = {name: text.value(value) for name, value in controller_numbers(problem).items()}
     return [*blocks, text.struct("quadsim_controller", "QUADSIM_CONTROLLER", **addresses, **limits)]

@@ -31,8 +31,7 @@ from quadsim.mpc.laws.parts.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIE
 from quadsim.mpc.pilot.allocation import allocate, make_allocation
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement, require_one_scale
 from quadsim.mpc.problem.model import require_delay, split_delay, target_model
-from quadsim.mpc.problem.nonlinear_model import SUBSTEPS, zero
-from quadsim.mpc.problem.rigidbody import Inputs, rigid_body
+from quadsim.mpc.problem.rigidbody import SUBSTEPS, Inputs, rigid_body, zero
 from quadsim.mpc.space import Shape
 from quadsim.mpc.tables.commands import USUAL_TARGETS, TargetBounds, require_space
 from quadsim.mpc.tables.controller import Range

@@ -10,6 +10,7 @@ import numpy as np
 from annotated_types import Gt, Le, doc
 
 from quadsim import shorthands
+from quadsim.controller import CORE
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
 from quadsim.mpc.estimate.observer import ObserverSettings
@@ -19,8 +20,8 @@ from quadsim.mpc.problem.constraints import Soft
 from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model
 from quadsim.mpc.problem.ocp import Problem, lqr_terminal_weight
 from quadsim.mpc.problem.tightening import TighteningSettings, margins, position_margins
-from quadsim.mpc.space import Shape
-from quadsim.mpc.tables.bounded import Bounded
+from quadsim.mpc.space import Shape, Space
+from quadsim.mpc.tables.bounded import USUAL_SOLVER, Bounded
 from quadsim.mpc.tables.lags import Lag, LagSeconds, require_lag, resolved_lag
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -121,6 +122,18 @@ class Robust(Bounded):
                 part if part.C is None else replace(part, C=_widened(part.C, n)) for part in self.constraints()
             ),
         )
+
+    def solver_name(self, problem: Problem, space: Space | None) -> str:
+        """See `quadsim.mpc.tables.bounded.Bounded.solver_name`: the core where it takes the problem."""
+        from quadsim.mpc.solvers.core import core_problem
+
+        if self.solver is not None or space is not None:
+            return super().solver_name(problem, space)
+        try:
+            core_problem(problem)
+        except ParameterError:
+            return USUAL_SOLVER
+        return CORE
 
     def margins(self, vehicle: Vehicle, period: float) -> Array | None:
         """Return the tightening of the output bounds at each predicted state, (N, n_c); None without tightening.

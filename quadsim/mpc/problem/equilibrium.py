@@ -9,18 +9,14 @@ alpha:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
-
-if TYPE_CHECKING:
-    from quadsim.mpc.problem.nonlinear_model import NonlinearModel
 
 LEAST_LIFT: Final = 0.1  # least thrust at rest as a share of the weight, so that no equilibrium is upside down
 _ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]
@@ -66,28 +62,3 @@ class Trimmed(Protocol):
     def trim(self) -> Trim | None:
         """The estimate; None where there is none."""
         ...
-
-
-def twisted(effectiveness: Array, twist: Array) -> Array:
-    """(4, 4) effectiveness of a model whose thrust causes an angular acceleration; see `Trim.twist`."""
-    changed = effectiveness.copy()
-    changed[1:] += twist[:, None] * effectiveness[0]
-    return changed
-
-
-def equilibrium(
-    model: NonlinearModel, *, acceleration: Sequence[float] | None = None, twist: Array | None = None
-) -> Trim:
-    """Compute the equilibrium under a model's disturbance; a rotor that would have to pull stops.
-
-    The model is not yet `twisted`; `acceleration` (3,), world frame [m/s^2], replaces the model's.
-    """
-    a_x, a_y, a_z = model.acceleration.tolist() if acceleration is None else acceleration
-    twist = np.zeros(3) if twist is None else twist
-    up = max(model.gravity - a_z, LEAST_LIFT * model.gravity)
-    thrust = math.hypot(a_x, a_y, up)
-    drive = np.empty(N_ROTORS)
-    drive[0] = thrust
-    np.subtract(-thrust * twist, model.angular_acceleration, out=drive[1:])
-    speeds = np.sqrt(np.maximum(np.dot(model.allocation, drive), 0.0))
-    return Trim(speeds=speeds, lift=np.array([-a_x, -a_y, up]), twist=twist)

@@ -16,7 +16,7 @@ import numpy as np
 from quadsim.mpc.problem.equilibrium import Trim
 from quadsim.mpc.problem.model import LinearModel
 from quadsim.mpc.problem.paper import rollout
-from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, Array
+from quadsim.state import INDEX, N_STATES, Array
 
 _YAW: Final = INDEX["yaw"]
 _ACCELERATED: Final = [INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]
@@ -75,31 +75,3 @@ def predict_in_heading_frame(model: LinearModel, states: Array, plans: Array, tr
 def advance(model: LinearModel, state: Array, speeds: Array, trim: Trim) -> Array:
     """The state (12,) a period later under speeds (4,) [rad/s], by the anchored model in the heading frame."""
     return predict_in_heading_frame(anchored(model, trim), state[None], speeds[None, None], trim)[0, 0]
-
-
-def with_limited_yaw(reference: Array, yaw: float, largest: float) -> Array:
-    """The reference (N, 4) with a yaw that starts from the present one and has no jumps above `largest` [rad]."""
-    yaws, steps = reference[:, 3], np.empty(len(reference))
-    steps[0] = yaws[0] - yaw
-    np.subtract(yaws[1:], yaws[:-1], out=steps[1:])
-    if -largest <= steps[steps.argmin()] and steps[steps.argmax()] <= largest:
-        return reference
-    turned = reference.copy()
-    turned[:, 3] = yaw + np.minimum(np.maximum(steps, -largest), largest).cumsum()
-    return turned
-
-
-def turned_axes(rows: Array, yaw: float) -> Array:
-    """Rows (N, 4), of which the first two are along world x and y, in axes turned by a yaw [rad]."""
-    turned = np.eye(len(REFERENCE_STATES))
-    turned[0, 0] = turned[1, 1] = math.cos(yaw)
-    turned[1, 0] = sine = math.sin(yaw)
-    turned[0, 1] = -sine
-    return np.dot(rows, turned)
-
-
-def seen_from(reference: Array, yaw: float) -> Array:
-    """The reference (N, 4) in axes turned by a yaw [rad]."""
-    seen = turned_axes(reference, yaw)
-    seen[:, 3] -= yaw
-    return seen

@@ -32,10 +32,12 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.mpc.problem.nonlinear_model import zero
+from quadsim.core.mirror import constant
 from quadsim.state import Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
+SUBSTEPS: Final = constant("QUADSIM_SUBSTEPS")
+"""Runge-Kutta steps of a prediction."""
 N_BODY: Final = 13
 """States of the body; rotor states follow."""
 P, Q, V, W = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
@@ -48,6 +50,11 @@ _FIRST, _SECOND = np.array([10, 6, 7, 6, 5, 11, 7, 11, 5]), np.array([15, 3, 2, 
 _SIGN: Final = np.array([1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
 _EYE: Final = np.eye(3).ravel()
 _OUTER: Final = 1.0 - 2.0 * _EYE
+
+
+def zero() -> Array:
+    """Three zeros, not to be written to."""
+    return read_only(np.zeros(3))
 
 
 def _zeros(columns: int) -> Array:

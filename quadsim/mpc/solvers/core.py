@@ -19,7 +19,7 @@ from quadsim.mpc.problem.ocp import Problem, Query
 from quadsim.mpc.problem.qp import QP, Solution
 from quadsim.mpc.solvers import CORES_SECOND, Answer, Method, QPSolver
 from quadsim.mpc.solvers.core_tables import members, tables
-from quadsim.state import N_STATES, Array, read_only
+from quadsim.state import Array, read_only
 from quadsim.vehicle import N_ROTORS
 
 MOST_CHANGES: Final = 3000
@@ -185,8 +185,7 @@ class Core:
     def __init__(self, problem: Problem) -> None:
         self._library, self._shared = core_library(), core_problem(problem)
         self.formulation = self._shared.condensed
-        self._equilibrium, self._C_r = problem.equilibrium, problem.objective.C_r
-        self._modes = self._shared.tables.modes if problem.model.n > N_STATES else None
+        self._equilibrium = problem.equilibrium
         p = self._shared.struct
         # The work struct and its views point into this memory.
         self._memory = np.zeros(self._library.quadsim_work_reals(p))
@@ -213,10 +212,10 @@ class Core:
         """See `quadsim.mpc.solvers.Solver.solve`."""
         started, (state, desired, u_before, rest, _) = clock.perf_counter(), query
         x_s, u_s = self._equilibrium if rest is None else rest
-        self._state[:], self._x_s[:], self._u_s[:], self._before[:] = state, x_s, u_s, u_before
-        np.subtract(desired, 0.0 if rest is None else self._C_r @ x_s, out=self._desired)
-        if self._modes is not None:
-            for speeds in (self._state[N_STATES:], self._x_s[N_STATES:]):
-                speeds[:] = self._modes @ speeds
+        self._state[:] = state
+        self._desired[:] = desired
+        self._x_s[:] = x_s
+        self._u_s[:] = u_s
+        self._before[:] = u_before
         found = self._library.quadsim_optimise(*self._arguments) if math.isfinite(self._query.sum()) else len(Method)
         return self._optimum.answer(found, query, started)

@@ -106,7 +106,7 @@ def tables(problem: Problem) -> Tables:
     """
     problem = with_constraints(problem)
     N, modes = problem.horizon, np.eye(problem.model.nu)
-    if problem.model.n == N_STATES + problem.model.nu:
+    if rotor_states(problem):
         modes = _modes(problem)
         problem = _in_modes(problem, modes)
     rows = problem.rows
@@ -156,7 +156,8 @@ def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
     """
     problem, rows = tables.problem, tables.rows
     past = np.cumsum([len(row.terms) for row in rows]).tolist()
-    reals = {name: getattr(tables, name) for name in ("T", "T_inverse", "scale", "tolerance")}
+    reals = {name: getattr(tables, name) for name in ("modes", "T", "T_inverse", "scale", "tolerance")}
+    reals["C_r"] = problem.objective.C_r
     limits = {name: np.clip(getattr(tables, name), -NO_BOUND, NO_BOUND) for name in ("lower", "upper")}
     return {
         "horizon": problem.horizon,
@@ -164,6 +165,7 @@ def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
         "step_rows": len(rows),
         "parts": len(tables.axes),
         "regulated": len(problem.objective.C_r),
+        "speeds": rotor_states(problem),
         "room": room,
         "changes": changes,
         "bounds_differ": int(len(tables.lower) > 1),
@@ -216,6 +218,12 @@ def with_constraints(problem: Problem) -> Problem:
     nothing = np.full(problem.model.nu, -math.inf)
     none = Constraint(name="none", lower=nothing, upper=-nothing, D=np.eye(problem.model.nu))
     return replace(problem, constraints=(none,))
+
+
+def rotor_states(problem: Problem) -> int:
+    """Return how many states at the end of a problem's are rotor speeds: one per rotor where these lag, otherwise 0."""
+    nu = problem.model.nu
+    return nu if problem.model.n == N_STATES + nu else 0
 
 
 def _modes(problem: Problem) -> Array:

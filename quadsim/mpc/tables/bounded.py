@@ -33,7 +33,7 @@ from quadsim.state import REFERENCE_RATES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 USUAL_SOLVER: Final = "piqp"
-"""The QP solver of a law in Python whose table states none."""
+"""The QP solver of a law whose table states none; that of `robust` is the core, where it takes the problem."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,13 +61,6 @@ class Weighted(ControllerTable):
     terminal: Annotated[
         Literal["lqr"] | None,
         doc("weight of the last predicted state: lqr: from the Riccati equation; absent: the weight of all others"),
-    ] = None
-    compiled: Annotated[
-        bool | None,
-        doc(
-            "true: run the whole law in the compiled C core; false: in Python; absent: true for robust where C "
-            "implements it and no solver but core is stated, else false"
-        ),
     ] = None
 
     def __post_init__(self) -> None:
@@ -119,7 +112,7 @@ class Bounded(Weighted):
         str | None,
         doc(
             "QP solver used where the unconstrained optimum violates a constraint, by its name in `quadsim list`; "
-            f"absent: {CORE} where compiled, else {USUAL_SOLVER}"
+            f"absent: {CORE} for robust where it takes the problem, else {USUAL_SOLVER}"
         ),
     ] = field(default=None, metadata={"json_schema_extra": {"examples": [*ALIASES, *SOLVERS, CORE]}})
     kkt_every: KktEvery = KKT_EVERY
@@ -131,8 +124,6 @@ class Bounded(Weighted):
             require_ordered(f"output_bounds.{name}", pair)
         if self.solver is not None:
             require_solver(self.solver)
-        if self.compiled and self.solver not in (None, CORE):
-            raise ParameterError("", "solver", self.solver, f'absent, or "{CORE}", where compiled = true')
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
@@ -177,7 +168,11 @@ class Bounded(Weighted):
         if space is not None and self.solver == CORE:
             rule = "a QP solver such as 'piqp' with controller.avoidance, whose half-spaces differ from step to step"
             raise ParameterError("controller", "solver", CORE, rule)
-        return make_solver(self.solver or USUAL_SOLVER, problem)
+        return make_solver(self.solver_name(problem, space), problem)
+
+    def solver_name(self, problem: Problem, space: Space | None) -> str:
+        """Return the name of that solver: the stated one, or the usual one."""
+        return self.solver or USUAL_SOLVER
 
 
 def require_solver(name: str) -> None:

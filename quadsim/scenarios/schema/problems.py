@@ -30,12 +30,15 @@ _TAGS: Final = ("type", "distribution")  # fields that distinguish tables
 _NAMES: Final = {float: "number", int: "whole number", str: "text"}
 _LIMITS: Final = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 _REASONS: Final = {
-    "controller.compiled": " with this controller: only MPC with fixed matrices (unconstrained, constrained, robust) "
-    "can be compiled",
     "controller.commands": " with this controller: only nonlinear and geometric can command thrust and rates; "
     "models and gains of the others are for rotor speeds",
 }
 """Reasons why a controller lacks a field that a reader may expect."""
+_GONE: Final = {
+    "controller.compiled": "C always prepares the queries of robust, and Python those of unconstrained and "
+    'constrained; solver = "core" solves in C',
+}
+"""Why fields of earlier versions went, and what is there instead."""
 _WRITTEN_OTHERWISE: Final = ("dataclass", "tuple", "enum")
 """Pydantic's types that a file does not have: it has a table, a list or a text instead."""
 _NO_SCHEMA: Final = ("default", "metadata", "expected")
@@ -318,6 +321,8 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *,
     field, kind, given = ".".join(place.names), details["type"], place.given
     if kind == "missing":
         return f"{field} is missing"
+    if kind in ("extra_forbidden", "unexpected_keyword_argument") and field in _GONE:
+        return f"{field} must be left out, as it went ({_GONE[field]}); got {shown(given)}"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         allowed = find(details["loc"][:-1], data, root).fields
         if len(place.names) == 1 and field != "base":

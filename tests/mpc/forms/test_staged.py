@@ -12,6 +12,7 @@ import pytest
 import scipy.optimize
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy_preparation import nonlinear_model
 from ocp_peer import Period
 from polish import polish
 from scipy.sparse import csc_matrix
@@ -29,7 +30,6 @@ from quadsim.controller import SOLVED
 from quadsim.mpc.forms.condensing import Condensed
 from quadsim.mpc.forms.staged import Staged
 from quadsim.mpc.problem.constraints import Constraint, Penalty
-from quadsim.mpc.problem.nonlinear_model import nonlinear_model
 from quadsim.mpc.problem.ocp import Equilibrium, Problem, Query
 from quadsim.mpc.problem.qp import QP, Solution, kkt_residuals
 from quadsim.mpc.solvers import Formulation

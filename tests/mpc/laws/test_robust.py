@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy_laws import respond
+from numpy_preparation import NonlinearModel, next_state, nonlinear_model
 from support import constrained_mpc, derivative, paper_problem, paper_reference, robust_mpc, robust_table
 
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Phase, StepInputs
@@ -18,7 +19,6 @@ from quadsim.mpc.laws.parts.linear import LinearMPC
 from quadsim.mpc.laws.parts.preparation import RobustPreparation
 from quadsim.mpc.problem.constraints import Soft
 from quadsim.mpc.problem.heading import turn_horizontally
-from quadsim.mpc.problem.nonlinear_model import NonlinearModel, next_state, nonlinear_model
 from quadsim.mpc.tables.commands import InputWeights
 from quadsim.rollout.flown import Flight
 from quadsim.sim.effects.rotors import RotorDynamics
@@ -76,10 +76,7 @@ def preparation_of(controller: LinearMPC) -> RobustPreparation:
 
 def believing(controller: LinearMPC, estimate: Array) -> None:
     """Let it have estimated (6,)."""
-    preparation = preparation_of(controller)
-    assert preparation._observer is not None
-    preparation._observer.estimate = estimate
-    preparation._update_trim()
+    preparation_of(controller).adopt(None, estimate)
 
 
 def moments(flight: Flight, first: int, periods: int) -> Iterator[tuple[StepInputs, Array, Array]]:
@@ -218,8 +215,9 @@ def test_the_effect_of_a_worn_rotor_is_predicted_at_any_thrust(vehicle: Vehicle)
     torques, thrusts = [], []
     for k, (_, speeds) in enumerate(flown(controller, worn, make_state(), reference, 200)):
         if k >= 140:
-            assert preparation_of(controller)._observer is not None
-            torques.append(preparation_of(controller)._observer.estimate[3])
+            estimate = preparation_of(controller).memory.estimate
+            assert estimate is not None
+            torques.append(estimate[3])
             thrusts.append(np.sum(speeds**2) / np.sum(preparation_of(controller).trim.speeds ** 2))
     assert np.ptp(thrusts) > 0.5
     assert np.ptp(torques) < 0.05 * np.mean(torques)

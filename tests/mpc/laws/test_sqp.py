@@ -135,7 +135,7 @@ def test_answers_are_optima(case: str) -> None:
 def test_answers_of_two_nodes_are_optima(case: str) -> None:
     """Where few rows fit into the responses' memory, which the other methods use as well."""
     rng, controller, answered = np.random.default_rng(0), law(horizon=2, **MANY[case]), 0
-    controller.reset(HOVER if controller.commands == "rotors" else controller._level)
+    controller.reset(HOVER if controller.commands == "rotors" else np.array(controller.numbers.level))
     for k in range(8):
         if call(controller, thrown(rng, 1.0 if k % 2 else 0.1), k * PERIOD).status in ACCEPTED:
             checked(controller)

@@ -7,12 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy_preparation import equilibrium, nonlinear_model, twisted
 from support import linearised
 
-from quadsim.mpc.problem.equilibrium import equilibrium, twisted
 from quadsim.mpc.problem.heading import advance, anchored, predict_in_heading_frame, turn, turn_horizontally
 from quadsim.mpc.problem.model import hover_model
-from quadsim.mpc.problem.nonlinear_model import nonlinear_model
 from quadsim.mpc.problem.paper import rollout
 from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle
@@ -68,7 +67,7 @@ def test_the_anchored_model_is_the_nonlinear_ones_linearisation_at_rest(vehicle:
     twist = np.array([2.2, -1.0, 0.1])
     plain = nonlinear_model(vehicle, 0.05, substeps=20)
     disturbed = replace(plain, effectiveness=twisted(plain.effectiveness, twist))
-    trim = equilibrium(plain, twist=twist)
+    trim = equilibrium(plain, twist)
     assert np.ptp(trim.speeds) > 20.0
     A, B, _ = linearised(disturbed, trim.state(), trim.speeds)
     model = anchored(hover_model(vehicle, 0.05), trim)

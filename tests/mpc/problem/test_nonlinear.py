@@ -1,4 +1,4 @@
-"""The nonlinear model and its derivatives: against MuJoCo, closed forms and complex steps."""
+"""The nonlinear model that C predicts with, in NumPy: against MuJoCo, closed forms, and C itself."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support import derivative, linearised
+from numpy_preparation import NonlinearModel, next_state, nonlinear_model, spun, twisted
+from support import derivative, linearised, robust_table
 
-from quadsim.mpc.problem import nonlinear_model as module
+from quadsim.controller import StepInputs
+from quadsim.mpc.estimate.observer import ObserverSettings
+from quadsim.mpc.laws.parts.preparation import RobustPreparation
 from quadsim.mpc.problem.model import hover_model
-from quadsim.mpc.problem.nonlinear_model import NonlinearModel, nonlinear_model
 from quadsim.rotation import body_to_euler_rates, body_to_world, euler_to_body_rates
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics
@@ -54,7 +56,7 @@ def flown(vehicle: Vehicle, x: Array, u: Array, *, effects: Effects, timestep: f
 
 
 def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
-    return np.array([module.next_state(model, *one) for one in zip(x, u, strict=True)])
+    return np.array([next_state(model, *one) for one in zip(x, u, strict=True)])
 
 
 def test_derivative_is_that_of_a_rigid_body_at_any_attitude(vehicle: Vehicle) -> None:
@@ -152,11 +154,31 @@ def test_heading_and_place_make_no_difference(vehicle: Vehicle, lag: float | Non
     np.testing.assert_allclose(advance(model, moved(x), u), moved(advance(model, x, u)), atol=1e-12)
 
 
-def test_a_state_that_runs_away_is_no_number(vehicle: Vehicle) -> None:
-    """Where an angle grows beyond all numbers its sine is none."""
-    model, x = nonlinear_model(vehicle, PERIOD), make_state(euler=(0.3, 0.5 * math.pi, 0.0))
-    x[list(EULER_RATE)] = 1e3
-    u = np.full(4, vehicle.hover_speed)
-    with np.errstate(all="ignore"):
-        assert not np.isfinite(advance(model, x[None], u[None])).all()
-        assert np.isnan(advance(model, 1e200 * x[None], u[None])).all()
+ESTIMATES = {"undisturbed": np.zeros(6), "disturbed": np.array([0.7, -0.4, 1.1, -0.5, 0.8, 0.3])}
+
+
+@pytest.mark.parametrize("estimate", ESTIMATES)
+@pytest.mark.parametrize("share", [0.3, 1.0])
+@pytest.mark.parametrize("lag", LAGS)
+def test_c_predicts_the_same(vehicle: Vehicle, lag: float | None, share: float, estimate: str) -> None:
+    """To the instant a known delay later, at any attitude, with the disturbance that is estimated."""
+    settings = robust_table(rotor_lag=lag or 0.0, delay=share * PERIOD, offset_free=ObserverSettings())
+    preparation = RobustPreparation(vehicle, settings.problem(vehicle, PERIOD), settings)
+    model, disturbance = nonlinear_model(vehicle, PERIOD, rotor_lag=lag), ESTIMATES[estimate]
+    x, u = points(vehicle, 20, lag=lag)
+    for state, command in zip(x, u, strict=True):
+        before = state[12:] if lag else command
+        preparation.reset(before)
+        preparation.adopt(None, disturbance)
+        query = preparation.prepare(StepInputs(), state[:12], np.zeros((50, 4)), command)
+        assert query is not None
+        push = disturbance[2] * body_to_world(state[list(EULER)])[:, 2] + [*disturbance[:2], 0.0]
+        rotors = spun(model, before, command, (1.0 - share) * PERIOD)
+        late = replace(
+            model,
+            period=share * PERIOD,
+            effectiveness=twisted(model.effectiveness, disturbance[3:] / vehicle.gravity),
+            acceleration=push,
+        )
+        expected = next_state(late, np.concatenate([state[:12], rotors])[: model.n], command)
+        np.testing.assert_allclose(query.state, expected, rtol=0.0, atol=1e-11)

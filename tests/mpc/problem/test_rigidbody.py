@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy_preparation import nonlinear_model
 from scipy.integrate import solve_ivp
 from support import advance_nodes, derivative, frame, linearise_nodes
 
 from quadsim.assets import vehicle_path
-from quadsim.mpc.problem.nonlinear_model import nonlinear_model
 from quadsim.mpc.problem.rigidbody import (
     N_BODY,
     Inputs,

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.linalg
+from numpy_preparation import next_state, nonlinear_model
 from support import derivative, fly_once, paper_problem, paper_reference, robust_mpc, robust_table
 
 from quadsim.controller import ACCEPTED, StepInputs
@@ -19,7 +20,6 @@ from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.laws.parts.linear import LinearMPC
 from quadsim.mpc.problem.constraints import Bounds, Soft
 from quadsim.mpc.problem.model import SHORTEST_LAG, discretise
-from quadsim.mpc.problem.nonlinear_model import next_state, nonlinear_model
 from quadsim.mpc.problem.regulator import observed
 from quadsim.mpc.problem.tightening import (
     ERROR_SHARE,

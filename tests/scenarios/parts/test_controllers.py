@@ -70,7 +70,7 @@ def preparation_of(law: Controller) -> RobustPreparation:
 
 
 def robust(**parts: Any) -> RobustPreparation:
-    return preparation_of(built({**ROBUST, "compiled": False, "fallback": {"enabled": False}, **parts}).law)
+    return preparation_of(built({**ROBUST, "fallback": {"enabled": False}, **parts}).law)
 
 
 def same(left: object, right: object) -> bool:
@@ -90,8 +90,9 @@ def test_of_the_robust_controller_every_part_is_absent_unless_given() -> None:
     law = robust()
     constrained = Assembly(scenario({**ROBUST, "type": "constrained"})).problem()
     assert same(law.problem, constrained)
-    assert (law.delay, law._heading, law._observer) == (0.0, False, None)
-    assert law._largest_turn == math.radians(30.0)
+    numbers = law._robust
+    assert (law.delay, numbers.heading, numbers.observes, numbers.spun_period) == (0.0, 0, 0, 0.0)
+    assert numbers.largest_turn == math.radians(30.0)
 
 
 BOUNDS = Bounds(
@@ -104,15 +105,15 @@ BOUNDS = Bounds(
     u_max=np.full(4, 250.0),
 )
 PARTS: dict[str, tuple[Any, Callable[[RobustPreparation], object], Any]] = {
-    "rotor_lag": (0.03, lambda law: law._model.rotor_lag, 0.03),
+    "rotor_lag": (0.03, lambda law: law._robust.spun_period, math.exp(-0.05 / 0.03)),
     "delay": (0.02, lambda law: law.delay, 0.02),
     "offset_free": (
         {"force_walk": 0.7},
-        lambda law: law._observer and law._observer.gain,
+        lambda law: law._robust.observes and np.array(law._robust.gain),
         DisturbanceObserver(ObserverSettings(force_walk=0.7), 0.05).gain,
     ),
-    "heading": (True, lambda law: law._heading, True),
-    "largest_turn": (90.0, lambda law: law._largest_turn, math.radians(90.0)),
+    "heading": (True, lambda law: law._robust.heading, True),
+    "largest_turn": (90.0, lambda law: law._robust.largest_turn, math.radians(90.0)),
     "move_weight": (2.0, lambda law: law.problem.objective.Q_d, 2.0 * np.eye(4)),
 }
 
@@ -158,14 +159,14 @@ def test_weights_and_bounds_arrive_in_si_units() -> None:
 
 
 def test_the_vehicles_lag_is_its_rotor_rise() -> None:
-    lag = {"compiled": False, "rotor_lag": "vehicle", "fallback": {"enabled": False}}
+    lag = {"rotor_lag": "vehicle", "fallback": {"enabled": False}}
     law = built(
         {**ROBUST, **lag, "input_bounds": {"speed": [0.0, 800.0], "slew": [-50.0, 50.0]}},
         "hummingbird",
     )
     vehicle = Assembly(scenario(ROBUST, "hummingbird")).vehicle
-    assert preparation_of(law.law)._model.rotor_lag == vehicle.rotor_rise
     assert vehicle.rotor_rise
+    assert preparation_of(law.law)._robust.spun_period == math.exp(-0.05 / vehicle.rotor_rise)
 
 
 # --- fallback ------------------------------------------------------------------------------------------------------
@@ -184,7 +185,7 @@ def test_the_vehicles_lag_is_its_rotor_rise() -> None:
 def test_the_fallback_is_on_and_keeps_well_within_the_bounds_on_tilt(
     bounds: dict[str, Any], given: dict[str, Any], tilt: float
 ) -> None:
-    law = built({**ROBUST, "compiled": False, "output_bounds": bounds, "fallback": given})
+    law = built({**ROBUST, "output_bounds": bounds, "fallback": given})
     assert law.guard is not None
     preparation_of(law.law)
     assert law.guard.numbers.tilt == pytest.approx(math.radians(tilt), rel=1e-12)

@@ -33,7 +33,7 @@ class Remembered(NamedTuple):
     ahead: Array | None  # (12,) state there; None if it is not known
     called_at: float  # [s] time of the last call
     measured: float  # [s] and of the last measured state
-    estimate: Array | None  # (6,) of `quadsim.mpc.estimate.observer.DisturbanceObserver`; None without one
+    estimate: Array | None  # (6,) of the observer, as `quadsim.mpc.estimate.observer` says; None without one
 
 
 class Preparation(Protocol):

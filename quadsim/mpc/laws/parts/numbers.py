@@ -17,8 +17,8 @@ from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.equilibrium import LEAST_LIFT
 from quadsim.mpc.problem.heading import slope
 from quadsim.mpc.problem.model import hover_model, split_delay
-from quadsim.mpc.problem.nonlinear_model import SUBSTEPS, nonlinear_model
 from quadsim.mpc.problem.ocp import Problem
+from quadsim.mpc.problem.rigidbody import SUBSTEPS
 from quadsim.mpc.space import Shape
 from quadsim.mpc.tables.bounded import Bounded, Weighted
 from quadsim.mpc.tables.lags import resolved_lag
@@ -58,18 +58,18 @@ def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequenc
     )
 
 
-def controller_numbers(law: Exportable) -> dict[str, float | Array]:
-    """Return the members of a `quadsim_controller` that are numbers; it also points to C_r."""
-    model, objective = law.problem.model, law.problem.objective
-    return {"hover": model.u_bar, "follows_rates": int(objective.needs_rates), "period": model.period}
+def controller_numbers(problem: Problem) -> dict[str, float | Array]:
+    """Return the members of a `quadsim_controller` that are numbers."""
+    model = problem.model
+    return {"hover": model.u_bar, "follows_rates": int(problem.objective.needs_rates), "period": model.period}
 
 
-def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
-    """Return the members of a `quadsim_robust`; `modes` (4, 4) as in `quadsim.mpc.solvers.core_tables.Tables`."""
-    settings, vehicle, period = law.settings, law.vehicle, law.problem.model.period
-    assert settings is not None
-    lag, (whole, late) = resolved_lag(settings.rotor_lag, vehicle), split_delay(settings.delay, period)
-    model = nonlinear_model(vehicle, period, rotor_lag=lag or None)
+def robust_numbers(settings: Robust, vehicle: Vehicle, period: float) -> dict[str, float | Array]:
+    """Return the members of a `quadsim_robust`, for a control `period` [s]."""
+    lag = resolved_lag(settings.rotor_lag, vehicle)
+    whole, late = split_delay(settings.delay, period)
+    effectiveness = np.asarray(vehicle.accelerations(vehicle.allocation), float)
+    ixx, iyy, izz = vehicle.inertia
     observing = settings.offset_free
     observer = None if observing is None else DisturbanceObserver(observing, period)
     instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
@@ -82,7 +82,7 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
         "observes": int(observer is not None),
         "heading": int(settings.heading),
         "under_way": whole,
-        "gravity": model.gravity,
+        "gravity": vehicle.gravity,
         "least_lift": LEAST_LIFT,
         "upright": UPRIGHT,
         "period": period,
@@ -93,11 +93,10 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
         "spun_delay": float(decay(late)),
         "spun_before": float(decay(period - late)),
         "largest_turn": math.radians(settings.largest_turn),
-        "effectiveness": np.asarray(model.effectiveness, float),
-        "allocation": np.asarray(model.allocation, float),
-        "gyration": np.asarray(model.gyration, float),
+        "effectiveness": effectiveness,
+        "allocation": np.asarray(np.linalg.inv(effectiveness), float),
+        "gyration": np.array([(iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz]),
         "slope_inverse": np.asarray(np.linalg.inv(slope(hover_model(vehicle, period))), float),
-        "modes": modes,
         "gain": np.zeros(6) if observer is None else observer.gain,
         "largest": np.zeros(6) if observer is None else observer.largest,
         "decay_before": decay(instants * (period - late)),

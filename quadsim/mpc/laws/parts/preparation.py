@@ -1,48 +1,34 @@
 """An MPC for imperfect vehicles: soft output bounds, rotor lag, known delays, disturbances, any heading.
 
-Each part has its own setting and is off by default; without any part it solves the paper's optimisation.
-
-The hover model is linearised at the vehicle's equilibrium under the estimated disturbance, (x_s, u_s) of
-`quadsim.mpc.problem.equilibrium`,
-
-    x(k+1) = x_s + A (x(k) - x_s) + B (u(k) - u_s),
-
-and u_s is the target of the inputs.  The equilibrium is then predicted exactly: with a constant reference and
-disturbance a loop that settles with no bound active has no steady-state error, whatever the errors of A and B.
+Each part has its own setting and is off by default; without any part it solves the paper's optimisation.  The query of
+each period is C's, whoever solves it: `quadsim_mpc_prepare`, whose equations are in `quadsim/mpc/c/quadsim_mpc.c`.
 """
 
 from __future__ import annotations
 
+import ctypes
 import math
-from collections import deque
 from dataclasses import replace
-from typing import Final
+from typing import Final, NoReturn
 
 import numpy as np
 
 from quadsim.controller import Phase, StepInputs
-from quadsim.mpc.estimate.observer import LONGEST_SPAN, DisturbanceObserver, thrust_axis
-from quadsim.mpc.guard.numbers import PLAUSIBLE, PLAUSIBLE_REFERENCE
+from quadsim.core.mirror import constant, core_library, set_members, struct
+from quadsim.mpc.estimate.disturbance import SAME_TIME
+from quadsim.mpc.estimate.observer import LONGEST_SPAN
 from quadsim.mpc.laws.parts.linear import Remembered
+from quadsim.mpc.laws.parts.numbers import controller_numbers, robust_numbers
 from quadsim.mpc.laws.robust import Robust
-from quadsim.mpc.problem.equilibrium import Trim, equilibrium, twisted
-from quadsim.mpc.problem.heading import (
-    predict_in_heading_frame,
-    seen_from,
-    slope,
-    turn_horizontally,
-    turned_axes,
-    with_limited_yaw,
-)
-from quadsim.mpc.problem.model import hover_model, split_delay
-from quadsim.mpc.problem.nonlinear_model import Triple, advance_disturbed, nonlinear_model, spun
+from quadsim.mpc.problem.equilibrium import Trim
+from quadsim.mpc.problem.heading import predict_in_heading_frame
+from quadsim.mpc.problem.model import hover_model
 from quadsim.mpc.problem.ocp import Equilibrium, Problem, Query
-from quadsim.mpc.tables.lags import resolved_lag
-from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, ReferenceTurns, all_true
-from quadsim.vehicle import Vehicle
+from quadsim.mpc.solvers.core_tables import rotor_states
+from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
+from quadsim.vehicle import N_ROTORS, Vehicle
 
-_SAME_TIME: Final = 1e-6  # [s]
-_YAW: Final = INDEX["yaw"]
+_FREE: Final = constant("QUADSIM_FREE")
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 
 
@@ -52,34 +38,56 @@ class RobustPreparation:
     Attributes:
         problem: the optimal control problem, that of the table `settings` (`Robust.problem`).
         delay: from t_k to the instant of x(k) [s].
-        yaw: angle by which the axes of the last query are turned about world z [rad].
-        trim: the equilibrium under the estimated disturbance.
+
+    Raises:
+        FileError: the library cannot be compiled or loaded.
     """
 
     def __init__(self, vehicle: Vehicle, problem: Problem, settings: Robust) -> None:
-        self.problem, self.delay, self.yaw = problem, settings.delay, 0.0
-        self._heading, self._largest_turn = settings.heading, math.radians(settings.largest_turn)
-        self._period = period = problem.model.period
-        whole, self._late = split_delay(settings.delay, period)
-        self._sent: deque[Array] = deque(maxlen=whole + 1)  # u(k-1-n) .. u(k-1): the command in force, and under way
-        self._nominal = hover_model(vehicle, period)
-        self._model = nonlinear_model(vehicle, period, rotor_lag=resolved_lag(settings.rotor_lag, vehicle) or None)
-        self._of_twist = np.ascontiguousarray(np.linalg.inv(slope(self._nominal))[:, 1:])
-        observing = settings.offset_free
-        self._observer = None if observing is None else DisturbanceObserver(observing, period)
-        self._turns = ReferenceTurns()
+        self.problem, self.delay = problem, settings.delay
+        self._library, self._nominal = core_library(), hover_model(vehicle, problem.model.period)
+        self._robust = struct("quadsim_robust")()
+        set_members(self._robust, **robust_numbers(settings, vehicle, problem.model.period))
+        self._C_r = np.ascontiguousarray(problem.objective.C_r)
+        self._sizes = struct("quadsim_problem")(
+            horizon=problem.horizon,
+            states=problem.model.n,
+            regulated=len(self._C_r),
+            speeds=rotor_states(problem),
+            C_r=self._C_r.ctypes.data,
+        )
+        self._controller = struct("quadsim_controller")(
+            problem=ctypes.addressof(self._sizes), robust=ctypes.addressof(self._robust)
+        )
+        set_members(self._controller, **controller_numbers(problem))
+        # The struct points into this memory, and the views into both.
+        self._memory = np.zeros(self._library.quadsim_mpc_reals(self._controller))
+        self._mpc = mpc = struct("quadsim_mpc")()
+        self._library.quadsim_mpc_start(mpc, self._controller, self._memory.ctypes.data)
+        n, N, n_r, under_way = problem.model.n, problem.horizon, len(self._C_r), self._robust.under_way
+        self._x = np.ctypeslib.as_array(mpc.state)[:n]
+        self._x_s = np.ctypeslib.as_array(mpc.rest)[:n]
+        self._u_s = np.ctypeslib.as_array(mpc.resting)
+        self._desired = _view(mpc.desired, N * n_r).reshape(N, n_r)
+        self._sent = _view(mpc.sent, under_way * N_ROTORS).reshape(under_way, N_ROTORS)
+        self._rotors = np.ctypeslib.as_array(mpc.rotors)
+        self._turning = np.ctypeslib.as_array(mpc.turning)
+        self._ahead = np.ctypeslib.as_array(mpc.ahead)
+        self._estimate = np.ctypeslib.as_array(mpc.estimate)
+        self._state, self._reference, self._acting = np.zeros(N_STATES), np.zeros((N, 4)), np.zeros(N_ROTORS)
+        self._inputs = [array.ctypes.data for array in (self._state, self._reference, self._acting)]
         self.reset(vehicle.hover_speeds)
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse: addresses are useless in a copy or another process."""
+        raise TypeError("a RobustPreparation cannot be copied or pickled: make another")
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
-        speeds = np.array(speeds, float)
-        self._sent.extend([speeds] * (self._sent.maxlen or 1))
-        # Rotor speeds and state when the next command takes over in this period, and speeds when this period's does.
-        self._rotors = self._turning = speeds.copy()
-        self._ahead: Array | None = None
+        self._acting[:] = speeds
+        self._library.quadsim_mpc_reset(self._mpc, self._acting.ctypes.data)
         self._called_at = self._measured = -math.inf
-        self._turns.reset()
-        self._forget()
+        self._trim: Trim | None = None  # of the estimate now, once it has been asked for
 
     @property
     def memory(self) -> Remembered:
@@ -88,34 +96,37 @@ class RobustPreparation:
             delay=self.delay,
             rotors=self._rotors.copy(),
             turning=self._turning.copy(),
-            sent=tuple(self._sent),
-            ahead=self._ahead,
+            sent=tuple(self._sent.copy()),
+            ahead=self._ahead.copy() if self._mpc.known else None,
             called_at=self._called_at,
             measured=self._measured,
-            estimate=None if self._observer is None else self._observer.estimate,
+            estimate=self._estimate.copy() if self._robust.observes else None,
         )
 
     def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
         """Take over the rotor speeds, the commands under way and the disturbance of the previous law."""
         if memory is not None:
-            self._rotors, self._turning = memory.rotors, memory.turning
-            self._sent.extend(memory.sent)
+            self._rotors[:], self._turning[:] = memory.rotors, memory.turning
+            for row, sent in zip(self._sent[::-1], memory.sent[::-1], strict=False):
+                row[:] = sent
             self._called_at, self._measured = memory.called_at, memory.measured
-            if self.delay == memory.delay:
-                self._ahead = memory.ahead
+            if memory.ahead is not None and memory.delay == self.delay:
+                self._ahead[:] = memory.ahead
+                self._mpc.known = 1
             if memory.estimate is not None:
                 disturbance = memory.estimate
-        if self._observer is not None and disturbance is not None:
-            self._observer.adopt(disturbance)
-            self._update_trim()
+        if disturbance is not None:
+            estimate = np.array(disturbance, float)
+            self._library.quadsim_mpc_learn(self._mpc, estimate.ctypes.data)
+            self._trim = None
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def stand(self, now: StepInputs, acting: Array) -> None:
         """Let the rotors follow their commands, and assume no disturbance."""
-        self._advance_rotors(now.time, acting)
-        self._forget()
+        self._acting[:] = acting
+        self._called_at = now.time
+        self._library.quadsim_mpc_stand(self._mpc, self._acting.ctypes.data)
+        self._trim = None
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # values out of range are rejected, not warned of
     def prepare(self, now: StepInputs, state: Array, reference: Array, acting: Array) -> Query | None:
         """See `quadsim.mpc.laws.parts.linear.Preparation.prepare`.
 
@@ -124,116 +135,57 @@ class RobustPreparation:
         first measured state after more than `LONGEST_SPAN` of such states, or a state after a pause: `now.time` must be
         one period later than last time.
         """
-        ahead, before, called_at = self._ahead, self._rotors, self._called_at
-        in_force, under_way, rotors, turning = self._advance_rotors(now.time, acting)
-        if not (all_true(np.abs(state) <= PLAUSIBLE) and all_true(np.abs(reference) <= PLAUSIBLE_REFERENCE)):
+        flying, learns = now.phase is Phase.FLYING, self._may_learn(now)
+        self._state[:] = state
+        self._reference[:] = reference
+        self._acting[:] = acting
+        status = self._library.quadsim_mpc_prepare(self._mpc, flying, learns, *self._inputs)
+        self._trim = None
+        if status != _FREE:
             return None
-        if ahead is None or abs(now.time - called_at - self._period) > _SAME_TIME:
-            self._measured = -math.inf
-        span = self._span(now)
-        if self._observer is not None and ahead is not None and span <= LONGEST_SPAN and now.phase is Phase.FLYING:
-            expected = self._after(self._period - self._late, ahead, before, in_force)
-            if all_true(np.isfinite(expected)):
-                self._observer.update(state, expected)
-                self._update_trim()
-        x0 = following = self._after(self._late, state, rotors, in_force)
-        for command, speeds in zip(under_way, turning, strict=False):
-            x0 = self._after(self._period, x0, speeds, command)
-        if not all_true(np.isfinite(x0)):
-            return None
-        self.yaw = float(x0[_YAW]) if self._heading else 0.0
-        if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, so its motion shows no disturbance
-            self._ahead = following
-        reference = self._turns.follow(reference, float(state[_YAW]))
-        rates = self.problem.rates(reference)
-        if self.delay:
-            reference = self._at_prediction(reference, len(under_way))
-            rates = None if rates is None else self._at_prediction(rates, len(under_way))
-        x0 = np.concatenate([x0, self._turning])[: self._model.n]
-        if self._heading:
-            reference = with_limited_yaw(reference, self.yaw, self._largest_turn)
-            x0 = turn_horizontally(x0, -self.yaw)
-            x0[_YAW] = 0.0
-        u_s = self._balanced()
-        x_s = self.trim.state(self.yaw, self._model.n)
-        x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
-        seen = seen_from(reference, self.yaw)
-        seen_rates = None if rates is None else turned_axes(rates, self.yaw)
-        desired = self.problem.objective.desired(seen, seen_rates)
-        return Query(x0, desired, acting, Equilibrium(x_s, u_s))
+        return Query(
+            self._x.copy(), self._desired.copy(), self._acting.copy(), Equilibrium(self._x_s.copy(), self._u_s.copy())
+        )
 
-    def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`; by the hover model, with the latest disturbance estimate."""
-        return predict_in_heading_frame(self._nominal, states, plans, replace(self.trim, speeds=self._balanced()))
+    @property
+    def yaw(self) -> float:
+        """Angle by which the axes of the last query are turned about world z [rad]."""
+        return float(self._mpc.yaw)
+
+    @property
+    def trim(self) -> Trim:
+        """The equilibrium under the estimated disturbance."""
+        if self._trim is None:
+            trim = self._mpc.trim
+            self._trim = Trim(speeds=np.array(trim.commands), lift=np.array(trim.lift), twist=np.array(trim.twist))
+        return self._trim
 
     @property
     def disturbance(self) -> Array:
         """(6,) estimated acceleration at rest, world [m/s^2], and angular acceleration, body [rad/s^2]."""
-        thrust = self._model.effectiveness[0] @ np.square(self.trim.speeds)
-        return np.concatenate([self._resting, thrust * self.trim.twist])
+        trim = self.trim
+        x, y, up = trim.lift.tolist()
+        thrust = math.hypot(x, y, up)
+        return np.array([-x, -y, self._robust.gravity - up, *(thrust * trim.twist)])
 
-    def _advance_rotors(self, time: float, acting: Array) -> tuple[Array, list[Array], Array, list[Array]]:
-        """Predict the rotor speeds from the last call to when this period's command takes over.
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`; by the hover model, with the latest disturbance estimate."""
+        return predict_in_heading_frame(self._nominal, states, plans, replace(self.trim, speeds=self._u_s.copy()))
 
-        Returns:
-            the command in force (4,), those under way, and the rotor speeds (4,) at t_k, and when each of the latter
-            and then this period's command takes over [rad/s].
-        """
-        self._sent.append(acting)
-        in_force, *under_way = self._sent
-        rotors = spun(self._model, self._rotors, in_force, self._period - self._late)
-        self._rotors = spun(self._model, rotors, in_force, self._late)
-        turning = [self._rotors]
-        for command in under_way:
-            turning.append(spun(self._model, turning[-1], command, self._period))
-        self._ahead, self._called_at, self._turning = None, time, turning[-1]
-        return in_force, under_way, rotors, turning
-
-    def _at_prediction(self, preview: Array, under_way: int) -> Array:
-        """Return the rows (N, 4) of a preview at the predicted instants, later by the delay; the last one is held."""
-        held = np.repeat(preview[-1:], under_way, axis=0)
-        preview = np.concatenate([preview[under_way:], held])
-        later = np.concatenate([preview[1:], preview[-1:]])
-        return np.asarray(preview + self._late / self._period * (later - preview))
-
-    def _forget(self) -> None:
-        """Assume no disturbance."""
-        if self._observer is not None:
-            self._observer.reset()
-        self._update_trim()
-
-    def _update_trim(self) -> None:
-        """Update the equilibrium from the disturbance estimate."""
-        self._estimate = np.zeros(6) if self._observer is None else self._observer.estimate
-        estimate, gravity = self._estimate, self._model.gravity
-        (x, y), twist = estimate[:2].tolist(), estimate[3:] / gravity
-        lift = math.hypot(x, y, gravity)
-        self._effectiveness = twisted(self._model.effectiveness, twist)
-        self._resting = self._acceleration((-x / lift, -y / lift, gravity / lift))
-        self.trim: Trim = equilibrium(self._model, acceleration=self._resting, twist=twist)
-
-    def _acceleration(self, axis: Triple) -> Triple:
-        """Return the estimated disturbance in the world frame [m/s^2], for thrust along a world-frame axis."""
-        x, y, along = self._estimate[:3].tolist()
-        return along * axis[0] + x, along * axis[1] + y, along * axis[2]
-
-    def _span(self, now: StepInputs) -> float:
-        """Time since the last measured state [s]; infinite after a pause, or if the present one is not measured."""
+    def _may_learn(self, now: StepInputs) -> bool:
+        """Return whether the observer may compare this period's state with the one that it expected."""
+        if abs(now.time - self._called_at - self.problem.model.period) > SAME_TIME:
+            self._measured = -math.inf
+        self._called_at = now.time
         if now.unseen is not None and now.unseen[_MOVING].any():
-            return math.inf
-        span, self._measured = now.time - self._measured, now.time
-        return span - _SAME_TIME
+            return False
+        span = now.time - self._measured
+        self._measured = now.time
+        return bool(span - SAME_TIME <= LONGEST_SPAN) and now.phase is Phase.FLYING
 
-    def _after(self, time: float, state: Array, rotors: Array, command: Array) -> Array:
-        """Predict the state (12,) a time [s] after a state (12,) with rotor speeds (4,), under a command (4,)."""
-        if time <= 1e-9:
-            return state
-        start = np.concatenate((state, rotors))[: self._model.n]
-        acceleration = self._acceleration(thrust_axis(state.tolist()))
-        return advance_disturbed(self._model, start, command, time, self._effectiveness, acceleration)[:N_STATES]
 
-    def _balanced(self) -> Array:
-        """(4,) speeds at rest [rad/s] that also balance the torque caused by thrust, which the hover matrices omit."""
-        thrust = self._model.effectiveness[0]
-        excess = np.dot(thrust, np.square(self._turning) - np.square(self.trim.speeds))
-        return np.asarray(self.trim.speeds - np.dot(self._of_twist, excess * self.trim.twist))
+def _view(address: int, count: int) -> Array:
+    """Return `count` numbers of C as an array."""
+    if not count:
+        return np.empty(0)
+    return np.ctypeslib.as_array((ctypes.c_double * count).from_address(address))

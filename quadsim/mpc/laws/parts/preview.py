@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from quadsim.errors import ParameterError
-from quadsim.mpc.problem.nonlinear_model import zero
+from quadsim.mpc.problem.rigidbody import zero
 from quadsim.state import Array, read_only
 
 SMALLEST_PREVIEW: Final = 3  # a parabola needs three samples
