@@ -20,6 +20,7 @@ from quadsim.flight import rundir
 from quadsim.flight.departure import departure_numbers, departure_of
 from quadsim.flight.log import ControlLog
 from quadsim.report.comparison import outcome
+from quadsim.report.film.frames import filmed
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.reaudit import reaudit
 from quadsim.rollout.rollout import Rollout
@@ -84,6 +85,7 @@ def test_a_flight_that_leaves_its_course_for_good_is_lost_though_every_constrain
     _, cases = leaving.verdicts()
     assert cases[0][:2] == ("flight", False)
     assert "lost.departure" in cases[0][2]
+    assert "lost.departure" in filmed(leaving).failures[0]
 
 
 def test_its_summary_has_the_numbers_and_a_new_audit_gives_the_same_verdict(leaving: Flight, run: Path) -> None:
