@@ -312,9 +312,9 @@ class ClosedLoop:
         if not samples or not isinstance(controller, Predicting | Foreseeing):
             return nothing
         states = np.stack([sample.observation.state for sample in samples])
-        plans = np.stack([sample.command.plan for sample in samples])
         try:
             with user_code(lambda error: InputError(described(error))):
+                plans = np.stack([sample.command.plan for sample in samples])
                 foreseen = controller.foresee(states, plans[:, 0]) if isinstance(controller, Foreseeing) else None
                 predicted = controller.predict(states, plans) if isinstance(controller, Predicting) else None
                 if predicted is None:
