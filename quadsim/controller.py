@@ -350,6 +350,15 @@ class Predicting(Protocol):
 
 
 @runtime_checkable
+class Foreseeing(Protocol):
+    """A controller with a model of one period, though it predicts no plan."""
+
+    def foresee(self, states: Array, commands: Array) -> Array | None:
+        """Return the states (K, 12) a period after states (K, 12) under commands (K, 4); None without a model."""
+        ...
+
+
+@runtime_checkable
 class Adopting(Protocol):
     """A controller that can take over in flight."""
 

@@ -63,9 +63,9 @@ def flight_verdicts(flight: FlightRecord) -> tuple[str, Cases]:
     A constraint that is not required is a case that passes, with what was measured in its output.  One that is
     required and was not reached is `skipped`: the flight shows neither that it holds nor that it does not.
     """
-    text = "; ".join([flight.log.reason or "completed", *failure_sentences(flight)])
+    text = "; ".join([flight.reason or "completed", *failure_sentences(flight)])
     failed = flight.numbers["controller"].get("unrecovered") or failed_takeoff(flight)
-    whole = flight.log.reason is None and not failed
+    whole = flight.reason is None and not failed
     cases = [("flight", whole, text), *map(_case, flight.findings)]
     if not flight.findings:
         cases.append(("audit", False, "; ".join(flight.numbers["audit_notes"])))

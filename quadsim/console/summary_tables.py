@@ -18,6 +18,7 @@ from quadsim.mpc.laws import law_name
 from quadsim.report.comparison import (
     NOT_REQUIRED,
     crash,
+    departing,
     event_sentences,
     failure_sentences,
     required,
@@ -45,6 +46,8 @@ def summary_tables(flight: FlightRecord) -> Iterator[RenderableType]:
         yield numbers["description"]
     yield from flight.log.traceback
     yield from failure_sentences(flight)
+    if "model_error" in numbers:
+        yield numbers["model_error"]["sentence"]
     if flight.findings:
         yield audit_table(flight.findings)
     yield from numbers.get("audit_notes", ())
@@ -67,10 +70,19 @@ def outcome_line(flight: FlightRecord) -> Text:
     if expected != "satisfied":
         remark = ", as the scenario expects" if as_expected else f"; the scenario expects: {expected}"
     colour = "green" if as_expected and (remark or verdict == "satisfied") else "red"
-    if flight.log.reason is not None:
-        return console.styled((f"{verdict}{remark}", colour), f": {flight.log.reason}")
+    if flight.reason is not None:
+        return console.styled((f"{verdict}{remark}", colour), f": {flight.reason}")
+    line = _judged(flight, colour, remark)
+    if sentence := departing(flight):
+        line += console.styled("; ", (sentence, "yellow"))
+    return line
+
+
+def _judged(flight: FlightRecord, colour: str, remark: str) -> Text:
+    """Return the verdict on the required constraints of a flight that was flown to its end."""
+    verdict = flight.outcome
     if verdict in ("incomplete", "unaudited"):
-        colour = "green" if remark and as_expected else "yellow"
+        colour = "green" if remark and flight.numbers.get("as_expected", True) else "yellow"
         what = required(flight).text if verdict == "incomplete" else "no constraint was audited"
         return console.styled((f"{verdict}, {what}{remark}", colour))
     phrase = "every required constraint holds" if verdict == "satisfied" else _violations(flight.findings)

@@ -417,13 +417,13 @@ def flight_verdict(findings: Sequence[Finding], *, aborted: bool, lost: bool, fa
     Args:
         findings: its audit.
         aborted: whether the user or an exception ended it.
-        lost: whether anything else ended it early.
+        lost: whether anything else ended it early, or it left its course, see `quadsim.flight.departure`.
         failed: whether it failed apart from its audit, see `quadsim.flight.metrics.failure`.
 
     Returns:
-        `aborted` or `lost`, where it ended early; `violated`, where it failed or a required limit is violated;
-        `incomplete`, where it ended before a required limit was reached; `unaudited`, where it has no limit; otherwise
-        `satisfied`.
+        `aborted` or `lost`, where it ended early or left its course; `violated`, where it failed or a required limit is
+        violated; `incomplete`, where it ended before a required limit was reached; `unaudited`, where it has no limit;
+        otherwise `satisfied`.
     """
     verdicts = {finding.verdict for finding in findings if finding.limit.required}
     if aborted or lost:

@@ -273,6 +273,9 @@ class FlightLog:
     predicted: np.ndarray[Any, np.dtype[np.float32]] | None = None
     """(K, N, 3) float32 positions [m] predicted in each period for t_{k+1} .. t_{k+N}, N the shortest horizon of its
     controllers; None if one of them has no model."""
+    foreseen: Array | None = None
+    """(K, 12) states predicted in each period for the next one, NaN where there is no prediction; None if there is
+    none, or the flight was read: it is not written."""
     reason: str | None = None  # why the flight ended early; None if it was completed
     interrupted: bool = False  # whether the user ended it
     traceback: tuple[str, ...] = ()  # last traceback lines of the exception in a controller or force that ended it

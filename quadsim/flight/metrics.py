@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.controller import ACCEPTED, MISSED, NO_OPTIMUM, NO_SOLVER, Phase
+from quadsim.flight.departure import departure_numbers
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, TimingLog
 from quadsim.flight.phase import AIRBORNE, TAKEOFF_RISE, Outline, clearance, takeoff_time, touchdown
 from quadsim.state import (
@@ -257,8 +258,13 @@ def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseSt
     if not log.control.t.size:
         return {"tracking": {}, "control": {}, "controller": {}}
     settled = settling(log.control.t, log.control.truth[:, REFERENCE_STATES], course)
+    departure = departure_numbers(log.control)
     return {
-        "tracking": {**tracking(log.control), "settling": settled},
+        "tracking": {
+            **tracking(log.control),
+            **({} if departure is None else {"departure": departure}),
+            "settling": settled,
+        },
         "control": control(log.control),
         "controller": controller(log.control, log.timing, deadline_ms),
     }

@@ -105,7 +105,7 @@ CRITERIA: Final = {
     "depth": ("the depth below the lowest of start and reference is", "m"),
     "speed": ("the speed is", "m/s"),
 }
-"""Criteria by their name in `[lost]`, with units; the first one met is the reason."""
+"""Criteria that end a flight, by their name in `[lost]`, with units; the first one met is the reason."""
 
 
 class TakeoffLead:

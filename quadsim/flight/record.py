@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from quadsim.flight.audit import Finding, FlightVerdict, Limit
+from quadsim.flight.departure import Departure
 from quadsim.flight.log import FlightLog
 from quadsim.vehicle import Vehicle
 
@@ -45,6 +46,14 @@ class FlightRecord(Protocol):
     @property
     def outcome(self) -> FlightVerdict:
         """The verdict in one word."""
+
+    @property
+    def departure(self) -> Departure | None:
+        """How it ended beside its course; None where that is not known."""
+
+    @property
+    def reason(self) -> str | None:
+        """Why it ended early, or is lost though it was flown to its end; None if it is neither."""
 
     @property
     def diagnosis(self) -> Mapping[str, Any] | None:

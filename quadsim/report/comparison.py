@@ -195,16 +195,27 @@ def comparison_rows(runs: Sequence[FlightRecord]) -> list[QuantityRow]:
 def outcome(flight: FlightRecord) -> Cell:
     """Return the verdict with its reason, and the constraints that are violated but not required."""
     cell = verdict_cell(flight)
-    if flight.log.status != "completed":
-        cell = replace(cell, text=f"{cell.text}: {flight.log.reason}")
+    if flight.reason is not None:
+        cell = replace(cell, text=f"{cell.text}: {flight.reason}")
     elif flight.outcome == "incomplete":
         cell = replace(cell, text=f"{cell.text}; {required(flight).text}")
     elif sentence := failed_takeoff(flight):
         cell = replace(cell, text=f"{cell.text}: {sentence}")
+    remarks = list(filter(None, [departing(flight)]))
     if violated := violated_unrequired(flight.findings):
+        remarks.append(f"{NOT_REQUIRED}: {', '.join(violated)}")
+    if remarks:
         mark = Mark.WARN if cell.mark is Mark.GOOD else cell.mark
-        cell = Cell(text=f"{cell.text}; {NOT_REQUIRED}: {', '.join(violated)}", mark=mark)
+        cell = Cell(text="; ".join([cell.text, *remarks]), mark=mark)
     return cell
+
+
+def departing(flight: FlightRecord) -> str | None:
+    """Say that a flight left its course at its end, not far enough to be lost; None if it did not, or ended early."""
+    departure = flight.departure
+    if flight.reason is not None or departure is None or not departure.leaving:
+        return None
+    return departure.sentence
 
 
 def violated_unrequired(findings: Iterable[Finding]) -> list[str]:

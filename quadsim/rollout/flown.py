@@ -31,7 +31,9 @@ from quadsim.flight.audit import (
     margins_sampled,
     worst_finding,
 )
+from quadsim.flight.departure import DEPARTURE, Departure, departure_numbers, departure_of
 from quadsim.flight.log import FlightLog, PlantLog, columns_of
+from quadsim.flight.model_error import model_report
 from quadsim.flight.parquet import FORMAT, log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
 from quadsim.interrupts import current_hold
@@ -42,6 +44,7 @@ from quadsim.rollout.machine import machine, versions
 from quadsim.scenarios.courses.csv_course import Csv
 from quadsim.scenarios.feasibility_check import report
 from quadsim.scenarios.mismatch import model_notes
+from quadsim.scenarios.plugin import is_plugin
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.scenarios.schema.settings import leaves
 from quadsim.sim.airframe import outline
@@ -158,7 +161,7 @@ class Flight(Result):
         if end is not None:
             flown += f" of a course that ends at {end:g} s"
         line = f"<Flight {self.scenario.name}: {self.outcome}, {flown} by {self.controller}"
-        return f"{line}{f', {self.log.reason}' if self.log.reason else ''}{worst_margin(self.findings)}>"
+        return f"{line}{f', {self.reason}' if self.reason else ''}{worst_margin(self.findings)}>"
 
     @property
     def outcome(self) -> FlightVerdict:
@@ -170,9 +173,28 @@ class Flight(Result):
         return flight_verdict(
             findings,
             aborted=self.log.aborted,
-            lost=self.log.reason is not None,
+            lost=self.reason is not None,
             failed=metrics.failure(self.log.control) is not None,
         )
+
+    @cached_property
+    def departure(self) -> Departure | None:
+        """How the flight ended beside its course; None where it ended on the ground, too early, or was not looked at.
+
+        A run of a version that did not look at it keeps its verdict.
+        """
+        if self.recorded is None:
+            numbers = departure_numbers(self.log.control)
+        else:
+            numbers = self.recorded["tracking"].get("departure")
+        return departure_of(numbers, self.scenario.lost.departure or None)
+
+    @property
+    def reason(self) -> str | None:
+        """Why the flight ended early, or is lost though it was flown to its end; None if it is neither."""
+        if self.log.reason is None and self.departure is not None and self.departure.lost:
+            return self.departure.sentence
+        return self.log.reason
 
     @cached_property
     def diagnosis(self) -> Mapping[str, Any] | None:
@@ -584,6 +606,9 @@ def summarise(flight: Flight) -> dict[str, Any]:
     steps = flight.assembly.course_steps
     course_cut = flight.assembly.course_cut
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=steps)
+    own_law = flight.own_code or is_plugin(scenario.controller.type)
+    owner = "your model" if own_law else f"the model of {flight.controller}"
+    model_error = model_report(log.control, log.foreseen, owner)
     notes = implausible(flight.actual)
     notes += model_notes(flight.assembly) if flight.controller == scenario.controller.type else []
     return {
@@ -593,7 +618,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "status": log.status,
         "reason": log.reason,
         **({"traceback": [*log.traceback]} if log.traceback else {}),
-        "lost": log.lost,
+        "lost": DEPARTURE if flight.log.reason is None and flight.reason is not None else log.lost,
         "satisfied": flight.satisfied,
         "verdict": flight.outcome,
         "group": scenario.group,
@@ -607,6 +632,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "constraints": [limit_to_json(finding) for finding in flight.findings],
         "audit_notes": flight.assembly.audit_notes,
         **({"model_notes": notes} if notes else {}),
+        **({} if model_error is None else {"model_error": model_error}),
         "control": numbers["control"],
         "diagnosis": flight._explanation,
         "controller": {

@@ -29,8 +29,6 @@ FlyUntil: TypeAlias = Callable[[Assembly, float], Flight]
 AFTER: Final = 5.0  # flown beyond the first period without an answer [s]
 LONGEST_TRIAL: Final = 60.0  # longest flight of a change [s]; what would have to be flown for longer is not flown
 MOST_FLOWN: Final = 6  # flights of one diagnosis
-LEAVING_FROM, LEAVING_FOR = 1.0, 1.0
-"""Distance from the reference [m], and time for which it has grown [s], from which on a vehicle is leaving it."""
 RETURNING: Final = 0.9  # violation at the end of a flight, over its largest, up to which it is passing
 HOVER_RESERVE: Final = 0.1  # distance of the advised bound on rotor speeds from hover, over hover
 _SPEED: Final = "controller.input_bounds.speed"
@@ -113,10 +111,8 @@ def _trial(scenario: Scenario, assembly: Assembly, settings: Settings, until: fl
         return _Trial(why=f"no answer at t = {unanswered.time:.4g} s")
     if flight.log.control.crashed or unrecovered(flight.log.control):
         return _Trial(why="crashed" if flight.log.control.crashed else "in fallback to its end")
-    distance = np.linalg.norm([flight.state[axis] - flight.reference[axis] for axis in "xyz"], axis=0)
-    last = distance[-max(round(LEAVING_FOR / period), 1) - 1 :]
-    if last[-1] > LEAVING_FROM and (np.diff(last) > 0.0).all():
-        return _Trial(why=f"{last[-1]:.3g} m from the reference at its end, and leaving")
+    if flight.departure is not None and flight.departure.leaving:
+        return _Trial(why=f"{flight.departure.distance:.3g} m off its course at its end, and leaving it")
     violated = [each.limit.name for each in flight.findings if each.limit.required and each.verdict == "violated"]
     lasting = [name for name in violated if _lasts(flight.margins[name])]
     return _Trial(why=f"violated: {', '.join(violated)}" if lasting else "", violated=tuple(violated))

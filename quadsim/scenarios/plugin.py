@@ -204,6 +204,18 @@ class PluginController:
         predicted = self._predicting.predict(states.copy(), plans.copy())
         return _numbers(predicted, (*plans.shape[:2], states.shape[1]), f"{self.name}.predict")
 
+    def foresee(self, states: Array, commands: Array) -> Array | None:
+        """See `quadsim.controller.Foreseeing`; by the law's `problem` (`quadsim.mpc.Problem`) if it cannot predict."""
+        from quadsim.mpc.problem.ocp import Problem
+        from quadsim.mpc.problem.paper import rollout
+
+        problem = _optional(lambda: self.law.problem, None)
+        if self._predicting is not None or self.commands != ROTORS or not isinstance(problem, Problem):
+            return None
+        if problem.model.A.shape[0] != states.shape[1] or problem.model.B.shape[1] != commands.shape[1]:
+            return None
+        return rollout(problem.model, states, commands[:, None])[:, 0]
+
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError if the answer is not a command."""
         acting, attitude, rates, unseen = (

@@ -7,10 +7,10 @@ import gc
 import logging
 import time as clock
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from quadsim.controller import (
     Command,
     Controller,
     Engaging,
+    Foreseeing,
     InnerLoop,
     Phase,
     Predicting,
@@ -38,7 +39,7 @@ from quadsim.motion import Motion
 from quadsim.sim.computation import Computation, physics_steps
 from quadsim.sim.physics import Observation, Period, flight_log, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
-from quadsim.state import INDEX, POSITION, REFERENCE_NAMES, Array, ReferenceTurns
+from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_NAMES, Array, ReferenceTurns
 
 if TYPE_CHECKING:
     from quadsim.flight.phase import PhaseMonitor
@@ -172,7 +173,7 @@ class ClosedLoop:
         self._observed: Observation | None = None
         self._samples: list[Period] | None = [] if recorded else None
         self.last: Period | None = None
-        self._predicted: list[Array | None] = []  # of the controllers before this one, and how many periods they flew
+        self._predicted: list[_Prediction] = []  # of the controllers before this one, and how many periods they flew
         self._switched = 0
 
     @property
@@ -249,9 +250,11 @@ class ClosedLoop:
         log = flight_log(
             self._samples, start, self._initial_speeds, self._yaw, self.period, timestep, quaternions=self.quaternions
         )
+        predictions = [*self._predicted, *([self._predict()] if self.k > self._switched else [])]
         return replace(
             log,
-            predicted=_joined([*self._predicted, *([self._predict()] if self.k > self._switched else [])]),
+            predicted=_joined([prediction.positions for prediction in predictions]),
+            foreseen=_foreseen(predictions),
             reason=self.reason,
             interrupted=self._interrupted,
             traceback=self._traceback,
@@ -302,19 +305,26 @@ class ClosedLoop:
         )
         return Observation(k=k, state=state, truth=truth, reference=row, preview=preview, moment=now)
 
-    def _predict(self) -> Array | None:
-        """Predicted positions (K, N, 3) [m] of the controller's periods; None where it has no model, or raised."""
+    def _predict(self) -> _Prediction:
+        """Predict the controller's periods; nothing where it has no model, or raised."""
         controller, samples = self.controller, (self._samples or [])[self._switched :]
-        if not isinstance(controller, Predicting) or not samples:
-            return None
+        nothing = _Prediction(len(samples), None, None)
+        if not samples or not isinstance(controller, Predicting | Foreseeing):
+            return nothing
         states = np.stack([sample.observation.state for sample in samples])
         try:
             with user_code(lambda error: InputError(described(error))):
-                predicted = controller.predict(states, np.stack([sample.command.plan for sample in samples]))
-                return None if predicted is None else predicted[:, :, list(POSITION)]
+                plans = np.stack([sample.command.plan for sample in samples])
+                foreseen = controller.foresee(states, plans[:, 0]) if isinstance(controller, Foreseeing) else None
+                predicted = controller.predict(states, plans) if isinstance(controller, Predicting) else None
+                if predicted is None:
+                    return _Prediction(len(samples), None, foreseen)
+                if foreseen is None:
+                    foreseen = predicted[:, 0].copy()
+                return _Prediction(len(samples), predicted[:, :, list(POSITION)], foreseen)
         except InputError as error:  # after the flight, which is not to be lost by it
             _log.warning("no predictions are kept: predict raised %s", error)
-            return None
+            return nothing
 
     def _asked(self, observed: Observation) -> tuple[StepInputs, Array, Array]:
         """Return a controller's inputs; the reference is raised where it has to be for the vehicle to take off."""
@@ -465,6 +475,25 @@ def _begin(controller: Controller, plant: Plant) -> None:
 def _ending_flight(time: float) -> AbstractContextManager[None]:
     """Make whatever a controller's code raises the flight's end, not its loss."""
     return user_code(lambda error: RaisedError("the controller", error, time=time), passing=(FlightError,))
+
+
+class _Prediction(NamedTuple):
+    """What a controller predicted in the periods that it flew."""
+
+    periods: int
+    positions: Array | None  # (K, N, 3) [m]
+    next_states: Array | None  # (K, 12) for the period after each
+
+
+def _foreseen(predictions: Sequence[_Prediction]) -> Array | None:
+    """The states (K, 12) that each controller predicted for the next period, NaN of those that did not."""
+    if all(prediction.next_states is None for prediction in predictions):
+        return None
+    parts = []
+    for prediction in predictions:
+        unknown = np.full((prediction.periods, N_STATES), np.nan)
+        parts.append(unknown if prediction.next_states is None else prediction.next_states)
+    return np.concatenate(parts)
 
 
 def _joined(parts: list[Array | None]) -> np.ndarray[Any, np.dtype[np.float32]] | None:

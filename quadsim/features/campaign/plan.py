@@ -158,10 +158,15 @@ class Plan:
 
     def row_of(self, flight: int, flown: Flight, wall_s: float = 0.0) -> Row:
         """Return the row of a flight that took `wall_s` [s] to compute."""
-        machine = processor_name()
-        return self._row(
-            flight, flown_row(flown.log, flown.findings, verdict=flown.outcome, wall_s=wall_s, machine=machine)
+        row = flown_row(
+            flown.log,
+            flown.findings,
+            verdict=flown.outcome,
+            reason=flown.reason,
+            wall_s=wall_s,
+            machine=processor_name(),
         )
+        return self._row(flight, row)
 
     def failed(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
         """The row of a flight that raised, met a limit of time or memory, or whose process died."""

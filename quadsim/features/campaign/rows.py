@@ -90,12 +90,20 @@ def make_schema(
     return pa.schema([*fields, *_WORST, *_TIMING], metadata={"format": str(FORMAT), "failure": "; ".join(failure)})
 
 
-def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall_s: float, machine: str) -> Row:
-    """Return the row of a flight, with plant rows at the physics rate, and its audit."""
+def flown_row(
+    log: FlightLog,
+    findings: Sequence[Finding],
+    *,
+    verdict: str,
+    reason: str | None = None,
+    wall_s: float,
+    machine: str,
+) -> Row:
+    """Return the row of a flight, with plant rows at the physics rate, its audit, and the reason of its verdict."""
     row: Row = {
         "status": log.status,
         "verdict": verdict,
-        "reason": log.reason,
+        "reason": reason or log.reason,
         "violated": verdict not in (HARMLESS, INCOMPLETE, UNAUDITED),
         "failed_by": metrics.failure(log.control),
         "crashed": log.control.crashed,

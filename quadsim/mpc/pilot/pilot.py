@@ -15,6 +15,7 @@ from quadsim.controller import (
     Commanding,
     Controller,
     Diagnosable,
+    Foreseeing,
     Predicting,
     Settling,
     StepInputs,
@@ -160,3 +161,7 @@ class Pilot:
         if self.guard is not None:
             return self.guard.predict(self.law, states, plans)
         return self.law.predict(states, plans) if isinstance(self.law, Predicting) else None
+
+    def foresee(self, states: Array, commands: Array) -> Array | None:
+        """See `quadsim.controller.Foreseeing`."""
+        return self.law.foresee(states, commands) if isinstance(self.law, Foreseeing) else None

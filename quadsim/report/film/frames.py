@@ -51,6 +51,9 @@ def filmed(flight: FlightRecord) -> Filmed:
     if flight.log.control.t.size == 0 or flight.log.plant.t.size == 0:
         place = flight.directory or flight.name
         raise FileError(place, "holds nothing to film: the flight ended before its first control period")
+    failures = failure_sentences(flight)
+    if flight.log.reason is None and flight.departure is not None and flight.departure.leaving:
+        failures.insert(0, flight.departure.sentence)
     return Filmed(
         name=flight.name,
         controller=flight.numbers["controller"].get("name", ""),
@@ -58,7 +61,7 @@ def filmed(flight: FlightRecord) -> Filmed:
         log=flight.log,
         limits=flight.limits,
         events=tuple(flight.numbers.get("events", ())),
-        failures=tuple(failure_sentences(flight)),
+        failures=tuple(failures),
     )
 
 

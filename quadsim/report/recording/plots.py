@@ -213,8 +213,12 @@ def send_texts(recording: rr.RecordingStream, run: FlightRecord) -> None:
     if (told := never_took_off(log)) is not None:
         events.append((told, takeoff_sentence(told), "ERROR"))
     events += [(event["time"], event["text"], "WARN") for event in run.numbers.get("events", ())]
-    reason = run.log.reason
-    events.append((run.end, "completed", "INFO") if reason is None else (run.end, f"aborted: {reason}", "ERROR"))
+    if run.log.reason is not None:
+        events.append((run.end, f"aborted: {run.log.reason}", "ERROR"))
+    elif run.reason is not None:
+        events.append((run.end, f"lost: {run.reason}", "ERROR"))
+    else:
+        events.append((run.end, "completed", "INFO"))
     times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
     recording.send_columns("events", [time_column(np.array(times))], rr.TextLog.columns(text=texts, level=levels))
     rows = [row for row in comparison_rows([run]) if row.group in ("Flight", "Tracking") or row.headline]

@@ -15,6 +15,7 @@ from quadsim import shorthands
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import FLOORS, Metres, Positive
 from quadsim.flight.audit import FlightVerdict, Limit
+from quadsim.flight.phase import CRITERIA
 from quadsim.input_limits import MOST_ENTRIES, MOST_STEPS
 from quadsim.mpc.problem.polytope import Polytope
 from quadsim.scenarios.catalogue import Group
@@ -101,7 +102,7 @@ Off = Annotated[Literal[False], BeforeValidator(_false_alone)]
 
 @dataclass(frozen=True, kw_only=True)
 class Lost:
-    """Criteria on the true state, at the control samples, that end the flight as lost; false switches one off."""
+    """Criteria on the true state, at the control samples, by which a flight is lost; false switches one off."""
 
     tilt: Annotated[
         Annotated[float, Gt(0.0), Le(180.0)] | Off,
@@ -113,11 +114,15 @@ class Lost:
     distance: Annotated[Metres | Off, doc("[m] largest distance from the reference at the same time")] = 100.0
     depth: Annotated[Metres | Off, doc("[m] largest depth below the lowest point of start and reference so far")] = 50.0
     speed: Annotated[Positive | Off, doc("[m/s] highest speed in any direction")] = 50.0
+    departure: Annotated[
+        Metres | Off,
+        doc("[m] largest distance from the course flown so far at the end of a flight, while it still grows"),
+    ] = 4.0
 
     @property
     def limits(self) -> dict[str, float]:
-        """The criteria that are on; see `quadsim.flight.phase`."""
-        return {name: limit for name, limit in vars(self).items() if limit is not False}
+        """The criteria that are on and end a flight; see `quadsim.flight.phase`."""
+        return {name: limit for name in CRITERIA if (limit := getattr(self, name)) is not False}
 
 
 LONGEST_FLIGHT: Final = 86_400.0
@@ -141,7 +146,8 @@ class Scenario:
         doc(
             "expected verdict: satisfied (flown to its end, every required constraint satisfied), violated (one "
             "violated, the vehicle crashes, or the controller ends in permanent fallback), lost (the flight ends "
-            "early, by a criterion of [lost] or otherwise), incomplete (it ends before a constraint's window starts), "
+            "early, by a criterion of [lost] or otherwise, or far off its course), incomplete (it ends before a "
+            "constraint's window starts), "
             "unaudited (it has no constraint)"
         ),
     ] = "satisfied"

@@ -178,6 +178,13 @@ class Mine:
 """A controller of the user's; `kind` is what it does beside hovering."""
 
 
+CLIMBING = """
+def law(now, state, reference):
+    return [202.0] * 4
+"""
+"""A controller of the user's that climbs, ever faster; hover is at 192.8 rad/s."""
+
+
 def plan_of_kinds(directory: Path, *kinds: str, **changes: Any) -> Plan:
     """A flight for each kind of the controller."""
     module = f"mine_{abs(hash(directory))}"  # one name is imported from one place, in a process
@@ -186,6 +193,20 @@ def plan_of_kinds(directory: Path, *kinds: str, **changes: Any) -> Plan:
     controller = {"type": f"{module}:Mine", "settings": {"kind": "calm"}, "folder": "."}
     flown = {"duration": 0.5, "constraints": [], "controller": controller}
     return make_plan(directory, **{"vary": [entry], "flights": len(kinds), "set": flown, **changes})
+
+
+def test_a_flight_that_leaves_its_course_counts_as_lost(tmp_path: Path) -> None:
+    (tmp_path / "climbing.py").write_text(CLIMBING, encoding="utf-8")
+    limits = {"name": "limit", "fields": ["lost.departure"], "distribution": "grid", "values": [90.0, 4.0]}
+    controller = {"type": "climbing:law", "horizon": 1, "folder": "."}
+    flown = {"duration": 6.0, "constraints": [], "lost": {"departure": 4.0}, "controller": controller}
+    result = fly_campaign(make_plan(tmp_path, vary=[limits], flights=2, set=flown), tmp_path / "c", Alone())
+    assert result.table["verdict"].to_pylist() == ["unaudited", "lost"]
+    reasons = result.table["reason"].to_pylist()
+    assert reasons[0] is None
+    assert "beyond lost.departure = 4 m" in reasons[1]
+    assert result.table["status"].to_pylist() == ["completed", "completed"]
+    assert result.summary["events"]["lost"]["count"] == 1
 
 
 def test_a_bad_flight_is_a_row_with_its_verdict_and_reason(tmp_path: Path) -> None:
