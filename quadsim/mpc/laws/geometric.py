@@ -16,7 +16,7 @@ import numpy as np
 from annotated_types import Len, doc
 
 from quadsim.controller import ROTORS, TARGET_SIZES, Command, Phase, StepInputs
-from quadsim.core.mirror import Struct, core_library, set_members, struct
+from quadsim.core.mirror import Struct, constant, core_library, set_members, struct
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.motion import Motion
@@ -31,7 +31,7 @@ from quadsim.mpc.laws.parts.preview import MOTION_DEGREE, MOTION_SAMPLES, PREVIE
 from quadsim.mpc.pilot.allocation import allocate, make_allocation
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement, require_one_scale
 from quadsim.mpc.problem.model import target_model
-from quadsim.mpc.problem.nonlinear_model import SUBSTEPS, zero
+from quadsim.mpc.problem.nonlinear_model import zero
 from quadsim.mpc.problem.rigidbody import Inputs, rigid_body
 from quadsim.mpc.space import Shape
 from quadsim.mpc.tables.bounded import USUAL_TARGETS, LagSeconds, Range, TargetBounds, require_lags, require_space
@@ -382,7 +382,7 @@ def _delay_of(settings: Geometric, vehicle: Vehicle, period: float) -> tuple[Str
     model = rigid_body(
         vehicle,
         period,
-        substeps=SUBSTEPS,
+        substeps=constant("QUADSIM_SUBSTEPS"),
         inputs=Inputs.RATES if targets else Inputs.SPEED,
         rotor_lag=None if targets else vehicle.rotor_rise or None,
         lag=settings.inner_lag or NO_LAG,
