@@ -168,10 +168,13 @@ class AnswerCheck:
             (at, C, of_inputs, of_state), (x_s, u_s) = self._map, query.equilibrium or problem.equilibrium
             of_plan = of_inputs @ (plan - u_s).ravel() + of_state @ (query.state - x_s)
             values[:, at] += of_plan.reshape(len(plan), -1) + C @ x_s
-        else:
+        elif rows.on_states.any():
             states = predicted(problem, query, plan)
-            before = np.concatenate((query.state[None], states[:-1]))
-            values += np.where(rows.of_states, *((rows.C @ x[:, :, None])[:, :, 0] for x in (states, before)))
+            of_plan = (rows.C @ states[:, :, None])[:, :, 0]
+            if rows.starts:
+                before = np.concatenate((query.state[None], states[:-1]))
+                of_plan = np.where(rows.of_states, of_plan, (rows.C @ before[:, :, None])[:, :, 0])
+            values += of_plan
         beyond = np.maximum(values - rows.upper, rows.lower - values)
         if rows.soft.size:
             beyond[:, rows.soft] -= (answer.slacks * rows.slack_scale)[:, rows.slack[rows.soft]]

@@ -231,6 +231,11 @@ class Rows:
         return np.asarray(self.C.any(axis=(0, 2) if self.C.ndim == 3 else 1)).reshape(len(self.D))
 
     @cached_property
+    def starts(self) -> bool:
+        """Return whether a row involves the state at the start of its step."""
+        return bool((self.on_states & ~self.of_states).any())
+
+    @cached_property
     def soft(self) -> Indices:
         """Return (m_s,) the indices of soft rows."""
         return np.flatnonzero(np.isfinite(self.l1))

@@ -340,8 +340,12 @@ def predicted(problem: Problem, query: Query, plan: Array) -> Array:
     """(N, n) the predicted states of a plan (N, nu)."""
     states, state = np.empty((len(plan), query.state.size)), query.state
     if query.steps is not None:
-        for i, (A, B, c, u) in enumerate(zip(*query.steps, plan, strict=True)):
-            states[i] = state = A @ state + B @ u + c
+        A, B, c = query.steps
+        pushes = np.matmul(B, plan[:, :, None])[:, :, 0]
+        for A_i, push, c_i, row in zip(A, pushes, c, states, strict=True):
+            state = np.dot(A_i, state, row)
+            np.add(state, push, state)
+            np.add(state, c_i, state)
         return states
     model, (x_s, u_s) = problem.model, query.equilibrium or problem.equilibrium
     state = state - x_s

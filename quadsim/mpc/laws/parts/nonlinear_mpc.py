@@ -61,7 +61,7 @@ from quadsim.mpc.problem.equilibrium import LEAST_LIFT, Trim
 from quadsim.mpc.problem.model import require_delay, split_delay
 from quadsim.mpc.problem.ocp import Equilibrium, InfeasiblePeriod, Problem, Query
 from quadsim.mpc.problem.qp import KKT_EVERY, QP, Solution
-from quadsim.mpc.problem.rigidbody import N_BODY, P, Q, V, W, thrust_axis
+from quadsim.mpc.problem.rigidbody import N_BODY, P, Q, V, W
 from quadsim.mpc.solvers import INVALID_DATA, Answer, Method
 from quadsim.mpc.space import HALF_SPACE_ROUNDING, SETTLED, Space, distances
 from quadsim.rotation import (
@@ -259,6 +259,13 @@ class NonlinearMPC:
         self._face, self._beyond = core_view(work.face, N, p.faces, 3), core_view(work.beyond, N, p.faces)
         self._map, self._offset = core_view(work.map, N, N_BODY, width_of(size)), core_view(work.offset, N, size)
         self._axis, self._known = core_view(work.axis, N * p.tilts, 2, 4), core_view(work.known, N * p.tilts, 2)
+        self._trim = np.ctypeslib.as_array(law.trim.commands), np.ctypeslib.as_array(law.trim.lift)
+        self._start_state = np.ctypeslib.as_array(work.start)[: self.model.n]
+        A, B = unpacked(np.zeros_like(self._map), self.model.n, size - self.model.n, self.program.pointed["left"][-1])
+        shape = N, self.problem.model.n
+        self._constant_steps = np.zeros((*shape, shape[1])), np.zeros((*shape, N_ROTORS)), np.zeros(shape)
+        self._constant_steps[0][:, : self.model.n, : self.model.n] = A
+        self._constant_steps[1][:, : self.model.n] = B
         self._origin, self._price = core_view(work.origin, N, p.slacks), core_view(work.price, N, p.slacks)
         self._free = core_view(work.free, N, p.slacks, kind=ctypes.c_int)
         self._held = core_view(work.held, N, N_ROTORS, kind=ctypes.c_int)
@@ -410,8 +417,8 @@ class NonlinearMPC:
         """The target at rest under the estimated force and thrust scale, for the fallback; None for rotor speeds."""
         if not self.model.targets:
             return None
-        trim = self.struct.trim
-        return Trim(speeds=np.array(trim.commands), lift=np.array(trim.lift))
+        commands, lift = self._trim
+        return Trim(speeds=commands.copy(), lift=lift.copy())
 
     @property
     def asked(self) -> tuple[Array, ...]:
@@ -551,6 +558,8 @@ class NonlinearMPC:
     def _slacks(self, groups: Indices) -> Array:
         """(N, m) slacks of the last optimum, of chosen groups, in the constraints' units."""
         program = self.program
+        if not groups.size:
+            return np.zeros((self._nodes, 0))
         normalised = self._free * (self._origin + (self._price - program.linear) / program.quadratic)
         return np.array((normalised / program.slack_scale)[:, groups])
 
@@ -563,25 +572,29 @@ class NonlinearMPC:
 
     def _query(self) -> Query:
         """The data of the last step's program."""
-        goal = self._goal.copy()
-        state = np.array(self._work.start[: self.model.n])
+        n = self.model.n
+        goal = np.zeros((self._nodes + 1, self.problem.model.n))
+        goal[:, :n] = self._goal
+        state = np.empty(self.problem.model.n)
+        state[:n] = self._start_state
         if self.program.struct.tilts:
-            goal = np.hstack([goal, np.zeros((len(goal), 2))])
-            state = np.append(state, thrust_axis(self._asked[0][Q])[:2])
+            w, x, y, z = self._asked[0][Q].tolist()
+            state[n:] = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)  # R(q) e_z along world x and y
         desired = goal[1:] @ self.problem.objective.C_r.T
         equilibrium = Equilibrium(goal[-1], self._aim.copy())
         return Query(state, desired, self._asked[1].copy(), equilibrium, self._steps())
 
     def _steps(self) -> tuple[Array, Array, Array]:
         """A (N, n, n), B (N, n, 4), c (N, n) of the program; under `tilt`, the thrust axis is two further states."""
-        n = self.model.n
-        A, B = unpacked(self._map, n, self._offset.shape[1] - n, self.program.pointed["left"][-1])
-        c = np.array(self._offset[:, :n])
+        n, inputs = self.model.n, self._offset.shape[1] - 3
+        A, B, c = (part.copy() for part in self._constant_steps)
+        A[:, :N_BODY, 3:n] = self._map[:, :, : n - 3]
+        B[:, :N_BODY] = self._map[:, :, inputs : inputs + N_ROTORS]
+        c[:, :n] = self._offset[:, :n]
         if self.program.struct.tilts:
-            axis = self._axis
-            A = np.pad(np.concatenate([A, axis @ A[:, 3:7]], axis=1), ((0, 0), (0, 0), (0, 2)))
-            B = np.concatenate([B, axis @ B[:, 3:7]], axis=1)
-            c = np.concatenate([c, (axis @ c[:, 3:7, None])[:, :, 0] + self._known], axis=1)
+            np.matmul(self._axis, A[:, Q, :n], out=A[:, n:, :n])
+            np.matmul(self._axis, B[:, Q], out=B[:, n:])
+            c[:, n:] = (self._axis @ c[:, Q, None])[:, :, 0] + self._known
         return A, B, c
 
     def _certificate(self) -> tuple[QP, Solution]:
