@@ -43,7 +43,7 @@ BATTERIES: Final = {
 MEMBERS: Final = {"campaigns": CAMPAIGNS, "battery": tuple(BATTERIES)}
 BENCHMARKS: Final = (
     *("solvers", "flight", "nonlinear", "film", "campaign", "mismatch", "speed", "autopilots", "interfaces"),
-    *("identification", "intervals"),
+    *("identification", "intervals", "stability"),
 )
 KEPT: Final = ("solvers", "mismatch", "speed", "interfaces", "identification")
 """Benchmarks whose figure is kept in docs/."""
@@ -321,7 +321,7 @@ def records(data: Any) -> list[Record]:
 
 
 CSV: Final[dict[str, Callable[[Any], list[Record]]]] = {
-    **dict.fromkeys((*KEPT, "autopilots", "flight", "intervals", "nonlinear"), records),
+    **dict.fromkeys((*KEPT, "autopilots", "flight", "intervals", "nonlinear", "stability"), records),
     "papers": paper_rows,
     "peers": peer_rows,
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from quadsim.controller import ROTORS
 from quadsim.mpc.bounded import Weighted, resolved_lag
 from quadsim.mpc.model import SHORTEST_LAG
@@ -10,6 +12,7 @@ from quadsim.mpc.robust.settings import Robust
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.schema.controllers import AnyController
 from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.state import Array
 
 
 def model_notes(assembly: Assembly) -> list[str]:
@@ -35,3 +38,10 @@ def _predicts_ideal_rotors(spec: AnyController, assembly: Assembly) -> bool:
     if isinstance(spec, Nonlinear):  # an autopilot's lags include that of its rotors
         return spec.commands == ROTORS and resolved_lag(spec.rotor_lag, assembly.vehicle) == 0.0
     return isinstance(spec, Weighted)
+
+
+def course_headings(assembly: Assembly) -> Array:
+    """Return the course's headings at the control instants of the flight (K,), without its filter [rad]."""
+    scenario = assembly.scenario
+    t = scenario.control_period * np.arange(scenario.periods + 1, dtype=np.float64)
+    return assembly.course.sample(t)[:, 3]
