@@ -20,9 +20,10 @@ from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 
-from quadsim.errors import FlightError
+from quadsim.errors import FlightError, InputError
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.mismatch import Unmodelled, unmodelled, worst_heading
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import EULER, POSITION, VELOCITY, Array, wrapped
 
@@ -41,6 +42,8 @@ _LEAST_BLOCKS: Final = 4
 _DECAYED: Final = 1e-5  # difference over that of the first block at which the flights end
 _GROWN: Final = 30.0  # the same, of one that grows
 _SATURATED: Final = math.e  # the same, beyond what the transients of a stable loop leave after some seconds
+_GLANCE: Final = 8.0  # flown before a flight [s]
+_NOTABLE: Final = 0.05  # least rate of what is said before a flight, as so little is flown [1/s]
 _HEIGHT: Final = 5.0  # of the hover [m]
 _VELOCITY: Final = (1.0, 0.6, 0.3)  # direction of the velocity, x component 1
 _YAW_RATE: Final = 50.0  # yaw rate [deg/s] per velocity along x [m/s]
@@ -105,7 +108,12 @@ def hovering(
 
 
 def measure_growth(
-    scenario: Scenario, *, heading: float = 0.0, size: float = SIZE, changes: Mapping[str, Any] | None = None
+    scenario: Scenario,
+    *,
+    heading: float = 0.0,
+    size: float = SIZE,
+    changes: Mapping[str, Any] | None = None,
+    longest: float = LONGEST_PAIR,
 ) -> Growth:
     """Fly a pair of hovers of one seed that start differently; return how their difference grows.
 
@@ -117,6 +125,7 @@ def measure_growth(
         heading: as in `hovering` [deg].
         size: as in `hovering`, of the second flight.
         changes: as in `hovering`.
+        longest: [s] ends the flights, at most `LONGEST_PAIR`.
 
     Raises:
         InputError: a changed field is not allowed, or the parts cannot be built.
@@ -124,13 +133,14 @@ def measure_growth(
     still = hovering(scenario, heading=heading, changes=changes)
     pushed = hovering(scenario, heading=heading, size=size, changes=changes)
     period = still.control_period
+    periods = min(still.periods, round(longest / period))
     per_block = max(round(_BLOCK / period), 1)
     distances: list[float] = []
     ended = ""
     with contextlib.ExitStack() as stack:
         first = stack.enter_context(Rollout(Assembly(still), recorded=False))
         second = stack.enter_context(Rollout(Assembly(pushed), recorded=False))
-        while len(distances) < still.periods:
+        while len(distances) < periods:
             try:
                 states = [rollout.step().observation.truth for rollout in (first, second)]
             except FlightError as error:
@@ -187,3 +197,35 @@ def _rate(distances: list[float], per_block: int, period: float) -> tuple[float,
     if left > _SATURATED:  # it may have grown to a limit cycle, in which it no longer does
         rate = max(rate, math.log(left) / (per_block * period * (blocks.size - 1)))
     return rate, left
+
+
+def instability_notes(assembly: Assembly) -> tuple[str, ...]:
+    """Return a line where a loop is unstable with what its scenario states and its controller's model lacks.
+
+    One pair is flown for some seconds at the worst stated point: the largest heading that the course holds, and the
+    plant as it is.  Where the model lacks nothing, nothing is flown.
+    """
+    lacking = unmodelled(assembly)
+    if not lacking:
+        return ()
+    try:
+        result = measure_growth(assembly.scenario, heading=worst_heading(assembly), longest=_GLANCE)
+    except InputError:  # the flight itself will say what does not fit
+        return ()
+    if not result.ended and result.rate < _NOTABLE:
+        return ()
+    return (_instability_note(assembly.scenario, lacking, result),)
+
+
+def _instability_note(scenario: Scenario, lacking: tuple[Unmodelled, ...], result: Growth) -> str:
+    """Say what grows, with what, and which fields let the model have it."""
+    grows = f"a push grows {math.exp(result.rate):.3g}-fold a second"
+    if not result.rate > 0.0:
+        grows = f"a hover ends {result.ended}"
+    stated = ", ".join(entry.text for entry in lacking)
+    remedies = "; ".join(entry.field for entry in lacking)
+    note = f"unstable: {grows} with what the model of {scenario.controller.type} lacks: {stated}; to try: {remedies}"
+    quantities = " ".join(dict.fromkeys(entry.quantity for entry in lacking if entry.quantity))
+    if quantities:
+        note += f"; the stable range: quadsim stability ... --over {quantities}"
+    return note

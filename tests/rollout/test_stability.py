@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.linalg import expm, logm
 
+import quadsim
 from quadsim.errors import InputError
 from quadsim.mpc.ocp import Problem
-from quadsim.rollout.stability import Growth, measure_growth
+from quadsim.rollout import stability
+from quadsim.rollout.stability import Growth, instability_notes, measure_growth
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
+from quadsim.scenarios.mismatch import unmodelled
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import INDEX, Array
 
@@ -211,3 +216,94 @@ def test_a_flight_that_is_lost_is_unstable_and_says_why() -> None:
 def test_parts_that_do_not_fit_are_refused() -> None:
     with pytest.raises(InputError, match="hover"):
         measure_growth(load_scenario("paper-constrained"), changes={"actual.mass": 40.0})
+
+
+# --- before a flight -------------------------------------------------------------------------------------------------
+
+TURNED = {
+    "reference": {"type": "yaw_turns", "turns": [{"start": 0.0, "yaw": 60.0, "rate": 30.0}]},
+    "initial.euler": [0.0, 0.0, 60.0],
+    "duration": 10.0,
+    "constraints": [],
+}
+YAW_90 = {
+    "reference": {"type": "steps", "response_time": 1.5, "yaw": [{"start": 1.0, "stop": 20.0, "value": 90.0}]},
+    "constraints": [],
+}
+LATE = {
+    "controller": {"type": "nonlinear", "rotor_lag": "vehicle"},
+    "computation": {"delay": 0.03},
+    "constraints": [],
+}
+
+
+def notes_on(name: str, changes: dict[str, Any]) -> tuple[str, ...]:
+    return instability_notes(Assembly(load_scenario(name).replace(changes)))
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "parts"),
+    [
+        (
+            "paper-constrained",
+            TURNED,
+            [
+                "unstable: a push grows 3.6",
+                "the model of constrained lacks: a heading of 60 deg",
+                'controller.type = "robust", controller.heading = true',
+                "quadsim stability ... --over heading",
+            ],
+        ),
+        ("hummingbird-figure-eight", YAW_90, ["a heading of 90 deg", "controller.heading = true"]),
+        ("hummingbird-real-rotors", LATE, ["nonlinear lacks", "commands 30 ms late", "controller.delay = 0.03"]),
+        (
+            "hummingbird-figure-eight",
+            {"actual.rotor_spins": [-1, 1, -1, 1]},
+            ["actual.rotor_spins", "vehicle.rotor_spins"],
+        ),
+        ("crazyflie-real-rotors", {}, ["rotors that lag by 72 ms", 'controller.rotor_lag = "vehicle"', "--over lag"]),
+    ],
+)
+def test_an_unstable_loop_is_named_before_its_flight(name: str, changes: dict[str, Any], parts: list[str]) -> None:
+    (note,) = notes_on(name, changes)
+    assert [part for part in parts if part not in note] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("paper-constrained-lag20", {}),
+        ("yaw-turns", {}),
+        ("slow-solver", {}),
+        ("hummingbird-figure-eight", {"actual.mass": 0.75}),
+    ],
+)
+def test_a_loop_that_is_stable_with_what_its_model_lacks_has_no_note(name: str, changes: dict[str, Any]) -> None:
+    scenario = load_scenario(name).replace(changes)
+    assert unmodelled(Assembly(scenario)) != ()
+    assert instability_notes(Assembly(scenario)) == ()
+
+
+@pytest.mark.parametrize("name", ["paper-constrained", "hover", "robust", "playground", "nonlinear"])
+def test_nothing_is_flown_where_the_model_lacks_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The paper's course starts at a heading of 30 deg, and is to turn away from it at once."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a pair was flown")
+
+    monkeypatch.setattr(stability, "measure_growth", refuse)
+    assert notes_on(name, {}) == ()
+
+
+def test_the_field_that_is_named_makes_the_loop_stable() -> None:
+    table = load_scenario("robust").tables["controller"] | {"heading": True}
+    assert notes_on("paper-constrained", TURNED | {"controller": table}) == ()
+
+
+def test_run_check_and_feasibility_say_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    scenario = load_scenario("paper-constrained").replace(TURNED | {"duration": 0.5})
+    assert "a heading of 60 deg" in quadsim.feasibility(scenario).notes[-1]
+    with caplog.at_level(logging.INFO, logger="quadsim"):
+        quadsim.check(scenario, progress=False)
+        quadsim.run(scenario, out=tmp_path / "run", video=False, recording=False, figures=False, progress=False)
+    assert sum("a heading of 60 deg" in record.getMessage() for record in caplog.records) == 2
