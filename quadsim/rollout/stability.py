@@ -223,7 +223,7 @@ def _instability_note(scenario: Scenario, lacking: tuple[Unmodelled, ...], resul
     if not result.rate > 0.0:
         grows = f"a hover ends {result.ended}"
     stated = ", ".join(entry.text for entry in lacking)
-    remedies = "; ".join(entry.field for entry in lacking)
+    remedies = "; ".join(entry.remedy for entry in lacking)
     note = f"unstable: {grows} with what the model of {scenario.controller.type} lacks: {stated}; to try: {remedies}"
     quantities = " ".join(dict.fromkeys(entry.quantity for entry in lacking if entry.quantity))
     if quantities:

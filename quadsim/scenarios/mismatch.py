@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import numpy as np
 
@@ -32,7 +33,9 @@ class Unmodelled:
 
     quantity: str  # as `quadsim stability --over` calls it; empty for what that does not vary
     text: str  # what is stated, e.g. `a heading of 60 deg`
-    field: str  # the change by which the model has it
+    remedy: str  # the change by which the model has it
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """The same for `robust`: fields of its table by dotted path; empty for what no field of a controller gives it."""
 
 
 def unmodelled(assembly: Assembly) -> tuple[Unmodelled, ...]:
@@ -58,7 +61,8 @@ def _heading(assembly: Assembly) -> list[Unmodelled]:
         return []
     law = "" if "heading" in fields else 'controller.type = "robust", '
     text = f"a heading of {heading:.4g} deg"
-    return [Unmodelled(quantity="heading", text=text, field=f"{law}controller.heading = true")]
+    remedy = f"{law}controller.heading = true"
+    return [Unmodelled(quantity="heading", text=text, remedy=remedy, settings={"controller.heading": True})]
 
 
 def _delay(assembly: Assembly) -> list[Unmodelled]:
@@ -73,7 +77,8 @@ def _delay(assembly: Assembly) -> list[Unmodelled]:
     text = f"commands {1e3 * delay:.4g} ms late"
     if known:
         text += f", of which it knows {1e3 * known:.4g} ms"
-    return [Unmodelled(quantity="delay", text=text, field=f"{law}controller.delay = {delay:g}")]
+    remedy = f"{law}controller.delay = {delay:g}"
+    return [Unmodelled(quantity="delay", text=text, remedy=remedy, settings={"controller.delay": delay})]
 
 
 def _lag(assembly: Assembly) -> list[Unmodelled]:
@@ -82,8 +87,9 @@ def _lag(assembly: Assembly) -> list[Unmodelled]:
     lag = _stated_lag(assembly)
     if lag < SHORTEST_LAG or not _predicts_ideal_rotors(spec, assembly):
         return []
-    field = ", ".join(_lag_remedy(spec, assembly, lag))
-    return [Unmodelled(quantity="lag", text=f"rotors that lag by {1e3 * lag:.4g} ms", field=field)]
+    remedy = ", ".join(_lag_remedy(spec, assembly, lag))
+    text = f"rotors that lag by {1e3 * lag:.4g} ms"
+    return [Unmodelled(quantity="lag", text=text, remedy=remedy, settings={"controller.rotor_lag": lag})]
 
 
 def _actual(assembly: Assembly) -> list[Unmodelled]:
@@ -97,7 +103,7 @@ def _actual(assembly: Assembly) -> list[Unmodelled]:
             continue
         stated = [*value] if isinstance(value, tuple) else value
         quantity = _VARIED.get(name, "")
-        found.append(Unmodelled(quantity=quantity, text=f"actual.{name}", field=f"vehicle.{name} = {stated}"))
+        found.append(Unmodelled(quantity=quantity, text=f"actual.{name}", remedy=f"vehicle.{name} = {stated}"))
     return found
 
 
