@@ -306,6 +306,14 @@ def identification(data: Any) -> str:
     return f"A constraint is violated in {'; in '.join(by)}.\n"
 
 
+def stability(data: Any) -> str:
+    """Up to where each law is stable on each vehicle."""
+    rows = records(data)
+    head = [*rows[0]]
+    note = "`<` and `>`: up to the end of the range searched; `*`: no flight beyond; `core`: processor time.\n"
+    return table(head, [[row.get(name, "-") for name in head] for row in rows]) + "\n" + note
+
+
 def autopilots(data: Any) -> str:
     """How far Betaflight's flights are from those of the built-in autopilot."""
     rows = records(data)
@@ -328,7 +336,7 @@ CSV: Final[dict[str, Callable[[Any], list[Record]]]] = {
 """What docs/data keeps, and how its rows are read."""
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     **{each.__name__: each for each in (results, ablation, papers, peers, export, campaigns, solvers, nonlinear)},
-    **{each.__name__: each for each in (flight, campaign, film, identification, autopilots)},
+    **{each.__name__: each for each in (flight, campaign, film, identification, autopilots, stability)},
     "paper": both_flights,
     "first-flights": first_flights,
     "battery": batteries,
