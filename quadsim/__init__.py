@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from quadsim.features.identify.commands import identify as identify
     from quadsim.features.live.commands import live as live
     from quadsim.features.papers.commands import reproduce as reproduce
+    from quadsim.features.stability.commands import stability as stability
     from quadsim.rollout.flown import Flight as Flight
     from quadsim.rollout.rollout import Rollout as Rollout
     from quadsim.scenarios.scenario_summary import scenario_html as scenario_html
@@ -80,6 +81,7 @@ _MODULES = {
     "quadsim.features.identify.commands": "identify",
     "quadsim.features.live.commands": "live",
     "quadsim.features.papers.commands": "reproduce",
+    "quadsim.features.stability.commands": "stability",
     "quadsim.rollout.rollout": "Rollout",
     "quadsim.scenarios.scenario_summary": "scenario_html",
     "quadsim.scenarios.schema.json_schema": "scenario_schema",

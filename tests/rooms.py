@@ -43,6 +43,7 @@ PARTS: Final = {
     "identify": ("docs/identify.md",),
     "live": ("docs/live.md",),
     "papers": ("scenarios/papers",),
+    "stability": ("tests/scaled_laws.py", "benchmarks/stability.py", "docs/stability.md"),
 }
 """Folders, tests and pages of each feature, beside `quadsim/features/NAME` and `tests/features/NAME`."""
 

@@ -266,6 +266,17 @@ SESSIONS: Final[dict[str, Session]] = {
         lines=("live --help", "live hover --script pulled.toml --no-browser", "live hover --script gone.toml"),
         files={"pulled.toml": PULLED},
     ),
+    "stability": Session(
+        lines=(
+            "stability --help",
+            "stability pushed.toml --over delay --workers 1",
+            "stability pushed.toml --over heading --set controller.horizon=5",
+            "stability hover --over weight",
+            "stability hover --map delay",
+            "stability nope",
+        ),
+        files=FLIGHTS,
+    ),
     "identify": Session(
         lines=(
             "identify --help",

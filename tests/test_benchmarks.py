@@ -132,6 +132,12 @@ def test_the_interval_of_a_hover_s_thrust_holds_the_truth(tmp_path: Path) -> Non
     assert records["drag_to_thrust"]["passed"] == 0
 
 
+def test_the_margins_of_lqr_are_on_both_sides(tmp_path: Path) -> None:
+    (record,) = quick("stability", tmp_path)
+    assert (record["law"], record["heading [deg]"]) == ("lqr", "< -180 .. > 180")
+    assert 50.0 < float(record["delay [ms]"]) < 100.0
+
+
 def test_wrong_input_is_one_message(tmp_path: Path) -> None:
     done = script("benchmarks/solvers.py", "--scenario", "hover-pid", "--json", tmp_path / "out.json")
     assert done.returncode == 2

@@ -230,7 +230,7 @@ def test_guides_have_figures_and_every_picture_says_what_it_shows() -> None:
         assert all(shows for shows, _ in pictures), page.name
         if "quadsim.plot(" in text or any("figures/" in file for _, file in pictures):
             drawn.add(page.name)
-    assert {*guides} - drawn == {"audit.md", "campaigns.md", "export.md", "live.md"}
+    assert {*guides} - drawn == {"audit.md", "campaigns.md", "export.md", "live.md", "stability.md"}
 
 
 def test_sections_of_docstrings_have_their_titles_on_lines_of_their_own() -> None:

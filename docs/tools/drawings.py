@@ -92,7 +92,7 @@ def floors() -> str:
     """The floors of quadsim in docs/architecture.md, each above those that it imports, and the data beside them."""
     page = (ASSETS.parent / "architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (`.*`|`.*) \| ([^:;|]*).*\|$", page.partition("## Floors")[2], re.MULTILINE)
-    height, left, width = 34, 30, 520
+    height, left, width = 34, 30, 570
     parts = []
     for i, (folders, has) in enumerate(rows):
         y = 10 + i * (height + 6)
@@ -108,7 +108,7 @@ def floors() -> str:
         parts.append(text(left + width + 145, y + 32, folder, colour=TURN))
         parts.append(text(left + width + 145, y + 54, has))
         parts.append(arrow(left + width + 48, y + height, left + width + 6, y + height, "turn"))
-    return svg(800, bottom, parts)
+    return svg(850, bottom, parts)
 
 
 def box(x: float, y: float, width: float, height: float, colour: str) -> str:

@@ -43,7 +43,7 @@ BATTERIES: Final = {
 MEMBERS: Final = {"campaigns": CAMPAIGNS, "battery": tuple(BATTERIES)}
 BENCHMARKS: Final = (
     *("solvers", "flight", "nonlinear", "film", "campaign", "mismatch", "speed", "autopilots", "interfaces"),
-    *("identification", "intervals"),
+    *("identification", "intervals", "stability"),
 )
 KEPT: Final = ("solvers", "mismatch", "speed", "interfaces", "identification")
 """Benchmarks whose figure is kept in docs/."""
@@ -306,6 +306,14 @@ def identification(data: Any) -> str:
     return f"A constraint is violated in {'; in '.join(by)}.\n"
 
 
+def stability(data: Any) -> str:
+    """Up to where each law is stable on each vehicle."""
+    rows = records(data)
+    head = [*rows[0]]
+    note = "`<` and `>`: up to the end of the range searched; `*`: no flight beyond; `core`: processor time.\n"
+    return table(head, [[row.get(name, "-") for name in head] for row in rows]) + "\n" + note
+
+
 def autopilots(data: Any) -> str:
     """How far Betaflight's flights are from those of the built-in autopilot."""
     rows = records(data)
@@ -321,14 +329,14 @@ def records(data: Any) -> list[Record]:
 
 
 CSV: Final[dict[str, Callable[[Any], list[Record]]]] = {
-    **dict.fromkeys((*KEPT, "autopilots", "flight", "intervals", "nonlinear"), records),
+    **dict.fromkeys((*KEPT, "autopilots", "flight", "intervals", "nonlinear", "stability"), records),
     "papers": paper_rows,
     "peers": peer_rows,
 }
 """What docs/data keeps, and how its rows are read."""
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     **{each.__name__: each for each in (results, ablation, papers, peers, export, campaigns, solvers, nonlinear)},
-    **{each.__name__: each for each in (flight, campaign, film, identification, autopilots)},
+    **{each.__name__: each for each in (flight, campaign, film, identification, autopilots, stability)},
     "paper": both_flights,
     "first-flights": first_flights,
     "battery": batteries,

@@ -129,9 +129,12 @@ def feasibility(scenario: ScenarioName) -> Feasibility:
         >>> quadsim.feasibility(fast).problems[0]
         'roll up to 40.43 deg (bound 5)'
     """
+    from quadsim.rollout.stability import instability_notes
     from quadsim.scenarios import feasibility_check, loading
 
-    return feasibility_check.report(loading.assemble(scenario))
+    assembly = loading.assemble(scenario)
+    report = feasibility_check.report(assembly)
+    return replace(report, notes=(*report.notes, *instability_notes(assembly)))
 
 
 def make_controller(scenario: ScenarioName) -> Pilot:
@@ -302,13 +305,14 @@ def run(
     from quadsim.outputs import run_directory
     from quadsim.rollout.flown import require_film, write_run
     from quadsim.rollout.rollout import Rollout
+    from quadsim.rollout.stability import instability_notes
     from quadsim.scenarios import loading, user_code
     from quadsim.scenarios.feasibility_check import notes
 
     require_film(video, fps)
     parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces, reference)
     products = {"video": video, "recording": recording, "figures": figures}
-    for note in notes(parts[0]):
+    for note in (*notes(parts[0]), *instability_notes(parts[0])):
         _log.info(note)
     with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory, SignalHold():
         with reporting(progress) as report:
@@ -422,6 +426,7 @@ def check(
     from quadsim.rollout.flown import Check
     from quadsim.rollout.reaudit import reaudit
     from quadsim.rollout.rollout import Rollout
+    from quadsim.rollout.stability import instability_notes
     from quadsim.scenarios import loading
     from quadsim.scenarios.catalogue import names_directory
 
@@ -437,6 +442,8 @@ def check(
             _log.info("%s: %s", target, note)
     else:
         assembly = loading.assemble(target, changes, seed)
+        for note in instability_notes(assembly):
+            _log.info(note)
         with reporting(progress) as report:
             audited = replace(Rollout(assembly).fly(report), checked=Check())
     if file is not None:

@@ -117,6 +117,18 @@ FEATURES: Final[dict[str, Feature]] = {
             ),
         }
     ),
+    "stability": Feature(
+        commands={
+            "stability": FeatureCommand(
+                function="stability",
+                help="Measure the margins of a closed loop: how fast it settles, and what makes it unstable.",
+                examples=(
+                    "quadsim stability paper-constrained",
+                    "quadsim stability mine.toml --over delay lag --controller robust nonlinear --out margins",
+                ),
+            )
+        }
+    ),
     "gym": Feature(),
 }
 

@@ -16,11 +16,11 @@ from quadsim.errors import InputError
 from quadsim.flight.metrics import unrecovered
 from quadsim.mpc.laws.constrained import Constrained
 from quadsim.mpc.laws.robust import Robust
-from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.infeasibility import Settings, change_text, changed_scenario
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.feasibility_check import hover_notes, hover_speeds
+from quadsim.scenarios.mismatch import unmodelled
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
 
@@ -52,8 +52,8 @@ def tried(explanation: Mapping[str, Any], flight: Flight, fly: FlyUntil) -> dict
     report, scenario, assembly = {**explanation, "rejected": []}, flight.scenario, flight.assembly
     notes = hover_notes(assembly)
     report["sentence"] = "; ".join([*notes, report["sentence"]])
-    lagging = _predicting_lag(scenario, assembly) if report["feasible"] is False else []
-    candidates = _reaching_hover(scenario, assembly) if notes else [*lagging, *report["suggestions"]]
+    modelling = _modelling(scenario, assembly) if report["feasible"] is False else []
+    candidates = _reaching_hover(scenario, assembly) if notes else [*modelling, *report["suggestions"]]
     if not candidates:
         return report
     until = min(report["time"] + AFTER, scenario.duration)
@@ -124,17 +124,29 @@ def _lasts(margins: Array) -> bool:
     return bool(margins[-1] < RETURNING * margins.min())
 
 
-def _predicting_lag(scenario: Scenario, assembly: Assembly) -> list[dict[str, Any]]:
-    """Return the change by which a linear MPC predicts the rotors' lag, if it does not and they have one."""
-    spec, rotors = scenario.controller, assembly.effects.rotors
-    lag = 0.0 if rotors is None else rotors.rise or 0.0
-    if not isinstance(spec, Constrained | Robust) or lag < SHORTEST_LAG:
+def _modelling(scenario: Scenario, assembly: Assembly) -> list[dict[str, Any]]:
+    """Return the changes by which a linear MPC has what the scenario states and its model lacks.
+
+    All together come first, then each alone; with soft bounds, as a state that the old model led to may lie beyond hard
+    ones, and a heading without them as well.
+    """
+    spec = scenario.controller
+    if not isinstance(spec, Constrained | Robust):
         return []
-    if isinstance(spec, Robust) and spec.rotor_lag:
+    lacking = [dict(entry.settings) for entry in unmodelled(assembly) if entry.settings]
+    if not lacking:
         return []
     law: Settings = {} if isinstance(spec, Robust) else {"controller.type": "robust"}
     soft: Settings = {} if isinstance(spec, Robust) and spec.soft is not None else {"controller.soft": {}}
-    return [{"settings": {**law, **soft, "controller.rotor_lag": lag}, "after": None}]
+    together: dict[str, Any] = {}
+    for settings in lacking:
+        together |= settings
+    changes: list[Settings] = [{**law, **soft, **together}]
+    if len(lacking) > 1:
+        changes += [{**law, **soft, **settings} for settings in lacking]
+    if soft and "controller.heading" in together:
+        changes.append({**law, "controller.heading": True})
+    return [{"settings": settings, "after": None} for settings in changes]
 
 
 def _reaching_hover(scenario: Scenario, assembly: Assembly) -> list[dict[str, Any]]:

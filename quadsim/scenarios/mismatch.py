@@ -2,32 +2,154 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
 from quadsim.controller import ROTORS
+from quadsim.mpc.laws.lqr import LQRTable
 from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.mpc.tables.bounded import Weighted
 from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.plugin import Plugin
 from quadsim.scenarios.schema.controllers import AnyController
+from quadsim.scenarios.schema.events import SetpointEvent
 from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.state import Array, wrapped
+
+HELD_FOR: Final = 1.0
+"""Time for which a course has a heading, at least, to count as its largest [s]: not while it turns through it."""
+_LEVEL: Final = 1.0  # heading up to which a model linearised at zero yaw lacks nothing [deg]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unmodelled:
+    """Something that a scenario states and that the model of its controller lacks."""
+
+    quantity: str  # as `quadsim stability --over` calls it; empty for what that does not vary
+    text: str  # what is stated, e.g. `a heading of 60 deg`
+    remedy: str  # the change by which the model has it
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """The same for `robust`: fields of its table by dotted path; empty for what no field of a controller gives it."""
+
+
+def unmodelled(assembly: Assembly) -> tuple[Unmodelled, ...]:
+    """Return what a scenario states and the model of its controller lacks; nothing of a user's, which nobody knows.
+
+    That is the largest heading that the course holds, the time that commands take, the rotors' lag, and what `[actual]`
+    states.  Every law is built for the control period, so its model has that.
+    """
+    if isinstance(assembly.scenario.controller, Plugin):
+        return ()
+    return (*_heading(assembly), *_delay(assembly), *_lag(assembly), *_actual(assembly))
+
+
+def _heading(assembly: Assembly) -> list[Unmodelled]:
+    """Return the heading that a model linearised at zero yaw lacks."""
+    spec = assembly.scenario.controller
+    is_linear = isinstance(spec, Weighted | LQRTable)
+    fields = vars(spec)
+    if not is_linear or fields.get("heading", False):
+        return []
+    heading = worst_heading(assembly)
+    if abs(heading) <= _LEVEL:
+        return []
+    law = "" if "heading" in fields else 'controller.type = "robust", '
+    text = f"a heading of {heading:.4g} deg"
+    remedy = f"{law}controller.heading = true"
+    return [Unmodelled(quantity="heading", text=text, remedy=remedy, settings={"controller.heading": True})]
+
+
+def _delay(assembly: Assembly) -> list[Unmodelled]:
+    """Return the delay that the law does not bridge."""
+    computation, spec = assembly.scenario.computation, assembly.scenario.controller
+    delay = 0.0 if computation is None else computation.delay
+    fields = vars(spec)
+    known = fields.get("delay", 0.0)
+    if delay == known:
+        return []
+    law = "" if "delay" in fields else 'controller.type = "robust", '
+    text = f"commands {1e3 * delay:.4g} ms late"
+    if known:
+        text += f", of which it knows {1e3 * known:.4g} ms"
+    remedy = f"{law}controller.delay = {delay:g}"
+    return [Unmodelled(quantity="delay", text=text, remedy=remedy, settings={"controller.delay": delay})]
+
+
+def _lag(assembly: Assembly) -> list[Unmodelled]:
+    """Return the rotors' lag that a predictive law does not predict."""
+    spec = assembly.scenario.controller
+    lag = _stated_lag(assembly)
+    if lag < SHORTEST_LAG or not _predicts_ideal_rotors(spec, assembly):
+        return []
+    remedy = ", ".join(_lag_remedy(spec, assembly, lag))
+    text = f"rotors that lag by {1e3 * lag:.4g} ms"
+    return [Unmodelled(quantity="lag", text=text, remedy=remedy, settings={"controller.rotor_lag": lag})]
+
+
+def _actual(assembly: Assembly) -> list[Unmodelled]:
+    """Return the numbers of the vehicle that the law has otherwise; lags are left to `_lag`."""
+    actual = assembly.scenario.actual
+    if actual is None:
+        return []
+    found: list[Unmodelled] = []
+    for name, value in actual.overrides().items():
+        if value == getattr(assembly.vehicle, name) or name in ("rotor_rise", "rotor_fall"):
+            continue
+        stated = [*value] if isinstance(value, tuple) else value
+        quantity = _VARIED.get(name, "")
+        found.append(Unmodelled(quantity=quantity, text=f"actual.{name}", remedy=f"vehicle.{name} = {stated}"))
+    return found
+
+
+_VARIED: Final = {"mass": "mass", "inertia": "inertia", "thrust_coefficient": "thrust"}
+
+
+def worst_heading(assembly: Assembly) -> float:
+    """Return the heading farthest from zero that the course, or a set-point, has for `HELD_FOR` seconds [deg]."""
+    headings = wrapped(course_headings(assembly))
+    held = min(max(round(HELD_FOR / assembly.scenario.control_period), 1), headings.size)
+    farthest = headings[np.argsort(np.abs(headings), kind="stable")[-held]]
+    stated = [float(farthest)]
+    for event in assembly.scenario.events:
+        if isinstance(event, SetpointEvent) and "yaw" in event.values:
+            stated.append(float(wrapped(event.values["yaw"])))
+    return round(math.degrees(max(stated, key=abs)), 9)
 
 
 def model_notes(assembly: Assembly) -> list[str]:
     """Return a line if the plant's rotors lag and a predictive controller of the scenario predicts none."""
-    scenario, rotors = assembly.scenario, assembly.effects.rotors or RotorDynamics()
-    lag = rotors.rise or rotors.fall or 0.0
+    scenario = assembly.scenario
+    lag = _stated_lag(assembly)
     laws = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
     ideal = [spec for spec in laws if _predicts_ideal_rotors(spec, assembly)]
     if lag < SHORTEST_LAG or not ideal:
         return []
-    remedy = [] if isinstance(ideal[0], Robust | Nonlinear) else ['controller.type = "robust" or "nonlinear"']
-    if assembly.vehicle.rotor_rise is None:
-        remedy.append(f"vehicle.rotor_rise = {lag:g}")
-    remedy.append('controller.rotor_lag = "vehicle"')
+    remedy = _lag_remedy(ideal[0], assembly, lag)
     return [
         f"the rotors lag by {1e3 * lag:.4g} ms, and {ideal[0].type} predicts none; to predict it: {', '.join(remedy)}"
     ]
+
+
+def _stated_lag(assembly: Assembly) -> float:
+    """Return the time constant of the plant's rotors [s]."""
+    rotors = assembly.effects.rotors or RotorDynamics()
+    return rotors.rise or rotors.fall or 0.0
+
+
+def _lag_remedy(spec: AnyController, assembly: Assembly, lag: float) -> list[str]:
+    """Return the changes by which a predictive law predicts the lag [s]."""
+    remedy = [] if isinstance(spec, Robust | Nonlinear) else ['controller.type = "robust" or "nonlinear"']
+    if assembly.vehicle.rotor_rise is None:
+        remedy.append(f"vehicle.rotor_rise = {lag:g}")
+    remedy.append('controller.rotor_lag = "vehicle"')
+    return remedy
 
 
 def _predicts_ideal_rotors(spec: AnyController, assembly: Assembly) -> bool:
@@ -36,3 +158,10 @@ def _predicts_ideal_rotors(spec: AnyController, assembly: Assembly) -> bool:
     if isinstance(spec, Nonlinear):  # an autopilot's lags include that of its rotors
         return spec.commands == ROTORS and resolved_lag(spec.rotor_lag, assembly.vehicle) == 0.0
     return isinstance(spec, Weighted)
+
+
+def course_headings(assembly: Assembly) -> Array:
+    """Return the course's headings at the control instants of the flight (K,), without its filter [rad]."""
+    scenario = assembly.scenario
+    t = scenario.control_period * np.arange(scenario.periods + 1, dtype=np.float64)
+    return assembly.course.sample(t)[:, 3]

@@ -24,7 +24,7 @@ COMMANDS = [
     "reproduce",
     "run",
 ]
-COMMANDS += ["scenario", "vehicle", "video", "view"]
+COMMANDS += ["scenario", "stability", "vehicle", "video", "view"]
 
 
 def test_these_are_the_commands() -> None:

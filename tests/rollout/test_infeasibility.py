@@ -525,3 +525,45 @@ def test_what_cannot_be_flown_again_is_advised_as_not_flown(monkeypatch: pytest.
     late = quadsim.fly(tilted, progress=False).diagnosis
     assert late is not None
     assert "not flown" in late["advice"]
+
+
+TURN_AND_STEP = {
+    "type": "steps",
+    "response_time": 1.5,
+    "yaw": [{"start": 1.0, "stop": 20.0, "value": 90.0}],
+    "x": [{"start": 5.0, "stop": 20.0, "value": 1.0}],
+}
+BACKWARDS = {
+    "type": "waypoints",
+    "response_time": 1.0,
+    "speed": 0.8,
+    "points": [
+        {"position": [2.0, 0.0, 1.0], "yaw": -174.0, "hold": 1.0},
+        {"position": [2.0, 2.0, 1.0], "yaw": 172.0, "hold": 1.0},
+        {"position": [0.0, 2.0, 1.0], "yaw": -170.0},
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "others"),
+    [
+        ("hummingbird-figure-eight", {"reference": TURN_AND_STEP}, {}),
+        (
+            "hummingbird-real-rotors",
+            {"reference": BACKWARDS, "initial": {"position": [0.0, 0.0, 1.0], "euler": [0.0, 0.0, -174.0]}},
+            {"controller.rotor_lag": 0.0125},
+        ),
+    ],
+)
+def test_a_heading_that_the_model_lacks_is_the_first_that_is_tried_and_helps(
+    name: str, changes: dict[str, Any], others: dict[str, Any]
+) -> None:
+    """The QP has no answer because the model steers in the wrong direction: no bound is to blame."""
+    flight = quadsim.fly(load_scenario(name).replace(changes | {"constraints": [], "duration": 14.0}), progress=False)
+    diagnosis = flight.summary["diagnosis"]
+    turning = {"controller.type": "robust", "controller.soft": {}, "controller.heading": True}
+    assert diagnosis["suggestions"][0]["settings"] == turning | others
+    assert turning in [change["settings"] for change in diagnosis["suggestions"]]
+    assert diagnosis["advice"].startswith("to try, each flown until")
+    assert "controller.heading = true" in diagnosis["advice"]

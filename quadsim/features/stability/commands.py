@@ -1,0 +1,170 @@
+"""The command `quadsim stability`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+from cyclopts import Parameter
+
+from quadsim.errors import ParameterError
+from quadsim.features.arguments import Changes, File, Flag, Labels, ScenarioName, Watched, Whole
+
+if TYPE_CHECKING:
+    from quadsim.features.stability.report import Stability
+    from quadsim.scenarios.schema.scenario import Scenario
+
+    Controllers: TypeAlias = object
+else:
+    Stability = Any
+    Controllers = Annotated[Sequence[str], Parameter(consume_multiple=True)]
+
+
+def stability(
+    scenario: ScenarioName,
+    /,
+    *,
+    over: Labels = (),
+    controller: Controllers = (),
+    map: Labels = (),
+    size: float | None = None,
+    out: File | None = None,
+    overwrite: Flag = False,
+    workers: Whole | None = None,
+    changes: Changes = (),
+    seed: Whole | None = None,
+    progress: Watched = True,
+) -> Stability:
+    """Measure the margins of a closed loop: how fast it settles, and what makes it unstable.
+
+    Two flights of one seed hold a hover, one of them pushed a little; the growth of their difference tells whether the
+    loop is stable, whatever its law.  Each quantity is then changed in both directions, by bisection to 2 %.
+
+    Args:
+        scenario: library name, or path to a TOML file; its vehicle, controller, effects and sensors are used.
+        over: quantities: heading, delay, lag, mass, thrust, inertia, period, drag, tilt (default: all).
+        controller: controllers side by side, in place of the scenario's: names of laws, module:Class, or scenarios
+            whose controller is meant; in Python also classes.
+        map: two quantities; the loop is also measured over both together.
+        size: velocity [m/s] of a second, larger push, for which everything is measured, too: how far the region
+            reaches.
+        out: directory for the table, the figures and summary.json.
+        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
+        workers: processes (default: one per core).
+        changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
+        seed: replace the seed of everything random in the scenario.
+        progress: whether to show a bar on a terminal, and elsewhere a line every ten seconds.
+
+    Returns:
+        The `loops`, one for each controller and size, with `growth`, `margins` by quantity, and the `closest` of them;
+        and the `maps`.
+
+    Raises:
+        InputError: a quantity or a controller does not exist, or a loop cannot be built.
+        OutputError: the directory exists, or cannot be written.
+
+    Examples:
+        >>> import quadsim
+        >>> found = quadsim.stability("hover", over=["delay"], workers=1, progress=False)
+        >>> loop = found.loops[0]
+        >>> loop.growth.verdict, round(loop.growth.rate, 1)  # [1/s]
+        ('stable', -1.8)
+        >>> delay = loop.margins["delay"].upper
+        >>> delay.stable, delay.unstable  # [ms]
+        (75.0, 76.0)
+    """
+    from contextlib import nullcontext
+
+    from quadsim.console.progress import reporting
+    from quadsim.features.stability.margins import MeasuredLoop, Measuring
+    from quadsim.features.stability.quantities import quantities_named
+    from quadsim.features.stability.report import Stability as Found
+    from quadsim.outputs import reserving
+    from quadsim.rollout.stability import SIZE
+    from quadsim.scenarios.loading import load_scenario
+
+    quantities = quantities_named(over)
+    pair = _pair(map)
+    if pair is not None:
+        missing = [quantity for quantity in quantities_named(pair) if quantity not in quantities]
+        quantities = (*quantities, *missing)
+    if size is not None and not SIZE < size <= 5.0:
+        raise ParameterError("", "--size", size, f"above {SIZE:g} and at most 5 m/s")
+    stated = load_scenario(scenario, changes, seed)
+    sizes = [SIZE] if size is None else [SIZE, size]
+    loops = [
+        MeasuredLoop(name=name, scenario=flown, size=each)
+        for name, flown in _flown(stated, controller)
+        for each in sizes
+    ]
+    with nullcontext() if out is None else reserving(out, overwrite=overwrite), reporting(progress) as report:
+        measuring = Measuring(loops, workers=workers, progress=report)
+        measured = measuring.margins(quantities)
+        maps = tuple(
+            measuring.map(loop, margins, pair)
+            for loop, margins in zip(loops, measured, strict=True)
+            if pair is not None and {*pair} <= {*margins.margins}
+        )
+    result = Found(scenario=stated.name, loops=tuple(measured), quantities=quantities, maps=maps)
+    if out is None:
+        return result
+    from quadsim.console.results import after
+
+    with after(result, Path(out)):
+        return result.write(Path(out), overwrite=overwrite)
+
+
+def _pair(names: Sequence[str]) -> tuple[str, str] | None:
+    """Return the two quantities of a map; None without one."""
+    if not names:
+        return None
+    if len(names) != 2 or names[0] == names[1]:
+        raise ParameterError("", "--map", list(names), "names of two different quantities")
+    return names[0], names[1]
+
+
+def _flown(scenario: Scenario, controllers: object) -> list[tuple[str, Scenario]]:
+    """Return each controller's name with the scenario that has it, with the numbers of its vehicle's file."""
+    from quadsim.scenarios.assembly import Assembly
+
+    several = controllers if isinstance(controllers, list | tuple) else [controllers]
+    flown = [_with_controller(scenario, controller) for controller in several] or [
+        (str(scenario.controller.type), scenario)
+    ]
+    return [(name, Assembly(each).recorded.scenario) for name, each in _distinct(flown)]
+
+
+def _with_controller(scenario: Scenario, controller: object) -> tuple[str, Scenario]:
+    """Return a controller's name, and the scenario with it.
+
+    A law keeps the scenario's table if that is of the same type.
+    """
+    from quadsim.scenarios.loading import load_scenario
+    from quadsim.scenarios.plugin import is_plugin
+    from quadsim.scenarios.schema.controllers import LAWS
+    from quadsim.scenarios.schema.writing import plain
+    from quadsim.scenarios.user_code import importable
+
+    if not isinstance(controller, str | Path):
+        named = importable(scenario, controller)
+        return named.controller.type.rpartition(":")[2], named
+    text = str(controller)
+    if text == scenario.controller.type:
+        return text, scenario
+    if text in LAWS:
+        return text, scenario.replace({"controller": {"type": text}})
+    if is_plugin(text):
+        return text.rpartition(":")[2], importable(scenario, text)
+    other = load_scenario(text)
+    return other.name, scenario.replace({"controller": plain(other.controller)})
+
+
+def _distinct(flown: list[tuple[str, Scenario]]) -> list[tuple[str, Scenario]]:
+    """Number the names that occur several times."""
+    names = [name for name, _ in flown]
+    numbered = []
+    for i, (name, scenario) in enumerate(flown):
+        count = names[: i + 1].count(name)
+        numbered.append((name if count == 1 else f"{name} ({count})", scenario))
+    return numbered

@@ -1,0 +1,378 @@
+"""The margins of a loop: up to which value of each quantity it is stable, by bisection."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, Final, Literal, TypeAlias
+
+from quadsim.console.progress import Progress
+from quadsim.errors import InputError
+from quadsim.features.stability.quantities import VARIED, VariedQuantity, point
+from quadsim.rollout import many
+from quadsim.rollout.stability import Growth, hovering, measure_growth
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.feasibility_check import hover_notes
+from quadsim.scenarios.plugin import Plugin
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.ties import first_smallest
+
+WIDTH: Final = 0.02
+"""Width of the last bracket: as a share of a margin, or of the value where this is a factor."""
+_SHARES: Final = (1.0 / 16.0, 1.0 / 8.0, 1.0 / 4.0, 1.0 / 2.0, 1.0)
+"""Of the way to the end of a range, where a search looks first: a loop may be stable again beyond an unstable value."""
+_NARROWEST: Final = 5e-4  # bracket at which a search ends anyway, as a share of the way to the end of the range
+MAP_POINTS: Final = 9  # values of either quantity in a map
+_BEYOND: Final = 1.25  # how far a map reaches, over the margin
+
+PointState: TypeAlias = Literal["stable", "neutral", "unstable", "no flight"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopPoint:
+    """The loop at one value of each quantity."""
+
+    values: Mapping[str, float]
+    """By name of a quantity, in its unit."""
+    state: PointState
+    rate: float | None = None  # [1/s]; None without a flight, or where it ended at once
+    why: str = ""  # why no flight is possible, or why it ended early
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarginSide:
+    """One side of a margin.
+
+    The loop is stable at `stable`, and at every value looked at between the nominal one and that, and not at
+    `unstable`; this is None where it is stable up to the end of the range.
+    """
+
+    stable: float
+    unstable: float | None
+    state: PointState  # at `unstable`; `stable` where that is None
+    why: str  # why the vehicle cannot be flown at `unstable`, or why the flight ended; empty if it did not
+    points: tuple[LoopPoint, ...]  # those that the search looked at, in its order
+
+
+@dataclass(frozen=True, kw_only=True)
+class Margin:
+    """A quantity's margin on both sides of its nominal value; a side is None where the range ends at that."""
+
+    quantity: str
+    nominal: float
+    lower: MarginSide | None
+    upper: MarginSide | None
+
+    @property
+    def sides(self) -> tuple[MarginSide, ...]:
+        """The sides that there are, the upper one first."""
+        return tuple(side for side in (self.upper, self.lower) if side is not None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Closest:
+    """The margin that is the smallest, as a share of the nominal value or of the range; see `VariedQuantity`."""
+
+    quantity: str
+    value: float
+    share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopMargins:
+    """The growth of one loop at its nominal point, and its margins."""
+
+    name: str  # of the controller
+    size: float  # velocity at the start of the second flight [m/s]
+    growth: Growth
+    margins: Mapping[str, Margin]
+    """By quantity; empty unless the loop is stable at its nominal point."""
+    failures: tuple[str, ...] = ()  # searches that failed, with the reason
+
+    @property
+    def closest(self) -> Closest | None:
+        """The smallest margin, the first of equal ones; None where nothing within its range makes the loop unstable."""
+        found: list[Closest] = []
+        for name, margin in self.margins.items():
+            for side in margin.sides:
+                if side.state in ("unstable", "neutral"):
+                    share = VARIED[name].distance(margin.nominal, side.stable)
+                    found.append(Closest(quantity=name, value=side.stable, share=share))
+        if not found:
+            return None
+        return found[first_smallest([margin.share for margin in found])]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StabilityMap:
+    """The loop over two quantities: points row by row, the first quantity varying fastest."""
+
+    name: str  # of the controller
+    quantities: tuple[str, str]
+    values: tuple[tuple[float, ...], tuple[float, ...]]
+    points: tuple[LoopPoint, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredLoop:
+    """A loop to be measured."""
+
+    name: str  # of the controller
+    scenario: Scenario
+    size: float  # velocity at the start of the second flight [m/s]
+
+    @property
+    def calls_user_code(self) -> bool:
+        """Whether its flights call a user's controller or force."""
+        return isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
+
+
+def look(loop: MeasuredLoop, values: Mapping[str, float]) -> LoopPoint:
+    """Return what the loop does with these values of some quantities."""
+    assembly = Assembly(loop.scenario)
+    heading, changes = point(assembly, values)
+    try:
+        changed = hovering(loop.scenario, heading=heading, changes=changes)
+        notes = hover_notes(Assembly(changed))
+        if notes:
+            return LoopPoint(values=values, state="no flight", why=notes[0])
+        result = measure_growth(loop.scenario, heading=heading, size=loop.size, changes=changes)
+    except InputError as error:
+        return LoopPoint(values=values, state="no flight", why=str(error))
+    rate = result.rate if math.isfinite(result.rate) else None
+    return LoopPoint(values=values, state=result.verdict, rate=rate, why=result.ended)
+
+
+def find_side(at: Callable[[float], LoopPoint], value_at: Callable[[float], float], *, geometric: bool) -> MarginSide:
+    """Search one side of a margin: outwards, then by bisection of the first interval at whose end it is not stable.
+
+    Args:
+        at: looks at a value.
+        value_at: the value at a share of the way from the nominal value to the end of the range.
+        geometric: whether the value is a factor.
+    """
+    points: list[LoopPoint] = []
+    inner, outer = 0.0, None
+    for share in _SHARES:
+        points.append(at(value_at(share)))
+        if points[-1].state != "stable":
+            outer = share
+            break
+        inner = share
+    if outer is None:
+        return MarginSide(stable=value_at(1.0), unstable=None, state="stable", why="", points=tuple(points))
+    last = points[-1]
+    while _is_wide(value_at, inner, outer, geometric=geometric):
+        middle = 0.5 * (inner + outer)
+        points.append(at(value_at(middle)))
+        if points[-1].state == "stable":
+            inner = middle
+        else:
+            outer, last = middle, points[-1]
+    return MarginSide(
+        stable=value_at(inner), unstable=value_at(outer), state=last.state, why=last.why, points=tuple(points)
+    )
+
+
+def _is_wide(value_at: Callable[[float], float], inner: float, outer: float, *, geometric: bool) -> bool:
+    """Return whether a bracket, in shares of the way, is wider than `WIDTH`."""
+    if outer - inner < _NARROWEST:
+        return False
+    low, high = value_at(inner), value_at(outer)
+    if value_at(0.5 * (inner + outer)) in (low, high):
+        return False
+    if geometric:
+        return abs(math.log(high / low)) > WIDTH
+    return abs(high - low) > WIDTH * abs(high - value_at(0.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Search:
+    """A task of a worker: one side of a margin."""
+
+    loop: MeasuredLoop
+    quantity: str
+    upward: bool
+
+
+def _search(task: _Search) -> many.Row:
+    assembly = Assembly(task.loop.scenario)
+    quantity = VARIED[task.quantity]
+    nominal = quantity.nominal(assembly)
+    end = quantity.ends(nominal)[task.upward]
+    side = find_side(
+        lambda value: look(task.loop, {task.quantity: value}),
+        partial(quantity.between, nominal, end, step=quantity.step(assembly)),
+        geometric=quantity.geometric,
+    )
+    return {"side": side}
+
+
+def _grow(loop: MeasuredLoop) -> many.Row:
+    heading, _ = point(Assembly(loop.scenario), {})
+    return {"growth": measure_growth(loop.scenario, heading=heading, size=loop.size)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Look:
+    """A task of a worker: one point of a map."""
+
+    loop: MeasuredLoop
+    values: Mapping[str, float]
+
+
+def _look(task: _Look) -> many.Row:
+    return {"point": look(task.loop, task.values)}
+
+
+def measured_here(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> LoopMargins:
+    """Return the margins of one loop, without any where it is not stable, measured in this process.
+
+    Raises:
+        InputError: the loop cannot be built.
+    """
+    result: Growth = _grow(loop)["growth"]
+    tasks = list(_searches(loop, quantities)) if result.stable else []
+    sides = {(task.quantity, task.upward): _search(task)["side"] for task in tasks}
+    return LoopMargins(name=loop.name, size=loop.size, growth=result, margins=_margins(loop, quantities, sides))
+
+
+class Measuring:
+    """Measures loops in worker processes, and tells how far it is."""
+
+    def __init__(self, loops: Sequence[MeasuredLoop], *, workers: int | None, progress: Progress) -> None:
+        self._loops = loops
+        self._workers = workers
+        self._progress = progress
+        self._isolated = any(loop.calls_user_code for loop in loops)
+
+    def _rows(self, stage: str, tasks: Sequence[Any], work: many.Fly) -> list[many.Row]:
+        """Return the row of each task, in order."""
+        rows: list[many.Row] = [{} for _ in tasks]
+        self._progress(stage, 0, len(tasks))
+        done = 0
+        with closing(many.fly_many(tasks, work, workers=self._workers, isolate=self._isolated)) as finished:
+            for place, row in finished:
+                rows[place] = row
+                done += 1
+                self._progress(stage, done, len(tasks))
+        return rows
+
+    def growths(self) -> list[Growth]:
+        """Return the growth of each loop at its nominal point.
+
+        Raises:
+            InputError: a loop cannot be built.
+        """
+        growths: list[Growth] = []
+        for loop, row in zip(self._loops, self._rows("nominal", self._loops, _grow), strict=True):
+            if "growth" not in row:
+                raise InputError(f"{loop.name}: {row['reason']}")
+            growths.append(row["growth"])
+        return growths
+
+    def margins(self, quantities: Sequence[VariedQuantity]) -> list[LoopMargins]:
+        """Return the margins of each loop, without any where it is not stable.
+
+        Raises:
+            InputError: a loop cannot be built.
+        """
+        growths = self.growths()
+        tasks = [
+            task
+            for loop, result in zip(self._loops, growths, strict=True)
+            if result.stable
+            for task in _searches(loop, quantities)
+        ]
+        rows = self._rows("margins", tasks, _search) if tasks else []
+        found = list(zip(tasks, rows, strict=True))
+        measured: list[LoopMargins] = []
+        for loop, result in zip(self._loops, growths, strict=True):
+            own = [(task, row) for task, row in found if task.loop is loop]
+            failures = tuple(f"{task.quantity}: {row['reason']}" for task, row in own if "side" not in row)
+            sides = {(task.quantity, task.upward): row["side"] for task, row in own if "side" in row}
+            margins = _margins(loop, quantities, sides)
+            measured.append(
+                LoopMargins(name=loop.name, size=loop.size, growth=result, margins=margins, failures=failures)
+            )
+        return measured
+
+    def map(self, loop: MeasuredLoop, measured: LoopMargins, pair: tuple[str, str]) -> StabilityMap:
+        """Return the map of a stable loop over two quantities, somewhat beyond the margins of either."""
+        columns, rows = (_map_values(measured.margins[name]) for name in pair)
+        tasks = [_Look(loop=loop, values={pair[0]: x, pair[1]: y}) for y in rows for x in columns]
+        looked = self._rows("map", tasks, _look)
+        points = [
+            row["point"] if "point" in row else LoopPoint(values=task.values, state="no flight", why=row["reason"])
+            for task, row in zip(tasks, looked, strict=True)
+        ]
+        return StabilityMap(name=loop.name, quantities=pair, values=(columns, rows), points=tuple(points))
+
+
+def _searches(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> Iterator[_Search]:
+    """Yield the sides that lie within the range of each quantity."""
+    assembly = Assembly(loop.scenario)
+    for quantity in quantities:
+        nominal = quantity.nominal(assembly)
+        low, high = quantity.ends(nominal)
+        if low < nominal:
+            yield _Search(loop=loop, quantity=quantity.name, upward=False)
+        if high > nominal:
+            yield _Search(loop=loop, quantity=quantity.name, upward=True)
+
+
+def _margins(
+    loop: MeasuredLoop, quantities: Sequence[VariedQuantity], sides: Mapping[tuple[str, bool], MarginSide]
+) -> dict[str, Margin]:
+    """Return the margins of those quantities of which a side was found."""
+    assembly = Assembly(loop.scenario)
+    margins: dict[str, Margin] = {}
+    for quantity in quantities:
+        lower = sides.get((quantity.name, False))
+        upper = sides.get((quantity.name, True))
+        if lower is None and upper is None:
+            continue
+        nominal = quantity.nominal(assembly)
+        margins[quantity.name] = Margin(quantity=quantity.name, nominal=nominal, lower=lower, upper=upper)
+    return margins
+
+
+def _map_values(margin: Margin) -> tuple[float, ...]:
+    """Return the values of a map along one quantity."""
+    quantity = VARIED[margin.quantity]
+    ends = list(quantity.ends(margin.nominal))
+    for i, side in enumerate((margin.lower, margin.upper)):
+        if side is None:
+            ends[i] = margin.nominal
+        elif side.unstable is not None:
+            reached = margin.nominal + _BEYOND * (side.stable - margin.nominal)
+            ends[i] = max(reached, ends[0]) if i == 0 else min(reached, ends[1])
+    low, high = ends
+    return tuple(quantity.between(low, high, i / (MAP_POINTS - 1)) for i in range(MAP_POINTS))
+
+
+def to_plain(margins: LoopMargins) -> dict[str, Any]:
+    """Return the margins of a loop as plain data."""
+    closest = margins.closest
+    listed: dict[str, Any] = {}
+    for name, margin in margins.margins.items():
+        sides = {"lower": margin.lower, "upper": margin.upper}
+        listed[name] = {
+            "unit": VARIED[name].unit,
+            "nominal": margin.nominal,
+            **{which: None if side is None else asdict(side) for which, side in sides.items()},
+        }
+    growth = asdict(margins.growth)
+    for name in ("rate", "left"):
+        growth[name] = growth[name] if math.isfinite(growth[name]) else None
+    return {
+        "controller": margins.name,
+        "size": margins.size,
+        "growth": {**growth, "verdict": margins.growth.verdict},
+        "margins": listed,
+        "closest": None if closest is None else asdict(closest),
+        "failures": list(margins.failures),
+    }
