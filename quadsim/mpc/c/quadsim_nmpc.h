@@ -68,7 +68,7 @@ typedef struct quadsim_nmpc_problem {
     quadsim_real lead[4];       /* targets: time constants over the step, for the reference */
     const quadsim_real *left;   /* [2 substeps + 1][4] of a distance from the input, after each half substep */
     quadsim_real weight[QUADSIM_NMPC_MOST], effort[QUADSIM_INPUTS], move; /* diagonals of Q and R; of steps of inputs */
-    const quadsim_real *terminal;                                         /* [n][n] */
+    const quadsim_real *terminal;                                         /* [n][n], symmetric */
     quadsim_real lower[QUADSIM_INPUTS], upper[QUADSIM_INPUTS];
     quadsim_real tilt, turn[3];           /* of the thrust axis along a side of the polygon, [rad/s] */
     const quadsim_nmpc_term *terms;       /* of all rows */
