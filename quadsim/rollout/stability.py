@@ -225,7 +225,6 @@ def _instability_note(scenario: Scenario, lacking: tuple[Unmodelled, ...], resul
     stated = ", ".join(entry.text for entry in lacking)
     remedies = "; ".join(entry.remedy for entry in lacking)
     note = f"unstable: {grows} with what the model of {scenario.controller.type} lacks: {stated}; to try: {remedies}"
-    quantities = " ".join(dict.fromkeys(entry.quantity for entry in lacking if entry.quantity))
-    if quantities:
-        note += f"; the stable range: quadsim stability ... --over {quantities}"
+    if any(entry.quantity == "heading" for entry in lacking):
+        note += "; stable up to: quadsim stability ... --heading 0 --over heading"
     return note

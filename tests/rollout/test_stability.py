@@ -251,7 +251,7 @@ def notes_on(name: str, changes: dict[str, Any]) -> tuple[str, ...]:
                 "unstable: a push grows 3.6",
                 "the model of constrained lacks: a heading of 60 deg",
                 'controller.type = "robust", controller.heading = true',
-                "quadsim stability ... --over heading",
+                "quadsim stability ... --heading 0 --over heading",
             ],
         ),
         ("hummingbird-figure-eight", YAW_90, ["a heading of 90 deg", "controller.heading = true"]),
@@ -261,7 +261,7 @@ def notes_on(name: str, changes: dict[str, Any]) -> tuple[str, ...]:
             {"actual.rotor_spins": [-1, 1, -1, 1]},
             ["actual.rotor_spins", "vehicle.rotor_spins"],
         ),
-        ("crazyflie-real-rotors", {}, ["rotors that lag by 72 ms", 'controller.rotor_lag = "vehicle"', "--over lag"]),
+        ("crazyflie-real-rotors", {}, ["rotors that lag by 72 ms", 'controller.rotor_lag = "vehicle"']),
     ],
 )
 def test_an_unstable_loop_is_named_before_its_flight(name: str, changes: dict[str, Any], parts: list[str]) -> None:

@@ -28,6 +28,7 @@ def stability(
     over: Labels = (),
     controller: Controllers = (),
     map: Labels = (),
+    heading: float | None = None,
     size: float | None = None,
     out: File | None = None,
     overwrite: Flag = False,
@@ -47,6 +48,7 @@ def stability(
         controller: controllers side by side, in place of the scenario's: names of laws, module:Class, or scenarios
             whose controller is meant; in Python also classes.
         map: two quantities; the loop is also measured over both together.
+        heading: of the nominal hover [deg] (default: the one that the course has most).
         size: velocity [m/s] of a second, larger push, for which everything is measured, too: how far the region
             reaches.
         out: directory for the table, the figures and summary.json.
@@ -81,7 +83,7 @@ def stability(
     from quadsim.features.stability.quantities import quantities_named
     from quadsim.features.stability.report import Stability as Found
     from quadsim.outputs import reserving
-    from quadsim.rollout.stability import SIZE
+    from quadsim.rollout.stability import SIZE, hovering
     from quadsim.scenarios.loading import load_scenario
 
     quantities = quantities_named(over)
@@ -92,6 +94,10 @@ def stability(
     if size is not None and not SIZE < size <= 5.0:
         raise ParameterError("", "--size", size, f"above {SIZE:g} and at most 5 m/s")
     stated = load_scenario(scenario, changes, seed)
+    if heading is not None:
+        if not abs(heading) <= 180.0:
+            raise ParameterError("", "--heading", heading, "within +-180 deg")
+        stated = hovering(stated, heading=heading)
     sizes = [SIZE] if size is None else [SIZE, size]
     loops = [
         MeasuredLoop(name=name, scenario=flown, size=each)

@@ -238,6 +238,16 @@ def test_a_map_is_stable_at_the_nominal_point_and_not_beyond_both_margins(monkey
     assert "delay [ms] across, lag [ms] up" in found.text()
 
 
+def test_the_heading_of_the_nominal_hover_can_be_chosen() -> None:
+    """A course at 60 deg, under a law that is stable to 46 deg."""
+    turned = {"reference": {"type": "yaw_turns", "turns": [{"start": 0.0, "yaw": 60.0, "rate": 30.0}]}}
+    scenario = load_scenario("paper-unconstrained").replace(turned | {"duration": 10.0})
+    chosen = quadsim.stability(scenario, over=["drag"], heading=10.0, progress=False).loops[0]
+    assert chosen.growth.verdict == "stable"
+    with pytest.raises(ParameterError, match="--heading"):
+        quadsim.stability(scenario, heading=270.0)
+
+
 # --- wrong input ---------------------------------------------------------------------------------------------------
 
 
