@@ -49,6 +49,7 @@ PARTS: Final = {
 
 EVERY: Final = tuple(PARTS)
 USING: Final = {
+    "mpc/laws/test_delay.py": ("export",),
     "mpc/laws/test_law_in_c.py": ("export",),
     "mpc/laws/test_one_list_of_laws.py": ("design",),
     "test_palette.py": ("live",),

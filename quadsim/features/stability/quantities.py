@@ -25,7 +25,7 @@ HEADING: Final = "heading"
 """The quantity that is no field of a scenario, but the hover's own."""
 MOST_FACTOR: Final = 8.0  # largest factor that is searched, and inverse of the smallest
 MOST_TURN: Final = 180.0  # [deg]
-LATEST: Final = 200.0  # range of delay and rotor lag beyond the nominal [ms]
+MOST_MILLISECONDS: Final = 200.0  # range of delay and rotor lag beyond the nominal [ms]
 LEAST_LAG: Final = 1.0  # [ms]
 MOST_DRAG: Final = 8.0  # [1/s]
 MOST_TILT: Final = 60.0  # [deg]
@@ -183,7 +183,7 @@ def _from_zero(most: float) -> Callable[[float], tuple[float, float]]:
 
 
 def _lags(nominal: float) -> tuple[float, float]:
-    return min(LEAST_LAG, nominal), nominal + LATEST
+    return min(LEAST_LAG, nominal), nominal + MOST_MILLISECONDS
 
 
 def _about(most: float) -> Callable[[float], tuple[float, float]]:
@@ -204,7 +204,7 @@ _ALL: Final = (
         title="time from measurement to command, computation.delay",
         unit="ms",
         nominal=_delay,
-        ends=_from_zero(LATEST),
+        ends=_from_zero(MOST_MILLISECONDS),
         fields=_set_delay,
         step=_step,
     ),
