@@ -1,7 +1,6 @@
 /* Sequential quadratic programming: the reference, the start, steps and what is kept of them. */
 #include "quadsim_nmpc_qp.h"
 
-static const real CONVERGED = R(0.1); /* largest defect of a plan that is kept, with targets */
 static const real SHORTEST = R(0.1);  /* share of a step that Aitken's relaxation takes */
 enum { ROW_INTS = sizeof(quadsim_nmpc_row) / sizeof(int) };
 enum { PATIENCE = 8 }; /* steps without a new shortest one after which the largest share of a step is halved */
@@ -383,11 +382,11 @@ int quadsim_nmpc_keep(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, 
     work->defect = quadsim_nmpc_defect(work, world);
     on = !work->ends && work->iterations < p->iterations + p->corrections &&
          !(p->iterations > 1 && work->moved <= p->tolerance) &&
-         !(p->corrections > 0 && work->iterations >= p->iterations && work->defect <= CONVERGED);
+         !(p->corrections > 0 && work->iterations >= p->iterations && work->defect <= p->converged);
     if (on && p->iterations > 1) {
         relax(work);
     }
-    if (!on && work->defect > CONVERGED) {
+    if (!on && work->defect > p->converged) {
         if (p->targets) {
             (void)choose(work, world, work->u);
         }

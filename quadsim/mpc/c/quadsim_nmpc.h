@@ -58,6 +58,7 @@ typedef struct quadsim_nmpc_problem {
     int changes;                /* of the active set in a search, after which it is given up */
     int iterations, corrections; /* most SQP steps of a call; further ones, if the plan misses the dynamics by too much */
     quadsim_real tolerance;     /* change of a state or input at which further steps end */
+    quadsim_real converged;     /* largest defect of a plan that has converged */
     quadsim_real step, gravity; /* time between nodes [s], [m/s^2] */
     quadsim_real largest;       /* thrust that is a share of 1 [N]: of a rotor, or with targets the weight */
     quadsim_real effect[16];    /* maps shares to T [m/s^2] and I^-1 tau; with targets its diagonal to T and body rates */

@@ -4,10 +4,7 @@
 
 #include "quadsim_nmpc_math.h"
 
-static const real PLAUSIBLE = R(1e5);         /* of any number that is taken for a measurement */
 static const real KEPT_SIDE = R(-0.08715574274765817); /* cosine of 95 deg, half of what a heading may be off */
-static const real INFEASIBLE = R(1e-3);       /* violation of a row that a plan may have */
-static const real UPRIGHT = R(1.4);           /* pitch up to which Euler rates are as plausible as body rates [rad] */
 #ifdef QUADSIM_FLOAT
 static const real OUTSIDE = 1e-3F; /* tolerance of bounds on inputs, as a share of the largest */
 #else
@@ -434,13 +431,13 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int
     law->learns = 0;
     put_shares(numbers, acting, law->before);
     update_actuators(law, periods, acting);
-    if (!is_within(state, PLAUSIBLE, 12) || !is_within(reference, PLAUSIBLE, count_of(numbers, motion)) ||
+    if (!is_within(state, numbers->plausible, 12) || !is_within(reference, numbers->plausible, count_of(numbers, motion)) ||
         !is_finite(law->before, NU)) {
         return 0;
     }
     put_body(state, attitude, rates, law->measured);
     memcpy(law->measured + BODY, law->rotors, (size_t)actuators * sizeof(real));
-    if (!is_within(law->measured, PLAUSIBLE, BODY + actuators)) {
+    if (!is_within(law->measured, numbers->plausible, BODY + actuators)) {
         return 0;
     }
     if (motion) {
@@ -462,7 +459,7 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int
     balance_reference(law);
     if (numbers->delay != NULL) {
         quadsim_delay_predict(&law->delay, numbers->delay, &law->world, law->measured, law->measured);
-        return is_within(law->measured, PLAUSIBLE, BODY + actuators);
+        return is_within(law->measured, numbers->plausible, BODY + actuators);
     }
     return 1;
 }
@@ -484,7 +481,7 @@ enum quadsim_status quadsim_nonlinear_end(quadsim_nonlinear *law, enum quadsim_n
             status = QUADSIM_OUT_OF_BOUNDS;
         }
     }
-    if (status <= QUADSIM_WHOLE && !(work->violation <= INFEASIBLE)) {
+    if (status <= QUADSIM_WHOLE && !(work->violation <= law->numbers->infeasible)) {
         status = QUADSIM_INFEASIBLE_ANSWER;
     }
     if (status > QUADSIM_WHOLE) {
@@ -496,7 +493,7 @@ enum quadsim_status quadsim_nonlinear_end(quadsim_nonlinear *law, enum quadsim_n
             put_commands(numbers, inputs + i * NU, law->plan + (i * numbers->stride + j) * NU);
         }
     }
-    return work->defect > numbers->converged ? QUADSIM_NOT_CONVERGED : status;
+    return work->defect > numbers->problem->converged ? QUADSIM_NOT_CONVERGED : status;
 }
 
 /* ---- with the fallback contract ------------------------------------------------------------------------------------ */
@@ -563,7 +560,7 @@ enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_
         const int *unseen = guard->unseen;
         const int turned = unseen[ROLL] == 0 && unseen[PITCH] == 0 && unseen[YAW] == 0;
         const int turning = unseen[ROLL + 1] == 0 && unseen[PITCH + 1] == 0 && unseen[YAW + 1] == 0;
-        const int steep = magnitude(guard->state[PITCH]) >= UPRIGHT; /* where Euler rates are implausible, not a gyro's */
+        const int steep = magnitude(guard->state[PITCH]) >= law->numbers->upright; /* where Euler rates are implausible, not a gyro's */
         const real *attitude = turned ? state + 12 : NULL, *rates = turning || steep ? state + 16 : NULL;
         status = QUADSIM_INVALID_DATA;
         if (quadsim_nonlinear_begin(law, guard->asked, phase == QUADSIM_PHASE_FLYING, numbers->motion, guard->state,

@@ -42,7 +42,8 @@ from quadsim.errors import ParameterError
 from quadsim.mpc.estimate.disturbance import RampObserver
 from quadsim.mpc.estimate.observer import DisturbanceObserver, disturbance_of
 from quadsim.mpc.forms.staged import Staged
-from quadsim.mpc.guard.answer import ActuatorBounds, AnswerCheck, command_of, refused, resized
+from quadsim.mpc.guard.answer import INFEASIBLE, ActuatorBounds, AnswerCheck, command_of, refused, resized
+from quadsim.mpc.guard.numbers import PLAUSIBLE, UPRIGHT
 from quadsim.mpc.guard.structs import STATUSES
 from quadsim.mpc.laws.nonlinear import MOST_LATE, Nonlinear
 from quadsim.mpc.laws.parts.body import next_states, unpacked, width_of
@@ -159,6 +160,7 @@ class NonlinearMPC:
             iterations=settings.iterations,
             corrections=CORRECTIONS if self.model.targets else 0,
             tolerance=tolerance,
+            converged=CONVERGED,
             faces=0 if space is None else space.count,
             price=None if space is None else space.penalty,
         )
@@ -214,7 +216,9 @@ class NonlinearMPC:
             coefficient=vehicle.mean_coefficient,
             left=math.exp(-self._period / self._lag) if self._lag else 0.0,
             least_lift=LEAST_LIFT,
-            converged=CONVERGED,
+            plausible=PLAUSIBLE.max(),
+            infeasible=INFEASIBLE,
+            upright=UPRIGHT,
         )
         for name, (body, _) in self.bodies.items():
             setattr(numbers, name, ctypes.addressof(body))

@@ -106,6 +106,7 @@ def nonlinear_program(
     iterations: int,
     corrections: int,
     tolerance: float,
+    converged: float,
     faces: int = 0,
     price: tuple[float, float] | None = None,
 ) -> SQPProgram:
@@ -120,6 +121,7 @@ def nonlinear_program(
         iterations: most steps in a period.
         corrections: further steps, if the plan misses the dynamics by too much.
         tolerance: change of a state or an input at which further steps end.
+        converged: largest defect of a plan that has converged.
         faces: half-spaces of positions per node.
         price: l1 and l2 of leaving the largest of a node's half-spaces; None if they are hard.
 
@@ -156,6 +158,7 @@ def nonlinear_program(
         iterations=iterations,
         corrections=corrections,
         tolerance=tolerance,
+        converged=converged,
         move=problem.objective.move_weight[0, 0],
     )
     size = model.n + N_ROTORS * moves
