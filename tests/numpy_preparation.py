@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from quadsim.mpc.estimate.observer import UPRIGHT, DisturbanceObserver
+from quadsim.mpc.estimate.observer import LEAST_UPRIGHT, DisturbanceObserver
 from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.equilibrium import LEAST_LIFT, Trim
 from quadsim.mpc.problem.heading import slope, turn_horizontally
@@ -118,7 +118,7 @@ def surprise(measured: Array, expected: Array) -> Array:
     """Innovations (6,): along world x, y and the thrust, whatever its direction, and about the body's axes."""
     axis = body_to_world(measured[[*EULER]])[:, 2]
     missed = (measured - expected)[[*VELOCITY]]
-    along = missed[2] / max(axis[2], UPRIGHT)
+    along = missed[2] / max(axis[2], LEAST_UPRIGHT)
     rates = [euler_to_body_rates(state[[*EULER]], state[[*EULER_RATE]]) for state in (measured, expected)]
     return np.concatenate([(missed - along * axis)[:2], [along], rates[0] - rates[1]])
 

@@ -1,4 +1,4 @@
-"""The controllers: model predictive control in numpy, scipy and PIQP, usable without a simulator.
+"""The controllers: model predictive control in Python and C, usable without a simulator.
 
 Public names are imported on first use: `quadsim.mpc.LinearMPC`, `quadsim.mpc.paper`, ...  `docs/conventions.md` defines
 states, units, frames and margins.

@@ -220,10 +220,10 @@ def instability_notes(assembly: Assembly) -> tuple[str, ...]:
 def _instability_note(scenario: Scenario, lacking: tuple[Unmodelled, ...], result: Growth) -> str:
     """Say what grows, with what, and which fields let the model have it."""
     grows = f"a push grows {math.exp(result.rate):.3g}-fold a second"
-    if not result.rate > 0.0:
+    if result.ended or not result.rate > 0.0:
         grows = f"a hover ends {result.ended}"
     stated = ", ".join(entry.text for entry in lacking)
-    remedies = "; ".join(entry.remedy for entry in lacking)
+    remedies = "; ".join(entry.remedy for entry in lacking if entry.remedy)
     note = f"unstable: {grows} with what the model of {scenario.controller.type} lacks: {stated}; to try: {remedies}"
     if any(entry.quantity == "heading" for entry in lacking):
         note += "; stable up to: quadsim stability ... --heading 0 --over heading"

@@ -77,8 +77,11 @@ def _delay(assembly: Assembly) -> list[Unmodelled]:
     law = "" if "delay" in fields else 'controller.type = "robust", '
     text = f"commands {1e3 * delay:.4g} ms late"
     if known:
-        text += f", of which it knows {1e3 * known:.4g} ms"
+        text += f", where it expects {1e3 * known:.4g} ms"
     remedy = f"{law}controller.delay = {delay:g}"
+    commands = fields.get("commands", ROTORS)
+    if commands == "attitude" or (commands != ROTORS and delay >= assembly.scenario.control_period):
+        remedy = ""  # such a law takes no delay, or none of a period
     return [Unmodelled(quantity="delay", text=text, remedy=remedy, settings={"controller.delay": delay})]
 
 

@@ -111,6 +111,7 @@ class StabilityMap:
     """The loop over two quantities: points row by row, the first quantity varying fastest."""
 
     name: str  # of the controller
+    size: float  # velocity at the start of the second flight [m/s]
     quantities: tuple[str, str]
     values: tuple[tuple[float, ...], tuple[float, ...]]
     points: tuple[LoopPoint, ...]
@@ -309,7 +310,9 @@ class Measuring:
             row["point"] if "point" in row else LoopPoint(values=task.values, state="no flight", why=row["reason"])
             for task, row in zip(tasks, looked, strict=True)
         ]
-        return StabilityMap(name=loop.name, quantities=pair, values=(columns, rows), points=tuple(points))
+        return StabilityMap(
+            name=loop.name, size=loop.size, quantities=pair, values=(columns, rows), points=tuple(points)
+        )
 
 
 def _searches(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> Iterator[_Search]:

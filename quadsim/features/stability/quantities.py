@@ -67,7 +67,10 @@ class VariedQuantity:
         value = start * (end / start) ** share if self.geometric else start + (end - start) * share
         if step == 0.0:
             return value
-        return round(max(round(value / step), 1) * step, 9)
+        steps = round(value / step)
+        if end != 0.0:
+            steps = max(steps, 1)
+        return round(steps * step, 9)
 
     def distance(self, nominal: float, value: float) -> float:
         """Return how far a value is from the nominal, as `measure` says."""

@@ -289,7 +289,7 @@ def _map_grid(found: StabilityMap) -> Grid:
         lines.append(line(f"{value:.3g}", *cells))
     return Grid(
         key=f"map-{across.name}-{up.name}",
-        title=f"{found.name}: growth [1/s], {across.label} across, {up.label} up",
+        title=f"{found.name}, {found.size:g} m/s: growth [1/s], {across.label} across, {up.label} up",
         head=("", *(f"{value:.3g}" for value in found.values[0])),
         lines=tuple(lines),
         note="Negative: stable.",
@@ -315,8 +315,9 @@ def _map_figure(found: StabilityMap) -> Figure:
             )
         )
     panel = Panel(title=up.name, unit=up.unit, x_label=across.label, areas=tuple(areas), legend=True, height=2.4)
-    title = f"{found.name}: stable or not"
-    return Figure(key=f"map-{across.name}-{up.name}-{found.name}", title=title, panels=(panel,), columns=1)
+    title = f"{found.name}, {found.size:g} m/s: stable or not"
+    key = f"map-{across.name}-{up.name}-{found.name}-{found.size:g}"
+    return Figure(key=key, title=title, panels=(panel,), columns=1)
 
 
 def _edges(values: Sequence[float]) -> list[float]:

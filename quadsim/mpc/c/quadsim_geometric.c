@@ -628,10 +628,10 @@ static void plan_commands(quadsim_geometric *law, int flying, const real *measur
     const numbers_of_law *n = law->numbers;
     const quadsim_guard *guard = &law->guard;
     const int *unseen = guard->unseen;
-    const int turned = unseen[ROLL] == 0 && unseen[PITCH] == 0 && unseen[YAW] == 0;
+    const int turned = quadsim_guard_turned(guard);
     const int turning = unseen[ROLL + 1] == 0 && unseen[PITCH + 1] == 0 && unseen[YAW + 1] == 0;
     const real *attitude = n->exact && turned && is_finite(measured + 12, 4) ? measured + 12 : NULL;
-    const real *rates = n->exact && turning && is_finite(measured + 16, 3) ? measured + 16 : NULL;
+    const real *rates = n->exact && quadsim_guard_has_rates(guard) && is_finite(measured + 16, 3) ? measured + 16 : NULL;
     motion_now motion;
     target_now target;
     const int moved = unseen[VX] == 0 && unseen[VY] == 0 && unseen[VZ] == 0;

@@ -524,6 +524,17 @@ enum quadsim_status quadsim_guard_check(const quadsim_guard *guard, enum quadsim
     return status;
 }
 
+int quadsim_guard_turned(const quadsim_guard *guard)
+{
+    return guard->unseen[ROLL] == 0 && guard->unseen[PITCH] == 0 && guard->unseen[YAW] == 0;
+}
+
+int quadsim_guard_has_rates(const quadsim_guard *guard)
+{
+    const int turning = guard->unseen[ROLL + 1] == 0 && guard->unseen[PITCH + 1] == 0 && guard->unseen[YAW + 1] == 0;
+    return turning || magnitude(guard->state[PITCH]) >= guard->numbers->upright;
+}
+
 int quadsim_guard_foresees(const quadsim_guard *guard, enum quadsim_phase phase, enum quadsim_status status)
 {
     return guard->planned && phase != QUADSIM_PHASE_LANDED && !quadsim_is_flown(status);

@@ -53,6 +53,7 @@ typedef struct quadsim_fallback {
     quadsim_real largest_command;  /* most that is taken for a command */
     quadsim_real largest_reference; /* and for a reference [m], [rad] */
     quadsim_real distance[12];     /* from a plan's states at most */
+    quadsim_real upright;          /* pitch below which implausible Euler rates are a fault of the measurement [rad] */
     quadsim_real plausible[12], unmoved[12]; /* most that is taken for a measurement; least motion of what moves */
     quadsim_real noise[12], unknown[12]; /* variances of what is measured, and before the first measurement */
     quadsim_real process[6];       /* of the prediction: position, with velocity, velocity; the same of angles */
@@ -111,6 +112,11 @@ enum quadsim_status quadsim_guard_begin(quadsim_guard *guard, enum quadsim_phase
 
 /* The law's status, unless its plan [horizon][4] may not be flown. */
 enum quadsim_status quadsim_guard_check(const quadsim_guard *guard, enum quadsim_status status, const quadsim_real *plan);
+
+/* Whether the attitude was measured; and whether the body rates may be taken: near a pitch of 90 deg, Euler rates are
+ * implausibly large, but body rates are not. */
+int quadsim_guard_turned(const quadsim_guard *guard);
+int quadsim_guard_has_rates(const quadsim_guard *guard);
 
 /* Whether `foreseen` is to be moved on by a period under quadsim_guard_row, as the law's answer is not flown but its plan
  * may be: by quadsim_guard_foresee, or by a model of the law's. */

@@ -239,7 +239,7 @@ enum quadsim_nmpc_status quadsim_nmpc_solve(quadsim_nmpc_work *work)
         if (status == QUADSIM_NMPC_GIVEN_UP && work->allowed < work->p->changes) {
             memset(work->held, 0, sizeof(int) * (size_t)size);
             quadsim_nmpc_optimum(work, work->p->horizon - 1);
-            work->inner = quadsim_nmpc_interior(work, 1, COMPLEMENTARY_ROWS, MOST_INNER_ROWS);
+            work->inner += quadsim_nmpc_interior(work, 1, COMPLEMENTARY_ROWS, MOST_INNER_ROWS);
             work->allowed = work->p->changes;
             status = search_held(work);
         }

@@ -557,11 +557,8 @@ enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_
     if (status == QUADSIM_FREE && phase == QUADSIM_PHASE_LANDED) {
         quadsim_nonlinear_stand(law, guard->asked, guard->in_force);
     } else if (status == QUADSIM_FREE) {
-        const int *unseen = guard->unseen;
-        const int turned = unseen[ROLL] == 0 && unseen[PITCH] == 0 && unseen[YAW] == 0;
-        const int turning = unseen[ROLL + 1] == 0 && unseen[PITCH + 1] == 0 && unseen[YAW + 1] == 0;
-        const int steep = magnitude(guard->state[PITCH]) >= law->numbers->upright; /* where Euler rates are implausible, not a gyro's */
-        const real *attitude = turned ? state + 12 : NULL, *rates = turning || steep ? state + 16 : NULL;
+        const real *attitude = quadsim_guard_turned(guard) ? state + 12 : NULL;
+        const real *rates = quadsim_guard_has_rates(guard) ? state + 16 : NULL;
         status = QUADSIM_INVALID_DATA;
         if (quadsim_nonlinear_begin(law, guard->asked, phase == QUADSIM_PHASE_FLYING, numbers->motion, guard->state,
                                     attitude, rates, reference, guard->in_force)) {

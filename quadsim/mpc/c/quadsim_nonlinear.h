@@ -51,7 +51,6 @@ typedef struct quadsim_nonlinear_numbers {
     quadsim_real least_lift;              /* least thrust at rest as a share of the weight */
     quadsim_real plausible;               /* largest magnitude of a number that is taken for a measurement */
     quadsim_real infeasible;              /* violation of a row that a plan may have */
-    quadsim_real upright;                 /* pitch up to which Euler rates are as plausible as body rates [rad] */
 } quadsim_nonlinear_numbers;
 
 /* A controller.  Read guard.level, work.changes and plan [rows][4], the last optimum as commands; the rest is its own. */

@@ -25,7 +25,7 @@ from annotated_types import doc
 from quadsim.fields import Positive
 from quadsim.state import Array
 
-UPRIGHT: Final = 0.1
+LEAST_UPRIGHT: Final = 0.1
 """Smallest vertical component of the thrust axis at which changes of vertical speed are attributed to thrust."""
 LONGEST_SPAN: Final = 0.25
 """Longest time between two measured states [s] that the observer compares; a sensor of 4 Hz."""

@@ -43,7 +43,7 @@ from quadsim.controller import (
     StepInputs,
     stopped,
 )
-from quadsim.core.mirror import core_library, set_members, struct
+from quadsim.core.mirror import constant, core_library, set_members, struct
 from quadsim.errors import FlightError, ParameterError
 from quadsim.mpc.guard.answer import ActuatorBounds, resized
 from quadsim.mpc.guard.numbers import UPRIGHT, fallback_numbers
@@ -59,12 +59,17 @@ from quadsim.vehicle import N_ROTORS
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """Exceptions of numerics and compiled back ends.  Programming errors (`TypeError`, `KeyError`, ...) end the run."""
 _MISTAKES: Final = (NotImplementedError, RecursionError)  # subclasses of `RuntimeError` that are programming errors
-_CALLED: Final = 0  # QUADSIM_FREE, by which the C wants the law to be called
+_CALLED: Final = constant("QUADSIM_FREE")  # by which the C wants the law to be called
 _ANSWERED: Final = STATUSES.index(COMMANDED)
 _FAILED: Final = STATUSES.index(INVALID_DATA)
 _LOST: Final = STATUSES.index("state_unknown")
 """What the C has to tell apart: an answer that is flown, none, and none because the state is not known."""
-PHASES: Final[Mapping[Phase, int]] = {Phase.FLYING: 0, Phase.ARMED: 1, Phase.LANDED: 2, Phase.CRASHED: 2}
+PHASES: Final[Mapping[Phase, int]] = {
+    Phase.FLYING: constant("QUADSIM_PHASE_FLYING"),
+    Phase.ARMED: constant("QUADSIM_PHASE_ARMED"),
+    Phase.LANDED: constant("QUADSIM_PHASE_LANDED"),
+    Phase.CRASHED: constant("QUADSIM_PHASE_LANDED"),
+}
 """`enum quadsim_phase` by phase."""
 
 
@@ -185,6 +190,7 @@ class Guard:
         self._kept = resized(self._kept, horizon)
         self._struct.horizon = horizon
         self._struct.kept = self._kept.ctypes.data
+        self._predicted = None  # along a plan of the old horizon
 
     def _set_trim(self, law: Controller) -> None:
         trim = self.trim(law)

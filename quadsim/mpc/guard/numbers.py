@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 
 from quadsim.controller import LARGEST_SPEED
+from quadsim.mpc.estimate.disturbance import SAME_TIME
 from quadsim.mpc.estimate.observer import LONGEST_SPAN
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import FallbackSettings
@@ -113,7 +114,7 @@ def fallback_numbers(
         "plan_age": _periods(settings.plan_age + _ROUNDING, period),
         "hover_periods": min(math.ceil((settings.hover - _ROUNDING) / period), MOST_PERIODS),
         "unseen": _periods(settings.unseen, period),
-        "compared": _periods(LONGEST_SPAN + 1e-6, period),
+        "compared": _periods(LONGEST_SPAN + SAME_TIME, period),
         "sink": settings.sink,
         "sunk": settings.sink * period,
         "settled": settings.settled,
@@ -123,6 +124,7 @@ def fallback_numbers(
         "largest_command": LARGEST_SPEED,
         "largest_reference": PLAUSIBLE_REFERENCE,
         "distance": settings.distance,
+        "upright": UPRIGHT,
         "plausible": PLAUSIBLE,
         "unmoved": UNMOVED,
         "noise": NOISE**2,

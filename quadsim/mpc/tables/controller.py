@@ -47,7 +47,7 @@ class ControllerTable:
     output_bounds: Mapping[str, Sequence[float]] = MappingProxyType({})
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """Return the law in Python for a control `period` [s], with obstacles and regions `shapes`.
+        """Return the law for a control `period` [s], with obstacles and regions `shapes`.
 
         Raises:
             InputError: no controller can be built from these numbers.

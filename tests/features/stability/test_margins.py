@@ -226,10 +226,16 @@ def test_two_controllers_stand_side_by_side(hummingbird: Scenario, tmp_path: Pat
 
 
 @pytest.mark.slow("stability")
-def test_a_map_is_stable_at_the_nominal_point_and_not_beyond_both_margins(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_is_stable_at_the_nominal_point_and_not_beyond_both_margins(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A second, larger push has a map of its own."""
     for module in ("margins", "report"):
         monkeypatch.setattr(f"quadsim.features.stability.{module}.MAP_POINTS", 3)
-    found = quadsim.stability("paper-unconstrained", over=["delay"], map=["delay", "lag"], progress=False)
+    options = {"over": ["delay"], "map": ["delay", "lag"], "size": 0.1, "out": tmp_path / "maps"}
+    found = quadsim.stability("paper-unconstrained", **options, progress=False)  # type: ignore[arg-type]
+    assert [each.size for each in found.maps] == [0.001, 0.1]
+    assert len([*(tmp_path / "maps").glob("map-*.png")]) == 2
     assert found.maps[0].quantities == ("delay", "lag")
     states = [looked.state for looked in found.maps[0].points]
     assert len(states) == 9

@@ -237,6 +237,23 @@ def test_a_plan_of_other_commands_is_not_taken_over() -> None:
     assert call(second).fallback == 2
 
 
+@pytest.mark.parametrize("horizon", [3, 10, 40])
+def test_a_law_may_change_its_horizon_while_it_fails(horizon: int) -> None:
+    """The state that its last plan leads to is then foreseen anew."""
+    inner = Scripted(failing(range(1, 30)), horizon=5)
+    guarded = guard(inner)
+    state = np.zeros(12)
+    levels = []
+    for k in range(12):
+        if k == 3:
+            inner.horizon = horizon
+        command = call(guarded, state)
+        levels.append(command.fallback)
+        state = advance(state, command.speeds)
+    assert levels[:3] == [0, 1, 1]
+    assert set(levels[3:]) <= {1, 2}
+
+
 def test_a_law_may_change_its_horizon() -> None:
     inner = Scripted(failing([1, 3]))
     guarded = guard(inner)

@@ -160,7 +160,7 @@ class LinearMPC:
 
         Args:
             preparation: makes the query of each period.
-            solver: the problem's (`quadsim.mpc.solvers.make_solver`).
+            solver: the problem's (`quadsim.mpc.solvers.by_name.make_solver`).
             name: of the law, in summaries.
             holds: whether the last plan is held where a QP has no answer.
             space: the obstacles to avoid; None for none.

@@ -43,7 +43,7 @@ from quadsim.mpc.estimate.disturbance import RampObserver
 from quadsim.mpc.estimate.observer import DisturbanceObserver, disturbance_of
 from quadsim.mpc.forms.staged import Staged
 from quadsim.mpc.guard.answer import INFEASIBLE, ActuatorBounds, AnswerCheck, command_of, refused, resized
-from quadsim.mpc.guard.numbers import PLAUSIBLE, UPRIGHT
+from quadsim.mpc.guard.numbers import PLAUSIBLE
 from quadsim.mpc.guard.structs import STATUSES
 from quadsim.mpc.laws.nonlinear import MOST_LATE, Nonlinear
 from quadsim.mpc.laws.parts.body import next_states, unpacked, width_of
@@ -94,7 +94,6 @@ further steps keep: that way a stiff soft bound on tilt and unfiltered steps of 
 _OPTIMA: Final = {SQPStatus.FREE, SQPStatus.BOUNDED, SQPStatus.UNCONVERGED}
 _NumbersStruct: Final = struct("quadsim_nonlinear_numbers")
 _LawStruct: Final = struct("quadsim_nonlinear")
-_WORLD: Final = 13
 """Numbers of a `quadsim_nmpc_world`: acceleration, angular acceleration, drag, quadratic drag, thrust scale."""
 
 
@@ -218,7 +217,6 @@ class NonlinearMPC:
             least_lift=LEAST_LIFT,
             plausible=PLAUSIBLE.max(),
             infeasible=INFEASIBLE,
-            upright=UPRIGHT,
         )
         for name, (body, _) in self.bodies.items():
             setattr(numbers, name, ctypes.addressof(body))
@@ -250,7 +248,7 @@ class NonlinearMPC:
         if self.ramp is not None:
             self.ramp.bind(law.ramp)
         self._work = work = law.work
-        self._world = np.ctypeslib.as_array((ctypes.c_double * _WORLD).from_buffer(law.world))
+        self._world = np.ctypeslib.as_array((ctypes.c_double * (ctypes.sizeof(law.world) // 8)).from_buffer(law.world))
         self.plan = core_view(law.plan, self.horizon, N_ROTORS)
         measured = np.ctypeslib.as_array(law.measured)[: self.model.n]
         before = np.ctypeslib.as_array(law.before)
@@ -335,6 +333,8 @@ class NonlinearMPC:
                 set_members(mine, **{name: rotors})
             mine.learns, mine.last[:N_BODY] = its.learns, its.last[:N_BODY]
             adopt_sent(mine.delay, self.delay, its.delay, law.delay)
+            if self.delay is not None:
+                set_members(mine.delay, rotors=mine.rotors, rotors_before=mine.rotors_before)
         plan = law.stored_plan
         if plan is not None and alike and self.model.n == law.model.n and self.model.step == law.model.step:
             self.stored_plan = resized(plan[0], self._nodes + 1), resized(plan[1], self._nodes)

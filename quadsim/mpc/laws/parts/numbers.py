@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from quadsim.errors import ExportError
-from quadsim.mpc.estimate.observer import UPRIGHT, DisturbanceObserver
+from quadsim.mpc.estimate.observer import LEAST_UPRIGHT, DisturbanceObserver
 from quadsim.mpc.guard.numbers import PLAUSIBLE
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws.robust import Robust
@@ -84,7 +84,7 @@ def robust_numbers(settings: Robust, vehicle: Vehicle, period: float) -> dict[st
         "under_way": whole,
         "gravity": vehicle.gravity,
         "least_lift": LEAST_LIFT,
-        "upright": UPRIGHT,
+        "upright": LEAST_UPRIGHT,
         "period": period,
         "delay": late,
         "delayed_share": late / period,

@@ -17,11 +17,10 @@ from quadsim.mpc.laws.parts.body import STATES_ROOM, ProblemStruct, body_numbers
 from quadsim.mpc.problem.constraints import Constraint
 from quadsim.mpc.problem.ocp import Problem
 from quadsim.mpc.problem.rigidbody import P, RigidBody, V
+from quadsim.mpc.solvers.core import MOST_CHANGES
 from quadsim.state import Array, Indices
 from quadsim.vehicle import N_ROTORS
 
-_MOST_CHANGES: Final = 3000
-"""Limit of active-set changes in a search."""
 _HARD: Final = 1e30
 _CURVATURE: Final = 1e-5
 """Curvature of a price without one, about the optimum that the core iterates for, per l1."""
@@ -37,7 +36,7 @@ _NAMES: Final = {
 """The constraint of a row by its kind in the core."""
 _STATED: Final = constant("QUADSIM_NMPC_STATED")
 _FACE: Final = constant("QUADSIM_NMPC_FACE")
-_ROW_MEMBERS: Final = 5
+_ROW_MEMBERS: Final = ctypes.sizeof(struct("quadsim_nmpc_row")) // ctypes.sizeof(ctypes.c_int)
 """Integers of a row in the core: node, kind, index, sign and slack."""
 OWN_NAMES: Final = ("inputs", "tilt", "body_rates")
 """Constraints whose rows the core has by themselves."""
@@ -46,13 +45,13 @@ OWN_NAMES: Final = ("inputs", "tilt", "body_rates")
 class SQPStatus(IntEnum):
     """The status of a program or plan, by the codes of `enum quadsim_nmpc_status`."""
 
-    FREE = 0
-    BOUNDED = 1
-    UNCONVERGED = 2
-    INFEASIBLE = 3
-    GIVEN_UP = 4
-    NO_ROOM = 5
-    NOT_FINITE = 6
+    FREE = constant("QUADSIM_NMPC_FREE")
+    BOUNDED = constant("QUADSIM_NMPC_BOUNDED")
+    UNCONVERGED = constant("QUADSIM_NMPC_UNCONVERGED")
+    INFEASIBLE = constant("QUADSIM_NMPC_INFEASIBLE")
+    GIVEN_UP = constant("QUADSIM_NMPC_GIVEN_UP")
+    NO_ROOM = constant("QUADSIM_NMPC_NO_ROOM")
+    NOT_FINITE = constant("QUADSIM_NMPC_NOT_FINITE")
 
 
 _TermStruct: Final = struct("quadsim_nmpc_term")
@@ -154,7 +153,7 @@ def nonlinear_program(
         faces=faces,
         slacks=len(prices),
         room=min(most_rows, 6 * horizon) + 1,
-        changes=_MOST_CHANGES,
+        changes=MOST_CHANGES,
         iterations=iterations,
         corrections=corrections,
         tolerance=tolerance,
