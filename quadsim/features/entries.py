@@ -124,7 +124,7 @@ FEATURES: Final[dict[str, Feature]] = {
                 help="Measure the margins of a closed loop: how fast it settles, and what makes it unstable.",
                 examples=(
                     "quadsim stability paper-constrained",
-                    "quadsim stability mine.toml --over delay lag --controller robust nonlinear --out margins",
+                    "quadsim stability first.toml --over delay lag --controller lqr nonlinear --out margins",
                 ),
             )
         }

@@ -70,8 +70,8 @@ def stability(
         >>> import quadsim
         >>> found = quadsim.stability("hover", over=["delay"], workers=1, progress=False)
         >>> loop = found.loops[0]
-        >>> loop.growth.verdict, round(loop.growth.rate, 1)  # [1/s]
-        ('stable', -1.8)
+        >>> loop.growth.verdict, loop.growth.rate < -1.5  # [1/s]
+        ('stable', True)
         >>> delay = loop.margins["delay"].upper
         >>> delay.stable, delay.unstable  # [ms]
         (75.0, 76.0)

@@ -241,7 +241,7 @@ def test_a_map_is_stable_at_the_nominal_point_and_not_beyond_both_margins(
     assert len(states) == 9
     assert states[0] == "stable"
     assert states[-1] == "unstable"
-    assert "delay [ms] across, lag [ms] up" in found.text()
+    assert "delay [ms] across, lag [ms] up" in " ".join(found.text().split())
 
 
 def test_the_heading_of_the_nominal_hover_can_be_chosen() -> None:

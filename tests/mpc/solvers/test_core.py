@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import flight_queries, paper_problem, random_axes, random_problem
 
-from quadsim.controller import ACCEPTED, CORE, GAIN, SOLVED, UNCONSTRAINED
+from quadsim.controller import ACCEPTED, CORE, GAIN, OPTIMAL, SOLVED, UNCONSTRAINED
 from quadsim.errors import ParameterError
 from quadsim.mpc.problem.constraints import Constraint, Penalty
 from quadsim.mpc.problem.ocp import Equilibrium, Problem, Query, lqr_terminal_weight
@@ -106,7 +106,8 @@ def test_flights_are_exact_in_every_period_and_those_of_piqp(name: str) -> None:
     assert ours.mean() > 0.9 or name == "paper-constrained-lag20"
     for residual in ("kkt_stationarity", "kkt_complementarity", "kkt_dual", "infeasibility"):
         assert getattr(control, residual)[ours].max() < 1e-6
-    assert control.status == theirs.status
+    answered, as_well = ([status in OPTIMAL for status in each.status] for each in (control, theirs))
+    assert answered == as_well  # where there is no answer, PIQP does not always tell why
     np.testing.assert_allclose(control.speeds, theirs.speeds, rtol=0.0, atol=2e-2)
 
 
