@@ -23,7 +23,7 @@ from quadsim.mpc.space import SOFT_SPACE
 from quadsim.mpc.tables.bounded import Bounded
 from quadsim.rollout.conflicts import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
 from quadsim.scenarios.assembly import Assembly
-from quadsim.scenarios.mismatch import modelling_changes, unmodelled
+from quadsim.scenarios.mismatch import modelling_changes, unmodelled, unpredicted
 from quadsim.scenarios.schema.base import fields_of
 from quadsim.scenarios.schema.controllers import TABLES
 from quadsim.scenarios.schema.scenario import Scenario
@@ -75,7 +75,7 @@ def lacking_report(assembly: Assembly, time: float) -> dict[str, Any] | None:
 
     It names what the scenario states and the law's model lacks; None where that is nothing.
     """
-    lacking = unmodelled(assembly)
+    lacking = [*unmodelled(assembly), *unpredicted(assembly)]
     if not lacking:
         return None
     suggestions = [{"settings": settings, "after": None} for settings in modelling_changes(assembly)]

@@ -22,7 +22,7 @@ from quadsim.rollout.growth import MeasureGrowth
 from quadsim.rollout.infeasibility import Settings, change_text, changed_scenario, fields_text
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.feasibility_check import hover_notes, hover_speeds
-from quadsim.scenarios.mismatch import modelling_changes, unmodelled, worst_heading
+from quadsim.scenarios.mismatch import modelling_changes, unmodelled, unpredicted, worst_heading
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
 
@@ -163,15 +163,17 @@ def _loop_report(assembly: Assembly, measure: MeasureGrowth) -> dict[str, Any]:
     report = {"heading": heading, **_grows(scenario, heading, measure), "without": [], "with": []}
     if _cures(report):
         return report
-    lacking = unmodelled(assembly)
-    for entry in lacking[:MOST_PAIRS]:
+    lacking, effects = unmodelled(assembly), unpredicted(assembly)
+    for entry in (*lacking, *effects)[:MOST_PAIRS]:
         level = 0.0 if entry.quantity == "heading" else heading
         grows = _grows(_replaced(scenario, entry.absent), level, measure)
         report["without"].append({"lacks": entry.text, **grows})
     alone = [dict(entry.settings) for entry in lacking]
     together: Settings = {}
-    for settings in alone[:MOST_PAIRS]:
+    for settings in alone:
         together |= settings
+    fields = [*alone, *(dict(entry.settings) for entry in effects)]
+    for settings in fields[:MOST_PAIRS]:
         report["with"].append(_with(settings, scenario, heading, measure))
     if len(alone) > 1 and not any(map(_cures, report["with"])):
         report["with"].append(_with(together, scenario, heading, measure))

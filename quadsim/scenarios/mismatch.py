@@ -23,6 +23,7 @@ from quadsim.scenarios.schema.controllers import AnyController
 from quadsim.scenarios.schema.events import SetpointEvent
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import Array, wrapped
+from quadsim.vehicle import N_ROTORS
 
 HELD_FOR: Final = 1.0
 """Time for which a course has a heading, at least, to count as its largest [s]: not while it turns through it."""
@@ -127,7 +128,7 @@ def _ideal_rotors(assembly: Assembly) -> dict[str, Any]:
     stated = {} if assembly.scenario.actual is None else assembly.scenario.actual.overrides()
     absent: dict[str, Any] = {f"actual.{name}": None for name in ("rotor_rise", "rotor_fall") if name in stated}
     if assembly.effects.rotors is not None:  # not 0: rotors with inertia need a lag
-        absent |= {"effects.rotors.rise": SHORTEST_LAG, "effects.rotors.fall": SHORTEST_LAG}
+        absent |= {"effects.rotors.rise": 0.5 * SHORTEST_LAG, "effects.rotors.fall": 0.5 * SHORTEST_LAG}
     return absent
 
 
@@ -157,6 +158,78 @@ def _actual(assembly: Assembly) -> list[Unmodelled]:
 _VARIED: Final = {"mass": "mass", "inertia": "inertia", "thrust_coefficient": "thrust"}
 
 
+def unpredicted(assembly: Assembly) -> tuple[Unmodelled, ...]:
+    """Return the drag, the moments and the forces that a scenario states, where an MPC has a field for them.
+
+    They hardly move the limits of a loop, which is why `unmodelled` is without them.
+    """
+    spec = assembly.scenario.controller
+    entries: list[Unmodelled] = []
+    if isinstance(spec, Nonlinear):
+        entries += [*_drag(spec, assembly), *_moments(spec, assembly)]
+    if isinstance(spec, Nonlinear | Bounded):
+        entries += _forces(spec, assembly)
+    return tuple(entries)
+
+
+def _drag(spec: Nonlinear, assembly: Assembly) -> list[Unmodelled]:
+    """Return the drag of body and rotors that the prediction lacks, that of the rotors as in hover."""
+    air = assembly.effects.air
+    if air is None or spec.disturbance is not None or any((*spec.drag, *spec.quadratic_drag)):
+        return []
+    of_rotors = N_ROTORS * assembly.vehicle.hover_speed * (air.rotor_drag or 0.0)
+    x, y, z = air.linear_drag
+    linear = [float(f"{drag:.4g}") for drag in (x + of_rotors, y + of_rotors, z)]
+    quadratic = [*air.quadratic_drag]
+    settings: dict[str, Any] = {}
+    if any(linear):
+        settings["controller.drag"] = linear
+    if any(quadratic):
+        settings["controller.quadratic_drag"] = quadratic
+    if not settings:
+        return []
+    still = [0.0, 0.0, 0.0]
+    absent = {"effects.air.linear_drag": still, "effects.air.quadratic_drag": still, "effects.air.rotor_drag": 0.0}
+    return [Unmodelled(quantity="drag", text="drag", remedy=_as_written(settings), absent=absent, settings=settings)]
+
+
+def _moments(spec: Nonlinear, assembly: Assembly) -> list[Unmodelled]:
+    """Return the air's moments that the vehicle has numbers for and that the prediction lacks."""
+    air, vehicle = assembly.effects.air, assembly.vehicle
+    modelled = (vehicle.rotor_moment, vehicle.inflow_moment, vehicle.rate_damping)
+    if air is None or spec.moment or not any(any(moment or ()) for moment in modelled):
+        return []
+    absent = {
+        "effects.air.rotor_moment": [0.0, 0.0],
+        "effects.air.inflow_moment": [0.0, 0.0],
+        "effects.air.rate_damping": [0.0, 0.0, 0.0],
+    }
+    settings = {"controller.moment": True}
+    text = "moments of the air"
+    return [Unmodelled(quantity="", text=text, remedy=_as_written(settings), absent=absent, settings=settings)]
+
+
+def _forces(spec: Nonlinear | Bounded, assembly: Assembly) -> list[Unmodelled]:
+    """Return wind and disturbance that the law does not estimate."""
+    fields, air, disturbance = vars(spec), assembly.effects.air, assembly.effects.disturbance
+    if fields.get("offset_free") is not None or fields.get("disturbance") is not None:
+        return []
+    absent: dict[str, Any] = {}
+    stated: list[str] = []
+    if air is not None and (any(air.wind) or air.turbulence is not None):
+        stated.append("wind")
+        absent |= {"effects.air.wind": [0.0, 0.0, 0.0], "effects.air.turbulence": None}
+    if disturbance is not None:
+        stated.append("a disturbance")
+        absent["effects.disturbance"] = None
+    if not stated:
+        return []
+    estimate = "controller.disturbance" if isinstance(spec, Nonlinear) else "controller.offset_free"
+    settings = {**_law_with(assembly, "offset_free"), estimate: {}}
+    text = " and ".join(stated)
+    return [Unmodelled(quantity="", text=text, remedy=_as_written(settings), absent=absent, settings=settings)]
+
+
 def worst_heading(assembly: Assembly) -> float:
     """Return the heading farthest from zero that the course, or a set-point, has for `HELD_FOR` seconds [deg]."""
     headings = wrapped(course_headings(assembly))
@@ -172,13 +245,14 @@ def worst_heading(assembly: Assembly) -> float:
 def modelling_changes(assembly: Assembly) -> list[dict[str, Any]]:
     """Return the changes by which a law has what the scenario states and its model lacks.
 
-    All together come first, then each alone.  `robust` gets soft bounds with them, as a state that the old model led to
-    may lie beyond hard ones; last comes a heading without them.
+    All of `unmodelled` together come first, then each alone, then each of `unpredicted`.  `robust` gets soft bounds
+    with them, as a state that the old model led to may lie beyond hard ones; a heading comes without them, too.
     """
     spec = assembly.scenario.controller
     lacking = [dict(entry.settings) for entry in unmodelled(assembly)]
+    others = [_softened(spec, entry.settings) for entry in unpredicted(assembly)]
     if not lacking:
-        return []
+        return others
     together: dict[str, Any] = {}
     for settings in lacking:
         together |= settings
@@ -188,7 +262,7 @@ def modelling_changes(assembly: Assembly) -> list[dict[str, Any]]:
     softened = [_softened(spec, settings) for settings in changes]
     if softened != changes and "controller.heading" in together:
         softened.append({**_law_with(assembly, "heading"), "controller.heading": True})
-    return softened
+    return softened + others
 
 
 def _softened(spec: AnyController, settings: Mapping[str, Any]) -> dict[str, Any]:

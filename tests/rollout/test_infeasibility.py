@@ -715,3 +715,14 @@ def test_few_pairs_are_flown_however_much_the_model_lacks() -> None:
     report = remedies._loop_report(assembly, growing)
     assert len(asked) == 2 * remedies.MOST_PAIRS + 2
     assert report["sentence"].endswith("nothing of what the model lacks, taken away or set, changes that")
+
+
+def test_wind_that_a_nonlinear_law_could_estimate_is_tried() -> None:
+    storm = {"linear_drag": [0.3, 0.3, 0.3], "wind": [14.0, 3.0, 0.0]}
+    scenario = load_scenario("hummingbird-figure-eight").replace({"controller": "nonlinear", "effects.air": storm})
+    diagnosis = quadsim.fly(scenario, progress=False).diagnosis
+    assert diagnosis is not None
+    assert {"controller.disturbance": {}} in [change["settings"] for change in diagnosis["suggestions"]]
+    (known,) = (entry for entry in diagnosis["loop"]["with"] if not entry["unstable"])
+    assert known["settings"] == {"controller.disturbance": {}}
+    assert "; without wind it shrinks at" in diagnosis["loop"]["sentence"]
