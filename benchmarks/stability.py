@@ -20,8 +20,8 @@ from quadsim.errors import QuadsimError
 from quadsim.features.stability.margins import LoopMargins, MeasuredLoop, measured_here
 from quadsim.features.stability.quantities import VARIED
 from quadsim.mpc.tables.bounded import Weighted
+from quadsim.rollout.growth import SIZE
 from quadsim.rollout.many import fly_many
-from quadsim.rollout.stability import SIZE
 from quadsim.scenarios.schema.controllers import LAWS, TABLES
 from quadsim.scenarios.schema.scenario import Scenario
 

@@ -298,7 +298,10 @@ def optimum_sentences(flight: FlightRecord) -> list[str]:
     """Return why there was no optimum: permanent fallback, and the reason for the first QP without an answer."""
     periods, diagnosis = flight.numbers["controller"].get("unrecovered"), flight.diagnosis
     sentences = [fallback_sentence(periods)] if periods else []
-    return sentences + ([] if diagnosis is None else [diagnosis["sentence"], *filter(None, [diagnosis["advice"]])])
+    if diagnosis is None:
+        return sentences
+    loop = diagnosis.get("loop", {})
+    return [*sentences, diagnosis["sentence"], *filter(None, [loop.get("sentence"), diagnosis["advice"]])]
 
 
 def event_sentences(events: Sequence[Mapping[str, Any]]) -> list[str]:

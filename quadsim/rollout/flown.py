@@ -200,8 +200,9 @@ class Flight(Result):
     def diagnosis(self) -> Mapping[str, Any] | None:
         """Why the first QP without an answer had none, and what helps; None if all QPs had one.
 
-        If all had one and a constraint does not hold, it explains the first SQP that did not converge, if any.  What is
-        advised has been flown, in `quadsim.rollout.remedies.MOST_FLOWN` flights at most; this takes seconds, once.
+        If all had one and a constraint does not hold, it explains the first SQP that did not converge, if any; if the
+        flight was lost, what the model lacks.  What is advised has been flown, in
+        `quadsim.rollout.remedies.MOST_FLOWN` flights at most; this takes seconds, once.
 
         `sentence` and `advice` are for users; `docs/audit.md` explains the other entries.
         """
@@ -215,10 +216,14 @@ class Flight(Result):
         """`diagnosis` before anything is flown."""
         if self.recorded is not None:
             return self.recorded.get("diagnosis")
-        if self.infeasible_period is None or (self.infeasible_period.status == NOT_CONVERGED and self.satisfied):
-            return None
-        from quadsim.rollout.infeasibility import diagnose
+        from quadsim.rollout.infeasibility import diagnose, lacking_report
 
+        if self.infeasible_period is None:
+            kept_law = self.scenario.controller_at(self.end) == self.scenario.controller
+            is_its_own = kept_law and not self.own_code
+            return lacking_report(self.assembly, self.end) if self.outcome == "lost" and is_its_own else None
+        if self.infeasible_period.status == NOT_CONVERGED and self.satisfied:
+            return None
         spec = self.scenario.controller_at(self.infeasible_period.time)
         scenario = self.scenario.altered(controller=spec, events=())
         return diagnose(self.infeasible_period, scenario, self.vehicle, self.log.control.status)

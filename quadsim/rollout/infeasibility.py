@@ -22,7 +22,10 @@ from quadsim.mpc.problem.ocp import InfeasiblePeriod
 from quadsim.mpc.space import SOFT_SPACE
 from quadsim.mpc.tables.bounded import Bounded
 from quadsim.rollout.conflicts import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.mismatch import modelling_changes, unmodelled, unpredicted
 from quadsim.scenarios.schema.base import fields_of
+from quadsim.scenarios.schema.controllers import TABLES
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.scenarios.schema.settings import get_field, set_field
 from quadsim.scenarios.schema.writing import plain
@@ -67,6 +70,28 @@ def diagnose(
     return {**report, "sentence": _sentence(report), "advice": advice}
 
 
+def lacking_report(assembly: Assembly, time: float) -> dict[str, Any] | None:
+    """Return `diagnosis` of a flight that was lost at a time [s], though every problem that it solved had an answer.
+
+    It names what the scenario states and the law's model lacks; None where that is nothing.
+    """
+    lacking = [*unmodelled(assembly), *unpredicted(assembly)]
+    if not lacking:
+        return None
+    suggestions = [{"settings": settings, "after": None} for settings in modelling_changes(assembly)]
+    stated = ", ".join(entry.text for entry in lacking)
+    changes = map(change_text, suggestions)
+    return {
+        "time": round(time, 9),
+        "status": "lost",
+        "feasible": None,
+        "conflict": [],
+        "suggestions": suggestions,
+        "sentence": f"lost, and the model of {assembly.scenario.controller.type} lacks: {stated}",
+        "advice": f"to try: {'; '.join(changes)}",
+    }
+
+
 def changed_scenario(scenario: Scenario, settings: Settings) -> Scenario | None:
     """Return the scenario with other fields of its file; None if that would be refused."""
     table = scenario.tables
@@ -75,7 +100,8 @@ def changed_scenario(scenario: Scenario, settings: Settings) -> Scenario | None:
         set_field(table, field, value, source="diagnosis", defaults=defaults)
     if "controller.type" in settings:
         law = table["controller"]
-        table["controller"] = {name: value for name, value in law.items() if name in fields_of(Robust)}
+        known = fields_of(TABLES[settings["controller.type"]])
+        table["controller"] = {name: value for name, value in law.items() if name in known}
     try:
         return scenario.derive(table)
     except InputError:
@@ -325,13 +351,18 @@ def _advice(report: Mapping[str, Any]) -> str:
 def change_text(change: Mapping[str, Any]) -> str:
     """Return a change as after `--set`, with what has to be known about it."""
     settings, after = change["settings"], change["after"]
-    fields = ", ".join(f"{field} = {_toml(value)}" for field, value in settings.items())
-    fields += " (without the field solver)" if "controller.type" in settings else ""
+    fields = fields_text(settings)
+    fields += " (without the field solver)" if settings.get("controller.type") == "robust" else ""
     if (count := settings.get("controller.iterations")) is not None:
         fields += f", which takes up to {count} times as long"
     fields += f" (level hover; an answer again after {after:.2f} s, by the model)" if after else ""
     violated = ", ".join(change.get("violated", ()))
     return fields + (f" (violates {violated} on its way)" if violated and "why" not in change else "")
+
+
+def fields_text(settings: Mapping[str, Any]) -> str:
+    """Return fields and values as after `--set`."""
+    return ", ".join(f"{field} = {_toml(value)}" for field, value in settings.items())
 
 
 def _toml(value: object) -> str:

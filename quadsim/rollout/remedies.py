@@ -6,6 +6,7 @@ ordinary ones, except that nobody asks them for a diagnosis.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
@@ -17,10 +18,11 @@ from quadsim.flight.metrics import unrecovered
 from quadsim.mpc.laws.constrained import Constrained
 from quadsim.mpc.laws.robust import Robust
 from quadsim.rollout.flown import Flight
-from quadsim.rollout.infeasibility import Settings, change_text, changed_scenario
+from quadsim.rollout.growth import MeasureGrowth
+from quadsim.rollout.infeasibility import Settings, change_text, changed_scenario, fields_text
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.feasibility_check import hover_notes, hover_speeds
-from quadsim.scenarios.mismatch import unmodelled
+from quadsim.scenarios.mismatch import modelling_changes, unmodelled, unpredicted, worst_heading
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
 
@@ -29,17 +31,22 @@ FlyUntil: TypeAlias = Callable[[Assembly, float], Flight]
 AFTER: Final = 5.0  # flown beyond the first period without an answer [s]
 LONGEST_TRIAL: Final = 60.0  # longest flight of a change [s]; what would have to be flown for longer is not flown
 MOST_FLOWN: Final = 6  # flights of one diagnosis
+MOST_PAIRS: Final = 4  # pairs of hovers without what the model lacks, and with changes, each
 RETURNING: Final = 0.9  # violation at the end of a flight, over its largest, up to which it is passing
 HOVER_RESERVE: Final = 0.1  # distance of the advised bound on rotor speeds from hover, over hover
+_CHANGED_LAW: Final = "an event had changed the controller"
 _SPEED: Final = "controller.input_bounds.speed"
 
 
-def tried(explanation: Mapping[str, Any], flight: Flight, fly: FlyUntil) -> dict[str, Any]:
+def tried(explanation: Mapping[str, Any], flight: Flight, fly: FlyUntil, measure: MeasureGrowth) -> dict[str, Any]:
     """Fly each suggestion of a flight's `diagnose`; return the report with those that prevent the failure as advice.
 
     `suggestions` are then those with an answer in every period, or the fallback, and a flight that is satisfied as far
     as it goes; if there are none, those that violate constraints (`violated`) on the way back to them, as from a start
     beyond a bound.  The others are in `rejected`, each with a reason `why`.
+
+    Changes by which the model has what the scenario states are flown first.  `loop` has how a push grows with each of
+    them, and without each thing that the model lacks; those with which it still grows are not flown further.
 
     A flight with code that was passed in cannot be repeated, nor can one be continued in the middle: where an event had
     changed the controller, or the failure is late, the advice says that it was not flown.
@@ -48,19 +55,28 @@ def tried(explanation: Mapping[str, Any], flight: Flight, fly: FlyUntil) -> dict
         explanation: of `quadsim.rollout.infeasibility.diagnose`.
         flight: the flight.
         fly: flies an assembly until a time [s].
+        measure: measures the loop of a scenario.
     """
     report, scenario, assembly = {**explanation, "rejected": []}, flight.scenario, flight.assembly
     notes = hover_notes(assembly)
     report["sentence"] = "; ".join([*notes, report["sentence"]])
-    modelling = _modelling(scenario, assembly) if report["feasible"] is False else []
-    candidates = _reaching_hover(scenario, assembly) if notes else [*modelling, *report["suggestions"]]
+    until = min(report["time"] + AFTER, scenario.duration)
+    unflown = _not_flown(flight, report["time"], until)
+    flew_its_law = flight.controller == scenario.controller.type and unflown != _CHANGED_LAW
+    modelling = _modelling(assembly) if flew_its_law and not notes else []
+    if modelling and not unflown:
+        report["loop"] = _loop_report(assembly, measure)
+    others = [change for change in report["suggestions"] if change not in modelling]
+    candidates = _reaching_hover(scenario, assembly) if notes else [*modelling, *others]
     if not candidates:
         return report
-    until = min(report["time"] + AFTER, scenario.duration)
-    if unflown := _not_flown(flight, report["time"], until):
+    if unflown:
         report["advice"] = f"to try, not flown, as {unflown}: {'; '.join(map(change_text, candidates))}"
         return {**report, "suggestions": candidates}
-    trials = [_trial(scenario, assembly, change["settings"], until, fly) for change in candidates[:MOST_FLOWN]]
+    trials: list[_Trial] = []
+    for change in candidates[:MOST_FLOWN]:
+        growing = _still_grows(change["settings"], report.get("loop", {}))
+        trials.append(_Trial(why=growing) if growing else _trial(scenario, assembly, change["settings"], until, fly))
     flown = [{**change, "violated": [*trial.violated]} for change, trial in zip(candidates, trials, strict=False)]
     flying = [change for change, trial in zip(flown, trials, strict=True) if not trial.why]
     kept = [change for change in flying if not change["violated"]] or flying
@@ -81,7 +97,7 @@ def _not_flown(flight: Flight, time: float, until: float) -> str:
     if flight.own_code:
         return "the scenario does not repeat code that was passed in"
     if flight.scenario.controller_at(time) != flight.scenario.controller:
-        return "an event had changed the controller"
+        return _CHANGED_LAW
     return f"it would take more than {LONGEST_TRIAL:g} s of flight" if until > LONGEST_TRIAL else ""
 
 
@@ -124,29 +140,96 @@ def _lasts(margins: Array) -> bool:
     return bool(margins[-1] < RETURNING * margins.min())
 
 
-def _modelling(scenario: Scenario, assembly: Assembly) -> list[dict[str, Any]]:
-    """Return the changes by which a linear MPC has what the scenario states and its model lacks.
+def _modelling(assembly: Assembly) -> list[dict[str, Any]]:
+    """Return the changes by which the law has what the scenario states and its model lacks."""
+    return [{"settings": settings, "after": None} for settings in modelling_changes(assembly)]
 
-    All together come first, then each alone; with soft bounds, as a state that the old model led to may lie beyond hard
-    ones, and a heading without them as well.
+
+def _still_grows(settings: Settings, loop: Mapping[str, Any]) -> str:
+    """Say that a push was measured to grow with a change, soft bounds or not; empty if it was not."""
+    hard = {path: value for path, value in settings.items() if path != "controller.soft"}
+    for entry in loop.get("with", ()):
+        if entry["settings"] == hard and entry.get("unstable", False):
+            return f"in hover a push still {_rate_text(entry)}"
+    return ""
+
+
+def _loop_report(assembly: Assembly, measure: MeasureGrowth) -> dict[str, Any]:
+    """Return how a push grows in hover: as stated, without each thing that the model lacks, with each field set.
+
+    Where it does not grow as stated, nothing else is measured.
     """
-    spec = scenario.controller
-    if not isinstance(spec, Constrained | Robust):
-        return []
-    lacking = [dict(entry.settings) for entry in unmodelled(assembly) if entry.settings]
-    if not lacking:
-        return []
-    law: Settings = {} if isinstance(spec, Robust) else {"controller.type": "robust"}
-    soft: Settings = {} if isinstance(spec, Robust) and spec.soft is not None else {"controller.soft": {}}
-    together: dict[str, Any] = {}
-    for settings in lacking:
+    scenario, heading = assembly.scenario, worst_heading(assembly)
+    report = {"heading": heading, **_grows(scenario, heading, measure), "without": [], "with": []}
+    if _cures(report):
+        return report
+    lacking, effects = unmodelled(assembly), unpredicted(assembly)
+    for entry in (*lacking, *effects)[:MOST_PAIRS]:
+        level = 0.0 if entry.quantity == "heading" else heading
+        grows = _grows(_replaced(scenario, entry.absent), level, measure)
+        report["without"].append({"lacks": entry.text, **grows})
+    alone = [dict(entry.settings) for entry in lacking]
+    together: Settings = {}
+    for settings in alone:
         together |= settings
-    changes: list[Settings] = [{**law, **soft, **together}]
-    if len(lacking) > 1:
-        changes += [{**law, **soft, **settings} for settings in lacking]
-    if soft and "controller.heading" in together:
-        changes.append({**law, "controller.heading": True})
-    return [{"settings": settings, "after": None} for settings in changes]
+    fields = [*alone, *(dict(entry.settings) for entry in effects)]
+    for settings in fields[:MOST_PAIRS]:
+        report["with"].append(_with(settings, scenario, heading, measure))
+    if len(alone) > 1 and not any(map(_cures, report["with"])):
+        report["with"].append(_with(together, scenario, heading, measure))
+    return {**report, "sentence": _loop_sentence(report)}
+
+
+def _with(settings: Settings, scenario: Scenario, heading: float, measure: MeasureGrowth) -> dict[str, Any]:
+    """Return a change and how a push grows with it."""
+    return {"settings": settings, **_grows(changed_scenario(scenario, settings), heading, measure)}
+
+
+def _replaced(scenario: Scenario, fields: Mapping[str, Any]) -> Scenario | None:
+    """Return a scenario with other fields; None if that would be refused."""
+    try:
+        return scenario.replace(fields)
+    except InputError:
+        return None
+
+
+def _grows(scenario: Scenario | None, heading: float, measure: MeasureGrowth) -> dict[str, Any]:
+    """Return whether a push grows, at which rate [1/s], and why a flight ended; nothing where none can be flown."""
+    if scenario is None:
+        return {}
+    try:
+        growth = measure(scenario, heading)
+    except InputError:
+        return {}
+    entry: dict[str, Any] = {"unstable": growth.notable}
+    if math.isfinite(growth.rate):
+        entry["rate"] = growth.rate
+    if growth.ended:
+        entry["ended"] = growth.ended
+    return entry
+
+
+def _loop_sentence(report: Mapping[str, Any]) -> str:
+    """Say that a push grows, and which single thing, taken away or known to the law, lets it shrink."""
+    cures = [f"without {entry['lacks']} it {_rate_text(entry)}" for entry in report["without"] if _cures(entry)]
+    for entry in report["with"]:
+        if _cures(entry):
+            cures.append(f"with {fields_text(entry['settings'])} it {_rate_text(entry)}")
+    found = "; ".join(cures) or "nothing of what the model lacks, taken away or set, changes that"
+    return f"in hover a push {_rate_text(report)}; {found}"
+
+
+def _cures(entry: Mapping[str, Any]) -> bool:
+    """Return whether the loop was measured and is stable."""
+    return not entry.get("unstable", True)
+
+
+def _rate_text(entry: Mapping[str, Any]) -> str:
+    """Return e.g. `grows at 1.88 1/s`."""
+    rate = entry.get("rate")
+    if rate is None:
+        return f"ends {entry['ended']}"
+    return f"{'grows' if entry['unstable'] else 'shrinks'} at {abs(rate):.3g} 1/s"
 
 
 def _reaching_hover(scenario: Scenario, assembly: Assembly) -> list[dict[str, Any]]:

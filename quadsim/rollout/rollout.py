@@ -324,6 +324,17 @@ class Rollout:
 
 def _try_remedies(explanation: Mapping[str, Any], flight: Flight) -> dict[str, Any]:
     """See `quadsim.rollout.remedies.tried`."""
-    from quadsim.rollout import remedies  # late: few flights need it
+    from quadsim.rollout import growth, remedies  # late: few flights need them
 
-    return remedies.tried(explanation, flight, lambda assembly, until: Rollout(assembly).fly(until=until))
+    def fly(assembly: Assembly, until: float) -> Flight:
+        return Rollout(assembly).fly(until=until)
+
+    def measure(scenario: Scenario, heading: float) -> growth.Growth:
+        return growth.grown(scenario, started_plain, heading=heading, longest=growth.SHORT_PAIR)
+
+    return remedies.tried(explanation, flight, fly, measure)
+
+
+def started_plain(assembly: Assembly) -> Rollout:
+    """Start a flight that is not recorded."""
+    return Rollout(assembly, recorded=False)

@@ -1,110 +1,17 @@
-"""Whether a closed loop is stable, measured in it: two flights of one seed, and the growth of their difference.
-
-Both hold a hover; the second starts with a small velocity and yaw rate.  Noise, gusts, biases and steady errors are the
-same in both and cancel in the difference d(t), which after its transients follows the slowest mode of the loop,
-
-    |d(t)| ~ exp(rate t),
-
-so `rate` is the largest real part of the loop's exponents: of any law, linear or not, with the plant as it is, sampled,
-delayed and lagging.  Negative means stable.  For a linear law it is ln(rho) / tau_s, rho the spectral radius of the
-sampled loop.
-"""
+"""Whether a scenario's loop is stable: `quadsim.rollout.growth` with ordinary flights, and the line before a flight."""
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any
 
-import numpy as np
-
-from quadsim.errors import FlightError, InputError
-from quadsim.rollout.rollout import Rollout
+from quadsim.errors import InputError
+from quadsim.rollout.growth import LONGEST_PAIR, SHORT_PAIR, SIZE, Growth, grown
+from quadsim.rollout.rollout import started_plain
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.mismatch import Unmodelled, unmodelled, worst_heading
 from quadsim.scenarios.schema.scenario import Scenario
-from quadsim.state import EULER, POSITION, VELOCITY, Array, wrapped
-
-SIZE: Final = 1e-3
-"""Velocity along x with which the second flight starts [m/s].
-
-So little that no bound acts, and that a loop which oscillates within its bounds has a far larger difference.
-"""
-NEUTRAL: Final = 0.003
-"""Rate [1/s] within which a difference neither grows nor decays: it takes longer than is flown to tell."""
-LONGEST_PAIR: Final = 24.0  # flown where the rate is small [s]
-USUAL_PAIR: Final = 12.0  # flown otherwise, at most [s]
-_SMALL: Final = 0.05  # magnitude of a rate below which `LONGEST_PAIR` is flown [1/s]
-_BLOCK: Final = 1.0  # time of which the largest difference is taken [s]
-_LEAST_BLOCKS: Final = 4
-_DECAYED: Final = 1e-5  # difference over that of the first block at which the flights end
-_GROWN: Final = 30.0  # the same, of one that grows
-_SATURATED: Final = math.e  # the same, beyond what the transients of a stable loop leave after some seconds
-_GLANCE: Final = 8.0  # flown before a flight [s]
-_NOTABLE: Final = 0.05  # least rate of what is said before a flight, as so little is flown [1/s]
-_HEIGHT: Final = 5.0  # of the hover [m]
-_VELOCITY: Final = (1.0, 0.6, 0.3)  # direction of the velocity, x component 1
-_YAW_RATE: Final = 50.0  # yaw rate [deg/s] per velocity along x [m/s]
-_EMPTY: Final[Mapping[str, list[Any]]] = {"constraints": [], "events": [], "obstacles": [], "corridors": []}
-
-LoopVerdict: TypeAlias = Literal["stable", "neutral", "unstable"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Growth:
-    """How the difference of two flights grows."""
-
-    rate: float  # [1/s]; infinite where a flight ended before its difference could be compared
-    left: float  # difference at the end, over that at the start
-    time: float  # flown [s]
-    ended: str = ""  # why a flight ended early; empty if none did
-
-    @property
-    def verdict(self) -> LoopVerdict:
-        """Whether the loop is stable; `neutral` where the difference stays what it was."""
-        if self.ended or self.rate > NEUTRAL:
-            return "unstable"
-        return "stable" if self.rate < -NEUTRAL else "neutral"
-
-    @property
-    def stable(self) -> bool:
-        """Whether the difference decays."""
-        return self.verdict == "stable"
-
-
-def hovering(
-    scenario: Scenario, *, heading: float, size: float = 0.0, changes: Mapping[str, Any] | None = None
-) -> Scenario:
-    """Return a scenario that holds a hover in free air, with vehicle, law, effects and sensors of this one.
-
-    Args:
-        scenario: gives all but course, start, events, obstacles, ground and constraints.
-        heading: of the hover [deg].
-        size: velocity along x at the start [m/s], with a yaw rate in proportion.
-        changes: values of further fields, by dotted path.
-
-    Raises:
-        InputError: a changed field is not allowed.
-    """
-    period = (changes or {}).get("control_period", scenario.control_period)
-    fields: dict[str, Any] = {
-        **_EMPTY,
-        "duration": math.ceil(LONGEST_PAIR / period - 1e-6) * period,
-        "reference": {"type": "yaw_turns", "turns": [{"start": 0.0, "yaw": heading, "rate": 30.0}]},
-        "initial": {
-            "position": [0.0, 0.0, _HEIGHT],
-            "euler": [0.0, 0.0, heading],
-            "velocity": [size * share for share in _VELOCITY],
-            "body_rates": [0.0, 0.0, _YAW_RATE * size],
-        },
-    }
-    if scenario.keep_in is not None:
-        fields["keep_in"] = None
-    if scenario.effects.ground is not None:
-        fields["effects.ground"] = None
-    return scenario.replace({**fields, **(changes or {})})
 
 
 def measure_growth(
@@ -115,88 +22,12 @@ def measure_growth(
     changes: Mapping[str, Any] | None = None,
     longest: float = LONGEST_PAIR,
 ) -> Growth:
-    """Fly a pair of hovers of one seed that start differently; return how their difference grows.
-
-    It is flown for `USUAL_PAIR` seconds, for `LONGEST_PAIR` where the rate is small, and less where the difference has
-    decayed or grown before.
-
-    Args:
-        scenario: as in `hovering`.
-        heading: as in `hovering` [deg].
-        size: as in `hovering`, of the second flight.
-        changes: as in `hovering`.
-        longest: [s] ends the flights, at most `LONGEST_PAIR`.
+    """Return how the difference of a pair of hovers grows; see `quadsim.rollout.growth.grown`.
 
     Raises:
         InputError: a changed field is not allowed, or the parts cannot be built.
     """
-    still = hovering(scenario, heading=heading, changes=changes)
-    pushed = hovering(scenario, heading=heading, size=size, changes=changes)
-    period = still.control_period
-    periods = min(still.periods, round(longest / period))
-    per_block = max(round(_BLOCK / period), 1)
-    distances: list[float] = []
-    ended = ""
-    with contextlib.ExitStack() as stack:
-        first = stack.enter_context(Rollout(Assembly(still), recorded=False))
-        second = stack.enter_context(Rollout(Assembly(pushed), recorded=False))
-        while len(distances) < periods:
-            try:
-                states = [rollout.step().observation.truth for rollout in (first, second)]
-            except FlightError as error:
-                ended = str(error)
-                break
-            distances.append(_distance(states[0], states[1]))
-            if len(distances) % per_block == 0 and _told(_blocks(distances, per_block), period * len(distances)):
-                break
-    time = round(period * len(distances), 9)
-    rate, left = _rate(distances, per_block, period)
-    return Growth(rate=rate, left=left, time=time, ended=ended)
-
-
-def _distance(first: Array, second: Array) -> float:
-    """Return the size of a difference of two states (12,): of position [m], velocity [m/s] and angles [rad]."""
-    difference = first - second
-    angles = wrapped(difference[list(EULER)])
-    moved = difference[[*POSITION, *VELOCITY]]
-    return float(np.sqrt(moved @ moved + angles @ angles))
-
-
-def _blocks(distances: list[float], per_block: int) -> Array:
-    """Return the largest distance within each whole block."""
-    whole = len(distances) // per_block
-    return np.array(distances[: whole * per_block]).reshape(whole, per_block).max(axis=1)
-
-
-def _told(blocks: Array, time: float) -> bool:
-    """Return whether the flights have told what they can, after a time [s]."""
-    if blocks.size < _LEAST_BLOCKS:
-        return False
-    share = float(blocks[-1] / blocks[0])
-    if share < _DECAYED or share > _GROWN:
-        return True
-    return time >= USUAL_PAIR and abs(_slope(blocks)) > _SMALL
-
-
-def _slope(blocks: Array) -> float:
-    """Return the rate of the later half of the blocks [1/block], by least squares."""
-    later = blocks[blocks.size // 2 :]
-    return float(np.polyfit(np.arange(later.size), np.log(np.maximum(later, np.finfo(float).tiny)), 1)[0])
-
-
-def _rate(distances: list[float], per_block: int, period: float) -> tuple[float, float]:
-    """Return the rate [1/s], and the difference at the end over that at the start."""
-    if len(distances) < 2:
-        return math.inf, math.inf
-    blocks = _blocks(distances, per_block)
-    if blocks.size < _LEAST_BLOCKS:  # a flight was lost within seconds
-        left = distances[-1] / distances[0]
-        return math.log(max(left, np.finfo(float).tiny)) / (period * (len(distances) - 1)), left
-    left = float(blocks[-1] / blocks[0])
-    rate = _slope(blocks) / (per_block * period)
-    if left > _SATURATED:  # it may have grown to a limit cycle, in which it no longer does
-        rate = max(rate, math.log(left) / (per_block * period * (blocks.size - 1)))
-    return rate, left
+    return grown(scenario, started_plain, heading=heading, size=size, changes=changes, longest=longest)
 
 
 def instability_notes(assembly: Assembly) -> tuple[str, ...]:
@@ -209,10 +40,10 @@ def instability_notes(assembly: Assembly) -> tuple[str, ...]:
     if not lacking:
         return ()
     try:
-        result = measure_growth(assembly.scenario, heading=worst_heading(assembly), longest=_GLANCE)
+        result = measure_growth(assembly.scenario, heading=worst_heading(assembly), longest=SHORT_PAIR)
     except InputError:  # the flight itself will say what does not fit
         return ()
-    if not result.ended and result.rate < _NOTABLE:
+    if not result.notable:
         return ()
     return (_instability_note(assembly.scenario, lacking, result),)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +15,7 @@ from quadsim.mpc.laws.lqr import LQRTable
 from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.model import SHORTEST_LAG
-from quadsim.mpc.tables.bounded import Weighted
+from quadsim.mpc.tables.bounded import Bounded, Weighted
 from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.plugin import Plugin
@@ -22,6 +23,7 @@ from quadsim.scenarios.schema.controllers import AnyController
 from quadsim.scenarios.schema.events import SetpointEvent
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import Array, wrapped
+from quadsim.vehicle import N_ROTORS
 
 HELD_FOR: Final = 1.0
 """Time for which a course has a heading, at least, to count as its largest [s]: not while it turns through it."""
@@ -35,8 +37,10 @@ class Unmodelled:
     quantity: str  # as `quadsim stability --over` calls it; empty for what that does not vary
     text: str  # what is stated, e.g. `a heading of 60 deg`
     remedy: str  # the change by which the model has it
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """The same for `robust`: fields of its table by dotted path; empty for what no field of a controller gives it."""
+    absent: Mapping[str, Any]
+    """Fields of the scenario with which the plant lacks it, too, by dotted path; none for a heading."""
+    settings: Mapping[str, Any]
+    """Fields with which the model has it, by dotted path; of another law where this one cannot."""
 
 
 def unmodelled(assembly: Assembly) -> tuple[Unmodelled, ...]:
@@ -60,10 +64,34 @@ def _heading(assembly: Assembly) -> list[Unmodelled]:
     heading = worst_heading(assembly)
     if abs(heading) <= _LEVEL:
         return []
-    law = "" if "heading" in fields else 'controller.type = "robust", '
     text = f"a heading of {heading:.4g} deg"
-    remedy = f"{law}controller.heading = true"
-    return [Unmodelled(quantity="heading", text=text, remedy=remedy, settings={"controller.heading": True})]
+    if "heading" in fields or isinstance(spec, Bounded):
+        settings = {**_law_with(assembly, "heading"), "controller.heading": True}
+    else:
+        settings = _law_with(assembly, "heading")
+    remedy = _as_written(settings)
+    return [Unmodelled(quantity="heading", text=text, remedy=remedy, absent={}, settings=settings)]
+
+
+def _law_with(assembly: Assembly, name: str) -> dict[str, Any]:
+    """Return the change of law by which there is a field, none if there is.
+
+    That is to `robust` where weights and bounds can be kept, and to `nonlinear` with the rotors' lag otherwise.
+    """
+    spec, lag = assembly.scenario.controller, _stated_lag(assembly)
+    if name in vars(spec):
+        return {}
+    if isinstance(spec, Bounded):
+        return {"controller.type": "robust"}
+    law: dict[str, Any] = {"controller.type": "nonlinear"}
+    if lag >= SHORTEST_LAG:
+        law["controller.rotor_lag"] = lag
+    return law
+
+
+def _as_written(settings: Mapping[str, Any]) -> str:
+    """Return fields and values as in a scenario file."""
+    return ", ".join(f"{path} = {json.dumps(value)}" for path, value in settings.items())
 
 
 def _delay(assembly: Assembly) -> list[Unmodelled]:
@@ -74,15 +102,16 @@ def _delay(assembly: Assembly) -> list[Unmodelled]:
     known = fields.get("delay", 0.0)
     if delay == known:
         return []
-    law = "" if "delay" in fields else 'controller.type = "robust", '
     text = f"commands {1e3 * delay:.4g} ms late"
     if known:
         text += f", where it expects {1e3 * known:.4g} ms"
-    remedy = f"{law}controller.delay = {delay:g}"
+    settings = {**_law_with(assembly, "delay"), "controller.delay": delay}
     commands = fields.get("commands", ROTORS)
     if commands == "attitude" or (commands != ROTORS and delay >= assembly.scenario.control_period):
-        remedy = ""  # such a law takes no delay, or none of a period
-    return [Unmodelled(quantity="delay", text=text, remedy=remedy, settings={"controller.delay": delay})]
+        settings = {}  # such a law takes no delay, or none of a period
+    absent = {"computation.delay": known}
+    remedy = _as_written(settings)
+    return [Unmodelled(quantity="delay", text=text, remedy=remedy, absent=absent, settings=settings)]
 
 
 def _lag(assembly: Assembly) -> list[Unmodelled]:
@@ -93,7 +122,17 @@ def _lag(assembly: Assembly) -> list[Unmodelled]:
         return []
     remedy = ", ".join(_lag_remedy(spec, assembly, lag))
     text = f"rotors that lag by {1e3 * lag:.4g} ms"
-    return [Unmodelled(quantity="lag", text=text, remedy=remedy, settings={"controller.rotor_lag": lag})]
+    settings = {**_law_with(assembly, "rotor_lag"), "controller.rotor_lag": lag}
+    return [Unmodelled(quantity="lag", text=text, remedy=remedy, absent=_ideal_rotors(assembly), settings=settings)]
+
+
+def _ideal_rotors(assembly: Assembly) -> dict[str, Any]:
+    """Return the fields with which the plant's rotors follow as good as at once."""
+    stated = {} if assembly.scenario.actual is None else assembly.scenario.actual.overrides()
+    absent: dict[str, Any] = {f"actual.{name}": None for name in ("rotor_rise", "rotor_fall") if name in stated}
+    if assembly.effects.rotors is not None:  # not 0: rotors with inertia need a lag
+        absent |= {"effects.rotors.rise": 0.5 * SHORTEST_LAG, "effects.rotors.fall": 0.5 * SHORTEST_LAG}
+    return absent
 
 
 def _actual(assembly: Assembly) -> list[Unmodelled]:
@@ -107,11 +146,91 @@ def _actual(assembly: Assembly) -> list[Unmodelled]:
             continue
         stated = [*value] if isinstance(value, tuple) else value
         quantity = _VARIED.get(name, "")
-        found.append(Unmodelled(quantity=quantity, text=f"actual.{name}", remedy=f"vehicle.{name} = {stated}"))
+        remedy = f"vehicle.{name} = {stated}"
+        entry = Unmodelled(
+            quantity=quantity,
+            text=f"actual.{name}",
+            remedy=remedy,
+            absent={f"actual.{name}": None},
+            settings={f"vehicle.{name}": stated},
+        )
+        found.append(entry)
     return found
 
 
 _VARIED: Final = {"mass": "mass", "inertia": "inertia", "thrust_coefficient": "thrust"}
+
+
+def unpredicted(assembly: Assembly) -> tuple[Unmodelled, ...]:
+    """Return the drag, the moments and the forces that a scenario states, where an MPC has a field for them.
+
+    They hardly move the limits of a loop, which is why `unmodelled` is without them.
+    """
+    spec = assembly.scenario.controller
+    entries: list[Unmodelled] = []
+    if isinstance(spec, Nonlinear):
+        entries += [*_drag(spec, assembly), *_moments(spec, assembly)]
+    if isinstance(spec, Nonlinear | Bounded):
+        entries += _forces(spec, assembly)
+    return tuple(entries)
+
+
+def _drag(spec: Nonlinear, assembly: Assembly) -> list[Unmodelled]:
+    """Return the drag of body and rotors that the prediction lacks, that of the rotors as in hover."""
+    air = assembly.effects.air
+    if air is None or spec.disturbance is not None or any((*spec.drag, *spec.quadratic_drag)):
+        return []
+    of_rotors = N_ROTORS * assembly.vehicle.hover_speed * (air.rotor_drag or 0.0)
+    x, y, z = air.linear_drag
+    linear = [float(f"{drag:.4g}") for drag in (x + of_rotors, y + of_rotors, z)]
+    quadratic = [*air.quadratic_drag]
+    settings: dict[str, Any] = {}
+    if any(linear):
+        settings["controller.drag"] = linear
+    if any(quadratic):
+        settings["controller.quadratic_drag"] = quadratic
+    if not settings:
+        return []
+    still = [0.0, 0.0, 0.0]
+    absent = {"effects.air.linear_drag": still, "effects.air.quadratic_drag": still, "effects.air.rotor_drag": 0.0}
+    return [Unmodelled(quantity="drag", text="drag", remedy=_as_written(settings), absent=absent, settings=settings)]
+
+
+def _moments(spec: Nonlinear, assembly: Assembly) -> list[Unmodelled]:
+    """Return the air's moments that the vehicle has numbers for and that the prediction lacks."""
+    air, vehicle = assembly.effects.air, assembly.vehicle
+    modelled = (vehicle.rotor_moment, vehicle.inflow_moment, vehicle.rate_damping)
+    if air is None or spec.moment or not any(any(moment or ()) for moment in modelled):
+        return []
+    absent = {
+        "effects.air.rotor_moment": [0.0, 0.0],
+        "effects.air.inflow_moment": [0.0, 0.0],
+        "effects.air.rate_damping": [0.0, 0.0, 0.0],
+    }
+    settings = {"controller.moment": True}
+    text = "moments of the air"
+    return [Unmodelled(quantity="", text=text, remedy=_as_written(settings), absent=absent, settings=settings)]
+
+
+def _forces(spec: Nonlinear | Bounded, assembly: Assembly) -> list[Unmodelled]:
+    """Return wind and disturbance that the law does not estimate."""
+    fields, air, disturbance = vars(spec), assembly.effects.air, assembly.effects.disturbance
+    if fields.get("offset_free") is not None or fields.get("disturbance") is not None:
+        return []
+    absent: dict[str, Any] = {}
+    stated: list[str] = []
+    if air is not None and (any(air.wind) or air.turbulence is not None):
+        stated.append("wind")
+        absent |= {"effects.air.wind": [0.0, 0.0, 0.0], "effects.air.turbulence": None}
+    if disturbance is not None:
+        stated.append("a disturbance")
+        absent["effects.disturbance"] = None
+    if not stated:
+        return []
+    estimate = "controller.disturbance" if isinstance(spec, Nonlinear) else "controller.offset_free"
+    settings = {**_law_with(assembly, "offset_free"), estimate: {}}
+    text = " and ".join(stated)
+    return [Unmodelled(quantity="", text=text, remedy=_as_written(settings), absent=absent, settings=settings)]
 
 
 def worst_heading(assembly: Assembly) -> float:
@@ -124,6 +243,38 @@ def worst_heading(assembly: Assembly) -> float:
         if isinstance(event, SetpointEvent) and "yaw" in event.values:
             stated.append(float(wrapped(event.values["yaw"])))
     return round(math.degrees(max(stated, key=abs)), 9)
+
+
+def modelling_changes(assembly: Assembly) -> list[dict[str, Any]]:
+    """Return the changes by which a law has what the scenario states and its model lacks.
+
+    All of `unmodelled` together come first, then each alone, then each of `unpredicted`.  `robust` gets soft bounds
+    with them, as a state that the old model led to may lie beyond hard ones; a heading comes without them, too.
+    """
+    spec = assembly.scenario.controller
+    lacking = [dict(entry.settings) for entry in unmodelled(assembly)]
+    others = [_softened(spec, entry.settings) for entry in unpredicted(assembly)]
+    if not lacking:
+        return others
+    together: dict[str, Any] = {}
+    for settings in lacking:
+        together |= settings
+    changes = [together]
+    if len(lacking) > 1:
+        changes += lacking
+    softened = [_softened(spec, settings) for settings in changes]
+    if softened != changes and "controller.heading" in together:
+        softened.append({**_law_with(assembly, "heading"), "controller.heading": True})
+    return softened + others
+
+
+def _softened(spec: AnyController, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a change with soft bounds, named after the law, where it is one of `robust` with hard ones."""
+    law = {path: name for path, name in settings.items() if path == "controller.type"}
+    is_robust = isinstance(spec, Robust) or law.get("controller.type") == "robust"
+    if not is_robust or vars(spec).get("soft") is not None:
+        return {**settings}
+    return {**law, "controller.soft": {}, **settings}
 
 
 def model_notes(assembly: Assembly) -> list[str]:

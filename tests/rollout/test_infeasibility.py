@@ -23,13 +23,17 @@ from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import PlanExhaustedError
 from quadsim.mpc.laws.parts.nonlinear_mpc import CONVERGED
 from quadsim.mpc.problem.ocp import InfeasiblePeriod
+from quadsim.report.comparison import failure_sentences
 from quadsim.rollout import infeasibility, remedies
 from quadsim.rollout.flown import Flight
+from quadsim.rollout.growth import SHORT_PAIR, Growth
 from quadsim.rollout.infeasibility import diagnose
 from quadsim.rollout.rollout import Rollout
+from quadsim.rollout.stability import measure_growth
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import FLIGHTS
 from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.mismatch import unmodelled
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.scenarios.schema.settings import get_field
 from quadsim.state import INDEX, Array, make_state
@@ -567,3 +571,158 @@ def test_a_heading_that_the_model_lacks_is_the_first_that_is_tried_and_helps(
     assert turning in [change["settings"] for change in diagnosis["suggestions"]]
     assert diagnosis["advice"].startswith("to try, each flown until")
     assert "controller.heading = true" in diagnosis["advice"]
+
+
+# --- what the model lacks --------------------------------------------------------------------------------------------
+
+UNAUDITED = {"constraints": [], "duration": 14.0}
+LACKING: dict[str, tuple[str, dict[str, Any], str, dict[str, Any]]] = {
+    "backwards": (
+        "hummingbird-real-rotors",
+        {
+            "reference": BACKWARDS,
+            "initial": {"position": [0.0, 0.0, 1.0], "euler": [0.0, 0.0, -174.0]},
+            "constraints": [],
+            "duration": 14.0,
+        },
+        "a heading of -178.5 deg",
+        {"controller.type": "robust", "controller.heading": True},
+    ),
+    "turn and step": (
+        "hummingbird-figure-eight",
+        {"reference": TURN_AND_STEP, "constraints": [], "duration": 14.0},
+        "a heading of 90 deg",
+        {"controller.type": "robust", "controller.heading": True},
+    ),
+    "turned hover": (
+        "paper-constrained",
+        {
+            "reference": {"type": "yaw_turns", "turns": [{"start": 0.0, "yaw": 60.0, "rate": 30.0}]},
+            "initial": {"position": [0.0, 0.0, 1.0], "euler": [0.0, 0.0, 60.0]},
+            "events": [{"type": "push", "at": 1.0, "duration": 0.2, "force": [4.0, 0.0, 0.0]}],
+            "constraints": [],
+            "duration": 20.0,
+        },
+        "a heading of 60 deg",
+        {"controller.type": "robust", "controller.heading": True},
+    ),
+    "late nonlinear": (
+        "hummingbird-real-rotors",
+        {"controller": "nonlinear", "computation": {"delay": 0.03}, **UNAUDITED},
+        "commands 30 ms late",
+        {"controller.delay": 0.03},
+    ),
+    "late geometric": (
+        "hummingbird-real-rotors",
+        {"controller": "geometric", "computation": {"delay": 0.12}, **UNAUDITED},
+        "commands 120 ms late",
+        {"controller.delay": 0.12},
+    ),
+    "late lqr": (
+        "hummingbird-real-rotors",
+        {"controller": "lqr", "computation": {"delay": 0.12}, **UNAUDITED},
+        "commands 120 ms late",
+        {"controller.type": "nonlinear", "controller.rotor_lag": 0.0125, "controller.delay": 0.12},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", LACKING)
+def test_what_the_model_lacks_is_named_with_the_growth_without_it_and_with_its_field(case: str) -> None:
+    """Each is the only one to blame: taken away alone, or known alone, it makes the loop stable."""
+    name, changes, lacks, settings = LACKING[case]
+    scenario = load_scenario(name).replace(changes)
+    flight = quadsim.fly(scenario, progress=False)
+    assert flight.outcome == "lost"
+    diagnosis = flight.summary["diagnosis"]
+    loop = diagnosis["loop"]
+    stated = measure_growth(scenario, heading=loop["heading"], longest=SHORT_PAIR)
+    assert loop["unstable"]
+    assert loop["rate"] == stated.rate > 0.5
+    without = {entry["lacks"]: entry for entry in loop["without"]}
+    assert [text for text, entry in without.items() if not entry["unstable"]] == [lacks]
+    assert without[lacks]["rate"] < -0.2
+    known = [entry for entry in loop["with"] if not entry["unstable"]]
+    assert [entry["settings"] for entry in known] == [settings]
+    assert known[0]["rate"] < -0.2
+    assert f"; without {lacks} it shrinks at {-without[lacks]['rate']:.3g} 1/s; with controller." in loop["sentence"]
+    fields = [path for path in settings if path != "controller.type"]
+    assert all(f"{path} = " in loop["sentence"] for path in fields)
+    advised = [change["settings"] for change in diagnosis["suggestions"]]
+    assert any(settings.items() <= change.items() for change in advised)
+    assert diagnosis["advice"].startswith("to try, each flown until")
+    assert loop["sentence"] in failure_sentences(flight)
+    if case == "late geometric":
+        text = (Path(__file__).resolve().parents[2] / "docs" / "audit.md").read_text(encoding="utf-8")
+        assert f"{diagnosis['sentence']}\n{loop['sentence']}\n{diagnosis['advice']}\n" in text
+
+
+def test_a_change_with_which_a_push_still_grows_is_not_advised() -> None:
+    """Rotors that lag are lacking, too; to know them alone helps for some seconds only."""
+    name, changes, _, _ = LACKING["late nonlinear"]
+    diagnosis = quadsim.fly(load_scenario(name).replace(changes), progress=False).diagnosis
+    assert diagnosis is not None
+    lag = {"controller.rotor_lag": 0.0125}
+    reasons = [change["why"] for change in diagnosis["rejected"] if change["settings"] == lag]
+    assert len(reasons) == 1
+    assert reasons[0].startswith("in hover a push still grows at ")
+
+
+def test_a_stable_loop_is_not_taken_apart() -> None:
+    """Its lag is why the QP has no answer, but in hover a push shrinks."""
+    flight = lagging()
+    diagnosis = flight.diagnosis
+    assert diagnosis is not None
+    loop = diagnosis["loop"]
+    assert not loop["unstable"]
+    assert loop["rate"] < 0.0
+    assert (loop["without"], loop["with"], "sentence" in loop) == ([], [], False)
+
+
+def test_a_lost_flight_whose_model_lacks_nothing_or_is_not_known_is_not_explained() -> None:
+    late = load_scenario("hummingbird-real-rotors").replace(
+        {"controller": "geometric", "computation": {"delay": 0.12}, "constraints": []}
+    )
+    fallen = quadsim.fly(late, controller=lambda now, state, reference: [0.0] * 4, progress=False)
+    assert (fallen.outcome, fallen.diagnosis) == ("lost", None)
+    thrown = load_scenario("hover").replace(
+        {"controller": "pid", "initial.body_rates": [2000.0, 0.0, 0.0], "constraints": [], "duration": 2.0}
+    )
+    tumbled = quadsim.fly(thrown, progress=False)
+    assert (tumbled.outcome, tumbled.diagnosis) == ("lost", None)
+
+
+def test_few_pairs_are_flown_however_much_the_model_lacks() -> None:
+    scenario = load_scenario("hummingbird-real-rotors").replace(
+        {
+            "computation": {"delay": 0.1},
+            "actual": {
+                "mass": 0.8,
+                "inertia": [0.008, 0.008, 0.013],
+                "thrust_coefficient": 9e-6,
+                "drag_to_thrust": 0.02,
+            },
+        }
+    )
+    assembly = Assembly(scenario)
+    assert len(unmodelled(assembly)) > remedies.MOST_PAIRS
+    asked: list[float] = []
+
+    def growing(scenario: Scenario, heading: float) -> Growth:
+        asked.append(heading)
+        return Growth(rate=1.0, left=100.0, time=5.0)
+
+    report = remedies._loop_report(assembly, growing)
+    assert len(asked) == 2 * remedies.MOST_PAIRS + 2
+    assert report["sentence"].endswith("nothing of what the model lacks, taken away or set, changes that")
+
+
+def test_wind_that_a_nonlinear_law_could_estimate_is_tried() -> None:
+    storm = {"linear_drag": [0.3, 0.3, 0.3], "wind": [14.0, 3.0, 0.0]}
+    scenario = load_scenario("hummingbird-figure-eight").replace({"controller": "nonlinear", "effects.air": storm})
+    diagnosis = quadsim.fly(scenario, progress=False).diagnosis
+    assert diagnosis is not None
+    assert {"controller.disturbance": {}} in [change["settings"] for change in diagnosis["suggestions"]]
+    (known,) = (entry for entry in diagnosis["loop"]["with"] if not entry["unstable"])
+    assert known["settings"] == {"controller.disturbance": {}}
+    assert "; without wind it shrinks at" in diagnosis["loop"]["sentence"]

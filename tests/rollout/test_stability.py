@@ -17,7 +17,8 @@ import quadsim
 from quadsim.errors import InputError
 from quadsim.mpc.problem.ocp import Problem
 from quadsim.rollout import stability
-from quadsim.rollout.stability import Growth, instability_notes, measure_growth
+from quadsim.rollout.growth import Growth
+from quadsim.rollout.stability import instability_notes, measure_growth
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.mismatch import unmodelled

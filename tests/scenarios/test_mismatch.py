@@ -9,9 +9,10 @@ import pytest
 
 import quadsim
 from quadsim.commands.cli import main
+from quadsim.rollout.infeasibility import changed_scenario
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
-from quadsim.scenarios.mismatch import model_notes
+from quadsim.scenarios.mismatch import model_notes, unmodelled, unpredicted
 
 LAG = {"effects.rotors": {"rise": 0.02, "fall": 0.02}}
 REMEDY = 'controller.rotor_lag = "vehicle"'
@@ -76,3 +77,80 @@ def test_it_is_printed_and_in_the_summary_where_that_controller_flew(
     assert len(quadsim.fly(scenario, progress=False).summary["model_notes"]) == 1
     own = quadsim.fly(scenario, controller=lambda now, state, reference: [205.0] * 4, progress=False)
     assert "model_notes" not in own.summary
+
+
+WINDY = {"effects.air": {"wind": [6.0, 0.0, 0.0]}}
+PUSHED = {"effects.disturbance": {"force": [0.5, 0.0, 0.0]}}
+NONLINEAR: dict[str, Any] = {"controller": "nonlinear"}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "expected"),
+    [
+        ("hover", {}, {}),
+        ("hover", WINDY, {"wind": {"controller.type": "robust", "controller.offset_free": {}}}),
+        ("robust", PUSHED, {}),  # it estimates one
+        ("robust", {**PUSHED, "controller.offset_free": None}, {"a disturbance": {"controller.offset_free": {}}}),
+        ("hover", {"controller": "pid", **WINDY}, {}),  # it has no field for it
+        ("hover", NONLINEAR | WINDY | PUSHED, {"wind and a disturbance": {"controller.disturbance": {}}}),
+        (
+            "hover",
+            NONLINEAR | {"effects.air": {"linear_drag": [0.3, 0.2, 0.1]}},
+            {"drag": {"controller.drag": [0.3, 0.2, 0.1]}},
+        ),
+        (
+            "hover",
+            {
+                "controller": {"type": "nonlinear", "drag": [0.3, 0.2, 0.1]},
+                "effects.air": {"linear_drag": [0.3, 0.2, 0.1]},
+            },
+            {},
+        ),
+    ],
+)
+def test_effects_that_a_law_has_a_field_for_are_named(
+    name: str, changes: dict[str, Any], expected: dict[str, dict[str, Any]]
+) -> None:
+    """Each field is one that the scenario takes, and with it the law lacks that effect no more."""
+    scenario = load_scenario(name).replace(changes)
+    found = unpredicted(Assembly(scenario))
+    assert {entry.text: entry.settings for entry in found} == expected
+    for entry in found:
+        changed = changed_scenario(scenario, dict(entry.settings))
+        assert changed is not None
+        assert entry.text not in [left.text for left in unpredicted(Assembly(changed))]
+        still = scenario.replace(entry.absent)
+        assert unpredicted(Assembly(still)) == ()
+
+
+def test_moments_of_the_air_are_named_where_the_vehicle_has_their_numbers() -> None:
+    moments = {"effects.air": {}, "vehicle.rate_damping": [0.01, 0.01, 0.01]}
+    scenario = load_scenario("hover").replace(NONLINEAR | moments)
+    (found,) = unpredicted(Assembly(scenario))
+    assert (found.text, found.settings) == ("moments of the air", {"controller.moment": True})
+    known = scenario.replace({"controller": {"type": "nonlinear", "moment": True}})
+    assert unpredicted(Assembly(known)) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("hover", {"computation": {"delay": 0.03}}),
+        ("paper-constrained-lag20", {}),
+        ("crazyflie-real-rotors", {}),
+        ("hover", NONLINEAR | {"actual": {"rotor_rise": 0.03, "rotor_fall": 0.03}}),
+        ("paper-unconstrained", {"computation": {"delay": 0.03}, "effects.rotors": LAG["effects.rotors"]}),
+        ("hover", {"controller": "pid", "computation": {"delay": 0.03}}),
+        ("hover", {"actual.mass": 4.2}),
+    ],
+)
+def test_what_is_lacking_is_gone_without_it_and_with_its_fields(name: str, changes: dict[str, Any]) -> None:
+    scenario = load_scenario(name).replace(changes)
+    lacking = unmodelled(Assembly(scenario))
+    assert lacking != ()
+    for entry in lacking:
+        texts = [other.text for other in unmodelled(Assembly(scenario.replace(entry.absent)))]
+        assert texts == [other.text for other in lacking if other is not entry]
+        changed = changed_scenario(scenario, dict(entry.settings))
+        assert changed is not None
+        assert entry.text not in [left.text for left in unmodelled(Assembly(changed))]

@@ -83,7 +83,7 @@ def stability(
     from quadsim.features.stability.quantities import quantities_named
     from quadsim.features.stability.report import Stability as Found
     from quadsim.outputs import reserving
-    from quadsim.rollout.stability import SIZE, hovering
+    from quadsim.rollout.growth import SIZE, hovering
     from quadsim.scenarios.loading import load_scenario
 
     quantities = quantities_named(over)

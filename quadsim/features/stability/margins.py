@@ -13,7 +13,8 @@ from quadsim.console.progress import Progress
 from quadsim.errors import InputError
 from quadsim.features.stability.quantities import VARIED, VariedQuantity, point
 from quadsim.rollout import many
-from quadsim.rollout.stability import Growth, hovering, measure_growth
+from quadsim.rollout.growth import Growth, hovering
+from quadsim.rollout.stability import measure_growth
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.feasibility_check import hover_notes
 from quadsim.scenarios.plugin import Plugin

@@ -17,7 +17,7 @@ from quadsim.commands.cli import main
 from quadsim.errors import InputError, OutputError, ParameterError, UnknownNameError
 from quadsim.features.stability.margins import WIDTH, LoopPoint, MarginSide, MeasuredLoop, find_side, look
 from quadsim.features.stability.quantities import VARIED, point
-from quadsim.rollout.stability import SIZE
+from quadsim.rollout.growth import SIZE
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.schema.scenario import Scenario
