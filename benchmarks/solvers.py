@@ -2,8 +2,7 @@
 
 A flight is recorded by the controller as its scenario has it.  Its measured states, references and commands before are
 then given to the same controller with each solver.  All answer from the gain where the unconstrained optimum is
-feasible.  Between two answers the plant flies a period, which leaves in the caches what it
-leaves there in a flight.
+feasible.  Between two answers the plant flies a period, which leaves in the caches what it leaves there in a flight.
 """
 
 from __future__ import annotations
