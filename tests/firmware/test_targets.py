@@ -54,7 +54,7 @@ LAWS = {
     "paper-constrained": Limits(
         (("cortex-m7", "double"), ("cortex-m7", "float"), ("cortex-m4f", "float")),
         (0.1, 3.0, 7.0, 9.0),
-        {"double": 200, "float": 125},
+        {"double": 200, "float": 127},
         {"double": 103, "float": 53},
         (1400, 4000),
         1200,
@@ -72,7 +72,7 @@ LAWS = {
     "autopilot": Limits(
         (("cortex-m7", "float"), ("cortex-m4f", "float")),
         (2.0, 5.0, 5.0, 5.0),
-        {"float": 150},
+        {"float": 152},
         {"float": 40},
         (14_500, 8000),
         302,

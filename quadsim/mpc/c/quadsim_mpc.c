@@ -436,7 +436,7 @@ static int prepare_robust(quadsim_mpc *mpc, int flying, int learns, const real *
     real ahead[12];
     const int known = predict_ahead(mpc, state, learns, ahead);
     mpc->known = known && flying;
-    if (known) {
+    if (known && state != NULL) {
         put_query(mpc, ahead, reference, first_turns(&mpc->headed, &mpc->heading, reference, state[YAW]));
     }
     return known;

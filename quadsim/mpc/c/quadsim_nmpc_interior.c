@@ -66,6 +66,7 @@ static inner lay_out(const quadsim_nmpc_work *work, int of_states)
     const int N = p->horizon;
     real *memory = work->response;
     inner at;
+    at.pairs = 0;
     at.inputs = N * NU;
     at.rows = of_states ? N * quadsim_nmpc_state_rows(p) : 0;
     at.count = 2 * at.inputs + at.rows;
