@@ -20,6 +20,7 @@ from quadsim.state import Array, read_only
 
 N_ROTORS: Final = 4
 AUTOPILOT: Final = "autopilot"  # table of a vehicle file; see `quadsim.sim.autopilot.AutopilotSettings`
+DISTURBANCE: Final = "disturbance"  # as AUTOPILOT: what its flights met; see `quadsim.sim.effects.Disturbance`
 OfRotors = Annotated[tuple[Number, ...], Len(N_ROTORS, N_ROTORS)]
 Positions = Annotated[tuple[Vector, ...], Len(N_ROTORS, N_ROTORS)]
 ARMS: Final = ("arm_length", "rotor_azimuths")
@@ -511,16 +512,16 @@ def vehicle_sources(path: Path) -> dict[str, str]:
     return {key: entry["source"] for key, entry in _read_entries(path)[1].items()}
 
 
-def vehicle_autopilot(path: Path) -> dict[str, Any]:
-    """Return the fields of a vehicle file's `[autopilot]` but its `source`; empty if it has no such table.
+def vehicle_table(path: Path, name: str) -> dict[str, Any]:
+    """Return the fields of a vehicle file's `[autopilot]` or `[disturbance]` but its `source`; empty without the table.
 
     Raises:
         FileError: as `load_vehicle`.
         ParameterError: it is not a table, or does not say where its numbers are from.
     """
-    table = read_toml(path).get(AUTOPILOT, {"source": "none"})
+    table = read_toml(path).get(name, {"source": "none"})
     if not isinstance(table, dict) or not isinstance(table.get("source"), str) or not table["source"].strip():
-        raise ParameterError("vehicle", AUTOPILOT, table, "a table with a source, a text saying where it is from")
+        raise ParameterError("vehicle", name, table, "a table with a source, a text saying where it is from")
     return {name: value for name, value in table.items() if name != "source"}
 
 
@@ -529,7 +530,7 @@ def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]
     texts: dict[str, str] = {}
     entries: dict[str, dict[str, Any]] = {}
     for key, entry in read_toml(path).items():
-        if key == AUTOPILOT:
+        if key in (AUTOPILOT, DISTURBANCE):
             continue
         if key in ("name", "description"):
             if not isinstance(entry, str):

@@ -38,7 +38,7 @@ from quadsim.scenarios.schema.writing import plain
 from quadsim.sim.airframe import outline
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings, built_in_lags, identify_lags
 from quadsim.sim.computation import Computation, ComputationTime, Stall, check_measured, times_by_solver
-from quadsim.sim.effects import Change, Effects, Force, Push, push_changes
+from quadsim.sim.effects import Change, Disturbance, Effects, Force, Push, push_changes
 from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss, efficiency_changes
 from quadsim.sim.effects.wind import Air, Gust, WindChange, WindField
 from quadsim.sim.navigation import Navigation
@@ -56,6 +56,7 @@ from quadsim.state import (
 )
 from quadsim.vehicle import (
     AUTOPILOT,
+    DISTURBANCE,
     N_ROTORS,
     VEHICLE_UNITS,
     Vehicle,
@@ -63,7 +64,7 @@ from quadsim.vehicle import (
     load_vehicle,
     missing_parameters,
     overridden,
-    vehicle_autopilot,
+    vehicle_table,
 )
 
 if TYPE_CHECKING:
@@ -95,6 +96,13 @@ class _Piloted:
     """A table with an autopilot, so that messages name the field."""
 
     autopilot: AutopilotSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Disturbed:
+    """A table with a disturbance, for the same."""
+
+    disturbance: Disturbance
 
 
 class Assembly:
@@ -616,11 +624,23 @@ def stated_autopilot(path: Path, stated: AutopilotSettings | None = None) -> Aut
     Raises:
         InputError: a field of the file's is wrong.
     """
-    of_file = vehicle_autopilot(path)
+    of_file = vehicle_table(path, AUTOPILOT)
     if not of_file:
         return stated
     table = {**of_file, **(plain(stated) if stated is not None else {})}
     return parse_table(_Piloted, {AUTOPILOT: table}, str(path), file="vehicle").autopilot
+
+
+def stated_disturbance(path: Path) -> Disturbance | None:
+    """Return the `[disturbance]` of a vehicle file, which is what flights of it met; None without it.
+
+    Raises:
+        InputError: a field of it is wrong.
+    """
+    of_file = vehicle_table(path, DISTURBANCE)
+    if not of_file:
+        return None
+    return parse_table(_Disturbed, {DISTURBANCE: of_file}, str(path), file="vehicle").disturbance
 
 
 def preferring_core(scenario: Scenario) -> Scenario:

@@ -126,6 +126,8 @@ class Plant:
         rng = rng if rng is not None else np.random.default_rng(0)
         # A generator each, so that neither draw changes the other's, however time is cut.
         self._generators = rng, rng.spawn(1)[0]
+        disturbance = effects.disturbance
+        self._lasting = None if disturbance is None else disturbance.lasting(timestep, rng)
         self._starts = [generator.bit_generator.state for generator in self._generators]
         self._struct = self._make_struct()
         self.reset(np.zeros(N_STATES))
@@ -198,6 +200,8 @@ class Plant:
             generator.bit_generator.state = start
         if self._wind is not None:
             self._wind.reset()
+        if self._lasting is not None:
+            self._lasting.reset()
         for force in self._own:
             getattr(force, "reset", lambda: None)()
 
@@ -384,6 +388,8 @@ class Plant:
             drawn["noise"][rows] = of_noise.standard_normal((steps, N_ROTORS))
         if self.effects.disturbance is not None:
             drawn["disturbance"][rows] = self.effects.disturbance.draw(steps, self.timestep, of_disturbance)
+        if self._lasting is not None:
+            drawn["disturbance"][rows] += self._lasting.advance(steps)
         if self._moving:
             times = self.timestep * np.arange(self._step, self._step + steps, dtype=np.float64)
             positions = np.stack([obstacle.positions(times) for obstacle in self._moving], axis=1)

@@ -65,6 +65,7 @@ def scenario(
     from quadsim.assets import vehicle_path
     from quadsim.features.design.first_scenario import first_scenario
     from quadsim.scenarios import loading
+    from quadsim.scenarios.assembly import stated_disturbance
     from quadsim.scenarios.courses.csv_course import Csv
     from quadsim.scenarios.schema.json_schema import scenario_schema
     from quadsim.vehicle import load_vehicle
@@ -77,9 +78,9 @@ def scenario(
         for option, value in {"a scenario": name, "--set": changes, "--seed": seed}.items():
             if value:
                 raise ParameterError("", "--for", vehicle, f"given without {option}")
-        return loading.ScenarioFile(
-            first_scenario(load_vehicle(vehicle_path(str(vehicle))), str(vehicle), **choice).to_toml()
-        )
+        path = vehicle_path(str(vehicle))
+        choice["disturbance"] = stated_disturbance(path)
+        return loading.ScenarioFile(first_scenario(load_vehicle(path), str(vehicle), **choice).to_toml())
     for option, value in choice.items():
         raise ParameterError("", f"--{'controller' if option == 'law' else option}", value, "given with --for alone")
     if name is None:

@@ -28,6 +28,7 @@ from quadsim.features.design.rules import (
 )
 from quadsim.mpc.laws.parts.bandwidths import lag_to_allow_for
 from quadsim.mpc.problem.model import SHORTEST_LAG
+from quadsim.sim.effects import Disturbance
 from quadsim.vehicle import Vehicle, span
 
 if TYPE_CHECKING:
@@ -66,6 +67,17 @@ half of a time constant counts as dead time (the half rule of SIMC, Skogestad, 2
 PREVIEW: Final = 2.0
 """Preview, times w, from which baselines take the reference's velocity, and all but the LQR its acceleration."""
 GRID: Final = 0.2  # durations are multiples of it [s], and so of every control period
+DISTURBANCE_UNITS: Final = {
+    "force": "N, world x, y, z",
+    "torque": "N m, body x, y, z",
+    "force_noise": "N s^0.5, white, each axis",
+    "torque_noise": "N m s^0.5, white, each axis",
+    "force_deviation": "N, standard deviation, world x, y, z",
+    "force_time": "s, with which it is forgotten",
+    "torque_deviation": "N m, standard deviation, body x, y, z",
+    "torque_time": "s, with which it is forgotten",
+}
+"""What a disturbance has, and in which unit."""
 _EIGHT_PEAK: Final = float(np.hypot(np.sin(angle := np.linspace(0.0, math.pi, 721)), 2.0 * np.sin(2.0 * angle)).max())
 """Largest |d2p/dt2| of the figure eight (a sin wt, a/2 sin 2wt), over a w^2."""
 
@@ -99,12 +111,18 @@ class FirstScenario:
 
 
 def first_scenario(
-    vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust", tilt: float | None = None
+    vehicle: Vehicle,
+    file: str,
+    *,
+    course: str = "hover",
+    law: str = "robust",
+    tilt: float | None = None,
+    disturbance: Disturbance | None = None,
 ) -> FirstScenario:
     """Return a scenario that the vehicle flies well, with numbers derived from the vehicle; see `quadsim.scenario`.
 
     `file` is where these are, as the scenario is to name it; `course` is one of `COURSES`, `law` of `DESIGNED_LAWS`; a
-    `tilt` bound [deg] replaces that of the rules.
+    `tilt` bound [deg] replaces that of the rules; a `disturbance` acts as the vehicle's file states it.
     """
     for kind, name, known in (("course", course, COURSES), ("controller", law, DESIGNED_LAWS)):
         if name not in known:
@@ -131,7 +149,7 @@ limit_speeds = true  # rotors saturate at their lowest and highest speed
 {_controller(law, vehicle, tuning, course)}
 {_rotors(vehicle)}
 [effects.air]  # drag of the vehicle file
-{_constraints(law, vehicle, tuning, size)}"""
+{_disturbance(disturbance)}{_constraints(law, vehicle, tuning, size)}"""
     return FirstScenario(text=text, size=size)
 
 
@@ -140,6 +158,18 @@ def _rotors(vehicle: Vehicle) -> str:
     if vehicle.rotor_inertia and not (vehicle.rotor_rise and vehicle.rotor_fall):
         return "[effects.rotors]\ninertia = 0.0  # kg m^2; that of the vehicle file needs its rotor_rise and fall\n"
     return "[effects.rotors]  # lag and inertia of the vehicle file\n"
+
+
+def _disturbance(disturbance: Disturbance | None) -> str:
+    """`[effects.disturbance]` with what differs from none; empty without."""
+    if disturbance is None:
+        return ""
+    text = "\n[effects.disturbance]  # of the vehicle file: what its flights met\n"
+    for name, unit in DISTURBANCE_UNITS.items():
+        value = getattr(disturbance, name)
+        if value is not None and np.any(value):
+            text += f"{name} = {json.dumps(value)}  # {unit}\n"
+    return text
 
 
 def _notes(vehicle: Vehicle, tuning: Design, course: str, law: str) -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
+from quadsim.features.identify.noise import AxisNoise
 from quadsim.vehicle import Vehicle
 
 VECTORS: Final = {"inertia": "xyz", "rotor_moment": "xy", "inflow_moment": "xy", "rate_damping": "xyz"}
@@ -44,6 +46,20 @@ class ParameterEstimate:
     in_file: bool = True  # whether a vehicle file has a field for it
 
 
+@dataclass(frozen=True, kw_only=True)
+class DisturbanceEstimate:
+    """An unknown torque about a body axis, or force along a world axis, that lasts."""
+
+    kind: str  # torque or force
+    axis: str
+    unit: str
+    deviation: float
+    deviation_interval: tuple[float, float]  # 95 %
+    time: float  # constant, with which it is forgotten [s]
+    time_interval: tuple[float, float]  # 95 % [s]
+    refused: str = ""  # why it is not told; empty where it is
+
+
 class FlightNumbers(NamedTuple):
     """What differs from flight to flight of one vehicle."""
 
@@ -66,6 +82,9 @@ class Identification:
     yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
     voltage_exponent: float = 0.0  # n of thrust over voltage, (V / V0)^n [-]
     voltage: float | None = None  # V0, at which the thrust coefficient holds [V]; None without a battery in the log
+    noise: tuple[AxisNoise, ...] = ()  # what is not modelled, in the order of `INCREMENTS`; empty where not sought
+    disturbance: tuple[DisturbanceEstimate, ...] = ()  # the same as torques and forces
+    rates_last: float = math.inf  # time constant with which body rates decay [s]
     whiteness: dict[str, float] = field(default_factory=dict)  # largest |autocorrelation| of innovations by axis [-]
 
     def of_flight(self, flight: int) -> Identification:

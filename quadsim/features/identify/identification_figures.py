@@ -9,12 +9,15 @@ import numpy as np
 
 from quadsim.features.identify.estimate import ParameterEstimate
 from quadsim.features.identify.prediction import (
+    FLOOR,
     HORIZONS,
     IDENTIFIED,
     QUANTITIES,
+    RATES_DECAY,
+    RATES_HELD,
     RESIDUAL_AFTER,
     START,
-    THRUST_ONLY,
+    UNDISTURBED,
     PredictionErrors,
     Trace,
 )
@@ -22,7 +25,9 @@ from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import Figure, Panel, Series
 from quadsim.state import shown_unit
 
-_COLOURS: Final = dict(zip((IDENTIFIED, THRUST_ONLY, START), CYCLE, strict=False))
+_COLOURS: Final = dict(zip((IDENTIFIED, RATES_HELD, START, UNDISTURBED, RATES_DECAY), CYCLE, strict=False)) | {
+    FLOOR: COLOUR.measured
+}
 _TRACED: Final = tuple(
     (i, title, *shown_unit(si))
     for axis, (velocity, rate) in enumerate(zip("xyz", ("roll", "pitch", "yaw"), strict=True))
@@ -78,7 +83,7 @@ def _percent(value: float, estimate: ParameterEstimate) -> float:
     return 100.0 * (value / estimate.value - 1.0)
 
 
-def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)) -> Figure:
+def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, RATES_HELD)) -> Figure:
     """Return velocity and body rates, measured and as predicted from each window's start."""
     t = trace.t - trace.t[0, 0]
     gap = np.full((len(t), 1), np.nan)
@@ -114,11 +119,11 @@ def horizon_figure(prediction: PredictionErrors) -> Figure:
 
 
 def residual_figure(prediction: PredictionErrors) -> Figure:
-    """Return what is left of velocity and body rates, axis by axis, of the identified vehicle and of thrust alone."""
+    """Return what is left of velocity and body rates, axis by axis, of the identified vehicle and with rates held."""
     panels = []
     for i, title, unit, scale in _TRACED:
         series = []
-        for name in (THRUST_ONLY, IDENTIFIED):
+        for name in (RATES_HELD, IDENTIFIED):
             left = scale * prediction.residuals[name][:, i]
             series.append(
                 Series(x=prediction.ends, y=left, colour=_COLOURS[name], label=name, style="points", width=3.0)

@@ -1,8 +1,15 @@
 """Open-loop prediction on flight that was not fitted: what the identified numbers are worth.
 
 From every window's start, the measured state is simulated with the rotor speeds that the log gives, and compared with
-what was measured up to 0.5 s later.  Beside the identified vehicle stand the start file as it is, and "thrust only":
-the identified thrust with the body rates of the window's start, the baseline of published comparisons.
+what was measured up to 0.5 s later.  The identified vehicle starts with the unknown torque and force that a filter
+knows at that instant, of the periods before it alone, and which fade as the identified noise does (`AxisNoise`).
+
+Beside it stand the same without them, the start file as it is, and two that have thrust and drag alone: the body rates
+are held as they were, as the baseline of published comparisons holds them, or decay as they did in what was fitted.
+
+The floor is what the identified noise leaves open to any prediction that knows the vehicle: the error of the simulation
+against itself with noise that comes after the start.  In a closed loop, it may exceed the errors of rates that are
+held: the rotors' coming speeds answer a torque that the model does not know, and the vehicle turns less than they say.
 """
 
 from __future__ import annotations
@@ -10,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -19,7 +26,8 @@ from scipy.spatial.transform import Rotation
 from quadsim.errors import InputError
 from quadsim.features.identify.checks import SHORTEST_SPAN
 from quadsim.features.identify.estimate import Identification
-from quadsim.features.identify.model import MeanMotion, Parameters, predicted_increments, turning
+from quadsim.features.identify.fit import part_of
+from quadsim.features.identify.model import INCREMENTS, MeanMotion, Parameters, predicted_increments, stretch, turning
 from quadsim.features.identify.record import Record
 from quadsim.features.identify.rotors import Turning
 from quadsim.state import Array, Indices
@@ -29,8 +37,11 @@ PREDICTION_WINDOW: Final = 0.5  # longest horizon [s]; windows start every half 
 HORIZONS: Final = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)  # at which errors are taken [s]
 RESIDUAL_AFTER: Final = 0.25  # [s] from a window's start
 JUDGED: Final = (0.1, 0.25, 0.5)  # horizons of the verdict [s]
+RATES_JUDGED: Final = 2  # of them for body rates: later, what is not known of the torque is most of the error
 TIE: Final = 0.05  # by which the errors of a quantity may exceed a rival's, in their geometric mean over the horizons
-IDENTIFIED, START, THRUST_ONLY = "identified", "start", "thrust only"
+IDENTIFIED, UNDISTURBED, START = "identified", "undisturbed", "start"
+RATES_HELD, RATES_DECAY, FLOOR = "rates held", "rates decay", "floor"
+RIVALS: Final = (START, RATES_HELD, RATES_DECAY)
 QUANTITIES: Final = {"position": "m", "velocity": "m/s", "attitude": "rad", "body rates": "rad/s"}
 ROTOR_FIELDS: Final = ("commands", "throttle", "speeds", "voltage")  # what a record may say of them
 _HELD_OUT: Final = 0.2  # share of the airborne samples of a log
@@ -38,6 +49,7 @@ _DRIFT: Final = 5.0  # [s] over which a velocity by the accelerometer is left ou
 _RESIDUAL: Final = HORIZONS.index(RESIDUAL_AFTER)
 _SHOWN: Final = 10  # windows in a trace
 _VELOCITY_AND_RATES: Final = [3, 4, 5, 10, 11, 12]  # of a state
+_FLOOR_DRAWS: Final = 4  # of noise, for each window
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,19 +75,21 @@ class PredictionErrors:
     """By model: (W, 6) measured less predicted velocity, world [m/s], and body rates [rad/s] after `RESIDUAL_AFTER`."""
 
     def ratios(self, rival: str) -> dict[str, tuple[float, ...]]:
-        """Errors of the identified vehicle over a rival's at `JUDGED`, by quantity that the logs have."""
+        """Errors of the identified vehicle over a rival's at those of `JUDGED` that count, by quantity in the logs."""
         at = [HORIZONS.index(horizon) for horizon in JUDGED]
         ratios = self.errors[IDENTIFIED][at] / np.maximum(self.errors[rival][at], 1e-12)
-        return {
-            name: tuple(of.tolist()) for name, of in zip(QUANTITIES, ratios.T, strict=True) if np.isfinite(of).all()
-        }
+        found = {}
+        for name, of in zip(QUANTITIES, ratios.T.tolist(), strict=True):
+            if np.isfinite(of).all():
+                found[name] = tuple(of[:RATES_JUDGED] if name == "body rates" else of)
+        return found
 
     @property
     def lost(self) -> tuple[str, ...]:
         """Where a rival predicts better by more than `TIE`, in words; empty where the identified vehicle wins."""
         return tuple(
             f"{quantity} than {rival}, {' '.join(f'{ratio:.2f}' for ratio in of)} times its error"
-            for rival in (START, THRUST_ONLY)
+            for rival in RIVALS
             for quantity, of in self.ratios(rival).items()
             if math.prod(of) > (1.0 + TIE) ** len(of)
         )
@@ -86,12 +100,13 @@ class PredictionErrors:
         horizons = f"at {', '.join(f'{horizon:g}' for horizon in JUDGED)} s"
         if self.lost:
             return f"predicts flight that was not fitted worse, {horizons}: {'; '.join(self.lost)}"
-        each = []
-        for rival in (START, THRUST_ONLY):
-            of = np.array([*self.ratios(rival).values()])
-            mean = np.exp(np.log(np.maximum(of, 1e-12)).mean(axis=0)).tolist()
-            each.append(f"{', '.join(f'{ratio:.2f}' for ratio in mean)} of the errors of {rival}")
-        return f"predicts flight that was not fitted better: {horizons}, {' and '.join(each)}"
+        texts = []
+        for rival in RIVALS:
+            by_quantity = self.ratios(rival).values()
+            by_horizon = [[of[i] for of in by_quantity if i < len(of)] for i in range(len(JUDGED))]
+            means = [math.exp(np.log(np.maximum(of, 1e-12)).mean()) for of in by_horizon]
+            texts.append(f"{', '.join(f'{mean:.2f}' for mean in means)} of the errors of {rival}")
+        return f"predicts flight that was not fitted better: {horizons}, {', '.join(texts[:-1])} and {texts[-1]}"
 
 
 def hold_out(record: Record, spans: Sequence[slice]) -> tuple[list[slice], list[slice]]:
@@ -124,9 +139,10 @@ def predict(
     Raises:
         InputError: no span is as long as a window.
     """
-    errors: dict[str, list[Array]] = {name: [] for name in (IDENTIFIED, START, THRUST_ONLY)}
-    residuals: dict[str, list[Array]] = {name: [] for name in errors}
+    errors: dict[str, list[Array]] = {}
+    residuals: dict[str, list[Array]] = {}
     traces, ends, begun = [], [], 0.0
+    rng = np.random.default_rng(0)
     for flight, record, span in (
         (i, record, span) for i, (record, own) in enumerate(zip(records, spans, strict=True)) for span in own
     ):
@@ -138,13 +154,16 @@ def predict(
         at = np.rint(np.array(HORIZONS) / record.period).astype(int)
         drawn = np.s_[: 2 * _SHOWN : 2, :, _VELOCITY_AND_RATES]
         drawn_states = {}
-        for name, model in _models(identification.of_flight(flight) if fitted else identification, start).items():
-            rotors = turning(_held(record), start, model)
-            states = _simulate(model, start, rotors, rows, measured, record.period, turns=name != THRUST_ONLY)
-            errors[name].append(_errors(states[:, at], measured[:, at]))
-            errors[name][-1][..., 1] *= np.nan if record.inertial else 1.0
-            residuals[name].append((measured - states)[:, at[_RESIDUAL], _VELOCITY_AND_RATES])
-            drawn_states[name] = states[drawn]
+        known = identification.of_flight(flight) if fitted else identification
+        predicted = _predictions(known, start, record, rows, measured, rng)
+        for name, prediction in predicted.items():
+            of_windows = _errors(prediction.states[:, at], prediction.truth[:, at])
+            of_windows[..., 1] *= np.nan if record.inertial else 1.0
+            errors.setdefault(name, []).append(of_windows)
+            if name == FLOOR:
+                continue
+            residuals.setdefault(name, []).append((measured - prediction.states)[:, at[_RESIDUAL], _VELOCITY_AND_RATES])
+            drawn_states[name] = prediction.states[drawn]
         taken = record.t[rows[:, at[_RESIDUAL]]]
         ends.append(begun + taken - taken[0])
         begun = float(ends[-1][-1]) + PREDICTION_WINDOW
@@ -166,9 +185,41 @@ def predict(
     )
 
 
-def _models(known: Identification, start: Vehicle) -> dict[str, Parameters]:
-    voltage = known.voltage or 0.0
-    identified = Parameters.of(
+class _Predicted(NamedTuple):
+    """States of windows."""
+
+    states: Array  # (W, K, 13)
+    truth: Array  # (W, K, 13) what they are compared with
+
+
+def _predictions(
+    known: Identification, start: Vehicle, record: Record, rows: Indices, measured: Array, rng: np.random.Generator
+) -> dict[str, _Predicted]:
+    """The windows (W, K) of a record, by each model."""
+    held = _held(record)
+    identified = parameters_of(known)
+    windows = _Windows(rows=rows, measured=measured, period=record.period, vehicle=start)
+    rotors = turning(held, start, identified)
+    disturbance = _forecast(known, start, held, rotors, rows)
+    states = {
+        IDENTIFIED: windows.simulated(identified, rotors, disturbance),
+        UNDISTURBED: windows.simulated(identified, rotors),
+    }
+    of_start = Parameters.of(start, voltage=known.voltage or 0.0)
+    states[START] = windows.simulated(of_start, turning(held, start, of_start))
+    states[RATES_HELD] = windows.simulated(identified, rotors, lasting=math.inf)
+    states[RATES_DECAY] = windows.simulated(identified, rotors, lasting=max(known.rates_last, record.period))
+    predicted = {name: _Predicted(of, measured) for name, of in states.items()}
+    again = windows.repeated(_FLOOR_DRAWS)
+    surprises = _surprises(known, record.period, (len(again.rows), rows.shape[1] - 1), rng)
+    nominal = np.tile(states[IDENTIFIED], (_FLOOR_DRAWS, 1, 1))
+    disturbed = again.simulated(identified, rotors, np.tile(disturbance, (_FLOOR_DRAWS, 1, 1)) + surprises)
+    return predicted | {FLOOR: _Predicted(nominal, disturbed)}
+
+
+def parameters_of(known: Identification) -> Parameters:
+    """The parameters of an identified vehicle, the wind at its mean."""
+    return Parameters.of(
         known.vehicle,
         delay=known.delay,
         offset=np.array(known.offset),
@@ -176,13 +227,31 @@ def _models(known: Identification, start: Vehicle) -> dict[str, Parameters]:
         yaw_trim=known.yaw_trim,
         throttle_curve=known.throttle_curve,
         voltage_exponent=known.voltage_exponent,
-        voltage=voltage,
+        voltage=known.voltage or 0.0,
     )
-    return {
-        IDENTIFIED: identified,
-        START: Parameters.of(start, voltage=voltage),
-        THRUST_ONLY: replace(identified, rotor_drag=0.0, body_drag=np.zeros(3)),
-    }
+
+
+def _forecast(known: Identification, start: Vehicle, held: Record, rotors: Turning, rows: Indices) -> Array:
+    """(W, K - 1, 6) increments that the unknown torque and force are expected to give, by what precedes each window."""
+    if not known.noise:
+        return np.zeros((len(rows), rows.shape[1] - 1, len(INCREMENTS)))
+    samples = slice(int(rows[0, 0]), int(rows[-1, 0]) + 1)
+    past = stretch(part_of(replace(held, speeds=None), samples), 0)
+    before = rotors.during(np.arange(samples.start, samples.stop - 1))
+    misfit = np.nan_to_num(past.increments - predicted_increments(past.motion, before, start, parameters_of(known)))
+    starts = rows[:, 0] - samples.start
+    forecasts = [
+        noise.forecast(misfit[:, i], held.period, starts, rows.shape[1] - 1) for i, noise in enumerate(known.noise)
+    ]
+    return np.stack(forecasts, axis=-1)
+
+
+def _surprises(known: Identification, period: float, shape: tuple[int, int], rng: np.random.Generator) -> Array:
+    """(*shape, 6) increments on top of those that are expected, drawn from the identified noise."""
+    if not known.noise:
+        return np.zeros((*shape, len(INCREMENTS)))
+    drawn = [noise.surprises(rng.standard_normal(shape), period) for noise in known.noise]
+    return np.stack(drawn, axis=-1)
 
 
 def _measured(record: Record) -> Array:
@@ -203,30 +272,52 @@ def _errors(predicted: Array, measured: Array) -> Array:
     return np.stack([*norms[:2], angle, norms[2]], axis=-1)
 
 
-def _simulate(
-    p: Parameters, vehicle: Vehicle, rotors: Turning, rows: Indices, measured: Array, period: float, *, turns: bool
-) -> Array:
-    """(W, K, 13) states at the samples (W, K) of windows, from the first measured ones on, by the midpoint rule.
+@dataclass(frozen=True, kw_only=True)
+class _Windows:
+    """Windows of a record, to be simulated from their first measured states on."""
 
-    Without `turns`, the body rates stay as they are.
-    """
-    position, velocity, rates = (measured[:, 0, part] for part in (slice(3), slice(3, 6), slice(10, 13)))
-    attitude = Rotation.from_quat(measured[:, 0, 6:10], scalar_first=True)
-    states, share = [measured[:, 0]], np.array([float(turns)] * 3 + [1.0] * 3)
-    for k in rows.T[:-1]:
-        of = rotors.during(k)
-        motion = MeanMotion(period=period, rates=rates, turn=attitude.as_matrix(), velocity=velocity)
-        begun = 0.5 * share * predicted_increments(motion, of, vehicle, p)
-        ahead = attitude * Rotation.from_rotvec(0.5 * period * rates)
-        middle = MeanMotion(
-            period=period, rates=rates + begun[:, :3], turn=ahead.as_matrix(), velocity=velocity + begun[:, 3:]
-        )
-        change = share * predicted_increments(middle, of, vehicle, p)
-        position = position + period * (velocity + 0.5 * change[:, 3:])
-        attitude = attitude * Rotation.from_rotvec(period * (rates + 0.5 * change[:, :3]))
-        velocity, rates = velocity + change[:, 3:], rates + change[:, :3]
-        states.append(np.concatenate([position, velocity, attitude.as_quat(scalar_first=True), rates], axis=1))
-    return np.stack(states, axis=1)
+    rows: Indices  # (W, K) samples
+    measured: Array  # (W, K, 13)
+    period: float  # [s]
+    vehicle: Vehicle
+
+    def repeated(self, times: int) -> _Windows:
+        """The same windows several times."""
+        return replace(self, rows=np.tile(self.rows, (times, 1)), measured=np.tile(self.measured, (times, 1, 1)))
+
+    def simulated(
+        self, p: Parameters, rotors: Turning, disturbance: Array | None = None, *, lasting: float | None = None
+    ) -> Array:
+        """(W, K, 13) states, by the midpoint rule.
+
+        Args:
+            p: the parameters.
+            rotors: over the record.
+            disturbance: (W, K - 1, 6) increments of body rates and velocity that the parameters do not give; or none.
+            lasting: the time constant [s] with which body rates decay, where no torque acts on them.
+        """
+        period = self.period
+        position, velocity, rates = (self.measured[:, 0, part] for part in (slice(3), slice(3, 6), slice(10, 13)))
+        attitude = Rotation.from_quat(self.measured[:, 0, 6:10], scalar_first=True)
+        states = [self.measured[:, 0]]
+
+        def changes(periods: Indices, turn: Rotation, rates: Array, velocity: Array, extra: Array | float) -> Array:
+            motion = MeanMotion(period=period, rates=rates, turn=turn.as_matrix(), velocity=velocity)
+            change = predicted_increments(motion, rotors.during(periods), self.vehicle, p) + extra
+            if lasting is not None:
+                change[:, :3] = -period / lasting * rates
+            return change
+
+        for step, periods in enumerate(self.rows.T[:-1]):
+            extra = 0.0 if disturbance is None else disturbance[:, step]
+            begun = 0.5 * changes(periods, attitude, rates, velocity, extra)
+            ahead = attitude * Rotation.from_rotvec(0.5 * period * rates)
+            change = changes(periods, ahead, rates + begun[:, :3], velocity + begun[:, 3:], extra)
+            position = position + period * (velocity + 0.5 * change[:, 3:])
+            attitude = attitude * Rotation.from_rotvec(period * (rates + 0.5 * change[:, :3]))
+            velocity, rates = velocity + change[:, 3:], rates + change[:, :3]
+            states.append(np.concatenate([position, velocity, attitude.as_quat(scalar_first=True), rates], axis=1))
+        return np.stack(states, axis=1)
 
 
 def _held(record: Record) -> Record:

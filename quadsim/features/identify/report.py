@@ -16,7 +16,7 @@ from quadsim.console.results import Result, Shown, after
 from quadsim.errors import InputError, MissingPackageError, ParameterError
 from quadsim.features.identify.border import judging
 from quadsim.features.identify.checks import check_log, spans
-from quadsim.features.identify.estimate import Identification, ParameterEstimate
+from quadsim.features.identify.estimate import DisturbanceEstimate, Identification, ParameterEstimate
 from quadsim.features.identify.fit import identify_records
 from quadsim.features.identify.identification_figures import (
     horizon_figure,
@@ -28,15 +28,14 @@ from quadsim.features.identify.prediction import (
     HORIZONS,
     JUDGED,
     QUANTITIES,
-    START,
-    THRUST_ONLY,
+    RIVALS,
     PredictionErrors,
     hold_out,
     predict,
 )
 from quadsim.features.identify.quantities import NamedQuantity
 from quadsim.features.identify.record import Record, read_record
-from quadsim.features.identify.vehicle_file import interval_text, rounded, vehicle_text, verdict
+from quadsim.features.identify.vehicle_file import factor_text, interval_text, rounded, vehicle_text, verdict
 from quadsim.outputs import require_file, writing_file
 from quadsim.report.page import Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
@@ -67,7 +66,7 @@ class IdentifiedVehicle(Result):
 
     @property
     def verdict(self) -> Cell:
-        """Whether the vehicle predicts flight that was not fitted better than the start and than thrust alone."""
+        """Whether the vehicle predicts flight that was not fitted better than the start and than thrust and drag."""
         return Cell(text=self.prediction.verdict, mark=Mark.BAD if self.prediction.lost else Mark.GOOD)
 
     @property
@@ -96,8 +95,8 @@ class IdentifiedVehicle(Result):
         settings = {"computation.delay": f"{known['delay']:g}"} if known.get("delay", 0.0) > 0.0 else {}
         return settings | ({"effects.load.centre_of_mass": f"[{offset[0]:g}, {offset[1]:g}, 0]"} if any(offset) else {})
 
-    def tables(self) -> tuple[Grid, Grid]:
-        """Return the parameters, and the errors of the prediction."""
+    def tables(self) -> tuple[Grid, Grid, Grid]:
+        """Return the parameters, the disturbance, and the errors of the prediction."""
         known = self.identification
         white = ", ".join(f"{axis} {value:.2f}" for axis, value in known.whiteness.items())
         parameters = Grid(
@@ -107,6 +106,14 @@ class IdentifiedVehicle(Result):
             lines=tuple(_parameter(estimate, known) for estimate in known.estimates),
             note=f"Largest autocorrelation of what is not predicted, 0 for noise: {white}." if white else "",
         )
+        disturbance = Grid(
+            key="disturbance",
+            title="Disturbance",
+            head=("not modelled", "unit", "deviation", "95 % interval", "lasts [s]", "95 % interval", "verdict"),
+            lines=tuple(_disturbance(estimate) for estimate in known.disturbance),
+            note="Random torque about body axes and force along world axes, wind's included. It is forgotten with the "
+            "time constant in seconds.",
+        )
         held_out = ", ".join(self.test) or "the last fifth of each log, which is not fitted"
         lines = []
         for j, (quantity, si) in enumerate(QUANTITIES.items()):
@@ -114,18 +121,20 @@ class IdentifiedVehicle(Result):
             for horizon in JUDGED:
                 errors = [scale * float(of[HORIZONS.index(horizon), j]) for of in self.prediction.errors.values()]
                 if all(map(math.isfinite, errors)):
-                    best = min(errors)
-                    cells = [Cell(text=format_number(e), mark=Mark.BEST if e == best else Mark.NONE) for e in errors]
+                    best = min(errors[:-1])  # the floor is no prediction
+                    cells = [Cell(text=format_number(e), mark=Mark.BEST if e <= best else Mark.NONE) for e in errors]
                     lines.append(line(f"{quantity} [{unit}]", f"{horizon:g} s", *cells))
         errors_grid = Grid(
             key="errors",
             title="Errors of prediction",
             head=("mean error", "horizon", *self.prediction.errors),
             lines=tuple(lines),
-            note=f"{self.prediction.windows} windows of {held_out}. start: the start file as it is. thrust only: the "
-            "identified thrust, the body rates held as they were.",
+            note=f"{self.prediction.windows} windows of {held_out}. identified: starts with the torque and force that "
+            "a filter knows at that instant; undisturbed: without. start: the start file as it is. rates held, rates "
+            f"decay: identified thrust and drag alone; decay with {known.rates_last:.2g} s, as in what was fitted. "
+            "floor: what the identified disturbance leaves open to any prediction.",
         )
-        return parameters, errors_grid
+        return parameters, disturbance, errors_grid
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
@@ -179,7 +188,7 @@ class IdentifiedVehicle(Result):
             "advice": self.advice,
             "settings": self.settings,
             "verdict": {"better": not self.prediction.lost, "text": self.prediction.verdict}
-            | {rival: self.prediction.ratios(rival) for rival in (START, THRUST_ONLY)},
+            | {rival: self.prediction.ratios(rival) for rival in RIVALS},
             "prediction": {"windows": self.prediction.windows, "horizons": HORIZONS, "errors": errors},
             "vehicle_file": self.content,
             "written": [str(path) for path in (self.file, self.page) if path is not None],
@@ -289,7 +298,7 @@ def _usable(
 
 def _render(result: IdentifiedVehicle) -> str:
     """Return the page as HTML."""
-    parameters, errors = result.tables()
+    parameters, disturbance, errors = result.tables()
     trace = result.prediction.trace
     figures = (trace_figure(trace), residual_figure(result.prediction), horizon_figure(result.prediction))
     return render_page(
@@ -299,7 +308,7 @@ def _render(result: IdentifiedVehicle) -> str:
             Section(
                 title="Parameters",
                 plots=(to_plot(interval_figure(result.identification.estimates)),),
-                tables=(parameters,),
+                tables=(parameters, disturbance),
             ),
             Section(title="Prediction of flight not fitted", plots=tuple(map(to_plot, figures)), tables=(errors,)),
         ],
@@ -314,6 +323,30 @@ def _parameter(estimate: ParameterEstimate, known: Identification) -> tuple[Cell
     value = f"{rounded(estimate.value, estimate):.7g}"
     found = Cell(text=verdict(estimate, known.vehicle), mark=Mark.TEXT)
     return line(estimate.name, estimate.unit, start, value, interval_text(estimate), found)
+
+
+def _disturbance(estimate: DisturbanceEstimate) -> tuple[Cell, ...]:
+    """Return a line of the table of disturbances."""
+    name = f"{estimate.kind} {estimate.axis}"
+    if estimate.refused:
+        return line(
+            name,
+            estimate.unit,
+            ABSENT,
+            ABSENT,
+            ABSENT,
+            ABSENT,
+            Cell(text=f"left out: {estimate.refused}", mark=Mark.TEXT),
+        )
+    return line(
+        name,
+        estimate.unit,
+        f"{estimate.deviation:.3g}",
+        factor_text(estimate.deviation_interval),
+        f"{estimate.time:.3g}",
+        factor_text(estimate.time_interval),
+        Cell(text="identified", mark=Mark.TEXT),
+    )
 
 
 def _plain(values: Any) -> Any:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -163,9 +164,13 @@ class Search:
         own.setdefault("throttle_curve", self.vehicle.throttle_share)
         return Parameters(body_drag=area / given[0] * np.array(given), voltage=self.voltage, **own)
 
-    def misfit(self, x: Array, part: int, rotors: Turning | None = None) -> tuple[Array, Turning]:
-        """(N, 6) measured less predicted increments of a stretch, and its rotors."""
+    def misfit(
+        self, x: Array, part: int, rotors: Turning | None = None, *, steady: bool = False
+    ) -> tuple[Array, Turning]:
+        """(N, 6) measured less predicted increments of a stretch, and its rotors; `steady`: in the mean wind."""
         parameters = self.parameters(x, part)
+        if steady:
+            parameters = replace(parameters, wind=parameters.wind.mean(axis=0, keepdims=True))
         rotors = rotors or turning(self.parts[part].record, self.vehicle, parameters)
         misfit = self.parts[part].increments - predicted_increments(
             self.parts[part].motion, rotors, self.vehicle, parameters
@@ -268,7 +273,7 @@ class Search:
                 slopes[:, :, i] = slope * np.interp(when, np.linspace(0.0, 1.0, len(wind)), share)[:, None]
         return misfit, slopes
 
-    def _rows(self, part: int) -> list[Indices]:
+    def rows(self, part: int) -> list[Indices]:
         """The samples of each block of a stretch."""
         long = sum(map(_seconds, self.parts))
         size = len(self.parts[part].increments) - self._skip[part]
@@ -278,7 +283,7 @@ class Search:
 
     def _lift(self, misfit: Array, part: int) -> Array:
         """Mean misfit (N, ...) of vz in each block, over what is allowed of it: thrust has to carry the weight."""
-        rows = self._rows(part)
+        rows = self.rows(part)
         most = BALANCE * math.sqrt(len(rows) * len(self.parts))
         return np.stack([misfit[of].mean(axis=0) for of in rows]) / (
             most * self.vehicle.gravity * self.parts[part].record.period
@@ -298,7 +303,7 @@ class Search:
                 moved = x.copy()
                 moved[i] += 1e-4
                 slopes[:, axis, i] = (self._innovations_of(misfit, moved, part, axis) - innovations[:, axis]) / 1e-4
-        lift = np.zeros((len(self._rows(part)), len(x)))
+        lift = np.zeros((len(self.rows(part)), len(x)))
         lift[:, : self._physical] = self._lift(raw[:, -1], part)
         return innovations, slopes, self._lift(misfit[:, -1], part), lift
 
@@ -308,7 +313,7 @@ class Search:
         for i in range(len(self.parts)):
             innovations, slopes, lift, lift_slopes = self._slopes(i)
             sigma = self.sigma[self.parts[i].flight]
-            for rows, mean, slope in zip(self._rows(i), lift, lift_slopes, strict=True):
+            for rows, mean, slope in zip(self.rows(i), lift, lift_slopes, strict=True):
                 J = np.vstack([(slopes[rows] / sigma[:, None]).reshape(-1, len(self.x)), slope])
                 blocks.append(NormalEquations(J.T @ J, J.T @ np.append((innovations[rows] / sigma).ravel(), mean)))
         return blocks

@@ -10,8 +10,14 @@ from typing import Any, Final
 import numpy as np
 import tomlkit
 
-from quadsim.features.identify.estimate import Identification, ParameterEstimate, field_of, number_in
-from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from quadsim.features.identify.estimate import (
+    DisturbanceEstimate,
+    Identification,
+    ParameterEstimate,
+    field_of,
+    number_in,
+)
+from quadsim.vehicle import DISTURBANCE, VEHICLE_UNITS, Vehicle
 
 _DIGITS: Final = 100.0  # the last digit is no more than this part of an interval
 
@@ -63,7 +69,36 @@ def vehicle_text(identification: Identification, start: Path, logs: Sequence[str
         table: Any = document[name]
         table["value"] = _value(value, estimates)
         table["source"] = _source(identification.vehicle, estimates, str(table["source"]), logs)
+    known = [estimate for estimate in identification.disturbance if not estimate.refused]
+    if known:
+        document.pop(DISTURBANCE, None)
+        document.add(tomlkit.nl())
+        document[DISTURBANCE] = _disturbance(known, logs)
     return tomlkit.dumps(document)
+
+
+def _disturbance(known: Sequence[DisturbanceEstimate], logs: Sequence[str]) -> dict[str, Any]:
+    """Return the table `[disturbance]` of a vehicle file; an axis of which nothing is known has none."""
+    table: dict[str, Any] = {}
+    parts = []
+    for estimate in known:
+        deviations = table.setdefault(f"{estimate.kind}_deviation", [0.0, 0.0, 0.0])
+        times = table.setdefault(f"{estimate.kind}_time", [1.0, 1.0, 1.0])
+        place = "xyz".index(estimate.axis)
+        deviations[place] = float(f"{estimate.deviation:.3g}")
+        times[place] = float(f"{estimate.time:.3g}")
+        parts.append(
+            f"{estimate.kind} {estimate.axis} 95 % within {factor_text(estimate.deviation_interval)} {estimate.unit}, "
+            f"{factor_text(estimate.time_interval)} s"
+        )
+    table["source"] = f"identified: {'; '.join(parts)}; logs {', '.join(logs)}"
+    return table
+
+
+def factor_text(interval: tuple[float, float]) -> str:
+    """Return an interval that is known to a factor as text."""
+    low, high = interval
+    return f"{low:.2g} to {high:.2g}"
 
 
 def _value(value: Any, estimates: Sequence[ParameterEstimate]) -> Any:

@@ -41,14 +41,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Final, Literal, Protocol
 
 import numpy as np
-from annotated_types import doc
+from annotated_types import Len, doc
 
-from quadsim.errors import ParameterError
+from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Instant, Metres, NonNegative, Seconds, Vector, filled
 from quadsim.sim.effects.battery import Battery
+from quadsim.sim.effects.coloured import ColouredNoise
 from quadsim.sim.effects.lasting import in_force
 from quadsim.sim.effects.load import Load, MassChange, PayloadDrop, PayloadPickup
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
@@ -109,9 +110,18 @@ class ThrustNoise:
     ] = 0.0
 
 
+_Deviations = Annotated[tuple[NonNegative, ...], Len(3, 3)]
+_Times = Annotated[tuple[Seconds, ...], Len(3, 3)]
+_NONE: Final = (0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """An unmodelled force and torque, with a constant and a random part."""
+    """An unmodelled force and torque: constant, white, and lasting parts; see `quadsim.sim.effects.coloured`.
+
+    Raises:
+        InputError: a deviation is given without its time constants.
+    """
 
     force: Annotated[Vector, doc("[N] world frame")] = (0.0, 0.0, 0.0)
     torque: Annotated[Vector, doc("[N m] body frame")] = (0.0, 0.0, 0.0)
@@ -119,15 +129,38 @@ class Disturbance:
         NonNegative, doc("[N s^0.5] root of the two-sided spectral density of white noise, each axis")
     ] = 0.0
     torque_noise: Annotated[NonNegative, doc("[N m s^0.5] as force_noise, for the torque")] = 0.0
+    force_deviation: Annotated[
+        _Deviations, doc("[N] standard deviation of a random force that lasts, along world x, y, z")
+    ] = _NONE
+    force_time: Annotated[_Times | None, doc("[s] time constants with which that force is forgotten")] = None
+    torque_deviation: Annotated[_Deviations, doc("[N m] as force_deviation, of a torque about body x, y, z")] = _NONE
+    torque_time: Annotated[_Times | None, doc("[s] as force_time, for the torque")] = None
+
+    def __post_init__(self) -> None:
+        for name, deviation, time in (
+            ("force", self.force_deviation, self.force_time),
+            ("torque", self.torque_deviation, self.torque_time),
+        ):
+            if any(deviation) and time is None:
+                raise InputError(f"{name}_time must be three time constants [s] where {name}_deviation is given")
 
     def draw(self, steps: int, timestep: float, rng: np.random.Generator) -> Array:
-        """(steps, 6) force, world [N], and torque, body [N m], over each step of `timestep` [s]."""
+        """(steps, 6) constant and white force, world [N], and torque, body [N m], over steps of `timestep` [s]."""
         constant = np.array([*self.force, *self.torque])
         density = np.repeat([self.force_noise, self.torque_noise], 3)
         if not density.any():
             return np.tile(constant, (steps, 1))
         drawn: Array = constant + density / math.sqrt(timestep) * rng.standard_normal((steps, 6))
         return drawn
+
+    def lasting(self, timestep: float, rng: np.random.Generator) -> ColouredNoise | None:
+        """Return the part that lasts, force and torque (6,) as in `draw`; None where there is none."""
+        deviations = np.array([*self.force_deviation, *self.torque_deviation])
+        if not deviations.any():
+            return None
+        absent = (1.0, 1.0, 1.0)  # of what has no deviation
+        times = np.array([*(self.force_time or absent), *(self.torque_time or absent)])
+        return ColouredNoise(deviations, times, timestep=timestep, rng=rng)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -120,9 +120,9 @@ class Turbulence:
         for axis, (transition, factor) in enumerate(self._steps):
             before = self._state[:, axis]
             drive_a, drive_b = factor @ noise[axis]
-            a = _first_order(transition[0, 0], drive_a, before[0])
+            a = first_order(transition[0, 0], drive_a, before[0])
             drive_b += transition[1, 0] * np.concatenate([before[:1], a[:-1]])
-            b = _first_order(transition[1, 1], drive_b, before[1])
+            b = first_order(transition[1, 1], drive_b, before[1])
             block[:, axis] = self._intensities[axis] * (_OUTPUT[0, axis] * a + _OUTPUT[1, axis] * b)
             self._state[:, axis] = a[-1], b[-1]
         return block
@@ -156,7 +156,7 @@ def discretise_filters(ratio: float) -> tuple[Array, Array]:
     return transition, np.linalg.cholesky(np.array([[q_aa, q_ab], [q_ab, q_bb]]))
 
 
-def _first_order(pole: float, drive: Array, before: float) -> Array:
+def first_order(pole: float, drive: Array, before: float) -> Array:
     """y(k) = pole y(k-1) + drive(k), from y = `before` on; in Python, as scipy.signal takes a second to load."""
     pole = float(pole)  # as NumPy's numbers take twice the time
     samples = itertools.accumulate(drive.tolist(), lambda last, driven: pole * last + driven, initial=float(before))
