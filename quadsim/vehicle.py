@@ -20,7 +20,7 @@ from quadsim.state import Array, read_only
 
 N_ROTORS: Final = 4
 AUTOPILOT: Final = "autopilot"  # table of a vehicle file; see `quadsim.sim.autopilot.AutopilotSettings`
-DISTURBANCE: Final = "disturbance"  # as AUTOPILOT: what its flights met; see `quadsim.sim.effects.Disturbance`
+VEHICLE_DISTURBANCE: Final = "disturbance"  # as AUTOPILOT: what its flights met; see `quadsim.sim.effects.Disturbance`
 OfRotors = Annotated[tuple[Number, ...], Len(N_ROTORS, N_ROTORS)]
 Positions = Annotated[tuple[Vector, ...], Len(N_ROTORS, N_ROTORS)]
 ARMS: Final = ("arm_length", "rotor_azimuths")
@@ -530,7 +530,7 @@ def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]
     texts: dict[str, str] = {}
     entries: dict[str, dict[str, Any]] = {}
     for key, entry in read_toml(path).items():
-        if key in (AUTOPILOT, DISTURBANCE):
+        if key in (AUTOPILOT, VEHICLE_DISTURBANCE):
             continue
         if key in ("name", "description"):
             if not isinstance(entry, str):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,14 +17,14 @@ NOISE = (0.0, *3 * [1e-3], *3 * [1e-2], *4 * [0.0], *3 * [1e-2], *4 * [0.0])
 """Standard deviation of each column: s, m, m/s, -, rad/s, rad/s."""
 
 
-def fly_eight(vehicle: str | Path) -> Flight:
+def fly_eight(vehicle: str | Path, **changes: Any) -> Flight:
     """A figure eight of some 12 s with yaw steps, by the geometric controller at 100 Hz."""
     first = quadsim.scenario(vehicle=vehicle, course="figure-eight", controller="geometric").scenario
     steps = [{"type": "setpoint", "at": 2.0 + 1.5 * i, "yaw": 25.0 * (-1) ** i} for i in range(6)]
     turn = 0.75 * first.reference.period  # type: ignore[union-attr]
     course = {"reference.period": turn, "reference.ramp": 0.5 * turn, "reference.turns": 10.0 / turn - 0.5}
     return quadsim.fly(
-        first.replace({"control_period": 0.01, "constraints": [], "events": steps, **course}), progress=False
+        first.replace({"control_period": 0.01, "constraints": [], "events": steps, **course, **changes}), progress=False
     )
 
 

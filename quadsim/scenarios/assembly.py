@@ -56,8 +56,8 @@ from quadsim.state import (
 )
 from quadsim.vehicle import (
     AUTOPILOT,
-    DISTURBANCE,
     N_ROTORS,
+    VEHICLE_DISTURBANCE,
     VEHICLE_UNITS,
     Vehicle,
     altered,
@@ -637,10 +637,10 @@ def stated_disturbance(path: Path) -> Disturbance | None:
     Raises:
         InputError: a field of it is wrong.
     """
-    of_file = vehicle_table(path, DISTURBANCE)
+    of_file = vehicle_table(path, VEHICLE_DISTURBANCE)
     if not of_file:
         return None
-    return parse_table(_Disturbed, {DISTURBANCE: of_file}, str(path), file="vehicle").disturbance
+    return parse_table(_Disturbed, {VEHICLE_DISTURBANCE: of_file}, str(path), file="vehicle").disturbance
 
 
 def preferring_core(scenario: Scenario) -> Scenario:

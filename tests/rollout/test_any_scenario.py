@@ -75,6 +75,8 @@ EFFECTS = some(
                 "torque": vector(2.0),
                 "force_noise": number(0.0, 5.0),
                 "torque_noise": number(0, 1),
+                "force_deviation": st.lists(number(0.0, 5.0), min_size=3, max_size=3),
+                "force_time": st.just([0.01, 0.1, 1.0]),
             }
         ),
         "battery": some(

@@ -270,7 +270,13 @@ def test_results_have_the_same_bits_however_time_is_cut(vehicle: Vehicle, integr
         rotors=RotorDynamics(rise=0.02, fall=0.04, acceleration=4e3, inertia=5e-5),
         air=Air(rotor_drag=1e-3, linear_drag=(0.1, 0.1, 0.1), body_drag=(0.02, 0.02, 0.03) if contact else None),
         ground=Ground(contact=contact, effect=True, rotor_radius=0.12),
-        disturbance=Disturbance(force=(0.1, 0.0, 0.0), force_noise=0.01, torque_noise=1e-4),
+        disturbance=Disturbance(
+            force=(0.1, 0.0, 0.0),
+            force_noise=0.01,
+            torque_noise=1e-4,
+            force_deviation=(0.1, 0.0, 0.2),
+            force_time=(0.1, 0.2, 0.3),
+        ),
         thrust_noise=ThrustNoise(loss=0.02, deviation=0.01),
         battery=Battery(cells=4, capacity=0.05, hover_current=40.0, reference_voltage=16.0),
     )

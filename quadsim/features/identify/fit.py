@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.stats import t as student
 
 from quadsim.errors import InputError
@@ -35,7 +36,7 @@ from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 INTERVAL_SHARE: Final = 0.95
 WIDEST: Final = 0.25
 """Half-width of an interval, in logarithms, above which a log is said not to excite a parameter."""
-WIDEST_NOISE: Final = 1.1  # the same of the deviation and the time constant of noise
+WIDEST_NOISE: Final = 1.4  # the same of the deviation and the time constant of noise: a factor of 4
 LEAST_GAIN: Final = 5.0  # in the logarithm of the likelihood, from which noise is not that of the sensor alone
 MOST_COLOUR: Final = 0.2  # autocorrelation of the innovations above which intervals widen [-]
 CHANCE: Final = 3.7
@@ -44,7 +45,8 @@ MOST_PRIOR: Final = 0.25  # share of the information on a parameter that rules a
 UNCARRIED: Final = 0.01  # share of the weight that thrust and drag may leave over, or carry too much
 _NORMAL: Final = 1.96  # standard deviations on either side, of a normal distribution
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
-_RATES_OVER: Final = 0.25  # [s]
+_RATES_OVER: Final = (0.1, 0.25)  # horizons [s]
+_LONGEST_RATES: Final = 100.0  # time constant of rates that do not decay [s]
 _YAW: Final = "yaw steps of 40 deg, one per second, for 10 s"
 _GUSTS: Final = 0.015  # of drag, by wind that changes faster than its knots
 _BLOWN: Final = 0.01  # of what torques show, by such wind where `rotor_moment` turns it into torque
@@ -470,16 +472,22 @@ def _unmodelled(search: Search) -> list[NoiseFit]:
 
 
 def _rates_last(parts: Sequence[Stretch]) -> float:
-    """Time constant [s] with which body rates decay in the mean, as least squares show it over `_RATES_OVER`."""
-    together = 0.0
-    squares = 0.0
+    """Time constant [s] with which decaying body rates predict themselves best, by least squares over `_RATES_OVER`."""
+    together = np.zeros(len(_RATES_OVER))
+    squares = np.zeros(len(_RATES_OVER))
     for part in parts:
-        later = round(_RATES_OVER / part.record.period)
         rates = part.record.rates
-        together += float((rates[later:] * rates[:-later]).sum())
-        squares += float(np.square(rates[:-later]).sum())
-    share = min(together / max(squares, 1e-30), 1.0 - 1e-9)
-    return 0.0 if share <= 0.0 else -_RATES_OVER / math.log(share)
+        for i, horizon in enumerate(_RATES_OVER):
+            later = round(horizon / part.record.period)
+            together[i] += float((rates[later:] * rates[:-later]).sum())
+            squares[i] += float(np.square(rates[:-later]).sum())
+
+    def error(log_time: float) -> float:
+        left = np.exp(-np.array(_RATES_OVER) / math.exp(log_time))
+        return float(squares @ left**2 - 2.0 * together @ left)
+
+    bounds = (math.log(parts[0].record.period), math.log(_LONGEST_RATES))
+    return math.exp(float(minimize_scalar(error, bounds=bounds, method="bounded").x))
 
 
 def _impossible(search: Search) -> dict[str, float]:

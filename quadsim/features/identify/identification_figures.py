@@ -9,15 +9,15 @@ import numpy as np
 
 from quadsim.features.identify.estimate import ParameterEstimate
 from quadsim.features.identify.prediction import (
-    FLOOR,
     HORIZONS,
     IDENTIFIED,
+    NO_DISTURBANCE,
+    NOISE_FLOOR,
     QUANTITIES,
     RATES_DECAY,
     RATES_HELD,
     RESIDUAL_AFTER,
     START,
-    UNDISTURBED,
     PredictionErrors,
     Trace,
 )
@@ -25,8 +25,8 @@ from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import Figure, Panel, Series
 from quadsim.state import shown_unit
 
-_COLOURS: Final = dict(zip((IDENTIFIED, RATES_HELD, START, UNDISTURBED, RATES_DECAY), CYCLE, strict=False)) | {
-    FLOOR: COLOUR.measured
+_COLOURS: Final = dict(zip((IDENTIFIED, RATES_HELD, START, NO_DISTURBANCE, RATES_DECAY), CYCLE, strict=False)) | {
+    NOISE_FLOOR: COLOUR.measured
 }
 _TRACED: Final = tuple(
     (i, title, *shown_unit(si))

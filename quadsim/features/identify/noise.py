@@ -25,8 +25,8 @@ from scipy.signal import lfilter
 
 from quadsim.state import Array, Indices
 
-LONGEST: Final = 10.0  # time constant [s]: what lasts longer is a trim
-SHORTEST_PERIODS: Final = 0.5  # time constant over the period: what is shorter is white
+LONGEST_NOISE: Final = 10.0  # time constant [s]: what lasts longer is a trim
+SHORTEST_NOISE: Final = 0.5  # time constant over the period: what is shorter is white
 _TIMES: Final = (0.03, 0.3)  # time constants that the search starts from [s]
 _STEP: Final = 1e-3  # of the slopes of innovations, in logarithms
 _LEAST_SPREAD: Final = 1e-9  # of misfits [rad/s, m/s]
@@ -104,8 +104,8 @@ def identify_noise(misfits: Sequence[Array], periods: Sequence[float], blocks: S
         blocks: of each stretch, the samples of the parts that are left out in turn.
     """
     spread = max(float(np.concatenate(misfits).std()), _LEAST_SPREAD)
-    shortest = math.log(SHORTEST_PERIODS * periods[0])
-    longest = math.log(LONGEST)
+    shortest = math.log(SHORTEST_NOISE * periods[0])
+    longest = math.log(LONGEST_NOISE)
 
     def noise_of(x: Array) -> AxisNoise:
         log_time = min(max(x[1], shortest), longest)

@@ -39,8 +39,9 @@ RESIDUAL_AFTER: Final = 0.25  # [s] from a window's start
 JUDGED: Final = (0.1, 0.25, 0.5)  # horizons of the verdict [s]
 RATES_JUDGED: Final = 2  # of them for body rates: later, what is not known of the torque is most of the error
 TIE: Final = 0.05  # by which the errors of a quantity may exceed a rival's, in their geometric mean over the horizons
-IDENTIFIED, UNDISTURBED, START = "identified", "undisturbed", "start"
-RATES_HELD, RATES_DECAY, FLOOR = "rates held", "rates decay", "floor"
+NEAR_FLOOR: Final = 0.25  # by which they may exceed the floor to be said to reach it
+IDENTIFIED, NO_DISTURBANCE, START = "identified", "undisturbed", "start"
+RATES_HELD, RATES_DECAY, NOISE_FLOOR = "rates held", "rates decay", "floor"
 RIVALS: Final = (START, RATES_HELD, RATES_DECAY)
 QUANTITIES: Final = {"position": "m", "velocity": "m/s", "attitude": "rad", "body rates": "rad/s"}
 ROTOR_FIELDS: Final = ("commands", "throttle", "speeds", "voltage")  # what a record may say of them
@@ -93,6 +94,13 @@ class PredictionErrors:
             for quantity, of in self.ratios(rival).items()
             if math.prod(of) > (1.0 + TIE) ** len(of)
         )
+
+    @property
+    def at_floor(self) -> tuple[str, ...]:
+        """Quantities in which it loses with errors within `NEAR_FLOOR` of the floor: no vehicle file mends them."""
+        lost = " ".join(self.lost)
+        floored = self.ratios(NOISE_FLOOR).items()
+        return tuple(name for name, of in floored if name in lost and math.prod(of) < (1.0 + NEAR_FLOOR) ** len(of))
 
     @property
     def verdict(self) -> str:
@@ -160,7 +168,7 @@ def predict(
             of_windows = _errors(prediction.states[:, at], prediction.truth[:, at])
             of_windows[..., 1] *= np.nan if record.inertial else 1.0
             errors.setdefault(name, []).append(of_windows)
-            if name == FLOOR:
+            if name == NOISE_FLOOR:
                 continue
             residuals.setdefault(name, []).append((measured - prediction.states)[:, at[_RESIDUAL], _VELOCITY_AND_RATES])
             drawn_states[name] = prediction.states[drawn]
@@ -203,18 +211,18 @@ def _predictions(
     disturbance = _forecast(known, start, held, rotors, rows)
     states = {
         IDENTIFIED: windows.simulated(identified, rotors, disturbance),
-        UNDISTURBED: windows.simulated(identified, rotors),
+        NO_DISTURBANCE: windows.simulated(identified, rotors),
     }
     of_start = Parameters.of(start, voltage=known.voltage or 0.0)
     states[START] = windows.simulated(of_start, turning(held, start, of_start))
     states[RATES_HELD] = windows.simulated(identified, rotors, lasting=math.inf)
-    states[RATES_DECAY] = windows.simulated(identified, rotors, lasting=max(known.rates_last, record.period))
+    states[RATES_DECAY] = windows.simulated(identified, rotors, lasting=known.rates_last)
     predicted = {name: _Predicted(of, measured) for name, of in states.items()}
     again = windows.repeated(_FLOOR_DRAWS)
     surprises = _surprises(known, record.period, (len(again.rows), rows.shape[1] - 1), rng)
     nominal = np.tile(states[IDENTIFIED], (_FLOOR_DRAWS, 1, 1))
     disturbed = again.simulated(identified, rotors, np.tile(disturbance, (_FLOOR_DRAWS, 1, 1)) + surprises)
-    return predicted | {FLOOR: _Predicted(nominal, disturbed)}
+    return predicted | {NOISE_FLOOR: _Predicted(nominal, disturbed)}
 
 
 def parameters_of(known: Identification) -> Parameters:

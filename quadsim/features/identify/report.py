@@ -150,6 +150,11 @@ class IdentifiedVehicle(Result):
         return (
             *(f"check: {note}" for note in self.notes),
             *(
+                f"check: the error of {name} is at the floor, what the disturbance leaves open: the true vehicle would "
+                "lose, too; fly more briskly to see what the file is worth"
+                for name in self.prediction.at_floor
+            ),
+            *(
                 f"check: the commands are logged {-1e3 * estimate.value:.0f} ms late, as a delay cannot be negative"
                 for estimate in self.identification.estimates
                 if estimate.name == "delay" and estimate.high < 0.0

@@ -17,7 +17,7 @@ from quadsim.features.identify.estimate import (
     field_of,
     number_in,
 )
-from quadsim.vehicle import DISTURBANCE, VEHICLE_UNITS, Vehicle
+from quadsim.vehicle import VEHICLE_DISTURBANCE, VEHICLE_UNITS, Vehicle
 
 _DIGITS: Final = 100.0  # the last digit is no more than this part of an interval
 
@@ -71,9 +71,9 @@ def vehicle_text(identification: Identification, start: Path, logs: Sequence[str
         table["source"] = _source(identification.vehicle, estimates, str(table["source"]), logs)
     known = [estimate for estimate in identification.disturbance if not estimate.refused]
     if known:
-        document.pop(DISTURBANCE, None)
+        document.pop(VEHICLE_DISTURBANCE, None)
         document.add(tomlkit.nl())
-        document[DISTURBANCE] = _disturbance(known, logs)
+        document[VEHICLE_DISTURBANCE] = _disturbance(known, logs)
     return tomlkit.dumps(document)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 
+import numpy as np
 import pytest
 
 import quadsim
@@ -17,6 +18,7 @@ from quadsim.features.design.shortfalls import shortfalls
 from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.scenarios.schema.base import fields_of
 from quadsim.sim.autopilot import AutopilotSettings
+from quadsim.sim.effects import Disturbance
 from quadsim.vehicle import ARMS, OPTIONAL_PARAMETERS, THRUST, VEHICLE_UNITS, Vehicle, load_vehicle
 
 TEMPLATE = quadsim.vehicle_report(template=True).content
@@ -80,7 +82,12 @@ def test_the_template_documents_every_parameter() -> None:
         assert tables[name]["unit"] == unit
         meaning = (fields_of(Vehicle)[name].description or "").partition("] ")[2]
         assert f"{name}: {meaning} Find it: " in text
-    assert text.count("May be left out:") == len(OPTIONAL_PARAMETERS) + 1  # and the autopilot, commented out
+    assert (
+        text.count("May be left out:") == len(OPTIONAL_PARAMETERS) + 2
+    )  # disturbance and autopilot are comments
+    disturbance = tomllib.loads(TEMPLATE.partition("# [disturbance]")[2].partition("\n\n")[0].replace("# ", ""))
+    assert disturbance.pop("source")
+    assert Disturbance(**disturbance).lasting(1e-3, np.random.default_rng(0)) is not None
     autopilot = tomllib.loads(TEMPLATE[TEMPLATE.index("# [autopilot]") :].replace("# ", ""))["autopilot"]
     assert autopilot["source"]
     assert AutopilotSettings(p=tuple(autopilot["p"])).p == (30.0, 30.0, 10.0)

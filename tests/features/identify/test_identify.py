@@ -87,7 +87,7 @@ def test_the_command_finds_the_vehicle_that_flew(identified: IdentifiedVehicle) 
     assert found.thrust_coefficient == pytest.approx(true.thrust_coefficient, rel=0.02)
     assert found.inertia[:2] == pytest.approx(true.inertia[:2], rel=0.05)
     errors = identified.prediction.errors
-    assert (errors["identified"][-1] < 0.5 * errors["thrust only"][-1]).all()
+    assert (errors["identified"][-1] < 0.5 * errors["rates held"][-1]).all()
     assert (errors["identified"][-1, 1:] < errors["start"][-1, 1:]).all()
 
 
@@ -140,7 +140,9 @@ def test_another_log_can_be_predicted_and_json_has_all_of_it(
     data = json.loads(capsys.readouterr().out)
     assert (data["logs"], data["test"], data["written"]) == (["eight.csv"], ["other.csv"], [])
     assert data["prediction"]["windows"] > 30
-    assert data["prediction"]["errors"].keys() == {"identified", "start", "thrust only"}
+    assert data["prediction"]["errors"].keys() == {
+        *("identified", "undisturbed", "start", "rates held", "rates decay", "floor"),
+    }
     assert all(len(errors) == 10 for errors in data["prediction"]["errors"]["identified"].values())
     assert {"low", "high", "start", "refused"} <= data["estimates"][0].keys()
     assert sorted(path.name for path in here.iterdir()) == ["eight.csv", "other.csv", "start.toml"]
@@ -233,7 +235,7 @@ def test_values_have_the_digits_of_their_intervals() -> None:
     assert rounded(0.123456789, replace(estimate("b", 1.0, None), low=1.0, high=1.0)) == 0.123456789
 
 
-def test_the_true_vehicle_predicts_and_thrust_alone_holds_the_rates(eight: Flight, place: Path) -> None:
+def test_the_true_vehicle_predicts_and_rates_are_held(eight: Flight, place: Path) -> None:
     true, wrong = load_vehicle(vehicle_path(TRUE)), load_vehicle(place / "start.toml")
     record = read_record(place / "eight.csv")
     identification = Identification(estimates=(), vehicle=true, delay=0.0, offset=(0.0, 0.0))
@@ -242,9 +244,9 @@ def test_the_true_vehicle_predicts_and_thrust_alone_holds_the_rates(eight: Fligh
     at_start, after = found.errors["identified"][1], found.errors["identified"][-1]
     assert (at_start < 2.0 * noise + [1e-3, 1e-3, 3e-3, 1e-2]).all()
     assert (after < 0.1 * found.errors["start"][-1] + 3.0 * noise + [0.01, 0.02, 0.01, 0.02]).all()
-    held = found.trace.predicted["thrust only"][..., 3:]
+    held = found.trace.predicted["rates held"][..., 3:]
     assert held == pytest.approx(np.broadcast_to(held[:, :1], held.shape), abs=1e-12)
-    assert found.trace.predicted["thrust only"][:, 0] == pytest.approx(found.trace.measured[:, 0])
+    assert found.trace.predicted["rates held"][:, 0] == pytest.approx(found.trace.measured[:, 0])
     assert [*QUANTITIES] == ["position", "velocity", "attitude", "body rates"]
     for name, left in found.residuals.items():
         norms = [np.linalg.norm(left[:, of], axis=1).mean() for of in (slice(3), slice(3, 6))]
@@ -274,20 +276,20 @@ def test_the_prediction_knows_delay_offset_and_wind(place: Path) -> None:
 def test_a_vehicle_that_predicts_worse_is_said_to_and_written_only_anyway(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The errors of identified vehicle and thrust only are exchanged, in body rates."""
+    """The identified vehicle has twice the errors of rates held, in body rates."""
 
-    def exchanged(*arguments: Any, **options: Any) -> PredictionErrors:
+    def doubled(*arguments: Any, **options: Any) -> PredictionErrors:
         found = predict(*arguments, **options)
         errors = {name: of.copy() for name, of in found.errors.items()}
-        errors["identified"][:, 3] = 2.0 * errors["thrust only"][:, 3]
+        errors["identified"][:, 3] = 2.0 * errors["rates held"][:, 3]
         return replace(found, errors=errors)
 
-    monkeypatch.setattr("quadsim.features.identify.report.predict", exchanged)
+    monkeypatch.setattr("quadsim.features.identify.report.predict", doubled)
     words = ["identify", "eight.csv", "--vehicle", "start.toml", "--out", "mine.toml"]
     assert main(words) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "worse" in text.partition(":")[0]
-    assert "2.00 2.00 2.00" in text
+    assert "body rates than rates held, 2.00 2.00 times its error" in text
     assert "--anyway" in text
     assert not (here / "mine.toml").exists()
     assert main([*words, "--anyway", "--overwrite"]) == 0
@@ -298,12 +300,18 @@ def test_a_vehicle_that_predicts_worse_is_said_to_and_written_only_anyway(
 def test_the_verdict_comes_first_with_the_errors_over_those_of_each_rival(identified: IdentifiedVehicle) -> None:
     errors = {
         name: np.full((len(HORIZONS), 4), of)
-        for name, of in (("identified", 1.0), ("start", 4.0), ("thrust only", 2.0))
+        for name, of in (("identified", 1.0), ("start", 4.0), ("rates held", 2.0), ("rates decay", 5.0), ("floor", 0.9))
     }
     better = replace(identified.prediction, errors=errors)
     assert "0.25, 0.25, 0.25" in better.verdict
     assert "0.50, 0.50, 0.50" in better.verdict
+    assert "0.20, 0.20, 0.20" in better.verdict
     assert not better.lost
+    assert not better.at_floor
+    lower = {**errors, "rates held": np.full((len(HORIZONS), 4), 0.5)}
+    assert replace(better, errors=lower).at_floor == ("position", "velocity", "attitude", "body rates")
+    far = {**lower, "floor": np.full((len(HORIZONS), 4), 0.5)}
+    assert replace(better, errors=far).at_floor == ()
     assert identified.verdict.text == identified.prediction.verdict
 
 

@@ -55,7 +55,9 @@ def test_every_field_arrives() -> None:
         "effects.ground={effect=true, rotor_radius=0.1}",
         "effects.load={mass_factor=1.1, inertia_factor=[1.2, 1.1, 1.05], centre_of_mass=[0.01, 0.02, 0.03], "
         "payloads=[{mass=0.3, position=[0.0, 0.0, -0.1]}]}",
-        "effects.disturbance={force=[1.0, 2.0, 3.0], torque=[0.1, 0.2, 0.3], force_noise=0.4, torque_noise=0.5}",
+        "effects.disturbance={force=[1.0, 2.0, 3.0], torque=[0.1, 0.2, 0.3], force_noise=0.4, torque_noise=0.5, "
+        "force_deviation=[0.1, 0.2, 0.3], force_time=[1.0, 2.0, 3.0], torque_deviation=[0.4, 0.5, 0.6], "
+        "torque_time=[4.0, 5.0, 6.0]}",
         "effects.battery={cells=2, capacity=1.5, resistance=0.1, charge=0.8, curve=[[0.0, 3.0], [1.0, 4.0]], "
         "hover_current=9.0, idle_current=0.5, reference_voltage=7.5, exponent=1.5}",
     )
@@ -76,7 +78,16 @@ def test_every_field_arrives() -> None:
             centre_of_mass=(0.01, 0.02, 0.03),
             payloads=(Payload(mass=0.3, position=(0.0, 0.0, -0.1)),),
         ),
-        disturbance=Disturbance(force=(1.0, 2.0, 3.0), torque=(0.1, 0.2, 0.3), force_noise=0.4, torque_noise=0.5),
+        disturbance=Disturbance(
+            force=(1.0, 2.0, 3.0),
+            torque=(0.1, 0.2, 0.3),
+            force_noise=0.4,
+            torque_noise=0.5,
+            force_deviation=(0.1, 0.2, 0.3),
+            force_time=(1.0, 2.0, 3.0),
+            torque_deviation=(0.4, 0.5, 0.6),
+            torque_time=(4.0, 5.0, 6.0),
+        ),
         battery=Battery(
             cells=2,
             capacity=1.5,
