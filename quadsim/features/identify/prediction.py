@@ -4,8 +4,8 @@ From every window's start, the measured state is simulated with the rotor speeds
 what was measured up to 0.5 s later.  The identified vehicle starts with the unknown torque and force that a filter
 knows at that instant, of the periods before it alone, and which fade as the identified noise does (`AxisNoise`).
 
-Beside it stand the same without them, the start file as it is, and two that have thrust and drag alone: the body rates
-are held as they were, as the baseline of published comparisons holds them, or decay as they did in what was fitted.
+Beside it stand the same without them; the start file with the same filter; and two that have thrust and drag alone: the
+body rates are held, as the baseline of published comparisons holds them, or decay as they did in what was fitted.
 
 The floor is what the identified noise leaves open to any prediction that knows the vehicle: the error of the simulation
 against itself with noise that comes after the start.  In a closed loop, it may exceed the errors of rates that are
@@ -28,6 +28,7 @@ from quadsim.features.identify.checks import SHORTEST_SPAN
 from quadsim.features.identify.estimate import Identification
 from quadsim.features.identify.fit import part_of
 from quadsim.features.identify.model import INCREMENTS, MeanMotion, Parameters, predicted_increments, stretch, turning
+from quadsim.features.identify.noise import AxisNoise
 from quadsim.features.identify.record import Record
 from quadsim.features.identify.rotors import Turning
 from quadsim.state import Array, Indices
@@ -208,13 +209,15 @@ def _predictions(
     identified = parameters_of(known)
     windows = _Windows(rows=rows, measured=measured, period=record.period, vehicle=start)
     rotors = turning(held, start, identified)
-    disturbance = _forecast(known, start, held, rotors, rows)
+    disturbance = _forecast(known.noise, identified, start, held, rotors, rows)
     states = {
         IDENTIFIED: windows.simulated(identified, rotors, disturbance),
         NO_DISTURBANCE: windows.simulated(identified, rotors),
     }
     of_start = Parameters.of(start, voltage=known.voltage or 0.0)
-    states[START] = windows.simulated(of_start, turning(held, start, of_start))
+    rotors_of_start = turning(held, start, of_start)
+    disturbance_of_start = _forecast(known.noise, of_start, start, held, rotors_of_start, rows)
+    states[START] = windows.simulated(of_start, rotors_of_start, disturbance_of_start)
     states[RATES_HELD] = windows.simulated(identified, rotors, lasting=math.inf)
     states[RATES_DECAY] = windows.simulated(identified, rotors, lasting=known.rates_last)
     predicted = {name: _Predicted(of, measured) for name, of in states.items()}
@@ -239,18 +242,18 @@ def parameters_of(known: Identification) -> Parameters:
     )
 
 
-def _forecast(known: Identification, start: Vehicle, held: Record, rotors: Turning, rows: Indices) -> Array:
+def _forecast(
+    noises: Sequence[AxisNoise], p: Parameters, vehicle: Vehicle, held: Record, rotors: Turning, rows: Indices
+) -> Array:
     """(W, K - 1, 6) increments that the unknown torque and force are expected to give, by what precedes each window."""
-    if not known.noise:
+    if not noises:
         return np.zeros((len(rows), rows.shape[1] - 1, len(INCREMENTS)))
-    samples = slice(int(rows[0, 0]), int(rows[-1, 0]) + 1)
+    samples = slice(int(rows[0, 0]), int(rows[-1, -1]) + 1)
     past = stretch(part_of(replace(held, speeds=None), samples), 0)
     before = rotors.during(np.arange(samples.start, samples.stop - 1))
-    misfit = np.nan_to_num(past.increments - predicted_increments(past.motion, before, start, parameters_of(known)))
+    misfit = np.nan_to_num(past.increments - predicted_increments(past.motion, before, vehicle, p))
     starts = rows[:, 0] - samples.start
-    forecasts = [
-        noise.forecast(misfit[:, i], held.period, starts, rows.shape[1] - 1) for i, noise in enumerate(known.noise)
-    ]
+    forecasts = [noise.forecast(misfit[:, i], held.period, starts, rows.shape[1] - 1) for i, noise in enumerate(noises)]
     return np.stack(forecasts, axis=-1)
 
 

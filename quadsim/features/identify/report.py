@@ -130,9 +130,9 @@ class IdentifiedVehicle(Result):
             head=("mean error", "horizon", *self.prediction.errors),
             lines=tuple(lines),
             note=f"{self.prediction.windows} windows of {held_out}. identified: starts with the torque and force that "
-            "a filter knows at that instant; undisturbed: without. start: the start file as it is. rates held, rates "
-            f"decay: identified thrust and drag alone; decay with {known.rates_last:.2g} s, as in what was fitted. "
-            "floor: what the identified disturbance leaves open to any prediction.",
+            "a filter knows at that instant; undisturbed: without. start: the start file with the same filter. rates "
+            f"held, rates decay: identified thrust and drag alone; decay with {known.rates_last:.2g} s, as in what was "
+            "fitted. floor: what the identified disturbance leaves open to any prediction.",
         )
         return parameters, disturbance, errors_grid
 

@@ -82,9 +82,7 @@ def test_the_template_documents_every_parameter() -> None:
         assert tables[name]["unit"] == unit
         meaning = (fields_of(Vehicle)[name].description or "").partition("] ")[2]
         assert f"{name}: {meaning} Find it: " in text
-    assert (
-        text.count("May be left out:") == len(OPTIONAL_PARAMETERS) + 2
-    )  # disturbance and autopilot are comments
+    assert text.count("May be left out:") == len(OPTIONAL_PARAMETERS) + 2  # disturbance and autopilot are comments
     disturbance = tomllib.loads(TEMPLATE.partition("# [disturbance]")[2].partition("\n\n")[0].replace("# ", ""))
     assert disturbance.pop("source")
     assert Disturbance(**disturbance).lasting(1e-3, np.random.default_rng(0)) is not None

@@ -191,6 +191,32 @@ def test_a_prediction_that_starts_from_the_disturbance_is_better_and_near_the_fl
     assert unknown.errors["floor"].max() < 1e-12
 
 
+def test_the_true_vehicle_may_lose_to_rates_that_are_held() -> None:
+    """After half a second of a disturbed hover, by a factor of two: at the floor, and beyond what is judged."""
+    first = quadsim.scenario(vehicle="hummingbird", controller="geometric").scenario
+    hover = {"control_period": 0.01, "duration": 12.0, "constraints": [], "effects.disturbance": vars(DISTURBANCE)}
+    record = record_of(quadsim.fly(first.replace(hover), progress=False))
+    deviations = np.concatenate([np.array(TORQUE) / TRUE.inertia, np.array(FORCE) / TRUE.mass])
+    times = (*(DISTURBANCE.torque_time or ()), *(DISTURBANCE.force_time or ()))
+    noise = [
+        AxisNoise(deviation=deviation, time=time, sensor=1e-2)
+        for deviation, time in zip(deviations.tolist(), times, strict=True)
+    ]
+    true = Identification(estimates=(), vehicle=TRUE, delay=0.0, offset=(0.0, 0.0), noise=tuple(noise))
+    found = predict([record], [[slice(100, len(record.t))]], true, TRUE)
+    assert found.errors["undisturbed"][-1, 3] > 2.0 * found.errors["rates held"][-1, 3]
+    assert found.errors["identified"][-1, 3] > 1.2 * found.errors["rates held"][-1, 3]
+    assert found.errors["identified"][1, 3] < 0.9 * found.errors["undisturbed"][1, 3]
+    assert found.errors["identified"][:, 3] == pytest.approx(found.errors["floor"][:, 3], rel=0.2)
+    assert not found.lost  # at the horizons that are judged
+
+
+def test_one_window_has_no_past() -> None:
+    found = predict([disturbed()], [[slice(300, 360)]], identified(), TRUE)
+    assert found.windows == 1
+    assert found.errors["identified"] == pytest.approx(found.errors["undisturbed"], rel=1e-9)
+
+
 def test_only_what_precedes_a_window_moves_its_start() -> None:
     """Another future of rates and velocities changes no predicted state of the windows that begin before it."""
     record = disturbed()
