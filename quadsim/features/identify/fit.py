@@ -197,17 +197,10 @@ class _Fit:
         return math.hypot(_NORMAL * widened * explained, self.quantile * beyond)
 
     def _between_flights(self, row: Array, widened: float) -> float:
-        """Deviation of a sum of x by what flights differ in beyond their noise (DerSimonian and Laird, 1986)."""
-        if len(self._by_flight) < 2:
-            return 0.0
+        """Deviation of a sum of x by what flights differ in beyond their noise."""
         each = np.array([step @ row for step, _ in self._by_flight])
-        variances = np.array([row @ cov @ row for _, cov in self._by_flight]) * widened**2
-        weights = 1.0 / variances
-        total = float(weights.sum())
-        apart = each - float(weights @ each) / total
-        excess = float(weights @ apart**2) - (len(each) - 1)
-        between = max(excess, 0.0) / (total - float(weights @ weights) / total)
-        return math.sqrt(between * float(weights @ weights)) / total
+        variances = np.array([row @ covariance @ row for _, covariance in self._by_flight])
+        return deviation_between(each, widened**2 * variances)
 
     def _floor(self, shares: Mapping[int, float], axes: Sequence[str]) -> float:
         """Deviation of a sum of shares of x by what the prediction leaves out."""
@@ -487,6 +480,26 @@ def _covariance(equations: NormalEquations) -> Array:
     """Covariance of x: H^-1 S H^-T, H^-1 without instruments."""
     inverse = np.linalg.inv(equations.H)
     return np.asarray(inverse @ equations.S @ inverse.T)
+
+
+def deviation_between(each: Array, variances: Array) -> float:
+    """Return the deviation of the weighted mean of some flights' values by what they differ in beyond their noise.
+
+    The variance between flights is that of DerSimonian and Laird, "Meta-analysis in clinical trials", Controlled
+    Clinical Trials 7 (1986): (sum w d^2 - (F - 1)) / (sum w - sum w^2 / sum w), w = 1 / variance, 0 at least.
+
+    Args:
+        each: value of each flight (F,).
+        variances: of their noise (F,).
+    """
+    if len(each) < 2:
+        return 0.0
+    weights = 1.0 / variances
+    total = float(weights.sum())
+    apart = each - float(weights @ each) / total
+    excess = float(weights @ apart**2) - (len(each) - 1)
+    between = max(excess, 0.0) / (total - float(weights @ weights) / total)
+    return math.sqrt(between * float(weights @ weights)) / total
 
 
 def _alone(
