@@ -7,11 +7,15 @@ up to a factor of two.  Of the logs that pass a parameter's gates, `inside` are 
 
 from __future__ import annotations
 
+import argparse
+import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -35,6 +39,7 @@ from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 
 Table = dict[str, Any]
+DrawnLog = tuple[str, int]  # condition and seed of a log
 VEHICLES: Final = 20
 FIRST_SEED: Final = 5000
 DURATION: Final = 20.0  # [s]
@@ -182,7 +187,7 @@ def truth_of(vehicle: Vehicle, late: int) -> dict[str, float]:
     }
 
 
-def identify(log: tuple[str, int]) -> Record:
+def identify(log: DrawnLog) -> Record:
     """Of one log: by parameter, whether it passes, and whether its interval holds the truth."""
     name, seed = log
     rng, condition = np.random.default_rng(seed), CONDITIONS[name]
@@ -194,23 +199,28 @@ def identify(log: tuple[str, int]) -> Record:
     return {
         estimate.name: {
             "passed": not estimate.refused,
-            "inside": estimate.low <= true[estimate.name] <= estimate.high,
-            "error": estimate.value / true[estimate.name] - 1.0 if true[estimate.name] else estimate.value,
+            "inside": bool(estimate.low <= true[estimate.name] <= estimate.high),
+            "error": float(estimate.value / true[estimate.name] - 1.0 if true[estimate.name] else estimate.value),
         }
         for estimate in found.estimates
     }
 
 
-def summaries(condition: str, found: Sequence[Mapping[str, Any]]) -> list[Record]:
-    """Of one condition: by parameter, how many passed, how many of these are inside, and the median error of all."""
+def summaries(condition: str, answers: Sequence[Mapping[str, Any]]) -> list[Record]:
+    """Of one condition: by parameter, how many passed, how many of these are inside, and the median error of all.
+
+    A log that raised has no estimates; it counts as `failed`.
+    """
+    found = [answer for answer in answers if "verdict" not in answer]
     records = []
-    for name in found[0]:
+    for name in found[0] if found else ():
         each = [log[name] for log in found]
         records.append(
             {
                 "condition": condition,
                 "parameter": name,
-                "logs": len(found),
+                "logs": len(answers),
+                "failed": len(answers) - len(found),
                 "passed": sum(one["passed"] for one in each),
                 "inside": sum(one["passed"] and one["inside"] for one in each),
                 "median_error": float(np.median([abs(one["error"]) for one in each])),
@@ -219,29 +229,51 @@ def summaries(condition: str, found: Sequence[Mapping[str, Any]]) -> list[Record
     return records
 
 
-def measure(quick: bool, workers: int | None, report: Progress) -> list[Record]:
-    """A record of each condition and parameter."""
-    conditions, vehicles = (["hover"], 1) if quick else ([*CONDITIONS], VEHICLES)
-    logs = [(name, FIRST_SEED + 100 * i + k) for i, name in enumerate(conditions) for k in range(vehicles)]
-    found: dict[int, Record] = {}
-    with closing(fly_many(logs, identify, workers=workers)) as answers:
+def remembered(file: Path | None) -> dict[DrawnLog, Record]:
+    """What an earlier call left in a file of answers, one line of JSON per log; a line that was cut off is none."""
+    known: dict[DrawnLog, Record] = {}
+    for line in file.read_text(encoding="utf-8").splitlines() if file is not None and file.is_file() else ():
+        with suppress(json.JSONDecodeError):
+            entry = json.loads(line)
+            known[entry["condition"], entry["seed"]] = entry["answer"]
+    return known
+
+
+def measure(chosen: argparse.Namespace, report: Progress) -> list[Record]:
+    """A record of each condition and parameter, vehicle after vehicle, so that a part of it is a part of each."""
+    conditions, vehicles = (["hover"], 1) if chosen.quick else ([*CONDITIONS], chosen.vehicles)
+    logs = [(name, chosen.seed + 100 * i + k) for k in range(vehicles) for i, name in enumerate(conditions)]
+    known = remembered(chosen.answers)
+    left = [log for log in logs if log not in known]
+    with closing(fly_many(left, identify, workers=chosen.workers)) as answers:
         for done, (place, answer) in enumerate(answers, 1):
-            report("logs", done, len(logs))
+            report("logs", done, len(left))
+            log = left[place]
+            known[log] = answer
             if "verdict" in answer:
-                raise QuadsimError(f"{logs[place]}: {answer['verdict']} ({answer['reason']})")
-            found[place] = answer
-    ordered = [found[place] for place in range(len(logs))]
-    return [
-        record
-        for i, name in enumerate(conditions)
-        for record in summaries(name, ordered[i * vehicles : (i + 1) * vehicles])
-    ]
+                print(f"{log}: {answer['verdict']} ({answer['reason']})", file=sys.stderr)
+            if chosen.answers is not None:
+                entry = {"condition": log[0], "seed": log[1], "answer": answer}
+                with chosen.answers.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(entry) + "\n")
+    records = []
+    for name in conditions:
+        records += summaries(name, [known[log] for log in logs if log[0] == name])
+    if not records:
+        raise QuadsimError("no log could be identified")
+    return records
 
 
 def main() -> None:
     """Fly, identify, print and write."""
-    chosen = options(__doc__, workers={"type": int, "metavar": "N", "help": "processes (default: one per core)"})
-    run(partial(measure, chosen.quick, chosen.workers), "Truth inside the interval, of the logs that pass", chosen.json)
+    chosen = options(
+        __doc__,
+        workers={"type": int, "metavar": "N", "help": "processes (default: one per core)"},
+        vehicles={"type": int, "metavar": "N", "default": VEHICLES, "help": "of each condition (default: %(default)s)"},
+        seed={"type": int, "metavar": "N", "default": FIRST_SEED, "help": "the first (default: %(default)s)"},
+        answers={"type": Path, "metavar": "FILE", "help": "keep each log's answer there, and what is there already"},
+    )
+    run(partial(measure, chosen), "Truth inside the interval, of the logs that pass", chosen.json)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from quadsim.features.identify.record import Record, driver
 from quadsim.features.identify.windows import body_z, mean, rate_over_window, to_world, turn_rate
 from quadsim.rotation import conjugate
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
 
 WINDOW: Final = 0.1  # [s] over which rates and thrust are compared
 SLOW_WINDOW: Final = 0.2  # [s] for lateral accelerations
@@ -35,8 +36,8 @@ Lateral = Sequence[tuple[Array, Array, Array]]
 """Acceleration, thrust axis and velocity in each part, level: x + i y, one row per tick."""
 
 
-def check_axes(record: Record, parts: Sequence[slice], gravity: float) -> None:
-    """Refuse a log whose axes or frames are not ours.
+def check_rate_axes(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
+    """Refuse rates and an attitude that do not turn alike.
 
     Raises:
         InputError: naming the columns that are negated, swapped, or in another frame.
@@ -44,9 +45,6 @@ def check_axes(record: Record, parts: Sequence[slice], gravity: float) -> None:
     readings = {reading: turning_pairs(record, parts, meant) for reading, meant in READINGS.items()}
     if better := _better(readings, ("wx", "wy", "wz"), record.period):
         raise InputError(f"{record.name}: the rates are not those at which the attitude turns: {better}")
-    if record.position is not None:
-        _check_velocity(record, parts, record.position)
-    _check_tilt(record, parts, gravity)
 
 
 def turning_pairs(record: Record, parts: Sequence[slice], meant: Callable[[Array], Array] = READINGS[""]) -> Pairs:
@@ -91,8 +89,13 @@ def tilt_fit(motion: Lateral, *, mirrored: bool = False, shift: int = 0) -> tupl
     return explained, complex(solution[0], solution[1])
 
 
-def _check_velocity(record: Record, parts: Sequence[slice], position: Array) -> None:
-    """Refuse a velocity that is not the slope of the position."""
+def check_velocity_axes(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
+    """Refuse a velocity that is not the slope of the position.
+
+    Raises:
+        InputError: naming the columns that are negated, swapped, or along the body's axes.
+    """
+    position = np.asarray(record.position)
 
     def beside_slope(velocity: Array) -> Pairs:
         return pairs_of(
@@ -119,9 +122,13 @@ def _difference(pairs: Pairs) -> float:
     return float(np.linalg.norm(difference) / max(float(np.linalg.norm(total)), 1e-30))
 
 
-def _check_tilt(record: Record, parts: Sequence[slice], gravity: float) -> None:
-    """Refuse a velocity that does not change as tilt and thrust make it."""
-    falls = max(_lifting(record, parts, gravity, lag) for lag in (0.0, 0.05, 0.1)) < -0.4
+def check_tilt(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
+    """Refuse a velocity that does not change as tilt and thrust make it.
+
+    Raises:
+        InputError: naming the frame or the columns that are negated or swapped.
+    """
+    falls = max(_lifting(record, parts, vehicle.gravity, lag) for lag in (0.0, 0.05, 0.1)) < -0.4
     motion = lateral_motion(record, parts)
     plain, direction = tilt_fit(motion)
     mirror, mirror_direction = tilt_fit(motion, mirrored=True)

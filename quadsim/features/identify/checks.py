@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Final
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import find_objects, label, maximum_filter1d, minimum_filter1d, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from quadsim.errors import InputError
-from quadsim.features.identify.axes import check_axes
+from quadsim.features.identify.axes import check_rate_axes, check_tilt, check_velocity_axes
 from quadsim.features.identify.clocks import check_clocks
 from quadsim.features.identify.quantities import RPM
 from quadsim.features.identify.record import INPUTS, SLOWEST_COMMANDS, Record, driver
 from quadsim.features.identify.rotor_order import check_rotor_order
+from quadsim.features.identify.rotor_speeds import check_against_commands, check_against_each_other, check_not_commands
 from quadsim.features.identify.scales import check_scales
+from quadsim.features.identify.sensors import LONGEST_HELD, ROUNDING, at_rest, runs
 from quadsim.features.identify.windows import body_z, rate_over_window
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -27,8 +29,6 @@ SLOW, CALM = 0.3, 0.5
 """Speed [m/s] and turn rate [rad/s] below which a vehicle may stand on the ground."""
 CONSTANT: Final = 3e-3  # share of the outputs below which their change in a second is none
 STILL: Final = 1e-3  # share of the largest output below which a rotor's outputs do not change
-ROUNDING: Final = 1e-9  # [rad, rad/s, m/s], and as a share of an output: below it, nothing has changed
-LONGEST_HELD: Final = 1.0  # [s] for which a radio holds a row
 MOST_REPEATED: Final = 0.05  # share of rows that may repeat the one before
 GOOD_RATE: Final = 50.0  # [Hz] below which lag and inertias are poor
 FACTOR: Final = 1.8  # by which hover speed in the log and by the start may differ
@@ -57,12 +57,13 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     """
     logged = _logged(record)
     if np.count_nonzero(logged) > 1:
-        _check_rows(record, logged)
+        for check in ROW_CHECKS:
+            check.run(record, logged)
     shortest = max(round(SHORTEST_SPAN / record.period), 2)
     flying = np.ones_like(logged) if record.flying is None else record.flying
     if not (logged & flying).any() and logged.any():
         raise InputError(f"{record.name}: never flies: by its autopilot it is disarmed or landed all the time")
-    aloft = _runs(logged, shortest) and _runs(logged & flying & ~_grounded(record, logged, vehicle.gravity), shortest)
+    aloft = runs(logged, shortest) and runs(logged & flying & ~_grounded(record, logged, vehicle.gravity), shortest)
     longest = max((part.stop - part.start for part in aloft), default=0) * record.period
     if longest >= LEAST * (1.0 - 1e-6):
         return aloft
@@ -80,15 +81,20 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     )
 
 
-def _check_rows(record: Record, logged: NDArray[np.bool_]) -> None:
-    """Refuse what stands still, rows that repeat the one before, and outputs that are logged too rarely."""
-    inputs, name = driver(record)[logged], record.name
+def _check_motors_run(record: Record, logged: NDArray[np.bool_]) -> None:
+    inputs = driver(record)[logged]
     still = np.ptp(inputs, axis=0) <= STILL * np.abs(inputs).max()
     if still.all():
-        raise InputError(f"{name}: the motors never run: the rotors' outputs stay at {inputs.mean():.4g}: no flight")
+        raise InputError(
+            f"{record.name}: the motors never run: the rotors' outputs stay at {inputs.mean():.4g}: no flight"
+        )
     if still.any():
         rotors = " and ".join(str(i + 1) for i in np.flatnonzero(still))
-        raise InputError(f"{name}: the outputs of rotor {rotors} never change while the others do: log all four")
+        raise InputError(f"{record.name}: the outputs of rotor {rotors} never change while the others do: log all four")
+
+
+def _check_columns_move(record: Record, logged: NDArray[np.bool_]) -> None:
+    name = record.name
     for field, columns in (("rates", "wx wy wz"), ("velocity", "vx vy vz"), ("attitude", "qw qx qy qz")):
         rows = getattr(record, field)[logged]
         frozen = [c for c, moved in zip(columns.split(), np.ptp(rows, axis=0) > ROUNDING, strict=True) if not moved]
@@ -97,56 +103,42 @@ def _check_rows(record: Record, logged: NDArray[np.bool_]) -> None:
         offsets = np.abs(rows[0, [columns.split().index(c) for c in frozen]])
         if frozen and field != "attitude" and (offsets > ROUNDING).any():
             raise InputError(f"{name}: {', '.join(frozen)} stands still while the others change: log all three axes")
+
+
+def _still(record: Record, logged: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Steps between logged rows in which nothing turns, and those of them at which the vehicle rests."""
     turning = np.concatenate([record.rates, record.attitude], axis=1)[logged]
     still = np.asarray((np.abs(np.diff(turning, axis=0)) <= ROUNDING).all(axis=1))
-    rest = _rest(still, round(LONGEST_HELD / record.period))
+    return still, at_rest(still, round(LONGEST_HELD / record.period))
+
+
+def _check_rows_are_new(record: Record, logged: NDArray[np.bool_]) -> None:
+    still, rest = _still(record, logged)
     repeated = float((still & ~rest).mean())
     if repeated > MOST_REPEATED:
         raise InputError(
-            f"{name}: {repeated:.0%} of its rows repeat rates and attitude of the one before, as a radio does that "
-            f"holds them; at most {MOST_REPEATED:.0%} may: drop such rows, or log on board"
+            f"{record.name}: {repeated:.0%} of its rows repeat rates and attitude of the one before, on clocks of "
+            f"their own; at most {MOST_REPEATED:.0%} may: drop such rows, or log on board"
         )
+
+
+def _check_outputs_are_logged_often(record: Record, logged: NDArray[np.bool_]) -> None:
+    if record.speeds is not None:
+        return
+    inputs = driver(record)[logged]
+    _, rest = _still(record, logged)
     changed = (np.abs(np.diff(inputs, axis=0)) > ROUNDING * np.abs(inputs).max()).any(axis=1)
     rate = float(changed[~rest].mean()) / record.period if not rest.all() else 0.0
-    if record.speeds is None and rate < 0.9 * SLOWEST_COMMANDS and 1.0 / record.period > 1.5 * rate:
+    if rate < 0.9 * SLOWEST_COMMANDS and 1.0 / record.period > 1.5 * rate:
         raise InputError(
-            f"{name}: the rotors' outputs change {rate:.3g} times per second, and rates are logged "
+            f"{record.name}: the rotors' outputs change {rate:.3g} times per second, and rates are logged "
             f"{1.0 / record.period:.3g} times: log the outputs as often as they are sent, "
             f"{SLOWEST_COMMANDS:g} times or more{_advised(record)}"
         )
 
 
-def _rest(still: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
-    """Steps (N - 1,) at which a vehicle rests, of those at which nothing turns.
-
-    A row that is held is followed by one that has moved, and a row that is held again: it is between steps that turn.
-    Rest lasts from the log's first step on, or to its last, or longer than `longest` steps until more than one turns.
-    """
-    rest = np.zeros_like(still)
-    for run in _runs(still, 1):
-        before = still[run.start - 2 : run.start] if run.start >= 2 else still[:0]
-        after = still[run.stop : run.stop + 2]
-        at_an_end = run.start == 0 or run.stop == len(still)
-        lasts = run.stop - run.start > longest and not before.any() and not after.any()
-        rest[run] = at_an_end or lasts
-    return rest
-
-
 def _advised(record: Record) -> str:
     return f" ({record.advice})" if record.advice else ""
-
-
-def check_log(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str, ...]:
-    """Return notes on a log that can be used, empty if nothing is to be said.
-
-    Raises:
-        InputError: naming what is wrong: an axis, a frame, a clock, a unit, the pole count, or the rotors' order.
-    """
-    check_axes(record, spans, vehicle.gravity)
-    check_scales(record, spans, vehicle.gravity)
-    notes = [*record.notes, *check_clocks(record, spans), *_check_units(record, spans, vehicle)]
-    check_rotor_order(record, spans, vehicle)
-    return (*notes, *_poor(record, spans))
 
 
 def _logged(record: Record) -> NDArray[np.bool_]:
@@ -184,11 +176,6 @@ def _bridged(rows: Array, logged: NDArray[np.bool_]) -> Array:
     return np.stack([np.interp(index, index[logged], column[logged]) for column in rows.T], axis=1)
 
 
-def _runs(mask: NDArray[np.bool_], shortest: int) -> list[slice]:
-    """Runs of true samples with at least the shortest length."""
-    return [run for (run,) in find_objects(label(mask)[0]) if run.stop - run.start >= shortest]
-
-
 def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
     """Refuse rotor speeds far from those that carry the start vehicle."""
     for field in ("commands", "speeds"):
@@ -221,15 +208,20 @@ def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
             yield f"{what} {start}: check unit, poles and the start's thrust_coefficient"
 
 
-def _poor(record: Record, parts: Sequence[slice]) -> Iterator[str]:
-    """Notes on what makes estimates poor: gaps, a slow log, commands at a limit."""
+def _note_gaps(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
     logged = _logged(record)
     if not logged.all():
         share, first = 100.0 * (1.0 - logged.mean()), record.t[np.argmin(logged)]
         yield f"{record.name}: {share:.2g} % of its samples, left out, are in gaps, the first at t = {first:.4g} s"
+
+
+def _note_slow_logs(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
     if record.period > (1.0 + 1e-6) / GOOD_RATE:
         poor = f"{1.0 / record.period:.3g} Hz; below {GOOD_RATE:g} Hz, lag and inertias will be poor"
         yield f"{record.name}: {poor}{_advised(record)}"
+
+
+def _note_limits(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
     for field in INPUTS[:2]:
         if (rows := getattr(record, field)) is not None:
             flown = np.concatenate([rows[part] for part in parts])
@@ -241,3 +233,56 @@ def _poor(record: Record, parts: Sequence[slice]) -> Iterator[str]:
                     f"{record.name}: in {100.0 * share:.0f} % of its samples a rotor's {field} are at a limit, "
                     f"{low:.4g} or {high:.4g}; fly more gently"
                 )
+
+
+class RowCheck(NamedTuple):
+    """What has to hold of a log's complete rows before it is asked when it flies."""
+
+    holds: str
+    run: Callable[[Record, NDArray[np.bool_]], None]  # raises InputError where it does not
+
+
+class LogCheck(NamedTuple):
+    """What has to hold of the parts of a log that fly."""
+
+    holds: str
+    needs: tuple[str, ...]  # fields of a record that not every log has
+    run: Callable[[Record, Sequence[slice], Vehicle], Iterable[str] | None]
+    """Raises InputError where it does not hold; returns notes where it nearly does not."""
+
+
+ROW_CHECKS: Final = (
+    RowCheck("the motors run, each of them", _check_motors_run),
+    RowCheck("no column stands still while others move", _check_columns_move),
+    RowCheck("rows are new, not those before once more", _check_rows_are_new),
+    RowCheck("outputs are logged about as often as they are sent", _check_outputs_are_logged_often),
+)
+LOG_CHECKS: Final = (
+    LogCheck("the attitude turns at the body rates", (), check_rate_axes),
+    LogCheck("the velocity is the slope of the position", ("position",), check_velocity_axes),
+    LogCheck("the velocity changes as tilt and thrust make it", (), check_tilt),
+    LogCheck("gyro, attitude, velocity, position and gravity agree in scale", (), check_scales),
+    LogCheck("rates, attitude and velocity tell one time", (), check_clocks),
+    LogCheck("speeds that carry the weight are about the start's", (), _check_units),
+    LogCheck("each rotor turns as the others do at its command", ("speeds",), check_against_commands),
+    LogCheck("no rotor's speed alone unbalances the torques", ("speeds",), check_against_each_other),
+    LogCheck("the vehicle turns with the measured speeds, not behind them", ("speeds",), check_not_commands),
+    LogCheck("the rotors are in the start's order and layout", (), check_rotor_order),
+    LogCheck("there are no gaps", (), _note_gaps),
+    LogCheck("samples are frequent", (), _note_slow_logs),
+    LogCheck("the rotors are within their limits", (), _note_limits),
+)
+"""Every check of a log that flies, in the order in which they are made: a later one trusts what an earlier one saw."""
+
+
+def check_log(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str, ...]:
+    """Make the `LOG_CHECKS`; return notes on a log that can be used, empty if nothing is to be said.
+
+    Raises:
+        InputError: naming what is wrong: an axis, a frame, a clock, a unit, a rotor, or their order.
+    """
+    notes = [*record.notes]
+    for check in LOG_CHECKS:
+        if all(getattr(record, field) is not None for field in check.needs):
+            notes += check.run(record, spans, vehicle) or ()
+    return tuple(notes)

@@ -12,13 +12,14 @@ from quadsim.features.identify.axes import lateral_motion, tilt_fit, turning_pai
 from quadsim.features.identify.correlation import likeness, shifts, stride
 from quadsim.features.identify.record import Record
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
 
 REFUSED_SHIFT: Final = {"rates are": 0.015, "velocity is": 0.05}
 """Shift [s] that is refused: drag and yaw reaction would be wrong, and their intervals with them."""
 SHOWN: Final = 5e-3  # [s] of shift
 
 
-def check_clocks(record: Record, parts: Sequence[slice]) -> Iterator[str]:
+def check_clocks(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
     """Notes on shifts between the clocks of attitude, rates and velocity, where the motion shows them clearly.
 
     Raises:

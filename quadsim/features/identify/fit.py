@@ -25,11 +25,11 @@ from quadsim.features.identify.estimate import (
     field_of,
     number_in,
 )
-from quadsim.features.identify.model import INCREMENTS, Stretch, stretch
+from quadsim.features.identify.model import INCREMENTS, Stretch, mean_voltage, stretch
 from quadsim.features.identify.noise import NoiseFit, identify_noise
-from quadsim.features.identify.record import Record
-from quadsim.features.identify.rotor_response import rotor_response
-from quadsim.features.identify.search import LEVEL_PLATE, PLATE, Search
+from quadsim.features.identify.record import Record, part_of
+from quadsim.features.identify.rotor_response import RotorResponse, foretold_speeds, rotor_response
+from quadsim.features.identify.search import LEVEL_PLATE, PLATE, NormalEquations, Search
 from quadsim.state import Array
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 
@@ -128,6 +128,12 @@ def identify_records(
         raise InputError(f"logs fitted together must have the same columns of rotors and battery; got {names}")
     blows = wind or any(record.position is None or record.inertial for record in records)  # or its velocity drifts
 
+    response: Mapping[str, RotorResponse] = {}
+    if records[0].speeds is not None and (records[0].commands is not None or records[0].throttle is not None):
+        voltage = mean_voltage(flown)
+        response = rotor_response(flown, vehicle, voltage)
+        flown = [replace(part, foretold=foretold_speeds(part, vehicle, voltage, response)) for part in flown]
+
     def searched(fixed: Mapping[str, float], found: Search | None = None) -> Search:
         search = Search(flown, vehicle, wind=blows, fixed=fixed)
         if found is not None:
@@ -136,45 +142,41 @@ def identify_records(
         return search
 
     search = searched({})
-    fit = _Fit(search)
+    fit = _Fit(search, response)
     while undamped := {name: 0.0 for name in _impossible(search) if name.startswith("rate_damping")}:
         search = searched({**search.fixed, **undamped}, search)  # negative damping would stand for lag
-        fit = _Fit(search, fit)
+        fit = _Fit(search, response, fit)
     held = fit.held()
     refined = searched(held, search)
-    while impossible := _impossible(refined):
-        held |= impossible
+    while refused := _impossible(refined) | fit.refuse_what_moved(refined):
+        held |= refused
         refined = searched(held, refined)
     return fit.result(refined)
-
-
-def part_of(record: Record, span: slice) -> Record:
-    """A span of a record as one of its own."""
-    cut: dict[str, Any] = {name: rows[span] for name, rows in vars(record).items() if isinstance(rows, np.ndarray)}
-    return replace(record, **cut)
 
 
 _UNKNOWN: Final = 50.0  # half-width in logarithms from which nothing is known
 _WEAK: Final = "not excited"
 _HOPELESS: Final = 1.1  # half-width above which its size is not told
+_SHARED: Final = 0.02  # of what all flights say together, that is added to what one says alone
 _NEARLY: Final = 2.0  # how much too wide an interval may be for more of the same flight to help
 
 
 class _Fit:
     """What a search found, judged; of numbers that it held, what another found `before`."""
 
-    def __init__(self, search: Search, before: _Fit | None = None) -> None:
-        self.search, self.vehicle = search, search.vehicle
-        blocks, prior = search.blocks(), search.prior(search.x)[1].H
-        H = sum((block.H for block in blocks), prior)
-        self.cov = np.linalg.inv(H)
+    def __init__(self, search: Search, response: Mapping[str, RotorResponse], before: _Fit | None = None) -> None:
+        self.search, self.vehicle, self.response = search, search.vehicle, response
+        blocks, prior = search.blocks(instrumented=True), search.prior(search.x)[1].H
+        whole = _together(blocks, prior)
+        H = whole.H
+        self.cov = _covariance(whole)
         self.left_out = np.array([np.linalg.solve(H - block.H, block.g) for block in blocks])
         self.quantile = _quantile(len(blocks))
         self.rests = np.diag(self.cov) * np.diag(prior)
+        self._by_flight = [_alone(flight, blocks, search, whole) for flight in range(search.flights)]
         record = search.parts[0].record
         self._blind = record.speeds is None  # to what the rotors do
         self._throttle = self._blind and record.commands is None
-        self._alone = record.commands is None and record.throttle is None  # measured speeds, without commands
         self.colour = _colour(search)
         self.most_colour = max(MOST_COLOUR, CHANCE / min(map(len, search.innovations(search.x))) ** 0.5)
         self._blown = self._gusts_turn()
@@ -199,9 +201,14 @@ class _Fit:
         colour = max(self.colour[axis] for axis in axes)
         widened = math.sqrt((1.0 + colour) / (1.0 - colour)) if colour > self.most_colour else 1.0
         explained = math.sqrt(row @ self.cov @ row)
-        return math.hypot(
-            _NORMAL * widened * explained, self.quantile * scatter, self.quantile * self._floor(shares, axes)
-        )
+        beyond = math.hypot(scatter, self._floor(shares, axes), self._between_flights(row, widened))
+        return math.hypot(_NORMAL * widened * explained, self.quantile * beyond)
+
+    def _between_flights(self, row: Array, widened: float) -> float:
+        """Deviation of a sum of x by what flights differ in beyond their noise."""
+        each = np.array([step @ row for step, _ in self._by_flight])
+        variances = np.array([row @ covariance @ row for _, covariance in self._by_flight])
+        return deviation_between(each, widened**2 * variances)
 
     def _floor(self, shares: Mapping[int, float], axes: Sequence[str]) -> float:
         """Deviation of a sum of shares of x by what the prediction leaves out."""
@@ -223,17 +230,26 @@ class _Fit:
         return "lateness" if name == "delay" and not self._blind else name
 
     def _every_estimate(self) -> dict[str, ParameterEstimate]:
-        places: dict[str, list[int]] = {}
-        for i in range(len(self.search.sought)):
-            if self._kind(i) in _KINDS:
-                places.setdefault(self._kind(i), []).append(i)
-        found = {name: self._estimate(name, at) for name, at in places.items()}
-        if not self._blind and not self._alone:
+        found = {name: self._estimate(name, at) for name, at in self._places().items()}
+        if self.response:
             found |= self._response()
         elif "rotor_rise" not in found:
             why, lag = "the log has the rotors' speeds but not their commands", self.vehicle.rotor_rise or 0.0
             found |= {name: self._judged(name, lag, lag, lag, why) for name in ("rotor_rise", "rotor_fall")}
-        elif lags := [name for name in ("rotor_rise", "rotor_fall") if found[name].refused]:
+        return self._judged_together(found)
+
+    def _places(self) -> dict[str, list[int]]:
+        """Where each parameter is in x: one place, or one for each flight."""
+        places: dict[str, list[int]] = {}
+        for i in range(len(self.search.sought)):
+            if self._kind(i) in _KINDS:
+                places.setdefault(self._kind(i), []).append(i)
+        return places
+
+    def _judged_together(self, found: dict[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
+        """Refuse what cannot be told without a number that is refused."""
+        lags = [name for name in ("rotor_rise", "rotor_fall") if found[name].refused]
+        if lags and self._blind:
             why = f"{' and '.join(lags)} tell nothing, and no lag can be told from inertia without the rotors' speeds"
             found |= {
                 name: replace(found[name], refused=why, advice=_MEASURE)
@@ -257,8 +273,8 @@ class _Fit:
 
     def _response(self) -> dict[str, ParameterEstimate]:
         """How the rotors answer, where the log has both speeds and commands."""
-        search, found = self.search, {}
-        for name, response in rotor_response(search.parts, self.vehicle, search.voltage).items():
+        found = {}
+        for name, response in self.response.items():
             kind, value = _KINDS[name], response.value
             spread = math.hypot(response.deviation, _ANSWERS * abs(value))
             half = _quantile(response.blocks) * spread
@@ -289,7 +305,7 @@ class _Fit:
         )
         if not WIDEST < half < _NEARLY * WIDEST or not found.refused.startswith(_WEAK):
             return found
-        flown = sum(part.record.period * len(part.increments) for part in self.search.parts)
+        flown = sum(part.seconds for part in self.search.parts)
         return replace(found, advice=f"{found.advice}, or the same again, {flown * (half / WIDEST) ** 2:.0f} s in all")
 
     def _speaks_against_the_start(self, i: int) -> bool:
@@ -304,6 +320,8 @@ class _Fit:
         """Why a number that is searched for tells nothing, or nothing."""
         number, kind = self.search.sought[places[0]], _KINDS[name]
         scale = number.scale
+        if name.startswith("inertia_") and not self.search.settled:
+            return f"{_WEAK}: the commands explain too little of the measured speeds"
         if name == "thrust_coefficient" and abs(left := self._uncarried()) > UNCARRIED:
             return f"with it, {left:.1%} of the weight is not carried, allowed {UNCARRIED:.0%}"
         if kind.widest is not None and scale is not None:
@@ -323,7 +341,7 @@ class _Fit:
         """Share of the weight that neither thrust nor drag carry, in the mean over all stretches."""
         search = self.search
         left = np.concatenate([search.misfit(search.x, i)[0][:, -1] for i in range(len(search.parts))])
-        return float(left.mean()) / (self.vehicle.gravity * search.parts[0].record.period)
+        return float(left.mean()) / (self.vehicle.gravity * search.parts[0].step)
 
     def _judged(self, name: str, value: float, low: float, high: float, refused: str) -> ParameterEstimate:
         field = field_of(name)
@@ -351,30 +369,51 @@ class _Fit:
         known = {number.name for number in self.search.sought} | {*self.search.fixed}
         return {**self.search.fixed} | {name: held[name] for name in held if name in known} | {"inflow": 0.0}
 
-    def result(self, refined: Search) -> Identification:
-        """Every estimate, and the vehicle with those that are not refused."""
-        first, x = refined.parameters(refined.x, 0), refined.x
+    def _moved_to(self, refined: Search) -> tuple[dict[str, float], dict[str, ParameterEstimate]]:
+        """Values by what another search found, and the estimates that are not refused moved there."""
         numbers: dict[str, list[float]] = {}
-        for number, value in zip(refined.sought, x, strict=False):
+        for number, value in zip(refined.sought, refined.x, strict=False):
             numbers.setdefault(number.name, []).append(number.value(value))
-        values, estimates = dict(refined.fixed), []
+        for name, value in refined.fixed.items():
+            numbers.setdefault(name, [value])
+        values = dict(refined.fixed)
         values |= {name: e.value for name, e in self.estimates.items() if name.startswith("rotor_") and not e.refused}
-        for name, estimate in self.estimates.items():
+        found = {}
+        for name in self.estimates:
             known = name == "lateness" or (name == "delay" and not self._blind)
-            found = numbers.get("delay", ()) if name == "lateness" else () if known else numbers.get(name, ())
-            if len(found) == 1:
-                values[name] = float(f"{found[0]:.6g}")
-            if found and not estimate.refused:
-                estimate = _moved(estimate, values.get(name, float(np.mean(found))))
-            estimates.append(estimate)
+            found[name] = numbers.get("delay", []) if name == "lateness" else [] if known else numbers.get(name, [])
+            if len(found[name]) == 1:
+                values[name] = float(f"{found[name][0]:.6g}")
         # Each within its interval, the three together may make no body.
         inertia = [values.get(f"inertia_{axis}", number_in(self.vehicle, f"inertia_{axis}") or 0.0) for axis in "xyz"]
         if not _is_body(inertia):
             values["inertia_z"] = float(f"{PLATE[0] * (inertia[0] + inertia[1]):.6g}")
-            estimates = [
-                replace(each, value=values["inertia_z"]) if each.name == "inertia_z" and not each.refused else each
-                for each in estimates
-            ]
+        moved = {}
+        for name, each in found.items():
+            if each and not self.estimates[name].refused:
+                moved[name] = _moved(self.estimates[name], values.get(name, float(np.mean(each))))
+        return values, moved
+
+    def refuse_what_moved(self, refined: Search) -> dict[str, float]:
+        """Judge the intervals that another search widened; return what is to be held since, as `held` does."""
+        places = self._places()
+        refused = {}
+        for name, estimate in self._moved_to(refined)[1].items():
+            number = self.search.sought[places[name][0]]
+            middle = number.place(estimate.value)
+            half = max(abs(number.place(end) - middle) for end in (estimate.low, estimate.high))
+            if why := self._weak(name, places[name], half, estimate.value):
+                refused[name] = replace(estimate, refused=why, advice=_KINDS[name].advice)
+        if not refused:
+            return {}
+        self.estimates = self._judged_together(self.estimates | refused)
+        return {name: value for name, value in self.held().items() if name not in refined.fixed}
+
+    def result(self, refined: Search) -> Identification:
+        """Every estimate, and the vehicle with those that are not refused."""
+        first = refined.parameters(refined.x, 0)
+        values, moved = self._moved_to(refined)
+        estimates = {**self.estimates, **moved}.values()
         vehicle = self._assembled(values)
         noise = _unmodelled(refined)
         flights = tuple(self._numbers_of(refined, flight) for flight in range(refined.flights))
@@ -509,6 +548,48 @@ def _moved(estimate: ParameterEstimate, value: float) -> ParameterEstimate:
     return replace(estimate, value=value, low=low, high=high)
 
 
+def _together(blocks: Sequence[NormalEquations], prior: Array) -> NormalEquations:
+    """All blocks and the priors' information as one."""
+    H, g, S = (np.sum(each, axis=0) for each in zip(*blocks, strict=True))
+    return NormalEquations(H + prior, g, S + prior)
+
+
+def _covariance(equations: NormalEquations) -> Array:
+    """Covariance of x: H^-1 S H^-T, H^-1 without instruments."""
+    inverse = np.linalg.inv(equations.H)
+    return np.asarray(inverse @ equations.S @ inverse.T)
+
+
+def deviation_between(each: Array, variances: Array) -> float:
+    """Return the deviation of the weighted mean of some flights' values by what they differ in beyond their noise.
+
+    The variance between flights is that of DerSimonian and Laird, "Meta-analysis in clinical trials", Controlled
+    Clinical Trials 7 (1986): (sum w d^2 - (F - 1)) / (sum w - sum w^2 / sum w), w = 1 / variance, 0 at least.
+
+    Args:
+        each: value of each flight (F,).
+        variances: of their noise (F,).
+    """
+    if len(each) < 2:
+        return 0.0
+    weights = 1.0 / variances
+    total = float(weights.sum())
+    apart = each - float(weights @ each) / total
+    excess = float(weights @ apart**2) - (len(each) - 1)
+    between = max(excess, 0.0) / (total - float(weights @ weights) / total)
+    return math.sqrt(between * float(weights @ weights)) / total
+
+
+def _alone(
+    flight: int, blocks: Sequence[NormalEquations], search: Search, whole: NormalEquations
+) -> tuple[Array, Array]:
+    """How far a flight alone would move x from what all flights gave together, and its covariance."""
+    own = [block for block, of in zip(blocks, search.flight_of_blocks(), strict=True) if of == flight]
+    alone = _together(own, _SHARED * whole.H)
+    alone = alone._replace(S=alone.S + _SHARED * (whole.S - whole.H))
+    return np.asarray(-np.linalg.solve(alone.H, alone.g)), _covariance(alone)
+
+
 def _is_body(inertia: Sequence[float]) -> bool:
     """Whether none of three moments of inertia exceeds the sum of the others."""
     return 2.0 * max(inertia) < sum(inertia)
@@ -529,6 +610,6 @@ def _colour(search: Search) -> dict[str, float]:
     colour = np.zeros(len(INCREMENTS))
     for part, innovations in zip(search.parts, search.innovations(search.x), strict=True):
         e = innovations - innovations.mean(axis=0)
-        for lag in range(1, 1 + max(1, round(_LONGEST_LAG / part.record.period))):
+        for lag in range(1, 1 + max(1, round(_LONGEST_LAG / part.step))):
             colour = np.maximum(colour, np.abs((e[lag:] * e[:-lag]).mean(axis=0)) / (e**2).mean(axis=0))
     return dict(zip(INCREMENTS, np.minimum(colour, 0.99).tolist(), strict=True))

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from quadsim.features.identify.record import Record
+from quadsim.features.identify.record import Record, part_of
 from quadsim.features.identify.rotors import Turning, lagging, measured, smoothed
 from quadsim.rotation import exponential, multiply, normalise
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
-from quadsim.state import Array
+from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
 
 INCREMENTS: Final = ("roll", "pitch", "yaw", "vx", "vy", "vz")
@@ -74,12 +75,39 @@ class Stretch:
 
     record: Record
     flight: int  # which of those fitted together
-    increments: Array  # (N - 1, 6) of body rates [rad/s] and world velocity [m/s]
+    increments: Array  # (K, 6) of body rates [rad/s] and world velocity [m/s], from each new row to the next
+    starts: Indices  # (K,) the period in which each begins; of a log without held rows, K = N - 1 and all of them
     motion: MeanMotion
+    foretold: Array | None = None  # (N, 4) rotor speeds by the commands, where both are logged [rad/s]
+
+    @property
+    def seconds(self) -> float:
+        """How long it flies [s]."""
+        return self.record.period * len(self.motion.rates)
+
+    @property
+    def step(self) -> float:
+        """Mean time from a new row to the next [s]."""
+        return self.seconds / len(self.increments)
+
+    def misfit(self, predicted: Array) -> Array:
+        """(K, 6) increments less those that are predicted for each period (N - 1, 6)."""
+        if len(self.starts) < len(predicted):
+            predicted = np.add.reduceat(predicted, self.starts, axis=0)
+        return self.increments - predicted
+
+
+def mean_voltage(parts: Sequence[Stretch]) -> float:
+    """Return the mean voltage of the battery in some stretches, 0 where none is logged [V]."""
+    voltages = [part.record.voltage for part in parts if part.record.voltage is not None]
+    return float(np.mean(np.concatenate(voltages))) if voltages else 0.0
 
 
 def stretch(record: Record, flight: int) -> Stretch:
-    """Prepare a record, all of which flies."""
+    """Prepare a record, all of which flies, from its first new row to its last."""
+    rows = np.arange(len(record.t)) if record.fresh is None else np.flatnonzero(record.fresh)
+    record = part_of(record, slice(rows[0], rows[-1] + 1))
+    rows = rows - rows[0]
     if record.speeds is not None:
         record = replace(record, speeds=smoothed(record.speeds))
     turn = Rotation.from_quat(_smoothed(record), scalar_first=True).as_matrix()
@@ -88,7 +116,8 @@ def stretch(record: Record, flight: int) -> Stretch:
     return Stretch(
         record=record,
         flight=flight,
-        increments=np.diff(np.concatenate([record.rates, record.velocity], axis=1), axis=0),
+        increments=np.diff(np.concatenate([record.rates, record.velocity], axis=1)[rows], axis=0),
+        starts=rows[:-1],
         motion=MeanMotion(period=record.period, rates=rates, turn=turns, velocity=velocity),
     )
 

@@ -26,10 +26,9 @@ from scipy.spatial.transform import Rotation
 from quadsim.errors import InputError
 from quadsim.features.identify.checks import SHORTEST_SPAN
 from quadsim.features.identify.estimate import Identification
-from quadsim.features.identify.fit import part_of
 from quadsim.features.identify.model import INCREMENTS, MeanMotion, Parameters, predicted_increments, stretch, turning
 from quadsim.features.identify.noise import AxisNoise
-from quadsim.features.identify.record import Record
+from quadsim.features.identify.record import Record, part_of
 from quadsim.features.identify.rotors import Turning
 from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle

@@ -18,6 +18,7 @@ from quadsim.features.identify.border import reading
 from quadsim.features.identify.dataflash import read_dataflash
 from quadsim.features.identify.inertial import filled_in, integrated_velocity, levelled_attitude
 from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, to_series
+from quadsim.features.identify.sensors import without_held_rows, without_spikes, without_stopped_counters
 from quadsim.features.identify.series import Column, held
 from quadsim.features.identify.tables import read_columns
 from quadsim.flight.parquet import FLIGHT_FILE
@@ -73,6 +74,7 @@ class Record:
     speeds: Array | None = None  # (N, 4) measured rotor speeds [rad/s]
     voltage: Array | None = None  # (N,) of the battery [V]
     flying: NDArray[np.bool_] | None = None  # (N,) whether its autopilot was armed and not landed
+    fresh: NDArray[np.bool_] | None = None  # (N,) rows that a radio did not hold, where it held any
     inertial: bool = False
     """Whether an accelerometer stands in for the velocity, which then has its changes, but neither mean nor drift."""
     notes: tuple[str, ...] = ()  # what was derived or assumed in reading it
@@ -82,6 +84,12 @@ class Record:
     def period(self) -> float:
         """Time between samples [s]."""
         return float(self.t[-1] - self.t[0]) / (self.t.size - 1)
+
+
+def part_of(record: Record, span: slice) -> Record:
+    """A span of a record as one of its own."""
+    cut: dict[str, Any] = {name: rows[span] for name, rows in vars(record).items() if isinstance(rows, np.ndarray)}
+    return replace(record, **cut)
 
 
 def driver(record: Record) -> Array:
@@ -143,11 +151,17 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
     has no gaps: it changes slowly; nor has `flying`, which changes rarely.
     """
-    voltage, flying = series.get("voltage"), series.get("flying")
-    series = {field: samples for field, samples in series.items() if field not in ("voltage", "flying")}
-    series, notes = _without_repeated_times(name, series)
+    flying = series.get("flying")
+    series, notes = _without_repeated_times(name, {field: of for field, of in series.items() if field != "flying"})
     for field, samples in series.items():
-        _check_clock(name, field, samples.t)
+        if field != "voltage":
+            _check_clock(name, field, samples.t)
+    series, spikes = without_spikes(name, series)
+    series, stops = without_stopped_counters(name, series)
+    series, repeats = without_held_rows(name, series)
+    notes = (*notes, *spikes, *stops, *repeats)
+    voltage = series.pop("voltage", None)
+    fresh = series.pop("fresh", None)
     force = series.pop("specific_force", None)
     optional = ("position", *INPUTS)
     series = {f: s for f, s in series.items() if f not in optional or np.isfinite(s.values).all(axis=1).any()}
@@ -183,12 +197,16 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
         notes = (*notes, f"{name}: the velocity is logged at {1.0 / slow:.3g} Hz; the accelerometer fills it in")
     if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
         values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
+    if fresh is not None:
+        values["fresh"] = held(fresh, grid + 0.05 * period)[:, 0]
     if len(grid) > 10 * (size := int(1.0 / (FASTEST_RATE * period))) > 20:
         grid, values = _thinned(grid, values, size - 1 + size % 2)
         values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
         rates = f"{1.0 / period:.0f} Hz, of which means at {1.0 / (grid[1] - grid[0]):.0f} Hz are used"
         notes = (*notes, f"{name}: {rates}")
     aloft = None if flying is None else held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
+    if "fresh" in values:
+        values["fresh"] = values["fresh"] > 0.0
     return Record(name=name, t=grid, flying=aloft, notes=notes, inertial=inertial, **values)
 
 

@@ -60,6 +60,12 @@ def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) 
     _check_spins(record.name, blocks, vehicle)
 
 
+def explained_at_lag(record: Record, parts: Sequence[slice], vehicle: Vehicle, lag: float) -> Array:
+    """Share (K,) of roll and pitch acceleration that rotors as given explain in each block, behind a lag [s]."""
+    x, y, _ = vehicle.hubs.T / vehicle.longest_arm
+    return _explained(_moments(record, parts, lag), np.stack([y, -x]))
+
+
 def _moments(record: Record, parts: Sequence[slice], lag: float) -> Moments:
     """Moments of the blocks of all parts, the mean of each block removed, the commands behind a lag [s]."""
     period, size = record.period, max(round(BLOCK / record.period), 8)

@@ -7,7 +7,7 @@ commands less often than they are sent shows what is faster than it at a wrong f
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from scipy.signal import butter, sosfiltfilt
 
 from quadsim.features.identify.model import Parameters, Stretch, commanded
+from quadsim.features.identify.rotors import lagging
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -94,3 +95,13 @@ def rotor_response(parts: Sequence[Stretch], vehicle: Vehicle, voltage: float) -
     deviations[2] = math.hypot(deviations[2], 0.25 * period)
     found.x[2] = held.get("delay", found.x[2])
     return {name: RotorResponse(float(found.x[i]), float(deviations[i]), len(blocks)) for i, name in enumerate(start)}
+
+
+def foretold_speeds(part: Stretch, vehicle: Vehicle, voltage: float, response: Mapping[str, RotorResponse]) -> Array:
+    """Speeds (N, 4) of a stretch by its commands and a response; in the mean those that were measured [rad/s]."""
+    numbers = {name: of.value for name, of in response.items()}
+    p = Parameters.of(vehicle, voltage=voltage, **numbers)
+    commands = commanded(part.record, vehicle, p)
+    rotors = lagging(commands, part.record.period, rise=p.rotor_rise, fall=p.rotor_fall, delay=p.delay)
+    means = np.asarray(part.record.speeds).mean(axis=0)
+    return np.asarray(rotors.speeds * means / rotors.speeds.mean(axis=0))

@@ -18,6 +18,7 @@ from quadsim.features.identify.correlation import Pairs, moments, pairs_of, stri
 from quadsim.features.identify.record import Record
 from quadsim.features.identify.windows import body_z, half_window, mean, rate_over_window, turn_rate
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
 
 _TOLERANCE: Final = 0.07
 """By which three columns may differ together: state estimators differ by 5 % from what they were fed, axis by axis."""
@@ -54,7 +55,7 @@ class ScaleFactor(NamedTuple):
         return abs(math.log(self.value / other)) < within
 
 
-def check_scales(record: Record, parts: Sequence[slice], gravity: float) -> None:
+def check_scales(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
     """Compare gyro with attitude, velocity with position, and both with gravity.
 
     Raises:
@@ -65,7 +66,7 @@ def check_scales(record: Record, parts: Sequence[slice], gravity: float) -> None
         lambda part: turn_rate(record.attitude[part], record.period, _WINDOW),
         lambda part: _turned(record.rates[part], record.period),
     ))  # fmt: skip
-    falls = _factor(*_tilts(record, parts, gravity))
+    falls = _factor(*_tilts(record, parts, vehicle.gravity))
     moves: list[ScaleFactor | None] = [None] * 3
     if (position := record.position) is not None:
         moves = _factors(pairs_of(
@@ -81,6 +82,12 @@ def check_scales(record: Record, parts: Sequence[slice], gravity: float) -> None
             raise InputError(
                 f"{name}: gyro against attitude and velocity against {'position' if moved else 'gravity'} say that the "
                 f"clock runs {turn.value:.3g} times as fast as the flight: correct t"
+            )
+        if falls is not None and not record.inertial and falls.like(turn.value, abs(math.log(falls.value))):
+            raise InputError(
+                f"{name}: the attitude turns {1.0 / turn.value:.3g} times as far as the gyro says, and tilts "
+                f"{1.0 / falls.value:.3g} times as far as the velocity shows: it is the attitude that is off, not the "
+                "gyro; give a better estimate, or leave it out beside ax, ay, az"
             )
     _refuse(name, "wx wy wz", turns, turn, "the rates at which the attitude turns", "gyro", "rad/s")
     if falls is None or not falls.off():  # gravity speaks for the velocity: small differences are the position's

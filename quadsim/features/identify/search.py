@@ -6,6 +6,11 @@ order and stable, are those of the stationary Kalman filter of that noise.  A an
 parameters, at the least N log(sum e^2) summed over axes: the likelihood.  A loop that feeds torque back through the
 commands does not bias this estimate, as each e_k is predicted from commands and samples before it alone (Ljung,
 "System Identification", 2nd ed., Secs. 7.2, 8.4 and 13.4).
+
+Noise of measured rotor speeds does: torques look larger than they are, and so do moments of inertia.  Where the
+commands are logged too, they are instruments (Sec. 7.6): by the moments of inertia about x and y, the innovations are
+made orthogonal not to their own slopes J but to Z, the slopes at the speeds that the commands foretell, which share no
+noise with the measured ones: sum Z' e = 0 in place of sum J' e = 0.
 """
 
 from __future__ import annotations
@@ -19,8 +24,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from quadsim.features.identify.estimate import VECTORS, field_of
-from quadsim.features.identify.model import INCREMENTS, Parameters, Stretch, predicted_increments, turning
-from quadsim.features.identify.rotors import Turning
+from quadsim.features.identify.model import INCREMENTS, Parameters, Stretch, mean_voltage, predicted_increments, turning
+from quadsim.features.identify.rotors import Turning, measured
 from quadsim.fields import floor_of
 from quadsim.state import Array, Indices
 from quadsim.vehicle import LARGEST, VEHICLE_UNITS, Vehicle
@@ -44,6 +49,9 @@ _LAG_RATIO: Final = 0.5  # standard deviation of log(rise / fall)
 _WIND: Final = (2.0, 2.0, 0.7)  # standard deviation of the mean wind of a stretch, world axes [m/s]
 _WIND_STEP: Final = 0.2  # of its change in one second, over that of the mean
 _STEPS, _TRIES, _SMALL = 60, 8, 5e-3  # of the search: how many, shortened how often, until the likelihood gains less
+_LOG_STEP: Final = 1e-4  # of a logarithm, for slopes
+_NEWTON_STEPS, _LONGEST_STEP, _SETTLED = 30, 0.5, 2e-3
+"""Of the search with instruments: how many, how long at most, and how short a step of the inertia ends it."""
 ROTOR_PARAMETERS: Final = ("rotor_rise", "rotor_fall", "delay", "throttle_curve", "voltage_exponent")
 """Parameters that the rotors' speeds depend on."""
 
@@ -65,6 +73,10 @@ class Sought(NamedTuple):
         least = floor_of(VEHICLE_UNITS[field_of(self.name)])
         within = np.clip(x, math.log(least / self.start), math.log(LARGEST / self.start))
         return float(self.start * np.exp(within))
+
+    def place(self, value: float) -> float:
+        """Where in x a value is: the inverse of `value`."""
+        return math.log(value / self.start) if self.scale is None else (value - self.start) / self.scale
 
 
 def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterator[Sought]:
@@ -101,19 +113,16 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterat
         yield Sought("delay", 0.0, 0.005, 4.0, flight)
         yield from (Sought(f"offset_{axis}", 0.0, 0.01 * arm, 10.0, flight) for axis in "xy")
     for i, part in enumerate(parts if wind else ()):
-        knots = int(np.clip(np.ceil(_seconds(part) / KNOT), 2, max(2, _MOST_KNOTS // len(parts))))
+        knots = int(np.clip(np.ceil(part.seconds / KNOT), 2, max(2, _MOST_KNOTS // len(parts))))
         yield from (Sought("wind", 0.0, of, knots**0.5, part.flight, i) for _ in range(knots) for of in _WIND)
 
 
-def _seconds(part: Stretch) -> float:
-    return len(part.increments) * part.record.period
-
-
 class NormalEquations(NamedTuple):
-    """Normal equations of the innovations of some samples: H dx = -g."""
+    """Normal equations of some samples by their innovations e, slopes J, and instruments Z, else J: H dx = -g."""
 
-    H: Array
-    g: Array
+    H: Array  # Z' J
+    g: Array  # Z' e
+    S: Array  # Z' Z, the covariance of g
 
 
 class Search:
@@ -131,15 +140,15 @@ class Search:
     ) -> None:
         self.parts, self.vehicle, self.fixed = parts, vehicle, fixed or {}
         self.sought = [number for number in _sought(vehicle, parts, wind=wind) if number.name not in self.fixed]
-        voltages = [part.record.voltage for part in parts if part.record.voltage is not None]
-        self.voltage = float(np.mean(np.concatenate(voltages))) if voltages else 0.0
+        self.voltage = mean_voltage(parts)
         self.flights = 1 + parts[-1].flight
         self._physical = len(self.sought)
         noise = [*_NOISE_AT_FIRST] * len(INCREMENTS) * self.flights
         self._starts = self._physical + len(noise)  # where what is wrong with the first samples is
         self.x = np.concatenate([np.zeros(self._physical), noise, np.zeros(len(INCREMENTS) * len(parts))])
-        self._fading = math.exp(-parts[0].record.period / LONGEST_FORCE)
-        self._skip = [int(TURN_ON / part.record.period) for part in parts]
+        self._fading = math.exp(-parts[0].step / LONGEST_FORCE)
+        self._skip = [int(np.searchsorted(part.starts, int(TURN_ON / part.record.period))) for part in parts]
+        self.settled = True  # whether instruments, if there are any, gave moments of inertia
         self.sigma = np.ones((self.flights, len(INCREMENTS)))  # of the innovations of each flight [rad/s, m/s]
         deviations = [number.deviation for number in self.sought]
         self._weights = np.array([0.0 if sd is None else sd**-2.0 for sd in deviations] + [1 / 9.0] * len(noise))
@@ -164,6 +173,13 @@ class Search:
         own.setdefault("throttle_curve", self.vehicle.throttle_share)
         return Parameters(body_drag=area / given[0] * np.array(given), voltage=self.voltage, **own)
 
+    def _turns(self, x: Array, part: int, *, foretold: bool = False) -> Turning:
+        """A stretch's rotors, as they were measured or as the commands foretell them."""
+        of, parameters = self.parts[part], self.parameters(x, part)
+        if foretold and of.foretold is not None:
+            return measured(of.foretold, of.record.period, delay=parameters.delay)
+        return turning(of.record, self.vehicle, parameters)
+
     def misfit(
         self, x: Array, part: int, rotors: Turning | None = None, *, steady: bool = False
     ) -> tuple[Array, Turning]:
@@ -171,10 +187,9 @@ class Search:
         parameters = self.parameters(x, part)
         if steady:
             parameters = replace(parameters, wind=parameters.wind.mean(axis=0, keepdims=True))
-        rotors = rotors or turning(self.parts[part].record, self.vehicle, parameters)
-        misfit = self.parts[part].increments - predicted_increments(
-            self.parts[part].motion, rotors, self.vehicle, parameters
-        )
+        rotors = rotors or self._turns(x, part)
+        of = self.parts[part]
+        misfit = of.misfit(predicted_increments(of.motion, rotors, self.vehicle, parameters))
         return misfit[self._skip[part] :], rotors
 
     def _polynomials(self, noise: Array, axis: int) -> tuple[Array, Array]:
@@ -219,7 +234,7 @@ class Search:
             H += np.outer(slope, slope)
             g += slope * residual / deviation
             cost += 0.5 * (residual / deviation) ** 2
-        return cost, NormalEquations(H, g)
+        return cost, NormalEquations(H, g, H)
 
     def _rules(self, x: Array) -> Iterator[tuple[list[tuple[int, float]], float, float]]:
         """Priors on several numbers at once: slopes by index, residual, standard deviation."""
@@ -238,7 +253,7 @@ class Search:
             ratio = self.sought[rise].value(x[rise]) / self.sought[fall].value(x[fall])
             yield [(rise, 1.0), (fall, -1.0)], float(np.log(ratio)), _LAG_RATIO
         for part, wind in zip(self.parts, self._winds, strict=True):
-            step = _WIND_STEP * math.sqrt(_seconds(part) / max(len(wind) - 1, 1))
+            step = _WIND_STEP * math.sqrt(part.seconds / max(len(wind) - 1, 1))
             for before, after in zip(wind[:-1].flat, wind[1:].flat, strict=True):
                 yield [(before, -1.0), (after, 1.0)], x[after] - x[before], step
 
@@ -258,13 +273,14 @@ class Search:
         for i, number in enumerate(self.sought):
             if number.flight not in (None, self.parts[part].flight) or number.part is not None:
                 continue
-            step = 1e-4 if number.scale is None else 1e-2
+            step = _LOG_STEP if number.scale is None else 1e-2
             moved = x.copy()
             moved[i] += step
             slopes[:, :, i] = (
                 self.misfit(moved, part, None if number.name in ROTOR_PARAMETERS else rotors)[0] - misfit
             ) / step
-        when = np.linspace(0.0, 1.0, len(misfit) + self._skip[part])[self._skip[part] :]
+        begun = self.parts[part].starts[self._skip[part] :]
+        when = begun / max(len(self.parts[part].motion.rates) - 1, 1)
         for wind in self._winds[part].T:  # as it is linear between its knots, so is what a change of all of them does
             moved = x.copy()
             moved[wind] += 1e-2
@@ -275,9 +291,9 @@ class Search:
 
     def rows(self, part: int) -> list[Indices]:
         """The samples of each block of a stretch."""
-        long = sum(map(_seconds, self.parts))
+        long = sum(part.seconds for part in self.parts)
         size = len(self.parts[part].increments) - self._skip[part]
-        seconds = size * self.parts[part].record.period
+        seconds = size * self.parts[part].step
         count = max(math.ceil(FEWEST / len(self.parts)), round(seconds / max(SHORTEST_FOLD, long / _MOST_BLOCKS)))
         return np.array_split(np.arange(size), count)
 
@@ -286,7 +302,7 @@ class Search:
         rows = self.rows(part)
         most = BALANCE * math.sqrt(len(rows) * len(self.parts))
         return np.stack([misfit[of].mean(axis=0) for of in rows]) / (
-            most * self.vehicle.gravity * self.parts[part].record.period
+            most * self.vehicle.gravity * self.parts[part].step
         )
 
     def _slopes(self, part: int) -> tuple[Array, Array, Array, Array]:
@@ -307,19 +323,78 @@ class Search:
         lift[:, : self._physical] = self._lift(raw[:, -1], part)
         return innovations, slopes, self._lift(misfit[:, -1], part), lift
 
-    def blocks(self) -> list[NormalEquations]:
-        """Normal equations of the log's parts, each of `SHORTEST_FOLD` or longer but for `FEWEST`, without priors."""
+    def blocks(self, *, instrumented: bool = False) -> list[NormalEquations]:
+        """Normal equations of the log's parts, each of `SHORTEST_FOLD` or longer but for `FEWEST`, without priors.
+
+        With the instruments that there are, if `instrumented`.
+        """
         blocks = []
         for i in range(len(self.parts)):
             innovations, slopes, lift, lift_slopes = self._slopes(i)
+            instruments = self._instruments(i, slopes) if instrumented else slopes
             sigma = self.sigma[self.parts[i].flight]
             for rows, mean, slope in zip(self.rows(i), lift, lift_slopes, strict=True):
                 J = np.vstack([(slopes[rows] / sigma[:, None]).reshape(-1, len(self.x)), slope])
-                blocks.append(NormalEquations(J.T @ J, J.T @ np.append((innovations[rows] / sigma).ravel(), mean)))
+                Z = J
+                if instruments is not slopes:
+                    Z = np.vstack([(instruments[rows] / sigma[:, None]).reshape(-1, len(self.x)), slope])
+                e = np.append((innovations[rows] / sigma).ravel(), mean)
+                blocks.append(NormalEquations(Z.T @ J, Z.T @ e, Z.T @ Z))
         return blocks
 
+    def _instrumented(self) -> list[int]:
+        """Where in x the moments of inertia are that the thrust turns: for yaw, commands foretell too little."""
+        return [i for i, number in enumerate(self.sought) if number.name in ("inertia_x", "inertia_y")]
+
+    def _instruments(self, part: int, slopes: Array) -> Array:
+        """Slopes (N, 6, X) with those by the moments of inertia at the speeds that the commands foretell."""
+        if self.parts[part].foretold is None or not self.settled:
+            return slopes
+        instruments = slopes.copy()
+        rotors = self._turns(self.x, part, foretold=True)
+        misfit, _ = self.misfit(self.x, part, rotors)
+        for i in self._instrumented():
+            moved = self.x.copy()
+            moved[i] += _LOG_STEP
+            raw = (self.misfit(moved, part, rotors)[0] - misfit) / _LOG_STEP
+            for axis in range(len(INCREMENTS)):
+                noise, _ = self._noise(part, axis)
+                instruments[:, axis, i] = lfilter(
+                    *self._polynomials(self.x[noise.start : noise.stop], axis), raw[:, axis]
+                )
+        return instruments
+
+    def flight_of_blocks(self) -> list[int]:
+        """The flight of each of `blocks`."""
+        return [part.flight for i, part in enumerate(self.parts) for _ in self.rows(i)]
+
     def run(self) -> None:
-        """Find the parameters: Gauss-Newton steps, damped by Levenberg and Marquardt."""
+        """Find the parameters: the most likely ones; then, where there are instruments, those orthogonal to them."""
+        self._most_likely()
+        self.settled = True
+        if all(part.foretold is not None for part in self.parts) and self._instrumented():
+            likely = self.x
+            self.settled = self._orthogonal()
+            if not self.settled:
+                self.x = likely
+
+    def _orthogonal(self) -> bool:
+        """Make the innovations orthogonal to the instruments, by Newton's steps; return whether that settles."""
+        for _ in range(_NEWTON_STEPS):
+            blocks, (_, prior) = self.blocks(instrumented=True), self.prior(self.x)
+            H = sum(block.H for block in blocks) + prior.H
+            g = sum(block.g for block in blocks) + prior.g
+            try:
+                step = np.clip(-np.linalg.solve(H, g), -_LONGEST_STEP, _LONGEST_STEP)
+            except np.linalg.LinAlgError:
+                return False
+            self.x = self.x + step
+            if np.abs(step[self._instrumented()]).max() < _SETTLED:
+                return True
+        return False
+
+    def _most_likely(self) -> None:
+        """Gauss-Newton steps, damped by Levenberg and Marquardt."""
         damping, cost = 1e-2, self.cost(self.x)
         for _ in range(_STEPS):
             scale, every = self.sigma, self._by_flight(self.innovations(self.x))

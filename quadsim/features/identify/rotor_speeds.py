@@ -1,0 +1,119 @@
+"""Rotor speeds beside their commands, the motion, and each other: which of a log's are not what they say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.signal import filtfilt
+
+from quadsim.errors import InputError
+from quadsim.features.identify.model import Parameters, commanded
+from quadsim.features.identify.record import Record
+from quadsim.features.identify.rotor_order import AGREEING, EXPLAINED, LAGS, explained_at_lag
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+NOTED_RATIO: Final = 1.07  # of a rotor's speed over its command to that of the others
+REFUSED_RATIO: Final = 1.15
+NOTED_SCALE: Final = 1.1  # by which one rotor's speeds alone, were they wrong, balance the torques
+BALANCED: Final = 0.35  # of the centre's distance that is left where they do
+LAGGING_BETTER: Final = 1.2  # what speeds leave unexplained, over what they leave behind a rotor's lag
+SMOOTHING: Final = (0.0, 0.005, 0.01, 0.015, 0.03, 0.06)  # [s] of a filter without lag, which takes noise away too
+
+
+def check_against_commands(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
+    """Compare each rotor's measured speed with its command, relative to the other rotors.
+
+    Raises:
+        InputError: one turns at another speed than the others do at such a command.
+    """
+    if record.commands is None and record.throttle is None:
+        return
+    voltage = 0.0 if record.voltage is None else float(np.nanmean(record.voltage))
+    wanted = commanded(record, vehicle, Parameters.of(vehicle, voltage=voltage))
+    speeds = np.concatenate([np.asarray(record.speeds)[part] for part in parts])
+    targets = np.concatenate([wanted[part] for part in parts])
+    if np.allclose(speeds, targets * (speeds.mean() / targets.mean()), rtol=1e-6):
+        raise InputError(f"{record.name}: the measured speeds are the commands: leave them out")
+    ratios = np.median(speeds, axis=0) / np.maximum(np.median(targets, axis=0), 1e-9)
+    i, ratio = _odd_one(ratios)
+    if ratio < 1.0 / NOTED_RATIO or ratio > NOTED_RATIO:
+        what = f"{record.name}: rotor {i + 1} turns {ratio:.3g} times as fast as the others do at its command"
+        if ratio < 1.0 / REFUSED_RATIO or ratio > REFUSED_RATIO:
+            raise InputError(f"{what}; at most {REFUSED_RATIO:g} is allowed: correct its measured speed or its command")
+        yield f"{what}: look for a wrong scale, or another propeller"
+
+
+def _odd_one(ratios: Array) -> tuple[int, float]:
+    """The rotor whose ratio is farthest from the median of the others', and by which factor."""
+    factors = [float(ratio / np.median(np.delete(ratios, i))) for i, ratio in enumerate(ratios)]
+    i = max(range(len(factors)), key=lambda i: abs(math.log(max(factors[i], 1e-9))))
+    return i, factors[i]
+
+
+def check_against_each_other(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
+    """Find a rotor whose speeds, were they scaled, would balance the mean yaw torque and the tilting ones at once.
+
+    Sum spin_j b_j w_j^2 = 0 gives the scale; the centre of mass, sum r_j b_j w_j^2 / sum b_j w_j^2, tells the rotor.
+
+    Raises:
+        InputError: there is one.
+    """
+    squares = np.concatenate([np.square(np.asarray(record.speeds)[part]) for part in parts]).mean(axis=0)
+    thrusts = squares * (vehicle.hover_speeds.mean() / vehicle.hover_speeds) ** 2
+    spins = np.array(vehicle.rotor_spins, float)
+    arms = vehicle.hubs[:, :2] / vehicle.longest_arm
+
+    def centre(of: Array) -> float:
+        return float(np.linalg.norm(arms.T @ of) / of.sum())
+
+    scales, left = np.ones(len(spins)), np.full(len(spins), np.inf)
+    for i, spin in enumerate(spins):
+        others = spins * thrusts
+        others[i] = 0.0
+        needed = -float(others.sum()) / spin
+        if needed > 0.0:
+            scales[i] = math.sqrt(thrusts[i] / needed)
+            balanced = thrusts.copy()
+            balanced[i] = needed
+            left[i] = centre(balanced)
+    i = int(np.argmin(left))
+    off = max(scales[i], 1.0 / scales[i])
+    if off > NOTED_SCALE and left[i] < BALANCED * centre(thrusts):
+        raise InputError(
+            f"{record.name}: the measured speed of rotor {i + 1} is {scales[i]:.3g} times what balances the torques of "
+            "the others about all three axes: correct its scale, or give each rotor its own thrust_coefficient"
+        )
+
+
+def check_not_commands(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
+    """Tell measured speeds from commands: the vehicle turns as they are, not as they were a rotor's lag ago.
+
+    A lag takes noise away too; the speeds as they are may do so by a filter without lag.
+
+    Raises:
+        InputError: behind a lag they explain roll and pitch far better.
+    """
+    lagging = [explained_at_lag(record, parts, vehicle, lag) for lag in LAGS[1:]]
+    best = int(np.argmax([of.mean() for of in lagging]))
+    as_they_are = [explained_at_lag(_smoothed(record, parts, tau), parts, vehicle, 0.0) for tau in SMOOTHING]
+    behind, beside = lagging[best], max(as_they_are, key=lambda of: float(of.mean()))
+    gain = (1.0 - beside.mean()) / max(1.0 - behind.mean(), 1e-9)
+    if behind.mean() > EXPLAINED and gain > LAGGING_BETTER and (behind > beside).mean() >= AGREEING - 0.05:
+        raise InputError(
+            f"{record.name}: the vehicle turns as its measured speeds were {1e3 * LAGS[1 + best]:.0f} ms ago, as it "
+            f"does behind commands ({behind.mean():.0%} of roll and pitch explained, {beside.mean():.0%} without): "
+            "name them commands, u1..u4"
+        )
+
+
+def _smoothed(record: Record, parts: Sequence[slice], tau: float) -> Record:
+    speeds = np.asarray(record.speeds).copy()
+    pole = math.exp(-record.period / tau) if tau else 0.0
+    for part in parts:
+        speeds[part] = filtfilt([1.0 - pole], [1.0, -pole], speeds[part], axis=0)
+    return replace(record, speeds=speeds)
