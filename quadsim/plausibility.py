@@ -175,6 +175,13 @@ RATIOS: Final = (
         high=1.2,
     ),
     Ratio(
+        of=("inflow", "mass"),
+        text="share of the climb that inflow takes per second at hover",
+        value=lambda v: _over((v.inflow or 0.0) * float(v.hover_speeds.sum()) or None, v.mass),
+        low=1e-2,
+        high=10.0,
+    ),
+    Ratio(
         of=("rotor_moment", "thrust_coefficient", "inertia"),
         text="angular acceleration of rotor_moment at hover per air speed [rad/(m s)]",
         value=lambda v: v.turned_by_air or None,

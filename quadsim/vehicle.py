@@ -27,6 +27,8 @@ ARMS: Final = ("arm_length", "rotor_azimuths")
 """The parameters that `rotor_positions` replaces."""
 THRUST: Final = ("thrust_coefficient", "thrust_of_speed", "thrust_of_throttle")
 """The parameters of which one states a rotor's thrust."""
+AIR_MOMENT: Final = ("rotor_moment", "inflow_moment", "rate_damping", "inflow")
+"""The parameters that a law or an estimator knows by its field `moment`."""
 LARGEST: Final = 1e6
 """Largest magnitude of a vehicle's numbers: larger ones overflow."""
 LEAST_SHARE: Final = 1e-3
@@ -58,7 +60,13 @@ class Vehicle:
     -rotor_moment[1] w v_x, 0) for each rotor: its disc flaps, and its drag acts above the centre of mass.  Flow along
     body z adds (-inflow_moment[0] v_y v_z, inflow_moment[1] v_x v_z, 0), of rotors and body together: blades flap less
     in a climb (Bramwell's Helicopter Dynamics, 2nd ed., Ch. 3).  Turning is damped by -rate_damping times the body
-    rates.  What is in `OPTIONAL_PARAMETERS` is None where its file does not give it.
+    rates.
+
+    Flow along its axis takes inflow w v_axial from a rotor's thrust, v_axial its hub's velocity through the air along
+    body z: climbing blades meet the air at a smaller angle (Leishman, Principles of Helicopter Aerodynamics, 2nd ed.,
+    Ch. 3).  It is a slope at small v_axial, and holds for a loss that is small beside the thrust.
+
+    What is in `OPTIONAL_PARAMETERS` is None where its file does not give it.
 
     Raises:
         ParameterError: a value is not finite or impossible, or the vehicle cannot hover within its rotors' range.
@@ -111,6 +119,9 @@ class Vehicle:
     rotor_inertia: Annotated[float | None, doc("[kg m^2] of one rotor about its axis")] = None
     rotor_radius: Annotated[float | None, doc("[m] R, of a propeller")] = None
     rotor_drag: Annotated[float | None, doc("[N s^2/(m rad)] linear drag of one rotor")] = None
+    inflow: Annotated[
+        float | None, doc("[N s^2/(m rad)] thrust that one rotor loses per speed and air speed along its axis")
+    ] = None
     rotor_moment: Annotated[
         Pair | None, doc("[N m s^2/(m rad)] of one rotor about its hub's x and y, per speed and air speed across it")
     ] = None
@@ -129,6 +140,8 @@ class Vehicle:
             object.__setattr__(self, name, _checked(name, value))
         if min(self.rate_damping or (0.0,)) < 0.0:
             self._refuse("rate_damping", ">= 0 N m s/rad about each axis")
+        if (self.inflow or 0.0) < 0.0:
+            self._refuse("inflow", ">= 0 N s^2/(m rad)")
         if self.speed_min < 0.0:
             self._refuse("speed_min", ">= 0 rad/s")
         if self.speed_min >= self.speed_max:
@@ -327,6 +340,37 @@ class Vehicle:
         across = np.array([(m_x * turning - k_x * v_z) * v_y, -(m_y * turning - k_y * v_z) * v_x, 0.0])
         return np.asarray(across - np.array(self.rate_damping or (0.0, 0.0, 0.0)) * rates)
 
+    def lost_to_inflow(self, speeds: Array, velocity: Array, rates: Array) -> Array:
+        """Return what `inflow` takes of the rotors' thrust and of its torques, (4,) [N, N m].
+
+        Of rotor i it takes inflow w_i v_i, with v_i = v_z + p y_i - q x_i at its hub.
+
+        Args:
+            speeds: (4,) w [rad/s].
+            velocity: (3,) v through the air, body axes [m/s].
+            rates: (3,) p, q, r, body axes [rad/s].
+        """
+        x, y, _ = self.hubs.T
+        axial = velocity[2] + rates[0] * y - rates[1] * x
+        lost = (self.inflow or 0.0) * speeds * axial
+        return np.asarray(self.allocation / self.coefficients @ lost)
+
+    def air_accelerations(self, velocity: Array, rates: Array) -> Array:
+        """Return what the air adds in hover to U / m [m/s^2] and J^-1 tau [rad/s^2], (4,): arguments of `air_moment`.
+
+        That is by `rotor_moment`, `inflow_moment`, `rate_damping` and `inflow`.
+        """
+        wrench = -self.lost_to_inflow(self.hover_speeds, velocity, rates)
+        wrench[1:] += self.air_moment(float(self.hover_speeds.sum()), velocity, rates)
+        return self.accelerations(wrench)
+
+    @property
+    def turn_damping(self) -> Array:
+        """(3,) torque that opposes each body rate [N m s/rad]: `rate_damping`, and that of `inflow` in hover."""
+        units, still = np.eye(3), np.zeros(3)
+        lost = [self.lost_to_inflow(self.hover_speeds, still, unit)[1:] for unit in units]
+        return np.asarray(np.array(self.rate_damping or (0.0, 0.0, 0.0)) + np.diagonal(lost))
+
     @property
     def turned_by_air(self) -> float:
         """Angular acceleration by `rotor_moment` at hover, per air speed across the rotors [rad/(m s)]."""
@@ -337,12 +381,11 @@ class Vehicle:
         """Refuse a model of the air's moment where nothing is known of it.
 
         Raises:
-            ParameterError: the vehicle states neither `rotor_moment` nor `inflow_moment` nor `rate_damping`.
+            ParameterError: the vehicle states none of `AIR_MOMENT`.
         """
-        if self.rotor_moment is None and self.inflow_moment is None and self.rate_damping is None:
-            rule = (
-                f"false, or {self.name} with rotor_moment, inflow_moment or rate_damping, of which its file states none"
-            )
+        if all(getattr(self, name) is None for name in AIR_MOMENT):
+            listed = f"{', '.join(AIR_MOMENT[:-1])} or {AIR_MOMENT[-1]}"
+            rule = f"false, or {self.name} with {listed}, of which its file states none"
             raise ParameterError(owner, "moment", True, rule)
 
     @property
@@ -569,5 +612,6 @@ _LENGTHS: Final = {
 }
 _ANY_SIGN: Final = (
     *("rotor_azimuths", "rotor_positions", "rotor_spins", "speed_min"),
-    *("products_of_inertia", "rotor_moment", "inflow_moment", "rate_damping", "thrust_of_speed", "thrust_of_throttle"),
+    *("products_of_inertia", "rotor_moment", "inflow_moment", "rate_damping", "inflow"),
+    *("thrust_of_speed", "thrust_of_throttle"),
 )

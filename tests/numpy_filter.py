@@ -82,6 +82,7 @@ class Drive:
     acceleration: float
     torque: tuple[float, float, float]
     turning: float  # sum of the rotors' speeds [rad/s]
+    speeds: Array  # (4,) and each of them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +95,7 @@ class MotionModel:
     moment: tuple[float, ...]  # m of the air [N m s^2/(m rad)]
     inflow: tuple[float, float]  # and per velocity along the body's z [N m s^2/m^2]
     damping: Array  # (3, 3) D [N m s/rad]
+    lost: float  # c of the thrust lost to inflow [N s^2/(m rad)]
     allocation: Array  # (4, 4) from squared rotor speeds to thrust and torque
     noise: tuple[Array, Array, Array]
     """Three (15, 15) coefficients of h, h^2, h^3 in the noise accumulated over a time h; see `_gathered`."""
@@ -112,6 +114,7 @@ def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:
         moment=(settings.moment and vehicle.rotor_moment) or (0.0, 0.0),
         inflow=(settings.moment and vehicle.inflow_moment) or (0.0, 0.0),
         damping=np.diag((settings.moment and vehicle.rate_damping) or (0.0, 0.0, 0.0)),
+        lost=(settings.moment and vehicle.inflow) or 0.0,
         allocation=read_only(vehicle.allocation),
         noise=_gathered(np.diag(density)),
     )
@@ -121,7 +124,7 @@ def drive(model: MotionModel, speeds: Array) -> Drive:
     """Return the action of rotor speeds (4,) [rad/s]; rotors do not turn backwards."""
     thrust, x, y, z = (model.allocation @ np.square(np.maximum(speeds, 0.0))).tolist()
     turning = float(np.maximum(speeds, 0.0).sum())
-    return Drive(acceleration=thrust / model.mass, torque=(x, y, z), turning=turning)
+    return Drive(acceleration=thrust / model.mass, torque=(x, y, z), turning=turning, speeds=np.maximum(speeds, 0.0))
 
 
 def predict_estimate(model: MotionModel, estimate: Estimate, driven: Drive, duration: float) -> Estimate:
@@ -129,13 +132,16 @@ def predict_estimate(model: MotionModel, estimate: Estimate, driven: Drive, dura
 
     The mean by the midpoint rule, the attitude on the sphere; the covariance as F P F' + Q(h), F to third order in h.
     """
-    h, a = duration, driven.acceleration
+    h = duration
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, p, q, r, *bias = estimate.mean.tolist()
     attitude = (qw, qx, qy, qz)
     J, J_inverse = model.inertia, np.linalg.inv(model.inertia)
     v_x, v_y, v_z = Rotation.from_quat(attitude, scalar_first=True).inv().apply([vx, vy, vz])
     m_x, m_y = driven.turning * np.array(model.moment) - v_z * np.array(model.inflow)
     across = np.array([m_x * v_y, -m_y * v_x, 0.0])
+    arms = model.allocation / model.allocation[0]  # (4, 4): 1, y, -x, reaction of each rotor's thrust
+    lost = arms @ (model.lost * driven.speeds * (v_z + p * arms[1] + q * arms[2]))
+    a, across = driven.acceleration - lost[0] / model.mass, across - lost[1:]
 
     def turned(rates: Array) -> Array:
         return J_inverse @ (driven.torque + across - model.damping @ rates - np.cross(rates, J @ rates))

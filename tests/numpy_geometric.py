@@ -173,7 +173,10 @@ class NumpyGeometric:
         moment = np.cross(Omega, J(Omega)) - J(self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
         if self._moment:
             turning = self._turning * math.sqrt(max(thrust, 0.0) / (self._vehicle.mass * self._vehicle.gravity))
-            moment -= self._vehicle.air_moment(turning, R.T @ target.velocity, R_rel @ desired.rates)
+            velocity, rates = R.T @ target.velocity, R_rel @ desired.rates
+            moment -= self._vehicle.air_moment(turning, velocity, rates)
+            moment += self._vehicle.lost_to_inflow(self._vehicle.hover_speeds, np.zeros(3), rates)[1:]
+            thrust += (self._vehicle.inflow or 0.0) * turning * float(velocity[2])
         return np.concatenate([[thrust], moment]), desired
 
     def targets(

@@ -89,6 +89,20 @@ def inflow_moment(moment: tuple[float, float], turn: Rotation, air: Array) -> Ar
     return np.asarray(z * np.array([-moment[0] * y, moment[1] * x, 0.0]))
 
 
+def inflow(vehicle: Vehicle, coefficient: float, speeds: Array, turn: Rotation, air: Array, rates: Array) -> Array:
+    """-c w_i v_z,i of each rotor's thrust, v_z,i its hub's velocity through the air along body z, with what that turns.
+
+    Force, world, and torque, body (6,): of arm times thrust, and of the reaction that follows the thrust.
+    """
+    force, torque = np.zeros(3), np.zeros(3)
+    for place, speed, spin in zip(vehicle.hubs, speeds, vehicle.rotor_spins, strict=True):
+        at_hub = turn.inv().apply(air) + np.cross(rates, place)
+        lost = np.array([0.0, 0.0, coefficient * speed * at_hub[2]])
+        force -= lost
+        torque -= np.cross(place, lost) + spin * vehicle.drag_to_thrust * lost
+    return np.concatenate([turn.apply(force), torque])
+
+
 def axis_drag(linear: Sequence[float], quadratic: Sequence[float], turn: Rotation, air: Array) -> Array:
     """F_i = -(l_i + k_i |v_i|) v_i along the body's axes, world (3,)."""
     along = turn.inv().apply(air)

@@ -34,6 +34,7 @@ class NonlinearModel:
     rotor_lag: float | None = None  # tau_r [s]; None if the inputs are the speeds
     acceleration: Array = field(default_factory=lambda: np.zeros(3))  # of a disturbance, world [m/s^2]
     angular_acceleration: Array = field(default_factory=lambda: np.zeros(3))  # and body [rad/s^2]
+    air: Vehicle | None = None  # whose moments and loss of thrust in still air it has; None for none
 
     @property
     def n(self) -> int:
@@ -62,6 +63,18 @@ def spun(model: NonlinearModel, rotors: Array, command: Array, time: float) -> A
     return np.asarray(command + math.exp(-time / model.rotor_lag) * (rotors - command))
 
 
+def air_on(vehicle: Vehicle, speeds: Array, velocity: Array, rates: Array) -> Array:
+    """What still air adds to U / m and I^-1 tau (4,), velocity and rates along the body's axes.
+
+    Of the thrust lost to inflow, the sum of the speeds counts, and the torque is that of turning, as in hover.
+    """
+    turning = float(speeds.sum())
+    torque = vehicle.air_moment(turning, velocity, rates)
+    torque = torque - vehicle.lost_to_inflow(vehicle.hover_speeds, np.zeros(3), rates)[1:]
+    lost = (vehicle.inflow or 0.0) * turning * velocity[2] / vehicle.mass
+    return np.append(-lost, vehicle.angular_acceleration(torque))
+
+
 def slopes(model: NonlinearModel, x: Array, speeds: Array) -> Array:
     """dx/dt (12,): Newton, Euler, and E(eta) d2(eta)/dt2 = d(omega)/dt - dE/dt d(eta)/dt, E^-1 written out."""
     roll, pitch, yaw = x[6:11:2].tolist()
@@ -70,6 +83,10 @@ def slopes(model: NonlinearModel, x: Array, speeds: Array) -> Array:
     sr, sp, sy = math.sin(roll), math.sin(pitch), math.sin(yaw)
     cr, cp, cy = math.cos(roll), math.cos(pitch), math.cos(yaw)
     p, q, r = dr - sp * dy, cr * dp + cp * sr * dy, cp * cr * dy - sr * dp  # omega = E d(eta)/dt
+    if model.air is not None:
+        velocity = body_to_world(x[[*EULER]]).T @ x[[*VELOCITY]]
+        added = air_on(model.air, speeds, velocity, np.array([p, q, r]))
+        thrust, *torque = (np.array([thrust, *torque]) + added).tolist()
     (i_x, i_y, i_z), (a_x, a_y, a_z) = model.inertia.tolist(), model.angular_acceleration.tolist()
     # d(omega)/dt less dE/dt d(eta)/dt
     turned_x = torque[0] + (i_y - i_z) / i_x * q * r + a_x + cp * dp * dy
@@ -129,7 +146,8 @@ class NumpyPreparation:
     def __init__(self, vehicle: Vehicle, problem: Problem, settings: Robust) -> None:
         period = problem.model.period
         self.problem, self.settings = problem, settings
-        self.model = nonlinear_model(vehicle, period, rotor_lag=resolved_lag(settings.rotor_lag, vehicle) or None)
+        model = nonlinear_model(vehicle, period, rotor_lag=resolved_lag(settings.rotor_lag, vehicle) or None)
+        self.model = replace(model, air=vehicle if settings.moment else None)
         self.whole, self.late = split_delay(settings.delay, period)
         self.from_accelerations = np.linalg.inv(slope(hover_model(vehicle, period)))
         self.observer = DisturbanceObserver(settings.offset_free, period) if settings.offset_free else None
@@ -187,6 +205,7 @@ class NumpyPreparation:
 
     def query(self, x: Array, turning: Array, reference: Array, acting: Array) -> Query:
         """The query from a state (12,) and rotor speeds (4,) at the instant from which the command acts."""
+        beyond = self.beyond_hover(x, turning)
         n, trim, yaw = self.problem.model.n, self.trim, float(x[YAW]) if self.settings.heading else 0.0
         rates = self.problem.rates(reference)
         reference = self.later(reference)
@@ -204,10 +223,25 @@ class NumpyPreparation:
         thrust = self.model.effectiveness[0]
         excess = thrust @ (turning**2 - trim.speeds**2)  # thrust that differs turns the vehicle otherwise
         u_s = trim.speeds - self.from_accelerations[:, 1:] @ (excess * trim.twist)
+        u_s = u_s - self.from_accelerations @ beyond
         x_s = trim.state(yaw, n)
         x_s[N_STATES:] = u_s[: n - N_STATES]
         desired = self.problem.objective.desired(reference, rates)
         return Query(np.concatenate([x, turning])[:n], desired, acting, Equilibrium(x_s, u_s))
+
+    def beyond_hover(self, x: Array, turning: Array) -> Array:
+        """What the air does at a state (12,) with rotor speeds (4,) beyond what the hover model has of it, (4,)."""
+        vehicle = self.model.air
+        if vehicle is None:
+            return np.zeros(4)
+        velocity, euler, euler_rates = x[[*VELOCITY]], x[[*EULER]], x[[*EULER_RATE]]
+        along = body_to_world(euler).T @ velocity
+        done = air_on(vehicle, turning, along, euler_to_body_rates(euler, euler_rates))
+        level = body_to_world(np.array([0.0, 0.0, euler[2] if self.settings.heading else 0.0])).T @ velocity
+        across, climbing = np.array([*level[:2], 0.0]), np.array([0.0, 0.0, level[2]])  # to first order, each alone
+        hover = vehicle.hover_speeds
+        known = air_on(vehicle, hover, across, euler_rates) + air_on(vehicle, hover, climbing, np.zeros(3))
+        return np.asarray(done - known)
 
     def later(self, rows: Array) -> Array:
         """Rows (N, 4) at instants that are later by the delay; the last one is held."""

@@ -87,6 +87,10 @@ class NumpyRamp:
         resisting = np.cross(Omega, momentum)
         if self.moment:
             resisting -= self.vehicle.air_moment(float(self.acting.sum()), v_b, Omega)
+            hover, still = self.vehicle.hover_speeds, np.zeros(3)
+            damping = [self.vehicle.lost_to_inflow(hover, still, unit)[1:] for unit in np.eye(3)]
+            resisting += np.diagonal(damping) * Omega
+            drag -= axis * (self.vehicle.inflow or 0.0) * float(self.acting.sum()) * v_b[2] / self.vehicle.mass
         last, self.last = self.last, (v, Omega, axis, turning, drag, resisting)
         if last is None or not follows:
             return

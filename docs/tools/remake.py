@@ -43,7 +43,7 @@ BATTERIES: Final = {
 MEMBERS: Final = {"campaigns": CAMPAIGNS, "battery": tuple(BATTERIES)}
 BENCHMARKS: Final = (
     *("solvers", "flight", "nonlinear", "film", "campaign", "mismatch", "speed", "autopilots", "interfaces"),
-    *("identification", "intervals", "stability"),
+    *("identification", "intervals", "stability", "moment"),
 )
 KEPT: Final = ("solvers", "mismatch", "speed", "interfaces", "identification")
 """Benchmarks whose figure is kept in docs/."""
@@ -58,6 +58,8 @@ SOLVERS: Final = ("piqp-multistage", "piqp-dense", "daqp", "core", "clarabel")
 DRAWN: Final = ("drawings.py", "live_picture.py", "figures.py", "film.py", "gallery.py thumbnails")
 WITHOUT_SOLVER: Final = ("film", "nonlinear")
 """Tables whose numbers come from no QP."""
+LOST: Final = 2.0
+"""Error over a course's size from which a vehicle counts as lost, in the table of the air's moment."""
 Record = dict[str, Any]
 
 
@@ -238,6 +240,28 @@ def first_flights(flights: list[Record]) -> str:
     return table(("controller", *courses), [(law, *(cell(law, course) for course in courses)) for law in laws])
 
 
+def moment(made: Record) -> str:
+    """The largest errors of first flights with the air's moment in the law's model and without, and which hold."""
+    flights = made["records"]
+    laws, courses, lags = ([*dict.fromkeys(flight[key] for flight in flights)] for key in ("law", "course", "lag"))
+
+    def cell(law: str, course: str, lag: float, known: str) -> str:
+        cell = {"law": law, "course": course, "lag": lag, "moment": known}
+        (flown,) = [flight for flight in flights if cell.items() <= flight.items()]
+        if flown["outcome"] == "lost" or flown["share"] > LOST:
+            return "lost"
+        error = f"{100.0 * flown['share']:.1f} %"
+        return f"**{error}**" if flown["outcome"] == "satisfied" else error
+
+    head = ["law", "course", *(f"{1e3 * lag:.0f} ms, {known}" for lag in lags for known in ("without", "with"))]
+    rows = [
+        (f"`{law}`", course, *(cell(law, course, lag, known) for lag in lags for known in ("without", "with")))
+        for law in laws
+        for course in courses
+    ]
+    return table(head, rows)
+
+
 def campaigns(summaries: Record) -> str:
     """How often flights of the shipped campaigns failed, with 95 % intervals."""
     rows = []
@@ -336,7 +360,7 @@ CSV: Final[dict[str, Callable[[Any], list[Record]]]] = {
 """What docs/data keeps, and how its rows are read."""
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     **{each.__name__: each for each in (results, ablation, papers, peers, export, campaigns, solvers, nonlinear)},
-    **{each.__name__: each for each in (flight, campaign, film, identification, autopilots, stability)},
+    **{each.__name__: each for each in (flight, campaign, film, identification, autopilots, stability, moment)},
     "paper": both_flights,
     "first-flights": first_flights,
     "battery": batteries,

@@ -225,16 +225,28 @@ static int alike(const double *commands, const uint8_t *grounded, int64_t one, i
            && !memcmp(commands + ROTORS * one, commands + ROTORS * other, ROTORS * sizeof *commands);
 }
 
-/* The moment of the air at the mean's velocity, for the sum of the rotors' speeds; the covariance knows nothing of it. */
-static void add_air_moment(const quadsim_filter *f, const quadsim_track *t, double turning, double *torque)
+/* The moment of the air at the mean's velocity, for the rotors' speeds and their sum, and the thrust lost to inflow; the
+ * covariance knows nothing of them. */
+static void add_air(const quadsim_filter *f, const quadsim_track *t, const double *speeds, double turning, double *wrench)
 {
-    double R[3][3], along[3];
+    const double *rate = t->mean + MEAN_RATES;
+    double R[3][3], along[3], *torque = wrench + 1;
     to_matrix(t->mean + QUATERNION, R);
     for (int i = 0; i < 3; i++) {
         along[i] = along_axis(R, i, t->mean + V_);
     }
     torque[0] += (f->rotor_moment[0] * turning - f->inflow_moment[0] * along[2]) * along[1];
     torque[1] -= (f->rotor_moment[1] * turning - f->inflow_moment[1] * along[2]) * along[0];
+    for (int j = 0; f->inflow > 0.0 && j < ROTORS; j++) { /* thrust j has the arms y and -x about x and y */
+        double arm[4];
+        for (int i = 0; i < 4; i++) {
+            arm[i] = f->allocation[i][j] / f->allocation[0][j];
+        }
+        const double lost = f->inflow * speeds[j] * (along[2] + rate[0] * arm[1] + rate[1] * arm[2]);
+        for (int i = 0; i < 4; i++) {
+            wrench[i] -= arm[i] * lost;
+        }
+    }
 }
 
 static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *commands, const uint8_t *grounded, int64_t base,
@@ -246,15 +258,16 @@ static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *
         while (length < f->stride && t->step + length < step && alike(commands, grounded, first, first + length)) {
             length++;
         }
-        double wrench[4] = {0.0}, mean[MEAN], turning = 0.0;
+        double wrench[4] = {0.0}, mean[MEAN], speeds[ROTORS], turning = 0.0;
         for (int i = 0; i < 4; i++) {
             for (int j = 0; j < ROTORS; j++) {
                 const double speed = fmax(commands[ROTORS * first + j], 0.0);
                 wrench[i] += f->allocation[i][j] * (speed * speed);
                 turning += i == 0 ? speed : 0.0;
+                speeds[j] = speed;
             }
         }
-        add_air_moment(f, t, turning, wrench + 1);
+        add_air(f, t, speeds, turning, wrench);
         memcpy(mean, t->mean, sizeof mean);
         const double acceleration = wrench[0] / f->mass, h = (double)length * f->timestep;
         if (grounded[first] && !(acceleration > f->gravity)) {

@@ -195,6 +195,24 @@ static void add_height(const quadsim_vehicle *v, double R[3][3], const double *a
     }
 }
 
+/* Thrust that rotors lose to the air along their axes, with its torques; `climbing`: the velocity of the air along z. */
+static void add_inflow(const quadsim_vehicle *v, double R[3][3], double climbing, const double *rate, const double *speed,
+                       double *wrench)
+{
+    double lost = 0.0;
+    for (int i = 0; i < ROTORS; i++) {
+        const double axial = climbing + rate[0] * v->place[i][1] - rate[1] * v->place[i][0];
+        const double loss = v->inflow * speed[i] * axial;
+        lost += loss;
+        for (int j = 0; j < 3; j++) {
+            wrench[3 + j] -= v->torque_of_thrust[j][i] * loss;
+        }
+    }
+    for (int j = 0; j < 3; j++) {
+        wrench[j] -= R[j][2] * lost;
+    }
+}
+
 /* Force, world, and torque, body, of a pose (7) and a velocity (6). */
 static void forces_at(const quadsim_vehicle *v, const double *pose, const double *velocity, const rotor_state *rotors,
                       const double *wind, double *wrench)
@@ -227,6 +245,9 @@ static void forces_at(const quadsim_vehicle *v, const double *pose, const double
     wrench[3] -= v->inflow_moment[0] * along[1] * along[2];
     wrench[4] += v->inflow_moment[1] * along[0] * along[2];
     add_height(v, R, along, rate, rotors->speed, wrench);
+    if (v->inflow > 0.0) {
+        add_inflow(v, R, along[2], rate, rotors->speed, wrench);
+    }
     add_pushes(v, R, wrench);
     if (v->radius > 0.0) {
         add_ground_effect(v, R, pose[2], rotors->thrust, wrench);

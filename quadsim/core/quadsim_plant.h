@@ -51,7 +51,7 @@ typedef struct quadsim_vehicle {
     double hover, demand[ROTORS], linear_demand; /* of power, at hover speed, over the mean rotor's in hover */
     double slowest, fastest, place[ROTORS][3], spin[ROTORS];
     double rotor_drag, rotor_inertia, rotor_moment[2], inflow_moment[2], rate_damping[3], linear_drag[3];
-    double quadratic_drag[3];
+    double quadratic_drag[3], inflow;
     double floor, disc, radius;      /* of the ground effect; radius 0: none */
     double loss, deviation, largest[ROTORS]; /* of thrust noise; largest 0: none */
     double cells, capacity, resistance, hover_current, idle_current, reference_voltage, exponent; /* cells 0: none */
@@ -143,7 +143,7 @@ void quadsim_allocate(const quadsim_inner *loop, const double *wrench, double *s
 
 typedef struct quadsim_filter {
     double timestep, mass, gravity, inertia[3], products[3], inverse[3][3], allocation[4][ROTORS];
-    double rotor_moment[2], inflow_moment[2], rate_damping[3];
+    double rotor_moment[2], inflow_moment[2], rate_damping[3], inflow;
     double density[5]; /* of white noise on the five blocks of the error */
     double variance[SENSORS][3], initial[ERRORS], gate, patience; /* patience in steps */
     int64_t stride;    /* longest prediction, in steps */

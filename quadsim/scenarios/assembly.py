@@ -80,6 +80,7 @@ _SIZES: Final = {
     "rotor_fall": ("rotors", "fall", RotorDynamics),
     "rotor_inertia": ("rotors", "inertia", RotorDynamics),
     "rotor_drag": ("air", "rotor_drag", Air),
+    "inflow": ("air", "inflow", Air),
     "rotor_moment": ("air", "rotor_moment", Air),
     "inflow_moment": ("air", "inflow_moment", Air),
     "rate_damping": ("air", "rate_damping", Air),

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.controller import ROTORS
+from quadsim.mpc.laws.geometric import Geometric
 from quadsim.mpc.laws.lqr import LQRTable
 from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.robust import Robust
@@ -23,7 +24,7 @@ from quadsim.scenarios.schema.controllers import AnyController
 from quadsim.scenarios.schema.events import SetpointEvent
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import Array, wrapped
-from quadsim.vehicle import N_ROTORS
+from quadsim.vehicle import AIR_MOMENT, N_ROTORS
 
 HELD_FOR: Final = 1.0
 """Time for which a course has a heading, at least, to count as its largest [s]: not while it turns through it."""
@@ -162,14 +163,17 @@ _VARIED: Final = {"mass": "mass", "inertia": "inertia", "thrust_coefficient": "t
 
 
 def unpredicted(assembly: Assembly) -> tuple[Unmodelled, ...]:
-    """Return the drag, the moments and the forces that a scenario states, where an MPC has a field for them.
+    """Return the drag, the moments and the forces that a scenario states, where a law has a field for them.
 
     They hardly move the limits of a loop, which is why `unmodelled` is without them.
     """
     spec = assembly.scenario.controller
     entries: list[Unmodelled] = []
+    if isinstance(spec, Plugin):
+        return ()
     if isinstance(spec, Nonlinear):
-        entries += [*_drag(spec, assembly), *_moments(spec, assembly)]
+        entries += _drag(spec, assembly)
+    entries += _moments(spec, assembly)
     if isinstance(spec, Nonlinear | Bounded):
         entries += _forces(spec, assembly)
     return tuple(entries)
@@ -196,18 +200,24 @@ def _drag(spec: Nonlinear, assembly: Assembly) -> list[Unmodelled]:
     return [Unmodelled(quantity="drag", text="drag", remedy=_as_written(settings), absent=absent, settings=settings)]
 
 
-def _moments(spec: Nonlinear, assembly: Assembly) -> list[Unmodelled]:
-    """Return the air's moments that the vehicle has numbers for and that the prediction lacks."""
-    air, vehicle = assembly.effects.air, assembly.vehicle
-    modelled = (vehicle.rotor_moment, vehicle.inflow_moment, vehicle.rate_damping)
-    if air is None or spec.moment or not any(any(moment or ()) for moment in modelled):
+def _moments(spec: AnyController, assembly: Assembly) -> list[Unmodelled]:
+    """Return the air's moments that the vehicle has numbers for and that a law of rotor speeds lacks.
+
+    An inner loop balances them where a law commands rates or an attitude.
+    """
+    air, vehicle, fields = assembly.effects.air, assembly.vehicle, vars(spec)
+    modelled = any(np.any(getattr(vehicle, name) or 0.0) for name in AIR_MOMENT)
+    if air is None or not modelled or fields.get("moment", False) or fields.get("commands", ROTORS) != ROTORS:
         return []
     absent = {
         "effects.air.rotor_moment": [0.0, 0.0],
         "effects.air.inflow_moment": [0.0, 0.0],
         "effects.air.rate_damping": [0.0, 0.0, 0.0],
+        "effects.air.inflow": 0.0,
     }
-    settings = {"controller.moment": True}
+    settings: dict[str, Any] = {**_law_with(assembly, "moment"), "controller.moment": True}
+    if isinstance(spec, Geometric):
+        settings["controller.feedforward"] = True
     text = "moments of the air"
     return [Unmodelled(quantity="", text=text, remedy=_as_written(settings), absent=absent, settings=settings)]
 

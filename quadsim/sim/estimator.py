@@ -36,6 +36,7 @@ horizon as well.  A vehicle on the ground leaves it once the modelled thrust exc
 
 With `moment`, tau includes the moment of the rotors in the air, (m_x W v_y, -m_y W v_x, 0) with W the sum of their
 speeds and v the mean velocity in body axes, as if there were no wind, and D is the vehicle's rate damping, otherwise 0.
+Rotor i then gives b w_i^2 - inflow w_i v_i, v_i its hub's velocity along body z.
 The error of the velocity is not passed on through this moment: w_alpha stands for it.
 
 A single prediction is at most 10 ms long, while rotor speeds do not change.  A mean or sample above 1e6 in its SI unit,
@@ -84,7 +85,8 @@ class EstimatorSettings:
     moment: Annotated[
         bool,
         doc(
-            "whether the model has the vehicle's rotor_moment, inflow_moment, at velocity over ground, and rate_damping"
+            "whether the model has the vehicle's rotor_moment, inflow_moment and inflow, at velocity over ground, and "
+            "rate_damping"
         ),
     ] = False
     acceleration_noise: Annotated[NonNegative, doc("[m/s^2/sqrt(Hz)] unmodelled white acceleration")] = 0.3
@@ -157,6 +159,7 @@ class ErrorStateFilter:
             f.rotor_moment[:] = vehicle.rotor_moment or (0.0, 0.0)
             f.inflow_moment[:] = vehicle.inflow_moment or (0.0, 0.0)
             f.rate_damping[:] = vehicle.rate_damping or (0.0, 0.0, 0.0)
+            f.inflow = vehicle.inflow or 0.0
         fill(f.allocation, vehicle.allocation)
         deviations = settings.acceleration_noise, settings.angular_acceleration_noise
         f.density[1], f.density[3] = (deviation**2 for deviation in deviations)

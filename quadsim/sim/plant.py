@@ -232,6 +232,7 @@ class Plant:
             if air.inflow_moment is not None:  # of which MuJoCo's ellipsoid gives a part
                 by_body = (0.0, 0.0) if air.body_drag is None else munk_moment(air.body_drag, air.density)
                 v.inflow_moment[:] = np.subtract(air.inflow_moment, by_body)
+            v.inflow = air.inflow or 0.0
             v.linear_drag[:], v.quadratic_drag[:] = air.linear_drag, air.quadratic_drag
         if (ground := effects.ground) is not None and ground.effect:
             shape = outline(vehicle)

@@ -123,13 +123,35 @@ def test_effects_that_a_law_has_a_field_for_are_named(
         assert unpredicted(Assembly(still)) == ()
 
 
-def test_moments_of_the_air_are_named_where_the_vehicle_has_their_numbers() -> None:
+@pytest.mark.parametrize("number", [{"rate_damping": [0.01, 0.01, 0.01]}, {"inflow": 1e-3}])
+@pytest.mark.parametrize(
+    ("name", "controller", "settings"),
+    [
+        ("hover", {"controller": "nonlinear"}, {}),
+        ("robust", {}, {}),
+        ("hover", {"controller": "lqr"}, {}),
+        ("hover", {"controller": "pid"}, {}),
+        ("hover", {"controller": "geometric"}, {"controller.feedforward": True}),
+        ("paper-constrained", {}, {"controller.type": "robust"}),
+    ],
+)
+def test_moments_of_the_air_are_named_where_the_vehicle_has_their_numbers(
+    name: str, controller: dict[str, Any], settings: dict[str, Any], number: dict[str, Any]
+) -> None:
+    """A law with the field set lacks them no more; nor does one of rates, whose inner loop balances them."""
+    moments = {f"vehicle.{field}": value for field, value in number.items()}
+    scenario = load_scenario(name).replace(controller | {"effects.air": {}} | moments)
+    (found,) = [entry for entry in unpredicted(Assembly(scenario)) if entry.text == "moments of the air"]
+    assert found.settings == {"controller.moment": True} | settings
+    known = changed_scenario(scenario, dict(found.settings))
+    assert known is not None
+    assert "moments of the air" not in [entry.text for entry in unpredicted(Assembly(known))]
+
+
+def test_a_law_of_rates_leaves_moments_of_the_air_to_its_inner_loop() -> None:
     moments = {"effects.air": {}, "vehicle.rate_damping": [0.01, 0.01, 0.01]}
-    scenario = load_scenario("hover").replace(NONLINEAR | moments)
-    (found,) = unpredicted(Assembly(scenario))
-    assert (found.text, found.settings) == ("moments of the air", {"controller.moment": True})
-    known = scenario.replace({"controller": {"type": "nonlinear", "moment": True}})
-    assert unpredicted(Assembly(known)) == ()
+    rates = {"controller": {"type": "nonlinear", "commands": "rates"}, "autopilot": {}}
+    assert unpredicted(Assembly(load_scenario("hover").replace(rates | moments))) == ()
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,10 @@ def test_every_other_effect_acts_as_in_mujoco(effects: Effects, torrente: Vehicl
 
 def test_an_uneven_body_turns_as_in_mujoco() -> None:
     """With products of inertia, rotors at four heights and as many thrust coefficients."""
-    vehicle, air = uneven(), Effects(air=Air(rotor_drag=2e-4, rotor_moment=(1e-5, 2e-5), inflow_moment=(3e-3, 4e-3)))
+    vehicle, air = (
+        uneven(),
+        Effects(air=Air(rotor_drag=2e-4, rotor_moment=(1e-5, 2e-5), inflow_moment=(3e-3, 4e-3), inflow=3e-4)),
+    )
     ends = [flown(vehicle, air, 300, timestep=5e-4, integrator=each) for each in ("rk4", "mujoco")]
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=2e-6)
     even = replace(vehicle, products_of_inertia=None)

@@ -29,14 +29,15 @@ from quadsim.features.design.rules import (
 from quadsim.mpc.laws.parts.bandwidths import lag_to_allow_for
 from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.sim.effects import Disturbance
-from quadsim.vehicle import Vehicle, span
+from quadsim.vehicle import AIR_MOMENT, Vehicle, span
 
 if TYPE_CHECKING:
     from quadsim.scenarios.schema.scenario import Scenario
 
 COURSES: Final = ("hover", "step", "figure-eight")
-DESIGNED_LAWS: Final = ("robust", "lqr", "pid", "geometric", "rates")
-"""Controllers: `rates` is nonlinear MPC of thrust and body rates, through the vehicle's autopilot."""
+DESIGNED_LAWS: Final = ("robust", "lqr", "pid", "geometric", "nonlinear", "rates")
+"""Controllers: `nonlinear` is nonlinear MPC of rotor speeds, `rates` the same of thrust and body rates, through the
+vehicle's autopilot."""
 NODE: Final = 0.04  # shortest time between its nodes [s]
 AHEAD: Final = 0.8  # its horizon [s]
 SHARE: Final = 0.6
@@ -46,9 +47,15 @@ EIGHT_RATIO: Final = 0.3
 """Turns of a figure eight per time [rad/s] over the loop's bandwidth: across it moves twice as fast."""
 STEP_RATIO: Final = 0.28  # bandwidth of the filter of steps over the loop's
 STEP: Final = 1.0  # [m]
-WALK_SHARE: Final = 0.8
-"""Standard deviation of an unknown torque's change per period, over the largest change of that of the air."""
-LEAST_WALK: Final = 0.5  # [rad/s^2] from which the observer is told
+TURNED: Final = 5.0
+"""Angular acceleration by `rotor_moment` at hover [rad/s^2 per m/s] from which first flights count on it: it makes
+hover unstable, with poles of size (g TURNED)^(1/3), 3.7 rad/s, of about the loop's own bandwidth."""
+BALANCED_SPEED: Final = 0.01
+BALANCED_MOVE: Final = 0.25
+"""Weights of speeds and of their changes, over those by rule, where the hover model has the moment: what balances it in
+steady motion would otherwise cost as much as a deviation, and the vehicle would lag."""
+OBSERVED_LAG_SHARE: Final = 0.3
+"""`LAG_SHARE` where the torque of the air is observed: the loop then has to be faster than that torque grows."""
 ALLOWED_SHARE: Final = 0.15
 """The tracking requirement, the same for every controller: the largest error along x, y and z over the course's size.
 The robust controller's is 11 % on steps and 5 % on figure eights, at most (docs/own-vehicle.md)."""
@@ -257,8 +264,8 @@ ramp = {round(0.5 * turn, 3)}  # s, half a turn to gain its speed, and to lose i
 
 
 def _controller(law: str, vehicle: Vehicle, tuning: Design, course: str) -> str:
-    if law == "rates":
-        return _rates(tuning)
+    if law in ("nonlinear", "rates"):
+        return _nonlinear(law, vehicle, tuning)
     return f"""{_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning, course)}
 [controller.input_bounds]
 speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {span(vehicle.hover_speeds)}
@@ -266,13 +273,25 @@ slew = {[*_slew(tuning)]}  # rad/s per period: what a rotor's own speed makes in
 """
 
 
-def _rates(tuning: Design) -> str:
+def _nonlinear(law: str, vehicle: Vehicle, tuning: Design) -> str:
+    """The table of nonlinear MPC, of rotor speeds or through the autopilot."""
     stride = math.ceil(NODE / tuning.period - 1e-9)
     nodes = math.ceil(AHEAD / (stride * tuning.period) - 1e-9)
+    flown_by = "the vehicle's autopilot: its file's [autopilot], or by rule"
+    commands = f'commands = "rates"  # thrust and body rates, flown by {flown_by}\n'
+    bounds = ""
+    if law == "nonlinear":
+        lag, known = _predicted_lag(vehicle)
+        commands = f"rotor_lag = {lag}  # {known}\n"
+        if _turns_in_air(vehicle):
+            commands += "moment = true  # the air's torque and loss of thrust are predicted\n"
+        bounds = f"""
+[controller.input_bounds]
+speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {span(vehicle.hover_speeds)}
+"""
     return f"""[controller]
 type = "nonlinear"
-commands = "rates"  # thrust and body rates, flown by the vehicle's autopilot: its file's [autopilot], or by rule
-horizon = {stride * nodes}  # periods, {stride * nodes * tuning.period:.3g} s
+{commands}horizon = {stride * nodes}  # periods, {stride * nodes * tuning.period:.3g} s
 node = {round(stride * tuning.period, 9)}  # s, whole periods of {NODE:g} s or more
 terminal = "lqr"
 tilt = {_tilt(tuning)}  # deg, the bound of the linear controllers
@@ -280,7 +299,14 @@ tilt = {_tilt(tuning)}  # deg, the bound of the linear controllers
 [controller.soft]
 
 [controller.disturbance]  # unknown force, drag, and how much thrust the rotors give for a command: batteries sag
-"""
+{bounds}"""
+
+
+def _predicted_lag(vehicle: Vehicle) -> tuple[str, str]:
+    """The rotors' lag that an MPC predicts, as TOML, and why, as a comment."""
+    if vehicle.rotor_rise is not None and vehicle.rotor_rise >= SHORTEST_LAG:
+        return '"vehicle"', "the vehicle's rotor_rise is predicted"
+    return "0.0", "the vehicle gives no lag"
 
 
 def _why_tilt(tuning: Design) -> str:
@@ -294,19 +320,25 @@ def _why_tilt(tuning: Design) -> str:
 def _robust(vehicle: Vehicle, tuning: Design) -> str:
     place, height, heading = (_rounded(weight) for weight in tuning.weights)
     speed, w, tilt = _rounded(tuning.speed_weight), tuning.bandwidth, _tilt(tuning)
-    lag, known = "0.0", "the vehicle gives no lag"
-    if vehicle.rotor_rise is not None and vehicle.rotor_rise >= SHORTEST_LAG:
-        lag, known = '"vehicle"', "the vehicle's rotor_rise is predicted"
+    why = f"1 / ({speed**-0.5:.3g} rad/s)^2: with it four integrators have the bandwidth w, (g beta)^2 x / w^8"
+    move = _rounded(tuning.move_weight)
+    why_move = f"as much as speed costs at {MOVE_RATIO:g} w, speed / ({MOVE_RATIO:g} w tau)^2"
+    moment = ""
+    if vehicle.turned_by_air >= TURNED:
+        turned = f"{vehicle.turned_by_air:.3g} rad/s^2 per m/s"
+        moment = f"moment = true  # the air's torque is in the model: at hover {turned}\n"
+        speed, why = _rounded(BALANCED_SPEED * speed), f"{BALANCED_SPEED:g} of that by rule: motion needs torque"
+        move, why_move = _rounded(BALANCED_MOVE * move), f"{BALANCED_MOVE:g} of those by rule, likewise"
+    lag, known = _predicted_lag(vehicle)
     return f"""[controller]
 type = "robust"
 horizon = {tuning.horizon}  # N, periods: {HORIZON_TIMES:g} / w = {HORIZON_TIMES / w:.3g} s
 rotor_lag = {lag}  # {known}
-heading = true  # the hover model is turned by the present yaw
-move_weight = {_rounded(tuning.move_weight)}  # of changes: as much as speed costs at {MOVE_RATIO:g} w, \
-speed / ({MOVE_RATIO:g} w tau)^2
+{moment}heading = true  # the hover model is turned by the present yaw
+move_weight = {move}  # of changes: {why_move}
 
 [controller.offset_free]  # force and torque that the model does not know are estimated and compensated
-{_walk(vehicle, tuning)}
+
 [controller.soft]
 linear = {_rounded(SOFT_WEIGHTS[0] * place)}  # l1: {SOFT_WEIGHTS[0]:g} times the weight of x
 quadratic = {_rounded(SOFT_WEIGHTS[1] * place)}  # l2: {SOFT_WEIGHTS[1]:g} times the weight of x
@@ -320,23 +352,11 @@ yaw = {heading}  # for {tuning.heading:.3g} rad/s, at most {HEADING_RATIO:g} w; 
 all torque in reserve answers {math.degrees(HEADING_STEP):.3g} deg or more
 
 [controller.input_weights]
-speed = {speed}  # 1 / ({speed**-0.5:.3g} rad/s)^2: with it four integrators have the bandwidth w, (g beta)^2 x / w^8
+speed = {speed}  # {why}
 
 [controller.output_bounds]
 roll = {[-tilt, tilt]}  # deg: {_why_tilt(tuning)}
 pitch = {[-tilt, tilt]}  # as roll
-"""
-
-
-def _walk(vehicle: Vehicle, tuning: Design) -> str:
-    """How fast the torque changes that the hover model does not know: that of the air on the rotors."""
-    turned = vehicle.turned_by_air
-    walk = turned * WALK_SHARE * SHARE * tuning.acceleration * vehicle.gravity * tuning.period
-    if walk < LEAST_WALK:
-        return ""
-    return f"""torque_walk = {_rounded(walk)}  # rad/s^2 per period: {WALK_SHARE:g} of what rotor_moment changes on a \
-figure eight; at hover it is {turned:.3g} rad/s^2 per m/s, which nonlinear MPC (rates) bears best
-largest_torque = {_rounded(min(tuning.authority.turning[:2]))}  # rad/s^2, what is in reserve
 """
 
 
@@ -350,21 +370,31 @@ tilt = {tilt}  # deg, largest that it commands; below the audit's, which it over
 horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for the reference's velocity: \
 {PREVIEW:g} / w = {PREVIEW / w:.3g} s
 """
+    turned = vehicle.turned_by_air >= TURNED
+    observed = law == "geometric" and turned and course != "figure-eight"
     if law != "lqr":
         lag = lag_to_allow_for(vehicle, tuning.period)
-        text += f"lag = {_rounded(LAG_SHARE * lag)}  # s that its gains allow for: {LAG_SHARE:g} times "
+        share = OBSERVED_LAG_SHARE if observed else LAG_SHARE
+        text += f"lag = {_rounded(share * lag)}  # s that its gains allow for: {share:g} times "
         text += f"{1e3 * lag:.3g} ms, the rotors' lag or half a period\n"
-    if law == "geometric":
-        text += "integral = true  # against drag and what else is not modelled\n"
-    if law == "geometric" and course == "figure-eight" and _turns_in_air(vehicle):
+    if law in ("lqr", "pid") and turned:
+        text += "moment = true  # what the air does to the vehicle is balanced\n"
+    if law != "geometric":
+        return text
+    if observed:  # the reference of steps has no jerk and snap that are worth feeding forward
+        lag = vehicle.rotor_rise or 0.0
+        lagging = f"rotor_lag = {lag}  # s, the vehicle's rotor_rise\n" if lag > 0.0 else ""
+        return text + f"\n[controller.disturbance]  # the air's torque, too, is observed and compensated\n{lagging}"
+    text += "integral = true  # against drag and what else is not modelled\n"
+    if course == "figure-eight" and _turns_in_air(vehicle):
         text += "feedforward = true  # of the reference's jerk and snap\n"
         text += "moment = true  # the air's torque on the vehicle at the reference's motion is balanced\n"
     return text
 
 
 def _turns_in_air(vehicle: Vehicle) -> bool:
-    """Whether the file states a torque of the air."""
-    return any(any(numbers or ()) for numbers in (vehicle.rotor_moment, vehicle.inflow_moment, vehicle.rate_damping))
+    """Whether the file states what the air does by `moment`."""
+    return any(np.any(getattr(vehicle, name) or 0.0) for name in AIR_MOMENT)
 
 
 def _constraints(law: str, vehicle: Vehicle, tuning: Design, size: float) -> str:
@@ -380,7 +410,7 @@ def _constraints(law: str, vehicle: Vehicle, tuning: Design, size: float) -> str
     )
     note = f"m, {100 * ALLOWED_SHARE:g} % of the course's size, {size:g} m: the same for every controller"
     entries = ["\n# Audited without an entry: every bound of the controller.\n"]
-    if law == "rates":  # it bounds the thrust of all rotors together
+    if law in ("nonlinear", "rates"):  # it bounds the thrust of all rotors together
         entries += [entry("speed", "speed", vehicle.speed_min, vehicle.speed_max, "rad/s, what the rotors hold")]
     elif law != "robust":  # baselines bound the tilt that they command, and overshoot it
         why = "deg, the tilt bound, at every instant"

@@ -55,6 +55,7 @@ _SPUN: Final = 0.004  # of inertia: noise of the gyro shrinks what commands expl
 _TURNS: Final = "a figure eight with yaw steps, 20 s"
 _FAST: Final = "a figure eight at 2 m/s or more, 20 s"
 _CLIMBING: Final = "climbs and descents of 1 m/s while moving sideways at 2 m/s, 20 s"
+_RISING: Final = "climbs and descents of 1 m/s, 20 s"
 _MEASURE: Final = "log the rotors' speeds too"
 
 
@@ -78,6 +79,7 @@ _KINDS: Final = {
     "rotor_fall": _Kind(("roll", "pitch", "yaw"), _YAW, floor=2.0 * _SPUN),
     "rotor_inertia": _Kind(("yaw",), _YAW, floor=_SPUN),
     "rotor_drag": _Kind(("vx", "vy"), _FAST, floor=_GUSTS),
+    "inflow": _Kind(("vz",), _RISING, floor=0.02, widest=1.0),
     "rotor_moment_x": _Kind(("roll",), _FAST, floor=0.02, widest=0.5),
     "rotor_moment_y": _Kind(("pitch",), _FAST, floor=0.02, widest=0.5),
     "inflow_moment_x": _Kind(("roll",), _CLIMBING, floor=0.02, widest=1.0),
@@ -96,8 +98,13 @@ _KINDS: Final = {
 }
 _ANSWERS: Final = 0.015  # deviation, as a share, of what a first-order lag leaves out
 _WIDEST_ANSWER: Final = {"delay": 0.01, "throttle_curve": 0.15, "voltage_exponent": 0.5}
+_DAMPING: Final = ("rate_damping_x", "rate_damping_y", "rate_damping_z", "inflow")
+"""Parameters that only slow a motion: none is below 0."""
 _PER_FLIGHT: Final = ("delay", "lateness", "offset_x", "offset_y")
-_PER_SPEED: Final = ("thrust_coefficient", "rotor_inertia", "rotor_drag", "rotor_moment_x", "rotor_moment_y")
+_PER_SPEED: Final = (
+    *("thrust_coefficient", "rotor_inertia", "rotor_drag", "inflow"),
+    *("rotor_moment_x", "rotor_moment_y"),
+)
 """Parameters that a log of the throttle alone shows only times a power of the rotors' highest speed."""
 
 
@@ -143,7 +150,7 @@ def identify_records(
 
     search = searched({})
     fit = _Fit(search, response)
-    while undamped := {name: 0.0 for name in _impossible(search) if name.startswith("rate_damping")}:
+    while undamped := {name: 0.0 for name in _impossible(search) if name in _DAMPING}:
         search = searched({**search.fixed, **undamped}, search)  # negative damping would stand for lag
         fit = _Fit(search, response, fit)
     held = fit.held()
@@ -330,8 +337,8 @@ class _Fit:
                 return f"{_WEAK}: the interval is +-{half * scale:.2g} {unit}, allowed {kind.widest * scale:.2g}"
         elif (relative := half if scale is None else half * scale / abs(value)) > WIDEST:
             return _not_excited(relative)
-        if name.startswith("rate_damping") and value < 0.0:
-            return "below 0: it would drive the turn"
+        if name in _DAMPING and value < 0.0:
+            return f"below 0: it would drive the {'climb' if name == 'inflow' else 'turn'}"
         if name == "body_drag" and self.vehicle.body_drag is None:
             return "its ratio along x, y and z is not known: give body_drag in the start file"
         rests = max(self.rests[i] for i in places)
@@ -367,7 +374,7 @@ class _Fit:
         held |= {"throttle_curve": self.vehicle.throttle_share} if "throttle_curve" in refused else {}
         held |= {"voltage_exponent": 0.0} if "voltage_exponent" in refused else {}
         known = {number.name for number in self.search.sought} | {*self.search.fixed}
-        return {**self.search.fixed} | {name: held[name] for name in held if name in known} | {"inflow": 0.0}
+        return {**self.search.fixed} | {name: held[name] for name in held if name in known}
 
     def _moved_to(self, refined: Search) -> tuple[dict[str, float], dict[str, ParameterEstimate]]:
         """Values by what another search found, and the estimates that are not refused moved there."""
@@ -534,6 +541,8 @@ def _impossible(search: Search) -> dict[str, float]:
     p = search.parameters(search.x, 0)
     sought = {number.name for number in search.sought}
     held = {f"rate_damping_{axis}": 0.0 for axis, value in zip("xyz", p.rate_damping, strict=True) if value < 0.0}
+    if p.inflow < 0.0:
+        held["inflow"] = 0.0
     held = {name: value for name, value in held.items() if name in sought}
     inertia = p.inertia.tolist()
     if not _is_body(inertia) and search.fixed.get("inertia_z") != (flat := PLATE[0] * (inertia[0] + inertia[1])):

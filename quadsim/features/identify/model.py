@@ -51,7 +51,7 @@ class Parameters:
     def of(cls, vehicle: Vehicle, **others: Any) -> Parameters:
         """Those of a vehicle, with `others` for what its file has no field for."""
         own: dict[str, Any] = {name: getattr(vehicle, name) or 0.0 for name in ("rotor_rise", "rotor_fall")}
-        own |= {name: getattr(vehicle, name) or 0.0 for name in ("rotor_inertia", "rotor_drag")}
+        own |= {name: getattr(vehicle, name) or 0.0 for name in ("rotor_inertia", "rotor_drag", "inflow")}
         own |= {"thrust_coefficient": vehicle.mean_coefficient, "drag_to_thrust": vehicle.drag_to_thrust}
         own |= {"throttle_curve": vehicle.throttle_share}
         vectors = {"rotor_moment": 2, "inflow_moment": 2, "rate_damping": 3, "body_drag": 3}

@@ -101,7 +101,7 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterat
     for i, axis in enumerate("xyz"):
         damping = vehicle.rate_damping[i] if vehicle.rate_damping else 0.0
         yield Sought(f"rate_damping_{axis}", damping, vehicle.inertia[i], 10.0)
-    yield Sought("inflow", 0.0, 0.02 * weight / (4.0 * hover), 5.0)
+    yield Sought("inflow", vehicle.inflow or 0.0, 0.02 * weight / (4.0 * hover), 5.0)
     yield Sought("yaw_trim", 0.0, 0.01 * weight * vehicle.drag_to_thrust, 10.0)
     if record.speeds is None:
         yield from (Sought(name, getattr(vehicle, name) or lag, None, 1.5) for name in ("rotor_rise", "rotor_fall"))

@@ -396,9 +396,11 @@ void quadsim_geometric_wrench(quadsim_geometric *law, const motion_now *motion, 
     }
     if (n->moment) {
         const real share = wrench[0] / (n->mass * n->gravity); /* speeds as the root of the thrust */
+        const real speed = n->turning * square_root(share);
         real velocity[3], air[3];
         turn_back_by(motion->attitude, target->path[VELOCITY], velocity);
-        air_moment(n->across, n->inflow, n->damping, n->turning * square_root(share), velocity, Omega_d, air);
+        air_moment(n->across, n->inflow, n->damping, speed, velocity, Omega_d, air);
+        wrench[0] += n->loss * speed * velocity[2];
         for (i = 0; i < 3; i++) {
             wrench[1 + i] -= air[i];
         }

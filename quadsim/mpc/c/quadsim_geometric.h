@@ -56,6 +56,7 @@ typedef struct quadsim_geometric_numbers {
     quadsim_real drag[3];           /* that is fed forward, body axes [1/s] */
     quadsim_real inertia[9];        /* J [kg m^2] */
     quadsim_real across[2], inflow[2], damping[3], turning; /* the air's moment, see quadsim_ramp.h; speeds of all rotors [rad/s] */
+    quadsim_real loss;              /* of thrust, per speed of a rotor and velocity along body z [N s^2/(m rad)] */
     quadsim_real least[4], most[4]; /* of targets */
     const quadsim_real *preview;    /* [orders][N] from samples one period on, two, ... to value and derivatives when the
                                      * command takes over, */

@@ -273,6 +273,20 @@ static inline void air_moment(const real *across, const real *inflow, const real
     torque[2] = -damping[2] * rates[2];
 }
 
+/* What the air does with so much speed of the rotors in all, at a velocity and rates along the body's axes, as angular
+ * acceleration: by maps [3][2] of the velocity across the rotors, per speed and per velocity along z, and [3][3] of the
+ * rates. */
+static inline void turn_by_air(const real *moment, const real *inflow, const real *damping, real speed, const real *along,
+                               const real *rates, real turned[3])
+{
+    int i;
+    for (i = 0; i < 3; i++) {
+        const real *m = moment + 2 * i, *k = inflow + 2 * i, *c = damping + 3 * i;
+        turned[i] = (speed * m[0] + along[2] * k[0]) * along[0] + (speed * m[1] + along[2] * k[1]) * along[1] -
+                    (c[0] * rates[0] + c[1] * rates[1] + c[2] * rates[2]);
+    }
+}
+
 /* ---- states: world axes, Z-Y-X Euler angles and their rates ---------------------------------------------------- */
 
 enum { X = 0, VX = 1, Y = 2, VY = 3, Z = 4, VZ = 5, ROLL = 6, PITCH = 8, YAW = 10 };
@@ -307,6 +321,16 @@ static inline void push_of(real thrust, const real s[3], const real k[3], real p
     push[0] = k[2] * level + s[2] * side;
     push[1] = s[2] * level - k[2] * side;
     push[2] = thrust * k[1] * k[0];
+}
+
+/* A vector of world axes along the body's, at Euler angles with these sines and cosines: R(eta)' v. */
+static inline void into_body_axes(const real v[3], const real s[3], const real k[3], real along[3])
+{
+    const real ahead = k[2] * v[0] + s[2] * v[1], aside = k[2] * v[1] - s[2] * v[0];
+    const real below = s[1] * ahead + k[1] * v[2];
+    along[0] = k[1] * ahead - s[1] * v[2];
+    along[1] = s[0] * below + k[0] * aside;
+    along[2] = k[0] * below - s[0] * aside;
 }
 
 /* Roll and pitch of a vehicle whose thrust points along lift (3,), upwards, at a yaw. */

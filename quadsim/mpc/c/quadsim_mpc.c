@@ -7,7 +7,8 @@
  *     d2(p)/dt2 = U / m R(eta) e_z - g e_z + a,
  *     d(omega)/dt = I^-1 (tau - omega x I omega) + (U / m) twist,
  *
- * where a has two components along world x and y and one along the thrust: a wrong mass scales the thrust in any
+ * with what the air does at R(eta)' d(p)/dt and omega, where the law knows it (`Vehicle.air_moment`, `lost_to_inflow`).
+ * Here a has two components along world x and y and one along the thrust: a wrong mass scales the thrust in any
  * direction.  The observer of (a, twist) is quadsim_math.h's update_disturbance, of the velocities and body rates that
  * were expected a period before (quadsim/mpc/estimate/observer.py).
  *
@@ -16,7 +17,7 @@
  *     x(k+1) = x_s + A (x(k) - x_s) + B (u(k) - u_s),
  *
  * and u_s is the target of the inputs: a loop that settles with no bound active has no steady error, whatever the errors
- * of A and B. */
+ * of A and B.  With the air's moment, u_s balances what it does at x(k) beyond A. */
 #include "quadsim_mpc.h"
 
 #include <stddef.h>
@@ -99,21 +100,42 @@ static void axis_at(const real *state, real axis[3])
     push_of(R(1.0), s, c, axis);
 }
 
-/* Rates of change of a state, of U/m and I^-1 tau (4,) and a constant acceleration (3,).  Sec. 2.2. */
+/* What the air takes from U/m and adds to the angular acceleration (3,), with a sum of the rotors' speeds. */
+static real air_on(const quadsim_robust *robust, const real *state, real speed, const real *sine, const real *cosine,
+                   const real *rates, real turned[3])
+{
+    real velocity[3], along[3];
+    velocity[0] = state[VX];
+    velocity[1] = state[VY];
+    velocity[2] = state[VZ];
+    into_body_axes(velocity, sine, cosine, along);
+    turn_by_air(robust->across, robust->inflow, robust->damping, speed, along, rates, turned);
+    return robust->loss * speed * along[2];
+}
+
+/* Rates of change of a state, of U/m, I^-1 tau and the sum of the rotors' speeds (5,) and a constant acceleration (3,).
+ * Sec. 2.2. */
 static void slopes(const quadsim_robust *robust, const real *state, const real *drive, const real *disturbance,
                    real *rates)
 {
     const real a = state[ROLL + 1], b = state[PITCH + 1], c = state[YAW + 1];
-    real s[3], k[3], w[3], push[3], turned[3], yaw;
+    real s[3], k[3], w[3], push[3], turned[3], thrust = drive[0], yaw;
     int i;
     sines_of(state, s, k);
     for (i = 0; i < 12; i += 2) {
         rates[i] = state[i + 1];
     }
-    push_of(drive[0], s, k, push);
     rates_of(state, s, k, w);
     memcpy(turned, drive + 1, sizeof(turned));
     add_gyroscopic(robust->gyration, w, turned);
+    if (robust->moment) {
+        real by_air[3];
+        thrust -= air_on(robust, state, drive[NU], s, k, w, by_air);
+        for (i = 0; i < 3; i++) {
+            turned[i] += by_air[i];
+        }
+    }
+    push_of(thrust, s, k, push);
     yaw = (turned[1] * s[0] + turned[2] * k[0] + b * (a + c * s[1])) / k[1];
     rates[VX] = push[0] + disturbance[0];
     rates[VY] = push[1] + disturbance[1];
@@ -132,13 +154,15 @@ static void moved(const real *state, real time, const real *rates, real *result)
     }
 }
 
-/* U/m and I^-1 tau of rotors whose speeds have gone from rotors to command but for a share that decays. */
+/* U/m, I^-1 tau and the sum of the speeds (5,) of rotors that have gone from rotors to command but for a share that
+ * decays. */
 static void find_drive(const quadsim_mpc *mpc, const real *rotors, const real *command, real decay, real *drive)
 {
     int i, j;
-    memset(drive, 0, NU * sizeof(real));
+    memset(drive, 0, (NU + 1) * sizeof(real));
     for (j = 0; j < NU; j++) {
         const real speed = command[j] + decay * (rotors[j] - command[j]);
+        drive[NU] += speed;
         for (i = 0; i < NU; i++) {
             drive[i] += mpc->effectiveness[i * NU + j] * (speed * speed);
         }
@@ -160,7 +184,7 @@ static void predict_state(const quadsim_mpc *mpc, real time, const real *decay, 
 {
     const quadsim_robust *robust = mpc->controller->robust;
     const real step = time / (real)QUADSIM_SUBSTEPS;
-    real axis[3], disturbance[3], drive[NU], rates[4][12], at[12];
+    real axis[3], disturbance[3], drive[NU + 1], rates[4][12], at[12];
     int k, i;
     if (!(time > R(1e-9))) {
         return;
@@ -221,18 +245,49 @@ static void update_trim(quadsim_mpc *mpc)
     }
 }
 
-/* u_s: speeds at rest that also balance the torque caused by thrust as it is now, which the hover matrices omit. */
-static void update_resting(quadsim_mpc *mpc)
+/* What the air does at a state and the rotors' speeds there beyond what the hover matrices have of it: U/m, I^-1 tau.  They
+ * have it at hover speeds, of level velocities in their axes and of rates of Euler angles. */
+static void air_beyond_hover(const quadsim_mpc *mpc, const real *state, real beyond[NU])
+{
+    static const real ONES[NU] = {R(1.0), R(1.0), R(1.0), R(1.0)};
+    const quadsim_robust *r = mpc->controller->robust;
+    const real hovering = dot(mpc->controller->hover, ONES, NU), speed = dot(mpc->turning, ONES, NU);
+    real s[3], k[3], rates[3], along[3], known[3];
+    int i;
+    sines_of(state, s, k);
+    rates_of(state, s, k, rates);
+    beyond[0] = r->loss * hovering * state[VZ] - air_on(r, state, speed, s, k, rates, beyond + 1);
+    along[0] = r->heading ? k[2] * state[VX] + s[2] * state[VY] : state[VX];
+    along[1] = r->heading ? k[2] * state[VY] - s[2] * state[VX] : state[VY];
+    along[2] = R(0.0); /* of two velocities' product they know nothing */
+    for (i = 0; i < 3; i++) {
+        rates[i] = state[ROLL + 1 + 2 * i];
+    }
+    turn_by_air(r->across, r->inflow, r->damping, hovering, along, rates, known);
+    for (i = 0; i < 3; i++) {
+        beyond[1 + i] -= known[i];
+    }
+}
+
+/* u_s: speeds at rest that also balance what is so now and the hover matrices omit: the torque caused by thrust as it is,
+ * and what the air does at a state `ahead`, unless it is NULL. */
+static void update_resting(quadsim_mpc *mpc, const real *ahead)
 {
     const quadsim_robust *r = mpc->controller->robust;
     const real *rest = mpc->trim.commands;
-    real excess_thrust = R(0.0);
+    real excess_thrust = R(0.0), beyond[NU];
     int j;
     for (j = 0; j < NU; j++) {
         excess_thrust += r->effectiveness[j] * (mpc->turning[j] * mpc->turning[j] - rest[j] * rest[j]);
     }
     for (j = 0; j < NU; j++) {
         mpc->resting[j] = rest[j] - excess_thrust * dot(r->slope_inverse + j * NU + 1, mpc->trim.twist, 3);
+    }
+    if (r->moment && ahead != NULL) {
+        air_beyond_hover(mpc, ahead, beyond);
+        for (j = 0; j < NU; j++) {
+            mpc->resting[j] -= dot(r->slope_inverse + j * NU, beyond, NU);
+        }
     }
 }
 
@@ -425,8 +480,8 @@ static int predict_ahead(quadsim_mpc *mpc, const real *state, int learns, real a
         spin(mpc->turning, next, r->spun_period);
     }
     note_sent(mpc, acting);
-    update_resting(mpc);
     mpc->known = state != NULL && is_finite(ahead, 12);
+    update_resting(mpc, mpc->known ? ahead : NULL);
     return mpc->known;
 }
 
@@ -545,7 +600,7 @@ void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
     mpc->trim.lift[2] = R(1.0);
     if (mpc->controller->robust != NULL) {
         update_trim(mpc);
-        update_resting(mpc);
+        update_resting(mpc, NULL);
     }
 }
 
@@ -563,7 +618,7 @@ void quadsim_mpc_stand(quadsim_mpc *mpc, const quadsim_real acting[4])
         (void)predict_ahead(mpc, NULL, 0, ahead);
         memset(mpc->estimate, 0, sizeof(mpc->estimate));
         update_trim(mpc);
-        update_resting(mpc);
+        update_resting(mpc, NULL);
     }
     memcpy(mpc->before, mpc->acting, sizeof(mpc->before));
 }
@@ -576,7 +631,7 @@ void quadsim_mpc_learn(quadsim_mpc *mpc, const quadsim_real estimate[6])
     }
     put_disturbance(r->largest, estimate, mpc->estimate);
     update_trim(mpc);
-    update_resting(mpc);
+    update_resting(mpc, NULL);
 }
 
 enum quadsim_status quadsim_mpc_prepare(quadsim_mpc *mpc, int flying, int learns, const quadsim_real state[12],

@@ -39,6 +39,10 @@ typedef struct quadsim_robust {
     quadsim_real effectiveness[16];                    /* from squared speeds to U/m and I^-1 tau */
     quadsim_real allocation[16];                       /* its inverse */
     quadsim_real gyration[3];
+    int moment;                                        /* whether the one-step prediction has what the air does: */
+    quadsim_real across[6], inflow[6], damping[9], loss; /* I^-1 torque: [3][2] of velocity along body x and y, per sum of
+                                                          * the rotors' speeds and per velocity along z, [3][3] of rates;
+                                                          * U/m lost per sum of speeds and velocity along z */
     quadsim_real slope_inverse[16]; /* from changes of U/m and I^-1 tau to those of speeds at hover */
     quadsim_real gain[6], largest[6];                                  /* of the observer; of its estimate */
     quadsim_real decay_before[QUADSIM_SUBSTEPS * 4];                   /* shares left at instants of rest_of_period */

@@ -66,6 +66,7 @@ typedef struct quadsim_nmpc_problem {
     quadsim_real moment[6], inflow[6], damping[9]; /* I^-1 torque: [3][2] of velocity along body x and y, per sum of the
                                          * rotors' speeds as shares, and per velocity along z, and [3][3] of body rates,
                                          * which it opposes */
+    quadsim_real loss;          /* T per sum of the rotors' speeds as shares and velocity along z, which it opposes */
     quadsim_real lead[4];       /* targets: time constants over the step, for the reference */
     const quadsim_real *left;   /* [2 substeps + 1][4] of a distance from the input, after each half substep */
     quadsim_real weight[QUADSIM_NMPC_MOST], effort[QUADSIM_INPUTS], move; /* diagonals of Q and R; of steps of inputs */
@@ -192,9 +193,10 @@ void quadsim_nmpc_slopes(const quadsim_nmpc_problem *problem, const quadsim_nmpc
 void quadsim_nmpc_advance(const quadsim_nmpc_problem *problem, const quadsim_nmpc_world *world, int count,
                           const quadsim_real *states, const quadsim_real *inputs, quadsim_real *ends);
 
-/* The angular acceleration [3] by the air's torque in a state [13] with thrusts of the rotors [4] in newton. */
-void quadsim_nmpc_turned(const quadsim_nmpc_problem *problem, const quadsim_real *state, const quadsim_real *thrusts,
-                         quadsim_real *turned);
+/* The angular acceleration [3] by the air's torque in a state [13] with thrusts of the rotors [4] in newton; returns how
+ * much of T is lost to inflow. */
+quadsim_real quadsim_nmpc_turned(const quadsim_nmpc_problem *problem, const quadsim_real *state,
+                                 const quadsim_real *thrusts, quadsim_real *turned);
 
 #ifdef __cplusplus
 }

@@ -22,6 +22,7 @@ struct drive {
 struct slope {
     real q[4], v[3], w[3];
     real axis[3], by_q[3][4], by_v[3][3];
+    real v_by_speed;                                /* along the axis, where the air turns the body */
     real w_by_q[3][4], w_by_v[3][3], w_by_speed[3]; /* where the air turns the body */
 };
 
@@ -89,18 +90,7 @@ static int meets_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wo
     return any;
 }
 
-/* What the air's torque does with so much speed of the rotors, at a velocity along body axes and body rates. */
-static void turn_by_air(const quadsim_nmpc_problem *p, real speed, const real *along, const real *w, real *turned)
-{
-    int i;
-    for (i = 0; i < 3; i++) {
-        const real *m = p->moment + 2 * i, *k = p->inflow + 2 * i, *c = p->damping + 3 * i;
-        turned[i] = (speed * m[0] + along[2] * k[0]) * along[0] + (speed * m[1] + along[2] * k[1]) * along[1] -
-                    (c[0] * w[0] + c[1] * w[1] + c[2] * w[2]);
-    }
-}
-
-void quadsim_nmpc_turned(const quadsim_nmpc_problem *p, const real *state, const real *thrusts, real *turned)
+real quadsim_nmpc_turned(const quadsim_nmpc_problem *p, const real *state, const real *thrusts, real *turned)
 {
     real turn[3][3], along[3], slope, speed = R(0.0);
     int i;
@@ -111,7 +101,8 @@ void quadsim_nmpc_turned(const quadsim_nmpc_problem *p, const real *state, const
     for (i = 0; p->moments && i < NU; i++) {
         speed += speed_of(thrusts[i] / p->largest, &slope);
     }
-    turn_by_air(p, speed, along, state + W, turned);
+    turn_by_air(p->moment, p->inflow, p->damping, speed, along, state + W, turned);
+    return p->loss * speed * along[2];
 }
 
 /* Add to a slope what the air does, drag and torque, and, where wanted, its derivatives. */
@@ -127,14 +118,23 @@ static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wor
     int i, j, a;
     rotation_of(q, R(2.0), turn);
     add_air_drag(world->drag, world->square_drag, turn, v, along, pull, k->v);
+    if (p->moments) {
+        const real lost = p->loss * drive->speed * along[2];
+        k->v_by_speed = -p->loss * along[2];
+        pull[2] -= lost;
+        for (i = 0; i < 3; i++) {
+            k->v[i] -= turn[i][2] * lost;
+        }
+    }
     for (a = 0; a < 3; a++) {
-        const real rate = -(world->drag[a] + R(2.0) * world->square_drag[a] * magnitude(along[a]));
+        const real climbing = p->moments && a == 2 ? p->loss * drive->speed : R(0.0);
+        const real rate = -(world->drag[a] + R(2.0) * world->square_drag[a] * magnitude(along[a])) - climbing;
         for (i = 0; i < 3; i++) {
             damped[i][a] = turn[i][a] * rate;
         }
     }
     if (p->moments) {
-        turn_by_air(p, drive->speed, along, w_b, turned);
+        turn_by_air(p->moment, p->inflow, p->damping, drive->speed, along, w_b, turned);
     }
     for (i = 0; p->moments && i < 3; i++) {
         const real *const m = p->moment + 2 * i, *const inflow = p->inflow + 2 * i;
@@ -245,11 +245,12 @@ INLINED void turning_slopes(const quadsim_nmpc_problem *p, const struct slope *k
         const real left = actuators ? drive->left[c] : R(0.0);
         for (i = 0; i < 3; i++) {
             const real turned = by_share[i + 1][c] + (moments ? k->w_by_speed[i] * by_share[4][c] : R(0.0));
+            const real pushed = by_share[0][c] + (moments ? k->v_by_speed * by_share[4][c] : R(0.0));
             if (actuators) {
-                K[4 + i][7 + c] += k->axis[i] * by_share[0][c] * left;
+                K[4 + i][7 + c] += k->axis[i] * pushed * left;
                 K[7 + i][7 + c] += turned * left;
             }
-            K[4 + i][7 + actuators + c] += k->axis[i] * by_share[0][c] * (R(1.0) - left);
+            K[4 + i][7 + actuators + c] += k->axis[i] * pushed * (R(1.0) - left);
             K[7 + i][7 + actuators + c] += turned * (R(1.0) - left);
         }
     }

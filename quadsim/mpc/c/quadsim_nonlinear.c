@@ -242,13 +242,13 @@ static void balance_reference(quadsim_nonlinear *law)
     for (i = N; i >= 0; i--) { /* the last node has the thrusts of the one before, as they were */
         real *state = law->states + i * BODY, *thrusts = law->thrusts + (i < N ? i : N - 1) * NU;
         const real total = ((thrusts[0] + thrusts[1]) + (thrusts[2] + thrusts[3])) / numbers->mass;
-        real turn[3][3], along[3], pull[3], drag[3] = {R(0.0)}, turned[3], axis[3], wanted[3], effort[NU], size;
+        real turn[3][3], along[3], pull[3], drag[3] = {R(0.0)}, turned[3], axis[3], wanted[3], effort[NU], size, lost;
         thrust_axis(state + Q, axis);
         rotation_of(state + Q, R(2.0), turn);
         add_air_drag(world->drag, world->square_drag, turn, state + V, along, pull, drag);
-        quadsim_nmpc_turned(numbers->problem, state, thrusts, turned);
+        lost = quadsim_nmpc_turned(numbers->problem, state, thrusts, turned);
         for (j = 0; j < 3; j++) {
-            wanted[j] = total * axis[j] - world->acceleration[j] - drag[j];
+            wanted[j] = (total + lost) * axis[j] - world->acceleration[j] - drag[j];
         }
         size = square_root(dot(wanted, wanted, 3));
         size = size > R(1e-9) ? size : R(1e-9);

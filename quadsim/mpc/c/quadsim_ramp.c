@@ -59,13 +59,24 @@ static void mean_wrench(quadsim_ramp *ramp, const ramp_numbers *n, const real *c
     torque[2] -= spun / n->period;
 }
 
-/* Drag that the model knows, world axes [m/s^2]. */
-static void known_drag(const ramp_numbers *n, const real *attitude, const real v_b[3], real pull[3])
+/* Sum of the rotors' speeds [rad/s]. */
+static real rotors_speed(const quadsim_ramp *ramp)
+{
+    static const real ONES[NU] = {R(1.0), R(1.0), R(1.0), R(1.0)};
+    return dot(ramp->acting, ONES, NU);
+}
+
+/* Drag, and loss of thrust to inflow, that the model knows, world axes [m/s^2]. */
+static void known_drag(const quadsim_ramp *ramp, const ramp_numbers *n, const real *attitude, const real v_b[3],
+                       real pull[3])
 {
     real along[3];
     int i;
     for (i = 0; i < 3; i++) {
         along[i] = -(n->drag[i] + n->square_drag[i] * magnitude(v_b[i])) * v_b[i];
+    }
+    if (n->moment) {
+        along[2] -= n->loss * rotors_speed(ramp) * v_b[2];
     }
     turn_by(attitude, along, pull);
 }
@@ -74,7 +85,6 @@ static void known_drag(const ramp_numbers *n, const real *attitude, const real v
 static void resisting_torque(const quadsim_ramp *ramp, const ramp_numbers *n, const real v_b[3], const real *rates,
                              real torque[3])
 {
-    static const real ONES[NU] = {R(1.0), R(1.0), R(1.0), R(1.0)};
     real momentum[3];
     int i;
     turn_by(n->inertia, rates, momentum);
@@ -82,7 +92,7 @@ static void resisting_torque(const quadsim_ramp *ramp, const ramp_numbers *n, co
     cross_product(rates, momentum, torque);
     if (n->moment) {
         real air[3];
-        air_moment(n->across, n->inflow, n->damping, dot(ramp->acting, ONES, NU), v_b, rates, air);
+        air_moment(n->across, n->inflow, n->damping, rotors_speed(ramp), v_b, rates, air);
         for (i = 0; i < 3; i++) {
             torque[i] -= air[i];
         }
@@ -137,7 +147,7 @@ void quadsim_ramp_update(quadsim_ramp *ramp, const ramp_numbers *n, int follows,
     int i;
     mean_wrench(ramp, n, command, &thrust, torque);
     turn_back_by(attitude, velocity, v_b);
-    known_drag(n, attitude, v_b, ramp->pull);
+    known_drag(ramp, n, attitude, v_b, ramp->pull);
     resisting_torque(ramp, n, v_b, rates, ramp->resisting);
     thrust_axis_of(attitude, rates, ramp->axis, ramp->turning);
     memcpy(ramp->velocity, velocity, sizeof(ramp->velocity));

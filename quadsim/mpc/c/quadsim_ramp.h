@@ -39,6 +39,7 @@ typedef struct quadsim_ramp_numbers {
     quadsim_real drag[3], square_drag[3]; /* that the model knows, body axes [1/s], [1/m] */
     quadsim_real across[2], inflow[2], damping[3]; /* the air's moment: of all rotors [N m s^2/(m rad)], of the whole
                                            * [N m s^2/m^2] and [N m s/rad] */
+    quadsim_real loss;              /* of specific thrust, per rotor speed and velocity along body z [s/(m rad) m/s^2] */
     quadsim_real decay, ballast;    /* of the fitted drag: share that a period leaves; squared speed [m^2/s^2] */
 } quadsim_ramp_numbers;
 

@@ -244,7 +244,8 @@ def _fill(
         momentum=-rotor_inertia * np.array(vehicle.rotor_spins, float),
         across=vehicle.rotor_moment or (0.0, 0.0),
         inflow=vehicle.inflow_moment or (0.0, 0.0),
-        damping=vehicle.rate_damping or (0.0, 0.0, 0.0),
+        damping=vehicle.turn_damping,
+        loss=(vehicle.inflow or 0.0) / vehicle.mass,
     )
     numbers.decay = math.exp(-period / settings.drag_memory)
     numbers.ballast = FITTED_FROM**2 / (1.0 - numbers.decay)

@@ -418,7 +418,7 @@ def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gain
         setattr(numbers, name, getattr(gains, name))
     numbers.least_lift, numbers.slope = LEAST_THRUST_SHARE * weight, math.tan(math.radians(settings.tilt))
     numbers.ahead = half + (lags[0] if targets else 0.0)
-    numbers.turning = float(vehicle.hover_speeds.sum())
+    numbers.turning, numbers.loss = float(vehicle.hover_speeds.sum()), vehicle.inflow or 0.0
     set_members(
         numbers,
         k_attitude=gains.k_attitude,
@@ -427,7 +427,7 @@ def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gain
         inertia=vehicle.inertia_matrix,
         across=vehicle.rotor_moment or (0.0, 0.0),
         inflow=vehicle.inflow_moment or (0.0, 0.0),
-        damping=vehicle.rate_damping or (0.0, 0.0, 0.0),
+        damping=vehicle.turn_damping,
         least=bounds.u_min,
         most=bounds.u_max,
     )
@@ -455,7 +455,7 @@ class Geometric(Tuned):
     ] = (0.0, 0.0, 0.0)
     moment: Annotated[
         bool,
-        doc("whether feedforward balances rotor_moment, inflow_moment and rate_damping, at the reference's motion"),
+        doc("whether feedforward balances rotor_moment, inflow_moment, rate_damping, inflow at the reference's motion"),
     ] = False
     disturbance: Annotated[RampSettings | None, doc("absent: no disturbance observer")] = None
     delay: Annotated[

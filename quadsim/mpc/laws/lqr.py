@@ -17,13 +17,31 @@ from quadsim.mpc.laws import register
 from quadsim.mpc.laws.parts.feedback import Baseline, FeedbackLaw
 from quadsim.mpc.pilot.allocation import allocate, make_allocation
 from quadsim.mpc.problem.heading import turn_horizontally
-from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model
+from quadsim.mpc.problem.model import (
+    ACCELERATED,
+    LinearModel,
+    air_slopes,
+    continuous_model,
+    discretise,
+    hover_model,
+)
 from quadsim.mpc.problem.ocp import Objective, objective_of
 from quadsim.mpc.problem.regulator import stabilising
 from quadsim.mpc.space import Shape
 from quadsim.mpc.tables.bounded import require_states
 from quadsim.mpc.tables.commands import InputWeights
-from quadsim.state import INDEX, N_STATES, REFERENCE_RATES, REFERENCE_STATES, STATE_NAMES, Array, read_only
+from quadsim.state import (
+    EULER_RATE,
+    INDEX,
+    N_STATES,
+    REFERENCE_RATES,
+    REFERENCE_STATES,
+    STATE_NAMES,
+    VELOCITY,
+    Array,
+    read_only,
+)
+from quadsim.ties import first_smallest
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 LARGEST_DEVIATIONS: Final = {
@@ -33,38 +51,47 @@ LARGEST_DEVIATIONS: Final = {
 """Deviations of equal cost, in each state's unit; `LQR_SPEED_SHARE` is that of the inputs; see `bryson_objective`."""
 HORIZONTAL: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 TILT: Final = [INDEX[name] for name in ("roll", "pitch")]
+_MOVING: Final = [*VELOCITY, *EULER_RATE]
 LQR_SPEED_SHARE: Final = 0.05  # deviation of a rotor's speed of the same cost, as a share of the hover speed
 LAG_MARGIN: Final = 1.5  # multiple of the vehicle's rotor lag that the loop with default weights must tolerate
 _HALVINGS: Final = 12
 _SHORTEST_LAG: Final = 1e-4  # [s]
 
 
-def bryson_objective(vehicle: Vehicle, period: float | None = None) -> Objective:
+def bryson_objective(vehicle: Vehicle, period: float | None = None, *, moment: bool = False) -> Objective:
     """Weights 1 / (largest deviation)^2 of every state and input: Bryson's rule (Bryson and Ho, 1975).
 
     The model has no lag.  If the loop with these weights would be unstable with `LAG_MARGIN` times the vehicle's rotor
     lag, the deviation of the rotor speeds is halved until the loop is stable.  Without a period [s] the lag is ignored.
+
+    With the air's `moment` in the models (`continuous_model`), hover is unstable, and a slow loop tolerates no more lag
+    than a fast one: where no deviation gives that margin, it is the one whose loop settles fastest with the lag itself.
     """
     deviations = np.array([LARGEST_DEVIATIONS[name] for name in STATE_NAMES])
     share = LQR_SPEED_SHARE
+    lag = max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0)
+    candidates: list[Objective] = []
     for _ in range(_HALVINGS):
         speed = share * vehicle.hover_speed
         objective = Objective(C_r=np.eye(N_STATES), Q_y=np.diag(deviations**-2.0), Q_u=np.eye(N_ROTORS) / speed**2)
-        if period is None or _tolerates_lag(vehicle, period, objective):
-            break
+        if period is None or LAG_MARGIN * lag < _SHORTEST_LAG:
+            return objective
+        if _spectral_radius(vehicle, period, objective, LAG_MARGIN * lag, moment) < 1.0:
+            return objective
+        candidates.append(objective)
         share *= 0.5
-    return objective
+    if not moment or period is None:
+        return objective
+    radii = [_spectral_radius(vehicle, period, candidate, lag, moment) for candidate in candidates]
+    return candidates[first_smallest(radii)]
 
 
-def _tolerates_lag(vehicle: Vehicle, period: float, objective: Objective) -> bool:
-    """Return whether an LQR's loop is stable with `LAG_MARGIN` times the lag of the vehicle's rotors."""
-    lag = LAG_MARGIN * max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0)
-    if lag < _SHORTEST_LAG:
-        return True
-    A, B = discretise(*continuous_model(vehicle, lag), period)
+def _spectral_radius(vehicle: Vehicle, period: float, objective: Objective, lag: float, moment: bool) -> float:
+    """Return by what factor deviations of an LQR's loop change per period, in the long run, with a rotor lag [s]."""
+    A, B = discretise(*continuous_model(vehicle, lag, moment=moment), period)
     K = np.zeros((N_ROTORS, len(A)))
-    K[:, :N_STATES] = lqr_gain(hover_model(vehicle, period), objective)
-    return float(np.abs(np.linalg.eigvals(A - B @ K)).max()) < 1.0
+    K[:, :N_STATES] = lqr_gain(hover_model(vehicle, period, moment=moment), objective)
+    return float(np.abs(np.linalg.eigvals(A - B @ K)).max())
 
 
 def lqr_gain(model: LinearModel, objective: Objective) -> Array:
@@ -88,6 +115,9 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
 class LQR(FeedbackLaw):
     """u = u_bar - K (xi - xi_r), where the reference state xi_r has the reference's pose and velocity, upright.
 
+    With `moment`, the rotors also balance what the air does at the reference's velocity: u has -S^-1 F (v_r, omega_r)
+    more, S the accelerations per rotor speed at hover and F those per velocity and rate (`air_slopes`).
+
     Speeds beyond the bounds are limited as by `allocate`: thrust, roll and pitch torque take precedence over yaw.  The
     law is linear up to the largest tilt that errors of x, y and their rates may demand: without that limit, a large
     error demands more tilt than the model, or the vehicle, tolerates.
@@ -100,11 +130,17 @@ class LQR(FeedbackLaw):
     name: Final = "lqr"
 
     def __init__(self, vehicle: Vehicle, period: float, settings: LQRTable) -> None:
-        super().__init__(vehicle, period, settings)
+        if settings.moment:
+            vehicle.require_moment("controller")
+        super().__init__(vehicle, period, settings, hover_model(vehicle, period, moment=settings.moment))
         self._heading, self._largest_tilt = settings.heading, math.radians(settings.tilt)
         self.objective = settings.objective(vehicle, period)
         self.gain = lqr_gain(self.model, self.objective)
         self._allocation = make_allocation(vehicle)
+        self._balance: Array = np.zeros((N_ROTORS, len(_MOVING)))
+        if settings.moment:
+            _, B = continuous_model(vehicle)
+            self._balance = np.asarray(np.linalg.solve(B[ACCELERATED], air_slopes(vehicle)), np.float64)
         self._tilt_demand = np.linalg.pinv(self.gain[:, TILT]) @ self.gain[:, HORIZONTAL]
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
@@ -119,7 +155,8 @@ class LQR(FeedbackLaw):
             )
         plan = np.empty((self.horizon, N_ROTORS))
         for i in range(self.horizon):
-            speeds = self.model.u_bar - self.gain @ self._limited(xi - targets[i])
+            balanced = self.model.u_bar - self._balance @ targets[i, _MOVING]
+            speeds = balanced - self.gain @ self._limited(xi - targets[i])
             lower, upper = self.bounds.reach(before)
             # The mixer's priorities matter for the command; the forecast is limited rotor by rotor.
             plan[i] = self._held(speeds, lower, upper) if i == 0 else np.clip(speeds, lower, upper)
@@ -178,6 +215,13 @@ class LQRTable(Baseline):
     input_weights: Annotated[
         InputWeights | None, doc("[1/(rad/s)^2] diagonal of Q_u; required with output_weights")
     ] = None
+    moment: Annotated[
+        bool,
+        doc(
+            "whether the hover model has the vehicle's rotor_moment, rate_damping and inflow, in still air, and the "
+            "rotors balance them at the reference's velocity"
+        ),
+    ] = False
     heading: Annotated[bool, doc("whether errors are turned into axes along the measured yaw")] = True
     tilt: Annotated[float, Ge(0.1), Le(80.0), doc("[deg] largest tilt commanded for position errors")] = 30.0
 
@@ -189,7 +233,7 @@ class LQRTable(Baseline):
     def objective(self, vehicle: Vehicle, period: float) -> Objective:
         """Return the weights of one period."""
         if self.output_weights is None or self.input_weights is None:
-            return bryson_objective(vehicle, period)
+            return bryson_objective(vehicle, period, moment=self.moment)
         return objective_of(self.output_weights, self.input_weights.speed)
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LQR:

@@ -157,7 +157,7 @@ class Nonlinear(ControllerTable):
     )
     moment: Annotated[
         bool,
-        doc("whether the prediction has the vehicle's rotor_moment, inflow_moment, in still air, and rate_damping"),
+        doc("whether the prediction has the vehicle's rotor_moment, inflow_moment, inflow, in still air, rate_damping"),
     ] = False
     output_bounds: Annotated[
         dict[str, Pair], doc("[m, m/s] lower and upper bound, of positions and velocities by their states' names")

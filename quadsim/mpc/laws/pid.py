@@ -81,7 +81,10 @@ class CascadedPID(FeedbackLaw):
 
     def __init__(self, vehicle: Vehicle, period: float, settings: PID) -> None:
         self.gains, self._vehicle = pid_gains(vehicle, period=period, lag=settings.lag), vehicle
+        if settings.moment:
+            vehicle.require_moment("controller")
         self._largest_velocity, self._largest_tilt = settings.velocity, math.radians(settings.tilt)
+        self._moment = settings.moment
         super().__init__(vehicle, period, settings)
         self.allocation = make_allocation(vehicle)
         highest = vehicle.level_thrust(float(self.bounds.u_max.min()))
@@ -116,13 +119,16 @@ class CascadedPID(FeedbackLaw):
         motion, k, period = motion_of(state), self.gains.bandwidths, self._period
         force, velocity_integral = self._velocity_loop(memory, motion, target)
         turning = np.zeros(3) if memory.rates is None else (motion.rates - memory.rates) / period
-        error = self._desired_rates(motion, force, target) - motion.rates
+        desired = self._desired_rates(motion, force, target)
+        error = desired - motion.rates
         proportional = np.array([k.rate, k.rate, k.yaw_rate])
         acceleration = proportional * error + memory.rate_integral - self.gains.rate_derivative * turning
         wrench = np.concatenate([[np.linalg.norm(force)], self._vehicle.momentum(acceleration)])
+        by_air = self._air(motion, wrench[0], desired)
+        wrench -= by_air
         speeds = allocate(self.allocation, wrench, lower, upper)
         # Anti-windup: an integral stops where it would ask for more than the mixer can give.
-        given = self._vehicle.angular_acceleration(self.allocation.wrench(speeds)[1:])
+        given = self._vehicle.angular_acceleration(self.allocation.wrench(speeds)[1:] + by_air[1:])
         missed = acceleration - given
         windup = missed * error > 1e-9 * (1.0 + np.abs(acceleration)) * np.abs(error)
         summed = np.where(windup, 0.0, error)
@@ -132,6 +138,20 @@ class CascadedPID(FeedbackLaw):
             velocity=motion.velocity,
             rates=motion.rates,
         )
+
+    def _air(self, motion: Measured, thrust: float, desired: Array) -> Array:
+        """(4,) thrust and torque that the air adds [N, N m] at the measured velocity and desired rates (3,) [rad/s].
+
+        The speeds are those of hover, times the root of the thrust [N] over the weight.
+        """
+        if not self._moment:
+            return np.zeros(4)
+        vehicle = self._vehicle
+        velocity = motion.attitude.T @ motion.velocity
+        speeds = vehicle.hover_speeds * math.sqrt(thrust / (vehicle.mass * vehicle.gravity))
+        wrench = -vehicle.lost_to_inflow(speeds, velocity, desired)
+        wrench[1:] += vehicle.air_moment(float(speeds.sum()), velocity, desired)
+        return wrench
 
     def _velocity_loop(self, memory: Memory, motion: Measured, target: Target) -> tuple[Array, Array]:
         """Return the force (3,) [N] to command, world, and the velocity integral (3,) [m/s^2] of the next period."""
@@ -197,6 +217,13 @@ class PID(Tuned):
 
     type: Annotated[Literal["pid"], doc("the control law, by its name in `quadsim list`")] = "pid"
     velocity: Annotated[Positive, doc("[m/s] largest velocity commanded")] = 12.0
+    moment: Annotated[
+        bool,
+        doc(
+            "whether thrust and torques balance the vehicle's rotor_moment, inflow_moment, rate_damping and inflow, in "
+            "still air, at the measured velocity and the desired rates"
+        ),
+    ] = False
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> CascadedPID:
         """See `quadsim.mpc.tables.controller.ControllerTable.law`."""

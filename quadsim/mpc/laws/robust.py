@@ -55,6 +55,13 @@ class Robust(Bounded):
     ] = 0.0
     offset_free: ObserverSettings | None = None
     tightening: TighteningSettings | None = None
+    moment: Annotated[
+        bool,
+        doc(
+            "whether the model has the vehicle's rotor_moment, inflow_moment, rate_damping and inflow, in still air: "
+            "the hover model as far as they are linear there, the observer and the prediction over a delay in full"
+        ),
+    ] = False
     heading: Annotated[bool, doc("whether the hover model is turned by the measured yaw")] = False
     """The weights of x and y then apply forward and to the left: if they differ, a flight depends on its heading."""
     largest_turn: Annotated[
@@ -105,7 +112,10 @@ class Robust(Bounded):
         if self.delay > self.horizon * period:
             rule = f"at most the horizon of {self.horizon} periods, {self.horizon * period:g} s"
             raise ParameterError("controller", "delay", self.delay, rule)
-        A, B = discretise(*continuous_model(vehicle, resolved_lag(self.rotor_lag, vehicle)), period)
+        if self.moment:
+            vehicle.require_moment("controller")
+        lag = resolved_lag(self.rotor_lag, vehicle)
+        A, B = discretise(*continuous_model(vehicle, lag, moment=self.moment), period)
         model = LinearModel(A=A, B=B, u_bar=hover_model(vehicle, period).u_bar, period=period)
         objective, bounds, n = self.objective(), self.bounds(), model.n
         moves = None if self.move_weight is None else self.move_weight * np.eye(N_ROTORS)
@@ -157,6 +167,7 @@ class Robust(Bounded):
             "horizon": self.horizon,
             "settings": self.tightening,
             "rotor_lag": resolved_lag(self.rotor_lag, vehicle),
+            "moment": self.moment,
             "delay": self.delay,
             "estimated": self.offset_free is not None,
         }

@@ -14,12 +14,11 @@ from typing import Final
 import numpy as np
 
 from quadsim.mpc.problem.equilibrium import Trim
-from quadsim.mpc.problem.model import LinearModel
+from quadsim.mpc.problem.model import ACCELERATED, LinearModel
 from quadsim.mpc.problem.paper import rollout
 from quadsim.state import INDEX, N_STATES, Array
 
 _YAW: Final = INDEX["yaw"]
-_ACCELERATED: Final = [INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]
 
 
 def turn_horizontally(states: Array, angles: Array | float) -> Array:
@@ -45,7 +44,7 @@ def turn(yaw: float) -> Array:
 def slope(model: LinearModel) -> Array:
     """(4, 4) accelerations along z and about x, y, z per rotor speed [(m/s^2)/(rad/s)], [1/s]."""
     # Rates and vz only integrate accelerations, so their rows of B are the period times the slope.
-    return np.asarray(model.B[_ACCELERATED] / model.period)
+    return np.asarray(model.B[ACCELERATED] / model.period)
 
 
 def anchored(model: LinearModel, trim: Trim) -> LinearModel:

@@ -11,11 +11,13 @@ import numpy as np
 import scipy.linalg
 
 from quadsim.errors import ParameterError
-from quadsim.state import EULER_RATE, INDEX, N_STATES, Array, read_only
+from quadsim.state import EULER_RATE, INDEX, N_STATES, VELOCITY, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 SHORTEST_LAG: Final = 1e-4
 """Shortest lag [s] for which gains can be computed; far below any period."""
+ACCELERATED: Final = [INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]
+"""States whose rates of change are U / m and J^-1 tau at hover."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,10 +47,12 @@ class LinearModel:
         return self.B.shape[1]
 
 
-def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0) -> tuple[Array, Array]:
+def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0, *, moment: bool = False) -> tuple[Array, Array]:
     """Jacobians (A_c, B_c) of the nonlinear model of Sec. 2.2 at hover with zero yaw.
 
-    With a rotor lag T [s], dw/dt = (u - w) / T, the rotor speeds w are four further states.
+    With a rotor lag T [s], dw/dt = (u - w) / T, the rotor speeds w are four further states.  With `moment`, velocities
+    and rates also turn the vehicle, and climbing costs thrust, as the air does in hover (`Vehicle.air_accelerations`);
+    `inflow_moment`, a product of two velocities, has no part in that.
 
     Returns:
         (12, 12) and (12, 4): d(xi)/dt = A_c (xi - xi_bar) + B_c (u - u_bar); with lag (16, 16) and (16, 4).
@@ -62,11 +66,21 @@ def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0) -> tuple[Array, A
     # a_1 w + a_2 w^2 = b w_bar^2 it is a_1 + 2 a_2 w_bar = b (2 w_bar - a_1 / b).
     linear, _ = vehicle.thrust_law
     wrench_slope = (2.0 * vehicle.hover_speeds - linear / vehicle.coefficients) * vehicle.allocation
-    B[[INDEX[name] for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")]] = vehicle.accelerations(wrench_slope)
+    B[ACCELERATED] = vehicle.accelerations(wrench_slope)
+    if moment:
+        A[np.ix_(ACCELERATED, [*VELOCITY, *EULER_RATE])] += air_slopes(vehicle)
     if rotor_lag == 0.0:
         return A, B
     follow = np.eye(N_ROTORS) / rotor_lag
     return np.block([[A, B], [np.zeros((N_ROTORS, N_STATES)), -follow]]), np.vstack([np.zeros_like(B), follow])
+
+
+def air_slopes(vehicle: Vehicle) -> Array:
+    """(4, 6) what air adds to U / m and J^-1 tau in hover, per velocity [1/s, rad/(m s)] and rate [m/s, 1/s]."""
+    units, still = np.eye(3), np.zeros(3)
+    by_velocity = [vehicle.air_accelerations(unit, still) for unit in units]
+    by_rate = [vehicle.air_accelerations(still, unit) for unit in units]
+    return np.array(by_velocity + by_rate).T
 
 
 def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
@@ -78,9 +92,9 @@ def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
     return exponential[:n, :n], exponential[:n, n:]
 
 
-def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
-    """The vehicle's discrete model at hover, for a control period tau_s [s]."""
-    A, B = discretise(*continuous_model(vehicle), period)
+def hover_model(vehicle: Vehicle, period: float, *, moment: bool = False) -> LinearModel:
+    """The vehicle's discrete model at hover, for a control period tau_s [s]; `moment` as in `continuous_model`."""
+    A, B = discretise(*continuous_model(vehicle, moment=moment), period)
     return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(vehicle.hover_speeds), period=period)
 
 

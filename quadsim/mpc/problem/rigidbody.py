@@ -6,8 +6,9 @@ rates omega: 13. With rotor lag, the four rotors' thrusts or speeds are four fur
     p' = v,    q' = 1/2 q (0, omega),    v' = T R(q) e_z - g e_z + R(q) d(R(q)' v) + a,
     omega' = I^-1 (tau + tau_a - omega x I omega) + alpha,    d(v_b) = -(D_1 v_b + D_2 |v_b| v_b) / m, by components.
 
-With `moment`, tau_a = (m_x W v_y, -m_y W v_x, 0) - D omega (`Vehicle.air_moment`), with v_b and the sum W of the
-rotors' speeds: roots of thrusts, but below a share of 1 % a parabola, as the root has no derivative at 0.
+With `moment`, tau_a = (m_x W v_y, -m_y W v_x, 0) - D omega (`Vehicle.air_moment`), and T is less by k W v_z / m, with
+v_b, the vehicle's `inflow` k and the sum W of the rotors' speeds: roots of thrusts, but below a share of 1 % a
+parabola, as the root has no derivative at 0.  D has the damping by `inflow`, as in hover.
 
 R(q) is polynomial and not divided by |q|^2, so the derivatives are valid for a q of any length.  Inputs u are the
 rotors' thrusts or speeds as shares of the largest, held between nodes; T = thrust / m and I^-1 tau are known exactly at
@@ -28,7 +29,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property, partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -89,7 +90,8 @@ class RigidBody:
     quadratic_drag: Array = field(default_factory=zero)  # (3,) D_2, body axes [N s^2/m^2]
     moment: Array = field(default_factory=partial(_zeros, 2))  # (3, 2) maps v_x, v_y [m/s] to I^-1 tau_a per share of W
     inflow: Array = field(default_factory=partial(_zeros, 2))  # (3, 2) maps v_x v_z, v_y v_z [m^2/s^2] to I^-1 tau_a
-    damping: Array = field(default_factory=partial(_zeros, 3))  # (3, 3) I^-1 D [1/s]; neither with targets
+    damping: Array = field(default_factory=partial(_zeros, 3))  # (3, 3) I^-1 D [1/s]
+    loss: float = 0.0  # T that v_z takes, per share of W [1/s]; none of these four with targets
     acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
     angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha, body frame [rad/s^2]; none with targets
 
@@ -101,7 +103,7 @@ class RigidBody:
     @cached_property
     def moments(self) -> bool:
         """Whether the air turns the body."""
-        return any(map(np.any, (self.moment, self.inflow, self.damping)))
+        return bool(self.loss) or any(map(np.any, (self.moment, self.inflow, self.damping)))
 
     @property
     def targets(self) -> bool:
@@ -147,16 +149,38 @@ class RigidBody:
         return shares if self.inputs is Inputs.THRUST else np.sqrt(np.maximum(shares, 0.0))
 
 
+class AirMaps(NamedTuple):
+    """What the air does to a vehicle, by its velocity through the air and its rates, body axes."""
+
+    across: Array  # (3, 2) maps v_x, v_y [m/s] to angular accelerations [rad/s^2], per share of the speed
+    inflow: Array  # (3, 2) maps v_x v_z, v_y v_z [m^2/s^2] to them
+    damping: Array  # (3, 3) maps rates [rad/s] to their loss
+    loss: float  # maps v_z [m/s] to the loss of U / m [m/s^2], per share of the speed
+
+
+def air_maps(vehicle: Vehicle, speed: float) -> AirMaps:
+    """Return them for shares of a `speed` [rad/s], to which the rotors' speeds add up.
+
+    Of the thrust that rotors lose to their own motion as the vehicle turns, `damping` has the torque, in hover.
+    """
+    still, units = np.zeros(3), np.eye(3)
+    across = [vehicle.air_moment(speed, unit, still) for unit in units[:2]]
+    climbing = [vehicle.air_moment(0.0, unit + units[2], still) for unit in units[:2]]
+    damped = [vehicle.air_moment(0.0, still, unit) for unit in units]
+    lost = [vehicle.lost_to_inflow(vehicle.hover_speeds, still, unit)[1:] for unit in units]
+    return AirMaps(
+        across=read_only(vehicle.angular_acceleration(np.array(across)).T),
+        inflow=read_only(vehicle.angular_acceleration(np.array(climbing)).T),
+        damping=read_only(vehicle.angular_acceleration(np.array(lost) - np.array(damped)).T),
+        loss=(vehicle.inflow or 0.0) * speed / vehicle.mass,
+    )
+
+
 def rigid_body(vehicle: Vehicle, step: float, *, moment: bool = False, **others: object) -> RigidBody:
     """Return the vehicle's model, undisturbed, with `moment` also in the air's torque; `others` sets other fields."""
     if moment:
-        still, units = np.zeros(3), np.eye(3)
-        across = [vehicle.air_moment(vehicle.speed_max, unit, still) for unit in units[:2]]
-        climbing = [vehicle.air_moment(0.0, unit + units[2], still) for unit in units[:2]]
-        damped = [vehicle.air_moment(0.0, still, unit) for unit in units]
-        others["moment"] = read_only(vehicle.angular_acceleration(np.array(across)).T)
-        others["inflow"] = read_only(vehicle.angular_acceleration(np.array(climbing)).T)
-        others["damping"] = read_only(-vehicle.angular_acceleration(np.array(damped)).T)
+        air = air_maps(vehicle, vehicle.speed_max)
+        others |= {"moment": air.across, "inflow": air.inflow, "damping": air.damping, "loss": air.loss}
     return RigidBody(
         effectiveness=read_only(vehicle.accelerations(vehicle.allocation / vehicle.mean_coefficient)),
         largest_thrust=vehicle.mean_coefficient * vehicle.speed_max**2,

@@ -78,6 +78,7 @@ def margins(
     bounds: Bounds,
     settings: TighteningSettings,
     rotor_lag: float = 0.0,
+    moment: bool = False,
     delay: float = 0.0,
     estimated: bool = False,
 ) -> Array:
@@ -90,6 +91,7 @@ def margins(
         bounds: bounds on outputs of the 12 states.
         settings: the stated bounds.
         rotor_lag: rotor time constant in the prediction [s]; 0 for none, else at least `SHORTEST_LAG`.
+        moment: whether the model has the air's moment, as in `continuous_model`.
         delay: d [s], between measuring and acting.
         estimated: whether the prediction uses a disturbance estimate, which may err by twice the bounds.
 
@@ -104,7 +106,9 @@ def margins(
         name, scale = output.name, output.factor
         sides = [scale * float(bounds.y_min[i]), scale * float(bounds.y_max[i])]
         raise ParameterError("controller.output_bounds", name, sides, "finite on both sides, to be tightened")
-    A, B, C, E, K = _corrected(vehicle, rotor_lag, period, bounds.C_c, ERROR_SHARE * half_band, settings, estimated)
+    A, B, C, E, K = _corrected(
+        vehicle, rotor_lag, moment, period, bounds.C_c, ERROR_SHARE * half_band, settings, estimated
+    )
     margins = growth(A, B, C, E, K, period=period, horizon=horizon, delay=delay)
     passed = between_samples(settings.turning, period)
     margins += passed
@@ -138,6 +142,7 @@ def position_margins(
     horizon: int,
     settings: TighteningSettings,
     rotor_lag: float = 0.0,
+    moment: bool = False,
     delay: float = 0.0,
     estimated: bool = False,
 ) -> Array:
@@ -147,13 +152,14 @@ def position_margins(
     and errors as in `margins`.
     """
     rows, sizes = np.eye(N_STATES)[list(POSITION)], np.full(3, POSITION_ERROR)
-    A, B, C, E, K = _corrected(vehicle, rotor_lag, period, rows, sizes, settings, estimated)
+    A, B, C, E, K = _corrected(vehicle, rotor_lag, moment, period, rows, sizes, settings, estimated)
     return read_only(growth(A, B, C, E, K, period=period, horizon=horizon, delay=delay))
 
 
 def _corrected(
     vehicle: Vehicle,
     rotor_lag: float,
+    moment: bool,
     period: float,
     rows: Array,
     sizes: Array,
@@ -161,7 +167,7 @@ def _corrected(
     estimated: bool,
 ) -> tuple[Array, ...]:
     """Return A, B, C, E of the states that the rows (n_c, 12) observe, and K, which weights errors (n_c,) equally."""
-    A, B, E = disturbed_model(vehicle, rotor_lag)
+    A, B, E = disturbed_model(vehicle, rotor_lag, moment=moment)
     C = np.hstack([rows, np.zeros((len(rows), len(A) - N_STATES))])
     basis = observed(A, C)
     A, B, C, E = basis.T @ A @ basis, basis.T @ B, C @ basis, basis.T @ E
@@ -194,12 +200,12 @@ def growth(
     return np.asarray(growth_in_delay + np.cumsum(terms, axis=0))
 
 
-def disturbed_model(vehicle: Vehicle, rotor_lag: float) -> tuple[Array, Array, Array]:
+def disturbed_model(vehicle: Vehicle, rotor_lag: float, *, moment: bool = False) -> tuple[Array, Array, Array]:
     """(n, n), (n, 4) and (n, 6): dx/dt = A x + B u + E w at hover, with 12 states, or 16 with rotor lag [s].
 
     w is acceleration along the axes and angular acceleration about them.
     """
-    A, B = continuous_model(vehicle, rotor_lag)
+    A, B = continuous_model(vehicle, rotor_lag, moment=moment)
     E = np.zeros((len(A), len(_ACCELERATED)))
     E[_ACCELERATED, range(len(_ACCELERATED))] = 1.0
     return A, B, E

@@ -7,6 +7,9 @@ The compiled core evaluates the forces that follow from how the vehicle moves (`
   in quadrotor control"; RotorS, Furrer et al. 2016).  It acts at the hub, and turns the vehicle if that is above or
   below the centre of mass.  MuJoCo's fluid forces know neither rotors nor forces linear in the air speed at these
   Reynolds numbers.
+- Inflow, -c w_i (v_air,i . z_b) of each rotor's thrust, with the torques that this thrust has: blades that climb meet
+  the air at a smaller angle (J. G. Leishman, "Principles of Helicopter Aerodynamics", 2nd ed., Ch. 3: C_T falls as the
+  inflow ratio grows), which damps climbing, and turning about x and y.
 - Rotor moment, (m_x w_i v_y, -m_y w_i v_x, 0) about the hub, v rotor i's velocity through the air, body frame:
   blade flapping tilts its disc, and its drag acts above the centre of mass (Martin & Salaun 2010; Mahony, Kumar and
   Corke 2012, "Multirotor Aerial Vehicles", Eqs. (5)-(7)): the part that the hubs' heights do not give.

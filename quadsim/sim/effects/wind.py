@@ -32,6 +32,12 @@ class Air:
         NonNegative | None,
         doc("[kg/rad] drag of one rotor per speed and air speed in its plane; absent: the vehicle's, or 0"),
     ] = None
+    inflow: Annotated[
+        NonNegative | None,
+        doc(
+            "[N s^2/(m rad)] thrust one rotor loses per speed and air speed along its axis; absent: the vehicle's, or 0"
+        ),
+    ] = None
     rotor_moment: Annotated[
         Pair | None,
         doc(
@@ -78,7 +84,7 @@ class Air:
     def drags(self) -> bool:
         """Whether anything drags, once resolved: without it, wind pushes nothing."""
         turns = any(self.rotor_moment or ()) or any(self.inflow_moment or ())
-        return bool(self.rotor_drag) or self.body_drag is not None or self.axis_drag or turns
+        return bool(self.rotor_drag) or bool(self.inflow) or self.body_drag is not None or self.axis_drag or turns
 
     def require_drag(self, vehicle: Vehicle) -> None:
         """Reject wind on a vehicle that nothing drags, once resolved.
@@ -96,6 +102,7 @@ class Air:
         air = filled(
             self,
             rotor_drag=vehicle.rotor_drag or 0.0,
+            inflow=vehicle.inflow or 0.0,
             rotor_moment=vehicle.rotor_moment or (0.0, 0.0),
             inflow_moment=vehicle.inflow_moment,
             rate_damping=vehicle.rate_damping or (0.0, 0.0, 0.0),

@@ -313,6 +313,7 @@ def test_the_core_has_the_numbers_of_the_equations(
         **{"inertia": (Ixx, 1.1 * Ixx, 1.5 * Ixx), "products_of_inertia": tuple(products.tolist())},
         rotor_inertia=0.01 * Ixx,
         **{"rotor_moment": (2e-5, -3e-5), "inflow_moment": (3e-3, -4e-3), "rate_damping": (0.1, 0.2, 0.3)},
+        inflow=2e-3,
     )
     settings = RampSettings(thrust_scale=scaled, rotor_lag=rotor_lag, largest_force=5.0)
     rng, weight = np.random.default_rng(5), vehicle.mass * vehicle.gravity

@@ -45,6 +45,7 @@ def heavy(vehicle: Vehicle) -> Vehicle:
         rotor_moment=(2e-5, -3e-5),
         inflow_moment=(3e-3, -4e-3),
         rate_damping=(0.1, 0.2, 0.3),
+        inflow=3e-3,
     )
 
 

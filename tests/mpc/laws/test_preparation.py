@@ -95,6 +95,10 @@ def test_one_law_takes_over_from_the_other(order: tuple[str, str]) -> None:
 
 
 MOVING = {"x": 10.0, "y": 10.0, "z": 100.0, "yaw": 100.0, "vx": 5.0, "vy": 6.0, "vz": 7.0, "yaw_rate": 8.0}
+AIR: dict[str, Any] = {
+    **{"controller.moment": True, "vehicle.rotor_moment": [2e-4, -3e-4], "vehicle.inflow_moment": [0.03, -0.04]},
+    **{"vehicle.rate_damping": [0.1, 0.2, 0.3], "vehicle.inflow": 3e-3},
+}
 PARTS: dict[str, dict[str, Any]] = {
     "late through two commands": {"controller.delay": 0.12},
     "late by a period": {"controller.delay": 0.05},
@@ -103,6 +107,8 @@ PARTS: dict[str, dict[str, Any]] = {
     "velocities": {"controller.output_weights": MOVING, "controller.delay": 0.12, "controller.heading": False},
     "velocities, along the heading": {"controller.output_weights": MOVING, "controller.delay": 0.08},
     "velocities over two periods": {"controller.output_weights": MOVING, "controller.horizon": 2},
+    "the air": AIR,
+    "the air, late and without heading": AIR | {"controller.delay": 0.08, "controller.heading": False},
     "turns that are cut": {"controller.largest_turn": 2.0},
 }
 

@@ -35,6 +35,7 @@ from quadsim.vehicle import load_vehicle
 VEHICLE = replace(
     load_vehicle(vehicle_path("hummingbird")),
     **{"rotor_moment": (2e-5, -3e-5), "inflow_moment": (3e-3, -4e-3), "rate_damping": (0.01, 0.02, 0.03)},
+    inflow=4e-4,
 )
 PERIOD = 0.02
 HOVER = np.full(4, VEHICLE.hover_speed)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
 from quadsim.mpc.problem.model import continuous_model, discretise, hover_model
 from quadsim.sim.airframe import compile_model
+from quadsim.sim.effects import Effects
+from quadsim.sim.effects.wind import Air
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -117,6 +121,25 @@ def test_discretisation_matches_central_differences_of_the_plant_itself(vehicle:
         for i, column in enumerate(np.eye(4)):
             slope = (after(hover, speeds + 1e-2 * column) - after(hover, speeds - 1e-2 * column)) / 2e-2
             np.testing.assert_allclose(exact.B[:, i], slope, atol=1e-7)
+
+
+def test_with_the_moment_it_matches_central_differences_of_the_plant_in_air(vehicle: Vehicle) -> None:
+    """The plant also has `inflow_moment`, a product of two velocities, which is 0 to first order."""
+    moments = {"rotor_moment": (2e-4, -3e-4), "inflow_moment": (0.02, 0.03), "rate_damping": (0.02, 0.03, 0.01)}
+    vehicle = replace(vehicle, **moments, inflow=4e-4)
+    known, ignorant = (hover_model(vehicle, PERIOD, moment=moment) for moment in (True, False))
+    hover, speeds = make_state(position=(0.0, 0.0, 10.0)), np.full(4, vehicle.hover_speed)
+    effects = Effects(air=Air(**moments, inflow=4e-4))
+    with Plant(vehicle, effects=effects, integrator="rk4") as plant:
+
+        def after(state: Array) -> Array:
+            plant.reset(state)
+            plant.advance(speeds, 50)
+            return plant.state()
+
+        slopes = [(after(hover + 1e-4 * unit) - after(hover - 1e-4 * unit)) / 2e-4 for unit in np.eye(12)]
+    np.testing.assert_allclose(known.A, np.transpose(slopes), atol=1e-6)
+    assert np.abs(ignorant.A - np.transpose(slopes)).max() > 0.05
 
 
 def test_hover_anywhere_is_an_equilibrium_of_deviations_only(vehicle: Vehicle) -> None:

@@ -38,6 +38,7 @@ from quadsim.vehicle import load_vehicle
 VEHICLE = replace(
     load_vehicle(vehicle_path("lopes2011")),
     **{"rotor_moment": (2e-5, -3e-5), "inflow_moment": (3e-3, -4e-3), "rate_damping": (0.01, 0.02, 0.03)},
+    inflow=4e-4,
 )
 DRAG = {"drag": np.array([0.3, 0.2, 0.1]), "quadratic_drag": np.array([0.08, 0.05, 0.02])}
 DISTURBED = {"acceleration": np.array([0.3, -0.2, 0.5]), "angular_acceleration": np.array([1.0, -2.0, 0.5])}
@@ -106,10 +107,14 @@ def test_it_moves_by_the_equations_of_a_rigid_body_in_air(inputs: Inputs) -> Non
         (w, *vector), v, omega = y[Q], y[V], y[W]
         R = rotation(y[Q])
         air = R.T @ v
-        force = np.array([0.0, 0.0, wrench[0]]) - (model.drag + model.quadratic_drag * np.abs(air)) * air
+        lost = VEHICLE.inflow * turning * air[2]
+        force = np.array([0.0, 0.0, wrench[0] - lost]) - (model.drag + model.quadratic_drag * np.abs(air)) * air
         turn = 0.5 * np.array([-np.dot(vector, omega), *(w * omega + np.cross(vector, omega))])
         v_slope = R @ force / VEHICLE.mass + model.acceleration - [0.0, 0.0, VEHICLE.gravity]
-        torque = wrench[1:] + VEHICLE.air_moment(turning, air, omega) - np.cross(omega, VEHICLE.momentum(omega))
+        damped = VEHICLE.lost_to_inflow(VEHICLE.hover_speeds, np.zeros(3), omega)[1:]  # as in hover
+        torque = (
+            wrench[1:] + VEHICLE.air_moment(turning, air, omega) - damped - np.cross(omega, VEHICLE.momentum(omega))
+        )
         return np.concatenate([v, turn, v_slope, VEHICLE.angular_acceleration(torque) + model.angular_acceleration])
 
     ends = [

@@ -10,6 +10,7 @@ from numpy_laws import (
     LOWEST_RATIO,
     axis_drag,
     ground_effect,
+    inflow,
     inflow_moment,
     pushed,
     respond,
@@ -102,6 +103,21 @@ def test_a_stated_inflow_moment_is_that_of_rotors_and_body(
     about_x, about_y = munk_moment(drag, 1.225) if stated is None else stated
     expected = np.array([-about_x, 2.0 * about_y]) / vehicle.inertia[:2] * seconds
     np.testing.assert_allclose(rates[:2], expected, rtol=0.02, atol=1e-4)
+
+
+@pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
+def test_inflow_slows_a_climb_exponentially(vehicle: Vehicle, integrator: Integrator) -> None:
+    """In hover m dv/dt = -4 c w v, v the velocity of climb; and without inflow the climb goes on."""
+    c, seconds = 4e-4, 1.5
+    rate = 4.0 * c * vehicle.hover_speed / vehicle.mass
+    for coefficient, left in ((c, math.exp(-rate * seconds)), (0.0, 1.0)):
+        effects = Effects(air=Air(inflow=coefficient))
+        with Plant(vehicle, effects=effects, integrator=integrator) as plant:
+            state = make_state(position=(0.0, 0.0, 5.0))
+            state[5] = 1.0
+            plant.reset(state)
+            plant.advance(vehicle.hover_speeds, 1500)
+            assert plant.state()[5] == pytest.approx(left, rel=1e-5)
 
 
 def test_rate_damping_slows_a_turn_exponentially(vehicle: Vehicle) -> None:
@@ -275,12 +291,12 @@ def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: I
     vehicle = uneven() if layout == "uneven" else vehicle
     rng, radius, drag, inertia, step = np.random.default_rng(6), 0.15, 3e-3, 2e-4, 1e-6
     linear, quadratic = (0.3, 0.2, 0.05), (0.08, 0.1, 0.12)
-    moment, inflow, damping = (2e-4, -3e-4), (0.1, -0.2), (0.02, 0.03, 0.01)
+    moment, climbing, damping, lost = (2e-4, -3e-4), (0.1, -0.2), (0.02, 0.03, 0.01), 2e-3
     dynamics = RotorDynamics(rise=0.03, fall=0.05, inertia=inertia)
     effects = Effects(
         air=Air(
             **{"rotor_drag": drag, "linear_drag": linear, "quadratic_drag": quadratic},
-            **{"rotor_moment": moment, "inflow_moment": inflow, "rate_damping": damping},
+            **{"rotor_moment": moment, "inflow_moment": climbing, "rate_damping": damping, "inflow": lost},
         ),
         ground=Ground(contact=False, effect=True, rotor_radius=radius),
         rotors=dynamics,
@@ -304,7 +320,8 @@ def test_the_wrench_is_that_of_the_laws_together(vehicle: Vehicle, integrator: I
             expected = rotor_drag(vehicle, drag, middle, turn, air, rates) + pushed(push, turn)
             expected[:3] += axis_drag(linear, quadratic, turn, air)
             expected[3:] += rotor_moment(vehicle, moment, middle, turn, air, rates) - np.array(damping) * rates
-            expected[3:] += inflow_moment(inflow, turn, air)
+            expected[3:] += inflow_moment(climbing, turn, air)
+            expected += inflow(vehicle, lost, middle, turn, air, rates)
             momentum = -inertia * np.array(vehicle.rotor_spins) @ middle
             expected[3:] += [
                 -rates[1] * momentum,

@@ -71,6 +71,7 @@ def uneven(vehicle: Vehicle) -> Vehicle:
         vehicle,
         **{"inertia": (0.03, 0.04, 0.05), "products_of_inertia": (0.002, -0.004, 0.003)},
         **{"rotor_moment": (1e-4, 2e-4), "inflow_moment": (0.03, -0.04), "rate_damping": (0.01, 0.02, 0.03)},
+        inflow=2e-3,
     )
 
 

@@ -48,6 +48,7 @@ def body_numbers(model: RigidBody, p: Struct) -> Array:
     gyration = (0.0, 0.0, 0.0) if model.targets else ((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz)
     lag = np.array(model.lags)
     air = {"moment": model.moment, "inflow": model.inflow, "damping": model.damping}
+    p.loss = model.loss
     set_members(p, effect=model.effect, gyration=gyration, lead=lag / model.step, **air)
     instants = np.arange(2 * model.substeps + 1)[:, None] * (0.5 * model.step / model.substeps)
     left = np.where(lag > 0.0, np.exp(-instants / np.where(lag > 0.0, lag, 1.0)), 0.0)

@@ -18,7 +18,7 @@ from quadsim.mpc.problem.equilibrium import LEAST_LIFT
 from quadsim.mpc.problem.heading import slope
 from quadsim.mpc.problem.model import hover_model, split_delay
 from quadsim.mpc.problem.ocp import Problem
-from quadsim.mpc.problem.rigidbody import SUBSTEPS
+from quadsim.mpc.problem.rigidbody import SUBSTEPS, air_maps
 from quadsim.mpc.space import Shape
 from quadsim.mpc.tables.bounded import Bounded, Weighted
 from quadsim.mpc.tables.lags import resolved_lag
@@ -72,6 +72,7 @@ def robust_numbers(settings: Robust, vehicle: Vehicle, period: float) -> dict[st
     ixx, iyy, izz = vehicle.inertia
     observing = settings.offset_free
     observer = None if observing is None else DisturbanceObserver(observing, period)
+    air = air_maps(vehicle, 1.0)
     instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
 
     def decay(time: Array | float) -> Array:
@@ -96,6 +97,11 @@ def robust_numbers(settings: Robust, vehicle: Vehicle, period: float) -> dict[st
         "effectiveness": effectiveness,
         "allocation": np.asarray(np.linalg.inv(effectiveness), float),
         "gyration": np.array([(iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz]),
+        "moment": int(settings.moment),
+        "across": air.across,
+        "inflow": air.inflow,
+        "damping": air.damping,
+        "loss": air.loss,
         "slope_inverse": np.asarray(np.linalg.inv(slope(hover_model(vehicle, period))), float),
         "gain": np.zeros(6) if observer is None else observer.gain,
         "largest": np.zeros(6) if observer is None else observer.largest,

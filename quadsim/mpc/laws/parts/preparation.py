@@ -45,7 +45,8 @@ class RobustPreparation:
 
     def __init__(self, vehicle: Vehicle, problem: Problem, settings: Robust) -> None:
         self.problem, self.delay = problem, settings.delay
-        self._library, self._nominal = core_library(), hover_model(vehicle, problem.model.period)
+        self._library = core_library()
+        self._nominal = hover_model(vehicle, problem.model.period, moment=settings.moment)
         self._robust = struct("quadsim_robust")()
         set_members(self._robust, **robust_numbers(settings, vehicle, problem.model.period))
         self._C_r = np.ascontiguousarray(problem.objective.C_r)
