@@ -43,6 +43,7 @@ class PlantBatch:
     diverges ends its own flight and no other's.
 
     Attributes:
+        steps: physics steps of a control period.
         state: (N, 12) true states, yaw unwrapped, at the last control instant.
         acting: (N, 4) rotor speeds commanded last [rad/s].
         reference: (N, 4) x, y, z [m], yaw [rad] at the start of the period: tracking errors are measured from it.
@@ -75,7 +76,7 @@ class PlantBatch:
         """
         self._flights = (FlightStruct * count)()
         self._places: list[_Place | None] = [None] * count
-        self._steps, self._count = steps, count
+        self.steps, self._count = steps, count
         self._attended: list[int] = []
         self._fields = _fields_of(self._flights)
         self.state, self.acting = self._fields["state"], self._fields["acting"]
@@ -119,7 +120,7 @@ class PlantBatch:
         plant.reset(state, speeds)
         before = self._places[place]
         if before is None or before.plant is not plant:
-            plant.begin(self._steps)
+            plant.begin(self.steps)
         flight = self._flights[place]
         vehicle, rows = plant.structs
         flight.vehicle, flight.rows = ctypes.addressof(vehicle), ctypes.addressof(rows)
@@ -130,7 +131,7 @@ class PlantBatch:
             assert struct is not None
             struct.stride, struct.until = inner_steps(loop.rate, plant.timestep), 0
             flight.loop = ctypes.addressof(struct)
-        rows.row, flight.period = 0, self._steps
+        rows.row, flight.period = 0, self.steps
         flight.sensing = None if sensing is None else ctypes.addressof(sensing)
         flight.bounds, flight.bounded = None, 0
         if margins is not None:
@@ -149,6 +150,10 @@ class PlantBatch:
         self.measured[place] = self.state[place]
         self._places[place] = _Place(plant, loop, struct, margins, plant.unattended)
         self._attended = [i for i, other in enumerate(self._places) if other is not None and not other.unattended]
+
+    def sense(self, place: int, sensing: Struct) -> None:
+        """Let this take samples at a place in the periods to come."""
+        self._flights[place].sensing = ctypes.addressof(sensing)
 
     def plant(self, place: int) -> Plant:
         """Return the plant at a place."""
@@ -175,7 +180,7 @@ class PlantBatch:
         ended: dict[int, FlightError] = {}
         fields["command"][:, :numbers] = commands
         fields["numbers"][:] = numbers
-        fields["steps"][:] = self._steps
+        fields["steps"][:] = self.steps
         fields["why"][:] = End.DONE
         if flying is not None:
             fields["steps"][~flying] = 0
@@ -193,7 +198,7 @@ class PlantBatch:
         for place in self._attended:
             if self._fields["steps"][place]:
                 self.plant(place).structs[1].row = 0
-                left[place] = self._steps
+                left[place] = self.steps
                 self._stage(place, left, ended)
         return left
 

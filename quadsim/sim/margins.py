@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from quadsim.core.mirror import Struct, constant, core_library
 from quadsim.core.structs import BoundStruct, PeriodStruct
@@ -33,6 +34,8 @@ class Margins:
         limits: the limits, in the order of all results.
         bounds: the core's, an array of structs.
         compiled: whether the core computes all of them; Python computes clearances from obstacles and regions.
+        tolerances: (2, m) violations accepted at the physics rate and at the control samples.
+        required: (m,) whether a violation counts.
     """
 
     def __init__(self, limits: Sequence[Limit], timestep: float) -> None:
@@ -51,6 +54,12 @@ class Margins:
             bound.first = _step_at(limit.start, timestep, after=True)
             bound.last = _step_at(limit.stop, timestep, after=False)
         self.compiled = not self._others
+        self.tolerances = np.array([limit.tolerances for limit in self.limits], float).reshape(-1, 2).T
+        self.required = np.array([limit.required for limit in self.limits], bool)
+
+    def __reduce__(self) -> tuple[type[Margins], tuple[tuple[Limit, ...], float]]:
+        """Pickle the arguments: structs with pointers cannot be copied."""
+        return Margins, (self.limits, self._timestep)
 
     def of_start(self, physics: Array, rotors: Array) -> tuple[Array, Array]:
         """(m,) margins at MuJoCo's state (14,) and rotor speeds (4,) [rad/s] at t = 0, twice; inf where there are none.
@@ -117,6 +126,15 @@ class Margins:
             margins = margins[first:]
         smallest[i] = margins.min()
         at_end[i] = margins[-1]
+
+
+def violated(tolerances: Array, required: NDArray[np.bool_], smallest: Array, at_end: Array) -> NDArray[np.bool_]:
+    """(..., m) which required limits are violated by margins (..., m) within a period, or by those at its end.
+
+    Tolerances (2, ..., m) and required (..., m) are those of `Margins`.
+    """
+    beyond: NDArray[np.bool_] = (-tolerances[0] - smallest > 0.0) | (-tolerances[1] - at_end > 0.0)  # `Limit.excess`
+    return beyond & required
 
 
 def _step_at(time: float, timestep: float, *, after: bool) -> int:
