@@ -57,13 +57,13 @@ class Episodes:
         Raises:
             InputError: the scenario cannot be loaded, or what varies it is wrong.
         """
-        scenario = preferring_core(load_scenario(scenario))
+        loaded: Scenario = preferring_core(load_scenario(scenario))
         self._plan: Any = None
         if vary is not None:
             vary = str(vary) if isinstance(vary, str | Path) else vary
-            self._plan = commands_of("campaign").drawn_flights(scenario, vary)
-            scenario = self._plan.scenario
-        self.base: Scenario = scenario
+            self._plan = commands_of("campaign").drawn_flights(loaded, vary)
+            loaded = self._plan.scenario
+        self.base = loaded
         self.varied = self._plan is not None
 
     def check_seed(self, seed: object) -> None:
