@@ -164,6 +164,7 @@ class Setup:
         loss: (4,) limits of `quadsim.flight.phase.CRITERIA`, infinite where there is none.
         sensed: whether sensors give the state.
         drawn: whether an episode's seed matters.
+        spares: what has flown such episodes, and flies nothing now.
     """
 
     def __init__(self, assembly: Assembly, action: str, preview: int) -> None:
@@ -181,6 +182,7 @@ class Setup:
         effects = assembly.effects
         disturbed = effects.disturbance is not None or effects.thrust_noise is not None
         self.drawn = disturbed or self.sensed or assembly.moving_air is not None or bool(scenario.forces)
+        self.spares: list[_Slot] = []
 
 
 @dataclass
@@ -280,12 +282,13 @@ class Together:
         """Return what flies an episode at a place: what flew there, where that is built the same, with other draws."""
         slot = self._slots[place]
         assembly = setup.assembly.of(episode.scenario)
-        if slot is None or slot.setup is not setup or episode.scenario.forces:
-            if slot is not None:
-                slot.plant.close()
-            slot = _Slot(setup, assembly.plant(), setup.actions.autopilot())
+        forces = bool(episode.scenario.forces)  # which are made with draws of their own
+        if slot is None or slot.setup is not setup or forces:
+            if slot is not None and not forces:
+                slot.setup.spares.append(slot)
+            slot = setup.spares.pop() if setup.spares else _Slot(setup, assembly.plant(), setup.actions.autopilot())
             self._slots[place] = slot
-        elif setup.drawn:
+        if setup.drawn:
             slot.plant.redraw(assembly.generator("disturbance"), assembly.wind())
         if slot.autopilot is not None:
             slot.autopilot.reset()
