@@ -52,17 +52,22 @@ def measure(quick: bool, report: Progress) -> list[Record]:
             scenario = load(SCENARIO).replace(dict(changes))
             stepping = _single(scenario) if count == 1 else _vector(scenario, count, further)
             rate = max(_rate(stepping, count, seconds) for _ in range(rounds))
-            records.append({"environment": name, "vehicles": count, "steps_per_cpu_s": rate, **_physics(rate, 50)})
+            records.append(_record(name, count, rate, steps=50, period=scenario.control_period))
         if find_spec(PEER) is not None:
             rate = max(_rate(_peer(), 1, seconds) for _ in range(rounds))
-            records.append({"environment": "gym-pybullet-drones", "vehicles": 1, "steps_per_cpu_s": rate})
-            records[-1] |= _physics(rate, 8)
+            records.append(_record("gym-pybullet-drones", 1, rate, steps=8, period=1.0 / 30.0))
     return records
 
 
-def _physics(rate: float, steps: int) -> Record:
-    """Physics steps within so many environment steps."""
-    return {"physics_steps_per_cpu_s": rate * steps}
+def _record(name: str, vehicles: int, rate: float, *, steps: int, period: float) -> Record:
+    """A row: environment steps of a period [s], with so many physics steps each."""
+    return {
+        "environment": name,
+        "vehicles": vehicles,
+        "steps_per_cpu_s": rate,
+        "physics_steps_per_cpu_s": rate * steps,
+        "real_time": rate * period,
+    }
 
 
 def _rate(stepping: Callable[[], None], count: int, seconds: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
@@ -86,11 +87,11 @@ class StepResults:
 class Fleet(Protocol):
     """N environments, each somewhere in its episode."""
 
-    def reset(self, place: int, episode: Episode, frame: StepResults) -> None:
-        """Start an episode at a place; fill in its row.
+    def reset(self, episodes: Mapping[int, Episode], frame: StepResults) -> None:
+        """Start episodes at their places; fill in these rows.
 
         Raises:
-            QuadsimError: it cannot be flown.
+            QuadsimError: one cannot be flown.
         """
         ...
 
@@ -115,10 +116,13 @@ class Apart:
         self._names = single.constraint_names
         self._state, self._reference, self._speeds = np.zeros((count, 12)), np.zeros((count, 4)), np.zeros((count, 4))
 
-    def reset(self, place: int, episode: Episode, frame: StepResults) -> None:
+    def reset(self, episodes: Mapping[int, Episode], frame: StepResults) -> None:
         """See `Fleet`."""
-        frame.observations[place], info = self._environments[place].start(episode)
-        self._fill(place, info, frame)
+        for place, episode in episodes.items():
+            frame.observations[place], info = self._environments[place].start(episode)
+            frame.rewards[place] = 0.0
+            frame.terminated[place] = frame.truncated[place] = False
+            self._fill(place, info, frame)
 
     def step(self, actions: Array, flying: Flags, frame: StepResults) -> None:
         """See `Fleet`."""
@@ -234,8 +238,22 @@ class Together:
 
     # --- reset -------------------------------------------------------------------------------------------------------
 
-    def reset(self, place: int, episode: Episode, frame: StepResults) -> None:
+    def reset(self, episodes: Mapping[int, Episode], frame: StepResults) -> None:
         """See `Fleet`."""
+        for place, episode in episodes.items():
+            self._put(place, episode)
+        places = np.array([*episodes])
+        self._follow(places)
+        for error in self._lost(places).values():
+            raise error
+        frame.observations[places] = self._observe(places)
+        frame.rewards[places], frame.time[places] = 0.0, 0.0
+        frame.terminated[places] = frame.truncated[places] = False
+        frame.phases[places], frame.reasons[places] = str(Phase.FLYING), ""
+        self._fill_margins(places, frame)
+
+    def _put(self, place: int, episode: Episode) -> None:
+        """Put what flies an episode at its start."""
         setup = self._setup(episode, key=episode.flight)
         slot = self._slot(place, setup, episode)
         margins = setup.margins if self._margined else None
@@ -253,15 +271,6 @@ class Together:
         if slot.navigation is not None:
             slot.navigation.reset(slot.plant.physics, setup.speeds, yaw=float(setup.state[_YAW]))
             self._state[place] = slot.navigation.state()
-        only = np.array([place])
-        self._follow(only)
-        for error in self._lost(only).values():
-            raise error
-        frame.observations[place] = self._observe(only)[0]
-        frame.rewards[place], frame.time[place] = 0.0, 0.0
-        frame.terminated[place] = frame.truncated[place] = False
-        frame.phases[place], frame.reasons[place] = str(Phase.FLYING), ""
-        self._fill_margins(only, frame)
 
     def _setup(self, episode: Episode, key: int | None) -> Setup:
         """Return what an episode's scenario has in common with others of its kind, kept from before where it is."""

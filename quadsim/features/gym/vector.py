@@ -264,11 +264,12 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
     def _start(self, episodes: Mapping[int, Episode], frame: StepResults) -> None:
         """Start episodes; fill in their rows."""
         self._of_episodes = deepcopy(self._of_episodes)  # users keep the last one's arrays
+        self._fleet.reset(episodes, frame)
         for place, episode in episodes.items():
-            self._fleet.reset(place, episode, frame)
             self._log.start(place, episode)
             self._started[place], self._ended[place] = True, False
             self._note(place, episode)
+        self._log.trim()
 
     def _note(self, place: int, episode: Episode) -> None:
         """Note what `info` has of an episode."""
@@ -332,6 +333,9 @@ class _ActionLog:
     def start(self, place: int, episode: Episode) -> None:
         """Start an episode with the next step."""
         self._present[place] = episode, self._next
+
+    def trim(self) -> None:
+        """Drop the steps of episodes that are no longer kept."""
         kept = [present[1] for present in self._present if present is not None]
         kept += [ended[1] for ended in self._ended if ended is not None]
         while self._dropped < min(kept):
