@@ -44,7 +44,7 @@ CASES: Final[dict[str, tuple[int, Mapping[str, Any], Mapping[str, Any]]]] = {
 
 def measure(quick: bool, report: Progress) -> list[Record]:
     """The best of rounds, of each kind of environment."""
-    rounds, seconds = (1, 0.3) if quick else (3, 4.0)
+    rounds, seconds = (1, 0.3) if quick else (3, 1.5)
     records = []
     with undisturbed():
         for i, (name, (count, changes, further)) in enumerate(CASES.items()):
