@@ -99,7 +99,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         """
         if self._vehicle is None:
             raise ResetNeeded("call env.reset() first; a pickled or copied environment is without its episode")
-        requested = self._base.actions.command(action, 1).speeds
+        requested = self._base.actions.command(action, 1, bounded=False).speeds
         self._filter.requested = requested
         seen, horizon = self._base.started.observation, self._law.horizon
         preview = seen.preview[:horizon]

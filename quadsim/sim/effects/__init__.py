@@ -118,6 +118,14 @@ _Times = Annotated[tuple[Seconds, ...], Len(3, 3)]
 _NONE: Final = (0.0, 0.0, 0.0)
 
 
+class Normals(Protocol):
+    """A generator of standard normal numbers."""
+
+    def standard_normal(self, size: tuple[int, int]) -> Array:
+        """As of `numpy.random.Generator`."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
     """An unmodelled force and torque: constant, white, and lasting parts; see `quadsim.sim.effects.coloured`.
@@ -147,7 +155,7 @@ class Disturbance:
             if any(deviation) and time is None:
                 raise InputError(f"{name}_time must be three time constants [s] where {name}_deviation is given")
 
-    def draw(self, steps: int, timestep: float, rng: np.random.Generator) -> Array:
+    def draw(self, steps: int, timestep: float, rng: Normals) -> Array:
         """(steps, 6) constant and white force, world [N], and torque, body [N m], over steps of `timestep` [s]."""
         constant = np.array([*self.force, *self.torque])
         density = np.repeat([self.force_noise, self.torque_noise], 3)
