@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import logging
 import time as clock
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
@@ -177,6 +176,11 @@ class ClosedLoop:
         self._switched = 0
 
     @property
+    def attends(self) -> bool:
+        """Whether its periods depend on computing time, on the ground or on obstacles."""
+        return self.computation is not None or self._ground is not None
+
+    @property
     def observed(self) -> bool:
         """Whether the period that starts now has been observed."""
         return self._observed is not None
@@ -215,8 +219,12 @@ class ClosedLoop:
             FlightError: the vehicle is lost; the flight has ended.
         """
         if self._observed is None:
-            with self._going_on():
+            self._require_going_on()
+            try:
                 self._observed = self._observe()
+            except FlightError as error:
+                self._end(error)
+                raise
         return self._observed
 
     def step(self, command: Command | None = None) -> Period:
@@ -226,8 +234,12 @@ class ClosedLoop:
             FlightError: the flight has ended in this period, which is not part of it.
             InputError: it had ended before.
         """
-        with self._going_on():
-            sample = self._fly(self.observation, command)
+        observation = self.observation
+        try:
+            sample = self._fly(observation, command)
+        except FlightError as error:
+            self._end(error)
+            raise
         self.k, self._observed, self.last = self.k + 1, None, sample
         if self._samples is not None:
             self._samples.append(sample)
@@ -261,15 +273,9 @@ class ClosedLoop:
             lost=self._criterion,
         )
 
-    @contextlib.contextmanager
-    def _going_on(self) -> Iterator[None]:
+    def _require_going_on(self) -> None:
         if self.reason is not None:
             raise InputError(f"the flight has ended {self.reason}")
-        try:
-            yield
-        except FlightError as error:
-            self._end(error)
-            raise
 
     def _end(self, error: FlightError) -> None:
         """Note why the flight ended; not the error itself, which would hold all that was flown in a cycle."""

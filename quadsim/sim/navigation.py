@@ -24,7 +24,7 @@ from quadsim.sim.estimator import (
 )
 from quadsim.sim.physics import PHYSICS, PhysicsSteps, physics_to_state
 from quadsim.sim.sensing import KINDS, MEASURED, Sampler, Sensor, SensorFault, SensorName, truth
-from quadsim.state import ANGLE_RATES, ANGLES, INDEX, Array, YawTurns
+from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
 from quadsim.vehicle import Vehicle
 
 _AHEAD: Final = 2000
@@ -162,9 +162,14 @@ class Navigation:
         quaternion, rates = row[PHYSICS["attitude"]], row[PHYSICS["body_rates"]]
         sign = -1.0 if quaternion @ self.attitude[0] < 0.0 else 1.0
         self.attitude = sign * quaternion, rates
-        state: Array = physics_to_state(row[None])[0]
-        if angles is not None:  # as they were measured: one that is no number leaves the others alone
-            state[ANGLES], state[ANGLE_RATES] = angles, body_to_euler_rates(angles, rates)
+        if angles is None:
+            state: Array = physics_to_state(row[None])[0]
+        else:  # as they were measured: one that is no number leaves the others alone
+            state = np.empty(N_STATES)
+            state[POSITIONS] = row[PHYSICS["position"]]
+            state[VELOCITIES] = row[PHYSICS["velocity"]]
+            state[ANGLES] = angles
+            state[ANGLE_RATES] = body_to_euler_rates(angles, rates)
         state[INDEX["yaw"]] = self._yaw.unwrapped(state[ANGLES])
         return state
 

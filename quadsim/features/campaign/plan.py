@@ -20,7 +20,7 @@ from quadsim.flight.audit import Limit
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.machine import processor_name
 from quadsim.rollout.many import ERROR, MEMORY, Row, fly_many
-from quadsim.rollout.rollout import Rollout
+from quadsim.rollout.rollout import fly_for_table
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import campaign_path, scenario_source
 from quadsim.scenarios.loading import apply_settings, parse_scenario
@@ -137,7 +137,7 @@ class Plan:
         """Return the row of a flight; a flight that cannot be flown has a row with the reason."""
         started = clock.perf_counter()
         try:
-            flown = Rollout(self.of(flight)).fly()
+            flown = fly_for_table(self.of(flight))
         except QuadsimError as error:
             return self.failed(flight, str(error))
         if raised := flown.log.traceback:  # no more of such a flight is kept than that it raised
