@@ -131,9 +131,9 @@ def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:
     if euler.ndim == body_rates.ndim == 1:
         angles = euler[:2]
         sin_roll, _ = np.sin(angles).tolist()
-        cosines = np.cos(angles).tolist()
+        cos_roll, cos_pitch = np.cos(angles).tolist()
         _, tan_pitch = np.tan(angles).tolist()
-        return np.array(_euler_rates(sin_roll, *cosines, tan_pitch, body_rates.tolist()))
+        return np.array(_euler_rates(sin_roll, cos_roll, cos_pitch, tan_pitch, body_rates.tolist()))
     roll, pitch, _ = np.moveaxis(euler, -1, 0)
     rates = _euler_rates(np.sin(roll), np.cos(roll), np.cos(pitch), np.tan(pitch), np.moveaxis(body_rates, -1, 0))
     return np.stack(rates, axis=-1)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,8 +19,9 @@ from quadsim.controller import CoreController, Phase
 from quadsim.errors import FlightError
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, TimingLog
 from quadsim.flight.phase import check_loss
+from quadsim.sim.loop import uncollected
 from quadsim.sim.navigation import Navigation
-from quadsim.sim.physics import plant_log, times
+from quadsim.sim.physics import instants, plant_log
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, KEPT, N_STATES, REFERENCE_NAMES, Array, whole_turns
 
@@ -60,9 +61,10 @@ def fly_in_core(
     law.start(periods, speeds)
     plant.begin(periods * steps_per_period)
     try:
-        for k in range(periods):
-            if not flight.step(k, loss):
-                return None
+        with uncollected():
+            for k in range(periods):
+                if not flight.step(k, loss):
+                    return None
     except FlightError:
         return None
     return flight.log() if law.accepted else None
@@ -128,8 +130,9 @@ class _Flight:
     def log(self) -> FlightLog:
         """Return the log of all periods."""
         law, plant, count = self._law, self._plant, len(self._truth)
-        t = times(count, self._steps * plant.timestep)
-        statistics = {name: np.full(count, np.nan) for name in RESIDUALS} | dict(law.statistics)
+        t = instants(count, self._steps * plant.timestep)
+        statistics: dict[str, Any] = {name: np.full(count, np.nan) for name in RESIDUALS}
+        statistics |= law.statistics
         control = ControlLog(
             t=t,
             state=self._state,

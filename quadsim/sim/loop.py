@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import logging
 import time as clock
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
@@ -456,19 +457,34 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
     everything up to it.  `progress` is called with the number of periods flown, after each.
     """
     hold = current_hold()
-    gc.freeze()  # a pass of the collector over all imported modules takes up to 30 ms, as long as a control period
+    with uncollected():
+        try:
+            while loop.k < periods:
+                loop.step()
+                if progress is not None:
+                    progress(loop.k)
+        except FlightError:
+            pass  # the loop has noted it
+        except KeyboardInterrupt:
+            hold.flown = True  # before any call, in which the next signal would come
+            loop.interrupt()
+        finally:
+            hold.flown = True
+
+
+@contextlib.contextmanager
+def uncollected() -> Iterator[None]:
+    """Keep the garbage collector from all that is there already.
+
+    A pass over all imported modules takes up to 30 ms, as long as a control period.
+    """
+    if gc.get_freeze_count():
+        yield
+        return
+    gc.freeze()
     try:
-        while loop.k < periods:
-            loop.step()
-            if progress is not None:
-                progress(loop.k)
-    except FlightError:
-        pass  # the loop has noted it
-    except KeyboardInterrupt:
-        hold.flown = True  # before any call, in which the next signal would come
-        loop.interrupt()
+        yield
     finally:
-        hold.flown = True
         gc.unfreeze()
 
 

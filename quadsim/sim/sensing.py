@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -167,7 +166,8 @@ class Sampler:
         self._step = np.array(in_si(name, sensor.bias_walk)) * math.sqrt(self.stride * timestep)
         self._timestep = timestep
         self.reschedule(faults)
-        self._initial = tuple(rng.spawn(4))
+        self._of_noise, self._of_bias, self._of_dropout, self._of_outliers = self._generators = rng.spawn(4)
+        self._initial = [generator.bit_generator.state for generator in self._generators]
         self.reset()
 
     def reschedule(self, faults: Sequence[SensorFault]) -> None:
@@ -177,7 +177,8 @@ class Sampler:
 
     def reset(self) -> None:
         """Restart with the same draws."""
-        self._of_noise, self._of_bias, self._of_dropout, self._of_outliers = copy.deepcopy(self._initial)
+        for generator, state in zip(self._generators, self._initial, strict=True):
+            generator.bit_generator.state = state
         self._walked: Array | None = None
         self._first = 0  # of the samples whose draws are kept
         self._errors, self._fates = np.empty((0, 3)), np.empty(0, np.uint8)

@@ -298,17 +298,16 @@ def changed(scenario: Scenario, changes: Sequence[DrawnChange], identity: Mappin
             if above == "actual" and name in defaults["vehicle"]:
                 for data in (tables, defaults):
                     data.setdefault("actual", {}).setdefault(name, defaults["vehicle"][name])
+    modelled = merge(defaults, {})  # a copy, as looking up a field makes the tables on its way
     for entry, value in changes:
         for field, single in separate({tuple(entry.fields): value}, source=table).items():
-            new = _scaled(scenario, defaults, entry, field, single, table) if entry.relative else single
+            new = _scaled(scenario, modelled, entry, field, single, table) if entry.relative else single
             set_field(tables, field, new, source=f"{table}.{entry.name}.fields", defaults=defaults)
     return scenario.derive({**tables, **identity}, source=identity.get("name"))
 
 
-def _scaled(
-    scenario: Scenario, defaults: Mapping[str, Any], entry: Varied, field: str, value: Value, table: str
-) -> Value:
-    modelled = get_field(merge(defaults, {}), field)
+def _scaled(scenario: Scenario, tables: dict[str, Any], entry: Varied, field: str, value: Value, table: str) -> Value:
+    modelled = get_field(tables, field)
     if modelled is None:  # refused with its own message where there is no such field
         changed(scenario, [(replace(entry, relative=False), value)], {}, table=table)
     for what, number in ((f"the scenario has no number at {field}", modelled), ("what is drawn is no number", value)):

@@ -204,7 +204,6 @@ class Core:
 
     def __init__(self, problem: Problem) -> None:
         self._library, self.shared = core_library(), core_problem(problem)
-        self.formulation = self.shared.condensed
         self._equilibrium = problem.equilibrium
         p = self.shared.struct
         # The work struct and its views point into this memory.
@@ -222,6 +221,11 @@ class Core:
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
         raise TypeError("a Core cannot be copied or pickled: make another from its problem")
+
+    @property
+    def formulation(self) -> Condensed:
+        """See `quadsim.mpc.solvers.Solver`."""
+        return self.shared.condensed
 
     def reset(self) -> None:
         """See `quadsim.mpc.solvers.Solver.reset`."""

@@ -20,7 +20,6 @@ out: a quadrotor is much smaller than the scale lengths.
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -92,12 +91,13 @@ class Turbulence:
         assert dryden.airspeed is not None, "resolved"
         self._intensities = dryden.intensities
         self._steps = [discretise_filters(timestep * dryden.airspeed / length) for length in dryden.lengths]
-        (self._source,) = rng.spawn(1)
+        (self._rng,) = rng.spawn(1)
+        self._initial = self._rng.bit_generator.state
         self.reset()
 
     def reset(self) -> None:
         """Rewind: the same turbulence again."""
-        self._rng = copy.deepcopy(self._source)
+        self._rng.bit_generator.state = self._initial
         first, second = self._rng.standard_normal((2, 3))
         self._state = np.stack([first, 0.5 * (first + second)])  # of the stationary covariance [[1, 1/2], [1/2, 1/2]]
         self._block, self._used = np.empty((0, 3)), 0

@@ -7,22 +7,30 @@ bits as by `quadsim.mpc.laws.parts.linear.LinearMPC` and `quadsim.mpc.guard.cont
 from __future__ import annotations
 
 import ctypes
-from typing import Final, NoReturn
+from typing import Final, NamedTuple, NoReturn
 
 import numpy as np
 
 from quadsim.controller import CORE, GAIN
-from quadsim.core.mirror import Struct, constant, core_library, set_members, struct
+from quadsim.core.mirror import Struct, constant, core_library, struct
 from quadsim.mpc.guard.answer import INFEASIBLE, AnswerCheck
 from quadsim.mpc.guard.structs import STATUSES
-from quadsim.mpc.laws.parts.numbers import controller_numbers
 from quadsim.mpc.problem.ocp import Problem
 from quadsim.mpc.solvers import Method, Solver
 from quadsim.mpc.solvers.core import Core, Optimum
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 
+_CHECKED: Final = 32
+"""Plans that are checked at a time, so that what is computed of them stays in the processor's caches."""
 _FLYING: Final = constant("QUADSIM_PHASE_FLYING")
+
+
+class CoreNumbers(NamedTuple):
+    """The numbers of a law in C, but for those of its problem and of its fallback contract."""
+
+    controller: Struct  # a `quadsim_controller`
+    robust: Struct  # the `quadsim_robust` that it points to
 
 
 class CoreLaw:
@@ -32,25 +40,24 @@ class CoreLaw:
         commands: (K + 1, 4) u(-1), then the command of each period so far [rad/s].
     """
 
-    def __init__(self, problem: Problem, robust: Struct, solver: Core, check: AnswerCheck, fallback: Struct) -> None:
+    def __init__(
+        self, problem: Problem, numbers: CoreNumbers, solver: Core, check: AnswerCheck, fallback: Struct
+    ) -> None:
         """Prepare the controller of a problem.
 
         Args:
             problem: the optimal control problem.
-            robust: the law's `quadsim_robust`.
+            numbers: the law's.
             solver: the problem's, whose tables are shared.
             check: of each answer against the problem.
             fallback: the contract's `quadsim_fallback`.
         """
         self._problem, self._check = problem, check
-        self._kept = solver.shared, robust, fallback  # the structs point to them
+        self._kept = solver.shared, numbers, fallback  # the controller points to them
         self._library = core_library()
-        self._controller = struct("quadsim_controller")(
-            problem=ctypes.addressof(solver.shared.struct),
-            robust=ctypes.addressof(robust),
-            fallback=ctypes.addressof(fallback),
-        )
-        set_members(self._controller, **controller_numbers(problem))
+        self._controller = type(numbers.controller).from_buffer_copy(numbers.controller)
+        self._controller.problem = ctypes.addressof(solver.shared.struct)
+        self._controller.fallback = ctypes.addressof(fallback)
         self._memory = np.zeros(self._library.quadsim_mpc_reals(self._controller))
         self._mpc = mpc = struct("quadsim_mpc")()
         self._library.quadsim_mpc_start(mpc, self._controller, self._memory.ctypes.data)
@@ -80,6 +87,7 @@ class CoreLaw:
         self._restings, self._actings = np.empty((2, periods, N_ROTORS))
         self._slacks = np.zeros((periods, *self._optimum.slacks(Method.FREE).shape))
         self._k = 0
+        self._violations: Array | None = None  # of the plans so far, once they are asked for
 
     def step(self, state: int, reference: int) -> bool:
         """Answer the next period, in the air.
@@ -111,6 +119,7 @@ class CoreLaw:
             self._active[k] = self._optimum.active
             self._slacks[k] = self._optimum.slacks(method)
         self._k = k + 1
+        self._violations = None
         return True
 
     @property
@@ -131,11 +140,15 @@ class CoreLaw:
 
     def _infeasibility(self) -> Array:
         """(K,) the largest violation of a row by each plan so far."""
-        rows = slice(self._k)
-        equilibrium = self._rests[rows], self._restings[rows]
-        return self._check.violations(
-            self._states[rows], equilibrium, self._actings[rows], self._plans[rows], self._slacks[rows]
-        )
+        if self._violations is None:
+            blocks = [np.empty(0)]
+            for start in range(0, self._k, _CHECKED):
+                rows = slice(start, min(start + _CHECKED, self._k))
+                equilibrium = self._rests[rows], self._restings[rows]
+                parts = self._states[rows], equilibrium, self._actings[rows], self._plans[rows], self._slacks[rows]
+                blocks.append(self._check.violations(*parts))
+            self._violations = np.concatenate(blocks)
+        return self._violations
 
     @property
     def status(self) -> tuple[str, ...]:
@@ -149,9 +162,9 @@ class CoreLaw:
 
 
 def core_law(
-    problem: Problem, robust: Struct | None, solver: Solver, check: AnswerCheck, fallback: Struct
+    problem: Problem, numbers: CoreNumbers | None, solver: Solver, check: AnswerCheck, fallback: Struct
 ) -> CoreLaw | None:
     """Return a law of these parts in the core; None where it is not C's alone, or would not have the same bits."""
-    if robust is None or not isinstance(solver, Core) or not check.maps:
+    if numbers is None or not isinstance(solver, Core) or not check.maps:
         return None
-    return CoreLaw(problem, robust, solver, check, fallback)
+    return CoreLaw(problem, numbers, solver, check, fallback)

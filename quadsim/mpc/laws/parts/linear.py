@@ -10,7 +10,7 @@ from quadsim.controller import GROUNDED, Command, StepInputs, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.mpc.estimate.observer import disturbance_of
 from quadsim.mpc.guard.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection, resized, shifted
-from quadsim.mpc.laws.parts.core_law import CoreLaw, core_law
+from quadsim.mpc.laws.parts.core_law import CoreLaw, CoreNumbers, core_law
 from quadsim.mpc.problem.equilibrium import Trim
 from quadsim.mpc.problem.ocp import InfeasiblePeriod, Problem, Query
 from quadsim.mpc.problem.paper import rollout
@@ -52,8 +52,8 @@ class Preparation(Protocol):
         ...
 
     @property
-    def robust(self) -> Struct | None:
-        """The `quadsim_robust` of a law that is C's; None for another."""
+    def numbers(self) -> CoreNumbers | None:
+        """The numbers of a law that is C's; None for another."""
         ...
 
     @property
@@ -108,7 +108,7 @@ class NominalPreparation:
     """The paper's query: the measured state, and the reference on the turn of its yaw, about hover."""
 
     delay = yaw = 0.0
-    trim = disturbance = memory = robust = None
+    trim = disturbance = memory = numbers = None
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self._turns = problem, ReferenceTurns()
@@ -262,7 +262,7 @@ class LinearMPC:
         """Return the law with a fallback contract of these numbers in the core; None where it is not C's alone."""
         if self._holds or self._obstacles is not None:
             return None
-        return core_law(self.problem, self.preparation.robust, self._solver, self._check, fallback)
+        return core_law(self.problem, self.preparation.numbers, self._solver, self._check, fallback)
 
     def _solved(self, time: float, query: Query) -> tuple[Answer, Problem]:
         """Return the optimum of a query whose x(k) is at a time [s], and the problem solved."""

@@ -17,6 +17,7 @@ from quadsim.controller import Phase, StepInputs
 from quadsim.core.mirror import constant, core_library, set_members, struct
 from quadsim.mpc.estimate.disturbance import SAME_TIME
 from quadsim.mpc.estimate.observer import LONGEST_SPAN
+from quadsim.mpc.laws.parts.core_law import CoreNumbers
 from quadsim.mpc.laws.parts.linear import Remembered
 from quadsim.mpc.laws.parts.numbers import controller_numbers, robust_numbers
 from quadsim.mpc.laws.robust import Robust
@@ -38,7 +39,6 @@ class RobustPreparation:
     Attributes:
         problem: the optimal control problem, that of the table `settings` (`Robust.problem`).
         delay: from t_k to the instant of x(k) [s].
-        robust: the `quadsim_robust` of the law.
 
     Raises:
         FileError: the library cannot be compiled or loaded.
@@ -47,8 +47,8 @@ class RobustPreparation:
     def __init__(self, vehicle: Vehicle, problem: Problem, settings: Robust) -> None:
         self.problem, self.delay = problem, settings.delay
         self._library, self._nominal = core_library(), hover_model(vehicle, problem.model.period)
-        self.robust = struct("quadsim_robust")()
-        set_members(self.robust, **robust_numbers(settings, vehicle, problem.model.period))
+        self._robust = struct("quadsim_robust")()
+        set_members(self._robust, **robust_numbers(settings, vehicle, problem.model.period))
         self._C_r = np.ascontiguousarray(problem.objective.C_r)
         self._sizes = struct("quadsim_problem")(
             horizon=problem.horizon,
@@ -58,14 +58,14 @@ class RobustPreparation:
             C_r=self._C_r.ctypes.data,
         )
         self._controller = struct("quadsim_controller")(
-            problem=ctypes.addressof(self._sizes), robust=ctypes.addressof(self.robust)
+            problem=ctypes.addressof(self._sizes), robust=ctypes.addressof(self._robust)
         )
         set_members(self._controller, **controller_numbers(problem))
         # The struct points into this memory, and the views into both.
         self._memory = np.zeros(self._library.quadsim_mpc_reals(self._controller))
         self._mpc = mpc = struct("quadsim_mpc")()
         self._library.quadsim_mpc_start(mpc, self._controller, self._memory.ctypes.data)
-        n, N, n_r, under_way = problem.model.n, problem.horizon, len(self._C_r), self.robust.under_way
+        n, N, n_r, under_way = problem.model.n, problem.horizon, len(self._C_r), self._robust.under_way
         self._x = np.ctypeslib.as_array(mpc.state)[:n]
         self._x_s = np.ctypeslib.as_array(mpc.rest)[:n]
         self._u_s = np.ctypeslib.as_array(mpc.resting)
@@ -91,6 +91,11 @@ class RobustPreparation:
         self._trim: Trim | None = None  # of the estimate now, once it has been asked for
 
     @property
+    def numbers(self) -> CoreNumbers:
+        """See `quadsim.mpc.laws.parts.linear.Preparation`."""
+        return CoreNumbers(self._controller, self._robust)
+
+    @property
     def memory(self) -> Remembered:
         """See `quadsim.mpc.laws.parts.linear.Preparation`."""
         return Remembered(
@@ -101,7 +106,7 @@ class RobustPreparation:
             ahead=self._ahead.copy() if self._mpc.known else None,
             called_at=self._called_at,
             measured=self._measured,
-            estimate=self._estimate.copy() if self.robust.observes else None,
+            estimate=self._estimate.copy() if self._robust.observes else None,
         )
 
     def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
@@ -167,7 +172,7 @@ class RobustPreparation:
         trim = self.trim
         x, y, up = trim.lift.tolist()
         thrust = math.hypot(x, y, up)
-        return np.array([-x, -y, self.robust.gravity - up, *(thrust * trim.twist)])
+        return np.array([-x, -y, self._robust.gravity - up, *(thrust * trim.twist)])
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; by the hover model, with the latest disturbance estimate."""
