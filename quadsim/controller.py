@@ -386,6 +386,60 @@ class Diagnosable(Protocol):
         ...
 
 
+class CoreController(Protocol):
+    """A law and what guards it in the core, which answers each period in one call.
+
+    It flies as long as every period has an optimum; other periods are the controller's that it was made of.
+    """
+
+    @property
+    def commands(self) -> Array:
+        """(K + 1, 4) u(-1), then the command of each period so far [rad/s]."""
+        ...
+
+    @property
+    def status(self) -> tuple[str, ...]:
+        """Status of each period so far, as of `Command`."""
+        ...
+
+    @property
+    def answered_by(self) -> tuple[str, ...]:
+        """Source of each command so far, as of `Command`."""
+        ...
+
+    @property
+    def statistics(self) -> Mapping[str, Array]:
+        """(K,) of the periods so far, by the names of `Statistics`, of those that there are."""
+        ...
+
+    @property
+    def accepted(self) -> bool:
+        """Whether every plan so far satisfies the problem's constraints."""
+        ...
+
+    def start(self, periods: int, speeds: Array) -> None:
+        """Restart after the command u(-1) (4,) [rad/s], with room for K periods."""
+        ...
+
+    def step(self, state: int, reference: int) -> bool:
+        """Answer the next period, in the air; return whether it has an optimum.
+
+        Args:
+            state: address of the measured state (12,).
+            reference: address of x, y, z [m], yaw [rad] (N, 4) at t_{k+1} .. t_{k+N}.
+        """
+        ...
+
+
+@runtime_checkable
+class InCore(Protocol):
+    """A law that the core can fly alone."""
+
+    def in_core(self, fallback: Struct) -> CoreController | None:
+        """Return it with a fallback contract of these numbers (`quadsim_fallback`); None where it cannot."""
+        ...
+
+
 @runtime_checkable
 class Commanding(Protocol):
     """A controller that says what it commands; one that does not commands rotor speeds."""

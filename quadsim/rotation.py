@@ -102,14 +102,23 @@ def quaternion_to_euler(quaternion: Array) -> Array:
 def euler_to_quaternion(euler: Array) -> Array:
     """Unit quaternions (..., 4), scalar first, body to world, of roll, pitch, yaw (..., 3) [rad]."""
     half = 0.5 * np.asarray(euler, float)
-    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(half), -1, 0), np.moveaxis(np.sin(half), -1, 0)
-    components = (
+    cosines = np.cos(half)
+    sines = np.sin(half)
+    if half.ndim == 1:
+        return np.array(_of_half_angles(cosines.tolist(), sines.tolist()))
+    return np.stack(_of_half_angles(np.moveaxis(cosines, -1, 0), np.moveaxis(sines, -1, 0)), axis=-1)
+
+
+def _of_half_angles(cosines: Iterable[Any], sines: Iterable[Any]) -> tuple[Any, Any, Any, Any]:
+    """Components of a quaternion from cosines and sines of half roll, pitch, yaw; arrays or plain numbers."""
+    cr, cp, cy = cosines
+    sr, sp, sy = sines
+    return (
         cr * cp * cy + sr * sp * sy,
         sr * cp * cy - cr * sp * sy,
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
     )
-    return np.stack(components, axis=-1)
 
 
 def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:
@@ -119,12 +128,24 @@ def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:
     result grows without bound.  The paper (Sec. 2.2) takes the two sets of rates as equal, which holds at small
     angles only.
     """
+    if euler.ndim == body_rates.ndim == 1:
+        angles = euler[:2]
+        sin_roll, _ = np.sin(angles).tolist()
+        cos_roll, cos_pitch = np.cos(angles).tolist()
+        _, tan_pitch = np.tan(angles).tolist()
+        return np.array(_euler_rates(sin_roll, cos_roll, cos_pitch, tan_pitch, body_rates.tolist()))
     roll, pitch, _ = np.moveaxis(euler, -1, 0)
-    p, q, r = np.moveaxis(body_rates, -1, 0)
-    sin_roll, cos_roll = np.sin(roll), np.cos(roll)
-    lateral = q * sin_roll + r * cos_roll
-    rates = [p + lateral * np.tan(pitch), q * cos_roll - r * sin_roll, lateral / np.cos(pitch)]
+    rates = _euler_rates(np.sin(roll), np.cos(roll), np.cos(pitch), np.tan(pitch), np.moveaxis(body_rates, -1, 0))
     return np.stack(rates, axis=-1)
+
+
+def _euler_rates(
+    sin_roll: Any, cos_roll: Any, cos_pitch: Any, tan_pitch: Any, body_rates: Iterable[Any]
+) -> tuple[Any, Any, Any]:
+    """Euler-angle rates from body rates (p, q, r), arrays or plain numbers."""
+    p, q, r = body_rates
+    lateral = q * sin_roll + r * cos_roll
+    return p + lateral * tan_pitch, q * cos_roll - r * sin_roll, lateral / cos_pitch
 
 
 def euler_to_body_rates(euler: Array, euler_rates: Array) -> Array:

@@ -315,8 +315,17 @@ def batch(data: Any) -> str:
 
 
 def campaign(data: Any) -> str:
-    """How many flights a core flies."""
-    return f"A campaign flies {span((row['per_core_hour'] for row in records(data)), '.0f')} flights per core-hour.\n"
+    """How many flights a core flies, and what one takes."""
+    rows = records(data)
+    whole = span((row["per_core_hour"] for row in rows if "wall_s" in row), ".0f")
+    text = f"A campaign flies {whole} flights per core-hour.\n"
+    single = [row for row in rows if "processor_ms" in row]
+    if not single:
+        return text
+    keys = ("campaign", "integrator", "flown_by", "processor_ms", "per_core_hour")
+    head = ("campaign", "integrator", "flown by the", "processor time of a flight (ms)", "flights per core-hour")
+    lines = [[f"{row[key]:.0f}" if isinstance(row[key], float) else row[key] for key in keys] for row in single]
+    return f"{text}\n{table(head, lines)}"
 
 
 def film(data: Any) -> str:

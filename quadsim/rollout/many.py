@@ -214,7 +214,9 @@ def _serve(pipe: connection.Connection, fly: bytes, memory: float) -> None:
     with suppress(EOFError, OSError):
         pipe.send(None)
         while True:
-            pipe.send_bytes(_row(lambda flight: load(fly)(flight), pipe.recv(), memory))
+            flight = pipe.recv()
+            gc.freeze()  # so that the pass below, up to 30 ms, is over what the flight has made alone
+            pipe.send_bytes(_row(lambda flight: load(fly)(flight), flight, memory))
             gc.collect()  # a flight may leave a dozen megabytes in cycles
 
 

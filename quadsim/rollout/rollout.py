@@ -15,16 +15,19 @@ from threadpoolctl import threadpool_limits
 
 from quadsim.border import numbers_of
 from quadsim.console.progress import Progress, silent
-from quadsim.controller import Command, Controller, takes_targets
+from quadsim.controller import Command, Controller, CoreController, takes_targets
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import audit, smallest_margins
+from quadsim.flight.log import FlightLog
 from quadsim.input_limits import MOST_STEPS
+from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.rollout.flight_events import FlightEvents, Successor, prepared
 from quadsim.rollout.flown import Flight
 from quadsim.scenarios.assembly import Assembly
-from quadsim.scenarios.schema.events import ControllerEvent, Event
+from quadsim.scenarios.schema.events import ControllerEvent, Event, SetpointEvent
 from quadsim.scenarios.schema.scenario import LONGEST_FLIGHT, Scenario
 from quadsim.sim.computation import check_measured
+from quadsim.sim.core_loop import fly_in_core
 from quadsim.sim.effects import Force
 from quadsim.sim.loop import ClosedLoop, Reference, complete
 from quadsim.sim.navigation import Navigation
@@ -149,7 +152,7 @@ class Rollout:
         self._own_code = law is not None or forces is not None or assembly.user_autopilot is not None
         self._plant, self._navigation = assembly.plant(forces), assembly.navigation()
         started = clock.perf_counter()
-        reference = assembly.followed()
+        self._reference = reference = assembly.followed()
         self.loop = closed_loop(
             assembly, self._plant, controller, reference, navigation=self._navigation, recorded=recorded
         )
@@ -245,6 +248,36 @@ class Rollout:
             self._simulate_s += clock.perf_counter() - started
             return self.flight()
 
+    @property
+    def core_law(self) -> CoreController | None:
+        """The controller in the core, where a flight of this scenario needs nothing else; see `fly_in_core`."""
+        scenario, controller = self._events.scenario, self.loop.controller
+        changing = any(isinstance(event, SetpointEvent | ControllerEvent) for event in scenario.events)
+        attended = changing or scenario.forces or self._own_code or self.loop.attends or needs_quaternions(scenario)
+        if attended or not isinstance(controller, Pilot):
+            return None
+        return controller.in_core()
+
+    def fly_in_core(self, law: CoreController) -> Flight | None:
+        """Fly a flight that has not begun by its `core_law`, audit it and close; None where the loop has to fly it.
+
+        The flight lacks predictions and KKT residuals; all other numbers are those of `fly`.
+        """
+        scenario, started = self.scenario, clock.perf_counter()
+        with self:
+            log = fly_in_core(
+                law,
+                self._plant,
+                self._reference.first(scenario.periods + self.loop.controller.horizon),
+                speeds=self._plant.speeds,
+                periods=scenario.periods,
+                steps_per_period=scenario.steps_per_period,
+                navigation=self._navigation,
+                loss=scenario.lost.limits,
+            )
+            self._simulate_s += clock.perf_counter() - started
+            return None if log is None else self._flight_of(log, scenario)
+
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
         """Apply an event from the next period on that is not yet observed, like an event of the file.
 
@@ -305,7 +338,10 @@ class Rollout:
         """Return the flight so far, audited; its scenario has the same length and reproduces it bit for bit."""
         scenario = self._events.flown()
         self.loop.quaternions = needs_quaternions(scenario)
-        log = self.loop.log()
+        return self._flight_of(self.loop.log(), scenario)
+
+    def _flight_of(self, log: FlightLog, scenario: Scenario) -> Flight:
+        """Return a log as a flight of a scenario, audited."""
         assembly = self._events.assembly.of(scenario)
         return Flight(
             scenario=assembly.recording,
@@ -333,6 +369,23 @@ def _try_remedies(explanation: Mapping[str, Any], flight: Flight) -> dict[str, A
         return growth.grown(scenario, started_plain, heading=heading, longest=growth.SHORT_PAIR)
 
     return remedies.tried(explanation, flight, fly, measure)
+
+
+def fly_for_table(scenario: Scenario) -> Flight:
+    """Fly a scenario for its verdict, margins and metrics: in the core where nothing else is needed.
+
+    The flight may lack predictions and KKT residuals (`Rollout.fly_in_core`); all other numbers are those of
+    `Rollout.fly`.
+
+    Raises:
+        InputError: something cannot be built.
+    """
+    rollout = Rollout(scenario)
+    law = rollout.core_law
+    if law is None:
+        return rollout.fly()
+    flight = rollout.fly_in_core(law)
+    return Rollout(scenario).fly() if flight is None else flight
 
 
 def started_plain(assembly: Assembly) -> Rollout:

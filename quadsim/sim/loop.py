@@ -177,6 +177,11 @@ class ClosedLoop:
         self._switched = 0
 
     @property
+    def attends(self) -> bool:
+        """Whether its periods depend on computing time, on the ground or on obstacles."""
+        return self.computation is not None or self._ground is not None
+
+    @property
     def observed(self) -> bool:
         """Whether the period that starts now has been observed."""
         return self._observed is not None
@@ -235,8 +240,12 @@ class ClosedLoop:
             FlightError: the vehicle is lost; the flight has ended.
         """
         if self._observed is None:
-            with self._going_on():
+            self._require_going_on()
+            try:
                 self._observed = self._observe()
+            except FlightError as error:
+                self._end(error)
+                raise
         return self._observed
 
     def step(self, command: Command | None = None) -> Period:
@@ -246,8 +255,12 @@ class ClosedLoop:
             FlightError: the flight has ended in this period, which is not part of it.
             InputError: it had ended before.
         """
-        with self._going_on():
-            sample = self._fly(self.observation, command)
+        observation = self.observation
+        try:
+            sample = self._fly(observation, command)
+        except FlightError as error:
+            self._end(error)
+            raise
         self.k, self._observed, self.last = self.k + 1, None, sample
         if self._samples is not None:
             self._samples.append(sample)
@@ -281,15 +294,9 @@ class ClosedLoop:
             lost=self._criterion,
         )
 
-    @contextlib.contextmanager
-    def _going_on(self) -> Iterator[None]:
+    def _require_going_on(self) -> None:
         if self.reason is not None:
             raise InputError(f"the flight has ended {self.reason}")
-        try:
-            yield
-        except FlightError as error:
-            self._end(error)
-            raise
 
     def _end(self, error: FlightError) -> None:
         """Note why the flight ended; not the error itself, which would hold all that was flown in a cycle."""
@@ -469,19 +476,34 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
     everything up to it.  `progress` is called with the number of periods flown, after each.
     """
     hold = current_hold()
-    gc.freeze()  # a pass of the collector over all imported modules takes up to 30 ms, as long as a control period
+    with uncollected():
+        try:
+            while loop.k < periods:
+                loop.step()
+                if progress is not None:
+                    progress(loop.k)
+        except FlightError:
+            pass  # the loop has noted it
+        except KeyboardInterrupt:
+            hold.flown = True  # before any call, in which the next signal would come
+            loop.interrupt()
+        finally:
+            hold.flown = True
+
+
+@contextlib.contextmanager
+def uncollected() -> Iterator[None]:
+    """Keep the garbage collector from all that is there already.
+
+    A pass over all imported modules takes up to 30 ms, as long as a control period.
+    """
+    if gc.get_freeze_count():
+        yield
+        return
+    gc.freeze()
     try:
-        while loop.k < periods:
-            loop.step()
-            if progress is not None:
-                progress(loop.k)
-    except FlightError:
-        pass  # the loop has noted it
-    except KeyboardInterrupt:
-        hold.flown = True  # before any call, in which the next signal would come
-        loop.interrupt()
+        yield
     finally:
-        hold.flown = True
         gc.unfreeze()
 
 

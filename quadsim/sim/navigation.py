@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import ctypes
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,11 @@ from quadsim.sim.estimator import (
 )
 from quadsim.sim.physics import PHYSICS, PhysicsSteps, physics_to_state
 from quadsim.sim.sensing import KINDS, MEASURED, Sampler, Sensor, SensorFault, SensorName, truth
-from quadsim.state import ANGLE_RATES, ANGLES, INDEX, Array, YawTurns
+from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
 from quadsim.vehicle import Vehicle
+
+_AHEAD: Final = 2000
+"""Physics steps whose samples are drawn ahead."""
 
 
 class Navigation:
@@ -86,12 +90,17 @@ class Navigation:
 
     def reschedule(self, faults: Sequence[SensorFault]) -> None:
         """Replace the faults of the sensors that there are; samples already taken stay."""
-        for sampler in self._samplers:
+        self._prepared = self._step + 1
+        for k, (sampler, struct) in enumerate(zip(self._samplers, self._structs, strict=False)):
             sampler.reschedule(faults)
+            taken = self._step // struct.stride + 1 - struct.first
+            values, fates = self._samples[k]
+            self._samples[k] = values[:taken], fates[:taken]
 
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
         """Restart at MuJoCo's state (14,) and rotor speeds [rad/s] with the same draws; yaw is near `yaw` [rad]."""
         self._step, self._yaw, self._physics = 0, YawTurns(yaw), physics.copy()
+        self._prepared = 0  # physics steps for whose samples there is room
         self.attitude: tuple[Array, Array] = physics[PHYSICS["attitude"]].copy(), physics[PHYSICS["body_rates"]].copy()
         samplers = self._samplers
         self._structs = (SensorStruct * max(len(samplers), 1))()
@@ -106,7 +115,7 @@ class Navigation:
         if self.filter is not None:
             known = [physics[PHYSICS[name]] for name in ("position", "velocity", "attitude", "body_rates")]
             self.filter.reset(np.concatenate([*known, np.zeros(3)]), speeds, copy.deepcopy(self._rng))
-        self._prepare(0, 1)
+        self._prepare(1)
         motion = np.ascontiguousarray(physics[1:])
         core_library().quadsim_sense(self._sensing, 0, motion.ctypes.data)
         self._hear(0, physics)
@@ -115,7 +124,7 @@ class Navigation:
 
     def begin(self, steps: int) -> Struct:
         """Draw the errors of the samples of the next physics steps; return what takes them."""
-        self._prepare(self._step + 1, self._step + 1 + steps)
+        self._prepare(self._step + 1 + steps)
         return self._sensing
 
     def record(self, flown: PhysicsSteps, *, on_ground: bool = False) -> None:
@@ -153,9 +162,14 @@ class Navigation:
         quaternion, rates = row[PHYSICS["attitude"]], row[PHYSICS["body_rates"]]
         sign = -1.0 if quaternion @ self.attitude[0] < 0.0 else 1.0
         self.attitude = sign * quaternion, rates
-        state: Array = physics_to_state(row[None])[0]
-        if angles is not None:  # as they were measured: one that is no number leaves the others alone
-            state[ANGLES], state[ANGLE_RATES] = angles, body_to_euler_rates(angles, rates)
+        if angles is None:
+            state: Array = physics_to_state(row[None])[0]
+        else:  # as they were measured: one that is no number leaves the others alone
+            state = np.empty(N_STATES)
+            state[POSITIONS] = row[PHYSICS["position"]]
+            state[VELOCITIES] = row[PHYSICS["velocity"]]
+            state[ANGLES] = angles
+            state[ANGLE_RATES] = body_to_euler_rates(angles, rates)
         state[INDEX["yaw"]] = self._yaw.unwrapped(state[ANGLES])
         return state
 
@@ -164,8 +178,15 @@ class Navigation:
         """Counts of each sensor's samples in the estimator; empty without one."""
         return {} if self.filter is None else self.filter.tallies
 
-    def _prepare(self, start: int, stop: int) -> None:
-        """Make room for the samples taken in these physics steps, with their errors; drop those no longer needed."""
+    def _prepare(self, stop: int) -> None:
+        """Make room for the samples taken before a physics step, with their errors; drop those no longer needed.
+
+        Room is made for many steps ahead, as each draw of random numbers has a price.
+        """
+        if stop <= self._prepared:
+            return
+        start, stop = self._prepared, stop + _AHEAD
+        self._prepared = stop
         for k, sampler in enumerate(self._samplers):
             struct, (values, fates) = self._structs[k], self._samples[k]
             first, end = -(-start // struct.stride), -(-stop // struct.stride)

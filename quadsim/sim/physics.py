@@ -232,7 +232,7 @@ def _control_log(samples: Sequence[Period], initial_speeds: Array, period: float
     late = np.array([sample.missed for sample in samples], dtype=bool)
     target = _targets(samples)
     return ControlLog(
-        t=_times(len(samples), period),
+        t=instants(len(samples), period),
         state=np.array([observation.state for observation in observed], float).reshape(-1, N_STATES),
         truth=np.array([observation.truth for observation in observed], float).reshape(-1, N_STATES),
         reference=np.array([observation.reference for observation in observed], float).reshape(-1, 4),
@@ -282,8 +282,20 @@ def _timing_log(samples: Sequence[Period], t: Array) -> TimingLog:
 
 def _plant_log(samples: Sequence[Period], start: Array, initial_speeds: Array, yaw: float, timestep: float) -> PlantLog:
     if not samples:
-        return PlantLog(t=_times(1, timestep), state=physics_to_state(start[None], yaw), speeds=initial_speeds[None])
-    steps = np.concatenate([sample.steps for sample in samples])
+        return PlantLog(t=instants(1, timestep), state=physics_to_state(start[None], yaw), speeds=initial_speeds[None])
+    return plant_log(np.concatenate([sample.steps for sample in samples]), samples[-1].rotors, start, yaw, timestep)
+
+
+def plant_log(steps: PhysicsSteps, rotors: Array, start: Array, yaw: float, timestep: float) -> PlantLog:
+    """Return the log of physics steps (M,), at least one.
+
+    Args:
+        steps: the steps.
+        rotors: (4,) rotor speeds at the end [rad/s].
+        start: (14,) MuJoCo's state before the first.
+        yaw: the first row's is on the turn nearest to it [rad].
+        timestep: [s].
+    """
     physics = np.concatenate([start[None], steps["physics"]])
     # What acts during a step is shown from its start on, so the last row repeats that of the last step.
     acting = {
@@ -292,13 +304,13 @@ def _plant_log(samples: Sequence[Period], start: Array, initial_speeds: Array, y
         if name in (steps.dtype.names or ())
     }
     return PlantLog(
-        t=_times(len(physics), timestep),
+        t=instants(len(physics), timestep),
         state=physics_to_state(physics, yaw),
-        speeds=np.concatenate([steps["speeds"], samples[-1].rotors[None]]),
+        speeds=np.concatenate([steps["speeds"], rotors[None]]),
         **acting,
     )
 
 
-def _times(count: int, spacing: float) -> Array:
+def instants(count: int, spacing: float) -> Array:
     """Return instants k * spacing, without the rounding of accumulation or binary fractions."""
     return np.round(np.arange(count) * spacing, 9)

@@ -48,6 +48,8 @@ _NUMERICAL_WARNINGS: Final = (
 _BLOCK: Final = 2048  # normal numbers that are drawn at a time
 _CALM: Final = Effects()
 _AS_IN_THE_FILE: Final = Load()
+_CARRYING: Final = (Payload, PayloadDrop)
+"""Changes that move the centre of mass."""
 
 
 if all(getattr(mujoco, name)() is None for name in dir(mujoco) if name.startswith("get_mjcb_")):
@@ -246,9 +248,8 @@ class Plant:
         """Return the core's vehicle, with all that does not change."""
         v, vehicle, effects, data = VehicleStruct(), self.vehicle, self.effects, self._data
         v.timestep, v.plausible, v.fastest_valid = self.timestep, _PLAUSIBLE, LARGEST_SPEED
-        v.mass, v.gravity, v.inertia[:] = vehicle.mass, vehicle.gravity, vehicle.inertia
-        v.products[:] = vehicle.products_of_inertia or (0.0, 0.0, 0.0)
-        fill(v.inverse, np.linalg.inv(vehicle.inertia_matrix))
+        v.gravity = vehicle.gravity
+        _weigh(v, vehicle.mass, vehicle.inertia_matrix)
         v.linear, quadratic = vehicle.thrust_law
         v.coefficient[:], v.hover = quadratic, vehicle.hover_speed
         # Power is torque times speed, (a_1 w + a_2 w^2) w; of each rotor at hover speed, over the mean rotor's.
@@ -468,8 +469,9 @@ class Plant:
     def allows(self, changes: Sequence[Change]) -> bool:
         """Return whether it was built for changes of these kinds."""
         weighing = not self._reweighed and any(isinstance(change, LOADING) for change in changes)
+        carrying = self._integrator == "rk4" and any(isinstance(change, _CARRYING) for change in changes)
         pushing = not self._follows_motion and any(isinstance(change, PushChange) for change in changes)
-        return not (weighing or pushing)
+        return not (weighing or carrying or pushing)
 
     def reschedule(self, changes: Sequence[Change]) -> None:
         """Schedule these changes, of kinds that it `allows`; past ones are ignored."""
@@ -506,7 +508,11 @@ class Plant:
     def _carry(self, payloads: tuple[Payload, ...], mass_factor: float) -> None:
         self._payloads, self._mass_factor = payloads, mass_factor
         load = replace(self._load, mass_factor=mass_factor)
-        apply_mass(self.model, BODY, mass_properties(self.vehicle, load, payloads))
+        properties = mass_properties(self.vehicle, load, payloads)
+        if self._integrator == "rk4":
+            _weigh(self._struct, properties.mass, properties.inertia)
+        else:
+            apply_mass(self.model, BODY, properties)
 
     def _own_wrench(self) -> Array:
         """Return the sum (6,) of the user-defined forces now, world [N] and body frame [N m].
@@ -556,16 +562,26 @@ def check_free(effects: Effects, changes: Sequence[Change], obstacles: Sequence[
     """Refuse features that the integrator `rk4` lacks.
 
     Raises:
-        ParameterError: there is a floor or an obstacle to touch, a load, or MuJoCo's drag.
+        ParameterError: there is a floor or an obstacle to touch, a load beside the origin, or MuJoCo's drag.
     """
+    load = effects.load or Load()
     unknown = {
         "contact with the ground": effects.ground is not None and effects.ground.contact,
         "obstacles": bool(obstacles),
-        "a load": effects.load not in (None, Load()) or any(isinstance(change, LOADING) for change in changes),
+        "effects.load.centre_of_mass": any(load.centre_of_mass),
+        "a payload": bool(load.payloads) or any(isinstance(change, _CARRYING) for change in changes),
         "effects.air.body_drag": effects.air is not None and effects.air.body_drag is not None,
     }
     if names := [name for name, present in unknown.items() if present]:
         raise ParameterError("plant", "integrator", "rk4", f"mujoco with {' and '.join(names)}")
+
+
+def _weigh(v: Struct, mass: float, inertia: Array) -> None:
+    """Give the core's own method a mass [kg] and an inertia (3, 3) [kg m^2] about the body's origin."""
+    v.mass = mass
+    v.inertia[:] = np.diagonal(inertia)
+    v.products[:] = inertia[0, 1], inertia[0, 2], inertia[1, 2]
+    fill(v.inverse, np.linalg.inv(inertia))
 
 
 def _discard(message: str) -> None:

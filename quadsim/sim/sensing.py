@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -167,7 +166,8 @@ class Sampler:
         self._step = np.array(in_si(name, sensor.bias_walk)) * math.sqrt(self.stride * timestep)
         self._timestep = timestep
         self.reschedule(faults)
-        self._initial = tuple(rng.spawn(4))
+        self._of_noise, self._of_bias, self._of_dropout, self._of_outliers = self._generators = rng.spawn(4)
+        self._initial = [generator.bit_generator.state for generator in self._generators]
         self.reset()
 
     def reschedule(self, faults: Sequence[SensorFault]) -> None:
@@ -177,18 +177,30 @@ class Sampler:
 
     def reset(self) -> None:
         """Restart with the same draws."""
-        self._of_noise, self._of_bias, self._of_dropout, self._of_outliers = copy.deepcopy(self._initial)
+        for generator, state in zip(self._generators, self._initial, strict=True):
+            generator.bit_generator.state = state
         self._walked: Array | None = None
+        self._first = 0  # of the samples whose draws are kept
+        self._errors, self._fates = np.empty((0, 3)), np.empty(0, np.uint8)
 
     def draw(self, first: int, count: int) -> tuple[Array, Fates]:
         """Draw the errors (count, 3) of the samples from number `first` on, and what befalls each (count,).
 
-        An attitude's error is a rotation vector in the body frame.  Calls follow one another from sample 0.
+        An attitude's error is a rotation vector in the body frame.  Calls follow one another from sample 0; one may
+        begin with any sample of the call before, for faults that have been rescheduled since.
         """
-        if not count:
-            return np.empty((0, 3)), np.empty(0, np.uint8)
-        errors = self._walk(count) + self._draw_noise(count) + 0.0  # turns -0 into 0
-        fates = (self._of_dropout.random(count) < self._sensor.dropout).astype(np.uint8) * np.uint8(Fate.LOST)
+        past = first - self._first
+        self._first = first
+        self._errors, self._fates = self._errors[past:], self._fates[past:]
+        missing = count - len(self._errors)
+        if missing > 0:
+            errors = self._walk(missing) + self._draw_noise(missing) + 0.0  # turns -0 into 0
+            lost = self._of_dropout.random(missing) < self._sensor.dropout
+            self._errors = np.concatenate([self._errors, errors])
+            self._fates = np.concatenate([self._fates, lost.astype(np.uint8) * np.uint8(Fate.LOST)])
+        errors, fates = self._errors[:count].copy(), self._fates[:count].copy()
+        if not self._faults:
+            return errors, fates
         taken = self.stride * np.arange(first, first + count)
         for fault, window in self._faults:
             within = _within(taken, window)

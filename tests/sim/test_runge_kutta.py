@@ -14,6 +14,7 @@ from uneven import uneven
 from quadsim.assets import vehicle_path
 from quadsim.errors import ForceError
 from quadsim.sim.effects import Disturbance, Effects, Ground, ThrustNoise
+from quadsim.sim.effects.load import Load, MassChange
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator
@@ -115,6 +116,19 @@ def test_mujocos_steps_differ_by_little_at_half_a_millisecond(torrente: Vehicle)
 def test_every_other_effect_acts_as_in_mujoco(effects: Effects, torrente: Vehicle) -> None:
     ends = [flown(torrente, effects, 300, timestep=1e-3, integrator=each) for each in ("rk4", "mujoco")]
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=2e-6)
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_other_mass_and_inertia_fly_as_in_mujoco(even: bool, torrente: Vehicle) -> None:
+    vehicle = torrente if even else uneven()
+    load = Effects(load=Load(mass_factor=1.2, inertia_factor=(0.95, 0.95, 0.9)))
+    changes = [MassChange(at=0.1, factor=0.8)]
+    ends = []
+    for integrator in ("rk4", "mujoco"):
+        ends.append(flown(vehicle, load, 300, timestep=1e-3, integrator=integrator, changes=changes))
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=2e-6)
+    light = flown(vehicle, Effects(), 300, timestep=1e-3, integrator="rk4")
+    assert np.abs(ends[0] - light).max() > 1e-2
 
 
 def test_an_uneven_body_turns_as_in_mujoco() -> None:

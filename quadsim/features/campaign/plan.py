@@ -21,7 +21,7 @@ from quadsim.flight.audit import Limit
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.machine import processor_name
 from quadsim.rollout.many import ERROR, MEMORY, Row, fly_many
-from quadsim.rollout.rollout import Rollout
+from quadsim.rollout.rollout import fly_for_table
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import campaign_path, scenario_source
 from quadsim.scenarios.loading import apply_settings, parse_scenario
@@ -140,7 +140,7 @@ class Plan:
         """Return the row of a flight; a flight that cannot be flown has a row with the reason."""
         started = clock.perf_counter()
         try:
-            flown = Rollout(self.of(flight)).fly()
+            flown = fly_for_table(self.of(flight))
         except QuadsimError as error:
             return self.failed(flight, str(error))
         if raised := flown.log.traceback:  # no more of such a flight is kept than that it raised
@@ -301,17 +301,16 @@ def changed(scenario: Scenario, changes: Sequence[DrawnChange], identity: Mappin
             if above == "actual" and name in defaults["vehicle"]:
                 for data in (tables, defaults):
                     data.setdefault("actual", {}).setdefault(name, defaults["vehicle"][name])
+    modelled = merge(defaults, {})  # a copy, as looking up a field makes the tables on its way
     for entry, value in changes:
         for field, single in separate({tuple(entry.fields): value}, source=table).items():
-            new = _scaled(scenario, defaults, entry, field, single, table) if entry.relative else single
+            new = _scaled(scenario, modelled, entry, field, single, table) if entry.relative else single
             set_field(tables, field, new, source=f"{table}.{entry.name}.fields", defaults=defaults)
     return scenario.derive({**tables, **identity}, source=identity.get("name"))
 
 
-def _scaled(
-    scenario: Scenario, defaults: Mapping[str, Any], entry: Varied, field: str, value: Value, table: str
-) -> Value:
-    modelled = get_field(merge(defaults, {}), field)
+def _scaled(scenario: Scenario, tables: dict[str, Any], entry: Varied, field: str, value: Value, table: str) -> Value:
+    modelled = get_field(tables, field)
     if modelled is None:  # refused with its own message where there is no such field
         changed(scenario, [(replace(entry, relative=False), value)], {}, table=table)
     for what, number in ((f"the scenario has no number at {field}", modelled), ("what is drawn is no number", value)):

@@ -14,8 +14,10 @@ from quadsim.controller import (
     Command,
     Commanding,
     Controller,
+    CoreController,
     Diagnosable,
     Foreseeing,
+    InCore,
     Predicting,
     Settling,
     StepInputs,
@@ -155,6 +157,12 @@ class Pilot:
         self.engage(commanded, rotors)
         assert self.inner is not None
         return self.inner.speeds(time, commanded, rates, rotors, attitude)
+
+    def in_core(self) -> CoreController | None:
+        """Return the law and its contract in the core, for a flight of their own; None where they are not C's alone."""
+        if self.guard is None or self.inner is not None or not isinstance(self.law, InCore):
+            return None
+        return self.law.in_core(self.guard.numbers)
 
     def predict(self, states: Array, plans: Array) -> Array | None:
         """See `quadsim.controller.Predicting`."""

@@ -106,6 +106,9 @@ class Optimum:
     """Reads the answers in a `quadsim_work`; PIQP gives those that the core gives up or finds infeasible.
 
     The work and its views point into memory that the caller keeps.
+
+    Attributes:
+        plan: (N, 4) the optimum that was found last, which the next one overwrites [rad/s].
     """
 
     def __init__(self, problem: Problem, shared: CoreProblem, work: Struct) -> None:
@@ -118,7 +121,7 @@ class Optimum:
             read_only(np.zeros((problem.horizon, count))) for count in (rows.soft.size, len(rows.D))
         )
         step_rows = shared.struct.step_rows
-        self._plan = self._view(work.plan, ctypes.c_double, N_ROTORS)
+        self.plan = self._view(work.plan, ctypes.c_double, N_ROTORS)
         self._multiplier, self._value, self._shift = (
             self._view(at, ctypes.c_double, step_rows) for at in (work.multiplier, work.value, work.shift)
         )
@@ -138,13 +141,11 @@ class Optimum:
         if found >= len(Method):
             return self._by_piqp(query, started)
         method = Method(found)
-        plan, slacks, multipliers, active = self._plan.copy(), self._no_slacks, self._no_multipliers, 0
+        plan = self.plan.copy()
+        slacks = self.slacks(method)
+        multipliers, active = self._no_multipliers, 0
         if method is not Method.FREE:
-            multipliers, active = self._multiplier * self._scale, int(np.count_nonzero(self._side))
-            if slacks.size and np.count_nonzero(violated := np.abs(self._side) == 2):
-                values = self._value + self._shift
-                beyond = np.maximum(np.maximum(values - self._upper, self._lower - values), 0.0)
-                slacks = (violated * beyond)[:, self._soft] / self._slack_scale
+            multipliers, active = self._multiplier * self._scale, self.active
         return Answer(
             plan,
             slacks,
@@ -154,6 +155,22 @@ class Optimum:
             certificate=partial(self._certificate, query, plan, slacks, multipliers),
             stats=Statistics(iterations=self._work.changes, active=active, solve_s=clock.perf_counter() - started),
         )
+
+    @property
+    def active(self) -> int:
+        """Active rows of the optimum that was found last, if any row was."""
+        return int(np.count_nonzero(self._side))
+
+    def slacks(self, method: Method) -> Array:
+        """Return (N, m_s) the violations of soft rows at the optimum that was found last."""
+        if method is Method.FREE or not self._no_slacks.size:
+            return self._no_slacks
+        violated = np.abs(self._side) == 2
+        if not np.count_nonzero(violated):
+            return self._no_slacks
+        values = self._value + self._shift
+        beyond = np.maximum(np.maximum(values - self._upper, self._lower - values), 0.0)
+        return np.asarray((violated * beyond)[:, self._soft] / self._slack_scale)
 
     def _certificate(self, query: Query, plan: Array, slacks: Array, multipliers: Array) -> tuple[QP, Solution]:
         """Return the condensed QP of a query, and a plan as its solution."""
@@ -174,6 +191,9 @@ class Core:
     The search starts from the last optimum's active set, shifted by one step.  PIQP answers the problems that the core
     gives up or finds infeasible, and `answered_by` names it.
 
+    Attributes:
+        shared: the problem's tables.
+
     Raises:
         FileError: the library cannot be compiled or loaded.
         ParameterError: the core cannot take the problem.
@@ -183,15 +203,14 @@ class Core:
     iterates: Final = frozenset({CORE, CORES_SECOND})
 
     def __init__(self, problem: Problem) -> None:
-        self._library, self._shared = core_library(), core_problem(problem)
-        self.formulation = self._shared.condensed
+        self._library, self.shared = core_library(), core_problem(problem)
         self._equilibrium = problem.equilibrium
-        p = self._shared.struct
+        p = self.shared.struct
         # The work struct and its views point into this memory.
         self._memory = np.zeros(self._library.quadsim_work_reals(p))
         self._work = WorkStruct()
         self._library.quadsim_work_start(self._work, p, self._memory.ctypes.data)
-        self._optimum = Optimum(problem, self._shared, self._work)
+        self._optimum = Optimum(problem, self.shared, self._work)
         sizes = p.states, p.horizon * p.regulated, p.states, N_ROTORS, N_ROTORS
         self._query = np.zeros(sum(sizes))
         parts = np.split(self._query, np.cumsum(sizes[:-1]))
@@ -202,6 +221,11 @@ class Core:
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
         raise TypeError("a Core cannot be copied or pickled: make another from its problem")
+
+    @property
+    def formulation(self) -> Condensed:
+        """See `quadsim.mpc.solvers.Solver`."""
+        return self.shared.condensed
 
     def reset(self) -> None:
         """See `quadsim.mpc.solvers.Solver.reset`."""

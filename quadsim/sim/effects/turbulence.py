@@ -20,8 +20,6 @@ out: a quadrotor is much smaller than the scale lengths.
 
 from __future__ import annotations
 
-import copy
-import itertools
 import math
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -29,6 +27,7 @@ from typing import Annotated, Final
 import numpy as np
 from annotated_types import Ge, Le, doc
 
+from quadsim.core.mirror import core_library
 from quadsim.state import Array
 
 LOWEST_HEIGHT, HIGHEST_HEIGHT = 3.048, 304.8
@@ -92,12 +91,13 @@ class Turbulence:
         assert dryden.airspeed is not None, "resolved"
         self._intensities = dryden.intensities
         self._steps = [discretise_filters(timestep * dryden.airspeed / length) for length in dryden.lengths]
-        (self._source,) = rng.spawn(1)
+        (self._rng,) = rng.spawn(1)
+        self._initial = self._rng.bit_generator.state
         self.reset()
 
     def reset(self) -> None:
         """Rewind: the same turbulence again."""
-        self._rng = copy.deepcopy(self._source)
+        self._rng.bit_generator.state = self._initial
         first, second = self._rng.standard_normal((2, 3))
         self._state = np.stack([first, 0.5 * (first + second)])  # of the stationary covariance [[1, 1/2], [1/2, 1/2]]
         self._block, self._used = np.empty((0, 3)), 0
@@ -157,7 +157,7 @@ def discretise_filters(ratio: float) -> tuple[Array, Array]:
 
 
 def first_order(pole: float, drive: Array, before: float) -> Array:
-    """y(k) = pole y(k-1) + drive(k), from y = `before` on; in Python, as scipy.signal takes a second to load."""
-    pole = float(pole)  # as NumPy's numbers take twice the time
-    samples = itertools.accumulate(drive.tolist(), lambda last, driven: pole * last + driven, initial=float(before))
-    return np.fromiter(samples, float, len(drive) + 1)[1:]
+    """y(k) = pole y(k-1) + drive(k), from y = `before` on; compiled, as scipy.signal takes a second to load."""
+    samples = np.array(drive, order="C")
+    core_library().quadsim_first_order(pole, before, len(samples), samples.ctypes.data)
+    return samples

@@ -18,6 +18,8 @@ from quadsim.vehicle import Vehicle
 
 SEA_LEVEL_DENSITY: Final = 1.225
 """Density of air [kg/m^3] at sea level in the International Standard Atmosphere (ISO 2533)."""
+_AHEAD: Final = 2000
+"""Physics steps whose wind is computed ahead."""
 
 
 _Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
@@ -181,12 +183,13 @@ class WindField:
         self._along = (x / speed, y / speed) if speed > 0.0 else (1.0, 0.0)
         self._timestep = timestep
         self._turbulence = None if turbulence is None else Turbulence(turbulence, timestep=timestep, rng=rng)
-        self.reschedule(gusts, changes)
         self.reset()
+        self.reschedule(gusts, changes)
 
     def reset(self) -> None:
         """Rewind: the same wind again."""
-        self._step = 0
+        self._step = self._start = 0
+        self._turbulent, self._wind = np.empty((0, 3)), np.empty((0, 3))
         if self._turbulence is not None:
             self._turbulence.reset()
 
@@ -196,15 +199,34 @@ class WindField:
         self._means = np.array([self._mean, *(change.velocity for change in ordered)], float)
         self._change_times = np.array([change.at for change in ordered])
         self._gusts = gusts
+        self._wind = self._sum_up()
 
     def advance(self, steps: int) -> Array:
         """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame, z up [m/s]."""
-        middles = self._timestep * (np.arange(steps, dtype=np.float64) + (self._step + 0.5))
-        self._step += steps
+        end = self._step + steps
+        if end > self._start + len(self._wind):
+            self._extend(end + _AHEAD)
+        wind = self._wind[self._step - self._start : end - self._start]
+        self._step = end
+        return wind.copy()
+
+    def _extend(self, end: int) -> None:
+        """Compute the wind from now on to a physics step."""
+        left = self._turbulent[self._step - self._start :]
+        more = end - self._step - len(left)
+        fresh = np.zeros((more, 3)) if self._turbulence is None else self._turbulence.advance(more)
+        self._turbulent = np.concatenate([left, fresh])
+        self._start = self._step
+        self._wind = self._sum_up()
+
+    def _sum_up(self) -> Array:
+        """(M, 3) the wind in the physics steps whose turbulence is known, from `_start` on."""
+        steps = np.arange(self._start, self._start + len(self._turbulent), dtype=np.float64)
+        middles = self._timestep * (steps + 0.5)
         wind: Array = self._means[np.searchsorted(self._change_times, middles, side="right")]
         wind += gust_velocity(self._gusts, middles)
         if self._turbulence is None:
             return wind
-        along, across, vertical = self._turbulence.advance(steps).T
+        along, across, vertical = self._turbulent.T
         x, y = self._along  # spelt out, as a matrix product may round by the number of rows
         return wind + np.stack([x * along - y * across, y * along + x * across, vertical], axis=1)

@@ -26,7 +26,7 @@ from quadsim.features.campaign.campaign import CampaignResult as Result
 from quadsim.features.campaign.campaign_file import Choice
 from quadsim.features.campaign.events import parse_event
 from quadsim.features.campaign.plan import Plan, load_plan
-from quadsim.features.campaign.rows import read_table
+from quadsim.features.campaign.rows import TIMES, read_table
 from quadsim.features.campaign.store import read_manifest
 from quadsim.outputs import SUMMARY_FILE, Growing, digest_of
 from quadsim.rollout.machine import processor_name
@@ -430,3 +430,13 @@ def test_a_campaign_whose_files_were_changed_is_not_replayed(flown: Path) -> Non
     path.write_text(path.read_text().replace("duration = 0.5", "duration = 0.6"))
     with pytest.raises(InputError, match=r"scenario\.toml"):
         recorded_flight(flown, 0)
+
+
+def test_rows_of_flights_in_the_core_are_those_of_the_loop() -> None:
+    plan = load_plan("paper-robustness-robust", ["duration=2"])
+    for flight in (0, 1):
+        assert Rollout(plan.of(flight)).core_law is not None
+        row, usual = plan.fly(flight), plan.row_of(flight, Rollout(plan.of(flight)).fly())
+        differing = {name for name in usual if row[name] != usual[name]}
+        assert differing <= {*TIMES}
+        assert row["machine"] == usual["machine"]

@@ -10,6 +10,7 @@ from quadsim.controller import GROUNDED, Command, StepInputs, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.mpc.estimate.observer import disturbance_of
 from quadsim.mpc.guard.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection, resized, shifted
+from quadsim.mpc.laws.parts.core_law import CoreLaw, CoreNumbers, core_law
 from quadsim.mpc.problem.equilibrium import Trim
 from quadsim.mpc.problem.ocp import InfeasiblePeriod, Problem, Query
 from quadsim.mpc.problem.paper import rollout
@@ -20,6 +21,7 @@ from quadsim.mpc.space import ObstacleQP, Space
 from quadsim.state import INDEX, Array, ReferenceTurns
 
 if TYPE_CHECKING:
+    from quadsim.core.mirror import Struct
     from quadsim.mpc.tables.bounded import Bounded
 
 
@@ -47,6 +49,11 @@ class Preparation(Protocol):
     @property
     def delay(self) -> float:
         """Time from t_k to the instant of x(k) [s]."""
+        ...
+
+    @property
+    def numbers(self) -> CoreNumbers | None:
+        """The numbers of a law that is C's; None for another."""
         ...
 
     @property
@@ -101,7 +108,7 @@ class NominalPreparation:
     """The paper's query: the measured state, and the reference on the turn of its yaw, about hover."""
 
     delay = yaw = 0.0
-    trim = disturbance = memory = None
+    trim = disturbance = memory = numbers = None
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self._turns = problem, ReferenceTurns()
@@ -250,6 +257,12 @@ class LinearMPC:
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
         return self.preparation.predict(states, plans)
+
+    def in_core(self, fallback: Struct) -> CoreLaw | None:
+        """Return the law with a fallback contract of these numbers in the core; None where it is not C's alone."""
+        if self._holds or self._obstacles is not None:
+            return None
+        return core_law(self.problem, self.preparation.numbers, self._solver, self._check, fallback)
 
     def _solved(self, time: float, query: Query) -> tuple[Answer, Problem]:
         """Return the optimum of a query whose x(k) is at a time [s], and the problem solved."""

@@ -17,6 +17,7 @@ from quadsim.controller import Phase, StepInputs
 from quadsim.core.mirror import constant, core_library, set_members, struct
 from quadsim.mpc.estimate.disturbance import SAME_TIME
 from quadsim.mpc.estimate.observer import LONGEST_SPAN
+from quadsim.mpc.laws.parts.core_law import CoreNumbers
 from quadsim.mpc.laws.parts.linear import Remembered
 from quadsim.mpc.laws.parts.numbers import controller_numbers, robust_numbers
 from quadsim.mpc.laws.robust import Robust
@@ -89,6 +90,11 @@ class RobustPreparation:
         self._library.quadsim_mpc_reset(self._mpc, self._acting.ctypes.data)
         self._called_at = self._measured = -math.inf
         self._trim: Trim | None = None  # of the estimate now, once it has been asked for
+
+    @property
+    def numbers(self) -> CoreNumbers:
+        """See `quadsim.mpc.laws.parts.linear.Preparation`."""
+        return CoreNumbers(self._controller, self._robust)
 
     @property
     def memory(self) -> Remembered:
