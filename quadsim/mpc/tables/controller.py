@@ -11,6 +11,7 @@ from annotated_types import Ge, Le, doc
 from quadsim.controller import ROTORS, Controller
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import FallbackSettings
+from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement
 from quadsim.mpc.problem.model import LinearModel, hover_model
 from quadsim.mpc.problem.polytope import Polytope
@@ -53,6 +54,10 @@ class ControllerTable:
             InputError: no controller can be built from these numbers.
         """
         raise NotImplementedError(f"the table {type(self).__name__} has no method `law`")
+
+    def attitudes(self) -> AttitudeTargets | None:
+        """Return what makes attitudes of the law's body rates; None where its commands are flown as they are."""
+        return None
 
     def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
         """Return the fallback contract around the law; None without one."""
