@@ -394,7 +394,7 @@ class Assembly:
         spec = self.scenario.controller if spec is None else spec
         if spec.commands != ROTORS and spec.inner_lag is None and is_dataclass(spec):
             spec = replace(spec, inner_lag=self.inner_lag)
-        if spec.commands == ATTITUDE and "attitude_lag" in vars(spec) and spec.attitude_lag is None:
+        if spec.turns_by_attitude and spec.attitude_lag is None and is_dataclass(spec):
             spec = replace(spec, attitude_lag=self.attitude_lag)
         shapes = (*self.scenario.obstacles, *self.regions)
         pilot = build(spec, self.vehicle, self.scenario.control_period, shapes)
@@ -461,7 +461,7 @@ class Assembly:
         flown: dict[str, Any] = {"name": name}
         if lag is not None:
             flown["inner_lag"] = [*lag]
-        attitude_lag = vars(self.scenario.controller).get("attitude_lag") or vars(self).get("attitude_lag")
+        attitude_lag = self.scenario.controller.attitude_lag or vars(self).get("attitude_lag")
         if attitude_lag is not None:
             flown["attitude_lag"] = [*attitude_lag]
         return flown
@@ -526,13 +526,10 @@ class Assembly:
         fallback = (self.scenario.controller if spec is None else spec).fallback
         guarded = fallback is not None and fallback.enabled  # within the fallback contract
         law = self.scenario.controller if spec is None else spec
-        if law.attitudes() is None:
-            stated = filled(settings or ComputationTime(), plan=guarded)
-        else:
-            stated = filled(settings or ComputationTime(), plan=False)
-            if stated.plan:
-                rule = f'false where controller.commands = "{ATTITUDE}": a plan has body rates, not later attitudes'
-                raise ParameterError("computation", "plan", True, rule)
+        stated = filled(settings or ComputationTime(), plan=guarded and not law.turns_by_attitude)
+        if stated.plan and law.turns_by_attitude:
+            rule = f'false where controller.commands = "{ATTITUDE}": a plan has body rates, not later attitudes'
+            raise ParameterError("computation", "plan", True, rule)
         per_iteration = times_by_solver(stated.per_iteration)
         return Computation(**vars(replace(stated, per_iteration=per_iteration)), stalls=stalls)
 

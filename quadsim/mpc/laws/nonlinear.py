@@ -242,7 +242,7 @@ class Nonlinear(ControllerTable):
         """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
         if self.commands != ROTORS:
             require_lags(self.inner_lag)
-        if self.commands == ATTITUDE:
+        if self.turns_by_attitude:
             require_attitude_lag(self.attitude_lag)
         law: Controller = shorthands.nonlinear_mpc(
             vehicle,
@@ -255,11 +255,16 @@ class Nonlinear(ControllerTable):
         )
         return law
 
+    @property
+    def turns_by_attitude(self) -> bool:
+        """See `quadsim.mpc.tables.controller.ControllerTable.turns_by_attitude`."""
+        return self.commands == ATTITUDE
+
     def attitudes(self) -> AttitudeTargets | None:
         """See `quadsim.mpc.tables.controller.ControllerTable.attitudes`."""
-        if self.commands != ATTITUDE or self.attitude_lag is None:
+        if not self.turns_by_attitude:
             return None
-        return AttitudeTargets(self.attitude_lag)
+        return AttitudeTargets(require_attitude_lag(self.attitude_lag))
 
     def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
         """See `quadsim.mpc.tables.controller.ControllerTable.level_hover`."""
