@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from annotated_types import Ge, Gt, Le, Len
+from annotated_types import Ge, Le, Len
 
 from quadsim.errors import ParameterError
 from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.vehicle import Vehicle
 
 LagSeconds = Annotated[float, Ge(0.0), Le(10.0)]
-AttitudeLag = Annotated[tuple[Annotated[float, Gt(0.0), Le(10.0)], ...], Len(3, 3)]
+AttitudeLag = Annotated[tuple[Annotated[float, Ge(1e-3), Le(10.0)], ...], Len(3, 3)]
 ATTITUDE_LAG: Final = (
     "[s] time constants of roll, pitch and yaw behind a commanded attitude, each one over the autopilot's gain from an "
     'attitude error to a body rate; only where commands = "attitude"; absent: identified by steps on the autopilot at '
