@@ -226,6 +226,9 @@ class Nonlinear(ControllerTable):
             "input_bounds": VEHICLES_SPEEDS,
         }
         require_space(self, of_rotors)
+        if self.commands == ATTITUDE and self.delay:
+            rule = f'zero where commands = "{ATTITUDE}", whose rates the autopilot decides'
+            raise ParameterError("", "delay", self.delay, rule)
         if self.commands != ATTITUDE and self.attitude_lag is not None:
             reason = "no attitude is commanded, behind which this is the lag"
             raise ValueError(f'attitude_lag must be absent where commands = "{self.commands}": {reason}')

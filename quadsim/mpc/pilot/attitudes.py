@@ -12,13 +12,19 @@ and predicts that omega_c shrinks as the body turns towards it (`quadsim.mpc.pro
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
-from quadsim.controller import ATTITUDE, TARGET_SIZES
+from quadsim.controller import ATTITUDE, RATES, TARGET_SIZES
 from quadsim.rotation import conjugate, multiply
 from quadsim.state import Array
+
+
+REMEMBERED: Final = 16
+"""Commands of which it is known what the law asked for; more are never under way in a flight that goes on."""
 
 
 class AttitudeTargets:
@@ -30,6 +36,11 @@ class AttitudeTargets:
 
     def __init__(self, attitude_lag: Sequence[float]) -> None:
         self.attitude_lag = np.array(attitude_lag, float)
+        self._sent: deque[tuple[Array, Array]] = deque(maxlen=REMEMBERED)
+
+    def reset(self) -> None:
+        """Forget what was commanded."""
+        self._sent.clear()
 
     def target(self, command: Array, attitude: Array) -> Array:
         """Return T, p, q, r, w, x, y, z (8,) of a command T, p, q, r (4,) at a measured attitude wxyz (4,).
@@ -44,14 +55,22 @@ class AttitudeTargets:
         target = np.zeros(TARGET_SIZES[ATTITUDE])
         target[0] = command[0]
         target[4:] = multiply(attitude, np.array([scalar, *vector]))
+        self._sent.append((target, command.copy()))
         return target
 
     def command(self, target: Array, attitude: Array) -> Array:
-        """Return the thrust and the body rates (4,) that a target (8,) commands at a measured attitude wxyz (4,)."""
+        """Return the thrust and the body rates (4,) that a target (8,) stands for.
+
+        Of a target of its own these are what the law asked for when it was commanded; of another's, what the target
+        commands at a measured attitude wxyz (4,).
+        """
+        for sent, command in reversed(self._sent):
+            if np.array_equal(sent, target):
+                return command.copy()
         error = multiply(conjugate(attitude), target[4:])
         if error[0] < 0.0:  # the shorter way
             error = -error
-        command = np.empty(TARGET_SIZES[ATTITUDE] // 2)
+        command = np.empty(TARGET_SIZES[RATES])
         command[0] = target[0]
         command[1:] = target[1:4] + 2.0 * error[1:] / self.attitude_lag
         return command

@@ -97,6 +97,8 @@ class Pilot:
         The target before the first is hover.
         """
         self._target, self._fresh, self._rates = self._hover, True, np.zeros(3)
+        if self.attitudes is not None:
+            self.attitudes.reset()
         before = self._hover.copy() if self.takes_targets else speeds
         if self.guard is not None:
             before = self.guard.reset(before)
