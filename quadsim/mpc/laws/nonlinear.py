@@ -29,11 +29,22 @@ from quadsim.mpc.problem.polytope import Polytope, rows_of
 from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.problem.rigidbody import RATE_SCALE
 from quadsim.mpc.space import Avoidance, Shape, Space
-from quadsim.mpc.tables.commands import USUAL_TARGETS, Rates, RotorBounds, TargetBounds, require_space
+from quadsim.mpc.tables.commands import (
+    COMMANDS,
+    TARGET_BOUNDS,
+    USUAL_TARGETS,
+    Rates,
+    RotorBounds,
+    TargetBounds,
+    attitude_targets,
+    require_space,
+)
 from quadsim.mpc.tables.controller import ControllerTable, Horizon, KktEvery, Range, ranges, require_ordered
 from quadsim.mpc.tables.lags import (
     ATTITUDE_LAG,
+    INNER_LAG,
     AttitudeLag,
+    InnerLag,
     Lag,
     LagSeconds,
     require_attitude_lag,
@@ -120,25 +131,10 @@ class Nonlinear(ControllerTable):
         bool | None, doc("whether the last plan is shifted by a node; absent: if a node lasts one period")
     ] = None
     substeps: Annotated[int, Ge(1), Le(100), doc("Runge-Kutta steps per node")] = 1
-    commands: Annotated[
-        Literal["rotors", "rates", "attitude"],
-        doc(
-            "what it commands: rotor speeds, or to an autopilot's inner loop collective thrust and body rates, or "
-            "collective thrust and an attitude"
-        ),
-    ] = "rotors"
-    inner_lag: Annotated[
-        Annotated[tuple[LagSeconds, ...], Len(4, 4)] | None,
-        doc(
-            "[s] time constants of thrust, p, q, r behind their targets, 0 for none; only where an autopilot flies; "
-            "absent: identified by steps on the autopilot at set-up"
-        ),
-    ] = None
+    commands: Annotated[Literal["rotors", "rates", "attitude"], doc(COMMANDS)] = "rotors"
+    inner_lag: Annotated[InnerLag | None, doc(INNER_LAG)] = None
     attitude_lag: Annotated[AttitudeLag | None, doc(ATTITUDE_LAG)] = None
-    target_bounds: Annotated[
-        TargetBounds,
-        doc("only where an autopilot flies; of an attitude, bounds on the body rates that its error commands"),
-    ] = USUAL_TARGETS
+    target_bounds: Annotated[TargetBounds, doc(TARGET_BOUNDS)] = USUAL_TARGETS
     inputs: Annotated[Literal["thrust", "speed"], doc("quantity of the inputs, as shares of the rotors' largest")] = (
         "thrust"
     )
@@ -226,12 +222,6 @@ class Nonlinear(ControllerTable):
             "input_bounds": VEHICLES_SPEEDS,
         }
         require_space(self, of_rotors)
-        if self.commands == ATTITUDE and self.delay:
-            rule = f'zero where commands = "{ATTITUDE}", whose rates the autopilot decides'
-            raise ParameterError("", "delay", self.delay, rule)
-        if self.commands != ATTITUDE and self.attitude_lag is not None:
-            reason = "no attitude is commanded, behind which this is the lag"
-            raise ValueError(f'attitude_lag must be absent where commands = "{self.commands}": {reason}')
         speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
         if speeds and self.commands != ROTORS:
             raise ValueError(f'polytopes must be without rotor speeds where commands = "{self.commands}"; got {speeds}')
@@ -265,9 +255,7 @@ class Nonlinear(ControllerTable):
 
     def attitudes(self) -> AttitudeTargets | None:
         """See `quadsim.mpc.tables.controller.ControllerTable.attitudes`."""
-        if not self.turns_by_attitude:
-            return None
-        return AttitudeTargets(require_attitude_lag(self.attitude_lag))
+        return attitude_targets(self)
 
     def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
         """See `quadsim.mpc.tables.controller.ControllerTable.level_hover`."""

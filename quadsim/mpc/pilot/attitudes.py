@@ -22,7 +22,6 @@ from quadsim.controller import ATTITUDE, RATES, TARGET_SIZES
 from quadsim.rotation import conjugate, multiply
 from quadsim.state import Array
 
-
 REMEMBERED: Final = 16
 """Commands of which it is known what the law asked for; more are never under way in a flight that goes on."""
 

@@ -11,6 +11,12 @@ from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.vehicle import Vehicle
 
 LagSeconds = Annotated[float, Ge(0.0), Le(10.0)]
+InnerLag = Annotated[tuple[LagSeconds, ...], Len(4, 4)]
+INNER_LAG: Final = (
+    "[s] time constants of thrust, p, q, r behind their targets, 0 for none; only where an autopilot flies; "
+    "absent: identified by steps on the autopilot at set-up"
+)
+"""Meaning of the field `inner_lag`."""
 AttitudeLag = Annotated[tuple[Annotated[float, Ge(1e-3), Le(10.0)], ...], Len(3, 3)]
 ATTITUDE_LAG: Final = (
     "[s] time constants of roll, pitch and yaw behind a commanded attitude, each one over the autopilot's gain from an "

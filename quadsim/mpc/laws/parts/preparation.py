@@ -22,7 +22,6 @@ from quadsim.mpc.laws.parts.numbers import controller_numbers, robust_numbers
 from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.problem.equilibrium import Trim
 from quadsim.mpc.problem.heading import predict_in_heading_frame
-from quadsim.mpc.problem.model import hover_model
 from quadsim.mpc.problem.ocp import Equilibrium, Problem, Query
 from quadsim.mpc.solvers.core_tables import rotor_states
 from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
@@ -45,7 +44,8 @@ class RobustPreparation:
 
     def __init__(self, vehicle: Vehicle, problem: Problem, settings: Robust) -> None:
         self.problem, self.delay = problem, settings.delay
-        self._library, self._nominal = core_library(), hover_model(vehicle, problem.model.period)
+        self._library = core_library()
+        self._nominal = settings.level_hover(vehicle, problem.model.period)
         self._robust = struct("quadsim_robust")()
         set_members(self._robust, **robust_numbers(settings, vehicle, problem.model.period))
         self._C_r = np.ascontiguousarray(problem.objective.C_r)
@@ -76,7 +76,7 @@ class RobustPreparation:
         self._estimate = np.ctypeslib.as_array(mpc.estimate)
         self._state, self._reference, self._acting = np.zeros(N_STATES), np.zeros((N, 4)), np.zeros(N_ROTORS)
         self._inputs = [array.ctypes.data for array in (self._state, self._reference, self._acting)]
-        self.reset(vehicle.hover_speeds)
+        self.reset(problem.model.u_bar)
 
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
