@@ -137,11 +137,12 @@ def test_worn_rotors_and_wind_leave_no_offset(commands: str) -> None:
     assert (flight.log.control.target_attitude is not None) == (commands == "attitude")
 
 
-def test_it_holds_its_place_in_wind_at_any_heading() -> None:
+def test_it_holds_its_place_in_wind_while_it_turns() -> None:
     start = {"reference": {"type": "steps"}, "initial.position": [0.3, -0.2, 1.0], "initial.euler": [0.0, 0.0, 130.0]}
     flight = flown("attitude", **start, duration=5.0)
     assert flight.log.reason is None
-    assert np.degrees(flight.state["yaw"][-1]) == pytest.approx(130.0, abs=1.0)
+    assert np.degrees(flight.state["yaw"][0]) == pytest.approx(130.0, abs=1.0)
+    assert np.degrees(flight.state["yaw"][-1]) == pytest.approx(0.0, abs=1.0)
     assert [flight.state[axis][-1] for axis in "xy"] == pytest.approx([0.3, -0.2], abs=0.01)
 
 
