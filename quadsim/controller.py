@@ -37,8 +37,22 @@ NO_OPTIMUM: Final = frozenset({LAW, FALLBACK, STOPPED})
 NO_SOLVER: Final = frozenset({GAIN, CORE}) | NO_OPTIMUM
 """Sources of a command other than QP solvers, which are recorded by name (`quadsim.mpc.solvers.find_solver`)."""
 ROTORS: Final = "rotors"
-"""Commands of rotor speeds; others are targets of an autopilot: `rates` (4,), `attitude` (8,)."""
-TARGET_SIZES: Final = {ROTORS: 4, "rates": 4, "attitude": 8}
+"""Commands of rotor speeds; others are targets of an autopilot."""
+RATES: Final = "rates"
+"""Targets (4,): collective thrust T [N] and body rates p, q, r [rad/s]."""
+ATTITUDE: Final = "attitude"
+"""Targets (8,): collective thrust T [N], body rates p, q, r [rad/s] that are fed forward, and the attitude to hold, a
+quaternion w, x, y, z, body to world."""
+COMMANDED_NUMBERS: Final = {
+    ROTORS: "four rotor speeds [rad/s]",
+    RATES: "T, p, q, r: collective thrust [N] and body rates [rad/s]",
+    ATTITUDE: (
+        "T, p, q, r, w, x, y, z: collective thrust [N], body rates that are fed forward [rad/s], and the attitude, a "
+        "unit quaternion from body to world"
+    ),
+}
+"""What a controller commands (its attribute or field `commands`), in words."""
+TARGET_SIZES: Final = {ROTORS: 4, RATES: 4, ATTITUDE: 8}
 """What a controller commands (its attribute or field `commands`), and the numbers in a command."""
 LARGEST_SPEED: Final = LARGEST
 """Largest magnitude of a valid rotor speed command [rad/s], that of a vehicle's numbers; a larger one is a fault."""

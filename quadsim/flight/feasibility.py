@@ -22,6 +22,8 @@ import numpy as np
 from quadsim.flight.audit import Mask
 from quadsim.rotation import euler_to_body_rates
 from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
     EULER,
     EULER_RATE,
     INDEX,
@@ -39,6 +41,10 @@ from quadsim.vehicle import Vehicle
 STENCIL: Final = 2  # samples on either side that a torque depends on
 DIFFERENCE_ROUNDING: Final = 1e-6
 """Tolerances of a bound, relative and absolute, for rounding in the differences."""
+
+
+BODY_RATES: Final = ("body_rate_x", "body_rate_y", "body_rate_z")
+"""Bounds on body rates, by their signals."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +153,7 @@ def assess(
         needed: the demands.
         vehicle: its rotor limits count.
         bounds: lower and upper bounds by name, in file units: a state of `quadsim.state`, `speed` [rad/s] of the rotors
-            or `slew` [rad/s per period].
+            or `slew` [rad/s per period]; or `thrust` [N] and the `BODY_RATES` [deg/s] of an autopilot's targets.
         tightened: the bounds on states after tightening at the end of the horizon; checked if the bounds themselves
             hold.
         jumps: times [s] at which the course jumps.
@@ -199,6 +205,12 @@ def _problems(
         elif name == "slew":
             slews = needed.slews[np.isfinite(needed.slews)]
             problems += _beyond("change of rotor speed", "rad/s per period", slews, (lower, upper), "bound")
+        elif name == "thrust":
+            problems += _beyond("thrust", "N", needed.thrust, (lower, upper), "bound")
+        elif name in BODY_RATES:
+            rates = euler_to_body_rates(needed.state[:, ANGLES], needed.state[:, ANGLE_RATES])
+            about_axis = np.degrees(rates[:, BODY_RATES.index(name)])
+            problems += _beyond(name, "deg/s", about_axis, (lower, upper), "bound")
         else:
             unit, scale = shown_unit(STATE_UNITS[INDEX[name]])
             values = scale * needed.state[:, INDEX[name]]

@@ -218,8 +218,12 @@ class _Case:
     def _helps(self, settings: Settings) -> bool:
         """Return whether the period has an answer with these fields."""
         spec = self._changed(settings)
-        if spec is None or spec.input_bounds.speed[1] > max(self._vehicle.speed_max, self._spec.input_bounds.speed[1]):
+        if spec is None:
             return False
+        if spec.input_bounds is not None and self._spec.input_bounds is not None:
+            fastest = max(self._vehicle.speed_max, self._spec.input_bounds.speed[1])
+            if spec.input_bounds.speed[1] > fastest:
+                return False
         try:
             problem = spec.problem(self._vehicle, self._period)
         except InputError:

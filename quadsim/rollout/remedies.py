@@ -235,7 +235,7 @@ def _rate_text(entry: Mapping[str, Any]) -> str:
 def _reaching_hover(scenario: Scenario, assembly: Assembly) -> list[dict[str, Any]]:
     """Return the change that gives the bound on rotor speeds room about hover, as far as the rotors have it."""
     spec, vehicle, hover = scenario.controller, assembly.vehicle, hover_speeds(assembly)
-    if not isinstance(spec, Constrained | Robust):
+    if not isinstance(spec, Constrained | Robust) or spec.input_bounds is None:
         return []
     lower, upper = spec.input_bounds.speed
     ends = (-1.0, float(hover.min())), (1.0, float(hover.max()))

@@ -16,7 +16,7 @@ import numpy as np
 
 from quadsim.assets import vehicle_path
 from quadsim.border import user_code
-from quadsim.controller import CORE, ROTORS
+from quadsim.controller import ATTITUDE, CORE, ROTORS
 from quadsim.errors import InputError, ParameterError, QuadsimError
 from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
@@ -36,7 +36,14 @@ from quadsim.scenarios.schema.events import ControllerEvent, Event, SensorFaultE
 from quadsim.scenarios.schema.problems import parse_table
 from quadsim.scenarios.schema.writing import plain
 from quadsim.sim.airframe import outline
-from quadsim.sim.autopilot import Autopilot, AutopilotSettings, built_in_lags, identify_lags
+from quadsim.sim.autopilot import (
+    Autopilot,
+    AutopilotSettings,
+    built_in_attitude_lags,
+    built_in_lags,
+    identify_attitude_lags,
+    identify_lags,
+)
 from quadsim.sim.computation import Computation, ComputationTime, Stall, check_measured, times_by_solver
 from quadsim.sim.effects import Change, Disturbance, Effects, Force, Push, push_changes
 from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss, efficiency_changes
@@ -88,7 +95,16 @@ _SIZES: Final = {
     "rotor_radius": ("ground", "rotor_radius", None),
 }
 """Vehicle parameters that act in an effect: its table, the field that also states it, and the switch of the effect."""
-_OF_ALL_EVENTS: Final = ("vehicle", "autopilot", "user_autopilot", "inner_lag", "actual", "effects", "course")
+_OF_ALL_EVENTS: Final = (
+    "vehicle",
+    "autopilot",
+    "user_autopilot",
+    "inner_lag",
+    "attitude_lag",
+    "actual",
+    "effects",
+    "course",
+)
 """Parts that do not depend on events, controller or duration."""
 
 
@@ -387,6 +403,8 @@ class Assembly:
         spec = self.scenario.controller if spec is None else spec
         if spec.commands != ROTORS and spec.inner_lag is None and is_dataclass(spec):
             spec = replace(spec, inner_lag=self.inner_lag)
+        if spec.turns_by_attitude and spec.attitude_lag is None and is_dataclass(spec):
+            spec = replace(spec, attitude_lag=self.attitude_lag)
         shapes = (*self.scenario.obstacles, *self.regions)
         pilot = build(spec, self.vehicle, self.scenario.control_period, shapes)
         check_measured(self.scenario.computation, pilot)
@@ -418,7 +436,7 @@ class Assembly:
             return pilot
         with self._calling_autopilot():
             autopilot = self.user_autopilot or Autopilot(self.vehicle, self.autopilot)
-            return Pilot(pilot.law, self.vehicle, guard=pilot.guard, inner=autopilot)
+            return Pilot(pilot.law, self.vehicle, guard=pilot.guard, inner=autopilot, attitudes=pilot.attitudes)
 
     @cached_property
     def inner_lag(self) -> tuple[float, ...]:
@@ -429,6 +447,17 @@ class Assembly:
                 return identify_lags(self.vehicle, self.user_autopilot, timestep=timestep)
         return built_in_lags(self.vehicle, self.autopilot or AutopilotSettings(), timestep)
 
+    @cached_property
+    def attitude_lag(self) -> tuple[float, ...]:
+        """(3,) lags of roll, pitch and yaw behind a commanded attitude [s], by a step on the autopilot."""
+        timestep = self.scenario.plant.timestep
+        rate_lags = tuple(self.scenario.controller.inner_lag or self.inner_lag)
+        if self.user_autopilot is not None:
+            with self._calling_autopilot():
+                return identify_attitude_lags(self.vehicle, self.user_autopilot, rate_lags[1:], timestep=timestep)
+        settings = self.autopilot or AutopilotSettings()
+        return built_in_attitude_lags(self.vehicle, settings, rate_lags[1:], timestep)
+
     def _calling_autopilot(self) -> AbstractContextManager[None]:
         what = f"autopilot: {type(self.user_autopilot).__name__} cannot be used"
         return user_code(lambda error: InputError(f"{what}: {reason_of(error)}"), passing=(QuadsimError,))
@@ -438,7 +467,13 @@ class Assembly:
         """What flew the targets: the class of an autopilot passed in, or `built-in`, and the lags that the law knew."""
         name = "built-in" if self.user_autopilot is None else type(self.user_autopilot).__name__
         lag = self.scenario.controller.inner_lag or vars(self).get("inner_lag")
-        return {"name": name, **({} if lag is None else {"inner_lag": [*lag]})}
+        flown: dict[str, Any] = {"name": name}
+        if lag is not None:
+            flown["inner_lag"] = [*lag]
+        attitude_lag = self.scenario.controller.attitude_lag or vars(self).get("attitude_lag")
+        if attitude_lag is not None:
+            flown["attitude_lag"] = [*attitude_lag]
+        return flown
 
     def problem(self) -> Problem:
         """The controller's optimisation.
@@ -499,7 +534,11 @@ class Assembly:
             return None
         fallback = (self.scenario.controller if spec is None else spec).fallback
         guarded = fallback is not None and fallback.enabled  # within the fallback contract
-        stated = filled(settings or ComputationTime(), plan=guarded)
+        law = self.scenario.controller if spec is None else spec
+        stated = filled(settings or ComputationTime(), plan=guarded and not law.turns_by_attitude)
+        if stated.plan and law.turns_by_attitude:
+            rule = f'false where controller.commands = "{ATTITUDE}": a plan has body rates, not later attitudes'
+            raise ParameterError("computation", "plan", True, rule)
         per_iteration = times_by_solver(stated.per_iteration)
         return Computation(**vars(replace(stated, per_iteration=per_iteration)), stalls=stalls)
 

@@ -317,9 +317,7 @@ def _lag_remedy(spec: AnyController, assembly: Assembly, lag: float) -> list[str
 
 
 def _predicts_ideal_rotors(spec: AnyController, assembly: Assembly) -> bool:
-    if isinstance(spec, Robust):
-        return resolved_lag(spec.rotor_lag, assembly.vehicle) == 0.0
-    if isinstance(spec, Nonlinear):  # an autopilot's lags include that of its rotors
+    if isinstance(spec, Robust | Nonlinear):  # an autopilot's lags include that of its rotors
         return spec.commands == ROTORS and resolved_lag(spec.rotor_lag, assembly.vehicle) == 0.0
     return isinstance(spec, Weighted)
 

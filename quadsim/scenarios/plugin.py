@@ -28,6 +28,7 @@ from annotated_types import doc
 from quadsim import border
 from quadsim.border import numbers_of, user_code
 from quadsim.controller import (
+    COMMANDED_NUMBERS,
     LAW,
     NO_STATISTICS,
     ROTORS,
@@ -243,8 +244,8 @@ class PluginController:
                 raise ValueError("its inner loop must have a positive rate")
             return replace(answer, **parts)
         except (AttributeError, TypeError, ValueError) as error:
-            what = "speeds" if self.commands == ROTORS else "numbers of a target"
-            problem = f"{self.name} answered {answer!r:.100}, neither {self._size} {what} nor a Command: {error}"
+            what = COMMANDED_NUMBERS[self.commands]
+            problem = f"{self.name} answered {answer!r:.100}, neither {what}, nor a Command: {error}"
             raise CommandError(problem, time=now.time) from error
 
 

@@ -17,6 +17,7 @@ Gains that a file does not state follow from the vehicle (`AutopilotSettings.res
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Final
@@ -30,6 +31,7 @@ from quadsim.core.mirror import fill
 from quadsim.core.structs import InnerStruct, LoopKind
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Fraction, Hertz, NonNegative, filled, require_floor
+from quadsim.mpc.problem.rigidbody import inner_response
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.physics import PHYSICS, inner_steps, whole
@@ -184,6 +186,9 @@ STEPS: Final = (0.1, 1.0, 1.0, 0.5)
 """Steps by which lags are identified: of the weight, and of body rates [rad/s]."""
 FIT_WINDOW: Final = 0.3  # time of a step response that is fitted [s]
 SHORTEST_FITTED_LAG, LONGEST_FITTED_LAG = 1e-4, 0.6  # [s]
+ATTITUDE_STEP: Final = 0.1
+"""Step by which lags of an attitude are identified [rad]."""
+SHORTEST_ATTITUDE_LAG, LONGEST_ATTITUDE_LAG = 0.01, 5.0  # [s]
 
 
 def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float = 1e-3) -> tuple[float, ...]:
@@ -194,11 +199,9 @@ def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float
     """
     from scipy.optimize import minimize_scalar  # slow to import
 
-    rise, fall = vehicle.rotor_rise or 0.0, vehicle.rotor_fall or vehicle.rotor_rise or 0.0
-    rotors = RotorDynamics(rise=rise or None, fall=fall or None, inertia=None if rise else 0.0).resolved(vehicle)
     times = np.arange(1, round(FIT_WINDOW / timestep) + 1) * timestep
     lags = []
-    with Plant(vehicle, timestep=timestep, effects=Effects(rotors=rotors), limit_speeds=True) as plant:
+    with _step_plant(vehicle, timestep) as plant:
         for axis in range(4):
             response = _step_response(plant, autopilot, axis)
 
@@ -213,25 +216,53 @@ def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float
     return tuple(lags)
 
 
+def identify_attitude_lags(
+    vehicle: Vehicle, autopilot: AutopilotLoop, rate_lags: Sequence[float], *, timestep: float = 1e-3
+) -> tuple[float, ...]:
+    """Return the lags of roll, pitch and yaw [s] behind a commanded attitude that fit its step responses best.
+
+    It steps each angle from hover, as `identify_lags` steps body rates, whose lags p, q, r are given [s].  The model is
+    `quadsim.mpc.problem.rigidbody.inner_response`: a lag is one over the gain from the attitude's error to a rate.
+    """
+    from scipy.optimize import minimize_scalar  # slow to import
+
+    count = round(FIT_WINDOW / timestep)
+    lags = []
+    with _step_plant(vehicle, timestep) as plant:
+        for axis, rate_lag in enumerate(rate_lags):
+            response = _attitude_response(plant, autopilot, axis)
+
+            def misfit(lag: float, response: Array = response, rate_lag: float = rate_lag) -> float:
+                left, taken = inner_response(timestep, count + 1, rate_lag, lag)
+                rates = (1.0 - left - taken)[1:] / lag
+                return float(np.square(rates - response).sum())
+
+            bounds = (SHORTEST_ATTITUDE_LAG, LONGEST_ATTITUDE_LAG)
+            lag = float(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
+            if lag > 0.95 * LONGEST_ATTITUDE_LAG:
+                name = ("roll", "pitch", "yaw")[axis]
+                raise InputError(f"autopilot: a step of {name} is not reached, so no lag fits it; state attitude_lag")
+            lags.append(lag)
+    return tuple(lags)
+
+
+def _step_plant(vehicle: Vehicle, timestep: float) -> Plant:
+    """Return a plant with the vehicle's rotor lag and without other effects, on which an autopilot is stepped."""
+    rise = vehicle.rotor_rise or 0.0
+    fall = vehicle.rotor_fall or rise
+    inertia = None if rise else 0.0
+    rotors = RotorDynamics(rise=rise or None, fall=fall or None, inertia=inertia).resolved(vehicle)
+    return Plant(vehicle, timestep=timestep, effects=Effects(rotors=rotors), limit_speeds=True)
+
+
 def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
     """(WINDOW / timestep,) the share of a step of a target, 0 thrust, 1 to 3 body rates, that is reached."""
-    vehicle, count = plant.vehicle, round(FIT_WINDOW / plant.timestep)
-    stride = inner_steps(autopilot.rate, plant.timestep, "autopilot")
+    vehicle = plant.vehicle
     weight = vehicle.mass * vehicle.gravity
-    target, size = np.array([weight, 0.0, 0.0, 0.0]), STEPS[axis] * (weight if axis == 0 else 1.0)
-    plant.reset(np.zeros(N_STATES))
-    autopilot.reset()
+    target = np.array([weight, 0.0, 0.0, 0.0])
+    size = STEPS[axis] * (weight if axis == 0 else 1.0)
     target[axis] += size
-
-    def answer() -> Array:
-        attitude, rates = plant.attitude
-        return autopilot.speeds(plant.time, target, rates, plant.speeds, attitude)
-
-    struct = autopilot.engage(target, plant.speeds) if isinstance(autopilot, CompiledLoop) else None
-    loop = struct or InnerStruct(kind=LoopKind.OUTSIDE)
-    loop.until, loop.stride = 0, stride
-    plant.begin(count)
-    plant.hold(target, count, loop=loop, ask=answer)
+    _fly_target(plant, autopilot, target)
     if axis:
         reached: Array = plant.flown["physics"][:, PHYSICS["body_rates"]][:, axis - 1] / size
         return reached
@@ -240,7 +271,46 @@ def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
     return np.asarray((vehicle.mean_coefficient * squares.sum(axis=1) - weight) / size)
 
 
+def _attitude_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
+    """(WINDOW / timestep,) the body rate about an axis, 0 to 2, after a step of the attitude, over its error [1/s]."""
+    half = 0.5 * ATTITUDE_STEP
+    target = np.zeros(8)
+    target[0] = plant.vehicle.mass * plant.vehicle.gravity
+    target[4] = math.cos(half)
+    target[5 + axis] = math.sin(half)
+    _fly_target(plant, autopilot, target)
+    response: Array = plant.flown["physics"][:, PHYSICS["body_rates"]][:, axis] / (2.0 * math.sin(half))
+    return response
+
+
+def _fly_target(plant: Plant, autopilot: AutopilotLoop, target: Array) -> None:
+    """Fly the window of a fit from hover under a target, which the autopilot holds."""
+    count = round(FIT_WINDOW / plant.timestep)
+    stride = inner_steps(autopilot.rate, plant.timestep, "autopilot")
+    plant.reset(np.zeros(N_STATES))
+    autopilot.reset()
+
+    def answer() -> Array:
+        attitude, rates = plant.attitude
+        return autopilot.speeds(plant.time, target, rates, plant.speeds, attitude)
+
+    struct = autopilot.engage(target, plant.speeds) if isinstance(autopilot, CompiledLoop) else None
+    loop = struct or InnerStruct(kind=LoopKind.OUTSIDE)
+    loop.until = 0
+    loop.stride = stride
+    plant.begin(count)
+    plant.hold(target, count, loop=loop, ask=answer)
+
+
 @cache
 def built_in_lags(vehicle: Vehicle, settings: AutopilotSettings, timestep: float) -> tuple[float, ...]:
     """`identify_lags` of the built-in autopilot, kept: a campaign asks for the same one in every flight."""
     return identify_lags(vehicle, Autopilot(vehicle, settings), timestep=timestep)
+
+
+@cache
+def built_in_attitude_lags(
+    vehicle: Vehicle, settings: AutopilotSettings, rate_lags: tuple[float, ...], timestep: float
+) -> tuple[float, ...]:
+    """`identify_attitude_lags` of the built-in autopilot, kept likewise."""
+    return identify_attitude_lags(vehicle, Autopilot(vehicle, settings), rate_lags, timestep=timestep)

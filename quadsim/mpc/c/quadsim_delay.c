@@ -6,7 +6,7 @@
 /* What a step leaves of actuators' distance from their inputs [4]. */
 static const real *left_after(const quadsim_nmpc_problem *body)
 {
-    return body->left + 2 * body->substeps * NU;
+    return body->left + 2 * body->substeps * LEFT;
 }
 
 /* Shares some steps after, under a command. */

@@ -17,7 +17,10 @@
  *     x(k+1) = x_s + A (x(k) - x_s) + B (u(k) - u_s),
  *
  * and u_s is the target of the inputs: a loop that settles with no bound active has no steady error, whatever the errors
- * of A and B.  With the air's moment, u_s balances what it does at x(k) beyond A. */
+ * of A and B.  With the air's moment, u_s balances what it does at x(k) beyond A.
+ *
+ * Where an inner loop turns the vehicle, U is commanded, and omega is known at every instant from its targets
+ * (quadsim/mpc/problem/rigidbody.py): omega = a omega(0) + (1 - a - b) omega_c.  There is no twist then. */
 #include "quadsim_mpc.h"
 
 #include <stddef.h>
@@ -177,16 +180,71 @@ static void find_disturbance(const quadsim_mpc *mpc, const real axis[3], real ac
     acceleration[2] = mpc->estimate[2] * axis[2];
 }
 
+/* Give a state the rates of Euler angles that body rates are. */
+static void put_body_rates(const real w[3], real *state)
+{
+    real s[3], k[3], yaw;
+    sines_of(state, s, k);
+    yaw = (w[1] * s[0] + w[2] * k[0]) / k[1];
+    state[ROLL + 1] = w[0] + yaw * s[1];
+    state[PITCH + 1] = w[1] * k[0] - w[2] * s[0];
+    state[YAW + 1] = yaw;
+}
+
+/* The state some time [s] later under an inner loop's targets: place, velocity and attitude by Runge-Kutta's classical
+ * method, body rates as `answer` [SUBSTEPS][4][6] has them at its instants. */
+static void predict_targets(const quadsim_mpc *mpc, real time, const real *answer, const real *command, real *state)
+{
+    static const real PART[4] = {R(0.0), R(0.5), R(0.5), R(1.0)}, WEIGHT[4] = {R(1.0), R(2.0), R(2.0), R(1.0)};
+    const quadsim_robust *robust = mpc->controller->robust;
+    const real step = time / (real)QUADSIM_SUBSTEPS;
+    real start[3], w[3], axis[3], disturbance[3], rates[12];
+    int k, stage, i;
+    axis_at(state, axis);
+    find_disturbance(mpc, axis, disturbance);
+    body_rates(state, start);
+    for (k = 0; k < QUADSIM_SUBSTEPS; k++) {
+        real sum[12] = {R(0.0)};
+        memset(rates, 0, sizeof(rates));
+        for (stage = 0; stage < 4; stage++, answer += 6) {
+            real at[12], s[3], c[3], push[3];
+            moved(state, PART[stage] * step, rates, at);
+            for (i = 0; i < 3; i++) {
+                const real target = command[1 + i];
+                w[i] = target + answer[i] * (start[i] - target) - answer[3 + i] * target;
+            }
+            put_body_rates(w, at);
+            sines_of(at, s, c);
+            push_of(command[0] / robust->mass, s, c, push);
+            for (i = 0; i < 3; i++) {
+                rates[2 * i] = at[2 * i + 1];
+                rates[2 * i + 1] = push[i] + disturbance[i];
+                rates[ROLL + 2 * i] = at[ROLL + 2 * i + 1];
+            }
+            rates[VZ] -= robust->gravity;
+            for (i = 0; i < 12; i++) {
+                sum[i] += WEIGHT[stage] * rates[i];
+            }
+        }
+        moved(state, step / R(6.0), sum, state);
+        put_body_rates(w, state);
+    }
+}
+
 /* The state some time [s] later under a command, by Runge-Kutta's classical method; decay [SUBSTEPS][4] of the rotors'
  * speeds at its instants. */
-static void predict_state(const quadsim_mpc *mpc, real time, const real *decay, const real *rotors, const real *command,
-                          real *state)
+static void predict_state(const quadsim_mpc *mpc, real time, const real *decay, const real *answer, const real *rotors,
+                          const real *command, real *state)
 {
     const quadsim_robust *robust = mpc->controller->robust;
     const real step = time / (real)QUADSIM_SUBSTEPS;
     real axis[3], disturbance[3], drive[NU + 1], rates[4][12], at[12];
     int k, i;
     if (!(time > R(1e-9))) {
+        return;
+    }
+    if (robust->targets) {
+        predict_targets(mpc, time, answer, command, state);
         return;
     }
     axis_at(state, axis);
@@ -231,6 +289,11 @@ static void update_trim(quadsim_mpc *mpc)
     mpc->trim.lift[0] = -acceleration[0];
     mpc->trim.lift[1] = -acceleration[1];
     mpc->trim.lift[2] = up;
+    if (r->targets) {
+        memset(mpc->trim.commands, 0, sizeof(mpc->trim.commands));
+        mpc->trim.commands[0] = r->mass * thrust;
+        return;
+    }
     memcpy(mpc->effectiveness, r->effectiveness, sizeof(mpc->effectiveness));
     drive[0] = thrust;
     for (i = 0; i < 3; i++) {
@@ -277,6 +340,10 @@ static void update_resting(quadsim_mpc *mpc, const real *ahead)
     const real *rest = mpc->trim.commands;
     real excess_thrust = R(0.0), beyond[NU];
     int j;
+    if (r->targets) {
+        memcpy(mpc->resting, rest, sizeof(mpc->resting));
+        return;
+    }
     for (j = 0; j < NU; j++) {
         excess_thrust += r->effectiveness[j] * (mpc->turning[j] * mpc->turning[j] - rest[j] * rest[j]);
     }
@@ -460,14 +527,14 @@ static int predict_ahead(quadsim_mpc *mpc, const real *state, int learns, real a
     spin(mpc->rotors, in_force, r->spun_before);
     if (state != NULL && r->observes && mpc->known && learns) {
         memcpy(expected, mpc->ahead, sizeof(expected));
-        predict_state(mpc, r->rest_of_period, r->decay_before, before, in_force, expected);
+        predict_state(mpc, r->rest_of_period, r->decay_before, r->answer_before, before, in_force, expected);
         if (is_finite(expected, 12)) {
             observe_state(mpc, state, expected);
         }
     }
     if (state != NULL) {
         memcpy(mpc->ahead, state, sizeof(mpc->ahead));
-        predict_state(mpc, r->delay, r->decay_delay, mpc->rotors, in_force, mpc->ahead);
+        predict_state(mpc, r->delay, r->decay_delay, r->answer_delay, mpc->rotors, in_force, mpc->ahead);
     }
     spin(mpc->rotors, in_force, r->spun_delay);
     memcpy(ahead, mpc->ahead, sizeof(mpc->ahead));
@@ -475,7 +542,7 @@ static int predict_ahead(quadsim_mpc *mpc, const real *state, int learns, real a
     for (i = 1; i <= r->under_way; i++) {
         const real *next = sent_command(mpc, i, acting);
         if (state != NULL) {
-            predict_state(mpc, r->period, r->decay_period, mpc->turning, next, ahead);
+            predict_state(mpc, r->period, r->decay_period, r->answer_period, mpc->turning, next, ahead);
         }
         spin(mpc->turning, next, r->spun_period);
     }

@@ -7,7 +7,8 @@
  * reference [N][4]  x y z yaw [m, rad], where to be one period from now, two, ... N periods from now; whole turns of
  *                   yaw make no difference
  * acting [4]        the command before, u(k-1), in force up to now unless it is still under way [rad/s]
- * command [4]       rotor speeds to hold for the period [rad/s], rotors in the vehicle file's order
+ * command [4]       rotor speeds to hold for the period [rad/s], rotors in the vehicle file's order; or targets of an
+ *                   inner loop: thrust [N] and body rates [rad/s]
  *
  * A controller's numbers are a quadsim_controller, which is read only and may be shared.  All that a controller
  * remembers is in a quadsim_mpc and its memory of quadsim_mpc_reals(controller) numbers, both of the caller's.  Nothing
@@ -24,12 +25,14 @@ extern "C" {
 /* Runge-Kutta steps of a prediction.  Over 50 ms from 30 deg of tilt, turning at 2 rad/s, with commands 50 rad/s apart,
  * two have errors of 1e-5 rad, or 3e-4 rad with a rotor lag of 20 ms; one has ten times as much. */
 enum { QUADSIM_SUBSTEPS = 2 };
+enum { QUADSIM_ANSWER = 4 * 6 }; /* numbers of an inner loop's answer in such a step */
 enum { QUADSIM_LAW_STATES = 16 }; /* of a problem: 12, and 4 that stand for rotor speeds where these lag */
 
 /* The robust controller's numbers besides those of its problem.  Matrices are row by row. */
 typedef struct quadsim_robust {
     int observes;                                      /* whether disturbances are estimated */
     int heading;                                       /* whether the model is turned by the yaw */
+    int targets;                                       /* whether commands are an inner loop's targets: T, p, q, r */
     int under_way;                                     /* whole periods that a command takes to act, before delay */
     quadsim_real gravity;                              /* [m/s^2] */
     quadsim_real least_lift, upright;                  /* least shares of weight, and of thrust along z */
@@ -48,6 +51,10 @@ typedef struct quadsim_robust {
     quadsim_real decay_before[QUADSIM_SUBSTEPS * 4];                   /* shares left at instants of rest_of_period */
     quadsim_real decay_delay[QUADSIM_SUBSTEPS * 4];                    /* of delay */
     quadsim_real decay_period[QUADSIM_SUBSTEPS * 4];                   /* and of a period */
+    quadsim_real mass;                                                 /* of targets: [kg] */
+    quadsim_real answer_before[QUADSIM_SUBSTEPS * QUADSIM_ANSWER];     /* what is left of body rates [3] and what the turn */
+    quadsim_real answer_delay[QUADSIM_SUBSTEPS * QUADSIM_ANSWER];      /* takes of their targets [3], at those instants */
+    quadsim_real answer_period[QUADSIM_SUBSTEPS * QUADSIM_ANSWER];
     quadsim_real plausible_state[12], plausible_reference[4];          /* most that is taken for a measurement */
 } quadsim_robust;
 

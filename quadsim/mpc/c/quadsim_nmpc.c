@@ -139,7 +139,7 @@ static void follow(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, con
             const real scale = j > 0 ? p->effect[5 * j] : R(1.0);
             const real now = work->goal[i * n + (j > 0 ? W + j - 1 : BODY)] / scale;
             const real next = work->goal[(i + 1) * n + (j > 0 ? W + j - 1 : BODY)] / scale;
-            const real target = R(0.5) * (now + next) + p->lead[j] * (next - now);
+            const real target = p->hold[j] * (R(0.5) * (now + next)) + p->lead[j] * (next - now);
             work->aim[i * NU + j] = clipped(target, p->lower[j], p->upper[j]);
         }
     }

@@ -26,6 +26,7 @@ enum {
     QUADSIM_NMPC_BODY = 13,
     QUADSIM_NMPC_MOST = QUADSIM_NMPC_BODY + 8, /* states */
     QUADSIM_NMPC_SIDES = 12,                   /* of the polygon that bounds the tilt */
+    QUADSIM_NMPC_LEFT = 8,                     /* columns of `left` */
     QUADSIM_NMPC_ENTRIES = 15                  /* bounded quantities of a node: inputs, tilt, rates, position, velocity */
 };
 
@@ -67,8 +68,10 @@ typedef struct quadsim_nmpc_problem {
                                          * rotors' speeds as shares, and per velocity along z, and [3][3] of body rates,
                                          * which it opposes */
     quadsim_real loss;          /* T per sum of the rotors' speeds as shares and velocity along z, which it opposes */
-    quadsim_real lead[4];       /* targets: time constants over the step, for the reference */
-    const quadsim_real *left;   /* [2 substeps + 1][4] of a distance from the input, after each half substep */
+    quadsim_real lead[4];       /* targets: time constants over the step, for the reference, */
+    quadsim_real hold[4];       /* and what a step's mean takes of them: 1, above it where an attitude is commanded */
+    const quadsim_real *left;   /* [2 substeps + 1][QUADSIM_NMPC_LEFT] after each half substep: what is left of a distance
+                                 * from the input [4]; of an attitude's targets, what the turn so far takes of them [4] */
     quadsim_real weight[QUADSIM_NMPC_MOST], effort[QUADSIM_INPUTS], move; /* diagonals of Q and R; of steps of inputs */
     const quadsim_real *terminal;                                         /* [n][n], symmetric */
     quadsim_real lower[QUADSIM_INPUTS], upper[QUADSIM_INPUTS];

@@ -19,7 +19,7 @@
 
 enum { LONG_AGO = 64 }; /* periods after which actuators have reached their command */
 
-enum { BODY = QUADSIM_NMPC_BODY, MOST = QUADSIM_NMPC_MOST, P = 0, Q = 3, V = 7, W = 10 };
+enum { BODY = QUADSIM_NMPC_BODY, MOST = QUADSIM_NMPC_MOST, LEFT = QUADSIM_NMPC_LEFT, P = 0, Q = 3, V = 7, W = 10 };
 
 static inline int states_of(const quadsim_nmpc_problem *p)
 {

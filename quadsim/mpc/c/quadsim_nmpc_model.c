@@ -45,14 +45,14 @@ static struct drive drive_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_w
 {
     struct drive drive;
     int i, j;
-    drive.left = p->left + instant * NU;
+    drive.left = p->left + instant * LEFT;
     drive.speed = R(0.0);
     if (p->targets) {
         const real thrust = p->effect[0] * world->thrust_scale;
         drive.thrust = thrust * (u[0] + drive.left[0] * (x[BODY] - u[0]));
         for (i = 0; i < 3; i++) {
             const real target = p->effect[5 * (i + 1)] * u[i + 1];
-            drive.rates[i] = target + drive.left[i + 1] * (x[W + i] - target);
+            drive.rates[i] = target + drive.left[i + 1] * (x[W + i] - target) - drive.left[NU + i + 1] * target;
             drive.angular[i] = R(0.0);
         }
         return drive;
@@ -290,7 +290,7 @@ INLINED void set_rates(const quadsim_nmpc_problem *p, const struct drive *drive,
         y[7 + i] = drive->rates[i];
         if (derive) {
             D[7 + i][4 + i] = drive->left[i + 1];
-            D[7 + i][7 + i] = p->effect[5 * (i + 1)] * (R(1.0) - drive->left[i + 1]);
+            D[7 + i][7 + i] = p->effect[5 * (i + 1)] * (R(1.0) - drive->left[i + 1] - drive->left[NU + i + 1]);
         }
     }
 }
@@ -300,7 +300,7 @@ static void actuators_after(const quadsim_nmpc_problem *p, const real *x, const 
 {
     int i;
     for (i = 0; i < p->actuators; i++) {
-        end[BODY + i] = u[i] + p->left[2 * p->substeps * NU + i] * (x[BODY + i] - u[i]);
+        end[BODY + i] = u[i] + p->left[2 * p->substeps * LEFT + i] * (x[BODY + i] - u[i]);
     }
     if (p->moves) {
         memcpy(end + BODY + p->actuators, u, sizeof(real) * NU);

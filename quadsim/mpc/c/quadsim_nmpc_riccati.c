@@ -30,7 +30,7 @@ INLINED int followed(const int actuators, int a)
 
 INLINED real left_of(const quadsim_nmpc_problem *p, const int actuators, int a)
 {
-    return a < actuators ? p->left[2 * p->substeps * NU + a] : R(0.0);
+    return a < actuators ? p->left[2 * p->substeps * LEFT + a] : R(0.0);
 }
 
 /* Rows from..to of [A B]' P [A B], but for what is right of the block on the diagonal; sizes are constants, so that a

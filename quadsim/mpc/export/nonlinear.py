@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.controller import ROTORS
+from quadsim.controller import ATTITUDE, ROTORS
 from quadsim.errors import ExportError
 from quadsim.mpc.export.ctext import CText
 from quadsim.mpc.export.follower import BODY_AHEAD_FILES, CFollower
@@ -48,6 +48,8 @@ class CNonlinear(CFollower):
     motion_row = "position, quaternion, velocity, body rates, thrusts of the rotors"
 
     def __post_init__(self) -> None:
+        if self.table.commands == ATTITUDE:
+            raise ExportError('it is \'nonlinear\' with commands = "attitude"; exported are "rotors" and "rates"')
         if self.table.indi is not None:
             raise ExportError("its rotor speeds are corrected at each physics step: leave out controller.indi")
         if self.table.time_limit is not None:

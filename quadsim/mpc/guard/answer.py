@@ -75,7 +75,9 @@ class ActuatorBounds:
                 j = at[i]
                 lower[j], upper[j] = max(lower[j], rows.lower[0, i]), min(upper[j], rows.upper[0, i])
             sides += [lower, upper]
-        return cls(u_min=sides[0], u_max=sides[1], delta_min=sides[2], delta_max=sides[3])
+        least, most, down, up = sides
+        targets = problem.model.targets
+        return cls(u_min=least, u_max=most, delta_min=down, delta_max=up, targets=targets)
 
     @classmethod
     def of_vehicle(cls, vehicle: Vehicle) -> ActuatorBounds:

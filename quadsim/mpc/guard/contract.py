@@ -166,6 +166,11 @@ class Guard:
         flown = replace(spent, speeds=speeds, plan=plan, stats=stats)
         return replace(flown, status=status, answered_by=FALLBACK, fallback=self._struct.level)
 
+    @property
+    def state(self) -> Array:
+        """(12,) the state of the present period, its missing channels predicted."""
+        return self._state.copy()
+
     def hover(self, law: Controller, state: Array, acting: Array) -> Array:
         """Restart after the command in force (4,), and return the plan (N, 4) of level hover from a state (12,)."""
         self.reset(acting)

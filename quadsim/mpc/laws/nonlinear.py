@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 
 from quadsim import shorthands
-from quadsim.controller import ROTORS, Controller
+from quadsim.controller import ATTITUDE, ROTORS, Controller
 from quadsim.core.mirror import constant
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Seconds, Weight
@@ -21,6 +21,7 @@ from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws import register
+from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement, require_one_scale
 from quadsim.mpc.problem.constraints import Constraint, Soft, origin_of_state, selection
 from quadsim.mpc.problem.model import LinearModel, hover_model, target_model
@@ -28,9 +29,28 @@ from quadsim.mpc.problem.polytope import Polytope, rows_of
 from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.problem.rigidbody import RATE_SCALE
 from quadsim.mpc.space import Avoidance, Shape, Space
-from quadsim.mpc.tables.commands import USUAL_TARGETS, Rates, RotorBounds, TargetBounds, require_space
+from quadsim.mpc.tables.commands import (
+    COMMANDS,
+    TARGET_BOUNDS,
+    USUAL_TARGETS,
+    Rates,
+    RotorBounds,
+    TargetBounds,
+    attitude_targets,
+    require_space,
+)
 from quadsim.mpc.tables.controller import ControllerTable, Horizon, KktEvery, Range, ranges, require_ordered
-from quadsim.mpc.tables.lags import Lag, LagSeconds, require_lag, require_lags
+from quadsim.mpc.tables.lags import (
+    ATTITUDE_LAG,
+    INNER_LAG,
+    AttitudeLag,
+    InnerLag,
+    Lag,
+    LagSeconds,
+    require_attitude_lag,
+    require_lag,
+    require_lags,
+)
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
@@ -111,18 +131,10 @@ class Nonlinear(ControllerTable):
         bool | None, doc("whether the last plan is shifted by a node; absent: if a node lasts one period")
     ] = None
     substeps: Annotated[int, Ge(1), Le(100), doc("Runge-Kutta steps per node")] = 1
-    commands: Annotated[
-        Literal["rotors", "rates"],
-        doc("what it commands: rotor speeds, or collective thrust and body rates to an autopilot's inner loop"),
-    ] = "rotors"
-    inner_lag: Annotated[
-        Annotated[tuple[LagSeconds, ...], Len(4, 4)] | None,
-        doc(
-            '[s] time constants of thrust, p, q, r behind their targets, 0 for none; only where commands = "rates"; '
-            "absent: identified by steps on the autopilot at set-up"
-        ),
-    ] = None
-    target_bounds: Annotated[TargetBounds, doc('only where commands = "rates"')] = USUAL_TARGETS
+    commands: Annotated[Literal["rotors", "rates", "attitude"], doc(COMMANDS)] = "rotors"
+    inner_lag: Annotated[InnerLag | None, doc(INNER_LAG)] = None
+    attitude_lag: Annotated[AttitudeLag | None, doc(ATTITUDE_LAG)] = None
+    target_bounds: Annotated[TargetBounds, doc(TARGET_BOUNDS)] = USUAL_TARGETS
     inputs: Annotated[Literal["thrust", "speed"], doc("quantity of the inputs, as shares of the rotors' largest")] = (
         "thrust"
     )
@@ -212,7 +224,7 @@ class Nonlinear(ControllerTable):
         require_space(self, of_rotors)
         speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
         if speeds and self.commands != ROTORS:
-            raise ValueError(f'polytopes must be without rotor speeds where commands = "rates"; got {speeds}')
+            raise ValueError(f'polytopes must be without rotor speeds where commands = "{self.commands}"; got {speeds}')
         if self.inputs == "thrust" and self.input_bounds.slew is not None:
             raise ValueError(
                 'input_bounds.slew must be absent where inputs = "thrust", in which steps of speeds are not linear: '
@@ -223,6 +235,8 @@ class Nonlinear(ControllerTable):
         """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
         if self.commands != ROTORS:
             require_lags(self.inner_lag)
+        if self.turns_by_attitude:
+            require_attitude_lag(self.attitude_lag)
         law: Controller = shorthands.nonlinear_mpc(
             vehicle,
             period=period,
@@ -234,11 +248,20 @@ class Nonlinear(ControllerTable):
         )
         return law
 
+    @property
+    def turns_by_attitude(self) -> bool:
+        """See `quadsim.mpc.tables.controller.ControllerTable.turns_by_attitude`."""
+        return self.commands == ATTITUDE
+
+    def attitudes(self) -> AttitudeTargets | None:
+        """See `quadsim.mpc.tables.controller.ControllerTable.attitudes`."""
+        return attitude_targets(self)
+
     def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
         """See `quadsim.mpc.tables.controller.ControllerTable.level_hover`."""
         if self.commands == ROTORS:
             return hover_model(vehicle, period)
-        return target_model(vehicle, period, require_lags(self.inner_lag))
+        return target_model(vehicle, period, require_lags(self.inner_lag), self.attitude_lag)
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -10,20 +11,45 @@ import numpy as np
 from annotated_types import Gt, Le, doc
 
 from quadsim import shorthands
-from quadsim.controller import CORE
+from quadsim.controller import ATTITUDE, CORE, ROTORS
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
 from quadsim.mpc.estimate.observer import ObserverSettings
+from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws import register
-from quadsim.mpc.problem.constraints import Soft
-from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model
-from quadsim.mpc.problem.ocp import Problem, lqr_terminal_weight
+from quadsim.mpc.pilot.attitudes import AttitudeTargets
+from quadsim.mpc.problem.constraints import Constraint, Origin, Soft, origin_of_state
+from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model, target_model
+from quadsim.mpc.problem.ocp import Objective, Problem, lqr_terminal_weight, objective_of
 from quadsim.mpc.problem.tightening import TighteningSettings, margins, position_margins
 from quadsim.mpc.space import Shape, Space
 from quadsim.mpc.tables.bounded import USUAL_SOLVER, Bounded
-from quadsim.mpc.tables.lags import Lag, LagSeconds, require_lag, resolved_lag
-from quadsim.state import Array
+from quadsim.mpc.tables.commands import (
+    COMMANDS,
+    TARGET_BOUNDS,
+    USUAL_TARGETS,
+    InputBounds,
+    InputWeights,
+    TargetBounds,
+    TargetWeights,
+    attitude_targets,
+    require_targets,
+)
+from quadsim.mpc.tables.controller import Range, ranges
+from quadsim.mpc.tables.lags import (
+    ATTITUDE_LAG,
+    INNER_LAG,
+    AttitudeLag,
+    InnerLag,
+    Lag,
+    LagSeconds,
+    require_attitude_lag,
+    require_lag,
+    require_lags,
+    resolved_lag,
+)
+from quadsim.state import INDEX, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 if TYPE_CHECKING:
@@ -44,6 +70,13 @@ class Robust(Bounded):
     """The robust MPC: soft bounds, rotor lag, delay, disturbances, heading and more, each switched on separately."""
 
     type: Annotated[Literal["robust"], doc("the control law, by its name in `quadsim list`")] = "robust"
+    commands: Annotated[Literal["rotors", "rates", "attitude"], doc(COMMANDS)] = "rotors"
+    inner_lag: Annotated[InnerLag | None, doc(INNER_LAG)] = None
+    attitude_lag: Annotated[AttitudeLag | None, doc(ATTITUDE_LAG)] = None
+    target_bounds: Annotated[TargetBounds, doc(TARGET_BOUNDS)] = USUAL_TARGETS
+    target_weights: Annotated[TargetWeights | None, doc("only where an autopilot flies")] = None
+    input_weights: Annotated[InputWeights | None, doc("only where rotors are commanded")] = None  # type: ignore[assignment]
+    input_bounds: Annotated[InputBounds | None, doc("only where rotors are commanded")] = None  # type: ignore[assignment]
     soft: Soft | None = None
     rotor_lag: Annotated[
         Lag,
@@ -78,6 +111,7 @@ class Robust(Bounded):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_lag(self.rotor_lag)
+        self._check_commands()
         if self.tightening is not None and not self.output_bounds:
             raise ValueError("tightening must be absent where there are no output_bounds to tighten")
         if self.heading:
@@ -92,6 +126,72 @@ class Robust(Bounded):
                         f"{name} must not be of {', '.join(turned)} where heading turns the model: "
                         'heading = false, or type = "nonlinear"'
                     )
+
+    def _check_commands(self) -> None:
+        """Refuse fields of the other space of commands.
+
+        Raises:
+            ValueError: a field is missing, or is given and does not act.
+        """
+        require_targets(self)
+        of_rotors: dict[str, object] = {"input_weights": self.input_weights, "input_bounds": self.input_bounds}
+        if self.commands == ROTORS:
+            missing = [name for name, value in of_rotors.items() if value is None]
+            if missing:
+                raise ValueError(f"{' and '.join(missing)} must be given where rotors are commanded")
+            if self.target_weights is not None:
+                raise ValueError('target_weights must be absent where commands = "rotors": these pass no autopilot')
+            return
+        if self.target_weights is None:
+            raise ValueError(f'target_weights must be given where commands = "{self.commands}"')
+        of_rotors |= {
+            "rotor_lag": self.rotor_lag or None,
+            "tightening": self.tightening,
+            "move_weight": self.move_weight,
+            "moment": self.moment or None,
+        }
+        for name, value in of_rotors.items():
+            if value is not None:
+                reason = "the autopilot turns the rotors; inner_lag, target_weights and target_bounds describe it"
+                raise ValueError(f'{name} must be absent where commands = "{self.commands}": {reason}')
+        speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
+        if speeds:
+            rule = f'without rotor speeds where commands = "{self.commands}"'
+            raise ValueError(f"polytopes must be {rule}; got {speeds}")
+
+    @property
+    def turns_by_attitude(self) -> bool:
+        """See `quadsim.mpc.tables.controller.ControllerTable.turns_by_attitude`."""
+        return self.commands == ATTITUDE
+
+    def attitudes(self) -> AttitudeTargets | None:
+        """See `quadsim.mpc.tables.controller.ControllerTable.attitudes`."""
+        return attitude_targets(self)
+
+    def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
+        """See `quadsim.mpc.tables.controller.ControllerTable.level_hover`."""
+        if self.commands == ROTORS:
+            return hover_model(vehicle, period)
+        return target_model(vehicle, period, require_lags(self.inner_lag), self.attitude_lag)
+
+    def audited(self, vehicle: Vehicle) -> dict[str, Range]:
+        """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
+        if self.commands == ROTORS:
+            return super().audited(vehicle)
+        return ranges(self.output_bounds) | self.target_bounds.audited(vehicle)
+
+    def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
+        """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
+        if self.commands == ROTORS:
+            return super().actuators(vehicle)
+        return self.target_bounds.actuators(vehicle)
+
+    def objective(self) -> Objective:
+        """See `quadsim.mpc.tables.bounded.Weighted.objective`."""
+        if self.target_weights is None:
+            return super().objective()
+        weights = objective_of(self.output_weights, self.target_weights.of_inputs)
+        return replace(weights, follows_rates=self.desired_rates == "reference")
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
         """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
@@ -112,16 +212,17 @@ class Robust(Bounded):
         if self.delay > self.horizon * period:
             rule = f"at most the horizon of {self.horizon} periods, {self.horizon * period:g} s"
             raise ParameterError("controller", "delay", self.delay, rule)
-        if self.moment:
-            vehicle.require_moment("controller")
-        lag = resolved_lag(self.rotor_lag, vehicle)
-        A, B = discretise(*continuous_model(vehicle, lag, moment=self.moment), period)
-        model = LinearModel(A=A, B=B, u_bar=hover_model(vehicle, period).u_bar, period=period)
-        objective, bounds, n = self.objective(), self.bounds(), model.n
+        model = self._model(vehicle, period)
+        objective = self.objective()
+        n = model.n
         moves = None if self.move_weight is None else self.move_weight * np.eye(N_ROTORS)
         objective = replace(objective, C_r=_widened(objective.C_r, n), Q_d=moves)
         if self.terminal == "lqr":
             objective = replace(objective, P=lqr_terminal_weight(model, objective))
+        if self.commands != ROTORS:
+            constraints = (*self._target_constraints(vehicle), *self.constraints())
+            return Problem(model=model, horizon=self.horizon, objective=objective, constraints=constraints)
+        bounds = self.bounds()
         penalty = None if self.soft is None else self.soft.penalty(len(self.output_bounds))
         return Problem(
             model=model,
@@ -132,6 +233,36 @@ class Robust(Bounded):
                 part if part.C is None else replace(part, C=_widened(part.C, n)) for part in self.constraints()
             ),
         )
+
+    def _model(self, vehicle: Vehicle, period: float) -> LinearModel:
+        """Return the prediction model: with rotor speeds as states if they lag, or above an autopilot."""
+        if self.commands != ROTORS:
+            if self.turns_by_attitude:
+                require_attitude_lag(self.attitude_lag)
+            return self.level_hover(vehicle, period)
+        if self.moment:
+            vehicle.require_moment("controller")
+        lag = resolved_lag(self.rotor_lag, vehicle)
+        A, B = discretise(*continuous_model(vehicle, lag, moment=self.moment), period)
+        return LinearModel(A=A, B=B, u_bar=hover_model(vehicle, period).u_bar, period=period)
+
+    def _target_constraints(self, vehicle: Vehicle) -> tuple[Constraint, Constraint]:
+        """Return the bounds on outputs and on an autopilot's targets as constraints."""
+        C_c, lower, upper = self.output_limits()
+        names = [name for name in STATE_NAMES if name in self.output_bounds]
+        penalty = None if self.soft is None else self.soft.penalty(len(names))
+        origins = tuple(origin_of_state(INDEX[name]) for name in names)
+        outputs = Constraint(name="outputs", lower=lower, upper=upper, C=C_c, penalty=penalty, origins=origins)
+        bounds = self.target_bounds.actuators(vehicle)
+        rates = tuple(Origin(f"target of body rate {axis}", "deg/s", math.degrees(1.0)) for axis in "xyz")
+        targets = Constraint(
+            name="targets",
+            lower=bounds.u_min,
+            upper=bounds.u_max,
+            D=np.eye(N_ROTORS),
+            origins=(Origin("target of thrust", "N"), *rates),
+        )
+        return outputs, targets
 
     def solver_name(self, problem: Problem, space: Space | None) -> str:
         """See `quadsim.mpc.tables.bounded.Bounded.solver_name`: the core where it takes the problem."""

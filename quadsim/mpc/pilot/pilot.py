@@ -27,8 +27,10 @@ from quadsim.controller import (
 from quadsim.core.inner import CompiledLoop
 from quadsim.core.mirror import Struct
 from quadsim.mpc.guard.contract import Guard
+from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.pilot.indi import TorqueIncrement
-from quadsim.state import Array
+from quadsim.rotation import euler_to_quaternion
+from quadsim.state import ANGLES, Array
 from quadsim.vehicle import Vehicle
 
 
@@ -39,12 +41,14 @@ class Pilot:
     autopilot. The law then commands targets: `speeds` a row, thrust [N] and body rates [rad/s] (4,), perhaps with an
     attitude (8,), `plan` such rows; `now.acting` and `reset` give it the target in force. To the flight the pilot is
     the inner loop then: it passes calls on to the autopilot, and so knows the target in force whenever commands come
-    late.
+    late.  With `attitudes` the law and the contract know thrust and body rates, `plan` has them, and what is commanded
+    are the attitudes whose errors make the autopilot turn so.
 
     Attributes:
         law: the law.
         guard: the fallback contract; None for none.
         inner: the inner loop; None where the rotors hold each command.
+        attitudes: what makes attitudes of the law's body rates; None where the law's commands are flown as they are.
     """
 
     def __init__(
@@ -54,8 +58,9 @@ class Pilot:
         *,
         guard: Guard | None = None,
         inner: TorqueIncrement | AutopilotLoop | None = None,
+        attitudes: AttitudeTargets | None = None,
     ) -> None:
-        self.law, self.guard, self.inner = law, guard, inner
+        self.law, self.guard, self.inner, self.attitudes = law, guard, inner, attitudes
         self.takes_targets, self.rate = takes_targets(inner), 0.0 if inner is None else inner.rate
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._slowest = np.full(4, vehicle.speed_min)
@@ -94,6 +99,8 @@ class Pilot:
         The target before the first is hover.
         """
         self._target, self._fresh, self._rates = self._hover, True, np.zeros(3)
+        if self.attitudes is not None:
+            self.attitudes.reset()
         before = self._hover.copy() if self.takes_targets else speeds
         if self.guard is not None:
             before = self.guard.reset(before)
@@ -123,7 +130,7 @@ class Pilot:
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the law's or the contract's command, with its inner loop; that is off on the ground."""
         if self.takes_targets:
-            now = replace(now, acting=self._target)
+            now = replace(now, acting=self._acting(now, state))
         if self.guard is None:
             command = self.law.step(now, state, reference)
         else:
@@ -131,12 +138,30 @@ class Pilot:
         if self.inner is None:
             return command
         if now.phase not in GROUNDED:
+            if self.attitudes is not None:
+                target = self.attitudes.target(command.speeds, self._attitude(now, state))
+                command = replace(command, speeds=target)
             return replace(command, inner=self if self.takes_targets else self.inner)
         if isinstance(self.inner, TorqueIncrement):
             self.inner.reset()
             return command
         self._target, self._fresh, self._rates = self._hover, True, None
         return stopped(self._slowest.copy(), self.horizon, now.phase)
+
+    def _acting(self, now: StepInputs, state: Array) -> Array:
+        """Return the target in force as the law knows targets."""
+        if self.attitudes is None or self._target.size == self._hover.size:
+            return self._target
+        return self.attitudes.command(self._target, self._attitude(now, state))
+
+    def _attitude(self, now: StepInputs, state: Array) -> Array:
+        """Return the measured attitude (4,); where none is measured, the one that the contract predicts."""
+        if now.attitude is not None and np.isfinite(now.attitude).all():
+            return now.attitude
+        angles = state[ANGLES]
+        if self.guard is not None and not np.isfinite(angles).all():
+            angles = self.guard.state[ANGLES]
+        return euler_to_quaternion(angles)
 
     def engage(self, command: Array, rotors: Array) -> Struct | None:
         """Let a target fly from now on, at rotor speeds (4,) [rad/s]; the autopilot is reset before its first.

@@ -98,19 +98,32 @@ def hover_model(vehicle: Vehicle, period: float, *, moment: bool = False) -> Lin
     return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(vehicle.hover_speeds), period=period)
 
 
-def target_model(vehicle: Vehicle, period: float, lag: Sequence[float]) -> LinearModel:
+def target_model(
+    vehicle: Vehicle, period: float, lag: Sequence[float], attitude_lag: Sequence[float] | None = None
+) -> LinearModel:
     """The discrete model at hover above an inner loop, whose targets are the inputs.
 
     The rates follow with the time constants `lag` (thrust, p, q, r) [s], at least `SHORTEST_LAG`; the thrust at once.
+    With `attitude_lag` (roll, pitch, yaw) [s] an attitude is commanded: the inputs are then the body rates that its
+    error commands at the start of a period, and the turn since then takes from them
+    (`quadsim.mpc.problem.rigidbody`).
     """
     A, B = continuous_model(vehicle)
-    B = np.zeros_like(B)
+    if attitude_lag is not None:
+        A = np.pad(A, (0, 3))  # three further states: the turn since the start of the period
+    B = np.zeros((len(A), N_ROTORS))
     B[INDEX["vz"], 0] = 1.0 / vehicle.mass
-    for rate, column, tau in zip(EULER_RATE, (1, 2, 3), lag[1:], strict=True):
-        B[rate, column] = 1.0 / max(tau, SHORTEST_LAG)
-        A[rate, rate] = -B[rate, column]
+    for axis, (rate, tau) in enumerate(zip(EULER_RATE, lag[1:], strict=True)):
+        B[rate, 1 + axis] = 1.0 / max(tau, SHORTEST_LAG)
+        A[rate, rate] = -B[rate, 1 + axis]
+        if attitude_lag is not None:
+            turn = N_STATES + axis
+            A[turn, rate] = 1.0
+            A[rate, turn] = -B[rate, 1 + axis] / attitude_lag[axis]
     u_bar = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
     A, B = discretise(A, B, period)
+    A = np.ascontiguousarray(A[:N_STATES, :N_STATES])
+    B = np.ascontiguousarray(B[:N_STATES])
     return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(u_bar), period=period, targets=True)
 
 

@@ -21,6 +21,15 @@ the only further state then, and omega has no torque in its equation:
 
 Both are known exactly at every instant; only p, q and v are integrated, so that a lag may be short, or 0.
 
+Where the inner loop takes an attitude q_c instead, it commands rates in proportion to the attitude's error,
+omega_c = 2 vec(q* q_c) / tau_a.  The inputs are those rates as they are at the start of a step, omega_0: they say by
+how much the attitude is to be turned, in the body's own axes.  In the step the body turns by theta towards q_c, which
+takes from them; to first order in theta,
+
+    omega' = (omega_0 - theta / tau_a - omega) / tau_omega,    theta' = omega,    theta = 0 at the start,
+
+is linear, so that omega is again known exactly at every instant.  `inner_response` has its two shares.
+
 The motion and its exact derivatives are computed in C, `quadsim_nmpc_model.c`.
 """
 
@@ -32,8 +41,10 @@ from functools import cached_property, partial
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 from quadsim.core.mirror import constant
+from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.state import Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -85,6 +96,7 @@ class RigidBody:
     inputs: Inputs = Inputs.THRUST
     rotor_lag: float | None = None  # time constant of thrusts or speeds [s]; None for none
     lag: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # time constants of collective thrust, p, q, r behind targets [s]
+    attitude_lag: tuple[float, ...] | None = None  # tau_a about body x, y, z [s], where an attitude is commanded
     thrust_scale: float = 1.0  # thrust that acts per thrust of the inputs
     drag: Array = field(default_factory=zero)  # (3,) D_1, linear, body axes [N s/m]
     quadratic_drag: Array = field(default_factory=zero)  # (3,) D_2, body axes [N s^2/m^2]
@@ -190,6 +202,37 @@ def rigid_body(vehicle: Vehicle, step: float, *, moment: bool = False, **others:
         step=step,
         **others,  # type: ignore[arg-type]
     )
+
+
+def inner_response(step: float, count: int, lag: float, attitude_lag: float | None) -> tuple[Array, Array]:
+    """Return the shares of an inner loop's answer: omega = a omega(0) + (1 - a - b) omega_0.
+
+    Args:
+        step: time between the instants [s], of which the first is 0.
+        count: M of them.
+        lag: tau_omega, of the rate behind its target [s].
+        attitude_lag: tau_a, one over the gain of the attitude's error [s]; None where rates are commanded.
+
+    Returns:
+        (M,) a, what is left of the rate at the start, and (M,) b, what the turn so far has taken of the target; without
+        `attitude_lag` no turn takes anything.
+    """
+    times = step * np.arange(count)
+    if attitude_lag is None:
+        left = np.exp(-times / lag) if lag else np.zeros(count)
+        return left, np.zeros(count)
+    lag = max(lag, SHORTEST_LAG)
+    # Of the turn theta, the rate omega and the held target omega_0.
+    slope = np.array([[0.0, 1.0, 0.0], [-1.0 / (attitude_lag * lag), -1.0 / lag, 1.0 / lag], [0.0, 0.0, 0.0]])
+    transition = scipy.linalg.expm(slope * step)
+    left = np.empty(count)
+    gained = np.empty(count)
+    motion = np.eye(3)
+    for i in range(count):
+        left[i] = motion[1, 1]
+        gained[i] = motion[1, 2]
+        motion = transition @ motion
+    return left, 1.0 - left - gained
 
 
 def thrust_axis(q: Array) -> Array:

@@ -133,14 +133,18 @@ class Bounded(Weighted):
         """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
         return self.input_bounds.actuators(vehicle)
 
-    def bounds(self) -> Bounds:
-        """Return the bounds in SI units."""
+    def output_limits(self) -> tuple[Array, Array, Array]:
+        """Return C_c (n_c, 12), y_min and y_max (n_c,) of the bounds on outputs, in SI units."""
         names = [name for name in STATE_NAMES if name in self.output_bounds]
         scale = np.array([math.radians(1.0) if name in IN_DEGREES else 1.0 for name in names])
         lower, upper = scale * np.array([self.output_bounds[name] for name in names], float).reshape(-1, 2).T
+        return selection(names), lower, upper
+
+    def bounds(self) -> Bounds:
+        """Return the bounds in SI units."""
         u_min, u_max = (np.full(N_ROTORS, bound) for bound in self.input_bounds.speed)
         down, up = (np.full(N_ROTORS, bound) for bound in self.input_bounds.slew)
-        C_c = selection(names)
+        C_c, lower, upper = self.output_limits()
         return Bounds(C_c=C_c, y_min=lower, y_max=upper, delta_min=down, delta_max=up, u_min=u_min, u_max=u_max)
 
     def constraints(self) -> tuple[Constraint, ...]:

@@ -10,19 +10,30 @@ from typing import Annotated, Any, Final
 import numpy as np
 from annotated_types import Len, doc
 
-from quadsim.controller import ROTORS
+from quadsim.controller import ATTITUDE, ROTORS
 from quadsim.errors import ParameterError
 from quadsim.fields import Pair, Positive, Weight
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.pilot.allocation import thrust_to_command
+from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.mpc.tables.controller import Range, require_ordered
+from quadsim.mpc.tables.lags import require_attitude_lag
 from quadsim.vehicle import N_ROTORS, Vehicle
 
+COMMANDS: Final = (
+    "what it commands: rotor speeds, or to an autopilot's inner loop collective thrust and body rates, or collective "
+    "thrust and an attitude"
+)
+"""Meaning of the field `commands` of laws that command all of these."""
+TARGET_BOUNDS: Final = "only where an autopilot flies; of an attitude, bounds on the body rates that its error commands"
+"""Meaning of the field `target_bounds` of such laws."""
 LEAST_THRUST, MOST_THRUST = 0.5, 0.9
 """Default bounds on a target of collective thrust: shares of the weight, and of the largest; see `TargetBounds`."""
 Rates = Positive | Annotated[tuple[Positive, ...], Len(3, 3)]
 """One largest magnitude for three body rates, or one per axis."""
+AxisWeights = Weight | Annotated[tuple[Weight, ...], Len(3, 3)]
+"""One weight for three axes, or one per axis."""
 RotorWeights = Weight | Annotated[tuple[Weight, ...], Len(N_ROTORS, N_ROTORS)]
 """One weight for all rotors, or one per rotor."""
 
@@ -32,6 +43,19 @@ class InputWeights:
     """Weights on deviations of the rotor speeds from hover."""
 
     speed: Annotated[RotorWeights, doc("[1/(rad/s)^2] diagonal of Q_u: one weight for all rotors, or a list of four")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetWeights:
+    """Weights on deviations of an inner loop's targets from those of hover."""
+
+    thrust: Annotated[Weight, doc("[1/N^2] of the collective thrust")]
+    body_rate: Annotated[AxisWeights, doc("[1/(rad/s)^2] one weight for three body rates, or about body x, y, z")]
+
+    @property
+    def of_inputs(self) -> tuple[float, ...]:
+        """(4,) diagonal of Q_u."""
+        return (self.thrust, *np.broadcast_to(np.asarray(self.body_rate, float), 3).tolist())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +135,36 @@ class TargetBounds:
 USUAL_TARGETS: Final = TargetBounds()
 
 
+def require_targets(table: Any) -> None:
+    """Refuse fields of an autopilot where there is none, and those of an attitude where none is commanded.
+
+    Raises:
+        ValueError: a field is given that does not act, or has a value that it cannot have.
+    """
+    if table.commands == ROTORS:
+        reason = "rotor speeds pass no autopilot, whose lags and targets these are"
+        for name, usual in (("inner_lag", None), ("target_bounds", USUAL_TARGETS)):
+            if getattr(table, name) != usual:
+                raise ValueError(f'{name} must be absent where commands = "{table.commands}": {reason}')
+    elif any(0.0 < lag < SHORTEST_LAG for lag in table.inner_lag or ()):
+        raise ParameterError("", "inner_lag", table.inner_lag, f"0, or at least {SHORTEST_LAG:g} s, each")
+    if not hasattr(table, "attitude_lag"):
+        return
+    if table.commands == ATTITUDE and table.delay:
+        rule = f'zero where commands = "{ATTITUDE}", whose rates the autopilot decides'
+        raise ParameterError("", "delay", table.delay, rule)
+    if table.commands != ATTITUDE and table.attitude_lag is not None:
+        reason = "no attitude is commanded, behind which this is the lag"
+        raise ValueError(f'attitude_lag must be absent where commands = "{table.commands}": {reason}')
+
+
+def attitude_targets(table: Any) -> AttitudeTargets | None:
+    """Return what makes attitudes of the body rates of a table's law; None where it commands none so."""
+    if not table.turns_by_attitude:
+        return None
+    return AttitudeTargets(require_attitude_lag(table.attitude_lag))
+
+
 def require_space(table: Any, of_rotors: Mapping[str, object]) -> None:
     """Refuse fields of the other space of commands: those `of_rotors` with an autopilot, of its targets without one.
 
@@ -119,15 +173,12 @@ def require_space(table: Any, of_rotors: Mapping[str, object]) -> None:
     Raises:
         ValueError: a field is given that does not act.
     """
+    require_targets(table)
     if table.commands == ROTORS:
-        others: Mapping[str, object] = {"inner_lag": None, "target_bounds": USUAL_TARGETS}
-        reason = "rotor speeds pass no autopilot, whose lags and targets these are"
-    else:
-        others, reason = of_rotors, "the autopilot turns the rotors; inner_lag and target_bounds describe it"
-        if table.disturbance is not None and table.disturbance.rotor_lag is not None:
-            raise ValueError(f'disturbance.rotor_lag must be absent where commands = "{table.commands}": {reason}')
-        if any(0.0 < lag < SHORTEST_LAG for lag in table.inner_lag or ()):
-            raise ParameterError("", "inner_lag", table.inner_lag, f"0, or at least {SHORTEST_LAG:g} s, each")
-    for name, usual in others.items():
+        return
+    reason = "the autopilot turns the rotors; inner_lag and target_bounds describe it"
+    if table.disturbance is not None and table.disturbance.rotor_lag is not None:
+        raise ValueError(f'disturbance.rotor_lag must be absent where commands = "{table.commands}": {reason}')
+    for name, usual in of_rotors.items():
         if getattr(table, name) != usual:
             raise ValueError(f'{name} must be absent where commands = "{table.commands}": {reason}')

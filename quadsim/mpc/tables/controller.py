@@ -11,6 +11,7 @@ from annotated_types import Ge, Le, doc
 from quadsim.controller import ROTORS, Controller
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import FallbackSettings
+from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement
 from quadsim.mpc.problem.model import LinearModel, hover_model
 from quadsim.mpc.problem.polytope import Polytope
@@ -41,6 +42,7 @@ class ControllerTable:
     polytopes: tuple[Polytope, ...] = ()
     commands: str = ROTORS
     inner_lag: tuple[float, ...] | None = None  # of what an autopilot flies: a field of each table with `commands`
+    attitude_lag: tuple[float, ...] | None = None  # a field of each table that `turns_by_attitude`
     indi: INDISettings | None = None
     fallback: FallbackSettings | None = None
     iterations: int = 1
@@ -53,6 +55,15 @@ class ControllerTable:
             InputError: no controller can be built from these numbers.
         """
         raise NotImplementedError(f"the table {type(self).__name__} has no method `law`")
+
+    @property
+    def turns_by_attitude(self) -> bool:
+        """Whether the law asks for body rates and commands the attitudes whose errors are those rates."""
+        return False
+
+    def attitudes(self) -> AttitudeTargets | None:
+        """Return what makes attitudes of the law's body rates; None where its commands are flown as they are."""
+        return None
 
     def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
         """Return the fallback contract around the law; None without one."""

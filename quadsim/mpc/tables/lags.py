@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
-from annotated_types import Ge, Le
+from annotated_types import Ge, Le, Len
 
 from quadsim.errors import ParameterError
 from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.vehicle import Vehicle
 
 LagSeconds = Annotated[float, Ge(0.0), Le(10.0)]
+InnerLag = Annotated[tuple[LagSeconds, ...], Len(4, 4)]
+INNER_LAG: Final = (
+    "[s] time constants of thrust, p, q, r behind their targets, 0 for none; only where an autopilot flies; "
+    "absent: identified by steps on the autopilot at set-up"
+)
+"""Meaning of the field `inner_lag`."""
+AttitudeLag = Annotated[tuple[Annotated[float, Ge(1e-3), Le(10.0)], ...], Len(3, 3)]
+ATTITUDE_LAG: Final = (
+    "[s] time constants of roll, pitch and yaw behind a commanded attitude, each one over the autopilot's gain from an "
+    'attitude error to a body rate; only where commands = "attitude"; absent: identified by steps on the autopilot at '
+    "set-up"
+)
+"""Meaning of the field `attitude_lag`."""
 Lag = LagSeconds | Literal["vehicle"]  # a time constant, or the one in the vehicle file
 
 
@@ -43,3 +56,11 @@ def require_lags(inner_lag: tuple[float, ...] | None) -> tuple[float, ...]:
         rule = "four time constants [s]: give them, or identify them on the vehicle's autopilot before it is built"
         raise ParameterError("controller", "inner_lag", None, rule)
     return inner_lag
+
+
+def require_attitude_lag(attitude_lag: tuple[float, ...] | None) -> tuple[float, ...]:
+    """Return the lags of an autopilot's attitude; raises ParameterError where there are none."""
+    if attitude_lag is None:
+        rule = "three time constants [s]: give them, or identify them on the vehicle's autopilot before it is built"
+        raise ParameterError("controller", "attitude_lag", None, rule)
+    return attitude_lag

@@ -8,12 +8,13 @@ from typing import Final
 import numpy as np
 
 from quadsim.core.mirror import Struct, constant, core_library, set_members, struct
-from quadsim.mpc.problem.rigidbody import N_BODY, Inputs, RigidBody
+from quadsim.mpc.problem.rigidbody import N_BODY, Inputs, RigidBody, inner_response
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 
 STATES_ROOM: Final = constant("QUADSIM_NMPC_MOST")
 """Most states, with the input before."""
+LEFT: Final = constant("QUADSIM_NMPC_LEFT")
 ProblemStruct: Final = struct("quadsim_nmpc_problem")
 WorldStruct: Final = struct("quadsim_nmpc_world")
 
@@ -33,14 +34,14 @@ def world_of(model: RigidBody) -> Struct:
 
 
 def body_of(model: RigidBody) -> tuple[Struct, Array]:
-    """Return a rigid body's numbers in the core's layout, and (2 substeps + 1, 4) the array that they point to."""
+    """Return a rigid body's numbers in the core's layout, and (2 substeps + 1, 8) the array that they point to."""
     numbers = ProblemStruct()
     left = body_numbers(model, numbers)
     return numbers, left
 
 
 def body_numbers(model: RigidBody, p: Struct) -> Array:
-    """Fill in the rigid body's numbers; return (2 substeps + 1, 4) what p.left points to, which the caller keeps."""
+    """Fill in the rigid body's numbers; return (2 substeps + 1, 8) what p.left points to, which the caller keeps."""
     p.actuators, p.targets, p.speeds = model.actuators, model.targets, model.inputs is Inputs.SPEED
     p.moments, p.substeps, p.step, p.gravity = model.moments, model.substeps, model.step, model.gravity
     p.largest = model.mass * model.gravity if model.targets else model.largest_thrust
@@ -49,9 +50,17 @@ def body_numbers(model: RigidBody, p: Struct) -> Array:
     lag = np.array(model.lags)
     air = {"moment": model.moment, "inflow": model.inflow, "damping": model.damping}
     p.loss = model.loss
-    set_members(p, effect=model.effect, gyration=gyration, lead=lag / model.step, **air)
-    instants = np.arange(2 * model.substeps + 1)[:, None] * (0.5 * model.step / model.substeps)
-    left = np.where(lag > 0.0, np.exp(-instants / np.where(lag > 0.0, lag, 1.0)), 0.0)
+    hold = np.ones(N_ROTORS)
+    if model.attitude_lag is not None:
+        hold[1:] += 0.5 * model.step / np.array(model.attitude_lag)  # by half of the step's turn
+    set_members(p, effect=model.effect, gyration=gyration, lead=lag / model.step, hold=hold, **air)
+    instants = 2 * model.substeps + 1
+    left = np.empty((instants, LEFT))
+    attitude_lags = (None, *(model.attitude_lag or (None, None, None)))
+    for i in range(N_ROTORS):
+        left[:, i], left[:, N_ROTORS + i] = inner_response(
+            0.5 * model.step / model.substeps, instants, lag[i], attitude_lags[i]
+        )
     p.left = left.ctypes.data
     return left
 
@@ -100,9 +109,10 @@ def width_of(n: int) -> int:
 
 
 def unpacked(slopes: Array, n: int, befores: int, left: Array) -> tuple[Array, Array]:
-    """A (M, n, n) and B (M, n, 4) from the core's maps (M, 13, W); `left` (4,) is what a step leaves of actuators.
+    """A (M, n, n) and B (M, n, 4) from the core's maps (M, 13, W).
 
-    The core's states may end with `befores` more, the inputs before.
+    `left` (8,) begins with what a step leaves of actuators.  The core's states may end with `befores` more, the inputs
+    before.
     """
     M, inputs = len(slopes), n - 3 + befores
     A, B = np.zeros((M, n, n)), np.zeros((M, n, N_ROTORS))

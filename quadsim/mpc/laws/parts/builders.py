@@ -33,7 +33,9 @@ def build(table: ControllerTable, vehicle: Vehicle, period: float, shapes: Seque
             "the controller's gain cannot be computed: its weights and the vehicle's numbers are too many orders "
             f"of magnitude apart ({error})"
         ) from error
-    return Pilot(law, vehicle, guard=table.guard(vehicle, period), inner=table.inner_loop(vehicle))
+    guard = table.guard(vehicle, period)
+    inner = table.inner_loop(vehicle)
+    return Pilot(law, vehicle, guard=guard, inner=inner, attitudes=table.attitudes())
 
 
 def stated(table: AnyTable, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> AnyTable:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from quadsim.controller import GROUNDED, Command, StepInputs, stopped
+from quadsim.controller import GROUNDED, ROTORS, Command, StepInputs, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.mpc.estimate.observer import disturbance_of
 from quadsim.mpc.guard.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection, resized, shifted
@@ -147,6 +147,7 @@ class LinearMPC:
     Attributes:
         preparation: what makes the queries.
         problem: the optimal control problem.
+        commands: what it commands: rotor speeds, or an autopilot's targets.
         infeasible_period: the first period since `reset` whose QP had no answer; None if there was none.
         answer: the answer of the last period that solved a QP; None before the first.
     """
@@ -162,6 +163,7 @@ class LinearMPC:
         holds: bool = False,
         space: Space | None = None,
         kkt_every: int = KKT_EVERY,
+        commands: str = ROTORS,
     ) -> None:
         """Set up at rest.
 
@@ -172,9 +174,11 @@ class LinearMPC:
             holds: whether the last plan is held where a QP has no answer.
             space: the obstacles to avoid; None for none.
             kkt_every: interval of KKT checks [periods].
+            commands: what it commands.
         """
         self.preparation, self.problem = preparation, preparation.problem
         self.name, self.solver, self.horizon = name, solver.name, self.problem.horizon
+        self.commands = commands
         self._solver, self._holds = solver, holds
         self._obstacles = None if space is None else ObstacleQP(self.problem, solver, space)
         self._bounds, self._check = ActuatorBounds.of_problem(self.problem), AnswerCheck(self.problem, kkt_every)
@@ -228,7 +232,7 @@ class LinearMPC:
             self._acting = np.array(now.acting, float)
         if now.phase in GROUNDED:
             self.preparation.stand(now, self._acting)
-            self._acting, self._plan, self._held = self._bounds.reach(self._acting)[0], None, 0
+            self._acting, self._plan, self._held = self._bounds.lowest(self._acting), None, 0
             return stopped(self._acting.copy(), self.horizon, now.phase)
         query = self.preparation.prepare(now, state, reference, self._acting)
         if query is None:
@@ -280,4 +284,5 @@ def linear_law(table: Bounded, preparation: Preparation, solver: Solver, space: 
         holds=table.holds_plans,
         space=space,
         kkt_every=table.kkt_every,
+        commands=table.commands,
     )

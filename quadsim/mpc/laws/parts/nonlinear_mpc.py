@@ -167,7 +167,7 @@ class NonlinearMPC:
         if settings.delay:
             require_delay(settings.delay, period, min(settings.horizon, MOST_LATE))
             if self.model.targets and settings.delay >= period:
-                rule = f'below the control period of {period:g} s where commands = "rates"'
+                rule = f"below the control period of {period:g} s where an autopilot flies the commands"
                 raise ParameterError("controller", "delay", settings.delay, rule)
             self.delay, self.delay_bodies = delay_numbers(settings.delay, self.model, vehicle, period)
         self.clock: Callable[[], float] = clock.perf_counter

@@ -49,6 +49,7 @@ def prediction_model(settings: Nonlinear, vehicle: Vehicle, period: float) -> Ri
         inputs=inputs,
         rotor_lag=resolved_lag(settings.rotor_lag, vehicle) or None,
         lag=settings.inner_lag or (0.0, 0.0, 0.0, 0.0),
+        attitude_lag=settings.attitude_lag,
         drag=np.array(settings.drag),
         quadratic_drag=np.array(settings.quadratic_drag),
         moment=settings.moment,
@@ -194,7 +195,7 @@ def _of_states(constraint: Constraint, vehicle: Vehicle, model: RigidBody, n: in
         C[:, V] = constraint.C[:, VELOCITIES]
     if constraint.D is not None and constraint.D.any():
         if model.targets:
-            rule = 'without rotor speeds where commands = "rates": an inner loop commands the rotors'
+            rule = "without rotor speeds where an autopilot flies the commands: an inner loop commands the rotors"
             raise ParameterError("controller", constraint.name, "of those", rule)
         if model.inputs is not Inputs.SPEED:
             rule = 'without rotor speeds where inputs = "thrust", in which they are not linear: inputs = "speed"'

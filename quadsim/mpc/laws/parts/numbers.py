@@ -9,6 +9,8 @@ from typing import Final
 
 import numpy as np
 
+from quadsim.controller import ROTORS
+from quadsim.core.mirror import constant
 from quadsim.errors import ExportError
 from quadsim.mpc.estimate.observer import LEAST_UPRIGHT, DisturbanceObserver
 from quadsim.mpc.guard.numbers import PLAUSIBLE
@@ -18,15 +20,19 @@ from quadsim.mpc.problem.equilibrium import LEAST_LIFT
 from quadsim.mpc.problem.heading import slope
 from quadsim.mpc.problem.model import hover_model, split_delay
 from quadsim.mpc.problem.ocp import Problem
-from quadsim.mpc.problem.rigidbody import SUBSTEPS, air_maps
+from quadsim.mpc.problem.rigidbody import SUBSTEPS, air_maps, inner_response
 from quadsim.mpc.space import Shape
 from quadsim.mpc.tables.bounded import Bounded, Weighted
-from quadsim.mpc.tables.lags import resolved_lag
+from quadsim.mpc.tables.lags import require_lags, resolved_lag
 from quadsim.state import REFERENCE_STATES, Array
 from quadsim.vehicle import Vehicle
 
 AVOIDS: Final = "its half-spaces around obstacles are others in each period: leave out controller.avoidance"
 """Why a controller that avoids obstacles is not exported."""
+
+
+ANSWER: Final = SUBSTEPS * constant("QUADSIM_ANSWER")
+"""Numbers of an inner loop's answer over a span of time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +55,8 @@ def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequenc
     """
     if isinstance(table, Bounded) and table.avoidance is not None and shapes:
         raise ExportError(AVOIDS)
+    if table.commands != ROTORS:
+        raise ExportError(f'it is {table.type!r} with commands = "{table.commands}"; exported is "rotors"')
     return Exportable(
         name=table.type,
         problem=table.problem(vehicle, period),
@@ -79,6 +87,12 @@ def robust_numbers(settings: Robust, vehicle: Vehicle, period: float) -> dict[st
         """Return the share of a deviation of rotor speeds that is left after a time [s]."""
         return np.asarray(np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time)), float)
 
+    answers = {name: np.zeros(ANSWER) for name in ("before", "delay", "period")}
+    gain = np.zeros(6) if observer is None else observer.gain.copy()
+    if settings.commands != ROTORS:
+        spans = {"before": period - late, "delay": late, "period": period}
+        answers = {name: inner_answer(settings, span) for name, span in spans.items()}
+        gain[3:] = 0.0  # an inner loop balances the torque
     return {
         "observes": int(observer is not None),
         "heading": int(settings.heading),
@@ -103,11 +117,33 @@ def robust_numbers(settings: Robust, vehicle: Vehicle, period: float) -> dict[st
         "damping": air.damping,
         "loss": air.loss,
         "slope_inverse": np.asarray(np.linalg.inv(slope(hover_model(vehicle, period))), float),
-        "gain": np.zeros(6) if observer is None else observer.gain,
+        "gain": gain,
         "largest": np.zeros(6) if observer is None else observer.largest,
         "decay_before": decay(instants * (period - late)),
         "decay_delay": decay(instants * late),
         "decay_period": decay(instants * period),
+        "targets": int(settings.commands != ROTORS),
+        "mass": vehicle.mass,
+        "answer_before": answers["before"],
+        "answer_delay": answers["delay"],
+        "answer_period": answers["period"],
         "plausible_state": PLAUSIBLE,
         "plausible_reference": PLAUSIBLE[list(REFERENCE_STATES)],
     }
+
+
+def inner_answer(settings: Robust, span: float) -> Array:
+    """Return (`ANSWER`,) the shares of an inner loop's answer over a span [s], at the instants of Runge-Kutta's steps.
+
+    At each instant they are, about body x, y, z, what is left of the rates at the start, and what the turn takes from
+    the targets (`quadsim.mpc.problem.rigidbody.inner_response`).
+    """
+    halves = 2 * SUBSTEPS
+    at_halves = np.zeros((halves + 1, 6))
+    attitude_lags = settings.attitude_lag or (None, None, None)
+    for axis, lag in enumerate(require_lags(settings.inner_lag)[1:]):
+        left, taken = inner_response(span / halves, halves + 1, lag, attitude_lags[axis])
+        at_halves[:, axis] = left
+        at_halves[:, 3 + axis] = taken
+    instants = 2 * np.arange(SUBSTEPS)[:, None] + [0, 1, 1, 2]
+    return at_halves[instants.ravel()].ravel()

@@ -13,7 +13,7 @@ from typing import Final, NoReturn
 
 import numpy as np
 
-from quadsim.controller import Phase, StepInputs
+from quadsim.controller import ROTORS, Phase, StepInputs
 from quadsim.core.mirror import constant, core_library, set_members, struct
 from quadsim.mpc.estimate.disturbance import SAME_TIME
 from quadsim.mpc.estimate.observer import LONGEST_SPAN
@@ -47,7 +47,10 @@ class RobustPreparation:
     def __init__(self, vehicle: Vehicle, problem: Problem, settings: Robust) -> None:
         self.problem, self.delay = problem, settings.delay
         self._library = core_library()
-        self._nominal = hover_model(vehicle, problem.model.period, moment=settings.moment)
+        if settings.commands == ROTORS:
+            self._nominal = hover_model(vehicle, problem.model.period, moment=settings.moment)
+        else:
+            self._nominal = settings.level_hover(vehicle, problem.model.period)
         self._robust = struct("quadsim_robust")()
         set_members(self._robust, **robust_numbers(settings, vehicle, problem.model.period))
         self._C_r = np.ascontiguousarray(problem.objective.C_r)
@@ -78,7 +81,7 @@ class RobustPreparation:
         self._estimate = np.ctypeslib.as_array(mpc.estimate)
         self._state, self._reference, self._acting = np.zeros(N_STATES), np.zeros((N, 4)), np.zeros(N_ROTORS)
         self._inputs = [array.ctypes.data for array in (self._state, self._reference, self._acting)]
-        self.reset(vehicle.hover_speeds)
+        self.reset(problem.model.u_bar)
 
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
