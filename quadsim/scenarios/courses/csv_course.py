@@ -13,10 +13,11 @@ from pathlib import Path as FilePath
 from typing import Annotated, Final, Literal
 
 import numpy as np
-from annotated_types import doc
+from annotated_types import Ge, Le, doc
 from pydantic import StringConstraints
 
 from quadsim.errors import FileError
+from quadsim.fields import Number
 from quadsim.input_limits import LARGEST_CSV
 from quadsim.scenarios.courses.course import EXACT, Course, Path, Started, begin
 from quadsim.scenarios.courses.legs import polyline
@@ -39,6 +40,7 @@ DISAGREEMENT: Final = 0.25
 SMALL: Final = 0.05  # such a difference that is never doubted [m/s]
 ALIKE: Final = 0.04  # relative difference up to which a ratio is that of a unit
 OVERSTATED: Final = 5.0  # stated over covered velocity, plus 1 m/s, above which a table is refused
+Factor = Annotated[float, Ge(1e-3), Le(1e3)]  # of a table's lengths or times
 MILLIMETRES: Final = 1000.0  # per m
 SPEED_UNITS: Final = {"mm/s": 1000.0, "cm/s": 100.0, "km/h": 3.6, "ft/s": 3.281, "knots": 1.944}  # per m/s
 
@@ -72,6 +74,9 @@ class Csv(Started):
         Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")] | None,
         doc("hash of the file, recorded when it is read; a file with another hash is refused"),
     ] = None
+    length_factor: Annotated[Factor, doc("[-] by which the table's lengths are multiplied")] = 1.0
+    time_factor: Annotated[Factor, doc("[-] by which the table's times are multiplied; 2: at half its speed")] = 1.0
+    lift: Annotated[Number, doc("[m] by which the course is raised, after length_factor")] = 0.0
 
     @property
     def content(self) -> bytes | None:
@@ -85,8 +90,33 @@ class Csv(Started):
         table = read_course_table(path) if self.content is None else parse_rows(path, self.content)
         if self.sha256 not in (None, table.sha256):
             raise FileError(self.file, f"is not the file of the scenario: its SHA-256 is not {self.sha256}")
+        table = self._rescaled_rows(table)
         course = begin(through_rows(table), start=self.start + float(table.t[0]), initial=initial)
         return replace(course, notes=(*course.notes, *_far(table.poses[0, :3], initial[:3])))
+
+    def rescaled(self, *, length: float, time: float, lift: float) -> Csv:
+        """Return the course with lengths and times multiplied, `start` included, and then raised [m]."""
+        return replace(
+            self,
+            start=time * self.start,
+            response_time=time * self.response_time,
+            repeat=None if self.repeat is None else time * self.repeat,
+            length_factor=length * self.length_factor,
+            time_factor=time * self.time_factor,
+            lift=length * self.lift + lift,
+        )
+
+    def _rescaled_rows(self, table: Table) -> Table:
+        """Return the rows with both factors, raised; the table itself where nothing changes."""
+        if (self.length_factor, self.time_factor, self.lift) == (1.0, 1.0, 0.0):
+            return table
+        scale = np.array([self.length_factor, self.length_factor, self.length_factor, 1.0])
+        poses = table.poses * scale + np.array([0.0, 0.0, self.lift, 0.0])
+        velocities = table.velocities
+        if velocities is not None:
+            velocities = velocities * (self.length_factor / self.time_factor)
+        resolution = tuple((scale * table.resolution).tolist())
+        return replace(table, t=self.time_factor * table.t, poses=poses, velocities=velocities, resolution=resolution)
 
     def located(self, directory: FilePath) -> Csv:
         """Return the table with absolute path and hash, so that a resolved scenario defines its flight.
