@@ -147,5 +147,6 @@ def _scaled_steps(table: Steps, scale: Scale) -> Steps:
         x=windows("x"),
         y=windows("y"),
         z=windows("z"),
-        yaw=windows("yaw"),
+        yaw=table.yaw if isinstance(table.yaw, str) else windows("yaw"),
+        yaw_rate=scale.number(table.yaw_rate, "deg/s"),
     )

@@ -274,7 +274,7 @@ def _time_factor(samples: Samples, length: float, vehicle: Vehicle, tuning: Desi
         shares = [_share(samples, length, time, filtered, vehicle, tuning)]
         if is_sharp:
             shares.append(by_rule / filtered)
-        if samples.jumps:
+        if samples.jumps and response:
             shares.append(1.2 * filtered / (time * samples.shortest))
         return max(shares)
 
@@ -361,7 +361,7 @@ def _written(
     entries = [_constraint(entry, scale, allowed, own=own) for entry in base.constraints if _carries(entry)]
     duration = None
     if not base.ends_with_course:
-        duration = later(scale.time * base.duration)
+        duration = later(scale.time * base.duration + response)
     stem = Path(name).stem
     return Course(
         name=stem.lower(),
