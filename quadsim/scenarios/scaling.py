@@ -19,7 +19,7 @@ from quadsim.scenarios.schema.base import fields_of, is_table
 from quadsim.scenarios.schema.writing import is_absent
 from quadsim.space import Region
 
-DIGITS: Final = 6  # significant, of what is scaled: a file is read by people
+SIGNIFICANT_DIGITS: Final = 6  # significant, of what is scaled: a file is read by people
 _POWERS: Final[Mapping[str, tuple[int, int]]] = {
     "m": (1, 0),
     "m, times the length of a": (1, 0),
@@ -53,19 +53,19 @@ class Scale:
         """
         of_length, of_time = _POWERS[unit]
         factor = self.length**of_length * self.time**of_time
-        return value if factor == 1.0 else rounded(factor * value)
+        return value if factor == 1.0 else significant(factor * value)
 
     def height(self, value: float) -> float:
         """Return a height above the world's origin [m] at the scale."""
-        return rounded(self.number(value, "m") + self.lift) if self.lift else self.number(value, "m")
+        return significant(self.number(value, "m") + self.lift) if self.lift else self.number(value, "m")
 
 
-def rounded(value: float) -> float:
+def significant(value: float) -> float:
     """Return a number without the rounding of a product or sum."""
-    return float(f"{value:.{DIGITS}g}")
+    return float(f"{value:.{SIGNIFICANT_DIGITS}g}")
 
 
-def unit_of(description: str | None) -> str:
+def leading_unit(description: str | None) -> str:
     """Return the unit that a field's description begins with; `-` where it has none."""
     text = description or ""
     return text[1 : text.index("]")] if text.startswith("[") else "-"
@@ -89,7 +89,7 @@ def scaled_table(table: Any, scale: Scale) -> Any:
             changed[name] = _scaled_value(value, field.description or "", scale)
     if isinstance(table, Region) and table.rows is not None:
         raised = zip(changed["upper"], table.rows, strict=True)
-        changed["upper"] = tuple(rounded(upper + row[2] * scale.lift) for upper, row in raised)
+        changed["upper"] = tuple(significant(upper + row[2] * scale.lift) for upper, row in raised)
     return replace(table, **changed)
 
 
@@ -106,7 +106,7 @@ def _scaled_value(value: Any, description: str, scale: Scale) -> Any:
         return value
     if description.startswith(_HEIGHT):
         return scale.height(value)
-    return scale.number(value, unit_of(description))
+    return scale.number(value, leading_unit(description))
 
 
 def scaled_limit(limit: Limit, scale: Scale) -> Limit:

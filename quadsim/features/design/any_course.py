@@ -36,17 +36,18 @@ from quadsim.features.design.first_scenario import (
     HEIGHT_OVER_ERROR,
     SHARE,
     STEP,
-    Course,
+    FirstCourse,
     course_by_rule,
     eight_length,
+    in_digits,
     later,
     lowest_centre,
     require_size,
-    rounded,
     step_bandwidth,
 )
 from quadsim.features.design.rules import HEADING_STEP, Design, design_for
 from quadsim.flight.audit import Limit
+from quadsim.mpc.space import Avoidance
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import scenario_names
 from quadsim.scenarios.courses.csv_course import Csv, read_course_table
@@ -59,25 +60,25 @@ from quadsim.scenarios.schema.writing import stated_lines
 from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import Vehicle
 
-REST: Final = 1.0  # after the end of a table [s]
-SAMPLES: Final = 4000  # of a course, by which its demands are found
-SHARPEST: Final = 0.05
+_REST: Final = 1.0  # after the end of a table [s]
+_SAMPLES: Final = 4000  # of a course, by which its demands are found
+_SHARPEST: Final = 0.05
 """Change of velocity between two samples, over the largest velocity, that is a corner and not a bend."""
-FREQUENCY_RATIO: Final = 1.5 * EIGHT_RATIO
+_FREQUENCY_RATIO: Final = 1.5 * EIGHT_RATIO
 """Largest acceleration over largest speed of a course [rad/s], over w: of a figure eight 1.5 times its turns."""
-SLOWEST, FASTEST = 1e-3, 1e3
+_SLOWEST, _FASTEST = 1e-3, 1e3
 """Range in which the factor of times is looked for."""
-HALVINGS: Final = 40
-YAW_ALLOWED: Final = 90.0 * ALLOWED_SHARE
+_HALVINGS: Final = 40
+_YAW_ALLOWED: Final = 90.0 * ALLOWED_SHARE
 """Least allowed error of the heading [deg]: that of a quarter turn."""
 AVOIDING: Final = ("robust", "rates")
 """Designed controllers that keep clear of obstacles."""
 _ERRORS: Final = tuple(f"{name}_error" for name in REFERENCE_NAMES)
-CARRIED: Final = ("x", "y", "z", "vx", "vy", "vz", *_ERRORS)
+_CARRIED: Final = ("x", "y", "z", "vx", "vy", "vz", *_ERRORS)
 """Signals of the constraints that belong to a course."""
-BOUNDED: Final = ("roll", "pitch", "speed", "slew")
+_BOUNDED: Final = ("roll", "pitch", "speed", "slew")
 """Signals that the new controller bounds itself: an entry of the old one is not missed."""
-RESERVED: Final = BOUNDED
+_RESERVED: Final = _BOUNDED
 """Names of constraints that the new scenario gives itself."""
 _NO_COURSE: Final = ("forces", "computation", "sensors", "estimator", "events", "actual")
 """Tables that are no part of a course."""
@@ -85,7 +86,7 @@ _NO_COURSE: Final = ("forces", "computation", "sensors", "estimator", "events", 
 
 def course_for(
     name: str, vehicle: Vehicle, file: str, *, law: str, tilt: float | None = None, size: float | None = None
-) -> Course:
+) -> FirstCourse:
     """Return a course by rule, or one of a scenario or a table made for a vehicle.
 
     Args:
@@ -105,13 +106,13 @@ def course_for(
     tuning = design_for(vehicle, tilt)
     if name in COURSES:
         return course_by_rule(name, vehicle, tuning, size)
-    if not is_table(name) and not name.endswith(".toml") and name not in scenario_names():
+    if not is_trajectory(name) and not name.endswith(".toml") and name not in scenario_names():
         hint = "or give a path ending in .toml or .csv"
         raise UnknownNameError("course", name, course_names(), hint=hint)
     return fitted_course(name, vehicle, file, tuning, avoids=law in AVOIDING, size=size)
 
 
-def is_table(course: str) -> bool:
+def is_trajectory(course: str) -> bool:
     """Return whether a course is the path of a table."""
     return course.lower().endswith(".csv")
 
@@ -123,7 +124,7 @@ def course_names() -> list[str]:
 
 def fitted_course(
     name: str, vehicle: Vehicle, file: str, tuning: Design, *, avoids: bool, size: float | None = None
-) -> Course:
+) -> FirstCourse:
     """Return a course made for a vehicle.
 
     Args:
@@ -137,12 +138,12 @@ def fitted_course(
     Raises:
         InputError: the course cannot be read, or such a controller cannot fly it.
     """
-    base = _of_table(name, file, tuning) if is_table(name) else load_scenario(name)
+    base = _of_table(name, file, tuning) if is_trajectory(name) else load_scenario(name)
     assembly = Assembly(base)
     _require_upright(name, base, assembly)
     if (base.obstacles or base.regions) and not avoids:
         raise ParameterError("", "--controller", name, "robust or rates: a course with obstacles or regions")
-    own = is_table(name) or _same(base, assembly, vehicle, file)
+    own = is_trajectory(name) or _same(base, assembly, vehicle, file)
     samples = _sampled(base, assembly)
     length = _length_factor(name, samples, size, 1.0 if own else vehicle.enclosing_radius / _radius(assembly))
     time, response = _time_factor(samples, length, vehicle, tuning)
@@ -155,7 +156,7 @@ def fitted_course(
         lowest = length * float(samples.poses[:, 2].min())
         least = lowest_centre(vehicle) + HEIGHT_OVER_ERROR * allowed
         lift = max(0.0, math.ceil(10.0 * (least - lowest) - 1e-6) / 10.0)
-    scale = Scale(length=rounded(length, 4), time=rounded(time, 4), lift=lift)
+    scale = Scale(length=in_digits(length, 4), time=in_digits(time, 4), lift=lift)
     return _written(name, base, assembly, scale, response, allowed, samples, own=own, size=size, touches=touches)
 
 
@@ -167,10 +168,10 @@ def _of_table(path: str, file: str, tuning: Design) -> Scenario:
         "name": "table",
         "description": "a table",
         "control_period": tuning.period,
-        "duration": later(float(table.t[-1]) + 2.0 * REST),
+        "duration": later(float(table.t[-1]) + 2.0 * _REST),
         "vehicle": {"file": file},
         "initial": {"position": [x, y, z], "euler": [0.0, 0.0, round(math.degrees(yaw), 6)]},
-        "reference": {"type": "csv", "file": path, "start": REST},
+        "reference": {"type": "csv", "file": path, "start": _REST},
         "controller": {"type": "pid"},
     }
     return parse_scenario(tables, source=path)
@@ -195,7 +196,7 @@ def _radius(assembly: Assembly) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Samples:
+class SampledCourse:
     """A course at equal intervals, as its scenario states it."""
 
     poses: Array  # (M, 4) x, y, z [m], yaw [rad], before the filter
@@ -217,15 +218,15 @@ class Samples:
         return bool(np.ptp(self.poses, axis=0).max() > 0.0)
 
 
-def _sampled(base: Scenario, assembly: Assembly) -> Samples:
+def _sampled(base: Scenario, assembly: Assembly) -> SampledCourse:
     """Return the samples of a scenario's course, over its flight."""
     course = assembly.course
     end = min(base.duration, course.end)
     if not end > 0.0:
         end = base.duration
-    t, interval = np.linspace(0.0, end, SAMPLES, retstep=True)
+    t, interval = np.linspace(0.0, end, _SAMPLES, retstep=True)
     poses = course.sample(t)
-    smooth_everywhere = np.zeros(SAMPLES - 1, bool)
+    smooth_everywhere = np.zeros(_SAMPLES - 1, bool)
     channels = zip(poses.T, course.resolution, strict=True)
     poses = np.column_stack([within_rounding(values, unit, smooth_everywhere) for values, unit in channels])
     before = course.sample(np.array(course.jumps) - 1e-6) if course.jumps else np.empty((0, 4))
@@ -236,18 +237,18 @@ def _sampled(base: Scenario, assembly: Assembly) -> Samples:
     velocity = np.diff(poses[:, :3], axis=0)
     fastest = float(np.linalg.norm(velocity, axis=1).max())
     bends = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
-    return Samples(
+    return SampledCourse(
         poses=poses,
         interval=float(interval),
         response_time=base.reference.response_time,
         jumps=has_jumps,
         largest_jump=float(np.abs(moved[:, :3]).max(initial=0.0)),
         shortest=float(gaps.min(initial=math.inf)),
-        corners=bool(fastest > 0.0 and bends.max() > SHARPEST * fastest),
+        corners=bool(fastest > 0.0 and bends.max() > _SHARPEST * fastest),
     )
 
 
-def _length_factor(name: str, samples: Samples, size: float | None, by_extent: float) -> float:
+def _length_factor(name: str, samples: SampledCourse, size: float | None, by_extent: float) -> float:
     """Return the factor of lengths."""
     if size is None:
         return by_extent
@@ -256,7 +257,7 @@ def _length_factor(name: str, samples: Samples, size: float | None, by_extent: f
     return size / samples.size
 
 
-def _time_factor(samples: Samples, length: float, vehicle: Vehicle, tuning: Design) -> tuple[float, float]:
+def _time_factor(samples: SampledCourse, length: float, vehicle: Vehicle, tuning: Design) -> tuple[float, float]:
     """Return the factor of times, and the response time [s] of a filter that the course needs; 0 for its own.
 
     The course asks for `SHARE` of the limits, and its filter is as slow as that of steps by rule, at least.
@@ -272,7 +273,7 @@ def _time_factor(samples: Samples, length: float, vehicle: Vehicle, tuning: Desi
     def share(time: float) -> float:
         filtered = response or time * samples.response_time
         shares = [_share(samples, length, time, filtered, vehicle, tuning)]
-        if is_sharp:
+        if is_sharp and not response:
             shares.append(by_rule / filtered)
         if samples.jumps and response:
             shares.append(1.2 * filtered / (time * samples.shortest))
@@ -282,9 +283,9 @@ def _time_factor(samples: Samples, length: float, vehicle: Vehicle, tuning: Desi
 
 
 def _where_one(share: Callable[[float], float]) -> float:
-    """Return the least factor of times, within `SLOWEST` to `FASTEST`, at which a falling share is at most 1."""
-    low, high = math.log(SLOWEST), math.log(FASTEST)
-    for _ in range(HALVINGS):
+    """Return the least factor of times, within `_SLOWEST` to `_FASTEST`, at which a falling share is at most 1."""
+    low, high = math.log(_SLOWEST), math.log(_FASTEST)
+    for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         if share(math.exp(middle)) > 1.0:
             low = middle
@@ -294,7 +295,7 @@ def _where_one(share: Callable[[float], float]) -> float:
 
 
 def _share(
-    samples: Samples, length: float, time: float, response_time: float, vehicle: Vehicle, tuning: Design
+    samples: SampledCourse, length: float, time: float, response_time: float, vehicle: Vehicle, tuning: Design
 ) -> float:
     """Return the largest demand of a course, with factors of lengths and times, over what it may ask for."""
     interval = time * samples.interval
@@ -326,7 +327,7 @@ def _share(
         shares.append(upward / (SHARE * min(tuning.authority.climb, tuning.authority.sink)))
         largest = float(np.linalg.norm(acceleration[:, :3], axis=1).max())
         if fastest > 0.0 and not samples.corners:
-            shares.append(largest / fastest / (FREQUENCY_RATIO * tuning.bandwidth))
+            shares.append(largest / fastest / (_FREQUENCY_RATIO * tuning.bandwidth))
     return max(shares)
 
 
@@ -337,12 +338,12 @@ def _written(
     scale: Scale,
     response: float,
     allowed: float,
-    samples: Samples,
+    samples: SampledCourse,
     *,
     own: bool,
     size: float | None,
     touches: bool,
-) -> Course:
+) -> FirstCourse:
     """Return the course as text."""
     explained: set[object] = set()
     reference = scaled_table(base.reference, scale)
@@ -363,7 +364,7 @@ def _written(
     if not base.ends_with_course:
         duration = later(scale.time * base.duration + response)
     stem = Path(name).stem
-    return Course(
+    return FirstCourse(
         name=stem.lower(),
         options=f"--course {name}" + ("" if size is None else f" --size {size:g}"),
         about=f"{stem} at {100.0 * SHARE:g} % of its limits" if samples.moves else f"{stem}",
@@ -372,14 +373,22 @@ def _written(
         duration=duration,
         size=scale.length * samples.size,
         allowed=0.0 if holds else allowed,
-        why_allowed=f"{100 * ALLOWED_SHARE:g} % of its own figure eight, {rounded(allowed / ALLOWED_SHARE):g} m",
+        why_allowed=f"{100 * ALLOWED_SHARE:g} % of its own figure eight, {in_digits(allowed / ALLOWED_SHARE):g} m",
         lasts=samples.moves and not samples.jumps,
-        avoids=bool(base.obstacles or base.regions),
+        clearance=_clearance(base, scale),
         has_floor=touches or any(_is_floor(entry) for entry in base.constraints),
         tables=tables,
         constraints="".join(entries),
         notes=(*_scale_notes(scale, response, own=own), *_left_out(base)),
     )
+
+
+def _clearance(base: Scenario, scale: Scale) -> float | None:
+    """Return the clearance that the controller adds [m]: that of the scenario's, scaled, or by default."""
+    if not base.obstacles and not base.regions:
+        return None
+    stated = vars(base.controller).get("avoidance") or Avoidance()
+    return scale.number(stated.margin, "m")
 
 
 def _initial(base: Scenario, scale: Scale) -> str:
@@ -411,7 +420,7 @@ def _is_floor(entry: Limit) -> bool:
 
 
 def _carries(entry: Limit) -> bool:
-    return entry.signal in CARRIED and entry.has_bounds
+    return entry.signal in _CARRIED and entry.has_bounds
 
 
 def _constraint(entry: Limit, scale: Scale, allowed: float, *, own: bool) -> str:
@@ -419,13 +428,13 @@ def _constraint(entry: Limit, scale: Scale, allowed: float, *, own: bool) -> str
     limit = scaled_limit(entry, scale)
     why = "scaled with the course"
     if entry.signal in _ERRORS and not own:
-        least = YAW_ALLOWED if entry.signal == "yaw_error" else rounded(allowed)
+        least = _YAW_ALLOWED if entry.signal == "yaw_error" else in_digits(allowed)
         lower = min(limit.lower, -least)
         upper = max(limit.upper, least)
         if (lower, upper) != (limit.lower, limit.upper):
             why = f"at least what the vehicle's own figure eight is allowed, {least:g}"
         limit = replace(limit, lower=lower, upper=upper)
-    if limit.name in RESERVED:
+    if limit.name in _RESERVED:
         limit = replace(limit, name=f"course_{limit.name}")
     lines = ["", *stated_lines("[[constraints]]", limit, {(Limit, name) for name in Limit.__dataclass_fields__})]
     return "\n".join([lines[0], f"{lines[1]}  # {limit.unit}: {why}", *lines[2:]]) + "\n"
@@ -447,7 +456,7 @@ def _left_out(base: Scenario) -> list[str]:
     if air is not None and (any(air.wind) or air.turbulence is not None):
         names.append("wind")
     names += [name for name in ("battery", "disturbance", "load") if getattr(base.effects, name, None) is not None]
-    names += [entry.name for entry in base.constraints if entry.signal not in (*CARRIED, *BOUNDED)]
+    names += [entry.name for entry in base.constraints if entry.signal not in (*_CARRIED, *_BOUNDED)]
     if base.polytopes:
         names.append("controller.polytopes")
     return [f"Left out, as no part of the course: {', '.join(names)}."] if names else []

@@ -112,7 +112,7 @@ def _for_vehicle(
     from quadsim.assets import vehicle_path
     from quadsim.console.progress import reporting
     from quadsim.features.design.any_course import course_for
-    from quadsim.features.design.fastest import MARGIN, at_fastest, fly_fastest
+    from quadsim.features.design.fastest import DEFAULT_MARGIN, at_fastest, fly_fastest
     from quadsim.features.design.first_scenario import first_scenario
     from quadsim.scenarios import loading
     from quadsim.vehicle import load_vehicle
@@ -127,7 +127,7 @@ def _for_vehicle(
     first = first_scenario(vehicle, file, course=course, law=law, tilt=tilt)
     if fastest:
         with reporting(progress) as report:
-            found = fly_fastest(first.scenario, MARGIN if margin is None else margin, report)
+            found = fly_fastest(first.scenario, DEFAULT_MARGIN if margin is None else margin, report)
         first = at_fastest(first, found)
     return loading.ScenarioFile(first.to_toml())
 

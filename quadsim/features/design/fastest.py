@@ -5,7 +5,7 @@ windows included, is 1 / p of what is stated; lengths and bounds stay.  A pace h
 every required margin is at least a share of half its band (`quadsim.flight.audit.worst_share`).  Limits of the commands
 have to hold alone: a command at its own bound is no near miss.
 
-What is found is a pace that was flown and holds, and one at most `RESOLUTION` faster that was flown and does not.
+What is found is a pace that was flown and holds, and one at most `_RESOLUTION` faster that was flown and does not.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from quadsim.scenarios.scaling import Scale, scaled_limit, scaled_table
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.scenarios.schema.writing import WIDTH, plain
 
-MARGIN: Final = 0.1  # default share of half a band that is left
+DEFAULT_MARGIN: Final = 0.1  # default share of half a band that is left
 LARGEST_MARGIN: Final = 0.9
-STEP: Final = 1.3  # from one pace to the next, until one holds and one does not
-LOWEST, HIGHEST = 0.05, 50.0
+_STEP: Final = 1.3  # from one pace to the next, until one holds and one does not
+_LOWEST, _HIGHEST = 0.05, 50.0
 """Paces that are looked at."""
-RESOLUTION: Final = 0.01  # between the pace that holds and the one that does not, as a share
-USUAL_FLIGHTS: Final = 9  # that the progress is stated in, until it is known
+_RESOLUTION: Final = 0.01  # between the pace that holds and the one that does not, as a share
+_USUAL_FLIGHTS: Final = 9  # that the progress is stated in, until it is known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,7 @@ def _retimed(entry: dict[str, Any], scenario: Scenario, i: int, scale: Scale) ->
     return {**entry, **{name: value for name, value in window.items() if name in entry}}
 
 
-def fly_fastest(scenario: Scenario, margin: float = MARGIN, progress: Progress = silent) -> FastestCourse:
+def fly_fastest(scenario: Scenario, margin: float = DEFAULT_MARGIN, progress: Progress = silent) -> FastestCourse:
     """Return the fastest pace at which every bound holds with a margin.
 
     Args:
@@ -132,14 +132,14 @@ def fly_fastest(scenario: Scenario, margin: float = MARGIN, progress: Progress =
     flights: list[PacedFlight] = []
 
     def fly(pace: float) -> PacedFlight:
-        total = max(USUAL_FLIGHTS, len(flights) + 1)
+        total = max(_USUAL_FLIGHTS, len(flights) + 1)
         progress(f"flight {len(flights) + 1}", len(flights), total)
         flight = _fly_at(scenario, pace, margin)
         flights.append(flight)
         return flight
 
     holds, fails = _bracket(fly)
-    while fails.pace / holds.pace > 1.0 + RESOLUTION:
+    while fails.pace / holds.pace > 1.0 + _RESOLUTION:
         middle = fly(math.sqrt(holds.pace * fails.pace))
         if middle.holds:
             holds = middle
@@ -184,17 +184,17 @@ def _bracket(fly: Callable[[float], PacedFlight]) -> tuple[PacedFlight, PacedFli
     if flight.holds:
         while flight.holds:
             holds = flight
-            if holds.pace * STEP > HIGHEST:
+            if holds.pace * _STEP > _HIGHEST:
                 raise InputError(
                     f"every bound holds at {holds.pace:.3g} times the speed by rule: nothing stops the course"
                 )
-            flight = fly(holds.pace * STEP)
+            flight = fly(holds.pace * _STEP)
         return holds, flight
     while not flight.holds:
         fails = flight
-        if fails.pace / STEP < LOWEST:
+        if fails.pace / _STEP < _LOWEST:
             raise InputError(f"no speed holds: at {fails.speed:.3g} m/s, {fails.text}")
-        flight = fly(fails.pace / STEP)
+        flight = fly(fails.pace / _STEP)
     return flight, fails
 
 

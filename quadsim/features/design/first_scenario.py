@@ -104,7 +104,7 @@ class FirstScenario:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Course:
+class FirstCourse:
     """What of a scenario depends on its course, as text of a file."""
 
     name: str  # in the scenario's name
@@ -117,7 +117,7 @@ class Course:
     allowed: float  # largest error along x, y and z [m]
     why_allowed: str  # where that is from
     lasts: bool = False  # whether it goes on turning, for what that needs
-    avoids: bool = False  # whether there are obstacles, or regions to stay in
+    clearance: float | None = None  # added to that of obstacles and regions [m]; None: there are none
     has_floor: bool = False  # whether it states a lowest height, or touches the ground
     tables: str = ""  # further tables
     constraints: str = ""  # further entries of `[[constraints]]`
@@ -128,7 +128,7 @@ def first_scenario(
     vehicle: Vehicle,
     file: str,
     *,
-    course: str | Course = "hover",
+    course: str | FirstCourse = "hover",
     law: str = "robust",
     tilt: float | None = None,
 ) -> FirstScenario:
@@ -180,7 +180,7 @@ def _rotors(vehicle: Vehicle) -> str:
     return "[effects.rotors]  # lag and inertia of the vehicle file\n"
 
 
-def _notes(vehicle: Vehicle, tuning: Design, course: Course, law: str) -> str:
+def _notes(vehicle: Vehicle, tuning: Design, course: FirstCourse, law: str) -> str:
     """Return the comments above the file: the figures it is based on."""
     can = tuning.authority
     limits = {
@@ -224,7 +224,7 @@ def _eight_limit(vehicle: Vehicle, tuning: Design) -> str:
     return "the largest acceleration within the tilt bound"
 
 
-def course_by_rule(name: str, vehicle: Vehicle, tuning: Design, size: float | None = None) -> Course:
+def course_by_rule(name: str, vehicle: Vehicle, tuning: Design, size: float | None = None) -> FirstCourse:
     """Return one of `COURSES` for a vehicle, of a size [m], or by rule.
 
     Raises:
@@ -267,9 +267,9 @@ def _by_rule(
     allowed: float,
     *,
     lasts: bool = False,
-) -> Course:
+) -> FirstCourse:
     """Return a course that starts above the origin, as low as the error that is allowed permits [m]."""
-    return Course(
+    return FirstCourse(
         name=name,
         options=options,
         about=about,
@@ -278,7 +278,7 @@ def _by_rule(
         duration=duration,
         size=size,
         allowed=allowed,
-        why_allowed=f"{100 * ALLOWED_SHARE:g} % of the course's size, {rounded(allowed / ALLOWED_SHARE):g} m",
+        why_allowed=f"{100 * ALLOWED_SHARE:g} % of the course's size, {in_digits(allowed / ALLOWED_SHARE):g} m",
         lasts=lasts,
     )
 
@@ -292,7 +292,7 @@ def step_bandwidth(tuning: Design, size: float) -> float:
     return STEP_RATIO * min(tuning.bandwidth, tuning.height) * min(1.0, STEP / size)
 
 
-def _steps(vehicle: Vehicle, tuning: Design, options: str, size: float) -> Course:
+def _steps(vehicle: Vehicle, tuning: Design, options: str, size: float) -> FirstCourse:
     """Return steps in x, y and z."""
     slowest = min(tuning.bandwidth, tuning.height)
     why = f"3 / ({STEP_RATIO:g} times {slowest:.3g} rad/s, the slower of w and that of z)"
@@ -314,7 +314,7 @@ z = [{{ start = {first}, stop = {third}, value = {above} }}]  # s, s, m
     return _by_rule(vehicle, "step", options, about, text, duration, size, ALLOWED_SHARE * size)
 
 
-def _eight(vehicle: Vehicle, tuning: Design, options: str, size: float | None) -> Course:
+def _eight(vehicle: Vehicle, tuning: Design, options: str, size: float | None) -> FirstCourse:
     """Return a figure eight: of a size [m], as fast as `SHARE` permits, or of that at which it turns with the loop."""
     acceleration = SHARE * largest_eight(vehicle, tuning)[0]
     by_rule = eight_length(vehicle, tuning)
@@ -348,12 +348,12 @@ ramp = {round(0.5 * turn, 3)}  # s, half a turn to gain its speed, and to lose i
 def eight_length(vehicle: Vehicle, tuning: Design) -> float:
     """Return the length [m] of the figure eight that turns with `EIGHT_RATIO` w at `SHARE` of the limits."""
     acceleration = SHARE * largest_eight(vehicle, tuning)[0]
-    return rounded(2.0 * acceleration / (_EIGHT_PEAK * (EIGHT_RATIO * tuning.bandwidth) ** 2), 3)
+    return in_digits(2.0 * acceleration / (_EIGHT_PEAK * (EIGHT_RATIO * tuning.bandwidth) ** 2), 3)
 
 
-def _controller(law: str, vehicle: Vehicle, tuning: Design, course: Course) -> str:
+def _controller(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
     if law == "rates":
-        return _rates(tuning) + ("\n[controller.avoidance]\nsoft = {}\n" if course.avoids else "")
+        return _rates(tuning) + _rates_avoidance(course)
     return f"""{_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning, course)}
 [controller.input_bounds]
 speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {span(vehicle.hover_speeds)}
@@ -361,17 +361,25 @@ slew = {[*_slew(tuning)]}  # rad/s per period: what a rotor's own speed makes in
 {_avoidance(course, tuning)}"""
 
 
-def _avoidance(course: Course, tuning: Design) -> str:
+def _rates_avoidance(course: FirstCourse) -> str:
+    """Return the same of a nonlinear MPC."""
+    if course.clearance is None:
+        return ""
+    return f"\n[controller.avoidance]\nmargin = {course.clearance}  # m, added\nsoft = {{}}\n"
+
+
+def _avoidance(course: FirstCourse, tuning: Design) -> str:
     """Return the table that keeps clear of obstacles, and within regions, where there are any."""
-    if not course.avoids:
+    if course.clearance is None:
         return ""
     place = tuning.weights[0]
     return f"""
 [controller.avoidance]  # planes between the plan and each obstacle
+margin = {course.clearance}  # m, added
 
 [controller.avoidance.soft]
-linear = {rounded(AVOIDANCE_WEIGHTS[0] * place)}  # l1: {AVOIDANCE_WEIGHTS[0]:g} times the weight of x
-quadratic = {rounded(AVOIDANCE_WEIGHTS[1] * place)}  # l2: {AVOIDANCE_WEIGHTS[1]:g} times the weight of x
+linear = {in_digits(AVOIDANCE_WEIGHTS[0] * place)}  # l1: {AVOIDANCE_WEIGHTS[0]:g} times the weight of x
+quadratic = {in_digits(AVOIDANCE_WEIGHTS[1] * place)}  # l2: {AVOIDANCE_WEIGHTS[1]:g} times the weight of x
 """
 
 
@@ -401,8 +409,8 @@ def _why_tilt(tuning: Design) -> str:
 
 
 def _robust(vehicle: Vehicle, tuning: Design) -> str:
-    place, height, heading = (rounded(weight) for weight in tuning.weights)
-    speed, w, tilt = rounded(tuning.speed_weight), tuning.bandwidth, _tilt(tuning)
+    place, height, heading = (in_digits(weight) for weight in tuning.weights)
+    speed, w, tilt = in_digits(tuning.speed_weight), tuning.bandwidth, _tilt(tuning)
     lag, known = "0.0", "the vehicle gives no lag"
     if vehicle.rotor_rise is not None and vehicle.rotor_rise >= SHORTEST_LAG:
         lag, known = '"vehicle"', "the vehicle's rotor_rise is predicted"
@@ -411,14 +419,14 @@ type = "robust"
 horizon = {tuning.horizon}  # N, periods: {HORIZON_TIMES:g} / w = {HORIZON_TIMES / w:.3g} s
 rotor_lag = {lag}  # {known}
 heading = true  # the hover model is turned by the present yaw
-move_weight = {rounded(tuning.move_weight)}  # of changes: as much as speed costs at {MOVE_RATIO:g} w, \
+move_weight = {in_digits(tuning.move_weight)}  # of changes: as much as speed costs at {MOVE_RATIO:g} w, \
 speed / ({MOVE_RATIO:g} w tau)^2
 
 [controller.offset_free]  # force and torque that the model does not know are estimated and compensated
 {_walk(vehicle, tuning)}
 [controller.soft]
-linear = {rounded(SOFT_WEIGHTS[0] * place)}  # l1: {SOFT_WEIGHTS[0]:g} times the weight of x
-quadratic = {rounded(SOFT_WEIGHTS[1] * place)}  # l2: {SOFT_WEIGHTS[1]:g} times the weight of x
+linear = {in_digits(SOFT_WEIGHTS[0] * place)}  # l1: {SOFT_WEIGHTS[0]:g} times the weight of x
+quadratic = {in_digits(SOFT_WEIGHTS[1] * place)}  # l2: {SOFT_WEIGHTS[1]:g} times the weight of x
 
 [controller.output_weights]
 x = {place}  # 1 / (g tan(tilt bound) / w^2)^2: {tuning.deviation:.3g} m is what the tilt bound answers
@@ -443,13 +451,13 @@ def _walk(vehicle: Vehicle, tuning: Design) -> str:
     walk = turned * WALK_SHARE * SHARE * tuning.acceleration * vehicle.gravity * tuning.period
     if walk < LEAST_WALK:
         return ""
-    return f"""torque_walk = {rounded(walk)}  # rad/s^2 per period: {WALK_SHARE:g} of what rotor_moment changes on a \
+    return f"""torque_walk = {in_digits(walk)}  # rad/s^2 per period: {WALK_SHARE:g} of what rotor_moment changes on a \
 figure eight; at hover it is {turned:.3g} rad/s^2 per m/s, which nonlinear MPC (rates) bears best
-largest_torque = {rounded(min(tuning.authority.turning[:2]))}  # rad/s^2, what is in reserve
+largest_torque = {in_digits(min(tuning.authority.turning[:2]))}  # rad/s^2, what is in reserve
 """
 
 
-def _baseline(law: str, vehicle: Vehicle, tuning: Design, course: Course) -> str:
+def _baseline(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
     rules = "  # weights by Bryson's rule, its defaults; it tracks pose and velocity, not acceleration"
     steepest, w = BASELINE_SHARE * _tilt(tuning), tuning.bandwidth
     tilt = round(min(LQR_TILT, steepest) if law == "lqr" else steepest, 3)
@@ -461,7 +469,7 @@ horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for t
 """
     if law != "lqr":
         lag = lag_to_allow_for(vehicle, tuning.period)
-        text += f"lag = {rounded(LAG_SHARE * lag)}  # s that its gains allow for: {LAG_SHARE:g} times "
+        text += f"lag = {in_digits(LAG_SHARE * lag)}  # s that its gains allow for: {LAG_SHARE:g} times "
         text += f"{1e3 * lag:.3g} ms, the rotors' lag or half a period\n"
     if law == "geometric":
         text += "integral = true  # against drag and what else is not modelled\n"
@@ -476,9 +484,9 @@ def _turns_in_air(vehicle: Vehicle) -> bool:
     return any(any(numbers or ()) for numbers in (vehicle.rotor_moment, vehicle.inflow_moment, vehicle.rate_damping))
 
 
-def _constraints(law: str, vehicle: Vehicle, tuning: Design, course: Course) -> str:
+def _constraints(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
     """Return the audited constraints that are not bounds of the controller."""
-    tilt, off = _tilt(tuning), rounded(course.allowed)
+    tilt, off = _tilt(tuning), in_digits(course.allowed)
 
     def entry(name: str, signal: str, lower: float, upper: float | None, why: str) -> str:
         text = f'\n[[constraints]]\nname = "{name}"\nsignal = "{signal}"\nlower = {lower}  # {why}\n'
@@ -516,11 +524,11 @@ def _tilt(tuning: Design) -> float:
     degrees = math.degrees(tuning.tilt) + 1e-9
     if tuning.tilt_stated:
         return round(degrees, 6)
-    return float(math.floor(degrees)) if degrees > 5.0 else rounded(degrees)
+    return float(math.floor(degrees)) if degrees > 5.0 else in_digits(degrees)
 
 
 def _slew(tuning: Design) -> tuple[float, float]:
-    return rounded(tuning.slew[0], 4), rounded(tuning.slew[1], 4)
+    return in_digits(tuning.slew[0], 4), in_digits(tuning.slew[1], 4)
 
 
 def later(time: float) -> float:
@@ -528,7 +536,7 @@ def later(time: float) -> float:
     return round(GRID * math.ceil(round(time / GRID, 6)), 9)
 
 
-def rounded(number: float, digits: int = 3) -> float:
+def in_digits(number: float, digits: int = 3) -> float:
     """Return a number to some significant digits."""
     return float(f"{number:.{digits}g}")
 

@@ -26,15 +26,15 @@ from scipy.signal import lfilter
 from quadsim.scenarios.courses.course import Course
 from quadsim.state import Array, unwrapped
 
-INTERVAL: Final = 0.02  # between the samples that the direction is taken from [s]
-MOST_SAMPLES: Final = 200_000  # of a course; a longer one has longer intervals
-APART: Final = 2  # samples on either side, whose difference is the velocity
-SLOW_SHARE: Final = 0.02
+_INTERVAL: Final = 0.02  # between the samples that the direction is taken from [s]
+_MOST_SAMPLES: Final = 200_000  # of a course; a longer one has longer intervals
+_APART: Final = 2  # samples on either side, whose difference is the velocity
+_SLOW_SHARE: Final = 0.02
 """Speed below which the heading is held, over the largest."""
-SLOW: Final = 0.02  # least such speed [m/s]
-AVERAGED: Final = 0.2  # time of each of the three moving averages [s]
-BLOCK: Final = 64.0  # of a course without an end, the time that is looked at first [s]
-AHEAD: Final = 8.0  # time at the end of what is looked at that is not used, as turns begin before their corners [s]
+_SLOW: Final = 0.02  # least such speed [m/s]
+_AVERAGED: Final = 0.2  # time of each of the three moving averages [s]
+_BLOCK: Final = 64.0  # of a course without an end, the time that is looked at first [s]
+_AHEAD: Final = 8.0  # time at the end of what is looked at that is not used, as turns begin before their corners [s]
 
 
 def along_path(course: Course, *, response_time: float, rate: float) -> Course:
@@ -73,16 +73,16 @@ class _Headings:
     def at(self, t: Array) -> Array:
         """Return the headings (M,) [rad] at times (M,) [s], before the filter."""
         latest = float(t.max(initial=0.0))
-        if not self._t.size or (latest > self._t[-1] - AHEAD and math.isinf(self._course.end)):
+        if not self._t.size or (latest > self._t[-1] - _AHEAD and math.isinf(self._course.end)):
             self._compute(latest)
         return np.interp(t, self._t, self._yaw)
 
     def _compute(self, latest: float) -> None:
         """Compute the headings up to a time [s], and those of a course with an end up to that and some time."""
-        span = self._course.end + AHEAD
+        span = self._course.end + _AHEAD
         if math.isinf(span):
-            span = BLOCK * 2.0 ** max(math.ceil(math.log2((latest + AHEAD) / BLOCK)), 0)
-        count = min(math.ceil(span / INTERVAL), MOST_SAMPLES) + 1
+            span = _BLOCK * 2.0 ** max(math.ceil(math.log2((latest + _AHEAD) / _BLOCK)), 0)
+        count = min(math.ceil(span / _INTERVAL), _MOST_SAMPLES) + 1
         t, interval = np.linspace(0.0, span, count, retstep=True)
         positions = self._course.sample(t)[:, :3]
         if self._response_time:
@@ -91,7 +91,7 @@ class _Headings:
             positions = lfilter([1.0 - keep], [1.0, -keep], positions, axis=0, zi=start)[0]
         before = float(self._course.initial[3])
         heading = turned(directions(positions, float(interval), before), self._rate * float(interval), before)
-        heading = _rounded_off(heading, max(round(AVERAGED / float(interval)), 1))
+        heading = _rounded_off(heading, max(round(_AVERAGED / float(interval)), 1))
         heading = limited(heading, self._rate * float(interval), before)
         self._t = t
         self._yaw = heading + self._response_time / 3.0 * np.gradient(heading, float(interval))
@@ -105,10 +105,10 @@ def directions(positions: Array, interval: float, before: float) -> Array:
         interval: between them [s].
         before: heading held before there is any speed [rad].
     """
-    padded = np.pad(positions[:, :2], ((APART, APART), (0, 0)), mode="edge")
-    velocity = (padded[2 * APART :] - padded[: -2 * APART]) / (2.0 * APART * interval)
+    padded = np.pad(positions[:, :2], ((_APART, _APART), (0, 0)), mode="edge")
+    velocity = (padded[2 * _APART :] - padded[: -2 * _APART]) / (2.0 * _APART * interval)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    moving = speed > max(SLOW, SLOW_SHARE * float(speed.max()))
+    moving = speed > max(_SLOW, _SLOW_SHARE * float(speed.max()))
     if not moving.any():
         return np.full(len(positions), before)
     along = unwrapped(np.arctan2(velocity[moving, 1], velocity[moving, 0]), before)

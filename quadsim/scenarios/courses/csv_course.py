@@ -23,16 +23,16 @@ from quadsim.rotation import quaternion_to_euler
 from quadsim.scenarios.courses.course import CLOSEST, EXACT, Course, Path, Travelled, begin
 from quadsim.scenarios.courses.legs import polyline
 from quadsim.scenarios.courses.table_formats import (
-    ACCELERATION,
-    AXES,
-    DEGREE,
-    DURATION,
+    ACCELERATION_QUANTITIES,
+    PIECE_DURATION,
+    POLYNOMIAL_AXES,
+    POLYNOMIAL_DEGREE,
     POLYNOMIALS,
-    POSITION,
-    QUATERNION,
-    VELOCITY,
-    format_of,
+    POSITION_QUANTITIES,
+    QUATERNION_QUANTITIES,
+    VELOCITY_QUANTITIES,
     nearest_format,
+    table_format,
 )
 from quadsim.state import Array, unwrapped
 from quadsim.ties import TIE_SHARE, first_smallest
@@ -52,7 +52,7 @@ DISAGREEMENT: Final = 0.25
 SMALL: Final = 0.05  # such a difference that is never doubted [m/s]
 ALIKE: Final = 0.04  # relative difference up to which a ratio is that of a unit
 OVERSTATED: Final = 5.0  # stated over covered velocity, plus 1 m/s, above which a table is refused
-Factor = Annotated[float, Ge(1e-3), Le(1e3)]  # of a table's lengths or times
+TableFactor = Annotated[float, Ge(1e-3), Le(1e3)]  # of a table's lengths or times
 UNIT_QUATERNION: Final = 0.01  # largest difference of a quaternion's length from 1
 LARGEST_GAP: Final = 0.01  # between a piece and the next [m, rad]
 MILLIMETRES: Final = 1000.0  # per m
@@ -94,8 +94,8 @@ class Csv(Travelled):
         Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")] | None,
         doc("hash of the file, recorded when it is read; a file with another hash is refused"),
     ] = None
-    length_factor: Annotated[Factor, doc("[-] by which the table's lengths are multiplied")] = 1.0
-    time_factor: Annotated[Factor, doc("[-] by which the table's times are multiplied; 2: at half its speed")] = 1.0
+    length_factor: Annotated[TableFactor, doc("[-] by which the lengths of the file are multiplied")] = 1.0
+    time_factor: Annotated[TableFactor, doc("[-] by which its times are multiplied; 2: at half its speed")] = 1.0
     lift: Annotated[Number, doc("[m] by which the course is raised, after length_factor")] = 0.0
 
     @property
@@ -142,7 +142,7 @@ class Csv(Travelled):
             accelerations = accelerations * (self.length_factor / self.time_factor**2)
         pieces = table.pieces
         if pieces is not None:
-            pieces = pieces * scale[:, None] / self.time_factor ** np.arange(DEGREE + 1)
+            pieces = pieces * scale[:, None] / self.time_factor ** np.arange(POLYNOMIAL_DEGREE + 1)
             pieces[:, 2, 0] += self.lift
         return replace(
             table,
@@ -179,7 +179,7 @@ def tabulated(file: str, t: Array, poses: Array) -> Csv:
 
 
 def read_course_table(path: FilePath) -> Table:
-    """Read a file of one of `quadsim.scenarios.courses.table_formats.FORMATS`, yaw in radians; see `parse_rows`.
+    """Read a file of one of `quadsim.scenarios.courses.table_formats.TABLE_FORMATS`, yaw in radians; see `parse_rows`.
 
     Raises:
         FileError: it cannot be read, or as of `parse_rows`.
@@ -218,7 +218,7 @@ def parse_rows(path: FilePath, content: bytes) -> Table:
     header = tuple(cell.strip().lower() for cell in rows[0]) if rows else ()
     if not header:
         raise FileError(path, "row 1: must be a header, such as t,x,y,z,yaw; the file is empty")
-    known = format_of(header)
+    known = table_format(header)
     if known is None:
         raise FileError(path, f"row 1: no known header, of {len(header)} columns; {nearest_format(header)}")
     kind, places = known
@@ -258,9 +258,9 @@ def _table_of_rows(
             return None
         return numbers[:, [places[quantity] for quantity in quantities]]
 
-    positions = numbers[:, [places[quantity] for quantity in POSITION]]
+    positions = numbers[:, [places[quantity] for quantity in POSITION_QUANTITIES]]
     yaw = columns(("yaw",))
-    quaternion = columns(QUATERNION)
+    quaternion = columns(QUATERNION_QUANTITIES)
     heading = np.zeros(len(t))
     if yaw is not None:
         heading = yaw[:, 0].copy()
@@ -268,16 +268,18 @@ def _table_of_rows(
         heading = _yaw_of(path, quaternion)
     _check_turns(path, heading)
     poses = np.column_stack([positions, unwrapped(heading, float(heading[0]))])
-    velocities = columns(VELOCITY)
-    accelerations = columns(ACCELERATION)
-    rounded = [places[quantity] for quantity in POSITION] + ([places["yaw"]] if yaw is not None else [])
+    velocities = columns(VELOCITY_QUANTITIES)
+    accelerations = columns(ACCELERATION_QUANTITIES)
+    rounded = [places[quantity] for quantity in POSITION_QUANTITIES] + ([places["yaw"]] if yaw is not None else [])
     resolution = [_resolution(row[column] for row in rows[1:]) for column in rounded]
     resolution += [0.0] * (len(EXACT) - len(resolution))
     notes = [*_speed_notes(path, t, positions), *_yaw_notes(path, t, poses[:, 3])]
     if velocities is not None:
         notes += _velocity_notes(path, t, poses, velocities, resolution)
     if accelerations is not None and velocities is None:
-        notes.append(f"columns {','.join(ACCELERATION)} are not used without {','.join(VELOCITY)}")
+        notes.append(
+            f"columns {','.join(ACCELERATION_QUANTITIES)} are not used without {','.join(VELOCITY_QUANTITIES)}"
+        )
         accelerations = None
     if accelerations is not None and velocities is not None:
         notes += _acceleration_notes(t, velocities, accelerations)
@@ -323,29 +325,28 @@ def _acceleration_notes(t: Array, velocities: Array, accelerations: Array) -> It
 
 def _table_of_pieces(path: FilePath, numbers: Array, places: Mapping[str, int], digest: str) -> Table:
     """Return the table of a file with a row per piece: its duration, and a polynomial of each axis."""
-    durations = numbers[:, places[DURATION]]
+    durations = numbers[:, places[PIECE_DURATION]]
     (short,) = np.nonzero(durations < CLOSEST)
     if short.size:
         row = int(short[0]) + 2
         raise FileError(path, f"row {row}, column duration: must be {CLOSEST} s or more; got {durations[short[0]]:g}")
     has_yaw = "yaw^0" in places
-    pieces = np.zeros((len(numbers), len(AXES), DEGREE + 1))
-    for axis, name in enumerate(AXES):
+    pieces = np.zeros((len(numbers), len(POLYNOMIAL_AXES), POLYNOMIAL_DEGREE + 1))
+    for axis, name in enumerate(POLYNOMIAL_AXES):
         if name == "yaw" and not has_yaw:
             continue
-        for i in range(DEGREE + 1):
+        for i in range(POLYNOMIAL_DEGREE + 1):
             pieces[:, axis, i] = numbers[:, places[f"{name}^{i}"]]
-    powers = durations[:, None] ** np.arange(DEGREE + 1)
+    powers = durations[:, None] ** np.arange(POLYNOMIAL_DEGREE + 1)
     ends = np.einsum("nai,ni->na", pieces, powers)
     gaps = np.abs(pieces[1:, :, 0] - ends[:-1])
     (apart,) = np.nonzero(gaps.max(axis=1, initial=0.0) > LARGEST_GAP)
     if apart.size:
-        row = int(apart[0]) + 3
-        axis = AXES[first_smallest(-gaps[apart[0]], TIE_SHARE * float(gaps[apart[0]].max()))]
-        gap = gaps[apart[0]].max()
-        raise FileError(
-            path, f"row {row}, column {axis}^0: must be where the piece before it ends; it is {gap:.4g} off"
-        )
+        place = int(apart[0])
+        gap = float(gaps[place].max())
+        column = POLYNOMIAL_AXES[first_smallest(-gaps[place], TIE_SHARE * gap)]
+        rule = "must be where the piece before it ends"
+        raise FileError(path, f"row {place + 3}, column {column}^0: {rule}; it is {gap:.4g} off")
     t = np.concatenate([[0.0], np.cumsum(durations)])
     poses = np.vstack([pieces[:, :, 0], ends[-1:]])
     return Table(

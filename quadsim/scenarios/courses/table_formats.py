@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-POSITION: Final = ("x", "y", "z")
-VELOCITY: Final = ("vx", "vy", "vz")
-ACCELERATION: Final = ("ax", "ay", "az")
-QUATERNION: Final = ("qw", "qx", "qy", "qz")
-AXES: Final = ("x", "y", "z", "yaw")
-DEGREE: Final = 7  # of the polynomials of a piece
-DURATION: Final = "duration"
+POSITION_QUANTITIES: Final = ("x", "y", "z")
+VELOCITY_QUANTITIES: Final = ("vx", "vy", "vz")
+ACCELERATION_QUANTITIES: Final = ("ax", "ay", "az")
+QUATERNION_QUANTITIES: Final = ("qw", "qx", "qy", "qz")
+POLYNOMIAL_AXES: Final = ("x", "y", "z", "yaw")
+POLYNOMIAL_DEGREE: Final = 7  # of the polynomials of a piece
+PIECE_DURATION: Final = "duration"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +25,7 @@ class TableFormat:
 
     name: str  # as messages call it
     columns: Mapping[str, str]  # quantity -> column
-    needed: tuple[str, ...] = ("t", *POSITION)  # quantities that must be there
+    needed: tuple[str, ...] = ("t", *POSITION_QUANTITIES)  # quantities that must be there
     groups: tuple[tuple[str, ...], ...] = ()  # quantities that are there together or not at all
     unused: tuple[str, ...] = ()  # further columns that it may have
 
@@ -75,34 +75,40 @@ def _named(pattern: str, quantities: Sequence[str], axes: Sequence[str] = ("x", 
     return {quantity: pattern.format(axis) for quantity, axis in zip(quantities, axes, strict=True)}
 
 
+def _coefficients(axis: str) -> tuple[str, ...]:
+    """Return the columns of an axis' polynomial, from the constant up."""
+    return tuple(f"{axis}^{i}" for i in range(POLYNOMIAL_DEGREE + 1))
+
+
+_COEFFICIENTS: Final = tuple(column for axis in POLYNOMIAL_AXES for column in _coefficients(axis))
 POLYNOMIALS: Final = TableFormat(
     name="polynomials by piece, as of uav_trajectories",
-    columns={DURATION: DURATION, **{f"{axis}^{i}": f"{axis}^{i}" for axis in AXES for i in range(DEGREE + 1)}},
-    needed=(DURATION, *(f"{axis}^{i}" for axis in POSITION for i in range(DEGREE + 1))),
-    groups=(tuple(f"yaw^{i}" for i in range(DEGREE + 1)),),
+    columns={column: column for column in (PIECE_DURATION, *_COEFFICIENTS)},
+    needed=(PIECE_DURATION, *_coefficients("x"), *_coefficients("y"), *_coefficients("z")),
+    groups=(_coefficients("yaw"),),
 )
-FORMATS: Final = (
+TABLE_FORMATS: Final = (
     TableFormat(
         name="quadsim",
         columns={
             "t": "t",
-            **_named("{}", POSITION),
+            **_named("{}", POSITION_QUANTITIES),
             "yaw": "yaw",
-            **_named("v{}", VELOCITY),
-            **_named("a{}", ACCELERATION),
+            **_named("v{}", VELOCITY_QUANTITIES),
+            **_named("a{}", ACCELERATION_QUANTITIES),
         },
-        groups=(("yaw",), VELOCITY, ACCELERATION),
+        groups=(("yaw",), VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
     ),
     TableFormat(
         name="pmm_uav_planner, Agilicious",
         columns={
             "t": "t",
-            **_named("p_{}", POSITION),
-            **_named("q_{}", QUATERNION, ("w", "x", "y", "z")),
-            **_named("v_{}", VELOCITY),
-            **_named("a_{}", ACCELERATION),
+            **_named("p_{}", POSITION_QUANTITIES),
+            **_named("q_{}", QUATERNION_QUANTITIES, ("w", "x", "y", "z")),
+            **_named("v_{}", VELOCITY_QUANTITIES),
+            **_named("a_{}", ACCELERATION_QUANTITIES),
         },
-        groups=(QUATERNION, VELOCITY, ACCELERATION),
+        groups=(QUATERNION_QUANTITIES, VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
         unused=tuple(f"{name}_{axis}" for name in ("w", "a_lin", "a_rot", "j", "s") for axis in "xyz")
         + tuple(f"u_{i}" for i in range(1, 5)),
     ),
@@ -110,12 +116,12 @@ FORMATS: Final = (
         name="uav_trajectories, sampled",
         columns={
             "t": "t",
-            **_named("pos{}", POSITION),
+            **_named("pos{}", POSITION_QUANTITIES),
             "yaw": "yaw",
-            **_named("vel{}", VELOCITY),
-            **_named("acc{}", ACCELERATION),
+            **_named("vel{}", VELOCITY_QUANTITIES),
+            **_named("acc{}", ACCELERATION_QUANTITIES),
         },
-        groups=(("yaw",), VELOCITY, ACCELERATION),
+        groups=(("yaw",), VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
         unused=tuple(f"{name}{axis}" for name in ("jerk", "snap") for axis in "xyz"),
     ),
     POLYNOMIALS,
@@ -123,9 +129,9 @@ FORMATS: Final = (
 """The known formats; of equally near ones the first is named."""
 
 
-def format_of(header: Sequence[str]) -> tuple[TableFormat, dict[str, int]] | None:
+def table_format(header: Sequence[str]) -> tuple[TableFormat, dict[str, int]] | None:
     """Return the format of a header and the places of its quantities; None if it is of none."""
-    for entry in FORMATS:
+    for entry in TABLE_FORMATS:
         places = entry.quantities(header)
         if places is not None:
             return entry, places
@@ -137,7 +143,7 @@ def nearest_format(header: Sequence[str]) -> str:
 
     A header is not quoted: the author of a scenario may not own the file that it names.
     """
-    nearest = min(FORMATS, key=lambda entry: entry.distance(header))
+    nearest = min(TABLE_FORMATS, key=lambda entry: entry.distance(header))
     text = f"the nearest known format is {nearest.name}: {nearest.header}"
     missing = nearest.missing(header)
     if nearest is POLYNOMIALS:
