@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from quadsim.flight.audit import Limit
+from quadsim.scenarios.courses.course import Headed
 from quadsim.scenarios.courses.csv_course import Csv
 from quadsim.scenarios.courses.steps import Steps, Window
 from quadsim.scenarios.schema.base import fields_of, is_table
@@ -87,6 +88,8 @@ def scaled_table(table: Any, scale: Scale) -> Any:
         value = getattr(table, name)
         if not is_absent(value):
             changed[name] = _scaled_value(value, field.description or "", scale)
+    if isinstance(table, Headed) and not table.looks_ahead:
+        changed["yaw_rate"] = table.yaw_rate  # without effect
     if isinstance(table, Region) and table.rows is not None:
         raised = zip(changed["upper"], table.rows, strict=True)
         changed["upper"] = tuple(significant(upper + row[2] * scale.lift) for upper, row in raised)
@@ -148,5 +151,5 @@ def _scaled_steps(table: Steps, scale: Scale) -> Steps:
         y=windows("y"),
         z=windows("z"),
         yaw=table.yaw if isinstance(table.yaw, str) else windows("yaw"),
-        yaw_rate=scale.number(table.yaw_rate, "deg/s"),
+        yaw_rate=scale.number(table.yaw_rate, "deg/s") if table.looks_ahead else table.yaw_rate,
     )

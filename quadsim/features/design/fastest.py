@@ -166,7 +166,7 @@ def _restate(stated: Any, before: Mapping[str, Any], after: Mapping[str, Any]) -
             continue
         if isinstance(value, dict):
             _restate(stated[key], earlier or {}, value)
-        elif isinstance(stated[key], AoT):
+        elif isinstance(stated.get(key), AoT):
             for entry, entry_before, entry_after in zip(stated[key], earlier or value, value, strict=True):
                 _restate(entry, entry_before, entry_after)
         else:

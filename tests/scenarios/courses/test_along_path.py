@@ -46,7 +46,7 @@ def flown(scenario: Scenario) -> tuple[Array, Array, Array]:
 def test_bends_are_followed_exactly(name: str) -> None:
     heading, direction, speed = flown(looking(name, **{"reference.yaw_rate": 720.0}))
     error = np.abs(np.remainder(heading - direction + math.pi, math.tau) - math.pi)
-    assert np.degrees(error[speed > 0.5 * speed.max()]).max() < 3.0
+    assert np.degrees(error[speed > 0.5 * speed.max()]).max() < 6.0
 
 
 @pytest.mark.parametrize("name", COURSES)
@@ -162,7 +162,7 @@ def test_the_steps_of_the_rule() -> None:
     heading = turned(direction, 0.1, 0.0)
     assert heading[10:12].tolist() == pytest.approx([0.0, 0.05])
     assert heading[19] + heading[20] == pytest.approx(1.0, abs=0.06)
-    assert np.abs(np.diff(heading)).max() == pytest.approx(0.05)
+    assert np.diff(heading)[11:19].tolist() == pytest.approx([0.05] * 8)
     slope = 0.08 * np.arange(41)
     np.testing.assert_allclose(turned(slope, 0.1, 0.0), slope, atol=1e-12)
     assert limited(np.array([5.0, 5.0, -5.0]), 1.0, 0.0).tolist() == [0.0, 1.0, 0.0]
