@@ -419,7 +419,7 @@ FILES: dict[Callable[[Path, str], None], dict[str, str]] = {
         "": "name is missing@description is missing@",
     },
     load_course: {
-        "": "row 1: the header must be t,x,y,z,yaw or t,x,y,z,yaw,vx,vy,vz; got none",
+        "": "row 1: must be a header, such as t,x,y,z,yaw; the file is empty",
         "t,x,y,z,yaw\n0,0,0,1,0\n1,0,0,1,0\n1,0,0,1,0\n": "row 4, column t: must be above that of the row @",
         "t,x,y,z,yaw\n0,0,0,1,0\n1,0,,1,0\n": "row 3, column y: is empty",
         "t,x,y,z,yaw\n0,0,0,1,0\n1,high,0,0,0\n": "row 3, column x: must be a number; got 'high'",

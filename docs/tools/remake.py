@@ -72,13 +72,14 @@ COMMANDS: Final[dict[str, list[list[str]]]] = {
     **{name: [[PYTHON, f"benchmarks/{name}.py", "--json", f"runs/numbers/{name}.json"]] for name in BENCHMARKS},
     "papers": [[QUADSIM, "reproduce", "--json"]],
     "first-flights": [[PYTHON, "tests/first_flights.py"]],
+    "fastest-courses": [[PYTHON, "tests/fastest_courses.py"]],
     "campaigns": [flown(name, name) for name in CAMPAIGNS],
     "battery": [flown(name, *arguments) for name, (_, arguments) in BATTERIES.items()],
     "pictures": [[PYTHON, *f"docs/tools/{script}".split()] for script in DRAWN],
 }
 """What makes the files of a name."""
 COMMANDS["solvers"][0] += ["--solvers", *SOLVERS]
-PRINTED: Final = ("papers", "first-flights")
+PRINTED: Final = ("papers", "first-flights", "fastest-courses")
 """Names whose command prints its JSON."""
 
 
@@ -262,6 +263,19 @@ def moment(made: Record) -> str:
     return table(head, rows)
 
 
+def fastest_courses(found: list[Record]) -> str:
+    """The fastest speed of each vehicle on each course, and the bound that stops it."""
+    courses = [*dict.fromkeys(row["course"] for row in found)]
+
+    def cell(row: Record) -> str:
+        return f"{row['size']:.3g} m: {row['by_rule']:.2f} to {row['speed']:.2f} m/s, {row['stopped_by']}"
+
+    rows = []
+    for vehicle in dict.fromkeys(row["vehicle"] for row in found):
+        rows.append((vehicle, *(cell(row) for row in found if row["vehicle"] == vehicle)))
+    return table(("vehicle", *courses), rows)
+
+
 def campaigns(summaries: Record) -> str:
     """How often flights of the shipped campaigns failed, with 95 % intervals."""
     rows = []
@@ -380,6 +394,7 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     **{each.__name__: each for each in (flight, batch, campaign, film, identification, autopilots, stability, moment)},
     "paper": both_flights,
     "first-flights": first_flights,
+    "fastest-courses": fastest_courses,
     "battery": batteries,
 }
 

@@ -26,7 +26,8 @@ from quadsim.mpc.pilot.pilot import Pilot
 from quadsim.mpc.problem.flatness import motion_along
 from quadsim.mpc.tables.bounded import Bounded, Weighted
 from quadsim.rotation import body_to_euler_rates
-from quadsim.scenarios.courses.course import Course, repeated
+from quadsim.scenarios.courses.along_path import along_path
+from quadsim.scenarios.courses.course import Course, Headed, repeated
 from quadsim.scenarios.courses.csv_course import Csv
 from quadsim.scenarios.courses.followed import FollowedCourse
 from quadsim.scenarios.courses.steps import Steps
@@ -318,9 +319,12 @@ class Assembly:
         """
         reference = self.scenario.reference
         course = reference.build(self.initial_pose, self.vehicle.gravity)
-        if reference.repeat is None:
-            return course
-        return repeated(course, reference.repeat, until=self.scenario.duration)
+        if reference.repeat is not None:
+            course = repeated(course, reference.repeat, until=self.scenario.duration)
+        if isinstance(reference, Headed) and reference.looks_ahead:
+            rate = math.radians(reference.yaw_rate)
+            course = along_path(course, response_time=reference.response_time, rate=rate)
+        return course
 
     @property
     def course_cut(self) -> float | None:
@@ -356,8 +360,13 @@ class Assembly:
             return None
         t = np.arange(max(math.floor(course.end / period + 1e-6), 1) + 1, dtype=np.float64) * period
         velocity, acceleration = course.derivatives(t)
-        yaw = float(course.initial[3]) if course.free_heading else np.full(len(t), course.initial[3])
-        position = course.sample(t)[:, :3]
+        poses = course.sample(t)
+        position = poses[:, :3]
+        yaw: Array | float = np.full(len(t), course.initial[3])
+        if course.stated_heading:
+            yaw = poses[:, 3]
+        elif course.free_heading:
+            yaw = float(course.initial[3])
         return motion_along(position, velocity, acceleration, period=period, vehicle=self.vehicle, yaw=yaw)
 
     @cached_property

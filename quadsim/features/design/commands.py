@@ -11,10 +11,12 @@ from cyclopts import Parameter
 
 from quadsim.assets import vehicle_names
 from quadsim.errors import InputError, ParameterError
-from quadsim.features.arguments import Changes, File, Flag, ScenarioName, VehicleName, Whole
+from quadsim.features.arguments import Changes, File, Flag, ScenarioName, VehicleName, Watched, Whole
 from quadsim.scenarios.catalogue import scenario_names
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from quadsim.console.results import Document
     from quadsim.features.design.vehicle_report import VehicleReport
     from quadsim.scenarios.loading import ScenarioFile
@@ -32,7 +34,11 @@ def scenario(
     course: str | None = None,
     controller: str | None = None,
     tilt: float | None = None,
+    size: float | None = None,
+    fastest: Flag = False,
+    margin: float | None = None,
     schema: Flag = False,
+    progress: Watched = True,
 ) -> ScenarioFile:
     """Print a scenario with all defaults and comments, as a start for your own.
 
@@ -41,14 +47,24 @@ def scenario(
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
         seed: replace the seed of everything random in the scenario.
         vehicle: print a first scenario for this vehicle instead.
-        course: its course: hover, step (of 1 m) or figure-eight, at 60 % of the vehicle's limits (default: hover).
+        course: its course, at 60 % of the vehicle's limits: hover, step (of 1 m), figure-eight, a scenario of the
+            library or a path to one (.toml), or a path to a trajectory (.csv) (default: hover).
         controller: its controller: robust, lqr, pid or geometric, or rates for nonlinear MPC of thrust and body rates
             through its autopilot (default: robust).
         tilt: its tilt bound [deg] (default: by rule, at most 40).
+        size: longest side of the course [m] (default: by rule; of a scenario by the vehicles' extents, of a trajectory
+            as it is).
+        fastest: fly the course at the largest speed at which every bound holds with the margin, found by bisection of
+            audited flights.
+        margin: share of half of each bound's band that --fastest leaves (default: 0.1); 0: within tolerances.
         schema: print the JSON Schema of scenario files instead.
+        progress: whether to show a bar of the flights of --fastest on a terminal, elsewhere a line every ten seconds.
 
     Returns:
         The `content` of the file, where every number has its unit or source, and the `scenario` itself.
+
+    Raises:
+        InputError: there is no such vehicle, course or controller, they do not fit together, or no speed holds.
 
     Examples:
         >>> import quadsim
@@ -62,27 +78,23 @@ def scenario(
     """
     import json
 
-    from quadsim.assets import vehicle_path
-    from quadsim.features.design.first_scenario import first_scenario
     from quadsim.scenarios import loading
-    from quadsim.scenarios.assembly import stated_disturbance
     from quadsim.scenarios.courses.csv_course import Csv
     from quadsim.scenarios.schema.json_schema import scenario_schema
-    from quadsim.vehicle import load_vehicle
 
     if schema:
         return loading.ScenarioFile(json.dumps(scenario_schema(), indent=2) + "\n", scenario_schema())
-    options = {"course": course, "law": controller, "tilt": tilt}
+    options = {"course": course, "controller": controller, "tilt": tilt, "size": size, "margin": margin}
     choice: dict[str, Any] = {option: value for option, value in options.items() if value is not None}
     if vehicle is not None:
         for option, value in {"a scenario": name, "--set": changes, "--seed": seed}.items():
             if value:
                 raise ParameterError("", "--for", vehicle, f"given without {option}")
-        path = vehicle_path(str(vehicle))
-        choice["disturbance"] = stated_disturbance(path)
-        return loading.ScenarioFile(first_scenario(load_vehicle(path), str(vehicle), **choice).to_toml())
+        return _for_vehicle(str(vehicle), choice, fastest=fastest, progress=progress)
+    if fastest:
+        raise ParameterError("", "--fastest", fastest, "given with --for alone")
     for option, value in choice.items():
-        raise ParameterError("", f"--{'controller' if option == 'law' else option}", value, "given with --for alone")
+        raise ParameterError("", f"--{option}", value, "given with --for alone")
     if name is None:
         names = ", ".join(scenario_names())
         raise InputError(f"scenario needs a name or a TOML file, or --schema (there are: {names})")
@@ -91,6 +103,36 @@ def scenario(
     if isinstance(table, Csv):  # so that you may replace the file
         assembly = assembly.of(assembly.scenario.altered(reference=replace(table, sha256=None)))
     return loading.ScenarioFile(assembly.to_toml())
+
+
+def _for_vehicle(
+    file: str, choice: dict[str, Any], *, fastest: bool, progress: bool | Callable[[str, int, int], None]
+) -> ScenarioFile:
+    """Return a first scenario for a vehicle; `choice` are options of `scenario` that were given."""
+    from quadsim.assets import vehicle_path
+    from quadsim.console.progress import reporting
+    from quadsim.features.design.any_course import course_for
+    from quadsim.features.design.fastest import DEFAULT_MARGIN, at_fastest, fly_fastest
+    from quadsim.features.design.first_scenario import first_scenario
+    from quadsim.scenarios import loading
+    from quadsim.scenarios.assembly import stated_disturbance
+    from quadsim.vehicle import load_vehicle
+
+    margin = choice.pop("margin", None)
+    if margin is not None and not fastest:
+        raise ParameterError("", "--margin", margin, "given with --fastest alone")
+    path = vehicle_path(file)
+    vehicle = load_vehicle(path)
+    law = choice.get("controller", "robust")
+    tilt = choice.get("tilt")
+    course = course_for(choice.get("course", "hover"), vehicle, file, law=law, tilt=tilt, size=choice.get("size"))
+    disturbance = stated_disturbance(path)
+    first = first_scenario(vehicle, file, course=course, law=law, tilt=tilt, disturbance=disturbance)
+    if fastest:
+        with reporting(progress) as report:
+            found = fly_fastest(first.scenario, DEFAULT_MARGIN if margin is None else margin, report)
+        first = at_fastest(first, found)
+    return loading.ScenarioFile(first.to_toml())
 
 
 def vehicle_report(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from quadsim.errors import UnknownNameError, printable
+from quadsim.errors import ParameterError, UnknownNameError, printable
 from quadsim.features.design.rules import (
     HEADING_RATIO,
     HEADING_STEP,
@@ -56,6 +56,8 @@ BALANCED_MOVE: Final = 0.25
 steady motion would otherwise cost as much as a deviation, and the vehicle would lag."""
 OBSERVED_LAG_SHARE: Final = 0.3
 """`LAG_SHARE` where the torque of the air is observed: the loop then has to be faster than that torque grows."""
+LEAST_SIZE, LARGEST_SIZE = 0.01, 1e4
+"""Range of a course's size that is stated [m]."""
 ALLOWED_SHARE: Final = 0.15
 """The tracking requirement, the same for every controller: the largest error along x, y and z over the course's size.
 The robust controller's is 11 % on steps and 5 % on figure eights, at most (docs/own-vehicle.md)."""
@@ -64,6 +66,9 @@ HEIGHT_OVER_ERROR: Final = 1.5
 LOWEST: Final = 1.0  # height of a course [m]
 SOFT_WEIGHTS: Final = (2e4, 1e3)
 """l1 and l2 of the tilt bounds over the weight of x, as the defaults have them with the paper's weight of 10."""
+AVOIDANCE_WEIGHTS: Final = (4e3, 80.0)
+"""The same of half-spaces, by flights through trees: with those of the tilt bounds, planes that change from period to
+period cost tilt."""
 LQR_TILT: Final = 30.0
 BASELINE_SHARE: Final = 0.8
 """Tilt [deg] that an LQR is limited to, and share of the tilt bound that every baseline is: they limit only the tilt
@@ -117,47 +122,76 @@ class FirstScenario:
         return self.text
 
 
+@dataclass(frozen=True, kw_only=True)
+class FirstCourse:
+    """What of a scenario depends on its course, as text of a file."""
+
+    name: str  # in the scenario's name
+    options: str  # of the command, that ask for it
+    about: str  # a description
+    initial: str  # the fields of `[initial]`
+    reference: str  # the table `[reference]`
+    duration: float | None  # of the flight [s]; None: to the end of the course
+    size: float  # [m]: the step, or the longest side
+    allowed: float  # largest error along x, y and z [m]
+    why_allowed: str  # where that is from
+    lasts: bool = False  # whether it goes on turning, for what that needs
+    clearance: float | None = None  # added to that of obstacles and regions [m]; None: there are none
+    has_floor: bool = False  # whether it states a lowest height, or touches the ground
+    tables: str = ""  # further tables
+    constraints: str = ""  # further entries of `[[constraints]]`
+    notes: tuple[str, ...] = ()  # for the head of the file
+
+
 def first_scenario(
     vehicle: Vehicle,
     file: str,
     *,
-    course: str = "hover",
+    course: str | FirstCourse = "hover",
     law: str = "robust",
     tilt: float | None = None,
     disturbance: Disturbance | None = None,
 ) -> FirstScenario:
     """Return a scenario that the vehicle flies well, with numbers derived from the vehicle; see `quadsim.scenario`.
 
-    `file` is where these are, as the scenario is to name it; `course` is one of `COURSES`, `law` of `DESIGNED_LAWS`; a
-    `tilt` bound [deg] replaces that of the rules; a `disturbance` acts as the vehicle's file states it.
+    Args:
+        vehicle: the numbers.
+        file: where these are, as the scenario is to name it.
+        course: one of `COURSES`, or one made for the vehicle by `quadsim.features.design.any_course`.
+        law: one of `DESIGNED_LAWS`.
+        tilt: bound [deg] that replaces that of the rules.
+        disturbance: acts as the vehicle's file states it; None for none.
+
+    Raises:
+        UnknownNameError: there is no such course or controller.
+        ParameterError: the vehicle cannot be controlled, or not at this tilt.
     """
-    for kind, name, known in (("course", course, COURSES), ("controller", law, DESIGNED_LAWS)):
-        if name not in known:
-            raise UnknownNameError(kind, name, known)
+    if law not in DESIGNED_LAWS:
+        raise UnknownNameError("controller", law, DESIGNED_LAWS)
     tuning = design_for(vehicle, tilt)
-    reference, duration, size = _course(course, vehicle, tuning)
-    name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course}".lower())[:80]
-    for_duration = "" if duration is None else f"duration = {duration}  # s\n"
+    if isinstance(course, str):
+        course = course_by_rule(course, vehicle, tuning)
+    name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course.name}".lower())[:80]
+    for_duration = "" if course.duration is None else f"duration = {course.duration}  # s\n"
     text = f"""{_notes(vehicle, tuning, course, law)}
 name = {_text(name)}
-description = {_text(_description(course, vehicle, tuning))}
+description = {_text(f"{vehicle.name}: {course.about}")}
 {for_duration}control_period = {tuning.period}  # s, tau: the longest of the usual ones with tau w <= {PERIOD_SHARE:g}
 
 [vehicle]
 file = {_text(file)}  # made for its numbers: remake this file when they change
 
 [initial]
-position = [0.0, 0.0, {_height(vehicle, size)}]  # m, world; at rest
-
+{course.initial}
 [plant]
 limit_speeds = true  # rotors saturate at their lowest and highest speed
 
-{reference}
+{course.reference}
 {_controller(law, vehicle, tuning, course)}
 {_rotors(vehicle)}
 [effects.air]  # drag of the vehicle file
-{_disturbance(disturbance)}{_constraints(law, vehicle, tuning, size)}"""
-    return FirstScenario(text=text, size=size)
+{_disturbance(disturbance)}{course.tables}{_constraints(law, vehicle, tuning, course)}"""
+    return FirstScenario(text=text, size=course.size)
 
 
 def _rotors(vehicle: Vehicle) -> str:
@@ -179,7 +213,7 @@ def _disturbance(disturbance: Disturbance | None) -> str:
     return text
 
 
-def _notes(vehicle: Vehicle, tuning: Design, course: str, law: str) -> str:
+def _notes(vehicle: Vehicle, tuning: Design, course: FirstCourse, law: str) -> str:
     """Return the comments above the file: the figures it is based on."""
     can = tuning.authority
     limits = {
@@ -196,9 +230,10 @@ def _notes(vehicle: Vehicle, tuning: Design, course: str, law: str) -> str:
     if law != "robust":
         option, what = f" --controller {law}", "The course is made for a robust MPC, whose bandwidth for x and y"
         then = "The controller's own rules: docs/own-vehicle.md."
-    return f"""# A first flight of {printable(_description(course, vehicle, tuning))}.
-# Made by: quadsim scenario --for VEHICLE --course {course}{option}{stated}
-#
+    about = "".join(f"# {line}\n" for line in course.notes)
+    return f"""# A first flight of {printable(f"{vehicle.name}: {course.about}")}.
+# Made by: quadsim scenario --for VEHICLE {course.options}{option}{stated}
+{about}#
 # Thrust to weight {can.thrust_to_weight:.3g}: at most {math.degrees(can.steady_tilt):.3g} deg of steady tilt; \
 angular acceleration in reserve at hover
 # {can.turning[0]:.3g}, {can.turning[1]:.3g}, {can.turning[2]:.3g} rad/s^2 about x, y, z.
@@ -206,15 +241,6 @@ angular acceleration in reserve at hover
 # limited by {limits[tuning.limited_by]};
 # {tuning.height:.3g} rad/s for z, {tuning.heading:.3g} rad/s for yaw. {then}
 """
-
-
-def _description(course: str, vehicle: Vehicle, tuning: Design) -> str:
-    what = {
-        "hover": f"hover at {_height(vehicle, STEP):g} m",
-        "step": f"steps of {STEP:g} m in x, y and z",
-        "figure-eight": f"a figure eight at {100.0 * SHARE:g} % of {_eight_limit(vehicle, tuning)}",
-    }
-    return f"{vehicle.name}: {what[course]}"
 
 
 def largest_eight(vehicle: Vehicle, tuning: Design) -> tuple[float, Literal["tilt", "speed"]]:
@@ -231,45 +257,162 @@ def _eight_limit(vehicle: Vehicle, tuning: Design) -> str:
     return "the largest acceleration within the tilt bound"
 
 
-def _course(course: str, vehicle: Vehicle, tuning: Design) -> tuple[str, float | None, float]:
-    """The table `[reference]`, the flight's duration [s], None to the end of the course, and its size [m]."""
-    if course == "hover":
-        return "[reference]  # no steps: every axis holds its initial position, yaw at 0\n", 4.0, STEP
-    if course == "step":
-        slowest = min(tuning.bandwidth, tuning.height)
-        response = round(3.0 / (STEP_RATIO * slowest), 2)
-        start = _later(max(1.0, 3.0 / tuning.bandwidth))
-        hold = _later(max(1.5, 1.2 * response))
-        above = round(_height(vehicle, STEP) + STEP, 9)
-        first, second, third, last = (round(start + i * hold, 9) for i in range(4))
-        text = f"""[reference]
-response_time = {response}  # s, 95 % of a step: 3 / ({STEP_RATIO:g} times {slowest:.3g} rad/s, \
-the slower of w and that of z)
-x = [{{ start = {first}, stop = {third}, value = {STEP} }}]  # s, s, m
-y = [{{ start = {second}, stop = {last}, value = {STEP} }}]  # s, s, m
+def course_by_rule(name: str, vehicle: Vehicle, tuning: Design, size: float | None = None) -> FirstCourse:
+    """Return one of `COURSES` for a vehicle, of a size [m], or by rule.
+
+    Raises:
+        UnknownNameError: there is no such course.
+        ParameterError: hover has no size.
+    """
+    if name not in COURSES:
+        raise UnknownNameError("course", name, COURSES)
+    require_size(size)
+    options = f"--course {name}" + ("" if size is None else f" --size {size:g}")
+    if name == "hover":
+        if size is not None:
+            raise ParameterError("", "--size", size, "absent with --course hover")
+        height = _height(vehicle, ALLOWED_SHARE * STEP)
+        reference = "[reference]  # no steps: every axis holds its initial position, yaw at 0\n"
+        return _by_rule(vehicle, name, options, f"hover at {height:g} m", reference, 4.0, STEP, ALLOWED_SHARE * STEP)
+    if name == "step":
+        return _steps(vehicle, tuning, options, STEP if size is None else size)
+    return _eight(vehicle, tuning, options, size)
+
+
+def require_size(size: float | None) -> None:
+    """Refuse a size [m] that no course has.
+
+    Raises:
+        ParameterError: it is out of range.
+    """
+    if size is not None and not LEAST_SIZE <= size <= LARGEST_SIZE:
+        raise ParameterError("", "--size", size, f"between {LEAST_SIZE:g} and {LARGEST_SIZE:g} [m]")
+
+
+def _by_rule(
+    vehicle: Vehicle,
+    name: str,
+    options: str,
+    about: str,
+    reference: str,
+    duration: float | None,
+    size: float,
+    allowed: float,
+    *,
+    lasts: bool = False,
+) -> FirstCourse:
+    """Return a course that starts above the origin, as low as the error that is allowed permits [m]."""
+    return FirstCourse(
+        name=name,
+        options=options,
+        about=about,
+        initial=f"position = [0.0, 0.0, {_height(vehicle, allowed)}]  # m, world; at rest\n",
+        reference=reference,
+        duration=duration,
+        size=size,
+        allowed=allowed,
+        why_allowed=f"{100 * ALLOWED_SHARE:g} % of the course's size, {in_digits(allowed / ALLOWED_SHARE):g} m",
+        lasts=lasts,
+    )
+
+
+def step_bandwidth(tuning: Design, size: float) -> float:
+    """Return the bandwidth [rad/s] of the filter of steps of a size [m].
+
+    A step of s through a filter of bandwidth w_f lets the reference's velocity jump by w_f s: by no more than that of a
+    step of `STEP`.
+    """
+    return STEP_RATIO * min(tuning.bandwidth, tuning.height) * min(1.0, STEP / size)
+
+
+def _steps(vehicle: Vehicle, tuning: Design, options: str, size: float) -> FirstCourse:
+    """Return steps in x, y and z."""
+    slowest = min(tuning.bandwidth, tuning.height)
+    why = f"3 / ({STEP_RATIO:g} times {slowest:.3g} rad/s, the slower of w and that of z)"
+    if size > STEP:
+        why += f", times {size:g}"
+    response = round(3.0 / step_bandwidth(tuning, size), 2)
+    start = later(max(1.0, 3.0 / tuning.bandwidth))
+    hold = later(max(1.5, 1.2 * response))
+    above = round(_height(vehicle, ALLOWED_SHARE * size) + size, 9)
+    first, second, third, last = (round(start + i * hold, 9) for i in range(4))
+    text = f"""[reference]
+response_time = {response}  # s, 95 % of a step: {why}
+x = [{{ start = {first}, stop = {third}, value = {size} }}]  # s, s, m
+y = [{{ start = {second}, stop = {last}, value = {size} }}]  # s, s, m
 z = [{{ start = {first}, stop = {third}, value = {above} }}]  # s, s, m
 """
-        return text, round(start + 4.0 * hold, 9), STEP
+    about = f"steps of {size:g} m in x, y and z"
+    duration = round(start + 4.0 * hold, 9)
+    return _by_rule(vehicle, "step", options, about, text, duration, size, ALLOWED_SHARE * size)
+
+
+def _eight(vehicle: Vehicle, tuning: Design, options: str, size: float | None) -> FirstCourse:
+    """Return a figure eight: of a size [m], as fast as `SHARE` permits, or of that at which it turns with the loop."""
     acceleration = SHARE * largest_eight(vehicle, tuning)[0]
-    length = _rounded(2.0 * acceleration / (_EIGHT_PEAK * (EIGHT_RATIO * tuning.bandwidth) ** 2), 3)
+    by_rule = eight_length(vehicle, tuning)
+    limit = _eight_limit(vehicle, tuning)
+    length, why = by_rule, f"such that it turns with {EIGHT_RATIO:g} w"
+    about = f"a figure eight at {100.0 * SHARE:g} % of {limit}"
+    if size is not None:
+        length, why = size, "as --size states it"
+        rate = min(
+            EIGHT_RATIO * tuning.bandwidth,
+            math.sqrt(2.0 * SHARE * vehicle.gravity * tuning.acceleration / (_EIGHT_PEAK * length)),
+            math.sqrt(2.0) * SHARE * tuning.fastest / length,
+        )
+        acceleration = 0.5 * _EIGHT_PEAK * length * rate**2
+        about = (
+            f"a figure eight of {size:g} m at {100.0 * SHARE:g} % of the vehicle's limits, or slower where it is small"
+        )
+        limit = "the vehicle's limits"
     turn = round(math.tau * math.sqrt(0.5 * length * _EIGHT_PEAK / acceleration), 3)
     text = f"""[reference]
 type = "figure_eight"
 start = 1.0  # s
-length = {length}  # m, end to end: such that it turns with {EIGHT_RATIO:g} w; width half of it
-period = {turn}  # s: at most {acceleration:.3g} m/s^2, at {100.0 * SHARE:g} % of {_eight_limit(vehicle, tuning)}
+length = {length}  # m, end to end: {why}; width half of it
+period = {turn}  # s: at most {acceleration:.3g} m/s^2, at {100.0 * SHARE:g} % of {limit}
 ramp = {round(0.5 * turn, 3)}  # s, half a turn to gain its speed, and to lose it
 """
-    return text, None, length
+    allowed = ALLOWED_SHARE * by_rule
+    return _by_rule(vehicle, "figure-eight", options, about, text, None, length, allowed, lasts=True)
 
 
-def _controller(law: str, vehicle: Vehicle, tuning: Design, course: str) -> str:
+def eight_length(vehicle: Vehicle, tuning: Design) -> float:
+    """Return the length [m] of the figure eight that turns with `EIGHT_RATIO` w at `SHARE` of the limits."""
+    acceleration = SHARE * largest_eight(vehicle, tuning)[0]
+    return in_digits(2.0 * acceleration / (_EIGHT_PEAK * (EIGHT_RATIO * tuning.bandwidth) ** 2), 3)
+
+
+def _controller(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
     if law in ("nonlinear", "rates"):
-        return _nonlinear(law, vehicle, tuning)
+        return _nonlinear(law, vehicle, tuning) + _nonlinear_avoidance(course)
     return f"""{_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning, course)}
 [controller.input_bounds]
 speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {span(vehicle.hover_speeds)}
 slew = {[*_slew(tuning)]}  # rad/s per period: what a rotor's own speed makes in one, from hover towards its limits
+{_avoidance(course, tuning)}"""
+
+
+def _nonlinear_avoidance(course: FirstCourse) -> str:
+    """Return the same of a nonlinear MPC."""
+    if course.clearance is None:
+        return ""
+    return f"\n[controller.avoidance]\nmargin = {course.clearance}  # m, added\nsoft = {{}}\n"
+
+
+def _avoidance(course: FirstCourse, tuning: Design) -> str:
+    """Return the table that keeps clear of obstacles, and within regions, where there are any."""
+    if course.clearance is None:
+        return ""
+    place = tuning.weights[0]
+    return f"""
+[controller.avoidance]  # planes between the plan and each obstacle
+margin = {course.clearance}  # m, added
+
+[controller.avoidance.soft]
+linear = {in_digits(AVOIDANCE_WEIGHTS[0] * place)}  # l1: {AVOIDANCE_WEIGHTS[0]:g} times the weight of x
+quadratic = {in_digits(AVOIDANCE_WEIGHTS[1] * place)}  # l2: {AVOIDANCE_WEIGHTS[1]:g} times the weight of x
 """
 
 
@@ -318,17 +461,17 @@ def _why_tilt(tuning: Design) -> str:
 
 
 def _robust(vehicle: Vehicle, tuning: Design) -> str:
-    place, height, heading = (_rounded(weight) for weight in tuning.weights)
-    speed, w, tilt = _rounded(tuning.speed_weight), tuning.bandwidth, _tilt(tuning)
+    place, height, heading = (in_digits(weight) for weight in tuning.weights)
+    speed, w, tilt = in_digits(tuning.speed_weight), tuning.bandwidth, _tilt(tuning)
     why = f"1 / ({speed**-0.5:.3g} rad/s)^2: with it four integrators have the bandwidth w, (g beta)^2 x / w^8"
-    move = _rounded(tuning.move_weight)
+    move = in_digits(tuning.move_weight)
     why_move = f"as much as speed costs at {MOVE_RATIO:g} w, speed / ({MOVE_RATIO:g} w tau)^2"
     moment = ""
     if vehicle.turned_by_air >= TURNED:
         turned = f"{vehicle.turned_by_air:.3g} rad/s^2 per m/s"
         moment = f"moment = true  # the air's torque is in the model: at hover {turned}\n"
-        speed, why = _rounded(BALANCED_SPEED * speed), f"{BALANCED_SPEED:g} of that by rule: motion needs torque"
-        move, why_move = _rounded(BALANCED_MOVE * move), f"{BALANCED_MOVE:g} of those by rule, likewise"
+        speed, why = in_digits(BALANCED_SPEED * speed), f"{BALANCED_SPEED:g} of that by rule: motion needs torque"
+        move, why_move = in_digits(BALANCED_MOVE * move), f"{BALANCED_MOVE:g} of those by rule, likewise"
     lag, known = _predicted_lag(vehicle)
     return f"""[controller]
 type = "robust"
@@ -340,8 +483,8 @@ move_weight = {move}  # of changes: {why_move}
 [controller.offset_free]  # force and torque that the model does not know are estimated and compensated
 
 [controller.soft]
-linear = {_rounded(SOFT_WEIGHTS[0] * place)}  # l1: {SOFT_WEIGHTS[0]:g} times the weight of x
-quadratic = {_rounded(SOFT_WEIGHTS[1] * place)}  # l2: {SOFT_WEIGHTS[1]:g} times the weight of x
+linear = {in_digits(SOFT_WEIGHTS[0] * place)}  # l1: {SOFT_WEIGHTS[0]:g} times the weight of x
+quadratic = {in_digits(SOFT_WEIGHTS[1] * place)}  # l2: {SOFT_WEIGHTS[1]:g} times the weight of x
 
 [controller.output_weights]
 x = {place}  # 1 / (g tan(tilt bound) / w^2)^2: {tuning.deviation:.3g} m is what the tilt bound answers
@@ -360,7 +503,7 @@ pitch = {[-tilt, tilt]}  # as roll
 """
 
 
-def _baseline(law: str, vehicle: Vehicle, tuning: Design, course: str) -> str:
+def _baseline(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
     rules = "  # weights by Bryson's rule, its defaults; it tracks pose and velocity, not acceleration"
     steepest, w = BASELINE_SHARE * _tilt(tuning), tuning.bandwidth
     tilt = round(min(LQR_TILT, steepest) if law == "lqr" else steepest, 3)
@@ -371,11 +514,11 @@ horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for t
 {PREVIEW:g} / w = {PREVIEW / w:.3g} s
 """
     turned = vehicle.turned_by_air >= TURNED
-    observed = law == "geometric" and turned and course != "figure-eight"
+    observed = law == "geometric" and turned and not course.lasts
     if law != "lqr":
         lag = lag_to_allow_for(vehicle, tuning.period)
         share = OBSERVED_LAG_SHARE if observed else LAG_SHARE
-        text += f"lag = {_rounded(share * lag)}  # s that its gains allow for: {share:g} times "
+        text += f"lag = {in_digits(share * lag)}  # s that its gains allow for: {share:g} times "
         text += f"{1e3 * lag:.3g} ms, the rotors' lag or half a period\n"
     if law in ("lqr", "pid") and turned:
         text += "moment = true  # what the air does to the vehicle is balanced\n"
@@ -386,7 +529,7 @@ horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for t
         lagging = f"rotor_lag = {lag}  # s, the vehicle's rotor_rise\n" if lag > 0.0 else ""
         return text + f"\n[controller.disturbance]  # the air's torque, too, is observed and compensated\n{lagging}"
     text += "integral = true  # against drag and what else is not modelled\n"
-    if course == "figure-eight" and _turns_in_air(vehicle):
+    if course.lasts and _turns_in_air(vehicle):
         text += "feedforward = true  # of the reference's jerk and snap\n"
         text += "moment = true  # the air's torque on the vehicle at the reference's motion is balanced\n"
     return text
@@ -397,9 +540,9 @@ def _turns_in_air(vehicle: Vehicle) -> bool:
     return any(np.any(getattr(vehicle, name) or 0.0) for name in AIR_MOMENT)
 
 
-def _constraints(law: str, vehicle: Vehicle, tuning: Design, size: float) -> str:
-    """Return the audited constraints that are not bounds of the controller; `size` of the course [m]."""
-    tilt, off = _tilt(tuning), _rounded(ALLOWED_SHARE * size)
+def _constraints(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
+    """Return the audited constraints that are not bounds of the controller."""
+    tilt, off = _tilt(tuning), in_digits(course.allowed)
 
     def entry(name: str, signal: str, lower: float, upper: float | None, why: str) -> str:
         text = f'\n[[constraints]]\nname = "{name}"\nsignal = "{signal}"\nlower = {lower}  # {why}\n'
@@ -408,25 +551,28 @@ def _constraints(law: str, vehicle: Vehicle, tuning: Design, size: float) -> str
     hull = (
         "m, radius of the ball about the hull: the lowest centre that keeps all of the vehicle above the ground, z = 0"
     )
-    note = f"m, {100 * ALLOWED_SHARE:g} % of the course's size, {size:g} m: the same for every controller"
+    note = f"m, {course.why_allowed}: the same for every controller"
     entries = ["\n# Audited without an entry: every bound of the controller.\n"]
     if law in ("nonlinear", "rates"):  # it bounds the thrust of all rotors together
         entries += [entry("speed", "speed", vehicle.speed_min, vehicle.speed_max, "rad/s, what the rotors hold")]
     elif law != "robust":  # baselines bound the tilt that they command, and overshoot it
         why = "deg, the tilt bound, at every instant"
         entries += [entry(name, name, -tilt, tilt, why) for name in ("roll", "pitch")]
-    entries += [entry("floor", "z", _floor(vehicle), None, hull)]
-    return "".join(entries + [entry(f"hold_{axis}", f"{axis}_error", -off, off, note) for axis in "xyz"])
+    if not course.has_floor:
+        entries += [entry("floor", "z", lowest_centre(vehicle), None, hull)]
+    if course.allowed:
+        entries += [entry(f"hold_{axis}", f"{axis}_error", -off, off, note) for axis in "xyz"]
+    return "".join([*entries, course.constraints])
 
 
-def _floor(vehicle: Vehicle) -> float:
+def lowest_centre(vehicle: Vehicle) -> float:
     """Lowest z [m] of the centre of mass at which no attitude brings the hull to the ground, to a millimetre above."""
     return math.ceil(1e3 * vehicle.enclosing_radius - 1e-6) / 1e3
 
 
-def _height(vehicle: Vehicle, size: float) -> float:
-    """Height [m] of the lowest points of a course of some size [m], to a decimetre above."""
-    return max(LOWEST, math.ceil(10.0 * (_floor(vehicle) + HEIGHT_OVER_ERROR * ALLOWED_SHARE * size) - 1e-6) / 10.0)
+def _height(vehicle: Vehicle, allowed: float) -> float:
+    """Height [m] of the lowest points of a course with an allowed error [m], to a decimetre above."""
+    return max(LOWEST, math.ceil(10.0 * (lowest_centre(vehicle) + HEIGHT_OVER_ERROR * allowed) - 1e-6) / 10.0)
 
 
 def _tilt(tuning: Design) -> float:
@@ -434,19 +580,20 @@ def _tilt(tuning: Design) -> float:
     degrees = math.degrees(tuning.tilt) + 1e-9
     if tuning.tilt_stated:
         return round(degrees, 6)
-    return float(math.floor(degrees)) if degrees > 5.0 else _rounded(degrees)
+    return float(math.floor(degrees)) if degrees > 5.0 else in_digits(degrees)
 
 
 def _slew(tuning: Design) -> tuple[float, float]:
-    return _rounded(tuning.slew[0], 4), _rounded(tuning.slew[1], 4)
+    return in_digits(tuning.slew[0], 4), in_digits(tuning.slew[1], 4)
 
 
-def _later(time: float) -> float:
+def later(time: float) -> float:
     """The next multiple of `GRID`."""
     return round(GRID * math.ceil(round(time / GRID, 6)), 9)
 
 
-def _rounded(number: float, digits: int = 3) -> float:
+def in_digits(number: float, digits: int = 3) -> float:
+    """Return a number to some significant digits."""
     return float(f"{number:.{digits}g}")
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, doc
@@ -19,6 +19,10 @@ EXACT: Final = (0.0, 0.0, 0.0, 0.0)
 MOST_POINTS: Final = 200  # points or turns of one course; a longer one is a table, `type = "csv"`
 CLOSEST: Final = 1e-3
 """Smallest distance [m] between points joined at a speed, and smallest time [s] between points."""
+
+ALONG_PATH: Final = "along_path"
+AlongPath = Literal["along_path"]
+ALONG_PATH_DOC: Final = '"along_path": yaw follows the direction of travel, see docs/conventions.md'
 
 Speed = Annotated[float, Ge(1e-3), Le(1e4)]  # of travel [m/s], or of turning [deg/s]
 Time = Annotated[float, Ge(CLOSEST), Le(1e6)]
@@ -50,6 +54,7 @@ class Course:
     resolution: tuple[float, ...] = EXACT  # to how much x, y, z [m], yaw [rad] were rounded; 0 where they are exact
     derivatives: Derivatives | None = None  # of the position, where they are known
     end: float = math.inf  # time [s] from which on it stays where it is
+    stated_heading: bool = False  # whether the reference motion has the heading of the samples, too
     free_heading: bool = False  # whether the heading is what leaves no rate about body z; else the initial one
     notes: tuple[str, ...] = ()  # doubts about its numbers, for the user
 
@@ -132,9 +137,33 @@ class Filtered:
         """
         raise NotImplementedError
 
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether the heading follows the direction of travel."""
+        return False
+
 
 @dataclass(frozen=True, kw_only=True)
-class Started(Filtered):
+class Headed(Filtered):
+    """A course that moves, and can look where it goes."""
+
+    yaw_rate: Annotated[
+        Speed,
+        doc(
+            '[deg/s] at which a heading "along_path" turns at most; at corners, stops and reversals at half of it, '
+            "half of the turn before them"
+        ),
+    ] = 180.0
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether the heading follows the direction of travel."""
+        fields = vars(self)
+        return fields.get("yaw") == ALONG_PATH or bool(fields.get("yaw_along_path", False))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Started(Headed):
     """A course with a start time."""
 
     start: Annotated[NonNegative, doc("[s] start of the course; before it, the initial position and yaw")] = 0.0
@@ -146,6 +175,13 @@ class Started(Filtered):
     def path(self, initial: Array, gravity: float) -> Path:
         """Return the path that starts at `start`; arguments and errors as in `build`."""
         raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Travelled(Started):
+    """A course with a heading of its own."""
+
+    yaw: Annotated[AlongPath | None, doc(f"{ALONG_PATH_DOC}; absent: the course's own heading")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +199,15 @@ def poses_of(points: Sequence[Point], initial: Array) -> Array:
         yaw = yaw if point.yaw is None else nearest_turn(math.radians(point.yaw), yaw)
         poses.append([*point.position, yaw])
     return np.array(poses)
+
+
+def require_free_yaw(points: Sequence[Point], yaw: str | None) -> None:
+    """Refuse a yaw at a point of a course that looks where it goes."""
+    if yaw is None:
+        return
+    for i, point in enumerate(points):
+        if point.yaw is not None:
+            raise ParameterError("", f"points.{i}.yaw", point.yaw, f'absent where yaw = "{yaw}"')
 
 
 def require_one(**fields: object) -> None:

@@ -6,25 +6,38 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path as FilePath
 from typing import Annotated, Final, Literal
 
 import numpy as np
-from annotated_types import doc
+from annotated_types import Ge, Le, doc
 from pydantic import StringConstraints
 
 from quadsim.errors import FileError
+from quadsim.fields import Number
 from quadsim.input_limits import LARGEST_CSV
-from quadsim.scenarios.courses.course import EXACT, Course, Path, Started, begin
+from quadsim.rotation import quaternion_to_euler
+from quadsim.scenarios.courses.course import CLOSEST, EXACT, Course, Path, Travelled, begin
 from quadsim.scenarios.courses.legs import polyline
+from quadsim.scenarios.courses.table_formats import (
+    ACCELERATION_QUANTITIES,
+    PIECE_DURATION,
+    POLYNOMIAL_AXES,
+    POLYNOMIAL_DEGREE,
+    POLYNOMIALS,
+    POSITION_QUANTITIES,
+    QUATERNION_QUANTITIES,
+    VELOCITY_QUANTITIES,
+    nearest_format,
+    table_format,
+)
 from quadsim.state import Array, unwrapped
 from quadsim.ties import TIE_SHARE, first_smallest
 
 POSE_HEADER: Final = ("t", "x", "y", "z", "yaw")
-VELOCITY_HEADER: Final = ("vx", "vy", "vz")
 LARGEST_NUMBER: Final = 1e6  # largest magnitude of a number in the table, as in the scenario file
 MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
 ROUNDED: Final = range(2, 8)
@@ -39,6 +52,9 @@ DISAGREEMENT: Final = 0.25
 SMALL: Final = 0.05  # such a difference that is never doubted [m/s]
 ALIKE: Final = 0.04  # relative difference up to which a ratio is that of a unit
 OVERSTATED: Final = 5.0  # stated over covered velocity, plus 1 m/s, above which a table is refused
+TableFactor = Annotated[float, Ge(1e-3), Le(1e3)]  # of a table's lengths or times
+UNIT_QUATERNION: Final = 0.01  # largest difference of a quaternion's length from 1
+LARGEST_GAP: Final = 0.01  # between a piece and the next [m, rad]
 MILLIMETRES: Final = 1000.0  # per m
 SPEED_UNITS: Final = {"mm/s": 1000.0, "cm/s": 100.0, "km/h": 3.6, "ft/s": 3.281, "knots": 1.944}  # per m/s
 
@@ -50,6 +66,11 @@ class Table:
     t: Array  # (n,) increasing, the first at least 0 [s]
     poses: Array  # (n, 4) x, y, z [m], yaw [rad], yaw unwrapped
     velocities: Array | None  # (n, 3) [m/s]; None where the file has none
+    accelerations: Array | None = None  # (n, 3) [m/s^2]; None where the file has none, or no velocities
+    has_yaw: bool = True  # whether the file states a heading; else it is the initial one
+    pieces: Array | None = None
+    """(n - 1, 4, 8) of a file of polynomials: the coefficients of x, y, z, yaw from the constant up, by time since the
+    start of the piece; else None, and the rows say all."""
     sha256: str  # hash of the file
     # one unit of the last decimal in each column of the poses [m, m, m, rad]; 0 where it is not rounded
     resolution: tuple[float, ...] = EXACT
@@ -57,21 +78,25 @@ class Table:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Csv(Started):
-    """A table with the header t,x,y,z,yaw or t,x,y,z,yaw,vx,vy,vz; yaw in RADIANS, as in flight.parquet."""
+class Csv(Travelled):
+    """A table with the header t,x,y,z[,yaw][,vx,vy,vz][,ax,ay,az], or of another format; yaw in RADIANS."""
 
     type: Annotated[Literal["csv"], doc("kind of course: a table in a file")]
     file: Annotated[
         str,
         doc(
-            "path of the CSV file, relative to the scenario file; "
-            "t [s] after start, x, y, z [m], yaw [rad] (radians, as ref_yaw in flight.parquet), vx, vy, vz [m/s]"
+            "path of the CSV file, relative to the scenario file; t [s] after start, x, y, z [m], yaw [rad] (radians, "
+            "as ref_yaw in flight.parquet; absent: the initial yaw), vx, vy, vz [m/s], ax, ay, az [m/s^2]; or "
+            "polynomials by piece, or as of pmm_uav_planner and uav_trajectories (docs/conventions.md)"
         ),
     ]
     sha256: Annotated[
         Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")] | None,
         doc("hash of the file, recorded when it is read; a file with another hash is refused"),
     ] = None
+    length_factor: Annotated[TableFactor, doc("[-] by which the lengths of the file are multiplied")] = 1.0
+    time_factor: Annotated[TableFactor, doc("[-] by which its times are multiplied; 2: at half its speed")] = 1.0
+    lift: Annotated[Number, doc("[m] by which the course is raised, after length_factor")] = 0.0
 
     @property
     def content(self) -> bytes | None:
@@ -85,8 +110,49 @@ class Csv(Started):
         table = read_course_table(path) if self.content is None else parse_rows(path, self.content)
         if self.sha256 not in (None, table.sha256):
             raise FileError(self.file, f"is not the file of the scenario: its SHA-256 is not {self.sha256}")
+        if not table.has_yaw:
+            table = replace(table, poses=np.column_stack([table.poses[:, :3], np.full(len(table.t), initial[3])]))
+        table = self._rescaled_rows(table)
         course = begin(through_rows(table), start=self.start + float(table.t[0]), initial=initial)
         return replace(course, notes=(*course.notes, *_far(table.poses[0, :3], initial[:3])))
+
+    def rescaled(self, *, length: float, time: float, lift: float) -> Csv:
+        """Return the course with lengths and times multiplied, `start` included, and then raised [m]."""
+        return replace(
+            self,
+            start=time * self.start,
+            response_time=time * self.response_time,
+            repeat=None if self.repeat is None else time * self.repeat,
+            length_factor=length * self.length_factor,
+            time_factor=time * self.time_factor,
+            lift=length * self.lift + lift,
+        )
+
+    def _rescaled_rows(self, table: Table) -> Table:
+        """Return the rows with both factors, raised; the table itself where nothing changes."""
+        if (self.length_factor, self.time_factor, self.lift) == (1.0, 1.0, 0.0):
+            return table
+        scale = np.array([self.length_factor, self.length_factor, self.length_factor, 1.0])
+        poses = table.poses * scale + np.array([0.0, 0.0, self.lift, 0.0])
+        velocities = table.velocities
+        if velocities is not None:
+            velocities = velocities * (self.length_factor / self.time_factor)
+        accelerations = table.accelerations
+        if accelerations is not None:
+            accelerations = accelerations * (self.length_factor / self.time_factor**2)
+        pieces = table.pieces
+        if pieces is not None:
+            pieces = pieces * scale[:, None] / self.time_factor ** np.arange(POLYNOMIAL_DEGREE + 1)
+            pieces[:, 2, 0] += self.lift
+        return replace(
+            table,
+            t=self.time_factor * table.t,
+            poses=poses,
+            velocities=velocities,
+            accelerations=accelerations,
+            pieces=pieces,
+            resolution=tuple((scale * table.resolution).tolist()),
+        )
 
     def located(self, directory: FilePath) -> Csv:
         """Return the table with absolute path and hash, so that a resolved scenario defines its flight.
@@ -113,7 +179,7 @@ def tabulated(file: str, t: Array, poses: Array) -> Csv:
 
 
 def read_course_table(path: FilePath) -> Table:
-    """Read a file with the header `t,x,y,z,yaw` or `t,x,y,z,yaw,vx,vy,vz`, yaw in radians; see `parse_rows`.
+    """Read a file of one of `quadsim.scenarios.courses.table_formats.TABLE_FORMATS`, yaw in radians; see `parse_rows`.
 
     Raises:
         FileError: it cannot be read, or as of `parse_rows`.
@@ -147,33 +213,151 @@ def parse_rows(path: FilePath, content: bytes) -> Table:
         raise FileError(path, f"cannot be read ({error})") from error
     while rows and not rows[-1]:
         rows.pop()
-    header = tuple(rows[0]) if rows else ()
-    if header not in (POSE_HEADER, POSE_HEADER + VELOCITY_HEADER):
-        wanted = f"{','.join(POSE_HEADER)} or {','.join(POSE_HEADER + VELOCITY_HEADER)}"
-        raise FileError(path, f"row 1: the header must be {wanted}; got {_header_text(header)}")
-    if len(rows) < 3:
-        raise FileError(path, f"must have 2 or more rows below its header; got {len(rows) - 1}")
+    if rows and len(rows[0]) > 1 and not any(row[-1].strip() for row in rows if row):
+        rows = [row[:-1] for row in rows]  # lines that end with a comma
+    header = tuple(cell.strip().lower() for cell in rows[0]) if rows else ()
+    if not header:
+        raise FileError(path, "row 1: must be a header, such as t,x,y,z,yaw; the file is empty")
+    known = table_format(header)
+    if known is None:
+        raise FileError(path, f"row 1: no known header, of {len(header)} columns; {nearest_format(header)}")
+    kind, places = known
+    least = 1 if kind is POLYNOMIALS else 2
+    if len(rows) < least + 1:
+        raise FileError(path, f"must have {least} or more rows below its header; got {len(rows) - 1}")
     if len(rows) > MOST_ROWS + 1:
         raise FileError(path, f"must have {MOST_ROWS} or fewer rows below its header")
     numbers = np.array([_parse_row(path, number, row, header) for number, row in enumerate(rows[1:], start=2)])
-    t = numbers[:, 0]
+    digest = hashlib.sha256(content).hexdigest()
+    if kind is POLYNOMIALS:
+        return _table_of_pieces(path, numbers, places, digest)
+    return _table_of_rows(path, rows, header, numbers, places, digest)
+
+
+def _table_of_rows(
+    path: FilePath,
+    rows: list[list[str]],
+    header: tuple[str, ...],
+    numbers: Array,
+    places: Mapping[str, int],
+    digest: str,
+) -> Table:
+    """Return the table of a file with a row per instant."""
+    t = numbers[:, places["t"]]
     if t[0] < 0.0:
-        raise FileError(path, f"row 2, column t: must be >= 0; got {rows[1][0]}")
+        raise FileError(path, f"row 2, column t: must be >= 0; got {rows[1][places['t']]}")
     (late,) = np.nonzero(np.diff(t) <= 0.0)
     if late.size:
         number = int(late[0]) + 3
-        rule = f"must be above that of the row before = {rows[number - 2][0]}"
-        raise FileError(path, f"row {number}, column t: {rule}; got {rows[number - 1][0]}")
-    poses = numbers[:, 1:5].copy()
-    _check_turns(path, poses[:, 3])
-    poses[:, 3] = unwrapped(poses[:, 3], float(poses[0, 3]))
-    velocities = numbers[:, 5:] if len(header) > len(POSE_HEADER) else None
-    resolution = tuple(_resolution(row[column] for row in rows[1:]) for column in range(1, 5))
-    digest = hashlib.sha256(content).hexdigest()
-    notes = [*_speed_notes(path, t, poses[:, :3]), *_yaw_notes(path, t, poses[:, 3])]
+        rule = f"must be above that of the row before = {rows[number - 2][places['t']]}"
+        raise FileError(path, f"row {number}, column t: {rule}; got {rows[number - 1][places['t']]}")
+
+    def columns(quantities: Sequence[str]) -> Array | None:
+        """(n, k) the numbers of quantities; None where the file has none."""
+        if quantities[0] not in places:
+            return None
+        return numbers[:, [places[quantity] for quantity in quantities]]
+
+    positions = numbers[:, [places[quantity] for quantity in POSITION_QUANTITIES]]
+    yaw = columns(("yaw",))
+    quaternion = columns(QUATERNION_QUANTITIES)
+    heading = np.zeros(len(t))
+    if yaw is not None:
+        heading = yaw[:, 0].copy()
+    elif quaternion is not None:
+        heading = _yaw_of(path, quaternion)
+    _check_turns(path, heading)
+    poses = np.column_stack([positions, unwrapped(heading, float(heading[0]))])
+    velocities = columns(VELOCITY_QUANTITIES)
+    accelerations = columns(ACCELERATION_QUANTITIES)
+    rounded = [places[quantity] for quantity in POSITION_QUANTITIES] + ([places["yaw"]] if yaw is not None else [])
+    resolution = [_resolution(row[column] for row in rows[1:]) for column in rounded]
+    resolution += [0.0] * (len(EXACT) - len(resolution))
+    notes = [*_speed_notes(path, t, positions), *_yaw_notes(path, t, poses[:, 3])]
     if velocities is not None:
         notes += _velocity_notes(path, t, poses, velocities, resolution)
-    return Table(t=t, poses=poses, velocities=velocities, sha256=digest, resolution=resolution, notes=tuple(notes))
+    if accelerations is not None and velocities is None:
+        notes.append(
+            f"columns {','.join(ACCELERATION_QUANTITIES)} are not used without {','.join(VELOCITY_QUANTITIES)}"
+        )
+        accelerations = None
+    if accelerations is not None and velocities is not None:
+        notes += _acceleration_notes(t, velocities, accelerations)
+    return Table(
+        t=t,
+        poses=poses,
+        velocities=velocities,
+        accelerations=accelerations,
+        has_yaw=yaw is not None or quaternion is not None,
+        sha256=digest,
+        resolution=tuple(resolution),
+        notes=tuple(notes),
+    )
+
+
+def _yaw_of(path: FilePath, quaternion: Array) -> Array:
+    """Return the yaw (n,) [rad] of attitudes (n, 4), scalar first."""
+    lengths = np.linalg.norm(quaternion, axis=1)
+    (wrong,) = np.nonzero(np.abs(lengths - 1.0) > UNIT_QUATERNION)
+    if wrong.size:
+        row = int(wrong[0]) + 2
+        raise FileError(path, f"row {row}: the quaternion must be of length 1; got {lengths[wrong[0]]:.4g}")
+    return quaternion_to_euler(quaternion / lengths[:, None])[:, 2]
+
+
+def _acceleration_notes(t: Array, velocities: Array, accelerations: Array) -> Iterator[str]:
+    """Yield a note on stated accelerations (n, 3) [m/s^2] that contradict the velocities."""
+    periods = np.diff(t)
+
+    def mean(values: Array) -> float:
+        return float(periods @ np.abs(values) / periods.sum())
+
+    for name, velocity, acceleration in zip("xyz", velocities.T, accelerations.T, strict=True):
+        gained = np.diff(velocity) / periods
+        stated = 0.5 * (acceleration[1:] + acceleration[:-1])
+        if mean(stated - gained) > DISAGREEMENT * max(mean(gained), mean(stated)) + SMALL:
+            hint = "; is gravity in it?" if name == "z" and abs(float(np.mean(stated - gained)) - 9.8) < 0.5 else ""
+            yield (
+                f"column a{name} is {mean(stated):.4g} m/s^2 on average, but column v{name} changes by "
+                f"{mean(gained):.4g} m/s^2{hint}"
+            )
+
+
+def _table_of_pieces(path: FilePath, numbers: Array, places: Mapping[str, int], digest: str) -> Table:
+    """Return the table of a file with a row per piece: its duration, and a polynomial of each axis."""
+    durations = numbers[:, places[PIECE_DURATION]]
+    (short,) = np.nonzero(durations < CLOSEST)
+    if short.size:
+        row = int(short[0]) + 2
+        raise FileError(path, f"row {row}, column duration: must be {CLOSEST} s or more; got {durations[short[0]]:g}")
+    has_yaw = "yaw^0" in places
+    pieces = np.zeros((len(numbers), len(POLYNOMIAL_AXES), POLYNOMIAL_DEGREE + 1))
+    for axis, name in enumerate(POLYNOMIAL_AXES):
+        if name == "yaw" and not has_yaw:
+            continue
+        for i in range(POLYNOMIAL_DEGREE + 1):
+            pieces[:, axis, i] = numbers[:, places[f"{name}^{i}"]]
+    powers = durations[:, None] ** np.arange(POLYNOMIAL_DEGREE + 1)
+    ends = np.einsum("nai,ni->na", pieces, powers)
+    gaps = np.abs(pieces[1:, :, 0] - ends[:-1])
+    (apart,) = np.nonzero(gaps.max(axis=1, initial=0.0) > LARGEST_GAP)
+    if apart.size:
+        place = int(apart[0])
+        gap = float(gaps[place].max())
+        column = POLYNOMIAL_AXES[first_smallest(-gaps[place], TIE_SHARE * gap)]
+        rule = "must be where the piece before it ends"
+        raise FileError(path, f"row {place + 3}, column {column}^0: {rule}; it is {gap:.4g} off")
+    t = np.concatenate([[0.0], np.cumsum(durations)])
+    poses = np.vstack([pieces[:, :, 0], ends[-1:]])
+    return Table(
+        t=t,
+        poses=poses,
+        velocities=None,
+        pieces=pieces,
+        has_yaw=has_yaw,
+        sha256=digest,
+        notes=(*_speed_notes(path, t, poses[:, :3]), *_yaw_notes(path, t, poses[:, 3])),
+    )
 
 
 def _far(first: Array, vehicle: Array) -> Iterator[str]:
@@ -265,21 +449,44 @@ def _velocity_notes(
 def through_rows(table: Table) -> Path:
     """Return the path from the first row, whose time becomes 0, to the last.
 
-    Straight lines between rows, or where the table has velocities the cubics that meet them (cubic Hermite
-    interpolation); yaw is straight either way.
+    Straight lines between rows; where the table has velocities the cubics that meet them (cubic Hermite interpolation),
+    and where it has accelerations, too, the polynomials of degree 5; yaw is straight in all of these.  Of a table of
+    polynomials it is those.
     """
     t = table.t - table.t[0]
     straight = polyline(t, table.poses)
+    if table.pieces is not None:
+        return replace(_through_pieces(t, table), notes=table.notes)
     if table.velocities is None:
         return replace(straight, resolution=table.resolution, notes=table.notes)
-    from scipy.interpolate import CubicHermiteSpline
+    from scipy.interpolate import BPoly
 
-    cubics = CubicHermiteSpline(t, table.poses[:, :3], table.velocities)
+    known = [table.poses[:, :3], table.velocities]
+    if table.accelerations is not None:
+        known.append(table.accelerations)
+    curve = BPoly.from_derivatives(t, np.stack(known, axis=1))
 
     def pose(times: Array) -> Array:
-        return np.hstack([cubics(times), straight.pose(times)[:, 3:]])
+        return np.hstack([curve(times), straight.pose(times)[:, 3:]])
 
     return replace(straight, pose=pose, resolution=table.resolution, notes=table.notes)
+
+
+def _through_pieces(t: Array, table: Table) -> Path:
+    """Return the path of a table of polynomials, its pieces at times t (n,) [s]."""
+    from scipy.interpolate import PPoly
+
+    assert table.pieces is not None
+    coefficients = np.moveaxis(table.pieces[:, :, ::-1], (0, 1, 2), (1, 2, 0))  # (8, n - 1, 4), the highest first
+    curve = PPoly(coefficients, t)
+
+    def pose(times: Array) -> Array:
+        poses = np.asarray(curve(times))
+        if not table.has_yaw:
+            poses[:, 3] = table.poses[0, 3]
+        return poses
+
+    return Path(pose=pose, duration=float(t[-1]), kinks=tuple(t.tolist()))
 
 
 def _resolution(cells: Iterable[str]) -> float:
@@ -309,12 +516,6 @@ def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, .
             raise FileError(path, f"{place}: must be a finite number within +-{LARGEST_NUMBER:g}; got {_short(cell)}")
         values.append(value)
     return values
-
-
-def _header_text(header: tuple[str, ...]) -> str:
-    """Describe a header without quoting it: the author of a scenario may not own the file that it names."""
-    known = [name for name in header if name in POSE_HEADER + VELOCITY_HEADER]
-    return f"{len(header)} columns (known: {','.join(known) if known else 'none'})" if header else "none"
 
 
 def _short(text: str) -> str:

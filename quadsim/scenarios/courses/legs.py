@@ -13,16 +13,19 @@ from annotated_types import Len, doc
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Number
 from quadsim.scenarios.courses.course import (
+    CLOSEST,
     MOST_POINTS,
     Course,
     Filtered,
     Path,
     Point,
     Speed,
-    Started,
+    Time,
+    Travelled,
     begin,
     poses_of,
     require_apart,
+    require_free_yaw,
 )
 from quadsim.state import Array
 
@@ -36,22 +39,45 @@ class Waypoint(Point):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Waypoints(Started):
+class Waypoints(Travelled):
     """Straight legs at constant speed, from the initial position from one point to the next."""
 
     type: Annotated[Literal["waypoints"], doc("kind of course: straight legs between points")]
     speed: Annotated[Speed, doc("[m/s] speed along a leg, unless its point has one")] = 1.0
     points: Annotated[tuple[Waypoint, ...], Len(1, MOST_POINTS), doc("the points, in order")]
+    times: Annotated[
+        tuple[Time, ...] | None,
+        doc("[s] after start, times at which the points are reached, in place of every speed; absent: by speed"),
+    ] = None
 
     def __post_init__(self) -> None:
         require_apart(self.points, "to stay at a point give it a hold")
+        require_free_yaw(self.points, self.yaw)
+        if self.times is not None:
+            self._check_times(self.times)
+
+    def _check_times(self, times: tuple[float, ...]) -> None:
+        """Refuse times that do not fit the points."""
+        if len(times) != len(self.points):
+            raise ParameterError("", "times", list(times), f"a list of {len(self.points)} times, one for each point")
+        left = 0.0
+        for i, (time, point) in enumerate(zip(times, self.points, strict=True)):
+            if point.speed is not None:
+                raise ParameterError("", f"points.{i}.speed", point.speed, "absent where times are given")
+            if time - left < CLOSEST:
+                rule = f"{left + CLOSEST:g} s or later, {CLOSEST} s after the point before it is left"
+                raise ParameterError("", f"times.{i}", time, rule)
+            left = time + point.hold
 
     def path(self, initial: Array, gravity: float) -> Path:
-        """The legs, yaw turning evenly along each; a first point at the initial position takes no time to reach."""
+        """The legs, yaw turning evenly along each; by speed, a first point at the initial position takes no time."""
         times, poses = [0.0], [initial]
-        for point, pose in zip(self.points, poses_of(self.points, initial), strict=True):
+        for i, (point, pose) in enumerate(zip(self.points, poses_of(self.points, initial), strict=True)):
             length = float(np.linalg.norm(pose[:3] - poses[-1][:3]))
-            if length > 0.0:
+            if self.times is not None:
+                times.append(self.times[i])
+                poses.append(pose)
+            elif length > 0.0:
                 times.append(times[-1] + length / (self.speed if point.speed is None else point.speed))
                 poses.append(pose)
             else:

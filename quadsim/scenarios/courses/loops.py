@@ -12,7 +12,7 @@ from annotated_types import doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Metres, NonNegative, Number, Pair
-from quadsim.scenarios.courses.course import Path, Speed, Started, Time, require_one
+from quadsim.scenarios.courses.course import ALONG_PATH_DOC, AlongPath, Path, Speed, Started, Time, require_one
 from quadsim.state import Array
 
 
@@ -21,7 +21,6 @@ class Loop:
     """A closed curve, or one that is closed seen from above, by an angle theta that grows by 2 pi per turn."""
 
     position: Callable[[Array], Array]  # theta (M,) [rad] -> (M, 3) [m], world
-    heading: Callable[[Array], Array]  # theta (M,) [rad] -> (M,) direction of travel about z [rad], without jumps
 
 
 def circle(
@@ -39,7 +38,7 @@ def circle(
             [radius * np.cos(phi), radius * np.sin(phi), climb_per_turn * theta / math.tau], axis=1
         )
 
-    return Loop(position=position, heading=lambda theta: angle + sign * (theta + 0.5 * math.pi))
+    return Loop(position=position)
 
 
 def figure_eight(
@@ -56,12 +55,7 @@ def figure_eight(
         along, across = half_length * np.sin(theta), sign * half_width * np.sin(2.0 * theta)
         return centre + np.stack([cos * along - sin * across, sin * along + cos * across, np.zeros_like(theta)], axis=1)
 
-    def heading(theta: Array) -> Array:
-        # The velocity never points along +y (b > 0): counted from -y, its angle has no jump.
-        vx, vy = half_length * np.cos(theta), 2.0 * half_width * np.cos(2.0 * theta)
-        return angle + sign * (np.arctan2(vx, -vy) - 0.5 * math.pi)
-
-    return Loop(position=position, heading=heading)
+    return Loop(position=position)
 
 
 def ramped(t: Array, *, rate: float, total: float, ramp: float) -> Array:
@@ -79,17 +73,16 @@ def ramped(t: Array, *, rate: float, total: float, ramp: float) -> Array:
     return np.where(t <= 0.5 * duration, angle, total - angle)
 
 
-def fly_round(loop: Loop, *, turn_time: float, turns: float, ramp: float, yaw: float, along: bool) -> Path:
+def fly_round(loop: Loop, *, turn_time: float, turns: float, ramp: float, yaw: float) -> Path:
     """A loop flown from and to rest, one turn at full speed in `turn_time` [s], gained and lost over `ramp` [s].
 
-    Yaw [rad] is held, or where it goes `along` the direction of travel, it starts near that.
+    Yaw [rad] is held.
     """
     rate, total = math.tau / turn_time, math.tau * turns
 
     def pose(t: Array) -> Array:
         theta = ramped(t, rate=rate, total=total, ramp=ramp)
-        headings = loop.heading(theta) if along else np.full(t.shape, yaw)
-        return np.column_stack([loop.position(theta), headings])
+        return np.column_stack([loop.position(theta), np.full(t.shape, yaw)])
 
     return Path(pose=pose, duration=total / rate + ramp)
 
@@ -103,8 +96,10 @@ class _Round(Started):
         NonNegative, doc("[s] time of the smooth acceleration, and of the deceleration at the end; 0: at once")
     ] = 5.0
     height: Annotated[Number | None, doc("[m] z at the start; absent: initial z")] = None
-    yaw: Annotated[Number | None, doc("[deg] constant yaw; absent: initial yaw")] = None
-    yaw_along_path: Annotated[bool, doc("true: yaw follows the direction of travel instead")] = False
+    yaw: Annotated[Number | AlongPath | None, doc(f"[deg] constant yaw; or {ALONG_PATH_DOC}; absent: initial yaw")] = (
+        None
+    )
+    yaw_along_path: Annotated[bool, doc('true: the same as yaw = "along_path"')] = False
 
     def __post_init__(self) -> None:
         require_one(period=self.period, speed=self.speed)
@@ -143,8 +138,7 @@ class _Round(Started):
             turn_time=self.turn_time,
             turns=abs(self.turns),
             ramp=self.ramp,
-            yaw=float(initial[3]) if self.yaw is None else math.radians(self.yaw),
-            along=self.yaw_along_path,
+            yaw=math.radians(self.yaw) if isinstance(self.yaw, float) else float(initial[3]),
         )
 
 

@@ -18,10 +18,11 @@ from quadsim.scenarios.courses.course import (
     Path,
     Point,
     Speed,
-    Started,
     Time,
+    Travelled,
     poses_of,
     require_apart,
+    require_free_yaw,
     require_one,
 )
 from quadsim.state import Array
@@ -34,7 +35,7 @@ ACCELERATION_ORDER: Final = 2
 
 
 @dataclass(frozen=True, kw_only=True)
-class MinimumSnap(Started):
+class MinimumSnap(Travelled):
     """The smoothest course through points, from rest at the initial position to rest at the last of them."""
 
     type: Annotated[Literal["minimum_snap"], doc("kind of course: least snap through points")]
@@ -48,6 +49,7 @@ class MinimumSnap(Started):
 
     def __post_init__(self) -> None:
         require_one(times=self.times, speed=self.speed)
+        require_free_yaw(self.points, self.yaw)
         if self.times is None:
             require_apart(self.points, "or give times instead of speed")
         elif len(self.times) != len(self.points):

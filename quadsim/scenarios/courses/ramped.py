@@ -18,7 +18,7 @@ from quadsim.errors import ParameterError
 from quadsim.fields import Metres
 from quadsim.mpc.problem.flatness import attitudes
 from quadsim.rotation import quaternion_to_euler
-from quadsim.scenarios.courses.course import Path, Speed, Started, Time
+from quadsim.scenarios.courses.course import Path, Speed, Time, Travelled
 from quadsim.state import Array
 
 MOST_SAMPLES: Final = 100_000  # of the phase: 2000 s at 50 Hz
@@ -141,7 +141,7 @@ def _level(x: Array, y: Array) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Ramped(Started):
+class _Ramped(Travelled):
     speed: Annotated[
         Speed,
         doc(
@@ -154,7 +154,10 @@ class _Ramped(Started):
     ramp: Annotated[Time, doc("[s] T, time over which the acceleration grows; below speed / acceleration")] = 2.0
     heading: Annotated[
         Literal["free", "held"],
-        doc("free: zero rate about body z, so the heading drifts; held: the initial yaw"),
+        doc(
+            "free: zero rate about body z, so the heading drifts; held: the initial yaw; "
+            'without effect where yaw = "along_path"'
+        ),
     ] = "free"
     sampling: Annotated[Time, doc("[s] step of the rectangle rule that integrates the phase")] = 0.02
 
@@ -205,6 +208,8 @@ class RampedCircle(_Ramped):
         super().__post_init__()
         if self.plane == "vertical" and self.heading == "held":
             raise ParameterError("", "heading", self.heading, "free where plane is vertical")
+        if self.plane == "vertical" and self.yaw is not None:
+            raise ParameterError("", "yaw", self.yaw, "absent where plane is vertical")
 
     def curve(self, yaw: float) -> Curve:
         """The circle."""

@@ -14,7 +14,7 @@ from annotated_types import MaxLen, doc
 from quadsim.errors import ParameterError
 from quadsim.fields import Number
 from quadsim.flight.metrics import CourseStep
-from quadsim.scenarios.courses.course import Course, Filtered
+from quadsim.scenarios.courses.course import ALONG_PATH_DOC, AlongPath, Course, Headed
 from quadsim.state import REFERENCE_NAMES, Array, nearest_turn
 
 
@@ -35,14 +35,14 @@ Windows = Annotated[tuple[Window, ...], MaxLen(1000)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Steps(Filtered):
+class Steps(Headed):
     """Steps of Eq. (30); outside its windows an axis stays at its initial position, and yaw at 0."""
 
     type: Annotated[Literal["steps"], doc("kind of course: values held in windows of time")] = "steps"
     x: Annotated[Windows, doc("[m] windows of the x axis, world")] = ()
     y: Annotated[Windows, doc("[m] windows of the y axis, world")] = ()
     z: Annotated[Windows, doc("[m] windows of the z axis, world")] = ()
-    yaw: Annotated[Windows, doc("[deg] windows of the yaw angle")] = ()
+    yaw: Annotated[Windows | AlongPath, doc(f"[deg] windows of the yaw angle; or {ALONG_PATH_DOC}")] = ()
 
     def build(self, initial: Array, gravity: float) -> Course:
         """As `Filtered.build`."""
@@ -57,8 +57,10 @@ class Steps(Filtered):
 
     def channels(self, initial: Array) -> list[tuple[Sequence[Window], float]]:
         """Windows of x, y, z [m] and yaw [rad], each with the value outside them."""
+        x, y, z, before = initial.tolist()
+        if isinstance(self.yaw, str):
+            return [(self.x, x), (self.y, y), (self.z, z), ((), before)]
         yaw = [replace(window, value=math.radians(1.0) * nearest_turn(window.value, turn=360.0)) for window in self.yaw]
-        x, y, z = initial[:3].tolist()
         return [(self.x, x), (self.y, y), (self.z, z), (yaw, 0.0)]
 
     def course_steps(self, initial: Array, *, duration: float, preview: float) -> list[CourseStep]:

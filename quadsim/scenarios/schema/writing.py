@@ -62,6 +62,42 @@ def to_toml(model: Any, stated: Mapping[str, Any] | None = None, recorded: Mappi
     return "\n".join(lines) + "\n"
 
 
+def stated_lines(header: str, model: Any, explained: set[object]) -> list[str]:
+    """Return a table with its header, without the fields that have their defaults.
+
+    Args:
+        header: its first line, `[name]` or `[[name]]`.
+        model: the table.
+        explained: kinds and names of the fields whose comments were written before; those of here are added.
+    """
+    kind = type(model)
+    lines = [header]
+    for name, field in sorted(fields_of(kind).items(), key=_type_first):
+        value = getattr(model, name)
+        if value == field.get_default(call_default_factory=True) and name != "type":
+            continue
+        comment = ""
+        if (kind, name) not in explained:
+            comment = " ".join((field.description or "").split())
+        explained.add((kind, name))
+        lines += _commented(_pair(name, _without_defaults(value)), comment)
+    return lines
+
+
+def _without_defaults(value: Any) -> Any:
+    """Return tables within a field as mappings of what differs from the defaults."""
+    if isinstance(value, list | tuple):
+        return [_without_defaults(entry) for entry in value]
+    if not is_table(type(value)):
+        return value
+    stated: dict[str, Any] = {}
+    for name, field in fields_of(type(value)).items():
+        entry = getattr(value, name)
+        if entry != field.get_default(call_default_factory=True):
+            stated[name] = _without_defaults(entry)
+    return stated
+
+
 def _lines(
     model: Any, path: str, explained: set[object], stated: Mapping[str, Any], recorded: Mapping[str, str]
 ) -> Iterator[str]:

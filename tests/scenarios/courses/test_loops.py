@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -24,8 +23,8 @@ LOOPS = {
 }
 
 
-def flown(loop: Loop, *, ramp: float = 2.0, yaw: float = 0.0, along: bool = False) -> Path:
-    return fly_round(loop, turn_time=10.0, turns=2.0, ramp=ramp, yaw=yaw, along=along)
+def flown(loop: Loop, *, ramp: float = 2.0, yaw: float = 0.0) -> Path:
+    return fly_round(loop, turn_time=10.0, turns=2.0, ramp=ramp, yaw=yaw)
 
 
 def derivative(values: Array, step: float) -> Array:
@@ -59,15 +58,6 @@ def test_a_figure_eight_is_the_lemniscate_of_gerono() -> None:
     assert np.all(np.diff(np.unwrap(np.arctan2(y[first], x[first] - 1.5))) > 0.0)
 
 
-@pytest.mark.parametrize("name", LOOPS)
-def test_the_heading_is_the_direction_of_travel_and_has_no_jumps(name: str) -> None:
-    loop, step = LOOPS[name], THETA[1]
-    velocity, heading = derivative(loop.position(THETA), step), loop.heading(THETA)
-    np.testing.assert_allclose(np.diff(heading), np.diff(np.unwrap(heading)), atol=1e-12)
-    error = heading[1:-1] - np.arctan2(velocity[:, 1], velocity[:, 0])
-    np.testing.assert_allclose(np.remainder(error + 1.0, math.tau), 1.0, atol=0.01)
-
-
 def test_the_rate_of_a_ramped_angle_is_the_known_polynomial() -> None:
     rate, ramp, total, h = 0.7, 2.0, 4.0, 1e-4
     t = np.arange(0.0, total / rate + ramp, h)
@@ -89,15 +79,7 @@ def test_two_turns_take_two_turn_times_and_a_ramp_and_end_where_they_began(ramp:
     np.testing.assert_allclose(speed, math.tau * 2.0 / 10.0, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("given_yaw", "along"), [(0.4, False), (-7.0, False), (6.0, True), (-9.5, True)])
-def test_yaw_is_held_or_follows_the_path_from_the_nearest_turn(given_yaw: float, along: bool) -> None:
-    loop = LOOPS["eight"]
-    path = flown(loop, yaw=given_yaw, along=along)
-    course = begin(path, start=0.0, initial=np.array([*CENTRE, given_yaw]))
-    yaw = course.sample(np.linspace(0.0, 22.0, 500))[:, 3]
-    if not along:
-        np.testing.assert_array_equal(yaw, given_yaw)
-        return
-    assert abs(yaw[0] - given_yaw) <= math.pi
-    assert all(abs(after - before) < 0.2 for before, after in pairwise(yaw))
-    assert math.remainder(yaw[0] - loop.heading(np.zeros(1))[0], math.tau) == pytest.approx(0.0, abs=1e-12)
+@pytest.mark.parametrize("yaw", [0.4, -7.0])
+def test_yaw_is_held(yaw: float) -> None:
+    course = begin(flown(LOOPS["eight"], yaw=yaw), start=0.0, initial=np.array([*CENTRE, yaw]))
+    np.testing.assert_array_equal(course.sample(np.linspace(0.0, 22.0, 500))[:, 3], yaw)

@@ -28,7 +28,7 @@ REFERENCES: dict[str, dict[str, Any]] = {
     "minimum_snap": {"points": POINTS, "speed": 1.0},
     "circle": {"radius": 2.0, "speed": 1.0},
     "helix": {"radius": 2.0, "period": 8.0, "climb": 1.5, "turns": -2.0},
-    "figure_eight": {"length": 4.0, "period": 12.0, "yaw_along_path": True},
+    "figure_eight": {"length": 4.0, "period": 12.0},
     "yaw_turns": {"turns": [{"start": 1.0, "yaw": 180.0, "rate": 45.0}]},
 }
 

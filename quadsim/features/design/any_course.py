@@ -1,0 +1,462 @@
+"""A course of the library, of a scenario file or of a table, made for a vehicle.
+
+What of a scenario is its course: `[reference]`, where it starts, obstacles, corridors, the fence, the ground, and the
+constraints on position, velocity, heading and their errors.  All of it scales by the units of its fields
+(`quadsim.scenarios.scaling`):
+
+- *Lengths* by the vehicles' bounding balls, so that a gap is as many vehicles wide as before; those of a table, or of
+  a scenario of the same vehicle, stay.
+- *Times* such that the course asks for `SHARE` of the vehicle's limits: of the acceleration within the tilt bound, of
+  climb and sink, of the fastest level speed, of the rates at which its loops follow, and of its turning.  Among
+  obstacles it asks for no more acceleration than is stated: what it takes to avoid them is not known beforehand.
+- *Heights* such that the lowest point keeps the allowed error, and the hull, above the ground.
+- *Errors* by lengths, but to no less than what the vehicle's own figure eight is allowed; those stated for the same
+  vehicle stay.
+
+Wind, faults, sensors and events are no part of a course; what is left out is named in the file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy.signal import lfilter
+
+from quadsim.errors import ParameterError, UnknownNameError
+from quadsim.features.design.first_scenario import (
+    ALLOWED_SHARE,
+    COURSES,
+    DESIGNED_LAWS,
+    EIGHT_RATIO,
+    HEIGHT_OVER_ERROR,
+    SHARE,
+    STEP,
+    FirstCourse,
+    course_by_rule,
+    eight_length,
+    in_digits,
+    later,
+    lowest_centre,
+    require_size,
+    step_bandwidth,
+)
+from quadsim.features.design.rules import HEADING_STEP, Design, design_for
+from quadsim.flight.audit import Limit
+from quadsim.mpc.space import Avoidance
+from quadsim.scenarios.assembly import Assembly
+from quadsim.scenarios.catalogue import scenario_names
+from quadsim.scenarios.courses.csv_course import Csv, read_course_table
+from quadsim.scenarios.courses.smoothing import within_rounding
+from quadsim.scenarios.courses.steps import Steps
+from quadsim.scenarios.loading import load_scenario, parse_scenario
+from quadsim.scenarios.scaling import Scale, scaled_limit, scaled_table
+from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.scenarios.schema.writing import stated_lines
+from quadsim.state import REFERENCE_NAMES, Array
+from quadsim.vehicle import Vehicle
+
+_REST: Final = 1.0  # after the end of a table [s]
+_SAMPLES: Final = 4000  # of a course, by which its demands are found
+_SHARPEST: Final = 0.05
+"""Change of velocity between two samples, over the largest velocity, that is a corner and not a bend."""
+_FREQUENCY_RATIO: Final = 1.5 * EIGHT_RATIO
+"""Largest acceleration over largest speed of a course [rad/s], over w: of a figure eight 1.5 times its turns."""
+_SLOWEST, _FASTEST = 1e-3, 1e3
+"""Range in which the factor of times is looked for."""
+_HALVINGS: Final = 40
+_YAW_ALLOWED: Final = 90.0 * ALLOWED_SHARE
+"""Least allowed error of the heading [deg]: that of a quarter turn."""
+AVOIDING: Final = ("robust", "rates")
+"""Designed controllers that keep clear of obstacles."""
+_ERRORS: Final = tuple(f"{name}_error" for name in REFERENCE_NAMES)
+_CARRIED: Final = ("x", "y", "z", "vx", "vy", "vz", *_ERRORS)
+"""Signals of the constraints that belong to a course."""
+_BOUNDED: Final = ("roll", "pitch", "speed", "slew")
+"""Signals that the new controller bounds itself: an entry of the old one is not missed."""
+_RESERVED: Final = _BOUNDED
+"""Names of constraints that the new scenario gives itself."""
+_NO_COURSE: Final = ("forces", "computation", "sensors", "estimator", "events", "actual")
+"""Tables that are no part of a course."""
+
+
+def course_for(
+    name: str, vehicle: Vehicle, file: str, *, law: str, tilt: float | None = None, size: float | None = None
+) -> FirstCourse:
+    """Return a course by rule, or one of a scenario or a table made for a vehicle.
+
+    Args:
+        name: one of `COURSES`; a scenario of the library, or a path to one (.toml); or a path to a table (.csv).
+        vehicle: the numbers.
+        file: where these are.
+        law: one of `DESIGNED_LAWS`.
+        tilt: bound [deg] that replaces that of the rules.
+        size: longest side of the course [m]; None: by rule.
+
+    Raises:
+        InputError: there is no such course, it cannot be read, or such a controller cannot fly it.
+    """
+    if law not in DESIGNED_LAWS:
+        raise UnknownNameError("controller", law, DESIGNED_LAWS)
+    require_size(size)
+    tuning = design_for(vehicle, tilt)
+    if name in COURSES:
+        return course_by_rule(name, vehicle, tuning, size)
+    if not is_trajectory(name) and not name.endswith(".toml") and name not in scenario_names():
+        hint = "or give a path ending in .toml or .csv"
+        raise UnknownNameError("course", name, course_names(), hint=hint)
+    return fitted_course(name, vehicle, file, tuning, avoids=law in AVOIDING, size=size)
+
+
+def is_trajectory(course: str) -> bool:
+    """Return whether a course is the path of a table."""
+    return course.lower().endswith(".csv")
+
+
+def course_names() -> list[str]:
+    """Return what `--course` takes by name: courses by rule, then the library's scenarios."""
+    return [*COURSES, *(name for name in scenario_names() if name not in COURSES)]
+
+
+def fitted_course(
+    name: str, vehicle: Vehicle, file: str, tuning: Design, *, avoids: bool, size: float | None = None
+) -> FirstCourse:
+    """Return a course made for a vehicle.
+
+    Args:
+        name: of a scenario of the library, or a path to a scenario file (.toml) or to a table (.csv).
+        vehicle: the numbers.
+        file: where these are.
+        tuning: of its controller.
+        avoids: whether the controller can keep clear of obstacles.
+        size: longest side of the course [m]; None: by the rules of this module.
+
+    Raises:
+        InputError: the course cannot be read, or such a controller cannot fly it.
+    """
+    base = _of_table(name, file, tuning) if is_trajectory(name) else load_scenario(name)
+    assembly = Assembly(base)
+    _require_upright(name, base, assembly)
+    if (base.obstacles or base.regions) and not avoids:
+        raise ParameterError("", "--controller", name, "robust or rates: a course with obstacles or regions")
+    own = is_trajectory(name) or _same(base, assembly, vehicle, file)
+    samples = _sampled(base, assembly)
+    length = _length_factor(name, samples, size, 1.0 if own else vehicle.enclosing_radius / _radius(assembly))
+    time, response = _time_factor(samples, length, vehicle, tuning)
+    if base.obstacles or base.regions:
+        time = max(time, math.sqrt(length))
+    allowed = ALLOWED_SHARE * eight_length(vehicle, tuning)
+    touches = base.effects.ground is not None and base.effects.ground.contact
+    lift = 0.0
+    if not touches:
+        lowest = length * float(samples.poses[:, 2].min())
+        least = lowest_centre(vehicle) + HEIGHT_OVER_ERROR * allowed
+        lift = max(0.0, math.ceil(10.0 * (least - lowest) - 1e-6) / 10.0)
+    scale = Scale(length=in_digits(length, 4), time=in_digits(time, 4), lift=lift)
+    return _written(name, base, assembly, scale, response, allowed, samples, own=own, size=size, touches=touches)
+
+
+def _of_table(path: str, file: str, tuning: Design) -> Scenario:
+    """Return a scenario that flies a table, from its first row."""
+    table = read_course_table(Path(path))
+    x, y, z, yaw = table.poses[0].tolist()
+    tables = {
+        "name": "table",
+        "description": "a table",
+        "control_period": tuning.period,
+        "duration": later(float(table.t[-1]) + 2.0 * _REST),
+        "vehicle": {"file": file},
+        "initial": {"position": [x, y, z], "euler": [0.0, 0.0, round(math.degrees(yaw), 6)]},
+        "reference": {"type": "csv", "file": path, "start": _REST},
+        "controller": {"type": "pid"},
+    }
+    return parse_scenario(tables, source=path)
+
+
+def _require_upright(name: str, base: Scenario, assembly: Assembly) -> None:
+    """Refuse a course that turns or starts upside down."""
+    if base.lost.tilt is False or any(abs(angle) > 90.0 for angle in base.initial.euler[:2]):
+        rule = "one that stays upright: the designed controllers bound the tilt (copy its file, and set vehicle.file)"
+        raise ParameterError("", "--course", name, rule)
+
+
+def _same(base: Scenario, assembly: Assembly, vehicle: Vehicle, file: str) -> bool:
+    """Return whether a scenario was stated for this vehicle."""
+    if base.vehicle.file == file:
+        return True
+    return Path(base.vehicle.file).name == Path(file).name and assembly.vehicle == vehicle
+
+
+def _radius(assembly: Assembly) -> float:
+    return assembly.vehicle.enclosing_radius
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampledCourse:
+    """A course at equal intervals, as its scenario states it."""
+
+    poses: Array  # (M, 4) x, y, z [m], yaw [rad], before the filter
+    interval: float  # [s]
+    response_time: float  # of the filter [s]; 0 for none
+    jumps: bool  # whether the pose itself jumps, as steps do
+    largest_jump: float  # of the position [m]
+    shortest: float  # shortest time between two jumps [s]; infinite without
+    corners: bool  # whether the velocity jumps
+
+    @property
+    def size(self) -> float:
+        """Longest side of the box about it [m]."""
+        return float(np.ptp(self.poses[:, :3], axis=0).max())
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves or turns at all."""
+        return bool(np.ptp(self.poses, axis=0).max() > 0.0)
+
+
+def _sampled(base: Scenario, assembly: Assembly) -> SampledCourse:
+    """Return the samples of a scenario's course, over its flight."""
+    course = assembly.course
+    end = min(base.duration, course.end)
+    if not end > 0.0:
+        end = base.duration
+    t, interval = np.linspace(0.0, end, _SAMPLES, retstep=True)
+    poses = course.sample(t)
+    smooth_everywhere = np.zeros(_SAMPLES - 1, bool)
+    channels = zip(poses.T, course.resolution, strict=True)
+    poses = np.column_stack([within_rounding(values, unit, smooth_everywhere) for values, unit in channels])
+    before = course.sample(np.array(course.jumps) - 1e-6) if course.jumps else np.empty((0, 4))
+    after = course.sample(np.array(course.jumps) + 1e-6) if course.jumps else np.empty((0, 4))
+    moved = after - before
+    has_jumps = isinstance(base.reference, Steps) and bool(np.abs(moved).max(initial=0.0) > 0.0)
+    gaps = np.diff(course.jumps) if has_jumps else np.array([math.inf])
+    velocity = np.diff(poses[:, :3], axis=0)
+    fastest = float(np.linalg.norm(velocity, axis=1).max())
+    bends = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
+    return SampledCourse(
+        poses=poses,
+        interval=float(interval),
+        response_time=base.reference.response_time,
+        jumps=has_jumps,
+        largest_jump=float(np.abs(moved[:, :3]).max(initial=0.0)),
+        shortest=float(gaps.min(initial=math.inf)),
+        corners=bool(fastest > 0.0 and bends.max() > _SHARPEST * fastest),
+    )
+
+
+def _length_factor(name: str, samples: SampledCourse, size: float | None, by_extent: float) -> float:
+    """Return the factor of lengths."""
+    if size is None:
+        return by_extent
+    if not samples.size > 0.0:
+        raise ParameterError("", "--size", size, f"absent with --course {name}, which does not move")
+    return size / samples.size
+
+
+def _time_factor(samples: SampledCourse, length: float, vehicle: Vehicle, tuning: Design) -> tuple[float, float]:
+    """Return the factor of times, and the response time [s] of a filter that the course needs; 0 for its own.
+
+    The course asks for `SHARE` of the limits, and its filter is as slow as that of steps by rule, at least.
+    """
+    by_rule = 3.0 / step_bandwidth(tuning, max(length * samples.largest_jump, STEP))
+    is_sharp = samples.jumps or samples.corners
+    response = 0.0
+    if is_sharp and not samples.response_time:
+        response = round(by_rule, 2)
+    if not samples.moves:
+        return 1.0, response
+
+    def share(time: float) -> float:
+        filtered = response or time * samples.response_time
+        shares = [_share(samples, length, time, filtered, vehicle, tuning)]
+        if is_sharp and not response:
+            shares.append(by_rule / filtered)
+        if samples.jumps and response:
+            shares.append(1.2 * filtered / (time * samples.shortest))
+        return max(shares)
+
+    return _where_one(share), response
+
+
+def _where_one(share: Callable[[float], float]) -> float:
+    """Return the least factor of times, within `_SLOWEST` to `_FASTEST`, at which a falling share is at most 1."""
+    low, high = math.log(_SLOWEST), math.log(_FASTEST)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        if share(math.exp(middle)) > 1.0:
+            low = middle
+        else:
+            high = middle
+    return math.exp(high)
+
+
+def _share(
+    samples: SampledCourse, length: float, time: float, response_time: float, vehicle: Vehicle, tuning: Design
+) -> float:
+    """Return the largest demand of a course, with factors of lengths and times, over what it may ask for."""
+    interval = time * samples.interval
+    poses = samples.poses * np.array([length, length, length, 1.0])
+    velocity = np.diff(poses, axis=0, prepend=poses[:1]) / interval
+    if response_time:
+        lag = response_time / 3.0
+        keep = math.exp(-interval / lag)
+
+        def lagging(values: Array) -> Array:
+            start = values[0] * keep
+            return np.asarray(lfilter([1.0 - keep], [1.0, -keep], values, axis=0, zi=start[None, :])[0])
+
+        filtered = lagging(velocity)
+        acceleration = (velocity - filtered) / lag
+        velocity = filtered
+    else:
+        acceleration = np.diff(velocity, axis=0, append=velocity[-1:]) / interval
+    fastest = float(np.linalg.norm(velocity[:, :3], axis=1).max())
+    turning = float(np.abs(velocity[:, 3]).max())
+    shares = [
+        fastest / (SHARE * tuning.fastest),
+        turning / (SHARE * HEADING_STEP * tuning.heading),
+    ]
+    if not samples.jumps:  # of steps the filter's bandwidth is the measure
+        level = float(np.hypot(acceleration[:, 0], acceleration[:, 1]).max())
+        shares.append(level / (SHARE * vehicle.gravity * tuning.acceleration))
+        upward = float(np.abs(acceleration[:, 2]).max())
+        shares.append(upward / (SHARE * min(tuning.authority.climb, tuning.authority.sink)))
+        largest = float(np.linalg.norm(acceleration[:, :3], axis=1).max())
+        if fastest > 0.0 and not samples.corners:
+            shares.append(largest / fastest / (_FREQUENCY_RATIO * tuning.bandwidth))
+    return max(shares)
+
+
+def _written(
+    name: str,
+    base: Scenario,
+    assembly: Assembly,
+    scale: Scale,
+    response: float,
+    allowed: float,
+    samples: SampledCourse,
+    *,
+    own: bool,
+    size: float | None,
+    touches: bool,
+) -> FirstCourse:
+    """Return the course as text."""
+    explained: set[object] = set()
+    reference = scaled_table(base.reference, scale)
+    if response:
+        reference = replace(reference, response_time=response)
+    if isinstance(reference, Csv):
+        stated = base.tables["reference"]["file"]
+        reference = replace(reference, file=stated, sha256=None)
+    tables = _space(base, scale, explained)
+    if touches:
+        ground = base.effects.ground
+        assert ground is not None
+        has_effect = ground.effect and assembly.vehicle.rotor_radius is not None
+        tables = "\n" + "\n".join(stated_lines("[effects.ground]", replace(ground, effect=has_effect), set())) + tables
+    holds = [entry for entry in base.constraints if entry.signal in _ERRORS and entry.has_bounds]
+    entries = [_constraint(entry, scale, allowed, own=own) for entry in base.constraints if _carries(entry)]
+    duration = None
+    if not base.ends_with_course:
+        duration = later(scale.time * base.duration + response)
+    stem = Path(name).stem
+    return FirstCourse(
+        name=stem.lower(),
+        options=f"--course {name}" + ("" if size is None else f" --size {size:g}"),
+        about=f"{stem} at {100.0 * SHARE:g} % of its limits" if samples.moves else f"{stem}",
+        initial=_initial(base, scale),
+        reference="\n".join(stated_lines("[reference]", reference, explained)) + "\n",
+        duration=duration,
+        size=scale.length * samples.size,
+        allowed=0.0 if holds else allowed,
+        why_allowed=f"{100 * ALLOWED_SHARE:g} % of its own figure eight, {in_digits(allowed / ALLOWED_SHARE):g} m",
+        lasts=samples.moves and not samples.jumps,
+        clearance=_clearance(base, scale),
+        has_floor=touches or any(_is_floor(entry) for entry in base.constraints),
+        tables=tables,
+        constraints="".join(entries),
+        notes=(*_scale_notes(scale, response, own=own), *_left_out(base)),
+    )
+
+
+def _clearance(base: Scenario, scale: Scale) -> float | None:
+    """Return the clearance that the controller adds [m]: that of the scenario's, scaled, or by default."""
+    if not base.obstacles and not base.regions:
+        return None
+    stated = vars(base.controller).get("avoidance") or Avoidance()
+    return scale.number(stated.margin, "m")
+
+
+def _initial(base: Scenario, scale: Scale) -> str:
+    """Return the fields of `[initial]`."""
+    x, y, z = base.initial.position
+    place = [scale.number(x, "m"), scale.number(y, "m"), scale.height(z)]
+    lines = [f"position = {place}  # m, world"]
+    if base.initial.euler[2]:
+        lines.append(f"euler = [0.0, 0.0, {base.initial.euler[2]}]  # deg: roll, pitch, yaw")
+    if base.initial.cold:
+        lines.append("cold = true  # rotors at rest")
+    return "\n".join(lines) + "\n"
+
+
+def _space(base: Scenario, scale: Scale, explained: set[object]) -> str:
+    """Return obstacles, corridors and fence."""
+    lines: list[str] = []
+    for header, shapes in (("[[obstacles]]", base.obstacles), ("[[corridors]]", base.corridors)):
+        for shape in shapes:
+            lines += ["", *stated_lines(header, scaled_table(shape, scale), explained)]
+    if base.keep_in is not None:
+        lines += ["", *stated_lines("[keep_in]", scaled_table(base.keep_in, scale), explained)]
+    return "\n".join([*lines, ""]) if lines else ""
+
+
+def _is_floor(entry: Limit) -> bool:
+    """Return whether a constraint is a lowest height throughout."""
+    return entry.signal == "z" and math.isfinite(entry.lower) and entry.start <= 0.0 and math.isinf(entry.stop)
+
+
+def _carries(entry: Limit) -> bool:
+    return entry.signal in _CARRIED and entry.has_bounds
+
+
+def _constraint(entry: Limit, scale: Scale, allowed: float, *, own: bool) -> str:
+    """Return an entry of `[[constraints]]` at a scale; errors are allowed what the vehicle needs."""
+    limit = scaled_limit(entry, scale)
+    why = "scaled with the course"
+    if entry.signal in _ERRORS and not own:
+        least = _YAW_ALLOWED if entry.signal == "yaw_error" else in_digits(allowed)
+        lower = min(limit.lower, -least)
+        upper = max(limit.upper, least)
+        if (lower, upper) != (limit.lower, limit.upper):
+            why = f"at least what the vehicle's own figure eight is allowed, {least:g}"
+        limit = replace(limit, lower=lower, upper=upper)
+    if limit.name in _RESERVED:
+        limit = replace(limit, name=f"course_{limit.name}")
+    lines = ["", *stated_lines("[[constraints]]", limit, {(Limit, name) for name in Limit.__dataclass_fields__})]
+    return "\n".join([lines[0], f"{lines[1]}  # {limit.unit}: {why}", *lines[2:]]) + "\n"
+
+
+def _scale_notes(scale: Scale, response: float, *, own: bool) -> list[str]:
+    """Return lines on what was scaled."""
+    lengths = "as stated" if own and scale.length == 1.0 else f"times {scale.length:g}"
+    notes = [f"Lengths {lengths}, times by {scale.time:g}, heights raised by {scale.lift:g} m."]
+    if response:
+        notes.append(f"Its corners are filtered: the response time of {response:g} s is that of steps by rule.")
+    return notes
+
+
+def _left_out(base: Scenario) -> list[str]:
+    """Return a line on what of the scenario is no part of its course."""
+    names = [name for name in _NO_COURSE if getattr(base, name)]
+    air = base.effects.air
+    if air is not None and (any(air.wind) or air.turbulence is not None):
+        names.append("wind")
+    names += [name for name in ("battery", "disturbance", "load") if getattr(base.effects, name, None) is not None]
+    names += [entry.name for entry in base.constraints if entry.signal not in (*_CARRIED, *_BOUNDED)]
+    if base.polytopes:
+        names.append("controller.polytopes")
+    return [f"Left out, as no part of the course: {', '.join(names)}."] if names else []

@@ -1,0 +1,159 @@
+"""Headers of trajectory files as planners write them, and what their columns are.
+
+A format is a list of column names by quantity.  Its columns may stand in any order, and some may be absent; those that
+the course does not use, such as jerk or rotor thrusts, are known so that a header with them is recognised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+POSITION_QUANTITIES: Final = ("x", "y", "z")
+VELOCITY_QUANTITIES: Final = ("vx", "vy", "vz")
+ACCELERATION_QUANTITIES: Final = ("ax", "ay", "az")
+QUATERNION_QUANTITIES: Final = ("qw", "qx", "qy", "qz")
+POLYNOMIAL_AXES: Final = ("x", "y", "z", "yaw")
+POLYNOMIAL_DEGREE: Final = 7  # of the polynomials of a piece
+PIECE_DURATION: Final = "duration"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableFormat:
+    """A kind of table, with its column of each quantity."""
+
+    name: str  # as messages call it
+    columns: Mapping[str, str]  # quantity -> column
+    needed: tuple[str, ...] = ("t", *POSITION_QUANTITIES)  # quantities that must be there
+    groups: tuple[tuple[str, ...], ...] = ()  # quantities that are there together or not at all
+    unused: tuple[str, ...] = ()  # further columns that it may have
+
+    @property
+    def header(self) -> str:
+        """Its columns as a header, those that may be absent in brackets."""
+        parts = [self.columns[quantity] for quantity in self.needed]
+        for group in self.groups:
+            parts.append(f"[{','.join(self.columns[quantity] for quantity in group)}]")
+        return ",".join(parts)
+
+    def known(self) -> set[str]:
+        """Return every column that it may have."""
+        return {*self.columns.values(), *self.unused}
+
+    def quantities(self, header: Sequence[str]) -> dict[str, int] | None:
+        """Return the place of each quantity in a header; None if the header is not of this format."""
+        if len(set(header)) < len(header) or not set(header) <= self.known():
+            return None
+        places = {quantity: header.index(column) for quantity, column in self.columns.items() if column in header}
+        if not all(quantity in places for quantity in self.needed):
+            return None
+        for group in self.groups:
+            present = [quantity in places for quantity in group]
+            if any(present) and not all(present):
+                return None
+        return places
+
+    def distance(self, header: Sequence[str]) -> tuple[int, int]:
+        """Return how many columns a header has and should not, and how many it lacks: (0, 0) for one of this format."""
+        foreign = sum(column not in self.known() for column in header)
+        return foreign, len(self.missing(header))
+
+    def missing(self, header: Sequence[str]) -> list[str]:
+        """Return the columns that a header lacks, those of a group of which it has some included."""
+        missing = [self.columns[quantity] for quantity in self.needed if self.columns[quantity] not in header]
+        for group in self.groups:
+            columns = [self.columns[quantity] for quantity in group]
+            absent = [column for column in columns if column not in header]
+            if len(absent) < len(columns):
+                missing += absent
+        return missing
+
+
+def _named(pattern: str, quantities: Sequence[str], axes: Sequence[str] = ("x", "y", "z")) -> dict[str, str]:
+    """Return the columns of quantities, by a pattern of their axes."""
+    return {quantity: pattern.format(axis) for quantity, axis in zip(quantities, axes, strict=True)}
+
+
+def _coefficients(axis: str) -> tuple[str, ...]:
+    """Return the columns of an axis' polynomial, from the constant up."""
+    return tuple(f"{axis}^{i}" for i in range(POLYNOMIAL_DEGREE + 1))
+
+
+_COEFFICIENTS: Final = tuple(column for axis in POLYNOMIAL_AXES for column in _coefficients(axis))
+POLYNOMIALS: Final = TableFormat(
+    name="polynomials by piece, as of uav_trajectories",
+    columns={column: column for column in (PIECE_DURATION, *_COEFFICIENTS)},
+    needed=(PIECE_DURATION, *_coefficients("x"), *_coefficients("y"), *_coefficients("z")),
+    groups=(_coefficients("yaw"),),
+)
+TABLE_FORMATS: Final = (
+    TableFormat(
+        name="quadsim",
+        columns={
+            "t": "t",
+            **_named("{}", POSITION_QUANTITIES),
+            "yaw": "yaw",
+            **_named("v{}", VELOCITY_QUANTITIES),
+            **_named("a{}", ACCELERATION_QUANTITIES),
+        },
+        groups=(("yaw",), VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
+    ),
+    TableFormat(
+        name="pmm_uav_planner, Agilicious",
+        columns={
+            "t": "t",
+            **_named("p_{}", POSITION_QUANTITIES),
+            **_named("q_{}", QUATERNION_QUANTITIES, ("w", "x", "y", "z")),
+            **_named("v_{}", VELOCITY_QUANTITIES),
+            **_named("a_{}", ACCELERATION_QUANTITIES),
+        },
+        groups=(QUATERNION_QUANTITIES, VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
+        unused=tuple(f"{name}_{axis}" for name in ("w", "a_lin", "a_rot", "j", "s") for axis in "xyz")
+        + tuple(f"u_{i}" for i in range(1, 5)),
+    ),
+    TableFormat(
+        name="uav_trajectories, sampled",
+        columns={
+            "t": "t",
+            **_named("pos{}", POSITION_QUANTITIES),
+            "yaw": "yaw",
+            **_named("vel{}", VELOCITY_QUANTITIES),
+            **_named("acc{}", ACCELERATION_QUANTITIES),
+        },
+        groups=(("yaw",), VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
+        unused=tuple(f"{name}{axis}" for name in ("jerk", "snap") for axis in "xyz"),
+    ),
+    POLYNOMIALS,
+)
+"""The known formats; of equally near ones the first is named."""
+
+
+def table_format(header: Sequence[str]) -> tuple[TableFormat, dict[str, int]] | None:
+    """Return the format of a header and the places of its quantities; None if it is of none."""
+    for entry in TABLE_FORMATS:
+        places = entry.quantities(header)
+        if places is not None:
+            return entry, places
+    return None
+
+
+def nearest_format(header: Sequence[str]) -> str:
+    """Say which known format a header comes nearest, and what it lacks of it.
+
+    A header is not quoted: the author of a scenario may not own the file that it names.
+    """
+    nearest = min(TABLE_FORMATS, key=lambda entry: entry.distance(header))
+    text = f"the nearest known format is {nearest.name}: {nearest.header}"
+    missing = nearest.missing(header)
+    if nearest is POLYNOMIALS:
+        text = f"the nearest known format is {nearest.name}: duration,x^0,...,x^7,y^0,...,z^7[,yaw^0,...,yaw^7]"
+    if missing:
+        shown = ",".join(missing[:6])
+        text += f"; missing: {shown}" + (", ..." if len(missing) > 6 else "")
+    unknown = sum(column not in nearest.known() for column in header)
+    if unknown:
+        text += f"; {unknown} {'column is' if unknown == 1 else 'columns are'} not of it"
+    if len(set(header)) < len(header):
+        text += "; a column occurs twice"
+    return text
