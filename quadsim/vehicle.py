@@ -36,7 +36,7 @@ SLOWEST_ROTOR: Final = 1.0
 """Longest time constant of a rotor [s]; propellers of 30 inch have some 0.3 s."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Vehicle:
     """A rigid body carried by four fixed rotors, thrust along body +z; validated on construction.
 
@@ -146,6 +146,17 @@ class Vehicle:
         self._check_layout()
         self._check_thrust()
         self._check_hover()
+
+    def __repr__(self) -> str:
+        lift = self.level_thrust(self.speed_max) / (self.mass * self.gravity)
+        parts = [
+            f"{self.mass:.3g} kg",
+            f"arms of {1e3 * self.longest_arm:.3g} mm",
+            f"hover at {self.hover_speed:.4g} of {self.speed_max:.4g} rad/s",
+            f"thrust {lift:.3g} times the weight",
+        ]
+        about = f"\n {self.description}" if self.description else ""
+        return f"<Vehicle {self.name}: {', '.join(parts)}{about}>"
 
     def _refuse(self, name: str, rule: str) -> NoReturn:
         raise ParameterError("vehicle", name, getattr(self, name), rule)
@@ -503,7 +514,7 @@ def _naming(path: Path) -> Iterator[None]:
     try:
         yield
     except ParameterError as error:
-        raise FileError(path, str(error)) from error
+        raise FileError(path, str(error)) from None
 
 
 def vehicle_sources(path: Path) -> dict[str, str]:

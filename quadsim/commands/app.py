@@ -28,6 +28,7 @@ from quadsim.features.arguments import (
     Plotted,
     ScenarioName,
     SignalName,
+    StyleName,
     UserCode,
     UserForces,
     UserReference,
@@ -239,7 +240,7 @@ def fly(
     """
     from quadsim.console.progress import reporting
 
-    with reporting(progress) as report:
+    with reporting(progress, "the flight") as report:
         begun = start(scenario, controller=controller, forces=forces, reference=reference, autopilot=autopilot)
         return begun.fly(report)
 
@@ -315,7 +316,7 @@ def run(
     for note in (*notes(parts[0]), *instability_notes(parts[0])):
         _log.info(note)
     with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory, SignalHold():
-        with reporting(progress) as report:
+        with reporting(progress, "the flight") as report:
             flight = Rollout(*parts).fly(report)
         return write_run(flight, directory, products, overwrite=overwrite, fps=fps, progress=progress, flown=flown)
 
@@ -444,7 +445,7 @@ def check(
         assembly = loading.assemble(target, changes, seed)
         for note in instability_notes(assembly):
             _log.info(note)
-        with reporting(progress) as report:
+        with reporting(progress, "the flight") as report:
             audited = replace(Rollout(assembly).fly(report), checked=Check())
     if file is not None:
         with after(audited, file):
@@ -528,7 +529,7 @@ def compare(
     else:
         options: dict[str, Any] = {"names": names, "products": products, "constraints": constraints, "fps": fps}
         first = None if markdown else flown
-        with reporting(progress) as report:
+        with reporting(progress, "the comparison") as report:
             compared = compare_flights(targets, page, report, overwrite=overwrite, flown=first, **options)
     return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared
 
@@ -545,6 +546,7 @@ def plot(
     *signals: SignalName,
     labels: Labels = (),
     width: Inches = 7.16,
+    style: StyleName = None,
     out: File | None = None,
     overwrite: Flag = False,
 ) -> Overlay:
@@ -558,6 +560,7 @@ def plot(
             logged (default: position and attitude).
         labels: names in the legend, one for each flight (default: scenario, and what tells its flights apart).
         width: of the figure [in]; 3.5 is one column of a journal, the default two.
+        style: a style sheet of matplotlib, by its name or file; in Python also rcParams: {"font.family": "serif"}.
         out: PDF, SVG or PNG file, with texts of 8 pt; without it a window opens.
         overwrite: replace an existing file.
 
@@ -582,7 +585,7 @@ def plot(
 
     each = [flights] if isinstance(flights, Flight | str | Path) else flights
     runs = [flight if isinstance(flight, Flight) else read_flight(Path(flight)) for flight in each]
-    return plot_runs(runs, signals, labels=labels, width=width, out=out, overwrite=overwrite)
+    return plot_runs(runs, signals, labels=labels, width=width, style=style, out=out, overwrite=overwrite)
 
 
 @app.command(
@@ -640,7 +643,7 @@ def film(
         raise ParameterError("", "--workers", workers, "at least 1")
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
-    with reporting(progress) as report:
+    with reporting(progress, "the film") as report:
         make, estimate = render_video if path.suffix == ".mp4" else render_gif, Estimate()
 
         def follow(done: int, total: int) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from quadsim.console.results import Result, Shown
+from quadsim.console.results import Shown, Tabular
 from quadsim.errors import InputError
 from quadsim.features.campaign.events import EVENT_NAMES, INCOMPLETE, UNAUDITED, FlightFlags, parse_event
 from quadsim.features.campaign.rows import (
@@ -101,7 +101,7 @@ class MetricComparison:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class PairedComparison(Result):
+class PairedComparison(Tabular):
     """Comparison of two campaigns on the same draws."""
 
     names: tuple[str, str]  # of the first and the second campaign
@@ -181,6 +181,21 @@ class PairedComparison(Result):
         yield from console.grids(self.tables)
         if self.page is not None:
             yield console.to_open(self.page)
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a row per event, its shares of the pairs, and per metric, its means; `p_holm` is of events alone."""
+        rows: list[dict[str, Any]] = []
+        for event in self.events:
+            first, second = event.counts
+            row: dict[str, Any] = {"kind": "event", "name": event.event, "unit": "-", "pairs": event.pairs}
+            row |= {"first": first / event.pairs, "second": second / event.pairs, "difference": event.difference}
+            rows.append({**row, "lower": None, "upper": None, "p_holm": event.p_holm})
+        for metric in self.metrics:
+            difference = metric.difference
+            row = {"kind": "metric", "name": metric.name, "unit": metric.unit, "pairs": difference.pairs}
+            row |= {"first": metric.mean_a, "second": metric.mean_b, "difference": difference.mean}
+            rows.append({**row, "lower": difference.lower, "upper": difference.upper, "p_holm": None})
+        return rows
 
     def to_markdown(self) -> str:
         """Return differences, verdict and tables as Markdown."""

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.console.results import Result, Shown
+from quadsim.console.results import Shown, Tabular
 from quadsim.errors import ParameterError, QuadsimError
 from quadsim.features.design.authority import TorqueRange, authority, torque_ranges
 from quadsim.features.design.rules import delay_margin, design_for
@@ -73,7 +73,7 @@ class VehicleSheet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VehicleReport(Result):
+class VehicleReport(Tabular):
     """A vehicle with its derived figures."""
 
     vehicle: Vehicle  # its numbers
@@ -102,6 +102,13 @@ class VehicleReport(Result):
         yield from implausible(self.vehicle)
         if self.picture is not None:
             yield console.written_to(self.picture)
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a row per parameter of the file: its value, unit and source."""
+        rows = []
+        for name, value, unit in self.parameters:
+            rows.append({"parameter": name, "value": value, "unit": unit, "source": self.sources[name]})
+        return rows
 
     def small_plot(self) -> Figure:
         """See `Result.small_plot`."""

@@ -21,6 +21,7 @@ import hashlib
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
@@ -54,7 +55,7 @@ def _encode(run: FlightRecord, path: Path) -> bytes:
     from quadsim.report.recording.plots import send_plots, send_texts
     from quadsim.report.recording.world import TIMELINE, scene_views, send_airframe, send_scene, send_space
 
-    digest = hashlib.sha256(repr((run.actual, run.limits)).encode())
+    digest = hashlib.sha256(repr((asdict(run.actual), run.limits)).encode())
     for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
         digest.update(np.ascontiguousarray(array).tobytes())
     # the viewer merges recordings that share an identity
