@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -520,6 +520,30 @@ def _naming(path: Path) -> Iterator[None]:
 def vehicle_sources(path: Path) -> dict[str, str]:
     """Return the source of each parameter, in the vehicle file's order; arguments and errors as `load_vehicle`."""
     return {key: entry["source"] for key, entry in _read_entries(path)[1].items()}
+
+
+EXAMPLE: Final = "example"
+"""The source of each number of `quadsim vehicle --template`."""
+EXAMPLE_DESCRIPTION: Final = "An example: "
+"""How its description begins."""
+
+
+def example_notes(path: Path, replaced: Collection[str] = ()) -> tuple[str, ...]:
+    """Return what a vehicle file still has of the template's example; errors as `load_vehicle`.
+
+    Args:
+        path: the vehicle file.
+        replaced: parameters that the file's values are not used of.
+    """
+    texts, entries = _read_entries(path)
+    left = [name for name, entry in entries.items() if entry["source"] == EXAMPLE and name not in replaced]
+    notes = []
+    if left:
+        count = f"{len(left)} of {len(entries)} values"
+        notes.append(f'{path.name}: {count} are of an example (source = "{EXAMPLE}"), not yours: {", ".join(left)}')
+    if texts.get("description", "").startswith(EXAMPLE_DESCRIPTION):
+        notes.append(f"{path.name}: the description is of an example, not yours: {texts['description']!r}")
+    return tuple(notes)
 
 
 def vehicle_autopilot(path: Path) -> dict[str, Any]:

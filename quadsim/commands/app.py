@@ -430,6 +430,7 @@ def check(
     from quadsim.rollout.stability import instability_notes
     from quadsim.scenarios import loading
     from quadsim.scenarios.catalogue import names_directory
+    from quadsim.scenarios.feasibility_check import leftover_notes
 
     file = None if junit is None else junit_file(junit)
     if isinstance(target, str | Path) and names_directory(target):
@@ -443,7 +444,7 @@ def check(
             _log.info("%s: %s", target, note)
     else:
         assembly = loading.assemble(target, changes, seed)
-        for note in instability_notes(assembly):
+        for note in (*leftover_notes(assembly), *instability_notes(assembly)):
             _log.info(note)
         with reporting(progress, "the flight") as report:
             audited = replace(Rollout(assembly).fly(report), checked=Check())

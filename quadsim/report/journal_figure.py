@@ -10,10 +10,8 @@ from matplotlib.figure import Figure
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
 
-_FONTS: Final[tuple[RcKeyType, ...]] = (
-    "pdf.fonttype",
-    "ps.fonttype",
-)  # which matplotlib reads when it saves: Type 3 by default
+_FONTS: Final[tuple[RcKeyType, ...]] = ("pdf.fonttype", "ps.fonttype")
+"""Settings that matplotlib reads when it saves; its default is Type 3."""
 
 
 class JournalFigure(Figure):

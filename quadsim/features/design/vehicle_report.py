@@ -86,6 +86,7 @@ class VehicleReport(Tabular):
     scenario: str | None = None  # scenario that it was compared with, or None
     shortfalls: tuple[str, ...] | None = None
     """Bounds of that scenario that it cannot meet, a sentence each; None without a scenario."""
+    leftovers: tuple[str, ...] = ()  # what its file still has of the template's example, a sentence each
     picture: Path | None = None  # where it was drawn to, or None
 
     @property
@@ -94,12 +95,17 @@ class VehicleReport(Tabular):
         values = ((name, getattr(self.vehicle, name), unit) for name, unit in VEHICLE_UNITS.items())
         return [(name, value, unit) for name, value, unit in values if value is not None]
 
+    @property
+    def notes(self) -> list[str]:
+        """What is doubtful: leftovers of an example, and numbers that no quadrotor has together."""
+        return [*self.leftovers, *implausible(self.vehicle)]
+
     def shown(self) -> Shown:
         """See `Result.shown`."""
         from quadsim.console import console
 
         yield from console.grids(vehicle_tables(self), left=("unit", "source", "what and why"))
-        yield from implausible(self.vehicle)
+        yield from self.notes
         if self.picture is not None:
             yield console.written_to(self.picture)
 
@@ -124,7 +130,7 @@ class VehicleReport(Tabular):
                 for name, value, unit in self.parameters
             },
             "derived": asdict(self.figures),
-            "notes": implausible(self.vehicle),
+            "notes": self.notes,
             "autopilot": {
                 **asdict(self.autopilot),
                 **({"inner_lag": None, "why": lag} if isinstance(lag := self.inner_lag, str) else {"inner_lag": lag}),

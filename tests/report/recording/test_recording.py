@@ -7,10 +7,12 @@ import itertools
 import math
 import subprocess
 import sys
+import time as clock
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from rerun.chunk import RrdReader
 from support import recording
@@ -313,3 +315,30 @@ def test_the_viewer_is_given_the_file_and_listens_to_this_machine_alone(
     assert notes.read_text() == f"--bind=127.0.0.1 --port=auto {path}"
     open_viewer(path, web=True)
     assert "--web-viewer" in notes.read_text().split()
+
+
+def test_a_signal_ends_the_viewer_and_the_processes_that_it_started(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    note = tmp_path / "started"
+    program = f"""
+import os, pathlib, signal, subprocess, sys, time
+started = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+pathlib.Path({str(note)!r}).write_text(str(started.pid))
+os.kill(os.getppid(), signal.SIGINT)
+time.sleep(60)
+"""
+    monkeypatch.setattr(recording_module, "_VIEWER", (sys.executable, "-c", program))
+    open_viewer(path, web=True)
+    started = int(note.read_text())
+    deadline = clock.monotonic() + 10.0
+    while is_running(started) and clock.monotonic() < deadline:
+        clock.sleep(0.02)
+    assert not is_running(started)
+
+
+def is_running(process: int) -> bool:
+    try:
+        return psutil.Process(process).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
