@@ -281,7 +281,7 @@ def run(
         video: film the flight (default: if possible).
         recording: write flight.rrd for the rerun viewer (default: if possible).
         figures: plot the flight (default: if possible).
-        fps: frames per second of the video (default: 30, or 20 from half a minute on).
+        fps: frames per second of the video (default: 30, or 20 for flights of half a minute or more).
         controller: as in `fly`.
         forces: as in `fly`.
         reference: as in `fly`.
@@ -490,7 +490,7 @@ def compare(
         video: film every flight that has no film (default: those that it flies, if possible).
         recording: write flight.rrd for the rerun viewer, of the scenarios that it flies (default: if possible).
         figures: plot them (default: if possible).
-        fps: frames per second of the films (default: 30, or 20 from half a minute on).
+        fps: frames per second of the films (default: 30, or 20 for flights of half a minute or more).
         progress: as in `fly`.
         flown: called with the comparison of flights as soon as its page is written, before the films.
 
@@ -612,7 +612,7 @@ def film(
         out: MP4 or GIF file (default: flight.mp4 in the run directory, replacing an earlier one).
         overwrite: replace an existing file.
         workers: rendering processes (default: one per core).
-        fps: frames per second (default: 30, or 20 from half a minute on; 8 of a GIF).
+        fps: frames per second (default: 30, or 20 for flights of half a minute or more; 8 of a GIF).
         progress: as in `fly`.
 
     Returns:

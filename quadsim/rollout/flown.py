@@ -395,7 +395,7 @@ class Flight(Result):
             video: whether to film the flight; None: if possible; True: raise if it fails.
             recording: whether to write `flight.rrd` for the rerun viewer, as for `video`.
             figures: whether to plot the flight, as for `video`.
-            fps: frames per second of the video; None: 30, or 20 from half a minute on.
+            fps: frames per second of the video; None: 30, or 20 for flights of half a minute or more.
             progress: as of `quadsim.fly`.
 
         Returns:
