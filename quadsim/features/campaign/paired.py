@@ -228,8 +228,8 @@ class PairedComparison(Tabular):
         return [self.sentence, *filter(None, [self.tracking])]
 
     def small_plot(self) -> Figure:
-        """See `Result.small_plot`: differences of the metrics with their intervals, and shares of the events."""
-        return paired_figure(self)
+        """See `Result.small_plot`: differences of the metrics with their intervals."""
+        return metrics_figure(self)
 
     def records(self) -> list[dict[str, Any]]:
         """Return a row per event, its shares of the pairs, and per metric, its means; `p_holm` is of events alone."""
@@ -261,7 +261,11 @@ class PairedComparison(Tabular):
             OutputError: the directory cannot be written, or holds something else.
         """
         sections = [
-            Section(title="Which is better", plots=(to_plot(self.small_plot()),), tables=self.tables),
+            Section(
+                title="Which is better",
+                plots=(to_plot(events_figure(self)), to_plot(metrics_figure(self))),
+                tables=self.tables,
+            ),
             Section(title="What is compared", text=(self.pairing,), tables=self.difference_tables),
         ]
         title = f"{self.names[1]} against {self.names[0]}"
@@ -474,8 +478,8 @@ def _is_minor(difference: tuple[str, Any, Any]) -> bool:
     return any(value is None or (isinstance(value, str) and Path(value).is_absolute()) for value in values)
 
 
-def paired_figure(comparison: PairedComparison) -> Figure:
-    """Plot the differences of the metrics as shares of the first campaign's means, and the shares of the events."""
+def metrics_figure(comparison: PairedComparison) -> Figure:
+    """Plot the differences of the metrics, with their intervals, as shares of the first campaign's means."""
     names: list[str] = []
     curves: list[Series] = []
     for metric in comparison.metrics:
@@ -494,20 +498,25 @@ def paired_figure(comparison: PairedComparison) -> Figure:
         curves.append(Series(x=np.repeat(place, 2), y=ends, colour=colour, width=2.0))
         curves.append(Series(x=place, y=mean, colour=colour, label=label, style="points", width=6.0))
         names.append(metric.name)
-    title = f"{comparison.names[1]} less {comparison.names[0]}, with {100.0 * CONFIDENCE:g} % interval"
-    metrics = Panel(
-        title=title, y_label="% of the mean", x_label="metric", x_names=tuple(names), series=tuple(curves),
-        bounds=(Bound(value=0.0),), legend=True, height=1.6,
+    (a, b), level = comparison.names, 100.0 * CONFIDENCE
+    title = f"{b} less {a}, in % of {a}'s mean, with {level:g} % interval"
+    panel = Panel(
+        title=title, y_label="difference [%]", x_label="metric", x_names=tuple(names), series=tuple(curves),
+        bounds=(Bound(value=0.0),), height=1.3,
     )  # fmt: skip
+    return Figure(key="metrics", title="Tracking and commands", panels=(panel,), columns=1)
+
+
+def events_figure(comparison: PairedComparison) -> Figure:
+    """Plot the shares of the pairs in which events happened to each campaign's flight."""
     happened = [event for event in comparison.events if any(event.counts)][:_MOST_EVENTS]
-    shares = []
+    curves = []
     for i, name in enumerate(comparison.names):
         values = np.array([100.0 * event.counts[i] / event.pairs for event in happened])
         place = np.arange(len(happened), dtype=np.float64) + 0.2 * (i - 0.5)
-        shares.append(Series(x=place, y=values, colour=line_colour(i), label=name, style="points", width=6.0))
-    events = Panel(
-        title="share of the pairs", y_label="%", x_label="event", x_names=tuple(event.event for event in happened),
-        series=tuple(shares), y_range=(-4.0, 104.0), legend=True, height=1.6,
+        curves.append(Series(x=place, y=values, colour=line_colour(i), label=name, style="points", width=6.0))
+    panel = Panel(
+        title="share of the pairs", y_label="share [%]", x_label="event", series=tuple(curves),
+        x_names=tuple(event.event for event in happened), whole=True, height=1.3,
     )  # fmt: skip
-    panels = [panel for panel in (events, metrics) if panel.x_names]
-    return Figure(key="paired", title="differences", panels=tuple(panels), columns=1)
+    return Figure(key="events", title="Failures and other events", panels=(panel,), columns=1)

@@ -12,7 +12,7 @@ import pytest
 
 from quadsim.errors import InputError, OutputError
 from quadsim.features.campaign.events import EVENT_NAMES
-from quadsim.features.campaign.paired import compare_pairs
+from quadsim.features.campaign.paired import compare_pairs, events_figure
 from quadsim.features.campaign.statistics import estimate, holm
 
 MakeCampaign = Callable[..., pa.Table]
@@ -191,7 +191,7 @@ def test_the_answer_says_who_tracks_closer_and_a_plot_shows_by_how_much(thousand
                 verdict = "farther"
             (told,) = [part for part in result.tracking.split(";") if f"{verdict} in" in part]
             assert f" {metric.name[-1]}" in told
-    events, metrics = result.small_plot().panels
+    (events,), (metrics,) = events_figure(result).panels, result.small_plot().panels
     assert "failure" in events.x_names
     assert events.series[0].y[0] == pytest.approx(3.0)
     first = result.metrics[0]
