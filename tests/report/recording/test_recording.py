@@ -287,7 +287,24 @@ def test_events_report_each_change_of_the_solver_why_it_failed_and_the_end(
     times = content.times("/events").round(9).tolist()
     levels, texts = ([row[0] for row in content.rows("/events", name)] for name in ("level", "text"))
     assert sorted(zip(times, levels, texts, strict=True)) == expected
-    assert "cannot hold together: roll upper" in content.rows("/summary", "text")[0][0]
+    summary = content.rows("/summary", "text")[0][0]
+    assert "cannot hold together: roll upper" in summary
+
+
+def test_the_summary_has_no_key_without_a_value_and_plots_end_with_the_flight(
+    content: Content, short_run: Flight
+) -> None:
+    summary = content.rows("/summary", "text")[0][0]
+    lines = [line.strip("| ").split("|") for line in summary.splitlines() if line.startswith("|")]
+    assert len(lines) > 10
+    assert [cells for cells in lines[2:] if cells[-1].strip() in ("", "-")] == []
+    assert "events" not in summary, "it has none"
+    blueprint = content.reader.stream(store=content.reader.blueprints()[0]).to_chunks()
+    batches = [chunk.to_record_batch() for chunk in blueprint if chunk.entity_path.endswith("/TimeAxis")]
+    ranges = [str(batch.to_pydict()) for batch in batches]
+    end = round(1e9 * short_run.end)
+    assert ranges
+    assert all(str(end) in text for text in ranges)
 
 
 def test_a_flight_without_predictions_or_finite_end_is_recorded(
