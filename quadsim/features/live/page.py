@@ -55,10 +55,11 @@ _PLOTS: Final = {
     "Step [ms]": {"step": ""},
 }
 """The signal that a constraint on each curve has, by its label; the step has its deadline."""
-_BOUND: Final = {"stroke": COLOUR.bound, "dash": (6.0, 4.0), "width": 1.0}
+_BOUND: Final = {"label": "bound", "stroke": COLOUR.bound, "dash": (6.0, 4.0), "width": 1.0}
 _TIME: Final = {"x": {"time": False}}  # not a date
+_AXIS: Final = {"ticks": {"show": False}}  # the grid shows where they are
 _LOOK: Final = {
-    "axes": ({}, {"size": 62}),  # of x and y; the width [pixels] that "-0.005" takes
+    "axes": (_AXIS, {**_AXIS, "size": 62}),  # of x and y; the width [pixels] that "-0.005" takes
     "legend": {"live": False},  # names alone: the values of a cursor are mostly absent
     "padding": (12, 12, 0, 0),  # of half a label beyond the end of an axis [pixels]
 }
@@ -370,15 +371,15 @@ class Page:
 def _series(names: Collection[str], bounds: Collection[bool]) -> tuple[dict[str, Any], ...]:
     """The look of a plot's curves, and of its bounds, which are shown or not: one without values spoils the axis.
 
-    The legend has one entry for all bounds: `readout.READOUT_STYLE` hides those without a name.
+    The legend has one entry for all bounds: `readout.READOUT_STYLE` hides the others.
     """
     curves = [{"label": name, "stroke": colour} for name, colour in zip(names, CYCLE, strict=False)]
     lines = []
     named = False
     for shown in bounds:
-        label = "" if named or not shown else "bound"
+        further = {"class": readout.FURTHER} if named or not shown else {}
         named = named or shown
-        lines.append({**_BOUND, "label": label, "show": shown})
+        lines.append({**_BOUND, **further, "show": shown})
     return {"label": "t [s]"}, *curves, *lines
 
 
