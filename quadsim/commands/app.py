@@ -547,7 +547,7 @@ def plot(
     *signals: SignalName,
     labels: Labels = (),
     width: Inches = 7.16,
-    style: StyleName = None,
+    style: StyleName | None = None,
     out: File | None = None,
     overwrite: Flag = False,
 ) -> Overlay:

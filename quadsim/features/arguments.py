@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     Plotted: TypeAlias = Flight | File | Sequence[Flight | File]
     SignalName = str
     Inches = float
-    StyleName: TypeAlias = Mapping[str, Any] | File | None
+    StyleName: TypeAlias = Mapping[str, Any] | File
     Whole = int
     Flag = bool
     UserCode = object
