@@ -5,7 +5,6 @@ Conditions are in benchmarks/mismatch.toml.  Flights do not depend on the number
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -128,37 +127,10 @@ def measure(quick: bool, workers: int | None, report: Progress) -> list[Record]:
     ]
 
 
-def draw(records: Sequence[Record], path: Path) -> None:
-    """Draw the outcome of every controller in every condition: green is good, red is lost."""
-    import matplotlib.pyplot as plt
-
-    names = list(dict.fromkeys(record["controller"] for record in records))
-    conditions = list(dict.fromkeys(record["condition"] for record in records))
-    figure, panels = plt.subplots(2, 1, sharex=True, figsize=(12.0, 7.0), layout="constrained")
-    for axes, key, least, most, title in (
-        (panels[0], "end_error", 0.05, 0.5, "distance from the reference at the end [m]"),
-        (panels[1], "peak_tilt", TILT, 15.0, f"peak roll or pitch [deg]; the bound is {TILT:g}"),
-    ):
-        image = np.full((len(names), len(conditions)), np.nan)
-        for record in records:
-            row, column = names.index(record["controller"]), conditions.index(record["condition"])
-            image[row, column] = most if record["fate"] else record[key]
-            text = record["fate"] or f"{record[key]:.2f}"
-            axes.text(column, row, text.replace(", ", "\n"), ha="center", va="center", fontsize=7)
-        axes.imshow(image, cmap="RdYlGn_r", vmin=least, vmax=most, alpha=0.7, aspect="auto")
-        axes.set_title(title, loc="left", fontsize=10)
-        axes.set_yticks(range(len(names)), names)
-    panels[1].set_xticks(range(len(conditions)), [name.replace(" ", "\n", 1) for name in conditions], fontsize=8)
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
-
-
 def main() -> None:
     """Fly, print and write."""
     chosen = options(__doc__, workers={"type": int, "metavar": "N", "help": "processes (default: one per core)"})
-    records = run(partial(measure, chosen.quick, chosen.workers), "What each controller survives", chosen.json)
-    if chosen.json is not None:
-        draw(records, chosen.json.with_suffix(".png"))
+    run(partial(measure, chosen.quick, chosen.workers), "What each controller survives", chosen.json)
 
 
 if __name__ == "__main__":

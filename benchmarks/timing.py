@@ -48,7 +48,7 @@ def run(measure: Callable[[Progress], list[Record]], title: str, file: Path | No
     try:
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
-        with reporting(True, bars=False) as report:
+        with reporting(True, "the measurement", bars=False) as report:
             records = measure(report)
         if file is not None:
             data = {"records": records, "machine": machine(), "versions": versions()}

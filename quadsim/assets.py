@@ -79,9 +79,9 @@ def read_toml(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(path, f"cannot be read ({error})") from error
     except InputError as error:
-        raise FileError(path, str(error)) from error
+        raise FileError(path, str(error)) from None
     except ValueError as error:  # includes numbers that Python cannot read
-        raise FileError(path, f"is not valid TOML: {error}") from error
+        raise FileError(path, f"is not valid TOML: {error}") from None
 
 
 def parse_toml(text: str) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -39,7 +39,7 @@ SLOWEST_ROTOR: Final = 1.0
 """Longest time constant of a rotor [s]; propellers of 30 inch have some 0.3 s."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Vehicle:
     """A rigid body carried by four fixed rotors, thrust along body +z; validated on construction.
 
@@ -160,6 +160,17 @@ class Vehicle:
         self._check_layout()
         self._check_thrust()
         self._check_hover()
+
+    def __repr__(self) -> str:
+        lift = self.level_thrust(self.speed_max) / (self.mass * self.gravity)
+        parts = [
+            f"{self.mass:.3g} kg",
+            f"arms of {1e3 * self.longest_arm:.3g} mm",
+            f"hover at {self.hover_speed:.4g} of {self.speed_max:.4g} rad/s",
+            f"thrust {lift:.3g} times the weight",
+        ]
+        about = f"\n {self.description}" if self.description else ""
+        return f"<Vehicle {self.name}: {', '.join(parts)}{about}>"
 
     def _refuse(self, name: str, rule: str) -> NoReturn:
         raise ParameterError("vehicle", name, getattr(self, name), rule)
@@ -547,12 +558,36 @@ def _naming(path: Path) -> Iterator[None]:
     try:
         yield
     except ParameterError as error:
-        raise FileError(path, str(error)) from error
+        raise FileError(path, str(error)) from None
 
 
 def vehicle_sources(path: Path) -> dict[str, str]:
     """Return the source of each parameter, in the vehicle file's order; arguments and errors as `load_vehicle`."""
     return {key: entry["source"] for key, entry in _read_entries(path)[1].items()}
+
+
+EXAMPLE: Final = "example"
+"""The source of each number of `quadsim vehicle --template`."""
+EXAMPLE_DESCRIPTION: Final = "An example: "
+"""How its description begins."""
+
+
+def example_notes(path: Path, replaced: Collection[str] = ()) -> tuple[str, ...]:
+    """Return what a vehicle file still has of the template's example; errors as `load_vehicle`.
+
+    Args:
+        path: the vehicle file.
+        replaced: parameters that the file's values are not used of.
+    """
+    texts, entries = _read_entries(path)
+    left = [name for name, entry in entries.items() if entry["source"] == EXAMPLE and name not in replaced]
+    notes = []
+    if left:
+        count = f"{len(left)} of {len(entries)} values"
+        notes.append(f'{path.name}: {count} are of an example (source = "{EXAMPLE}"), not yours: {", ".join(left)}')
+    if texts.get("description", "").startswith(EXAMPLE_DESCRIPTION):
+        notes.append(f"{path.name}: the description is of an example, not yours: {texts['description']!r}")
+    return tuple(notes)
 
 
 def vehicle_table(path: Path, name: str) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Build the page on which the paper's MPC flies into site/fly, and link it from site/index.html: `make docs`.
 
 It takes clang and wasm-ld for the controllers, npm for MuJoCo, three.js and esbuild, and a network the first time.
-Without them the page is left out.
+Without them the page is left out.  The font of formulas takes npm alone.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 import gzip
 import json
 import math
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from importlib.metadata import distribution, version
 from pathlib import Path
 from typing import Any
@@ -28,9 +30,13 @@ HERE = Path(__file__).resolve().parent
 SITE = HERE.parents[1] / "site"
 CACHE = Path(sys.prefix) / "fly"
 """Where npm installs."""
-PACKAGES = {"@mujoco/mujoco": "3.14.0", "three": "0.187.0", "esbuild": "0.28.2", "@fontsource/stix-two-math": "5.3.0"}
-FONT = CACHE / "node_modules/@fontsource/stix-two-math"
+PACKAGES = {"@mujoco/mujoco": "3.14.0", "three": "0.187.0", "esbuild": "0.28.2"}
+FONT_PACKAGE = {"@fontsource/stix-two-math": "5.3.0"}
 """For formulas, where the reader's machine has no font with a MATH table."""
+FONT_CACHE = Path(sys.prefix) / "math-font"
+FONT = FONT_CACHE / "node_modules/@fontsource/stix-two-math"
+FONT_LINK = ', url("math.woff2") format("woff2")'
+"""What docs/assets/site.css has of it."""
 CONTROLLERS = {"constrained": "paper-constrained", "unconstrained": "paper-unconstrained", "robust": "robust"}
 """Buttons, and the scenarios whose controllers they switch to."""
 CLANG = [
@@ -46,22 +52,32 @@ ESBUILD = [
     *("--define:import.meta.url=document.baseURI", "--external:module", "--external:node:*", "--legal-comments=none"),
 ]
 PALETTE = "/* palette: docs/fly/build.py */"
-LEFT_OUT = '<p id="fly">This copy of the site was built without the page.</p>'
+LEFT_OUT = '<p id="fly"></p>'
+SECTION = re.compile(r'<h2 id="without-installing">.*?(?=<h2 )', re.DOTALL)
+"""Of the home page, what stands around it."""
 LINK = '<p id="fly"><a class="md-button md-button--primary" href="fly/index.html">Fly it</a></p>'
 
 
-def missing() -> str | None:
-    """What the build lacks on this machine; installs the packages where they are not yet."""
-    for tool in ("clang", "wasm-ld", "npm"):
+def lacking(*tools: str) -> str | None:
+    """Which of the tools is not installed; None where all are."""
+    for tool in tools:
         if shutil.which(tool) is None:
             return f"{tool} is not installed"
-    wanted, stamp = json.dumps(PACKAGES), CACHE / "installed.json"
+    return None
+
+
+def install(packages: Mapping[str, str], place: Path) -> str | None:
+    """Install packages into a folder of their own, where they are not yet; why it cannot be done, or None."""
+    if reason := lacking("npm"):
+        return reason
+    wanted = json.dumps(packages)
+    stamp = place / "installed.json"
     if stamp.is_file() and stamp.read_text(encoding="utf-8") == wanted:
         return None
-    CACHE.mkdir(exist_ok=True)
+    place.mkdir(exist_ok=True)
     command = ["npm", "install", "--no-save", "--no-package-lock", "--no-audit", "--no-fund", "--fetch-retries=3"]
-    names = [f"{name}@{pin}" for name, pin in PACKAGES.items()]
-    done = subprocess.run([*command, f"--prefix={CACHE}", *names], capture_output=True, text=True)
+    names = [f"{name}@{pin}" for name, pin in packages.items()]
+    done = subprocess.run([*command, f"--prefix={place}", *names], capture_output=True, text=True)
     if done.returncode != 0:
         return f"npm could not install {', '.join(names)}"
     stamp.write_text(wanted, encoding="utf-8")
@@ -113,7 +129,7 @@ def controller_wasm(name: str, work: Path) -> bytes:
 
 def build(out: Path) -> str | None:
     """Build the page into a directory; what is missing where it cannot be."""
-    if reason := missing():
+    if reason := lacking("clang", "wasm-ld") or install(PACKAGES, CACHE):
         return reason
     modules = CACHE / "node_modules"
     with tempfile.TemporaryDirectory() as name:
@@ -139,17 +155,35 @@ def build(out: Path) -> str | None:
     return None
 
 
+def add_font() -> str | None:
+    """Put the font of formulas into the site; where it cannot be had, why, and the site does not ask for it."""
+    reason = install(FONT_PACKAGE, FONT_CACHE)
+    if reason is None:
+        shutil.copy(FONT / "files/stix-two-math-latin-400-normal.woff2", SITE / "assets/math.woff2")
+        shutil.copy(FONT / "LICENSE", SITE / "assets/LICENSE-math.txt")
+        return None
+    style = SITE / "assets/site.css"
+    text = style.read_text(encoding="utf-8")
+    assert FONT_LINK in text, "docs/assets/site.css has no font"
+    style.write_text(text.replace(FONT_LINK, ""), encoding="utf-8")
+    return reason
+
+
 def main() -> None:
-    """Build the page into the site, and link it."""
-    if reason := build(SITE / "fly"):
-        print(f"The page on which the MPC flies is left out of the site: {reason}.")
-        return
+    """Build the page and the font into the site, and link the page; the home page has no place for one left out."""
+    if reason := add_font():
+        print(f"Formulas are shown in a font of the reader's machine: {reason}.")
+    reason = build(SITE / "fly")
     page = SITE / "index.html"
     text = page.read_text(encoding="utf-8")
     assert LEFT_OUT in text, "docs/index.md has no place for the link"
-    page.write_text(text.replace(LEFT_OUT, LINK), encoding="utf-8")
-    shutil.copy(FONT / "files/stix-two-math-latin-400-normal.woff2", SITE / "assets/math.woff2")
-    shutil.copy(FONT / "LICENSE", SITE / "assets/LICENSE-math.txt")
+    if reason is None:
+        text = text.replace(LEFT_OUT, LINK)
+    else:
+        print(f"The page on which the MPC flies is left out of the site: {reason}.")
+        text, count = SECTION.subn("", text)
+        assert count == 1, "docs/index.md has no section for the page"
+    page.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def main() -> None:
     for name, text in texts().items():
         (FILES / f"{name}.txt").write_text(text, encoding="utf-8")  # as text, which a browser shows
     try:
-        with ProcessPoolExecutor(usable_cores()) as pool, reporting(True) as report:
+        with ProcessPoolExecutor(usable_cores()) as pool, reporting(True, "the films") as report:
             films = sys.argv[1:] == ["films"]
             stages = {film_flight: NAMES} if films else {thumbnail: scenario_names(), poster: NAMES}
             for make, of in stages.items():

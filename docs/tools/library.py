@@ -34,7 +34,7 @@ def html() -> str:
     """Every scenario with its path, topic and verdict; films under posters, to which library.js gives controls."""
     shown = sorted(read_catalogue().scenarios.items(), key=lambda entry: [*TOPICS].index(entry[1].group))
     rows = [
-        f'<tr><td><img alt="{name}" src="assets/gallery/{name}.svg" loading="lazy"> {title(name)} '
+        f'<tr><td><img alt="{name}" src="assets/gallery/{name}.svg"> {title(name)} '
         f"{escape(scenario.description)}</td><td>{TOPICS[scenario.group]}</td><td>{scenario.expect}</td></tr>"
         for name, scenario in shown
     ]

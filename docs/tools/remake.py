@@ -45,7 +45,7 @@ BENCHMARKS: Final = (
     *("solvers", "flight", "nonlinear", "film", "campaign", "mismatch", "speed", "autopilots", "interfaces"),
     *("identification", "intervals", "stability", "moment", "batch"),
 )
-KEPT: Final = ("solvers", "mismatch", "speed", "interfaces", "identification")
+KEPT: Final = ("solvers", "speed", "interfaces", "identification")
 """Benchmarks whose figure is kept in docs/."""
 FIGURES: Final = {
     "campaign-paper-nominal.png": "runs/campaigns/paper-nominal/campaign.png",
@@ -383,8 +383,44 @@ def records(data: Any) -> list[Record]:
     return [{key: value for key, value in row.items() if not isinstance(value, (dict, list))} for row in rows]
 
 
+SURVIVED: Final = (
+    ("end_error", "Distance from the reference at the end [m]", 0.05, 0.5),
+    ("peak_tilt", "Peak roll or pitch [deg]; the bound is 5", 5.05, 15.0),
+)
+"""Columns of the mismatch, what they are, and the numbers beyond which a cell is shaded, and darker."""
+
+
+def mismatch(data: Record) -> str:
+    """What each controller survives: a table for each number, a row per condition."""
+    flights = {(row["condition"], row["controller"]): row for row in data["records"]}
+    conditions = list(dict.fromkeys(condition for condition, _ in flights))
+    names = list(dict.fromkeys(name for _, name in flights))
+    head = "".join(f"<th>{name}</th>" for name in names)
+    tables = []
+    for key, title, near, far in SURVIVED:
+        rows = []
+        for condition in conditions:
+            cells = "".join(_survived(flights[condition, name], key, near, far) for name in names)
+            rows.append(f"<tr><th>{condition}</th>{cells}</tr>\n")
+        caption = f"<caption>{title}</caption>"
+        tables.append(f'<table class="heat">{caption}\n<tr><th></th>{head}</tr>\n{"".join(rows)}</table>\n')
+    return f'<div class="wide">\n{"".join(tables)}</div>\n'
+
+
+def _survived(row: Record, key: str, near: float, far: float) -> str:
+    """A cell of `mismatch`."""
+    if row["fate"]:
+        return f'<td class="lost">{row["fate"].replace(", ", "<br>")}</td>'
+    value = row[key]
+    if value > far:
+        return f'<td class="far">{value:.2f}</td>'
+    if value > near:
+        return f'<td class="near">{value:.2f}</td>'
+    return f"<td>{value:.2f}</td>"
+
+
 CSV: Final[dict[str, Callable[[Any], list[Record]]]] = {
-    **dict.fromkeys((*KEPT, "autopilots", "flight", "intervals", "nonlinear", "stability"), records),
+    **dict.fromkeys((*KEPT, "autopilots", "flight", "intervals", "mismatch", "nonlinear", "stability"), records),
     "papers": paper_rows,
     "peers": peer_rows,
 }
@@ -392,6 +428,7 @@ CSV: Final[dict[str, Callable[[Any], list[Record]]]] = {
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     **{each.__name__: each for each in (results, ablation, papers, peers, export, campaigns, solvers, nonlinear)},
     **{each.__name__: each for each in (flight, batch, campaign, film, identification, autopilots, stability, moment)},
+    "mismatch": mismatch,
     "paper": both_flights,
     "first-flights": first_flights,
     "fastest-courses": fastest_courses,

@@ -28,6 +28,7 @@ from quadsim.features.arguments import (
     Plotted,
     ScenarioName,
     SignalName,
+    StyleName,
     UserCode,
     UserForces,
     UserReference,
@@ -239,7 +240,7 @@ def fly(
     """
     from quadsim.console.progress import reporting
 
-    with reporting(progress) as report:
+    with reporting(progress, "the flight") as report:
         begun = start(scenario, controller=controller, forces=forces, reference=reference, autopilot=autopilot)
         return begun.fly(report)
 
@@ -280,7 +281,7 @@ def run(
         video: film the flight (default: if possible).
         recording: write flight.rrd for the rerun viewer (default: if possible).
         figures: plot the flight (default: if possible).
-        fps: frames per second of the video (default: 30, or 20 from half a minute on).
+        fps: frames per second of the video (default: 30, or 20 for flights of half a minute or more).
         controller: as in `fly`.
         forces: as in `fly`.
         reference: as in `fly`.
@@ -315,7 +316,7 @@ def run(
     for note in (*notes(parts[0]), *instability_notes(parts[0])):
         _log.info(note)
     with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory, SignalHold():
-        with reporting(progress) as report:
+        with reporting(progress, "the flight") as report:
             flight = Rollout(*parts).fly(report)
         return write_run(flight, directory, products, overwrite=overwrite, fps=fps, progress=progress, flown=flown)
 
@@ -429,6 +430,7 @@ def check(
     from quadsim.rollout.stability import instability_notes
     from quadsim.scenarios import loading
     from quadsim.scenarios.catalogue import names_directory
+    from quadsim.scenarios.feasibility_check import leftover_notes
 
     file = None if junit is None else junit_file(junit)
     if isinstance(target, str | Path) and names_directory(target):
@@ -442,9 +444,9 @@ def check(
             _log.info("%s: %s", target, note)
     else:
         assembly = loading.assemble(target, changes, seed)
-        for note in instability_notes(assembly):
+        for note in (*leftover_notes(assembly), *instability_notes(assembly)):
             _log.info(note)
-        with reporting(progress) as report:
+        with reporting(progress, "the flight") as report:
             audited = replace(Rollout(assembly).fly(report), checked=Check())
     if file is not None:
         with after(audited, file):
@@ -488,7 +490,7 @@ def compare(
         video: film every flight that has no film (default: those that it flies, if possible).
         recording: write flight.rrd for the rerun viewer, of the scenarios that it flies (default: if possible).
         figures: plot them (default: if possible).
-        fps: frames per second of the films (default: 30, or 20 from half a minute on).
+        fps: frames per second of the films (default: 30, or 20 for flights of half a minute or more).
         progress: as in `fly`.
         flown: called with the comparison of flights as soon as its page is written, before the films.
 
@@ -528,7 +530,7 @@ def compare(
     else:
         options: dict[str, Any] = {"names": names, "products": products, "constraints": constraints, "fps": fps}
         first = None if markdown else flown
-        with reporting(progress) as report:
+        with reporting(progress, "the comparison") as report:
             compared = compare_flights(targets, page, report, overwrite=overwrite, flown=first, **options)
     return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared
 
@@ -545,6 +547,7 @@ def plot(
     *signals: SignalName,
     labels: Labels = (),
     width: Inches = 7.16,
+    style: StyleName | None = None,
     out: File | None = None,
     overwrite: Flag = False,
 ) -> Overlay:
@@ -558,6 +561,7 @@ def plot(
             logged (default: position and attitude).
         labels: names in the legend, one for each flight (default: scenario, and what tells its flights apart).
         width: of the figure [in]; 3.5 is one column of a journal, the default two.
+        style: a style sheet of matplotlib, by its name or file; in Python also rcParams: {"font.family": "serif"}.
         out: PDF, SVG or PNG file, with texts of 8 pt; without it a window opens.
         overwrite: replace an existing file.
 
@@ -582,7 +586,7 @@ def plot(
 
     each = [flights] if isinstance(flights, Flight | str | Path) else flights
     runs = [flight if isinstance(flight, Flight) else read_flight(Path(flight)) for flight in each]
-    return plot_runs(runs, signals, labels=labels, width=width, out=out, overwrite=overwrite)
+    return plot_runs(runs, signals, labels=labels, width=width, style=style, out=out, overwrite=overwrite)
 
 
 @app.command(
@@ -608,7 +612,7 @@ def film(
         out: MP4 or GIF file (default: flight.mp4 in the run directory, replacing an earlier one).
         overwrite: replace an existing file.
         workers: rendering processes (default: one per core).
-        fps: frames per second (default: 30, or 20 from half a minute on; 8 of a GIF).
+        fps: frames per second (default: 30, or 20 for flights of half a minute or more; 8 of a GIF).
         progress: as in `fly`.
 
     Returns:
@@ -640,7 +644,7 @@ def film(
         raise ParameterError("", "--workers", workers, "at least 1")
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
-    with reporting(progress) as report:
+    with reporting(progress, "the film") as report:
         make, estimate = render_video if path.suffix == ".mp4" else render_gif, Estimate()
 
         def follow(done: int, total: int) -> None:

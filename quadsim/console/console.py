@@ -23,6 +23,10 @@ from quadsim.report.table import Cell, Grid, Mark
 
 CONSOLE_WIDTH: Final = 120  # characters, without a terminal
 _UNBOUNDED: Final = 10_000  # characters, more than any table has
+_HTML: Final = (
+    '<pre style="line-height: normal; white-space: pre; overflow-x: auto; '
+    "font-family: Menlo, 'DejaVu Sans Mono', Consolas, 'Courier New', monospace\">{code}</pre>"
+)
 _STYLES: Final = {Mark.BEST: "bold", Mark.GOOD: "green", Mark.WARN: "yellow", Mark.BAD: "red"}
 
 
@@ -35,7 +39,14 @@ class PlainConsole(Console):
     def __init__(self, *, stderr: bool = False, width: int | None = None, file: IO[str] | None = None) -> None:
         recorded = file is not None
         super().__init__(
-            stderr=stderr, width=width, file=file, record=recorded, highlight=False, markup=False, emoji=False
+            stderr=stderr,
+            width=width,
+            file=file,
+            record=recorded,
+            highlight=False,
+            markup=False,
+            emoji=False,
+            force_jupyter=False,  # rich would display each line in the cell, also of what is only turned into text
         )
 
     def render_str(self, text: str, **options: Any) -> Text:
@@ -68,7 +79,7 @@ def show(parts: Iterable[RenderableType], console: PlainConsole | None = None) -
     for part in parts:
         if isinstance(part, str | Text) and not on_one_line:
             part = _wrapped(styled(part) if isinstance(part, str) else part, console.width)
-        console.print(part, soft_wrap=isinstance(part, str | Text))
+        console.print(part, soft_wrap=isinstance(part, str | Text), crop=False)
 
 
 def _wrapped(text: Text, width: int) -> Text:
@@ -98,7 +109,7 @@ def to_html(parts: Iterable[RenderableType]) -> str:
     """Return sentences and tables as HTML for a notebook."""
     console = PlainConsole(width=CONSOLE_WIDTH, file=io.StringIO())
     show(parts, console)
-    return console.export_html(inline_styles=True, code_format='<pre style="line-height: normal">{code}</pre>')
+    return console.export_html(inline_styles=True, code_format=_HTML)
 
 
 def say(text: str) -> None:
@@ -189,12 +200,32 @@ def grids(grids: Iterable[Grid], *, left: Collection[str] = ()) -> Iterator[Rend
 def listing(sections: Mapping[str, Mapping[str, str]]) -> Iterator[RenderableType]:
     """Return names with one line each, by section."""
     for title, entries in sections.items():
-        table = Table(
-            title=title, title_justify="left", title_style="bold", box=None, show_header=False, padding=(0, 2)
-        )
+        yield _Entries(title, entries)
+        yield ""
+
+
+class _Entries:
+    """Names with a line each: wrapped beside the names on a terminal, whole in a file or a pipe, for `grep`."""
+
+    def __init__(self, title: str, entries: Mapping[str, str]) -> None:
+        self._title = title
+        self._entries = entries
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """See `rich.console.Console`."""
+        yield styled((self._title, "bold"))
+        if not options.is_terminal:
+            width = max(map(cell_len, self._entries), default=0)
+            for name, line in self._entries.items():
+                padding = " " * (width - cell_len(name))
+                whole = styled("  ", (name, "cyan"), f"{padding}  {line}")
+                whole.no_wrap = True
+                whole.overflow = "ignore"
+                yield whole
+            return
+        table = Table(box=None, show_header=False, padding=(0, 2))
         table.add_column(no_wrap=True, style="cyan")
         table.add_column()
-        for name, line in entries.items():
+        for name, line in self._entries.items():
             table.add_row(name, line)
         yield table
-        yield ""

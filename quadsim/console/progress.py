@@ -24,10 +24,11 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 @contextlib.contextmanager
-def reporting(progress: Progress | bool, *, bars: bool = True) -> Iterator[Progress]:
+def reporting(progress: Progress | bool, what: str, *, bars: bool = True) -> Iterator[Progress]:
     """Yield the function that reports progress: a bar per stage on a terminal, elsewhere a line every `LINE_EVERY`.
 
-    False reports nothing; a function replaces both.  Without `bars` a terminal has the lines too, which take no time
+    `what` is what starts, until the first stage is reported, e.g. `the flight`.  False reports nothing; a function
+    replaces both.  Without `bars` a terminal has the lines too, which take no time
     from what is being timed.
     """
     if callable(progress):
@@ -39,7 +40,7 @@ def reporting(progress: Progress | bool, *, bars: bool = True) -> Iterator[Progr
         yield silent
         return
     if not (screen := stderr()).is_terminal or not bars:
-        with lines(screen) as tell:
+        with lines(screen, f"starting {what}") as tell:
             yield lambda stage, done, total: tell(f"{stage} {100 * done // total} %" if total > 1 else stage)
         return
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -58,11 +59,16 @@ def reporting(progress: Progress | bool, *, bars: bool = True) -> Iterator[Progr
 
 
 @contextlib.contextmanager
-def lines(screen: PlainConsole) -> Iterator[Callable[[str], None]]:
-    """Yield a function that takes what is done now; the latest is printed every `LINE_EVERY`, also while it lasts."""
+def lines(screen: PlainConsole, first: str) -> Iterator[Callable[[str], None]]:
+    """Yield a function that takes what is done now; the latest is printed every `LINE_EVERY`, also while it lasts.
+
+    `first` is what is done at first.
+    """
     from quadsim.console import console
 
-    now, started, over = "starting", clock.monotonic(), threading.Event()
+    now = first
+    started = clock.monotonic()
+    over = threading.Event()
 
     def tell(text: str) -> None:
         nonlocal now
@@ -71,7 +77,7 @@ def lines(screen: PlainConsole) -> Iterator[Callable[[str], None]]:
     def tick() -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are for the thread that works
         while not over.wait(LINE_EVERY):
-            console.show([f"quadsim: {now} after {clock.monotonic() - started:.0f} s"], screen)
+            console.show([f"quadsim: {now}, {clock.monotonic() - started:.0f} s so far"], screen)
 
     ticking = threading.Thread(target=tick, daemon=True)
     ticking.start()

@@ -6,10 +6,11 @@ import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from quadsim.errors import OutputError, QuadsimError, failure_line
+from quadsim.errors import MissingPackageError, OutputError, QuadsimError, failure_line
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -69,6 +70,35 @@ class Result:
         return console.to_html([*self.shown(), *self.outputs()]) + plot_html(self.small_plot())
 
 
+class Tabular(Result):
+    """A result with rows of numbers, for an analysis of one's own."""
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return its rows by column, numbers as numbers; None where a row has no value."""
+        raise NotImplementedError
+
+    def to_pandas(self) -> Any:
+        """Return its rows as a pandas DataFrame, numbers as numbers.
+
+        Raises:
+            MissingPackageError: pandas is not installed.
+        """
+        require_pandas()
+        import pandas
+
+        return pandas.DataFrame(self.records())
+
+
+def require_pandas() -> None:
+    """Raise if there is no pandas to make a DataFrame with.
+
+    Raises:
+        MissingPackageError: pandas is not installed.
+    """
+    if find_spec("pandas") is None:
+        raise MissingPackageError("a DataFrame", "pandas", extra="pandas")
+
+
 def plot_html(figure: Figure | None) -> str:
     """Return a plot for a notebook, or a line where it cannot be drawn."""
     from quadsim.report.to_matplotlib import figure_html
@@ -126,8 +156,15 @@ class Document(Result):
         return f"<pre>{escape(self.content)}</pre>"
 
 
-class Listing(dict[str, Mapping[str, str]], Result):
+class Listing(dict[str, Mapping[str, str]], Tabular):
     """Names by section, with a line about each."""
+
+    def records(self) -> list[dict[str, Any]]:
+        """See `Tabular.records`."""
+        rows = []
+        for section, entries in self.items():
+            rows += [{"section": section, "name": name, "line": line} for name, line in entries.items()]
+        return rows
 
     def shown(self) -> Shown:
         """See `Result.shown`."""

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     Plotted: TypeAlias = Flight | File | Sequence[Flight | File]
     SignalName = str
     Inches = float
+    StyleName: TypeAlias = Mapping[str, Any] | File
     Whole = int
     Flag = bool
     UserCode = object
@@ -62,6 +63,7 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
     Labels = Annotated[Sequence[str], Parameter(consume_multiple=True)]
     Plotted, Inches = Files, float
     SignalName = Annotated[str, Parameter(name="--signals", consume_multiple=True)]
+    StyleName = str
     Whole = Annotated[int, Parameter(converter=_whole)]
     Flag = Annotated[bool, Parameter(negative="")]
     UserCode = UserForces = UserReference = Fields = Watched = Flown = Annotated[Any, Parameter(parse=False)]

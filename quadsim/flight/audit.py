@@ -89,6 +89,7 @@ class Signal:
     plant: Callable[[PlantLog], Array] | None
     """log -> (M,) or (M, j) values at the physics rate, or None for a quantity that exists only at samples."""
     tolerance: Tolerance = MOTION  # default tolerances of its limits
+    gaps: bool = False  # whether it has no value at some instants, NaN, which no limit judges
 
     def finest(self, log: FlightLog | PeriodLog) -> tuple[Array, Array]:
         """Return times [s] and values at the plant's rate, or at the control samples if the plant has none."""
@@ -122,6 +123,15 @@ def _body_rate(axis: int) -> Signal:
     return Signal(unit="deg/s", sampled=lambda log: rates(log.truth), plant=plant)
 
 
+def _climb_acceleration(t: Array, states: Array) -> Array:
+    """(M,) mean vertical acceleration, world, from each of M states (M, 12) to the next [m/s^2]; NaN at the last.
+
+    It is the change of velocity, whatever causes it: thrust, wind, contact.  It is 0 in hover; with gravity added it is
+    the vertical part of the specific force, which an accelerometer measures.
+    """
+    return np.append(np.diff(states[:, INDEX["vz"]]) / np.diff(t), math.nan)
+
+
 def _present(values: Array | None, t: Array) -> Array:
     """The values (K,), or NaN where there are none."""
     return np.full(t.shape, math.nan) if values is None else values
@@ -135,11 +145,18 @@ SIGNALS: Final[dict[str, Signal]] = {
         unit="deg", sampled=lambda log: np.degrees(tilt(log.truth)), plant=lambda log: np.degrees(tilt(log.state))
     ),
     **{f"body_rate_{name}": _body_rate(axis) for axis, name in enumerate("xyz")},
+    "climb_acceleration": Signal(
+        unit="m/s^2",
+        sampled=lambda log: _climb_acceleration(log.t, log.truth),
+        plant=lambda log: _climb_acceleration(log.t, log.state),
+        gaps=True,
+    ),
     # Commanded at the samples, acting in between: the two differ when rotors saturate, or the mixer changes the thrust.
     "thrust": Signal(
         unit="N",
         sampled=lambda log: _present(log.target[:, 0] if log.target is not None else None, log.t),
         plant=lambda log: _present(log.thrust, log.t),
+        gaps=True,  # it has no target on the ground
     ),
     "speed": Signal(
         unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds, tolerance=COMMAND_TOLERANCE
@@ -328,7 +345,7 @@ class SpaceLimit(Limit):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Finding:
     """The audit's result for one limit; margins and peaks in the limit's unit."""
 
@@ -339,6 +356,13 @@ class Finding:
     worst_margin: float  # smallest signed margin at the physics rate, or at the samples if the signal exists only there
     worst_time: float  # first time at which the margin is within `Limit.tie` of the smallest [s]
     time_violated: float  # time spent beyond bound plus tolerance [s]
+
+    def __repr__(self) -> str:
+        if self.verdict == "incomplete":
+            return f"<Finding {self.limit.name}: {VERDICT_TEXT[self.verdict]}>"
+        margin, tolerance = self.deciding
+        judged = f"margin {margin:.4g} {self.limit.unit}, tolerance {tolerance:.3g}"
+        return f"<Finding {self.limit.name}: {VERDICT_TEXT[self.verdict]}, {judged}, at {self.worst_time:.2f} s>"
 
     @property
     def verdict(self) -> Verdict:
@@ -511,7 +535,7 @@ def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
     Of tied instants (`Limit.tie`) the first gives the time, and the bound and rotor whose extreme is the value.
     """
     inside = limit.holds_at(t)
-    if limit.signal == "thrust":  # which has no target on the ground
+    if limit.source.gaps:
         inside &= np.isfinite(values)
     if not inside.any():
         return math.nan, math.nan, math.nan

@@ -60,7 +60,7 @@ class Demand:
     slews: Array  # (K - 1, 4) speed steps from sample to sample [rad/s], NaN next to an omitted torque
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Feasibility:
     """A course compared with a vehicle's limits and a controller's bounds; peaks over the whole course."""
 
@@ -79,6 +79,12 @@ class Feasibility:
     sentence: str  # summary for the user
     advice: str  # the speed, response time or size that would be within limits and bounds, in a sentence
     notes: tuple[str, ...]  # what no controller can do, and doubts about the course's numbers
+
+    def __repr__(self) -> str:
+        lines = [self.sentence, *self.problems, *self.notes]
+        if self.advice:
+            lines.append(self.advice)
+        return "\n ".join(["<Feasibility", *lines]) + ">"
 
 
 def demand(

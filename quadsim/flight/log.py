@@ -263,7 +263,7 @@ class PeriodLog(NamedTuple):
     plant: PlantLog
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class FlightLog:
     """A whole flight, or the part that was flown."""
 
@@ -280,6 +280,10 @@ class FlightLog:
     interrupted: bool = False  # whether the user ended it
     traceback: tuple[str, ...] = ()  # last traceback lines of the exception in a controller or force that ended it
     lost: str | None = None  # loss criterion that ended it, e.g. `tilt`; None if none did
+
+    def __repr__(self) -> str:
+        ended = "" if self.reason is None else f", {self.reason}"
+        return f"<FlightLog: {self.control.t.size} control periods, {self.plant.t.size} rows of the plant{ended}>"
 
     @property
     def aborted(self) -> bool:

@@ -131,6 +131,7 @@ def _place(run: FlightRecord, name: str, folder: str, colour: str, page_director
         description=run.numbers.get("description", ""),
         facts=(", modelled with ".join([vehicle, *mismatch(run)]), _made_with(run)),
         video=video,
+        length=run.end,
         poster=poster,
         files=files,
     )

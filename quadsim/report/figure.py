@@ -37,6 +37,25 @@ def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | Non
     return middle - 0.5 * span, middle + 0.5 * span
 
 
+_START: Final = 0.001  # share of its time that is a curve's start, its first sample at least
+_SPIKE: Final = 3.0  # how many times its later span a panel's span has to be, for a start to be left outside
+
+
+def _later(x: Array, y: Array) -> Array:
+    """Values y over x, both (K,), after their start."""
+    if not x.size:
+        return y
+    start = x[0] + _START * (x[-1] - x[0])
+    return y[x > start]
+
+
+def _extent(curves: Sequence[Array]) -> tuple[float, float] | None:
+    """Return the lowest and the highest finite value; None without any."""
+    values = np.concatenate([np.ravel(curve) for curve in curves]) if curves else np.empty(0)
+    values = values[np.isfinite(values)]
+    return (float(values.min()), float(values.max())) if values.size else None
+
+
 def reference_curve(log: ControlLog, name: str) -> Array:
     """(K,) filtered reference of x, y, z or yaw, in the unit of its signal."""
     values = log.reference[:, REFERENCE_NAMES.index(name)]
@@ -196,9 +215,48 @@ class Panel:
 
     @property
     def heading(self) -> str:
-        """Title and unit."""
+        """Title and unit, and the value of a start outside the axis."""
         unit = self.unit.replace(" ", "\u00a0")  # no line break within it
-        return f"{self.title} [{unit}]" if unit else self.title
+        heading = f"{self.title} [{unit}]" if unit else self.title
+        if self.settled_range is None:
+            return heading
+        low, high = self.settled_range
+        first, last = _extent(self._curves()) or self.settled_range
+        peak = last if last - high > low - first else first
+        return f"{heading}, {peak:.3g} at first"
+
+    def _curves(self) -> list[Array]:
+        """Return what is drawn over time."""
+        edges = [edge for band in self.bands for edge in (band.low, band.high)]
+        return [*(series.y for series in self.series), *edges]
+
+    @property
+    def settled_range(self) -> tuple[float, float] | None:
+        """The range of y after the curves' starts, where a start would flatten all that follows; None elsewhere.
+
+        A first command, or the iterations of a first solve without a warm start, may be far beyond all others.
+        """
+        is_timed = not (self.x_label or self.y_log or self.equal or self.y_range)
+        if not is_timed or any(series.style == "bars" for series in self.series):
+            return None
+        bounds = [np.array([bound.value for bound in self.bounds])]
+        later = [_later(series.x, series.y) for series in self.series]
+        for band in self.bands:
+            later += [_later(band.x, band.low), _later(band.x, band.high)]
+        settled = _extent([*later, *bounds])
+        every = _extent([*self._curves(), *bounds])
+        if settled is None or every is None:
+            return None
+        low, high = settled
+        span = max(high - low, LEAST_SPANS.get(self.unit, 0.0))
+        if every[1] - every[0] <= _SPIKE * span:
+            return None
+        return low - 0.05 * span, high + 0.05 * span
+
+    @property
+    def fixed_range(self) -> tuple[float, float] | None:
+        """The range of y that is stated, or that leaves a start outside; None if the axis fits itself."""
+        return self.y_range or self.settled_range
 
     @property
     def least_range(self) -> tuple[float, float] | None:

@@ -40,6 +40,7 @@ class RunView:
     description: str
     facts: tuple[str, ...]  # vehicle, versions and machine
     video: str | None  # URL; None without one
+    length: float  # of the flight [s]
     poster: str | None  # URL of the video's picture before it plays; None if the video cannot be read
     files: Mapping[str, str]  # URL of each, by its label
 

@@ -8,9 +8,9 @@ import logging
 import re
 import textwrap
 from base64 import b64encode
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
     from matplotlib.typing import RcKeyType
 
+Style: TypeAlias = "Mapping[str, Any] | str | Path | None"
+"""What a user's figure has besides: matplotlib's rcParams, or a style sheet by its name or file."""
 DPI: Final = 160
 STYLE: Final[dict[RcKeyType, Any]] = {
     "axes.axisbelow": True,
@@ -38,6 +40,7 @@ STYLE: Final[dict[RcKeyType, Any]] = {
     "font.size": 9.0,
     "grid.color": "#e3e5e8",
     "grid.linewidth": 0.7,
+    "legend.fontsize": 8.5,
     "legend.frameon": False,
     "path.simplify_threshold": 0.2,
     "text.parse_math": False,
@@ -53,19 +56,27 @@ JOURNAL: Final[dict[RcKeyType, Any]] = {
     "axes.titlesize": 8.0,
     "font.size": 8.0,
     "grid.linewidth": 0.5,
-    "legend.fontsize": 8.0,
+    "legend.borderaxespad": 0.2,
+    "legend.borderpad": 0.2,
+    "legend.columnspacing": 1.2,
+    "legend.fontsize": 7.5,
+    "legend.handlelength": 1.6,
+    "legend.handletextpad": 0.5,
+    "legend.labelspacing": 0.25,
     "pdf.fonttype": 42,
+    "ps.fonttype": 42,
     "xtick.labelsize": 7.5,
     "ytick.labelsize": 7.5,
 }
-"""What a figure of a stated width has besides: texts of 8 pt, and fonts that journals accept."""
+"""What a figure of a stated width has besides: texts of 8 pt, and fonts that journals accept, Type 42."""
 JOURNAL_DPI: Final = 300
 SUFFIXES: Final = (".pdf", ".svg", ".png")
 _WIDTH, _ROW, _HEAD = 9.6, 1.95, 0.7  # of a figure, of a row of panels and of what stands above and below them [in]
 _LETTERS: Final = 26  # characters beside a vertical axis
 _JOURNAL_ROW, _JOURNAL_HEAD, _JOURNAL_LETTERS = 1.2, 0.5, 17  # the same of a figure of a stated width
 _LARGEST_SVG, _NOTEBOOK_DPI = 40_000, 55
-_LETTER, _HANDLE = 0.55, 4.5  # of a legend: width of a letter, and of a line with the spaces about it [font size]
+_MOST_COLUMNS: Final = 6  # of a legend
+_LINE: Final = 1.25  # height of a line of text [font size]
 _DASHES: Final = (0, (5, 2))
 _MARKERS: Final = {
     **{"circle": "o", "diamond": "D", "square": "s", "x": "x", "cross": "P"},
@@ -126,8 +137,12 @@ def figure_file(path: Path | str, *, overwrite: bool = False) -> Path:
     return require_file(path, overwrite=overwrite)
 
 
-def write_figure(figure: Figure, path: Path | str, *, width: float, overwrite: bool = False) -> list[Axes]:
+def write_figure(
+    figure: Figure, path: Path | str, *, width: float, overwrite: bool = False, style: Style = None
+) -> list[Axes]:
     """Write a figure for a journal as PDF, SVG or PNG, by the suffix of its path; the same numbers give the same bytes.
+
+    `style` is as of `draw`.
 
     Returns:
         Its axes, panel by panel.
@@ -137,7 +152,7 @@ def write_figure(figure: Figure, path: Path | str, *, width: float, overwrite: b
     """
     path = figure_file(path, overwrite=overwrite)
     metadata: dict[str, Any] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(path.suffix, {})
-    with _style({**JOURNAL, "svg.hashsalt": figure.key}):
+    with _style(JOURNAL, style, {"svg.hashsalt": figure.key}):
         canvas = _draw(figure, interactive=False, width=width)
         with writing_file(path, overwrite=overwrite) as new:
             canvas.savefig(new, metadata=metadata, dpi=JOURNAL_DPI)
@@ -154,32 +169,59 @@ def show_window(canvas: Canvas) -> bool:
     return True
 
 
-def draw(figure: Figure, *, interactive: bool = False, width: float | None = None) -> Canvas:
+def draw(figure: Figure, *, interactive: bool = False, width: float | None = None, style: Style = None) -> Canvas:
     """The figure as matplotlib's.
 
     Args:
         figure: what to draw.
         interactive: whether notebooks and `pyplot.show` show it.
         width: its width [in], in the style of a journal; None: as wide as a page of ours.
+        style: replaces settings of texts, axes, grid and legend; curves keep their colours.
+
+    Raises:
+        ParameterError: matplotlib knows no such style, or refuses a value of it.
     """
-    with _style({} if width is None else JOURNAL):
+    with _style({} if width is None else JOURNAL, style):
         return _draw(figure, interactive=interactive, width=width)
 
 
 @contextlib.contextmanager
-def _style(more: dict[RcKeyType, Any] | None = None) -> Iterator[None]:
-    """Matplotlib's defaults with `STYLE`, whatever the user's matplotlibrc says, and without its notices."""
+def _style(*more: Style | Mapping[RcKeyType, Any]) -> Iterator[None]:
+    """Matplotlib's defaults with `STYLE` and more, whatever the user's matplotlibrc says, and without its notices.
+
+    Raises:
+        ParameterError: matplotlib knows no such style, or refuses a value of it.
+    """
     notices = logging.getLogger("matplotlib")
     level = notices.level
     notices.setLevel(logging.ERROR)  # as on a home directory that it cannot write
     try:
         import matplotlib.style
 
-        styles: list[Any] = ["default", STYLE, more or {}]
-        with matplotlib.style.context(styles):
+        with matplotlib.style.context("default"):
+            for style in (STYLE, *more):
+                if style is not None:
+                    _use(style)
             yield
     finally:
         notices.setLevel(level)
+
+
+def _use(style: Style | Mapping[RcKeyType, Any]) -> None:
+    """Apply a style to what is drawn from now on.
+
+    Raises:
+        ParameterError: matplotlib knows no such style, or refuses a value of it.
+    """
+    import matplotlib.style
+
+    try:
+        matplotlib.style.use(str(style) if isinstance(style, Path) else style)  # type: ignore[arg-type]
+    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
+        rule = "rcParams of matplotlib, or a style sheet by its name or file"
+        reason = str(error.args[0] if error.args else error).splitlines()[0]
+        shown = dict(style) if isinstance(style, Mapping) else str(style)
+        raise ParameterError("", "style", shown, f"{rule} ({reason})") from None
 
 
 def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
@@ -192,7 +234,9 @@ def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
     if interactive:
         from matplotlib import pyplot
 
-        canvas = pyplot.figure(figsize=size, layout="constrained")
+        from quadsim.report.journal_figure import JournalFigure
+
+        canvas = pyplot.figure(figsize=size, layout="constrained", FigureClass=JournalFigure)
     else:
         canvas = Canvas(figsize=size, layout="constrained")
     grid = canvas.subplots(len(rows), figure.columns, squeeze=False, height_ratios=heights)
@@ -203,7 +247,7 @@ def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
         if panel.legend and entries:
             beside = {} if panel.y_label else {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
             axes.legend(entries.values(), entries, loc="lower right", ncols=1 if panel.y_label else 4,
-                        fontsize=8.0, columnspacing=1.0, handletextpad=0.4, **beside)  # fmt: skip
+                        columnspacing=1.0, handletextpad=0.4, **beside)  # fmt: skip
         else:
             shown |= {label: artist for label, artist in entries.items() if label not in shown}
         if not panel.x_label:
@@ -215,18 +259,47 @@ def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
     if figure.title:
         canvas.suptitle(figure.title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
     if shown:
-        canvas.legend(
-            list(shown.values()), list(shown), loc="outside lower right", ncols=_legend_columns(shown, size[0])
-        )
+        ncols = _legend_columns(list(shown), size[0])
+        canvas.legend(list(shown.values()), list(shown), loc="outside lower right", ncols=ncols)
+        rows_of_labels = -(-len(shown) // ncols)
+        canvas.set_figheight(size[1] + (rows_of_labels - 1) * _legend_line())  # which panels would lose otherwise
     return canvas
 
 
-def _legend_columns(labels: Iterable[str], width: float) -> int:
-    """How many labels fit beside one another in so many inches, at most six."""
+def _legend_size() -> float:
+    """Size of a legend's texts [pt]."""
+    from matplotlib import rcParams
+    from matplotlib.font_manager import FontProperties
+
+    return FontProperties(size=rcParams["legend.fontsize"]).get_size_in_points()
+
+
+def _legend_line() -> float:
+    """Height of a line of a legend [in]."""
     from matplotlib import rcParams
 
-    longest = max(map(len, labels)) * _LETTER + _HANDLE
-    return min(6, max(1, int(72.0 * width / (longest * rcParams["font.size"]))))
+    return (_LINE + rcParams["legend.labelspacing"]) * _legend_size() / 72.0
+
+
+def _legend_columns(labels: Sequence[str], width: float) -> int:
+    """How many columns of labels fit in a width [in], each as wide as its longest label; filled one by one."""
+    from matplotlib import rcParams
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    size = _legend_size()
+    font = FontProperties(family=rcParams["font.family"], size=size)
+    handle = (rcParams["legend.handlelength"] + rcParams["legend.handletextpad"]) * size
+    space = rcParams["legend.columnspacing"] * size
+    ends = 2.0 * (rcParams["legend.borderpad"] + rcParams["legend.borderaxespad"]) * size
+    widths = [handle + TextPath((0.0, 0.0), label, prop=font).get_extents().width for label in labels]
+    for ncols in range(min(_MOST_COLUMNS, len(labels)), 1, -1):
+        taken = ends + (ncols - 1) * space
+        for column in np.array_split(np.array(widths), ncols):
+            taken += column.max()
+        if taken <= 72.0 * width:
+            return ncols
+    return 1
 
 
 def _share_time(panels: list[Axes], figure: Figure) -> None:
@@ -274,7 +347,7 @@ def _draw_panel(axes: Axes, panel: Panel, letters: int) -> dict[str, Artist]:
         axes.set_xticks(range(len(panel.x_names)), panel.x_names)
     if panel.equal:
         axes.set_aspect("equal", adjustable="datalim")
-    if ends := panel.y_range or panel.least_range:
+    if ends := panel.fixed_range or panel.least_range:
         axes.set_ylim(*ends)
     if panel.y_label:
         axes.set_title(panel.heading)

@@ -192,8 +192,8 @@ def _draw_panel(canvas: Canvas, panel: Panel, place: dict[str, int], points: int
     if panel.x_names:
         text = list(map(html.escape, panel.x_names))
         canvas.update_xaxes(tickvals=list(range(len(text))), ticktext=text, automargin=True, **place)
-    if panel.y_range:
-        canvas.update_yaxes(range=list(panel.y_range), **place)
+    if panel.fixed_range:
+        canvas.update_yaxes(range=list(panel.fixed_range), **place)
     elif panel.least_range:
         canvas.update_yaxes(autorangeoptions={"include": panel.least_range}, **place)
 

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from quadsim.console.progress import Progress, silent
-from quadsim.console.results import Result, Shown, after
+from quadsim.console.results import Shown, Tabular, after
 from quadsim.errors import ParameterError
 from quadsim.flight.audit import Limit, audit, limit_differences
 from quadsim.flight.rundir import VIDEO_FILE, limit_to_json
@@ -39,7 +39,7 @@ Compared = Flight | Scenario | str | Path
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class FlightComparison(Result):
+class FlightComparison(Tabular):
     """Flights side by side."""
 
     flights: tuple[Flight, ...]
@@ -68,6 +68,23 @@ class FlightComparison(Result):
 
         flown = [flight for flight in self.flights if flight.time.size]
         return signals(self.flights, ("x", "y", "z")) if flown else None
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a row per flight: verdict, `Flight.metrics`, and of each constraint its margin and verdict.
+
+        The columns are named as those of a sweep, e.g. `rmse.x`, `margin.roll`, `satisfied.roll`.
+        """
+        rows = []
+        for name, flight in zip(self.names, self.flights, strict=True):
+            row: dict[str, Any] = {"flight": name, "verdict": flight.outcome, "reason": flight.reason}
+            row |= {"duration": flight.numbers["duration"], **flight.metrics}
+            for finding in flight.findings:
+                constraint = finding.limit.name
+                row[f"margin.{constraint}"] = finding.margin
+                row[f"time_violated.{constraint}"] = finding.time_violated
+                row[f"satisfied.{constraint}"] = finding.satisfied
+            rows.append(row)
+        return rows
 
     def to_markdown(self) -> str:
         """The table as Markdown."""

@@ -191,7 +191,7 @@ class FlightEvents:
             try:
                 scenario.require_consistent()
             except ValueError as error:
-                raise InputError(str(error)) from error
+                raise InputError(str(error)) from None
         return scenario
 
     def _schedule(self, event: Event, ready: Successor | None = None) -> None:

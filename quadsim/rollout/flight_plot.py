@@ -11,7 +11,7 @@ from quadsim.errors import InputError, ParameterError
 from quadsim.flight.record import FlightRecord
 from quadsim.report.comparison import check_names
 from quadsim.report.flight_figures import signals as draw_signals
-from quadsim.report.to_matplotlib import draw, figure_file, show_window, write_figure
+from quadsim.report.to_matplotlib import Style, draw, figure_file, show_window, write_figure
 
 PAGE_WIDTH: Final = 7.16  # of a figure across both columns of a journal's page [in]; 3.5 is one column
 _WIDTHS: Final = (2.0, 20.0)  # smallest and largest [in]
@@ -33,6 +33,15 @@ class Overlay(list[Any], Result):
             super().show()
         elif not show_window(self[0].figure):
             raise InputError("no display to show the plot on; write it to a file: --out plot.pdf")
+
+    def _ipython_display_(self) -> None:
+        """Print the axes, or where the file is; a notebook itself shows a figure of pyplot, once."""
+        from matplotlib import get_backend
+
+        if self.path is not None:
+            super().show()
+        elif "inline" not in get_backend():
+            print(list(self))
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
@@ -56,6 +65,7 @@ def plot_runs(
     width: float = PAGE_WIDTH,
     out: Path | str | None = None,
     overwrite: bool = False,
+    style: Style = None,
 ) -> Overlay:
     """Overlay runs; arguments and errors as `quadsim.commands.app.plot`."""
     if not runs:
@@ -69,7 +79,7 @@ def plot_runs(
         out = figure_file(out, overwrite=overwrite)
     figure = draw_signals(runs, signals or _USUAL)
     if out is None:
-        return Overlay(draw(figure, interactive=True, width=width).axes)
-    plot = Overlay(write_figure(figure, out, width=width, overwrite=overwrite))
+        return Overlay(draw(figure, interactive=True, width=width, style=style).axes)
+    plot = Overlay(write_figure(figure, out, width=width, overwrite=overwrite, style=style))
     plot.path = out
     return plot

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from html import escape
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -18,9 +17,9 @@ import numpy as np
 
 from quadsim.console.junit import Cases, flight_verdicts
 from quadsim.console.progress import Progress, reporting, silent
-from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown, plot_html
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown, plot_html, require_pandas
 from quadsim.controller import NOT_CONVERGED
-from quadsim.errors import MissingPackageError, OutputError, UnknownNameError, failure_line
+from quadsim.errors import OutputError, UnknownNameError, failure_line
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import (
     VERDICT_TEXT,
@@ -365,7 +364,7 @@ class Flight(Result):
 
         Args:
             signals: as in `quadsim.plot`.
-            options: its `labels`, `width`, `out` and `overwrite`.
+            options: its `labels`, `width`, `style`, `out` and `overwrite`.
 
         Returns:
             The matplotlib axes, top to bottom.
@@ -386,7 +385,7 @@ class Flight(Result):
         recording: bool | None = None,
         figures: bool | None = None,
         fps: int | None = None,
-        progress: Progress = silent,
+        progress: Progress | bool = True,
     ) -> Path:
         """Write the run directory, as `quadsim run` does: tables and summary first, then figures, recording and video.
 
@@ -396,8 +395,8 @@ class Flight(Result):
             video: whether to film the flight; None: if possible; True: raise if it fails.
             recording: whether to write `flight.rrd` for the rerun viewer, as for `video`.
             figures: whether to plot the flight, as for `video`.
-            fps: frames per second of the video; None: 30, or 20 from half a minute on.
-            progress: called with (activity, done, total).
+            fps: frames per second of the video; None: 30, or 20 for flights of half a minute or more.
+            progress: as of `quadsim.fly`.
 
         Returns:
             The directory.
@@ -414,7 +413,8 @@ class Flight(Result):
         flight, whole = self.write_tables(directory, overwrite=overwrite)
         if whole:
             products = {"video": video, "recording": recording, "figures": figures}
-            _require_products(add_products(flight, products, fps=fps, progress=progress), products)
+            with reporting(progress, "the figures") as report:
+                _require_products(add_products(flight, products, fps=fps, progress=report), products)
         return Path(directory)
 
     def write_tables(self, directory: str | Path, *, overwrite: bool = False) -> tuple[Flight, bool]:
@@ -542,8 +542,7 @@ def to_pandas(table: pa.Table) -> Any:
     Raises:
         MissingPackageError: pandas is not installed.
     """
-    if find_spec("pandas") is None:
-        raise MissingPackageError("a DataFrame", "pandas", extra="pandas")
+    require_pandas()
     return table.to_pandas()
 
 
@@ -574,7 +573,7 @@ def write_run(
         flown(flight)
     if not whole:
         return flight
-    with reporting(progress) as report:
+    with reporting(progress, "the figures") as report:
         try:
             flight = add_products(flight, products, fps=fps, progress=report)
             _require_products(flight, products)

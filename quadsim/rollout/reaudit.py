@@ -60,7 +60,7 @@ def reaudit(directory: Path, *, products: bool = True) -> Flight:
         again = audit(flight.log, assembly.limits)
     except InputError as error:
         changed = list(_changed(directory, rundir.read_summary(directory), products=products))
-        raise _contradiction(directory, changed or [f"it cannot be audited again: {error}"]) from error
+        raise _contradiction(directory, changed or [f"it cannot be audited again: {error}"]) from None
     summary = flight.summary
     differing = list(_changed(directory, summary, products=products))
     differing += _inconsistencies(flight)

@@ -167,6 +167,12 @@ class Rollout:
         )
         self._longest = controller.horizon
 
+    def __repr__(self) -> str:
+        scenario = self.scenario
+        flown = f"{self.k * scenario.control_period:.2f} of {scenario.duration:g} s flown by {self._law[0]}"
+        ended = "" if self.loop.reason is None else f", {self.loop.reason}"
+        return f"<Rollout {scenario.name}: {flown}{ended}>"
+
     def __enter__(self) -> Rollout:
         return self
 

@@ -249,7 +249,7 @@ class Assembly:
         try:
             return altered(modelled, self._stated)
         except ParameterError as error:
-            raise ParameterError("actual", error.name, error.value, error.rule) from error
+            raise ParameterError("actual", error.name, error.value, error.rule) from None
 
     @property
     def _stated(self) -> dict[str, Any]:

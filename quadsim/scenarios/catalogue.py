@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias, get_args
 
 from quadsim.assets import library_dir, read_toml, vehicle_names, vehicle_path
-from quadsim.console.results import Result, Shown
+from quadsim.console.results import Shown, Tabular
 from quadsim.errors import FileError, UnknownNameError
 from quadsim.outputs import SUMMARY_FILE
 
@@ -132,8 +132,8 @@ class LibraryScenario:
         return self.description + _MEANT.get(self.expect, "")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Catalogue(Result):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Catalogue(Tabular):
     """Everything shipped, by name."""
 
     scenarios: Mapping[str, LibraryScenario]  # for `load` and `fly`
@@ -156,6 +156,16 @@ class Catalogue(Result):
         others = ("campaigns", "vehicles", "controllers", "papers", "solvers")
         groups = {title: lines for title, lines in groups.items() if lines}
         return console.listing({**groups, **{title: getattr(self, title) for title in others}})
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a row per name: its `kind`, `group` of a scenario, and `description`."""
+        rows: list[dict[str, Any]] = []
+        for name, entry in self.scenarios.items():
+            rows.append({"kind": "scenario", "name": name, "group": entry.group, "description": entry.description})
+        for title in ("campaigns", "vehicles", "controllers", "papers", "solvers"):
+            for name, text in getattr(self, title).items():
+                rows.append({"kind": title.removesuffix("s"), "name": name, "group": None, "description": text})
+        return rows
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values; those of scenarios by field."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quadsim.assets import vehicle_path
 from quadsim.errors import ParameterError
 from quadsim.flight.audit import Mask
 from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
@@ -23,7 +24,7 @@ from quadsim.scenarios.courses.smoothing import within_rounding
 from quadsim.scenarios.schema.events import SetpointEvent, first_period
 from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.state import INDEX, REFERENCE_NAMES, STATE_NAMES, STATE_UNITS, Array, shown_unit
-from quadsim.vehicle import span
+from quadsim.vehicle import example_notes, span
 
 if TYPE_CHECKING:
     from quadsim.scenarios.assembly import Assembly
@@ -57,7 +58,15 @@ def hover_speeds(assembly: Assembly) -> Array:
 
 def notes(assembly: Assembly) -> tuple[str, ...]:
     """Return what no controller can do, or what nobody can mean, as `run` says before it flies."""
-    return (*hover_notes(assembly), *floor_notes(assembly))
+    return (*leftover_notes(assembly), *hover_notes(assembly), *floor_notes(assembly))
+
+
+def leftover_notes(assembly: Assembly) -> tuple[str, ...]:
+    """Return what the vehicle's file still has of an example; nothing of a run, whose numbers are its scenario's."""
+    scenario = assembly.scenario
+    if scenario.recorded is not None:
+        return ()
+    return example_notes(vehicle_path(scenario.vehicle.file), scenario.vehicle.overrides())
 
 
 def hover_notes(assembly: Assembly) -> tuple[str, ...]:

@@ -70,7 +70,7 @@ def _read(name: str, settings: Sequence[str]) -> Scenario:
         return parse_scenario(data, source=label, directory=file.parent)
     except ScenarioError as error:
         causes = _of_types(error.problems, name, unchanged, data)
-        raise ScenarioError(label, [*error.problems, *causes]) from error
+        raise ScenarioError(label, [*error.problems, *causes]) from None
 
 
 def apply_settings(data: dict[str, Any], settings: Sequence[str], directory: Path) -> None:

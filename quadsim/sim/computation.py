@@ -126,7 +126,7 @@ def times_by_solver(per_iteration: Mapping[str, float]) -> dict[str, float]:
             except UnknownNameError as error:
                 known = ", ".join(sorted({*_COUNT_THEMSELVES, *ALIASES, *solver_entries()}))
                 rule = f"absent: {error}" if name in SUCCESSORS else f"absent, or one of {known}"
-                raise ParameterError("computation.per_iteration", name, seconds, rule) from error
+                raise ParameterError("computation.per_iteration", name, seconds, rule) from None
         own_name = ALIASES.get(name, name)
         if own_name in times:
             rule = f"given once: {own_name} is another name of the same solver"

@@ -35,17 +35,17 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], list[str]]]:
 
 
 def test_elsewhere_lines_say_what_is_done_however_long_it_takes(lines: Callable[[], list[str]]) -> None:
-    with reporting(True) as report:
-        assert lines()[-1] == "quadsim: starting after 0 s"
+    with reporting(True, "the flight") as report:
+        assert lines()[-1] == "quadsim: starting the flight, 0 s so far"
         report("flight", 10, 40)
-        assert lines()[-1] == "quadsim: flight 25 % after 0 s"
+        assert lines()[-1] == "quadsim: flight 25 %, 0 s so far"
         report("figures", 0, 1)
-        assert lines()[-1] == "quadsim: figures after 0 s"
+        assert lines()[-1] == "quadsim: figures, 0 s so far"
 
 
 def test_no_progress_is_silent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("quadsim.console.progress.LINE_EVERY", 0.01)
-    with reporting(False) as report:
+    with reporting(False, "the flight") as report:
         report("flight", 1, 2)
         clock.sleep(0.1)
     assert capsys.readouterr().err == ""
@@ -56,7 +56,7 @@ def test_a_campaign_says_how_far_it_is(lines: Callable[[], list[str]]) -> None:
         watch(CampaignProgress(flown=10, flights=25, failed=0, rate=1.0))
         assert lines()[-1].startswith("quadsim: flights 10/25, 1.00/s, 0:00:15 left; 0 failed (")
         watch(CampaignProgress(flown=25, flights=25, failed=0, rate=1.0))
-        assert lines()[-1] == "quadsim: report after 0 s"
+        assert lines()[-1] == "quadsim: report, 0 s so far"
 
 
 def test_a_terminal_has_bars(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,7 +65,7 @@ def test_a_terminal_has_bars(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = PlainConsole(file=shown, width=80)
     screen._force_terminal, screen.is_interactive = True, True
     monkeypatch.setattr(console, "stderr", lambda: screen)
-    with reporting(True) as report:
+    with reporting(True, "the flight") as report:
         report("flight", 1, 4)
         report("figures", 0, 1)
         report("video", 3, 4)

@@ -13,6 +13,7 @@ from support import logged, small_log
 
 from quadsim.flight.audit import SIGNALS, Finding, Limit, audit, margins_sampled, worst_finding, worst_share
 from quadsim.flight.log import FlightLog
+from quadsim.state import INDEX
 
 Z = Limit(name="height", signal="z", lower=-1.0, upper=2.0)
 SAMPLES = (0.0, 1.0, 1.9)
@@ -111,6 +112,21 @@ def test_tilt_is_the_angle_between_thrust_and_vertical(roll: float, pitch: float
     log.control.truth[0, [6, 8]] = np.radians([roll, pitch])
     expected = math.degrees(math.acos(math.cos(math.radians(roll)) * math.cos(math.radians(pitch))))
     assert SIGNALS["tilt"].sampled(log.control)[0] == pytest.approx(expected)
+
+
+def test_climb_acceleration_is_the_change_of_the_vertical_velocity() -> None:
+    log = small_log(3)
+    log.plant.state[:, INDEX["vz"]] = 0.5 * 3.0 * log.plant.t**2  # the acceleration is 3 t
+    last = log.plant.t.size - 1
+    rows = SIGNALS["climb_acceleration"].finest(log)[1]
+    middles = 0.5 * (log.plant.t[1:] + log.plant.t[:-1])
+    assert rows[:last] == pytest.approx(3.0 * middles)
+    assert math.isnan(rows[last])
+    finding = find(log, Limit(name="climb", signal="climb_acceleration", upper=float(3.0 * middles[-1]) - 0.25))
+    assert finding.limit.unit == "m/s^2"
+    assert finding.worst_margin == pytest.approx(-0.25)
+    assert finding.worst_time == log.plant.t[last - 1]
+    assert finding.verdict == "violated"
 
 
 @pytest.mark.parametrize(("axis", "state", "scale"), [("x", 0, 1.0), ("yaw", 10, 180.0 / math.pi)])

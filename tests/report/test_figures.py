@@ -17,6 +17,7 @@ import pytest
 from matplotlib.image import imread
 from support import judged_by, renamed, small_log
 
+from quadsim.errors import ParameterError
 from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
 from quadsim.flight.log import FlightLog
 from quadsim.palette import COLOUR
@@ -295,6 +296,67 @@ def test_a_user_s_own_settings_change_no_figure_and_its_texts_are_literal() -> N
         assert to_png(figure) == expected
         assert figure_html(figure).count("$") >= 4
         assert matplotlib.rcParams["text.usetex"]
+
+
+LABELS = ("constrained MPC, horizon of 50 periods", "infinite-horizon LQR", "cascaded PID", "bound", "reference")
+
+
+def test_the_legend_of_a_figure_as_wide_as_a_column_takes_a_sixth_of_it_at_most() -> None:
+    x = np.linspace(0.0, 1.0, 5)
+    curves = tuple(Series(x=x, y=i * x, colour="#000000", label=label) for i, label in enumerate(LABELS))
+    canvas = draw(Figure(key="k", title="", panels=(Panel(title="x", series=curves),) * 2, columns=1), width=3.5)
+    canvas.draw_without_rendering()
+    (legend,) = canvas.legends
+    box, whole = legend.get_window_extent(), canvas.bbox
+    assert box.height < whole.height / 6.0
+    assert 0.0 <= box.x0 < box.x1 <= whole.width
+
+
+@pytest.mark.parametrize("style", [{"font.family": "serif"}, "sheet.mplstyle"])
+def test_a_style_of_the_user_s_replaces_ours(style: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("sheet.mplstyle").write_text("font.family: serif\n")
+    series = (Series(x=np.arange(3.0), y=np.arange(3.0), colour="#000000", label="one"),)
+    figure = Figure(key="k", title="", panels=(Panel(title="x", series=series),))
+    canvas = draw(figure, width=3.5, style=style)
+    assert canvas.axes[0].yaxis.label.get_fontfamily() == ["serif"]
+    assert canvas.axes[0].yaxis.label.get_fontsize() == 8.0
+    assert draw(figure, width=3.5).axes[0].yaxis.label.get_fontfamily() == ["sans-serif"]
+
+
+@pytest.mark.parametrize(
+    ("style", "reason"),
+    [("nostyle", "is not a valid package style"), ({"font.sze": 3}, "font.sze"), ({"font.size": "x"}, "to float")],
+)
+def test_a_style_that_matplotlib_does_not_know_is_refused(style: Any, reason: str) -> None:
+    with pytest.raises(ParameterError, match=f"style must be rcParams of matplotlib, or a style sheet .*{reason}"):
+        draw(Figure(key="k", title="", panels=(Panel(title="x"),)), width=3.5, style=style)
+
+
+def test_a_figure_that_is_saved_later_has_fonts_that_journals_accept(tmp_path: Path) -> None:
+    series = (Series(x=np.arange(3.0), y=np.arange(3.0), colour="#000000", label="one"),)
+    figure = Figure(key="k", title="", panels=(Panel(title="x", series=series),))
+    with matplotlib.rc_context({"backend": "agg"}):
+        draw(figure, interactive=True, width=3.5).savefig(tmp_path / "later.pdf")
+    content = (tmp_path / "later.pdf").read_bytes()
+    assert b"/CIDFontType2" in content
+    assert b"/Type3" not in content
+
+
+def test_a_first_sample_far_off_does_not_flatten_what_follows() -> None:
+    x = np.arange(200.0)
+    y = np.sin(x)
+    y[0] = 90.0
+    curve = Series(x=x, y=y, colour="#000000", style="steps")
+    panel = Panel(title="slew", unit="rad/s", series=(curve,), bounds=(Bound(value=2.0),))
+    assert panel.fixed_range == pytest.approx((-1.15, 2.15), abs=0.01)
+    assert panel.heading == "slew [rad/s], 90 at first"
+    assert draw(Figure(key="k", title="", panels=(panel,))).axes[0].get_ylim() == panel.fixed_range
+    y[0] = 4.0
+    usual = replace(panel, series=(replace(curve, y=y),))
+    assert usual.fixed_range is None
+    assert usual.heading == "slew [rad/s]"
+    assert replace(panel, x_label="speed [m/s]").fixed_range is None, "it is no time"
 
 
 def test_matplotlib_s_notices_on_a_home_that_it_cannot_write_stay_quiet(tmp_path: Path) -> None:

@@ -312,6 +312,10 @@ class Replay(Result):
         """Return `summary.json` of the new flight."""
         return self.flight.to_json()
 
+    def to_pandas(self, table: str = "flight") -> Any:
+        """Return a table of the new flight, see `Flight.to_pandas`."""
+        return self.flight.to_pandas(table)
+
 
 def compare_replay(flight: Flight, recorded: Recorded) -> Replay:
     """Compare a replayed flight with the campaign's record of it."""

@@ -277,7 +277,7 @@ class CampaignFile:
                 if parse_event(text).text == "failure":
                     raise InputError("failure is what this list defines")
             except InputError as error:
-                raise ValueError(f"failure has an entry {text!r} that is no event: {error}") from error
+                raise ValueError(f"failure has an entry {text!r} that is no event: {error}") from None
 
     @property
     def cells(self) -> int:

@@ -88,7 +88,7 @@ def sweep(
     from quadsim.scenarios.loading import load_scenario
     from quadsim.scenarios.user_code import importable
 
-    with reporting(progress) as report:
+    with reporting(progress, "the sweep") as report:
         return fly_sweep(importable(load_scenario(scenario), controller, forces), values, workers, report)
 
 
@@ -246,7 +246,7 @@ def replay(
         _log.info(note)
     products = {"video": video, "recording": recording, "figures": figures}
     with run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory, SignalHold():
-        with reporting(progress) as report:
+        with reporting(progress, "the flight") as report:
             again = Rollout(recorded.scenario).fly(report)
         again = write_run(again, directory, products, overwrite=overwrite, progress=progress, flown=flown)
     return compare_replay(again, recorded)

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from quadsim.console.results import Result, Shown
+from quadsim.console.results import Shown, Tabular
 from quadsim.errors import InputError
 from quadsim.features.campaign.events import EVENT_NAMES, INCOMPLETE, UNAUDITED, FlightFlags, parse_event
 from quadsim.features.campaign.rows import (
@@ -47,10 +47,13 @@ from quadsim.features.campaign.statistics import (
     percent,
 )
 from quadsim.outputs import to_json, writing
+from quadsim.palette import COLOUR, line_colour
 from quadsim.report.comparison import different_audits
 from quadsim.report.comparison_page import TABLE_FILE
+from quadsim.report.figure import Bound, Figure, Panel, Series
 from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
+from quadsim.report.to_plotly import to_plot
 from quadsim.scenarios.schema.settings import field_text
 
 COMPARISON_FILE: Final = "comparison.json"
@@ -61,6 +64,15 @@ COMPARED: Final = (
 )
 """Metrics that are compared, where both campaigns have them."""
 _BY_AUDIT: Final = (VIOLATION, INCOMPLETE, UNAUDITED)  # events that depend on it, by name
+_POSITION_ERROR: Final = "rmse."
+_AXES: Final = ("x", "y", "z")
+_VERDICT_MARKS: Final = {
+    "better": Mark.GOOD,
+    "worse": Mark.BAD,
+    "not distinguishable": Mark.NONE,
+    "not comparable": Mark.WARN,
+}
+_MOST_EVENTS: Final = 8  # events that are drawn
 Differences = tuple[tuple[str, Any, Any], ...]
 """Fields, with the value of the first and of the second; None where it is absent."""
 
@@ -99,9 +111,17 @@ class MetricComparison:
     mean_b: float | None
     difference: PairedDifference  # of the second less the first
 
+    @property
+    def is_beyond_chance(self) -> bool:
+        """Whether the interval of the mean difference does not hold 0."""
+        difference = self.difference
+        if difference.lower is None or difference.upper is None:
+            return False
+        return difference.lower > 0.0 or difference.upper < 0.0
+
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class PairedComparison(Result):
+class PairedComparison(Tabular):
     """Comparison of two campaigns on the same draws."""
 
     names: tuple[str, str]  # of the first and the second campaign
@@ -145,6 +165,25 @@ class PairedComparison(Result):
         )
 
     @property
+    def tracking(self) -> str:
+        """Return in which axes the second campaign tracks closer or farther beyond chance; empty without errors."""
+        parts: dict[str, list[str]] = {"closer": [], "farther": [], "not distinguishable": []}
+        for metric in self.metrics:
+            axis = metric.name.removeprefix(_POSITION_ERROR)
+            if axis not in _AXES or metric.difference.lower is None or metric.difference.upper is None:
+                continue
+            if metric.is_beyond_chance:
+                closer = metric.difference.upper < 0.0
+                errors = f"{format_number(metric.mean_b)} against {format_number(metric.mean_a)} {metric.unit}"
+                parts["closer" if closer else "farther"].append(f"{axis} ({errors})")
+            else:
+                parts["not distinguishable"].append(axis)
+        told = [f"{verdict} in {', '.join(axes)}" for verdict, axes in parts.items() if axes]
+        if not told:
+            return ""
+        return f"RMS error, where both flights were completed: {self.names[1]} is {'; '.join(told)}."
+
+    @property
     def pairing(self) -> str:
         """Return the common and the differing settings of the pairs."""
         phrase = f"Pairs share {', '.join(('their seed', *self.shared_draws))}"
@@ -158,8 +197,12 @@ class PairedComparison(Result):
 
     @property
     def difference_tables(self) -> tuple[Grid, ...]:
-        """Return the fields in which the campaigns' scenarios and draws differ; no table without differences."""
-        lines = tuple(line(field, field_text(a), field_text(b)) for field, a, b in self.differences or ())
+        """Return the fields in which the campaigns' scenarios and draws differ; no table without differences.
+
+        Fields that only one of them has, and files by their paths, come last.
+        """
+        ordered = sorted(self.differences or (), key=_is_minor)
+        lines = tuple(line(field, field_text(a), field_text(b)) for field, a, b in ordered)
         grid = Grid(key="differences", title="What differs", head=("field", *self.names), lines=lines)
         return (grid,) if lines else ()
 
@@ -172,21 +215,44 @@ class PairedComparison(Result):
         """See `Result.shown`."""
         from quadsim.console import console
 
-        if self.audits:
-            yield different_audits(*self.names, self.audits)
+        yield from self._answer()
+        yield ""
+        yield from console.grids(self.tables)
         yield self.pairing
         yield from console.grids(self.difference_tables)
-        if self.verdict != "not comparable":
-            yield self.sentence
-        yield from console.grids(self.tables)
         if self.page is not None:
             yield console.to_open(self.page)
 
+    def _answer(self) -> list[str]:
+        """Return the verdict on failures, and on tracking."""
+        return [self.sentence, *filter(None, [self.tracking])]
+
+    def small_plot(self) -> Figure:
+        """See `Result.small_plot`: differences of the metrics with their intervals."""
+        return metrics_figure(self)
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a row per event, its shares of the pairs, and per metric, its means; `p_holm` is of events alone."""
+        rows: list[dict[str, Any]] = []
+        for event in self.events:
+            first, second = event.counts
+            row: dict[str, Any] = {"kind": "event", "name": event.event, "unit": "-", "pairs": event.pairs}
+            row |= {"first": first / event.pairs, "second": second / event.pairs, "difference": event.difference}
+            rows.append({**row, "lower": None, "upper": None, "p_holm": event.p_holm})
+        for metric in self.metrics:
+            difference = metric.difference
+            row = {"kind": "metric", "name": metric.name, "unit": metric.unit, "pairs": difference.pairs}
+            row |= {"first": metric.mean_a, "second": metric.mean_b, "difference": difference.mean}
+            rows.append({**row, "lower": difference.lower, "upper": difference.upper, "p_holm": None})
+        return rows
+
     def to_markdown(self) -> str:
-        """Return differences, verdict and tables as Markdown."""
-        head = [f"# {self.names[1]} against {self.names[0]}\n", f"{self.pairing}\n"]
-        verdict = [*map(section, self.difference_tables), f"{self.sentence}\n", *map(section, self.tables)]
-        return "\n".join([*head, *verdict])
+        """Return verdict, tables and differences as Markdown."""
+        head = f"# {self.names[1]} against {self.names[0]}\n"
+        answer = [f"{sentence}\n" for sentence in self._answer()]
+        tables = [section(table) for table in self.tables]
+        differences = [section(table) for table in self.difference_tables]
+        return "\n".join([head, *answer, *tables, f"{self.pairing}\n", *differences])
 
     def write_report(self, directory: Path, *, overwrite: bool = False) -> Path:
         """Write `index.html`, `comparison.json` and `comparison.md`, together or not at all; the page.
@@ -195,16 +261,19 @@ class PairedComparison(Result):
             OutputError: the directory cannot be written, or holds something else.
         """
         sections = [
+            Section(
+                title="Which is better",
+                plots=(to_plot(events_figure(self)), to_plot(metrics_figure(self))),
+                tables=self.tables,
+            ),
             Section(title="What is compared", text=(self.pairing,), tables=self.difference_tables),
-            Section(title="Which is better", tables=self.tables),
         ]
-        title, verdict = f"{self.names[1]} against {self.names[0]}", Cell(text=self.sentence)
+        title = f"{self.names[1]} against {self.names[0]}"
+        verdict, *notes = self._answer()
         files = {file: file for file in (COMPARISON_FILE, TABLE_FILE)}
-        texts = {
-            COMPARISON_FILE: to_json(self.to_json()),
-            TABLE_FILE: self.to_markdown(),
-            PAGE_FILE: render_page("campaign comparison", title, sections, verdict=verdict, files=files),
-        }
+        cell = Cell(text=verdict, mark=_VERDICT_MARKS[self.verdict])
+        page = render_page("campaign comparison", title, sections, verdict=cell, notes=notes, files=files)
+        texts = {COMPARISON_FILE: to_json(self.to_json()), TABLE_FILE: self.to_markdown(), PAGE_FILE: page}
         with writing(directory, overwrite=overwrite) as partial:
             for name, text in texts.items():
                 (partial / name).write_text(text, encoding="utf-8")
@@ -216,6 +285,7 @@ class PairedComparison(Result):
             "names": list(self.names),
             "verdict": self.verdict,
             "sentence": self.sentence,
+            "tracking": self.tracking,
             "confidence": CONFIDENCE,
             **{name: getattr(self, name) for name in ("flights", "left_out", "completed")},
             "shared_draws": list(self.shared_draws),
@@ -388,7 +458,7 @@ def _metric_table(comparison: PairedComparison) -> Grid:
         difference, ends, mark = metric.difference, ABSENT, Mark.NONE
         if difference.lower is not None and difference.upper is not None:
             ends = f"{format_number(difference.lower)} to {format_number(difference.upper)}"
-            mark = Mark.BEST if difference.lower > 0.0 or difference.upper < 0.0 else Mark.NONE
+            mark = Mark.BEST if metric.is_beyond_chance else Mark.NONE
         means = map(format_number, (metric.mean_a, metric.mean_b))
         mean = Cell(text=format_number(difference.mean), mark=mark)
         lines.append(line(label(metric.name, metric.unit), *means, mean, ends, str(difference.pairs)))
@@ -400,3 +470,53 @@ def _metric_table(comparison: PairedComparison) -> Grid:
         note=f"Over the {comparison.completed} of {comparison.flights} pairs in which both flights were completed. "
         f"Differences are {b} less {a}; bold where Student's t interval does not hold 0.",
     )
+
+
+def _is_minor(difference: tuple[str, Any, Any]) -> bool:
+    """Return whether one of the campaigns lacks a field, or its values are paths of a machine."""
+    _, *values = difference
+    return any(value is None or (isinstance(value, str) and Path(value).is_absolute()) for value in values)
+
+
+def metrics_figure(comparison: PairedComparison) -> Figure:
+    """Plot the differences of the metrics, with their intervals, as shares of the first campaign's means."""
+    names: list[str] = []
+    curves: list[Series] = []
+    for metric in comparison.metrics:
+        difference = metric.difference
+        if not metric.mean_a or difference.mean is None or difference.lower is None or difference.upper is None:
+            continue
+        scale = 100.0 / abs(metric.mean_a)
+        place = np.array([float(len(names))])
+        better = difference.mean > 0.0 if metric.name == "worst_margin" else difference.mean < 0.0
+        colour, label = COLOUR.measured, "not beyond chance"
+        if metric.is_beyond_chance:
+            colour = COLOUR.satisfied if better else COLOUR.violated
+            label = "better" if better else "worse"
+        ends = scale * np.array([difference.lower, difference.upper])
+        mean = scale * np.array([difference.mean])
+        curves.append(Series(x=np.repeat(place, 2), y=ends, colour=colour, width=2.0))
+        curves.append(Series(x=place, y=mean, colour=colour, label=label, style="points", width=6.0))
+        names.append(metric.name)
+    (a, b), level = comparison.names, 100.0 * CONFIDENCE
+    title = f"{b} less {a}, in % of {a}'s mean, with {level:g} % interval"
+    panel = Panel(
+        title=title, y_label="difference [%]", x_label="metric", x_names=tuple(names), series=tuple(curves),
+        bounds=(Bound(value=0.0),), height=1.3,
+    )  # fmt: skip
+    return Figure(key="metrics", title="Tracking and commands", panels=(panel,), columns=1)
+
+
+def events_figure(comparison: PairedComparison) -> Figure:
+    """Plot the shares of the pairs in which events happened to each campaign's flight."""
+    happened = [event for event in comparison.events if any(event.counts)][:_MOST_EVENTS]
+    curves = []
+    for i, name in enumerate(comparison.names):
+        values = np.array([100.0 * event.counts[i] / event.pairs for event in happened])
+        place = np.arange(len(happened), dtype=np.float64) + 0.2 * (i - 0.5)
+        curves.append(Series(x=place, y=values, colour=line_colour(i), label=name, style="points", width=6.0))
+    panel = Panel(
+        title="share of the pairs", y_label="share [%]", x_label="event", series=tuple(curves),
+        x_names=tuple(event.event for event in happened), whole=True, height=1.3,
+    )  # fmt: skip
+    return Figure(key="events", title="Failures and other events", panels=(panel,), columns=1)

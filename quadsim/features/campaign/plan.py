@@ -96,7 +96,7 @@ class Plan:
         try:
             return tuple(parse_event(text, self.columns) for text in self.spec.failure)
         except InputError as error:
-            raise InputError(f"failure: {error}") from error
+            raise InputError(f"failure: {error}") from None
 
     def of(self, flight: int) -> Scenario:
         """The scenario of one flight.
@@ -331,10 +331,10 @@ def check_ends(entries: Iterable[Varied], check: Callable[[Varied, Value], objec
             try:
                 check(entry, value)
             except ScenarioError as error:
-                raise ScenarioError(where, error.problems) from error
+                raise ScenarioError(where, error.problems) from None
             except InputError as error:
                 named = str(error).startswith(f"{table}.")
-                raise InputError(str(error) if named else f"{where}: {error}") from error
+                raise InputError(str(error) if named else f"{where}: {error}") from None
 
 
 def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -> Plan:

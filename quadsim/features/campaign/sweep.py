@@ -135,7 +135,7 @@ def fly_sweep(
     try:
         spec = CampaignFile(name=scenario.name, scenario=scenario.name, flights=count, vary=[*entries])
     except ValueError as error:
-        raise InputError(f"sweep: {error}") from error
+        raise InputError(f"sweep: {error}") from None
     plan = Plan(spec, Assembly(scenario).recorded.scenario, one_seed=True)
     plan.check()
     progress("sweep", 0, count)
@@ -175,7 +175,7 @@ def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> GridValues:
     try:
         return GridValues(name=owner, fields=[*fields], distribution="grid", values=values)
     except ValueError as error:
-        raise InputError(f"sweep.{owner}: {error}") from error
+        raise InputError(f"sweep.{owner}: {error}") from None
 
 
 def _swept(entries: Sequence[GridValues]) -> dict[str, pa.Array]:

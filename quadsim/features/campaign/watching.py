@@ -26,12 +26,12 @@ def watching(progress: bool) -> Iterator[Watch]:
         with Bars(
             TextColumn("flights"), BarColumn(), TextColumn("{task.description}"), console=screen, transient=True
         ) as bars:
-            bar = bars.add_task("starting")
+            bar = bars.add_task("starting the campaign")
             yield lambda state: bars.update(
                 bar, completed=state.flown, total=state.flights, description=_describe(state)
             )
     else:
-        with lines(screen) as tell:
+        with lines(screen, "starting the campaign") as tell:
             yield lambda state: tell(f"flights {_describe(state)}" if state.flown < state.flights else "report")
 
 

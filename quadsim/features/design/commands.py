@@ -184,7 +184,7 @@ def vehicle_report(
     from quadsim.scenarios import loading
     from quadsim.scenarios.assembly import stated_autopilot
     from quadsim.sim.autopilot import AutopilotSettings
-    from quadsim.vehicle import load_vehicle, vehicle_sources
+    from quadsim.vehicle import example_notes, load_vehicle, vehicle_sources
 
     blank = Path(__file__).with_name("vehicle_template.toml")
     if thrust_stand is not None:
@@ -209,6 +209,7 @@ def vehicle_report(
     report = vehicle_report.VehicleReport(
         vehicle=loaded,
         sources=vehicle_sources(path),
+        leftovers=example_notes(path),
         autopilot=autopilot,
         inner_lag=vehicle_report.inner_lag_of(loaded, autopilot),
         figures=vehicle_report.make_sheet(loaded),

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.console.results import Result, Shown
+from quadsim.console.results import Shown, Tabular
 from quadsim.errors import ParameterError, QuadsimError
 from quadsim.features.design.authority import TorqueRange, authority, torque_ranges
 from quadsim.features.design.rules import delay_margin, design_for
@@ -73,7 +73,7 @@ class VehicleSheet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VehicleReport(Result):
+class VehicleReport(Tabular):
     """A vehicle with its derived figures."""
 
     vehicle: Vehicle  # its numbers
@@ -86,6 +86,7 @@ class VehicleReport(Result):
     scenario: str | None = None  # scenario that it was compared with, or None
     shortfalls: tuple[str, ...] | None = None
     """Bounds of that scenario that it cannot meet, a sentence each; None without a scenario."""
+    leftovers: tuple[str, ...] = ()  # what its file still has of the template's example, a sentence each
     picture: Path | None = None  # where it was drawn to, or None
 
     @property
@@ -94,14 +95,26 @@ class VehicleReport(Result):
         values = ((name, getattr(self.vehicle, name), unit) for name, unit in VEHICLE_UNITS.items())
         return [(name, value, unit) for name, value, unit in values if value is not None]
 
+    @property
+    def notes(self) -> list[str]:
+        """What is doubtful: leftovers of an example, and numbers that no quadrotor has together."""
+        return [*self.leftovers, *implausible(self.vehicle)]
+
     def shown(self) -> Shown:
         """See `Result.shown`."""
         from quadsim.console import console
 
         yield from console.grids(vehicle_tables(self), left=("unit", "source", "what and why"))
-        yield from implausible(self.vehicle)
+        yield from self.notes
         if self.picture is not None:
             yield console.written_to(self.picture)
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a row per parameter of the file: its value, unit and source."""
+        rows = []
+        for name, value, unit in self.parameters:
+            rows.append({"parameter": name, "value": value, "unit": unit, "source": self.sources[name]})
+        return rows
 
     def small_plot(self) -> Figure:
         """See `Result.small_plot`."""
@@ -117,7 +130,7 @@ class VehicleReport(Result):
                 for name, value, unit in self.parameters
             },
             "derived": asdict(self.figures),
-            "notes": implausible(self.vehicle),
+            "notes": self.notes,
             "autopilot": {
                 **asdict(self.autopilot),
                 **({"inner_lag": None, "why": lag} if isinstance(lag := self.inner_lag, str) else {"inner_lag": lag}),

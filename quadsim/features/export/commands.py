@@ -54,7 +54,7 @@ def export(
     from quadsim.scenarios import loading
 
     flown, options = loading.load_scenario(scenario, changes, seed), {"precision": precision, "target": target}
-    with reporting(progress) as report:
+    with reporting(progress, "the export") as report:
         report("export", 0, 1)
         directory = exporter.export(flown, out, overwrite=overwrite, rows=rows, **options)  # type: ignore[arg-type]
     room = exporter.room_sentence(json.loads((directory / exporter.FACTS).read_text()))

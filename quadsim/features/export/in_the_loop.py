@@ -316,7 +316,7 @@ def fly_exported(
     require_programs(machine, "to fly an exported controller")
     if precision == "float" and source.bounds is not None:
         assembly = _allowing(assembly, float(np.spacing(np.float32(source.bounds.u_max.max()))))
-    with tempfile.TemporaryDirectory(prefix="quadsim-") as scratch, reporting(progress) as report:
+    with tempfile.TemporaryDirectory(prefix="quadsim-") as scratch, reporting(progress, "the emulator") as report:
         directory = Path(scratch)
         for name, text in files.items():
             (directory / name).write_text(text, encoding="utf-8")

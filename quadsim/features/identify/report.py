@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from quadsim.console.results import Result, Shown, after
+from quadsim.console.results import Shown, Tabular, after
 from quadsim.errors import InputError, MissingPackageError, ParameterError
 from quadsim.features.identify.border import judging
 from quadsim.features.identify.checks import check_log, spans
@@ -47,7 +47,7 @@ NEEDED_PARAMETERS: Final = "mass, gravity, arm_length, rotor_azimuths, rotor_spi
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class IdentifiedVehicle(Result):
+class IdentifiedVehicle(Tabular):
     """A vehicle that was identified from flight logs."""
 
     identification: Identification
@@ -135,6 +135,15 @@ class IdentifiedVehicle(Result):
             "fitted. floor: what the identified disturbance leaves open to any prediction.",
         )
         return parameters, disturbance, errors_grid
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a row per parameter: `start`, `estimate` with its 95 % interval, and whether that was refused."""
+        rows = []
+        for estimate in self.identification.estimates:
+            row: dict[str, Any] = {"parameter": estimate.name, "unit": estimate.unit, "start": estimate.start}
+            row |= {"estimate": estimate.value, "low": estimate.low, "high": estimate.high}
+            rows.append({**row, "refused": bool(estimate.refused)})
+        return rows
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
@@ -251,7 +260,7 @@ def identify_logs(
             raise InputError(
                 f"the logs and {start} give a vehicle that cannot be: {error}; correct mass, arm_length or speed "
                 "range, or what was kept and does not suit what was identified"
-            ) from error
+            ) from None
         prediction = predict(tested or records, held, identification, vehicle, fitted=not tested)
     result = IdentifiedVehicle(
         identification=identification,

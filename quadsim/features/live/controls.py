@@ -30,6 +30,8 @@ _STEER_MOST: Final = 5.0
 _BROKEN: Final = 0.4  # share of its thrust that a rotor loses by the button
 _WIND: Final = 15.0  # [m/s] up to which fields take a wind
 _SENSORS: Final = get_args(SensorText)
+BREAKS: Final = "red"
+"""Colour of a button that breaks something, or throws something away."""
 _Input = Callable[[Any, Disturbances], Mapping[str, Any]]
 
 
@@ -82,9 +84,9 @@ class Widgets:
         self.on(button.on_click, act)
         return button
 
-    def event(self, label: str, table: Callable[[], Mapping[str, Any]], refused: str = "") -> None:
+    def event(self, label: str, table: Callable[[], Mapping[str, Any]], refused: str = "", **look: Any) -> None:
         """A button that submits an event, if this scenario can have it."""
-        self.button(label, lambda event: self.session.submit(table()), disabled=bool(refused))
+        self.button(label, lambda event: self.session.submit(table()), disabled=bool(refused), **look)
 
     def group(self, label: str, acts: Mapping[str, Callable[[Any], Any]], **look: Any) -> Any:
         """Buttons in a row."""
@@ -146,9 +148,11 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
 
     async def named(event: Any) -> None:  # also after a reset
         button.label = "Repair the rotor" if is_broken() else "Break a rotor"
+        button.color = None if is_broken() else BREAKS
 
     widgets.on(stage.grab.on_drag("left"), pulled)
-    button = widgets.button("Break a rotor", broken, hint=f"rotor 1 loses {100 * _BROKEN:.0f} % of its thrust")
+    loss = f"rotor 1 loses {100 * _BROKEN:.0f} % of its thrust"
+    button = widgets.button("Break a rotor", broken, hint=loss, color=BREAKS)
     wear = [
         widgets.shows(
             gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, _rotor_loss(rotor, acts)),
@@ -191,10 +195,15 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     sensor = gui.add_dropdown("Sensor", seen or _SENSORS, disabled=not seen)
     fault = gui.add_dropdown("Fault", ("dropout", "freeze", "nan"), disabled=not seen)
     no_fault = "" if seen else blind[0]
-    widgets.event("Fail sensor for 1 s", lambda: sensors[0] | {"sensor": sensor.value, "fault": fault.value}, no_fault)
+    widgets.event(
+        "Fail sensor for 1 s",
+        lambda: sensors[0] | {"sensor": sensor.value, "fault": fault.value},
+        no_fault,
+        color=BREAKS,
+    )
     gui.add_html(readout.says(no_fault, "why"))
     late = gui.add_number("Late commands [ms]", 200, min=10, max=5000, step=10)
-    widgets.event("Stall the computer", lambda: {"type": "stall", "duration": late.value / 1e3})
+    widgets.event("Stall the computer", lambda: {"type": "stall", "duration": late.value / 1e3}, color=BREAKS)
 
 
 class Steering:

@@ -27,7 +27,7 @@ from viser import _messages
 
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.features.live import readout
-from quadsim.features.live.controls import ControllerTab, Steering, Widgets, disturb
+from quadsim.features.live.controls import BREAKS, ControllerTab, Steering, Widgets, disturb
 from quadsim.features.live.guard import Guard
 from quadsim.features.live.incoming import Incoming
 from quadsim.features.live.look import dressed
@@ -57,6 +57,12 @@ _PLOTS: Final = {
 """The signal that a constraint on each curve has, by its label; the step has its deadline."""
 _BOUND: Final = {"label": "bound", "stroke": COLOUR.bound, "dash": (6.0, 4.0), "width": 1.0}
 _TIME: Final = {"x": {"time": False}}  # not a date
+_AXIS: Final = {"ticks": {"show": False}}  # the grid shows where they are
+_LOOK: Final = {
+    "axes": (_AXIS, {**_AXIS, "size": 62}),  # of x and y; the width [pixels] that "-0.005" takes
+    "legend": {"live": False},  # names alone: the values of a cursor are mostly absent
+    "padding": (12, 12, 0, 0),  # of half a label beyond the end of an axis [pixels]
+}
 T = TypeVar("T")
 
 
@@ -202,12 +208,13 @@ class Page:
         self._margins = gui.add_html("")
         with gui.add_folder("Run"):
             toggles = {"Pause": self._toggle, "Resume": self._toggle}  # one at a time
-            self._flight = self._widgets.group("Flight", {**toggles, "Step": self._step, "Reset": self._reset})
+            self._flight = self._widgets.group("Flight", {**toggles, "Step": self._step})
             outputs = {"Save": self._keep, "Scenario": self._download, "Replay": self._scene}
             self._widgets.group("Output", outputs, hint=readout.OUTPUT)
             speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1", hint="simulated over real time")
             self._widgets.on(speed.on_update, lambda event: setattr(self._pace, "speed", float(event.target.value)))
             self._follow = gui.add_checkbox("Camera follows", True)
+            self._widgets.button("Reset", self._reset, hint="begin anew; what was not saved is lost", color=BREAKS)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Disturb"):
             disturb(self._widgets, self.stage, self._use)
@@ -224,6 +231,7 @@ class Page:
                     scales=_TIME,
                     aspect=1.9,
                     title=title,
+                    **_LOOK,
                 )
                 for (title, names), bounds in zip(_PLOTS.items(), self._bounds, strict=True)
             ]
@@ -253,7 +261,7 @@ class Page:
         else:
             state = "flying"
         self._headline.content = readout.status_line(state, self._frame, self._factor)
-        self._flight.options = ("Resume" if self._pace.paused else "Pause", "Step", "Reset")
+        self._flight.options = ("Resume" if self._pace.paused else "Pause", "Step")
 
     def _use(self, hint: str) -> None:
         """Take a hint away that a person has followed."""
@@ -361,9 +369,18 @@ class Page:
 
 
 def _series(names: Collection[str], bounds: Collection[bool]) -> tuple[dict[str, Any], ...]:
-    """The look of a plot's curves, and of its bounds, which are shown or not: one without values spoils the axis."""
+    """The look of a plot's curves, and of its bounds, which are shown or not: one without values spoils the axis.
+
+    The legend has one entry for all bounds: `readout.READOUT_STYLE` hides the others.
+    """
     curves = [{"label": name, "stroke": colour} for name, colour in zip(names, CYCLE, strict=False)]
-    return {"label": "t [s]"}, *curves, *({**_BOUND, "show": shown} for shown in bounds)
+    lines = []
+    named = False
+    for shown in bounds:
+        further = {"class": readout.FURTHER} if named or not shown else {}
+        named = named or shown
+        lines.append({**_BOUND, **further, "show": shown})
+    return {"label": "t [s]"}, *curves, *lines
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ STEER: Final = (
     "left one x and y, the right one z."
 )
 
+FURTHER: Final = "further"  # class of a plot's curves that have no entry in its legend
 READOUT_STYLE: Final = f"""<style>
 .q{{font:12px/1.5 system-ui,sans-serif;padding:0 .8em}}.q b,.q .n{{font-variant-numeric:tabular-nums}}
 .q .line{{height:1.5em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}}
@@ -52,6 +53,7 @@ READOUT_STYLE: Final = f"""<style>
 .hints{{bottom:16px}}.over{{top:16px}}.hints .key{{font-size:12px}}
 .hints div{{margin-top:6px;padding:4px 12px;border-radius:1em;background:#1f2937d9;color:#fff;width:max-content;
  max-width:calc(100vw - 400px)}}
+.u-legend .{FURTHER}{{display:none}}
 .touch{{display:none}}
 @media (pointer:coarse){{.touch{{display:inline}}.mouse{{display:none}}.mantine-Button-root{{min-height:36px}}}}
 @media (max-width:36em){{

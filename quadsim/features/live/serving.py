@@ -71,7 +71,7 @@ def fly_live(
             if inputs is None:
                 _serve(session, save, **place)
             else:
-                with reporting(True) as report:
+                with reporting(True, "the flight") as report:
                     refused = session.play(inputs, report)
                 for reason in refused:
                     console.show(f"quadsim: refused: {script}: {reason}".split("\n"), console.stderr())

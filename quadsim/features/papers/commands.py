@@ -50,7 +50,7 @@ def reproduce(
 
     file = None if junit is None else junit_file(junit)
     papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
-    with reporting(progress) as report:
+    with reporting(progress, "the flights") as report:
         reproductions = Reproductions(reproduce_paper(spec, report) for spec in papers)
     if file is not None:
         with after(reproductions, file):

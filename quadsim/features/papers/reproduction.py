@@ -19,7 +19,7 @@ from annotated_types import MaxLen, MinLen, doc
 from quadsim.assets import read_toml
 from quadsim.console.junit import Cases
 from quadsim.console.progress import Progress, silent
-from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown
+from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Shown, Tabular
 from quadsim.errors import InputError
 from quadsim.fields import NonNegative, Number, Positive
 from quadsim.input_limits import MOST_ENTRIES
@@ -307,7 +307,7 @@ class Reproduction:
         )
 
 
-class Reproductions(tuple[Reproduction, ...], Result):
+class Reproductions(tuple[Reproduction, ...], Tabular):
     """One for each paper."""
 
     @property
@@ -319,6 +319,19 @@ class Reproductions(tuple[Reproduction, ...], Result):
         """See `quadsim.console.junit.Judged`."""
         numbers = [(entry.paper.name, number) for entry in self for number in entry.numbers]
         return "reproduce", [(f"{paper}: {it.spec.name}", it.within, it.sentence) for paper, it in numbers]
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a row per number: theirs as `lowest` and `highest`, `ours`, `difference`, `tolerance`, `within`."""
+        rows = []
+        for entry in self:
+            for number in entry.numbers:
+                lowest, highest = number.spec.span
+                row: dict[str, Any] = {"paper": entry.paper.name, "number": number.spec.name, "unit": number.spec.unit}
+                row |= {"counted_as": number.spec.counted_as, "relation": number.spec.relation}
+                row |= {"lowest": lowest, "highest": highest, "ours": number.ours, "difference": number.difference}
+                row |= {"tolerance": number.spec.tolerance, "within": number.within}
+                rows.append(row)
+        return rows
 
     def shown(self) -> Shown:
         """See `Result.shown`."""

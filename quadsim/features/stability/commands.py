@@ -104,7 +104,10 @@ def stability(
         for name, flown in _flown(stated, controller)
         for each in sizes
     ]
-    with nullcontext() if out is None else reserving(out, overwrite=overwrite), reporting(progress) as report:
+    with (
+        nullcontext() if out is None else reserving(out, overwrite=overwrite),
+        reporting(progress, "the stability check") as report,
+    ):
         measuring = Measuring(loops, workers=workers, progress=report)
         measured = measuring.margins(quantities)
         maps = tuple(

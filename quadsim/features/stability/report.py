@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.console.results import Result, Shown
+from quadsim.console.results import Shown, Tabular
 from quadsim.features.stability.margins import (
     MAP_POINTS,
     WIDTH,
@@ -33,7 +33,7 @@ _FASTEST: Final = 4.0  # largest magnitude of a rate that is drawn [1/s]
 
 
 @dataclass(frozen=True, repr=False)
-class Stability(Result):
+class Stability(Tabular):
     """The growth of one or several loops at their nominal point, and their margins.
 
     `loops` has a `LoopMargins` for each controller and size; `loops[0].margins["delay"].upper.stable` is the largest
@@ -103,6 +103,22 @@ class Stability(Result):
                 ]
             sentences += [f"Not measured: {failure}." for failure in loop.failures]
         return tuple(sentences)
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a row per loop and quantity: `nominal`, and stable from `lower` to `upper`.
+
+        `lower_state` and `upper_state` say what is beyond: `unstable`, or `stable` where the range searched ends.
+        """
+        rows = []
+        for loop in self.loops:
+            for margin in loop.margins.values():
+                row: dict[str, Any] = {"loop": loop.name, "size": loop.size, "quantity": margin.quantity}
+                row["nominal"] = margin.nominal
+                for end, side in (("lower", margin.lower), ("upper", margin.upper)):
+                    row[end] = None if side is None else side.stable
+                    row[f"{end}_state"] = None if side is None else side.state
+                rows.append(row)
+        return rows
 
     def shown(self) -> Shown:
         """See `Result.shown`."""

@@ -68,6 +68,16 @@ class Pilot:
         # Body rates at which it starts then, with the rotors as they turn [rad/s]; None from the ground: as at hover.
         self._rates: Array | None = np.zeros(3)
 
+    def __repr__(self) -> str:
+        parts = [f"horizon {self.horizon}"]
+        if self.solver:
+            parts.append(self.solver)
+        if self.guard is not None:
+            parts.append("with fallback")
+        if self.takes_targets:
+            parts.append("flown by an autopilot")
+        return f"<Pilot of {self.name}: {', '.join(parts)}>"
+
     @property
     def name(self) -> str:
         """Short name of the law."""

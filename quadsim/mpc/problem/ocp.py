@@ -161,7 +161,7 @@ class CondensedQP(NamedTuple):
     x_max: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Problem:
     """A complete definition of a controller, apart from how its optimum is computed."""
 
@@ -188,6 +188,13 @@ class Problem:
                     check_shape(f"{constraint.name}.{name}", matrix, (*steps, m, columns))
             if constraint.lower.ndim == 2:
                 check_shape(f"{constraint.name}.lower", constraint.lower, (self.horizon, m))
+
+    def __repr__(self) -> str:
+        model = self.model
+        sizes = f"{model.n} states, {model.nu} inputs, {self.horizon} periods of {model.period:g} s"
+        names = [constraint.name for constraint in self.every_constraint]
+        rows = f"{self.rows.lower.size} rows of constraints: {', '.join(names)}" if names else "without constraints"
+        return f"<Problem: {sizes}\n {rows}>"
 
     @property
     def equilibrium(self) -> Equilibrium:

@@ -23,4 +23,4 @@ def make_solver(name: str, problem: Problem) -> Solver:
         return Core(problem)
     except ParameterError as error:
         rule = f"a QP solver such as 'piqp' for this problem: {error}"
-        raise ParameterError("controller", "solver", CORE, rule) from error
+        raise ParameterError("controller", "solver", CORE, rule) from None

@@ -184,7 +184,7 @@ def require_solver(name: str) -> None:
     try:
         find_solver(name)
     except UnknownNameError as error:
-        raise ValueError(f"solver: {error}") from error
+        raise ValueError(f"solver: {error}") from None
 
 
 def require_states(values: Mapping[str, object], name: str) -> None:

@@ -31,8 +31,8 @@ _MOST_MARGINS: Final = 6
 
 
 _LAST: Final = 1.0
-"""Time at a film's end [s] in which it states why a QP had no answer, or that the flight stayed in fallback."""
-_SHOWN: Final = 2.0  # time [s] for which an event is shown
+"""Time of film, at its end [s], in which it states why a QP had no answer, or that the flight stayed in fallback."""
+_SHOWN: Final = 2.0  # time of film [s] for which an event is shown
 _MOST_EVENTS: Final = 3
 _MOST_LINES: Final = 10  # of that: more would reach the strip at the bottom
 _WIDEST: Final = 140  # letters of a line of that, between the frame's edge and the legend
@@ -44,8 +44,9 @@ class Overlay:
     Lengths below are design pixels of a 1280 x 720 frame, scaled to the frame's real size.
     """
 
-    def __init__(self, run: Filmed, footage: Footage, *, width: int, height: int) -> None:
+    def __init__(self, run: Filmed, footage: Footage, *, width: int, height: int, speed: float = 1.0) -> None:
         self._run, self._footage = run, footage
+        self._speed = speed  # simulated seconds per second of film
         self._scale = min(width / 1280.0, height / 720.0)
         self._width, self._height = width / self._scale, height / self._scale
         self._subtitle = law_name(run.controller)
@@ -89,19 +90,20 @@ class Overlay:
         control, k = self._run.log.control, self._footage.period[i]
         time = self._footage.times[i]
         lines: list[tuple[str, float, str]] = [(self._run.name, 21, ink.WHITE)]
-        lines += [(self._subtitle, 14, ink.GREY), (f"t = {time:.2f} s", 20, ink.WHITE), self._answer(k)]
+        faster = "" if self._speed == 1.0 else f"   {self._speed:g} times real speed"
+        lines += [(self._subtitle, 14, ink.GREY), (f"t = {time:.2f} s{faster}", 20, ink.WHITE), self._answer(k)]
         for vectors, what, unit, colour in (
             (self._footage.wind, "wind", "m/s", ON_DARK.disturbance),
             (self._footage.force, "external force", "N", ON_DARK.disturbance),
         ):
             if vectors is not None:
                 lines.append((f"{what} {np.linalg.norm(vectors[i]):.2g} {unit}", 14, colour))
-        happened = [event for event in self._run.events if 0.0 <= time - event["time"] <= _SHOWN]
+        happened = [event for event in self._run.events if 0.0 <= time - event["time"] <= _SHOWN * self._speed]
         lines += [(event["text"][:_WIDEST], 15, ON_DARK.warning) for event in happened[-_MOST_EVENTS:]]
         reason = self._run.log.reason
         if reason is not None and time >= control.t[-1]:
             lines.append((f"aborted {reason}"[:130], 15, ON_DARK.violated))
-        if time >= self._footage.times[-1] - _LAST:
+        if time >= self._footage.times[-1] - _LAST * self._speed:
             wrapped = [textwrap.wrap(sentence, _WIDEST) for sentence in self._run.failures]
             parts = [part for sentence in wrapped for part in sentence]
             lines += [(part, 14, ON_DARK.warning) for part in parts[:_MOST_LINES]]

@@ -188,7 +188,9 @@ class FilmStage:
 def frames(run: Filmed, shot: Shot) -> Iterator[Picture]:
     """The frames of a shot, each (height, width, 3)."""
     footage = make_footage(run, shot.times)
-    overlay = Overlay(run, footage, width=shot.width, height=shot.height) if shot.captions else None
+    overlay = None
+    if shot.captions:
+        overlay = Overlay(run, footage, width=shot.width, height=shot.height, speed=shot.speed)
     with FilmStage(run, footage, width=shot.width, height=shot.height) as stage:
         for i in range(shot.count):
             picture = stage.render(i)

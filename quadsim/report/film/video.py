@@ -45,7 +45,9 @@ _PROBE: Final = (
 _PROBE_SECONDS: Final = 60.0
 _LEAST_FREE_BYTES: Final = 1024 * 1024
 _FEWEST_FRAMES: Final = 30  # smallest number of frames that justifies a further worker
-_LONG: Final = 30.0  # from this length on [s] a film has fewer frames per second
+_LONG: Final = 30.0
+"""Length of a flight [s] from which on its film has fewer frames per second, and beyond which it is shown faster."""
+_FAST: Final = 3.0  # how many times as fast
 _TIMED: Final = 2.0  # for how long frames are timed before an estimate [s]
 FPS_RANGE: Final = (1, 120)  # frames per second that a film may have
 _log: Final = logging.getLogger("quadsim")
@@ -95,7 +97,7 @@ def worker_count(frames: int, most: int | None = None) -> int:
 
 
 def frame_rate(length: float, fps: int | None = None) -> int:
-    """Return `fps`, or else the default of a film of a length [s]: 30 frames per second, 20 of a long one.
+    """Return `fps`, or else the default for a flight of a length [s]: 30 frames per second, 20 of a long one.
 
     Raises:
         ParameterError: `fps` is no whole number within `FPS_RANGE`.
@@ -108,9 +110,14 @@ def frame_rate(length: float, fps: int | None = None) -> int:
     return fps
 
 
-def frame_count(length: float, fps: int) -> int:
-    """Number of frames of a film of a length [s]."""
-    return max(1, round(length * fps))
+def film_speed(length: float) -> float:
+    """How many times as fast as it was flown a flight of a length [s] is shown: three times if it is long."""
+    return _FAST if length > _LONG else 1.0
+
+
+def frame_count(length: float, fps: int, speed: float | None = None) -> int:
+    """Number of frames of a film of a flight of a length [s], at a speed; None: `film_speed`."""
+    return max(1, round(length / (film_speed(length) if speed is None else speed) * fps))
 
 
 class Estimate:
@@ -161,7 +168,7 @@ def render_video(
     fps: int | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Film a flight as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all.
+    """Film a flight as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all; see `film_speed`.
 
     Width and height are even [pixels].  `workers` is how many processes render, at most; the machine's cores when None.
     `progress` is called with frames done and frames in all, in the caller's thread.  `fps` is in frames per second;
@@ -175,7 +182,7 @@ def render_video(
     """
     run = filmed(flight)
     rate = frame_rate(run.end, fps)
-    shot = Shot(width=width, height=height, fps=rate, count=frame_count(run.end, rate))
+    shot = Shot(width=width, height=height, fps=rate, speed=film_speed(run.end), count=frame_count(run.end, rate))
     with _making(path, overwrite) as new:
         _film(run, shot, new, workers, progress)
 
@@ -195,7 +202,7 @@ def render_gif(
     """
     run = filmed(flight)
     speed, rate = 6.0, frame_rate(0.0, 8 if fps is None else fps)
-    count = frame_count(run.end / speed, rate)
+    count = frame_count(run.end, rate, speed)
     shot = Shot(width=960, height=540, fps=rate, speed=speed, count=count, captions=False)
     with _making(path, overwrite) as new:
         film = new.with_suffix(".mp4")

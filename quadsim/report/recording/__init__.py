@@ -17,10 +17,15 @@ Everything stands on one timeline, `sim_time`, the simulated time:
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import signal
 import subprocess
 import sys
+import time as clock
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
@@ -34,6 +39,7 @@ _CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main()
 _VIEWER: Final = (sys.executable, "-P", "-c", _CALL, "--bind=127.0.0.1", "--port=auto")
 """Starts a viewer of its own, which only this machine can reach."""
 _INTERRUPTED: Final = 130  # the viewer's exit status after Ctrl-C
+_PATIENCE: Final = 2.0  # time that a viewer has to end by itself [s]
 
 
 def write_recording(run: FlightRecord, path: Path) -> None:
@@ -54,7 +60,7 @@ def _encode(run: FlightRecord, path: Path) -> bytes:
     from quadsim.report.recording.plots import send_plots, send_texts
     from quadsim.report.recording.world import TIMELINE, scene_views, send_airframe, send_scene, send_space
 
-    digest = hashlib.sha256(repr((run.actual, run.limits)).encode())
+    digest = hashlib.sha256(repr((asdict(run.actual), run.limits)).encode())
     for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
         digest.update(np.ascontiguousarray(array).tobytes())
     # the viewer merges recordings that share an identity
@@ -110,9 +116,34 @@ def open_viewer(path: Path, *, web: bool = False) -> None:
         raise ViewerUnavailableError(f"{problem}: show it in a browser with --web, or open {path} on another machine")
     browser = ("--web-viewer", "--web-viewer-port=0") if web else ()
     try:
-        status = subprocess.run([*_VIEWER, *browser, str(path)], check=False).returncode
-    except KeyboardInterrupt:
+        status = _run([*_VIEWER, *browser, str(path)])
+    except KeyboardInterrupt:  # also of SIGTERM and SIGHUP, see `quadsim.commands.entry`
         return
     if status not in (0, _INTERRUPTED):
         advice = "see its message above" if web else "see its message above, or show it in a browser with --web"
         raise ViewerUnavailableError(f"the rerun viewer ended with status {status}; {advice}")
+
+
+def _run(command: Sequence[str]) -> int:
+    """Run a program and return its exit status; whatever ends the wait ends the program too, and those that it started.
+
+    rerun's command starts the viewer as a process of its own, which would outlive it.
+    """
+    program = subprocess.Popen(command, start_new_session=True)
+    try:
+        return program.wait()
+    finally:
+        _end_group(program)
+        program.wait()
+
+
+def _end_group(leader: subprocess.Popen[bytes]) -> None:
+    """End the processes of a group: by SIGTERM, and by SIGKILL those that do not heed it."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):  # all of them have ended
+        os.killpg(leader.pid, signal.SIGTERM)
+        deadline = clock.monotonic() + _PATIENCE
+        while clock.monotonic() < deadline:
+            clock.sleep(0.02)
+            leader.poll()  # until then an ended leader counts as one of the group
+            os.killpg(leader.pid, 0)
+        os.killpg(leader.pid, signal.SIGKILL)

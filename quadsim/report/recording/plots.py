@@ -35,7 +35,7 @@ from quadsim.report.recording.world import (
     panels,
     time_column,
 )
-from quadsim.report.table import to_markdown
+from quadsim.report.table import ABSENT, to_markdown
 from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -221,7 +221,12 @@ def send_texts(recording: rr.RecordingStream, run: FlightRecord) -> None:
         events.append((run.end, "completed", "INFO"))
     times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
     recording.send_columns("events", [time_column(np.array(times))], rr.TextLog.columns(text=texts, level=levels))
-    rows = [row for row in comparison_rows([run]) if row.group in ("Flight", "Tracking") or row.headline]
+    rows = []
+    for row in comparison_rows([run]):
+        is_shown = row.group in ("Flight", "Tracking") or row.headline
+        (cell,) = row.cells
+        if is_shown and cell.text not in ("", ABSENT):
+            rows.append(row)
     document = rr.TextDocument(to_markdown(rows, [run.name]), media_type=rr.MediaType.MARKDOWN)
     recording.log("summary", document, static=True)
 
@@ -263,10 +268,10 @@ def _send_curves(
 def _view(
     title: str, contents: Sequence[str], run: FlightRecord, *, ends: tuple[float, float] | None = None
 ) -> list[rrb.TimeSeriesView]:
-    """Curves over the whole flight, and the legend to their right; `ends` of the vertical axis; no view of nothing."""
+    """Curves over the whole flight, with a legend; `ends` of the vertical axis; no view of nothing."""
     if not contents:
         return []
-    first, last = (rr.TimeRangeBoundary.absolute(seconds=seconds) for seconds in (0.0, 1.4 * max(run.end, 1e-3)))
+    first, last = (rr.TimeRangeBoundary.absolute(seconds=seconds) for seconds in (0.0, max(run.end, 1e-3)))
     view = rrb.TimeSeriesView(
         name=title,
         contents=list(contents),

@@ -32,6 +32,7 @@ PANELS: Final[dict[str, tuple[str, ...]]] = {
     "Steps of the rotor speeds, per period": ("slew",),
     "Velocity": ("vx", "vy", "vz"),
     "Position errors": ("x_error", "y_error", "z_error"),
+    "Climb acceleration": ("climb_acceleration",),
     "Attitude rates": ("roll_rate", "pitch_rate", "yaw_rate"),
     "Body rates": ("body_rate_x", "body_rate_y", "body_rate_z"),
     "Yaw and tilt": ("yaw", "tilt", "yaw_error"),

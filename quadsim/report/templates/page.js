@@ -102,12 +102,18 @@ async function drawPlots() {
 const videos = [...document.querySelectorAll("video")];
 const button = document.getElementById("play-all");
 
+// Films of long flights run faster than those of short ones: simulated seconds per second of film.
+const speedOf = (video) => (video.duration ? Number(video.dataset.length) / video.duration : 1);
+const flownTime = (video) => video.currentTime * speedOf(video);
+
 function playAll() {
   const playing = videos.some((video) => !video.paused);
   if (playing) return videos.forEach((video) => video.pause());
-  const start = videos[0].ended ? 0 : videos[0].currentTime;
+  const start = videos[0].ended ? 0 : flownTime(videos[0]);
+  const fastest = Math.max(...videos.map(speedOf));
   videos.forEach((video) => {
-    video.currentTime = Math.min(start, video.duration || start);
+    video.playbackRate = fastest / speedOf(video);
+    video.currentTime = Math.min(start / speedOf(video), video.duration || start);
     video.play().catch(() => {}); // paused again before it had begun
   });
 }
@@ -115,7 +121,8 @@ function playAll() {
 function followLeader() {
   const [leader, ...others] = videos;
   for (const video of others) {
-    if (!video.ended && Math.abs(video.currentTime - leader.currentTime) > 0.15) video.currentTime = leader.currentTime;
+    const drift = flownTime(video) - flownTime(leader);
+    if (!video.ended && Math.abs(drift) > 0.15 * speedOf(leader)) video.currentTime = flownTime(leader) / speedOf(video);
   }
 }
 

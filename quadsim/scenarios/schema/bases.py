@@ -59,7 +59,7 @@ def read_merged(
         try:
             set_field(data, field, value, source="set")
         except InputError as error:
-            raise FileError(VARIANTS, f"{changes['name']}.set.{field}: {error}") from error
+            raise FileError(VARIANTS, f"{changes['name']}.set.{field}: {error}") from None
     return data
 
 

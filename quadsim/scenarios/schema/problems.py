@@ -226,7 +226,7 @@ def parse_table(kind: type[TableType], data: Mapping[str, Any], source: str, *, 
     try:
         table: TableType = _validator(cast(Any, kind)).validate_python(tables)
     except ValidationError as error:
-        raise ScenarioError(source, describe_all(error, data, kind, file=file)) from error
+        raise ScenarioError(source, describe_all(error, data, kind, file=file)) from None
     return table
 
 

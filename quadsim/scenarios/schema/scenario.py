@@ -293,11 +293,11 @@ class Scenario:
         ):
             try:
                 steps_per_period(value, unit)
-            except ParameterError as error:
+            except ParameterError:
                 what = "the control period" if name == "duration" else "the physics step plant.timestep"
                 rate = self.log_rate if name == "log_rate" else value
                 period = "have a period that is" if name == "log_rate" else "be"
-                raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {rate}") from error
+                raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {rate}") from None
         if self.recorded is not None and self.recorded.file != self.vehicle.file:
             advice = (
                 "for another vehicle remove [recorded], and the numbers of [vehicle] and [autopilot] that repeat it"
@@ -312,12 +312,12 @@ class Scenario:
                 try:
                     inner_steps(spec.indi.rate, self.plant.timestep)
                 except ParameterError as error:
-                    raise ValueError(f"controller.indi.rate must be {error.rule}; got {spec.indi.rate}") from error
+                    raise ValueError(f"controller.indi.rate must be {error.rule}; got {spec.indi.rate}") from None
         if self.autopilot is not None and self.autopilot.rate is not None:
             try:
                 inner_steps(self.autopilot.rate, self.plant.timestep)
             except ParameterError as error:
-                raise ValueError(f"autopilot.rate must be {error.rule}; got {self.autopilot.rate}") from error
+                raise ValueError(f"autopilot.rate must be {error.rule}; got {self.autopilot.rate}") from None
         for what, count in (
             ("physics steps", self.periods * self.steps_per_period),
             ("planned steps", self.periods * max(spec.horizon for spec in specs)),
@@ -370,7 +370,7 @@ class Scenario:
                     controller = changed_controller(controller, event.fields)
                 except InputError as error:
                     problems = getattr(error, "problems", (error,))
-                    raise ValueError(f"events.{i}.fields: {'; '.join(map(str, problems))}") from error
+                    raise ValueError(f"events.{i}.fields: {'; '.join(map(str, problems))}") from None
 
     @property
     def controller_changes(self) -> list[tuple[float, AnyController]]:

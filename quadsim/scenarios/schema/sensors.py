@@ -60,7 +60,7 @@ def check_sensing(sensors: Sensors | None, estimator: EstimatorSpec | None, *, t
             sensor.stride(name, timestep)
             sensor.latency(name, timestep)
         except ParameterError as error:
-            raise ValueError(str(error)) from error
+            raise ValueError(str(error)) from None
         noise = [*sensor.noise] if isinstance(sensor.noise, tuple) else sensor.noise
         if estimator is not None and not np.all(np.array(noise) > 0.0):
             raise ValueError(

@@ -12,7 +12,7 @@ import pytest
 
 from quadsim.errors import InputError, OutputError
 from quadsim.features.campaign.events import EVENT_NAMES
-from quadsim.features.campaign.paired import compare_pairs
+from quadsim.features.campaign.paired import compare_pairs, events_figure
 from quadsim.features.campaign.statistics import estimate, holm
 
 MakeCampaign = Callable[..., pa.Table]
@@ -165,11 +165,40 @@ def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.T
         compare_pairs(thousand, better, NAMES, differences=d) for d in ((), (("effects.air", None, 3e-4),) * 2)
     )
     assert "differ: 0." in same.to_markdown()
-    before = other.to_markdown().partition(other.sentence)[0]
-    assert "differ: 2." in before
-    assert "| effects.air | absent | 0.0003 |" in before
+    after = other.to_markdown().partition(other.sentence)[2]
+    assert "differ: 2." in after.partition("| failure |")[2], "the result comes first"
+    assert "| effects.air | absent | 0.0003 |" in after
     assert "| failure | 30 (3.0 %) |" in text
     assert "| worst_margin |" in text
+
+
+def test_fields_of_one_campaign_alone_and_paths_come_last(thousand: pa.Table, better: pa.Table) -> None:
+    differences = (("effects.air", None, 3e-4), ("vehicle.file", "/home/me/a.toml", "b.toml"), ("seed", 1, 2))
+    (grid,) = compare_pairs(thousand, better, NAMES, differences=differences).difference_tables
+    assert [line[0].text for line in grid.lines] == ["seed", "effects.air", "vehicle.file"]
+
+
+def test_the_answer_says_who_tracks_closer_and_a_plot_shows_by_how_much(thousand: pa.Table, better: pa.Table) -> None:
+    result = compare_pairs(thousand, better, NAMES)
+    assert result.tracking.startswith("RMS error, where both flights were completed: robust is ")
+    for metric in result.metrics:
+        if metric.name in ("rmse.x", "rmse.y", "rmse.z"):
+            difference = metric.difference
+            verdict = "not distinguishable"
+            if difference.upper is not None and difference.upper < 0.0:
+                verdict = "closer"
+            elif difference.lower is not None and difference.lower > 0.0:
+                verdict = "farther"
+            (told,) = [part for part in result.tracking.split(";") if f"{verdict} in" in part]
+            assert f" {metric.name[-1]}" in told
+    (events,), (metrics,) = events_figure(result).panels, result.small_plot().panels
+    assert "failure" in events.x_names
+    assert events.series[0].y[0] == pytest.approx(3.0)
+    first = result.metrics[0]
+    points = [curve for curve in metrics.series if curve.style == "points"]
+    assert first.mean_a is not None
+    assert first.difference.mean is not None
+    assert points[0].y[0] == pytest.approx(100.0 * first.difference.mean / abs(first.mean_a))
 
 
 def test_the_page_stands_with_its_files(thousand: pa.Table, better: pa.Table, tmp_path: Path) -> None:

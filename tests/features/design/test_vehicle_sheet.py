@@ -137,6 +137,37 @@ def test_the_command_prints_figures_and_sources(name: str, capsys: pytest.Captur
     assert ("rotors that rise" in printed) == (vehicle.rotor_rise is not None)
 
 
+def test_what_is_left_of_the_example_is_told_by_the_report_and_before_a_flight(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    template, file = quadsim.vehicle_report(template=True).content, tmp_path / "mine.toml"
+    count = len(re.findall(r'(?m)^source = "example"$', template))
+    text = template.replace('source = "example"', 'source = "weighed"', 1)  # of the mass
+    file.write_text(text, encoding="utf-8")
+    left, description = quadsim.vehicle_report(file).leftovers
+    assert left.startswith(
+        f'mine.toml: {count - 1} of {count} values are of an example (source = "example"), not yours'
+    )
+    assert ": gravity, inertia" in left
+    assert description.startswith("mine.toml: the description is of an example, not yours: 'An example: 1.5 kg")
+    assert main(["vehicle", str(file)]) == EXIT_DONE
+    assert left[:60] in capsys.readouterr().out
+    flown = ("hover", "--set", f"vehicle.file={file}", "--set", "duration=0.1", "--set", "vehicle.gravity=9.8")
+    for command in (
+        ("run", "--out", str(tmp_path / "run"), "--no-video", "--no-figures", "--no-recording"),
+        ("check",),
+    ):
+        main([*command, *flown])
+        message = capsys.readouterr().err
+        assert f"quadsim: mine.toml: {count - 2} of {count} values are of an example" in message
+        assert "gravity" not in message
+    main(["check", str(tmp_path / "run")])
+    assert "example" not in capsys.readouterr().err, "its scenario states every number"
+    ours = re.sub(r'(?m)^source = "example"$', 'source = "data sheet"', text).replace("An example: ", "")
+    file.write_text(ours, encoding="utf-8")
+    assert quadsim.vehicle_report(file).leftovers == ()
+
+
 @pytest.mark.slow("first flights")
 @pytest.mark.parametrize(
     ("field", "value", "axis"),

@@ -20,6 +20,7 @@ from quadsim.report.film.captions import Overlay, margin_rows
 from quadsim.report.film.frames import filmed, make_footage, ranked_tracks
 from quadsim.report.film.video import (
     Estimate,
+    film_speed,
     frame_count,
     frame_rate,
     render_gif,
@@ -71,7 +72,8 @@ def test_the_film_has_the_frames_requested(
 def test_a_long_film_has_fewer_frames_per_second_unless_told() -> None:
     assert [frame_rate(length) for length in (6.0, 29.9, 30.0, 60.0)] == [30, 30, 20, 20]
     assert frame_rate(60.0, 50) == 50
-    assert (frame_count(60.0, 20), frame_count(0.01, 30)) == (1200, 1)
+    assert (frame_count(60.0, 20), frame_count(30.0, 20), frame_count(0.01, 30)) == (400, 600, 1)
+    assert [film_speed(length) for length in (6.0, 30.0, 30.1, 60.0)] == [1.0, 1.0, 3.0, 3.0]
     for wrong in (0, 121, 24.0, True):
         with pytest.raises(ParameterError, match="--fps"):
             frame_rate(6.0, wrong)  # type: ignore[arg-type]

@@ -7,10 +7,12 @@ import itertools
 import math
 import subprocess
 import sys
+import time as clock
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from rerun.chunk import RrdReader
 from support import recording
@@ -285,7 +287,24 @@ def test_events_report_each_change_of_the_solver_why_it_failed_and_the_end(
     times = content.times("/events").round(9).tolist()
     levels, texts = ([row[0] for row in content.rows("/events", name)] for name in ("level", "text"))
     assert sorted(zip(times, levels, texts, strict=True)) == expected
-    assert "cannot hold together: roll upper" in content.rows("/summary", "text")[0][0]
+    summary = content.rows("/summary", "text")[0][0]
+    assert "cannot hold together: roll upper" in summary
+
+
+def test_the_summary_has_no_key_without_a_value_and_plots_end_with_the_flight(
+    content: Content, short_run: Flight
+) -> None:
+    summary = content.rows("/summary", "text")[0][0]
+    lines = [line.strip("| ").split("|") for line in summary.splitlines() if line.startswith("|")]
+    assert len(lines) > 10
+    assert [cells for cells in lines[2:] if cells[-1].strip() in ("", "-")] == []
+    assert "events" not in summary, "it has none"
+    blueprint = content.reader.stream(store=content.reader.blueprints()[0]).to_chunks()
+    batches = [chunk.to_record_batch() for chunk in blueprint if chunk.entity_path.endswith("/TimeAxis")]
+    ranges = [str(batch.to_pydict()) for batch in batches]
+    end = round(1e9 * short_run.end)
+    assert ranges
+    assert all(str(end) in text for text in ranges)
 
 
 def test_a_flight_without_predictions_or_finite_end_is_recorded(
@@ -313,3 +332,30 @@ def test_the_viewer_is_given_the_file_and_listens_to_this_machine_alone(
     assert notes.read_text() == f"--bind=127.0.0.1 --port=auto {path}"
     open_viewer(path, web=True)
     assert "--web-viewer" in notes.read_text().split()
+
+
+def test_a_signal_ends_the_viewer_and_the_processes_that_it_started(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    note = tmp_path / "started"
+    program = f"""
+import os, pathlib, signal, subprocess, sys, time
+started = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+pathlib.Path({str(note)!r}).write_text(str(started.pid))
+os.kill(os.getppid(), signal.SIGINT)
+time.sleep(60)
+"""
+    monkeypatch.setattr(recording_module, "_VIEWER", (sys.executable, "-c", program))
+    open_viewer(path, web=True)
+    started = int(note.read_text())
+    deadline = clock.monotonic() + 10.0
+    while is_running(started) and clock.monotonic() < deadline:
+        clock.sleep(0.02)
+    assert not is_running(started)
+
+
+def is_running(process: int) -> bool:
+    try:
+        return psutil.Process(process).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
