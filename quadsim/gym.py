@@ -5,7 +5,8 @@
 
     env = gymnasium.make("quadsim/PaperConstrained-v0")
 
-Importing this module registers an id for each library scenario; `make_env` makes an environment from any other.
+Importing this module registers an id for each library scenario, and for each task of `TASKS`; `make_env` makes an
+environment from any other scenario.
 """
 
 from __future__ import annotations
@@ -22,11 +23,15 @@ if TYPE_CHECKING:
     from quadsim.features.gym.environment import make_env as make_env
     from quadsim.features.gym.environment import make_vec as make_vec
     from quadsim.features.gym.safety import MPCSafetyFilter as MPCSafetyFilter
+    from quadsim.features.gym.tasks import TASKS as TASKS
 
-__all__ = ["MPCSafetyFilter", "QuadrotorEnv", "environment_id", "make_env", "make_vec"]
+__all__ = ["TASKS", "MPCSafetyFilter", "QuadrotorEnv", "environment_id", "make_env", "make_vec"]
 
 if find_spec("gymnasium") is None:
     raise MissingPackageError("quadsim.gym", "gymnasium", extra="gym")
-_environment, _safety = (importlib.import_module(f"quadsim.features.gym.{part}") for part in ("environment", "safety"))
-globals().update({name: getattr(_environment, name, None) or getattr(_safety, name) for name in __all__})
+_parts = [importlib.import_module(f"quadsim.features.gym.{part}") for part in ("environment", "safety", "tasks")]
+for _name in __all__:
+    globals()[_name] = next(getattr(part, _name) for part in _parts if hasattr(part, _name))
+_environment, _, _tasks = _parts
 _environment.register_library()
+_tasks.register_tasks()

@@ -72,6 +72,7 @@ COMMANDS: Final[dict[str, list[list[str]]]] = {
     "first-flights": [[PYTHON, "tests/first_flights.py"]],
     "campaigns": [flown(name, name) for name in CAMPAIGNS],
     "battery": [flown(name, *arguments) for name, (_, arguments) in BATTERIES.items()],
+    "ppo": [[PYTHON, *["examples/ppo.py", "--json", "runs/numbers/ppo.json", "--policy", "examples/ppo_policy.json"]]],
     "pictures": [[PYTHON, *f"docs/tools/{script}".split()] for script in DRAWN],
 }
 """What makes the files of a name."""
@@ -321,6 +322,17 @@ def autopilots(data: Any) -> str:
     return f"Of {len(rows)} flights {held} are satisfied; RMS errors differ by at most {most:.2g} cm.\n"
 
 
+def ppo(data: Record) -> str:
+    """What a learned policy and the MPC do on the same draws, and how long it learned."""
+    head = ("", "flights", "lost", "violated", "RMS error, m", "largest of a flight, m", "largest tilt, deg")
+    numbers = ("flights", "lost", "violated", "error", "largest_error", "peak_tilt")
+    rows = []
+    for score in data["comparison"]:
+        rows.append([score["controller"], *(f"{score[number]:.3g}" for number in numbers)])
+    last = data["curve"][-1]
+    return f"{table(head, rows)}\n{last['steps']} steps took {last['seconds']:.0f} s.\n"
+
+
 def records(data: Any) -> list[Record]:
     """A benchmark's records, without what is no number or text."""
     lists = [data] if isinstance(data, list) else [value for value in data.values() if isinstance(value, list)]
@@ -329,14 +341,14 @@ def records(data: Any) -> list[Record]:
 
 
 CSV: Final[dict[str, Callable[[Any], list[Record]]]] = {
-    **dict.fromkeys((*KEPT, "autopilots", "flight", "intervals", "nonlinear", "stability"), records),
+    **dict.fromkeys((*KEPT, "autopilots", "flight", "intervals", "nonlinear", "ppo", "stability"), records),
     "papers": paper_rows,
     "peers": peer_rows,
 }
 """What docs/data keeps, and how its rows are read."""
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     **{each.__name__: each for each in (results, ablation, papers, peers, export, campaigns, solvers, nonlinear)},
-    **{each.__name__: each for each in (flight, campaign, film, identification, autopilots, stability)},
+    **{each.__name__: each for each in (flight, campaign, film, identification, autopilots, ppo, stability)},
     "paper": both_flights,
     "first-flights": first_flights,
     "battery": batteries,

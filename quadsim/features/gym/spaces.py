@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -67,9 +68,9 @@ class Actions:
         if kind == "rates":
             timestep = scenario.plant.timestep
             rate = 1.0 / (max(1, round(INNER_PERIOD / timestep)) * timestep)
-            none = (0.0, 0.0, 0.0)
-            settings = AutopilotSettings(rate=rate, p=BANDWIDTH, i=none, d=none, gyro_cutoff=0.0, delay=0.0)
-            self._autopilot = Autopilot(vehicle, settings, speeds=(float(low[0]), float(high[0])))
+            speeds = (float(low[0]), float(high[0]))
+            self._autopilot = _rate_loop(vehicle, BANDWIDTH, rate, speeds)
+            self._holding = _rate_loop(vehicle, _held_gains(scenario.control_period), rate, speeds)
             self._weight = vehicle.mass * vehicle.gravity
             self._thrusts = [vehicle.level_thrust(float(speed)) for speed in (low.max(), high.min())]
 
@@ -94,6 +95,28 @@ class Actions:
         plan = np.broadcast_to(speeds, (horizon, N_ROTORS))
         return Command(speeds=speeds, plan=plan, status=GIVEN, inner=inner)
 
+    def held_speeds(self, action: Action, body_rates: Array) -> Array:
+        """Return the rotor speeds (4,) [rad/s] that an action asks for, if they are to be held for a control period T.
+
+        For `rates`, they give its thrust, and at the period's end the body rates at which its loop arrives: that turns
+        from omega to omega_c with the bandwidth b, so it covers a share 1 - exp(-b T), and a constant acceleration of
+        (1 - exp(-b T)) / T (omega_c - omega) covers the same.
+
+        Args:
+            action: (4,) the action.
+            body_rates: (3,) measured omega [rad/s].
+
+        Raises:
+            ParameterError: see `command`.
+        """
+        command = self.command(action, 1)
+        if command.inner is None:
+            return command.speeds
+        if not np.isfinite(command.speeds).all():
+            return np.full(N_ROTORS, np.nan)
+        rotors, level = np.zeros(N_ROTORS), np.array([1.0, 0.0, 0.0, 0.0])  # a rate loop uses neither
+        return self._holding.speeds(0.0, command.speeds, body_rates, rotors, level)
+
     def of(self, speeds: Array) -> Action:
         """The action that commands rotor speeds (4,) [rad/s]; beyond [-1, 1] where these are beyond their bounds.
 
@@ -107,6 +130,18 @@ class Actions:
             return np.array(speeds, float)
         deviation = speeds - self._hover
         return (deviation / np.where(deviation < 0.0, self._down, self._up)).astype(np.float32)
+
+
+def _rate_loop(vehicle: Vehicle, gains: tuple[float, ...], rate: float, speeds: tuple[float, float]) -> Autopilot:
+    """Return a proportional rate loop, about body x, y, z [1/s], without filter and delay, within rotor speeds."""
+    none = (0.0, 0.0, 0.0)
+    settings = AutopilotSettings(rate=rate, p=gains, i=none, d=none, gyro_cutoff=0.0, delay=0.0)
+    return Autopilot(vehicle, settings, speeds=speeds)
+
+
+def _held_gains(period: float) -> tuple[float, ...]:
+    """Return the gains [1/s] whose first answer, held for a period [s], turns as far as `BANDWIDTH` does within it."""
+    return tuple((1.0 - math.exp(-bandwidth * period)) / period for bandwidth in BANDWIDTH)
 
 
 @dataclass(frozen=True, kw_only=True)
