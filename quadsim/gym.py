@@ -19,19 +19,27 @@ from quadsim.errors import MissingPackageError
 
 if TYPE_CHECKING:
     from quadsim.features.gym.environment import QuadrotorEnv as QuadrotorEnv
-    from quadsim.features.gym.environment import environment_id as environment_id
-    from quadsim.features.gym.environment import make_env as make_env
-    from quadsim.features.gym.environment import make_vec as make_vec
+    from quadsim.features.gym.making import environment_id as environment_id
+    from quadsim.features.gym.making import make_env as make_env
+    from quadsim.features.gym.making import make_vec as make_vec
     from quadsim.features.gym.safety import MPCSafetyFilter as MPCSafetyFilter
     from quadsim.features.gym.tasks import TASKS as TASKS
+    from quadsim.features.gym.vector import QuadrotorVectorEnv as QuadrotorVectorEnv
 
-__all__ = ["TASKS", "MPCSafetyFilter", "QuadrotorEnv", "environment_id", "make_env", "make_vec"]
+__all__ = ["TASKS", "MPCSafetyFilter", "QuadrotorEnv", "QuadrotorVectorEnv", "environment_id", "make_env", "make_vec"]
 
 if find_spec("gymnasium") is None:
     raise MissingPackageError("quadsim.gym", "gymnasium", extra="gym")
-_parts = [importlib.import_module(f"quadsim.features.gym.{part}") for part in ("environment", "safety", "tasks")]
-for _name in __all__:
-    globals()[_name] = next(getattr(part, _name) for part in _parts if hasattr(part, _name))
-_environment, _, _tasks = _parts
-_environment.register_library()
-_tasks.register_tasks()
+_MODULES = {
+    "MPCSafetyFilter": "safety",
+    "QuadrotorEnv": "environment",
+    "QuadrotorVectorEnv": "vector",
+    "TASKS": "tasks",
+    "environment_id": "making",
+    "make_env": "making",
+    "make_vec": "making",
+}
+for _name, _module in _MODULES.items():
+    globals()[_name] = getattr(importlib.import_module(f"quadsim.features.gym.{_module}"), _name)
+importlib.import_module("quadsim.features.gym.making").register_library()
+importlib.import_module("quadsim.features.gym.tasks").register_tasks()

@@ -160,6 +160,32 @@ class ReferenceTurns:
         return moved
 
 
+def follow_turns(references: Array, yaws: Array, firsts: Array) -> Array:
+    """Return the references (M, N, 4) of M vehicles on the turns of their yaws (M,), as `ReferenceTurns` does for one.
+
+    Args:
+        references: rows a period apart; they are not changed.
+        yaws: of the vehicles [rad].
+        firsts: (M,) each flight's first row's yaw in the period before [rad], NaN before the first; updated in place.
+    """
+    first = references[:, 0, 3]
+    known = ~np.isnan(firsts)
+    start = first - TURN * np.where(known, whole_turns(first - np.where(known, firsts, first)), 0.0)
+    anew = ~known | (np.abs(yaws - start) > KEPT)
+    start = start + TURN * np.where(anew, whole_turns(yaws - start), 0.0)
+    finite = np.isfinite(start + yaws)
+    start = np.where(finite, start, first)
+    firsts[finite] = start[finite]
+    steps = np.diff(references[:, :, 3], axis=1, prepend=start[:, None])
+    turns = whole_turns(steps)
+    turns[~finite] = 0.0
+    if not turns.any():
+        return references
+    moved = references.copy()
+    moved[:, :, 3] -= TURN * turns.cumsum(axis=1)
+    return moved
+
+
 class YawTurns:
     """Counts a yaw's whole turns, sample by sample.
 

@@ -56,6 +56,7 @@ USING: Final = {
     "test_plausibility.py": ("design",),
     "features/gym/test_environment.py": ("campaign",),
     "features/gym/test_ppo.py": ("campaign",),
+    "features/gym/test_vector.py": ("campaign",),
     "features/identify/test_border_of_logs.py": ("design",),
     "features/identify/test_identify.py": ("design",),
     "features/identify/test_identify_fit.py": ("design",),

@@ -323,14 +323,14 @@ def autopilots(data: Any) -> str:
 
 
 def ppo(data: Record) -> str:
-    """What a learned policy and the MPC do on the same draws, and how long it learned."""
+    """What a learned policy and the MPC do on the same draws, and how long the policy learned."""
     head = ("", "flights", "lost", "violated", "RMS error, m", "largest of a flight, m", "largest tilt, deg")
     numbers = ("flights", "lost", "violated", "error", "largest_error", "peak_tilt")
     rows = []
     for score in data["comparison"]:
         rows.append([score["controller"], *(f"{score[number]:.3g}" for number in numbers)])
-    last = data["curve"][-1]
-    return f"{table(head, rows)}\n{last['steps']} steps took {last['seconds']:.0f} s.\n"
+    steps = data["curve"][-1]["steps"]
+    return f"{table(head, rows)}\n{steps} steps of training took {data['seconds']:.0f} s of one core.\n"
 
 
 def records(data: Any) -> list[Record]:

@@ -13,7 +13,13 @@ from quadsim.state import Array
 
 
 class CompiledLoop:
-    """An inner loop whose constants and state are a struct of the core; `quadsim.controller.InnerLoop`."""
+    """An inner loop whose constants and state are a struct of the core; `quadsim.controller.InnerLoop`.
+
+    Attributes:
+        rate: of its calls [Hz].
+    """
+
+    rate: float
 
     def __init__(self, struct: Struct, *, delay: int = 0) -> None:
         """Take over a struct whose constants are filled in; `delay` calls pass before an answer comes out."""

@@ -512,30 +512,46 @@ static double nearest_turn(double angle, double to)
     return angle + TURN * floor(0.5 + TIE - (angle - to) / TURN);
 }
 
+void quadsim_turn(const double *euler, double *last, double *upright)
+{
+    if (isfinite(euler[0] + euler[1] + euler[2])) {
+        const int up = cos(euler[0]) * cos(euler[1]) >= 0.0;
+        *last = nearest_turn(euler[2], up ? *upright : *last);
+        *upright = up ? *last : *upright;
+    }
+}
+
+void quadsim_euler_rates(const double *euler, const double *rate, double *rates)
+{
+    const double sin_roll = sin(euler[0]), cos_roll = cos(euler[0]);
+    const double lateral = rate[1] * sin_roll + rate[2] * cos_roll;
+    rates[0] = rate[0] + lateral * tan(euler[1]);
+    rates[1] = rate[1] * cos_roll - rate[2] * sin_roll;
+    rates[2] = lateral / cos(euler[1]);
+}
+
+void quadsim_observe(const double *physics, double *last, double *upright, double *state)
+{
+    double euler[3], rates[3];
+    to_euler(physics + 4, euler);
+    quadsim_euler_rates(euler, physics + 11, rates);
+    if (isfinite(euler[0] + euler[1] + euler[2])) {
+        quadsim_turn(euler, last, upright);
+        euler[2] = *last;
+    }
+    for (int i = 0; i < 3; i++) {
+        state[2 * i] = physics[1 + i];
+        state[2 * i + 1] = physics[8 + i];
+        state[6 + 2 * i] = euler[i];
+        state[7 + 2 * i] = rates[i];
+    }
+}
+
 void quadsim_states(const double *physics, int64_t count, int64_t width, double yaw, double *states)
 {
     double last = yaw, upright = yaw;
     for (int64_t k = 0; k < count; k++) {
-        const double *row = physics + width * k, *rate = row + 11;
-        double *x = states + 12 * k, euler[3];
-        to_euler(row + 4, euler);
-        const double sin_roll = sin(euler[0]), cos_roll = cos(euler[0]), cos_pitch = cos(euler[1]);
-        const double lateral = rate[1] * sin_roll + rate[2] * cos_roll;
-        for (int i = 0; i < 3; i++) {
-            x[2 * i] = row[1 + i];
-            x[2 * i + 1] = row[8 + i];
-        }
-        if (isfinite(euler[0] + euler[1] + euler[2])) {
-            const int up = cos_roll * cos_pitch >= 0.0;
-            euler[2] = last = nearest_turn(euler[2], up ? upright : last);
-            upright = up ? last : upright;
-        }
-        x[6] = euler[0];
-        x[7] = rate[0] + lateral * tan(euler[1]);
-        x[8] = euler[1];
-        x[9] = rate[1] * cos_roll - rate[2] * sin_roll;
-        x[10] = euler[2];
-        x[11] = lateral / cos_pitch;
+        quadsim_observe(physics + width * k, &last, &upright, states + 12 * k);
     }
 }
 

@@ -128,6 +128,14 @@ const char *quadsim_complaint(void);
  * rates; the yaw unwrapped along the rows, as by `quadsim.state.YawTurns`, from the turn nearest to `yaw`. */
 void quadsim_states(const double *physics, int64_t count, int64_t width, double yaw, double *states);
 
+/* One of them, from MuJoCo's [14], on the turn of the yaw nearest the last one, or upright the last upright one. */
+void quadsim_observe(const double *physics, double *last, double *upright, double *state);
+
+/* Its parts: the turn of the yaw of Euler angles [3], which stays where one is not finite; rates of Euler angles [3] from
+ * body rates [3]. */
+void quadsim_turn(const double *euler, double *last, double *upright);
+void quadsim_euler_rates(const double *euler, const double *rate, double *rates);
+
 /* Take the samples of step `now` at a motion [13]; hear what has arrived by step `now`. */
 void quadsim_sense(quadsim_sensing *sensed, int64_t now, const double *motion);
 void quadsim_hear(quadsim_sensing *sensed, int64_t now, const double *motion);

@@ -46,6 +46,10 @@ FilterStruct: Final = struct("quadsim_filter")
 TrackStruct: Final = struct("quadsim_track")
 SampleStruct: Final = struct("quadsim_sample")
 
+BoundStruct: Final = struct("quadsim_bound")
+PeriodStruct: Final = struct("quadsim_period")
+FlightStruct: Final = struct("quadsim_flight")
+
 SAMPLE: Final = np.dtype(SampleStruct)
 """The type of an array of samples."""
 SAMPLES: Final = ctypes.POINTER(SampleStruct)

@@ -208,6 +208,26 @@ class ClosedLoop:
         self.controller, self._switched = controller, self.k
 
     @property
+    def truth(self) -> Array:
+        """(12,) the true state now."""
+        return self._plant.state()
+
+    @property
+    def physics(self) -> Array:
+        """(14,) MuJoCo's state now."""
+        return self._plant.physics
+
+    @property
+    def rotors(self) -> Array:
+        """(4,) rotor speeds now [rad/s]."""
+        return self._plant.speeds
+
+    def followed(self, yaw: float) -> Array:
+        """Return the reference now and as far ahead as the controller looks (1 + N, 4), on the turn of a yaw [rad]."""
+        ahead = [self.course.row(self.k)[None], self.course.preview(self.k, self.controller.horizon)]
+        return self._turns.follow(np.concatenate(ahead), yaw)
+
+    @property
     def observation(self) -> Observation:
         """What the period that starts now begins with, made once.
 
@@ -284,8 +304,7 @@ class ClosedLoop:
         truth = plant.state()
         state = truth.copy() if navigation is None else navigation.state()
         attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
-        ahead = [self.course.row(k)[None], self.course.preview(k, self.controller.horizon)]
-        rows = self._turns.follow(np.concatenate(ahead), float(state[INDEX["yaw"]]))
+        rows = self.followed(float(state[INDEX["yaw"]]))
         row, preview = rows[0], rows[1:]
         phase = Phase.FLYING
         if self._ground is not None:

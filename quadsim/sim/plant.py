@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, Protocol, assert_never
+from typing import Any, Final, Protocol, assert_never
 
 import mujoco
 import numpy as np
@@ -27,12 +27,16 @@ from quadsim.sim.effects import LOADING, Change, Effects, Force, PushChange
 from quadsim.sim.effects.load import Load, MassChange, Payload, PayloadDrop, apply_mass, mass_properties
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
-from quadsim.sim.physics import PHYSICS, Integrator, PhysicsSteps, physics_to_state, steps_type
+from quadsim.sim.physics import Integrator, PhysicsSteps, physics_to_state, steps_type
 from quadsim.space import Obstacle
 from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 _FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+_POSITION: Final = 3  # numbers of a position
+_POSE: Final = 7  # and of a pose, with its quaternion
+_MOTION: Final = 13  # and of a motion, with velocity and body rates
+_PHYSICS: Final = 14  # and of MuJoCo's state, with the time
 _PLAUSIBLE: Final = 1e6
 """Largest magnitude of time [s], position [m], speed [m/s] or rate [rad/s] that is not divergence."""
 _NUMERICAL_WARNINGS: Final = (
@@ -72,7 +76,7 @@ class Plant:
         vehicle: the vehicle flown, as in its file.
         timestep: physics step [s].
         effects: the active effects, resolved; see `quadsim.sim.effects.Effects.resolved`.
-        model: the compiled model; do not change it.
+        model: the compiled model, None with `rk4`; do not change it.
     """
 
     def __init__(
@@ -94,39 +98,43 @@ class Plant:
         self.effects = effects
         self._load, air = effects.load or _AS_IN_THE_FILE, effects.air or Air()
         self._reweighed = self._load != _AS_IN_THE_FILE or any(isinstance(change, LOADING) for change in changes)
-        self.model = compile_model(
-            vehicle,
-            timestep=timestep,
-            limit_speeds=limit_speeds,
-            contact=effects.ground is not None and effects.ground.contact,
-            reweighed=self._reweighed,
-            body_drag=air.body_drag,
-            air_density=air.density,
-            obstacles=obstacles,
-        )
         self._moving = [obstacle for obstacle in obstacles if obstacle.moves]
         self._speed_range = (vehicle.speed_min, vehicle.speed_max) if limit_speeds else (0.0, math.inf)
-        self._data = mujoco.MjData(self.model)
-        mujoco.set_mju_user_warning(_discard)
-        self._physics = np.zeros((1, mujoco.mj_stateSize(self.model, _FULL)))
         self._yaw = YawTurns(0.0)
         self._wind, self._own = wind, tuple(forces)
+        self._integrator = integrator
+        self._motion: Array = np.zeros(_MOTION)
+        self._velocity = self._motion[_POSE:]
+        self.model: Any = None
+        self._data: Any = None
         if integrator == "rk4":
             check_free(effects, changes, obstacles)
-        self._integrator = integrator
+        else:
+            self.model = compile_model(
+                vehicle,
+                timestep=timestep,
+                limit_speeds=limit_speeds,
+                contact=effects.ground is not None and effects.ground.contact,
+                reweighed=self._reweighed,
+                body_drag=air.body_drag,
+                air_density=air.density,
+                obstacles=obstacles,
+            )
+            self._data = mujoco.MjData(self.model)
+            self._motion, self._velocity = self._data.qpos, self._data.qvel
+            mujoco.set_mju_user_warning(_discard)
         pushed = any(isinstance(change, PushChange) for change in changes)
         self._follows_motion = effects.follows_state or wind is not None or bool(self._own) or pushed
         self._follows_motion = self._follows_motion or bool(self._moving) or integrator == "rk4"
         self._steps_type = steps_type(
             wrench=self._follows_motion, wind=wind is not None, battery=effects.battery is not None
         )
-        bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
-        assert self.model.body_mocapid[bodies].tolist() == list(range(len(bodies)))  # the core writes them in order
+        if self._moving:
+            bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
+            assert self.model.body_mocapid[bodies].tolist() == list(range(len(bodies)))  # the core writes them in order
         self._changes = self._scheduled(changes)
         rng = rng if rng is not None else np.random.default_rng(0)
-        # A generator each, so that neither draw changes the other's, however time is cut.
-        self._generators = rng, rng.spawn(1)[0]
-        self._starts = [generator.bit_generator.state for generator in self._generators]
+        self._seed(rng)
         self._struct = self._make_struct()
         self.reset(np.zeros(N_STATES))
 
@@ -138,7 +146,7 @@ class Plant:
 
     def close(self) -> None:
         """Free native memory; the plant cannot fly on."""
-        for name in ("_struct", "_data", "model"):
+        for name in ("_struct", "_data", "model", "_motion", "_velocity"):
             self.__dict__.pop(name, None)
 
     @property
@@ -149,17 +157,36 @@ class Plant:
     @property
     def time(self) -> float:
         """Simulated time [s]."""
-        return float(self._physics[0, 0])
+        return float(self._struct.time)
 
     @property
     def physics(self) -> Array:
         """(14,) copy of MuJoCo's state; see `physics_to_state`."""
-        return self._physics[0].copy()
+        physics = np.empty(_PHYSICS)
+        physics[0] = self._struct.time
+        physics[1 : 1 + _POSE] = self._motion[:_POSE]
+        physics[1 + _POSE :] = self._velocity
+        return physics
 
     @property
     def speeds(self) -> Array:
         """(4,) rotor speeds now [rad/s]."""
-        return self._speeds.copy()
+        return np.array(self._struct.speeds)
+
+    @property
+    def _step(self) -> int:
+        """The physics step that comes next."""
+        return int(self._struct.now)
+
+    def _seed(self, rng: np.random.Generator) -> None:
+        # A generator each, so that neither draw changes the other's, however time is cut.
+        self._generators = rng, rng.spawn(1)[0]
+        self._starts = [generator.bit_generator.state for generator in self._generators]
+
+    def redraw(self, rng: np.random.Generator, wind: WindField | None) -> None:
+        """Take other draws from the next reset on: of noise and disturbances, and of the wind if there is one."""
+        self._seed(rng)
+        self._wind = wind
 
     def reset(self, state: Array, speeds: Array | None = None) -> None:
         """Put the vehicle at a state (12,) at time zero, with rotor speeds (4,) or hover [rad/s]; reset all else.
@@ -170,26 +197,24 @@ class Plant:
         state = np.asarray(state, float)
         if state.shape != (N_STATES,) or not np.all(np.isfinite(state)):
             raise ParameterError("plant", "state", state.tolist(), f"{N_STATES} finite numbers")
-        mujoco.mj_resetData(self.model, self._data)
         euler = state[ANGLES]
         rates = euler_to_body_rates(euler, state[ANGLE_RATES])
-        self._physics[0] = np.concatenate(
-            [[0.0], state[POSITIONS], euler_to_quaternion(euler), state[VELOCITIES], rates]
-        )
+        motion = np.concatenate([state[POSITIONS], euler_to_quaternion(euler), state[VELOCITIES], rates])
         self._yaw = YawTurns(float(euler[2]))
-        self._step = 0
         self._pending = deque(self._changes)
         self._rotors = self.effects.rotors or RotorDynamics()
-        self._speeds = self.vehicle.hover_speeds if speeds is None else np.array(speeds, float)
         self._efficiency = np.array(self._rotors.efficiency)
-        self._charge = 0.0 if self.effects.battery is None else self.effects.battery.charge
         struct = self._struct
         if self._integrator == "mujoco":
-            mujoco.mj_setState(self.model, self._data, self._physics[0], _FULL)
+            mujoco.mj_resetData(self.model, self._data)
+            mujoco.mj_setState(self.model, self._data, np.append(0.0, motion), _FULL)
         else:
-            self._motion[:] = self._physics[0, 1:]
-        struct.now, struct.time, struct.charge = 0, 0.0, self._charge
-        struct.speeds[:], struct.before[:] = self._speeds, self._physics[0, 8:]
+            self._motion[:] = motion
+        struct.now = 0
+        struct.time = 0.0
+        struct.charge = 0.0 if self.effects.battery is None else self.effects.battery.charge
+        struct.speeds[:] = self.vehicle.hover_speeds if speeds is None else np.array(speeds, float)
+        struct.before[:] = motion[_POSE:]
         self._pushes: Array = np.empty((0, 6))
         self._tell()
         if self._reweighed:
@@ -241,13 +266,11 @@ class Plant:
             v.cells, v.capacity, v.resistance = battery.cells, battery.capacity, battery.resistance
             v.hover_current, v.idle_current = battery.hover_current, battery.idle_current
             v.reference_voltage, v.exponent = battery.reference_voltage, battery.exponent
+        v.motion, v.velocity = self._motion.ctypes.data, self._velocity.ctypes.data
         if self._integrator == "rk4":
-            self._motion = np.zeros(13)
-            v.motion, v.velocity = self._motion.ctypes.data, self._motion[7:].ctypes.data
             return v
         v.step = step_address()
         v.model, v.data = addresses(self.model, data)
-        v.motion, v.velocity = data.qpos.ctypes.data, data.qvel.ctypes.data
         v.applied, v.control = data.qfrc_applied.ctypes.data, data.ctrl.ctypes.data
         if air is not None and air.body_drag is not None:
             v.fluid = data.qfrc_fluid.ctypes.data
@@ -265,15 +288,14 @@ class Plant:
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""
-        state = physics_to_state(self._physics)[0]
+        state: Array = physics_to_state(self.physics[None])[0]
         state[EULER[2]] = self._yaw.unwrapped(state[ANGLES])
         return state
 
     @property
     def attitude(self) -> tuple[Array, Array]:
         """The true attitude now (4,), wxyz, body to world, sign continuous, and the body rates (3,) [rad/s]."""
-        physics = self._physics[0]
-        return physics[PHYSICS["attitude"]].copy(), physics[PHYSICS["body_rates"]].copy()
+        return self._motion[_POSITION:_POSE].copy(), self._velocity[_POSITION:].copy()
 
     def advance(self, speeds: Array, steps: int) -> PhysicsSteps:
         """Hold commanded rotor speeds (4,) [rad/s] for M physics steps, at least 1; return these (M,).
@@ -332,13 +354,8 @@ class Plant:
             raise CommandError(problem, time=self.time)
         command, end = np.ascontiguousarray(command, dtype=np.float64), self._step + steps
         while self._step < end:
-            self._change()
-            until = min(end, self._pending[0][0]) if self._pending else end
-            self._draw(until - self._step)
-            while self._step < until:
-                if self._own:
-                    self._drawn["disturbance"][self._rows.row] += self._own_wrench()
-                self._fly(self._step + 1 if self._own else until, command, loop, sensing, ask)
+            staged = self.stage(end - self._step)
+            self._fly(self._step + staged, command, loop, sensing, ask)
 
     def _fly(
         self,
@@ -351,21 +368,9 @@ class Plant:
         """Let the core fly to a physics step while only vehicle and air change."""
         v, rows, fly = self._struct, self._rows, core_library().quadsim_fly
         while self._step < end:
-            before, why = self._step, fly(v, loop, sensing, rows, command.ctypes.data, end)
-            if v.now > before:
-                self._physics[0] = self.flown["physics"][rows.row - 1]
-                self._step, self._charge = v.now, v.charge
-                self._speeds = np.array(v.speeds)
-            if why == End.FAILED:
-                complaint = core_library().quadsim_complaint().decode(errors="replace")
-                raise DivergenceError(f"the plant diverged: MuJoCo reports {complaint}", time=self.time)
-            if why == End.DIVERGED:
-                raise DivergenceError("the plant diverged: its state is not finite or not plausible", time=self.time)
-            self._check_warnings()
-            if why == End.INVALID:
-                assert loop is not None
-                problem = check_command(np.array(loop.answer))
-                raise CommandError(str(problem), time=self.time)
+            why = fly(v, loop, sensing, rows, command.ctypes.data, end)
+            complaint = core_library().quadsim_complaint() if why == End.FAILED else b""
+            self.check(why, loop, complaint)
             if why == End.DUE:
                 assert loop is not None
                 assert ask is not None
@@ -373,6 +378,56 @@ class Plant:
                 if (problem := check_command(answer)) is not None:
                     raise CommandError(problem, time=self.time)
                 loop.answer[:], loop.until = answer, loop.stride
+
+    def check(self, why: int, loop: Struct | None, complaint: bytes) -> None:
+        """Raise what ended a flight by the core, for this reason; `complaint` is MuJoCo's.
+
+        Raises:
+            CommandError: the inner loop's answer is not four finite numbers.
+            DivergenceError: the state is no longer finite or plausible.
+        """
+        if why == End.FAILED:
+            text = complaint.decode(errors="replace")
+            raise DivergenceError(f"the plant diverged: MuJoCo reports {text}", time=self.time)
+        if why == End.DIVERGED:
+            raise DivergenceError("the plant diverged: its state is not finite or not plausible", time=self.time)
+        self._check_warnings()
+        if why == End.INVALID:
+            assert loop is not None
+            problem = check_command(np.array(loop.answer))
+            raise CommandError(str(problem), time=self.time)
+
+    @property
+    def unattended(self) -> bool:
+        """Whether the core can fly all periods to come by itself: nothing changes, and nothing is drawn."""
+        attended = self._pending or self._own or self._moving or self._wind is not None
+        return not (attended or self.effects.thrust_noise is not None or self.effects.disturbance is not None)
+
+    def stage(self, steps: int) -> int:
+        """Apply the changes that are due, and draw; return how many of the next physics steps may be flown at once.
+
+        Raises:
+            FlightError: a force of the user raised.
+        """
+        self._change()
+        if self._own:
+            steps = 1
+        elif self._pending:
+            steps = min(steps, self._pending[0][0] - self._step)
+        self._draw(steps)
+        if self._own:
+            self._drawn["disturbance"][self._rows.row] += self._own_wrench()
+        return steps
+
+    @property
+    def watched(self) -> bool:
+        """Whether MuJoCo's warnings are to be read after each call of the core, by `check`."""
+        return self._data is not None
+
+    @property
+    def structs(self) -> tuple[Struct, Struct]:
+        """The core's vehicle, and the rows of the period that `begin` began."""
+        return self._struct, self._rows
 
     def _draw(self, steps: int) -> None:
         """Draw for the next steps of the period."""
@@ -384,6 +439,8 @@ class Plant:
             drawn["noise"][rows] = of_noise.standard_normal((steps, N_ROTORS))
         if self.effects.disturbance is not None:
             drawn["disturbance"][rows] = self.effects.disturbance.draw(steps, self.timestep, of_disturbance)
+        elif self._own:
+            drawn["disturbance"][rows] = 0.0
         if self._moving:
             times = self.timestep * np.arange(self._step, self._step + steps, dtype=np.float64)
             positions = np.stack([obstacle.positions(times) for obstacle in self._moving], axis=1)
@@ -440,7 +497,7 @@ class Plant:
             RaisedError: a force raised an exception.
         """
         time, total = self.time, np.zeros(6)
-        state = physics_to_state(self._physics)[0]
+        state = physics_to_state(self.physics[None])[0]
         for force in self._own:
             name = getattr(force, "__name__", type(force).__name__)
             with user_code(lambda error, name=name: RaisedError(f"the force {name}", error, time=time)):  # type: ignore[misc]
@@ -452,6 +509,8 @@ class Plant:
         return total
 
     def _check_warnings(self) -> None:
+        if self._data is None:
+            return
         counts = self._data.warning.number
         if counts.any() and (raised := [kind.name for kind in _NUMERICAL_WARNINGS if counts[int(kind)]]):
             raise DivergenceError(f"the plant diverged: MuJoCo reports {', '.join(raised)}", time=self.time)

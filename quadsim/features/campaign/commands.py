@@ -275,11 +275,11 @@ def owns(directory: Path) -> bool:
     return is_campaign(directory)
 
 
-def drawn_flights(scenario: Scenario, campaign: str) -> Plan:
+def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -> Plan:
     """Draw a campaign's flights for a scenario that need not be its own; see `quadsim.features.campaign.plan`."""
     from quadsim.features.campaign.plan import drawn_flights as draw
 
-    return draw(scenario, campaign)
+    return draw(scenario, vary)
 
 
 def check_advice(directory: File) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
@@ -41,6 +42,8 @@ from quadsim.scenarios.schema.settings import (
 from quadsim.scenarios.schema.writing import plain
 
 FIRST: Final = 5  # flights of which one at least has to be possible
+DRAWN: Final = 1000
+"""Flights that are drawn where entries of `[[vary]]` are given without a campaign."""
 DrawnChange = tuple[Varied, Value]
 _OF_VEHICLE: Final = ("vehicle", "vehicle.file")  # fields that choose the vehicle
 
@@ -335,12 +338,31 @@ def check_ends(entries: Iterable[Varied], check: Callable[[Varied, Value], objec
                 raise InputError(str(error) if named else f"{where}: {error}") from error
 
 
-def drawn_flights(scenario: Scenario, campaign: str) -> Plan:
-    """The draws of a campaign, with its `[set]`, for a scenario that need not be its own."""
-    data = read_campaign(campaign)
+def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -> Plan:
+    """The draws of a campaign, with its `[set]`, for a scenario that need not be its own.
+
+    Args:
+        scenario: the scenario that they vary.
+        vary: the campaign's name or file; or entries as of its `[[vary]]`, of which `DRAWN` flights are drawn, or more
+            to have each combination of grids as often as another.
+
+    Raises:
+        InputError: there is no such campaign, or what it draws cannot be flown.
+    """
+    if not isinstance(vary, str):
+        entries = list(vary)
+        cells = math.prod(len(entry["values"]) for entry in entries if _is_grid(entry))
+        return make_plan(scenario, {"flights": max(1, -(-DRAWN // cells)) * cells, "vary": entries})
+    data = read_campaign(vary)
     if data.get("set"):
         merged = merge(scenario.tables, data["set"])
-        scenario = scenario.derive(merged, source=f"{scenario.name}, as {campaign} sets it")
+        scenario = scenario.derive(merged, source=f"{scenario.name}, as {vary} sets it")
     return make_plan(
         scenario, {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
     )
+
+
+def _is_grid(entry: Any) -> bool:
+    """Whether an entry has the values of a grid; what is wrong with it is told when it is parsed."""
+    values = entry.get("values") if isinstance(entry, Mapping) else None
+    return isinstance(values, list | tuple) and len(values) > 0 and entry.get("distribution") == "grid"

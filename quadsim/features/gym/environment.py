@@ -2,47 +2,28 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
-from gymnasium.vector import VectorEnv
 
 from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import FlightError, ParameterError
-from quadsim.features.entries import commands_of
+from quadsim.features.gym.episodes import Episode, Episodes, Variation
+from quadsim.features.gym.rewards import Reward, RewardHook, nearness
 from quadsim.features.gym.spaces import USUAL, Action, Actions, Observations
-from quadsim.flight.audit import Limit
-from quadsim.flight.log import FlightLog, PeriodLog
 from quadsim.report.film.camera import Camera
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
-from quadsim.scenarios.assembly import Assembly, preferring_core
-from quadsim.scenarios.catalogue import scenario_names
-from quadsim.scenarios.loading import load_scenario
-from quadsim.scenarios.schema.base import LARGEST_WHOLE
-from quadsim.scenarios.schema.bases import read_scenario
+from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.schema.scenario import Scenario
-from quadsim.sim.physics import Observation, one_period
-from quadsim.state import REFERENCE_STATES, Array, wrapped
-
-Reward = Callable[[Array, Array, Array], float]
-"""Function of the true state (12,) after a step, the reference (4,) and the commanded rotor speeds (4,) [rad/s]."""
-
-
-def nearness(state: Array, reference: Array, speeds: Array) -> float:
-    """Default reward, exp(-d) in (0, 1], with d the distance from the reference [m] plus the yaw error [rad].
-
-    It is never negative, so ending an episode early never pays.
-    """
-    error = state[list(REFERENCE_STATES)] - reference
-    return math.exp(-math.hypot(*error[:3].tolist()) - abs(wrapped(float(error[3]))))
+from quadsim.sim.margins import Margins, violated
+from quadsim.sim.physics import Observation
+from quadsim.state import INDEX, Array
 
 
 class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
@@ -86,12 +67,12 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
     def __init__(
         self,
-        scenario: Scenario | str | Path,
+        scenario: Scenario | str | Path | Episodes,
         *,
         action: str = "deviations",
         observation: Sequence[str] = USUAL,
         preview: int | None = None,
-        vary: str | Path | None = None,
+        vary: Variation | None = None,
         reward: Reward = nearness,
         render_mode: str | None = None,
         width: int = 640,
@@ -114,9 +95,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         Raises:
             InputError: an argument is not allowed.
         """
-        scenario = preferring_core(load_scenario(scenario))
-        self._plan = None if vary is None else commands_of("campaign").drawn_flights(scenario, str(vary))
-        self._base = scenario if self._plan is None else self._plan.scenario
+        self.episodes = scenario if isinstance(scenario, Episodes) else Episodes(scenario, vary)
+        self._base = self.episodes.base
         if render_mode not in (None, "rgb_array"):
             raise ParameterError("", "render_mode", render_mode, "rgb_array or None")
         horizon = self._base.controller.horizon
@@ -128,17 +108,24 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self.actions = Actions(action, self._base, Assembly(self._base).vehicle)
         self.action_space, self.observation_space = self.actions.space, self.observations.space
         self.render_mode, self._size = render_mode, (width, height)
-        self._preview, self._reward, self._action = preview, reward, action
+        self.preview, self._reward, self._action = preview, RewardHook(reward), action
         self._flight: Rollout | None = None
         self._camera: Camera | None = None
         self._closed = False
         self.scenario = self._base
-        self.limits = self._assembly(self._base).limits
+        self.limits = self.episodes.assembly(self._base).limits
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
         """The names of `limits`, in the order of `constraint_values`."""
         return tuple(limit.name for limit in self.limits)
+
+    @property
+    def outcome(self) -> tuple[Array, Array, Array]:
+        """What the last step's reward depends on: true state (12,), reference (4,), commanded speeds (4,) [rad/s]."""
+        acting = self._seen.moment.acting
+        assert acting is not None
+        return self._truth, self._seen.reference, acting
 
     @property
     def started(self) -> Rollout:
@@ -173,25 +160,44 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             ClosedEnvironmentError: `close` has been called.
         """
         self._require_open()
-        if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed <= LARGEST_WHOLE):
-            raise ParameterError("", "seed", seed, f"from 0 to {LARGEST_WHOLE}")
-        if seed is None and self._flight is None:
+        if seed is not None:
+            self.episodes.check_seed(seed)
+        elif self._flight is None:
             seed = self._base.seed
         super().reset(seed=seed)
-        scenario = self._drawn(seed, options or {})
+        return self.start(self.episodes.draw(seed, options or {}, self.np_random))
+
+    def replay(self, episode: Episode, actions: Iterable[Action]) -> Flight:
+        """Fly an episode by these actions, to their end or its own; return its flight.
+
+        Raises:
+            ClosedEnvironmentError: `close` has been called.
+        """
+        self._require_open()
+        self.start(episode)
+        for action in actions:
+            if self.started.done:
+                break
+            self.step(action)
+        return self.flight()
+
+    def start(self, episode: Episode) -> tuple[Array, dict[str, Any]]:
+        """Start an episode that has been drawn; see `reset`."""
+        scenario = episode.scenario
         if self._flight is not None:
             self._flight.close()
-        self.scenario = scenario
-        if self._plan is not None:
+        self.scenario, self._episode = scenario, episode
+        if self.episodes.varied:
             self.actions = Actions(self._action, scenario, Assembly(scenario).vehicle)
         # events that change the controller need a real one
         law: Any = None if scenario.controller_changes else Agent(scenario.controller.horizon)
-        self._flight = Rollout(self._assembly(scenario), law)
+        self._flight = Rollout(self.episodes.assembly(scenario), law)
         self.limits = self._flight.limits
+        self._margins = Margins(self.limits, scenario.plant.timestep)
         self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
-        self._seen, log = self._flight.observation, self._flight.loop.log()
-        self._truth, self._rotors = log.plant.state[-1], log.plant.speeds[-1]
-        return self._vector(self._seen), self._info(*_margins(self.limits, log))
+        self._seen = self._flight.observation
+        self._truth, self._rotors = self._flight.loop.truth, self._flight.loop.rotors
+        return self._vector(self._seen), self._info(*self._margins.of_start(self._flight.loop.physics, self._rotors))
 
     def step(self, action: Action) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Fly one control period.
@@ -211,30 +217,23 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if self._answered and self._answered[0] == flight.k and np.array_equal(self._answered[1], action):
             command = self._answered[2]
         else:
-            command = self.actions.command(action, flight.loop.controller.horizon)
+            command = self.actions.command(action, flight.loop.controller.horizon, float(seen.state[INDEX["yaw"]]))
         nothing = np.full(len(self.limits), np.inf)
         try:
             sample = flight.loop.step(command)
         except FlightError:
             return self._vector(seen), 0.0, True, False, self._info(nothing, nothing)
-        period = one_period(sample, self.scenario.plant.timestep)
-        self._truth, self._rotors = period.plant.state[-1], period.plant.speeds[-1]
+        self._truth, self._rotors = flight.loop.truth, flight.loop.rotors
         try:
             self._seen = flight.loop.observation
         except FlightError:  # lost: no controller would be called any more
+            rows = flight.loop.followed(float(self._truth[INDEX["yaw"]]))
             moment = replace(seen.moment, acting=sample.speeds)
-            rows = seen.preview
             self._seen = replace(seen, state=self._truth, reference=rows[0], preview=rows[1:], moment=moment)
         terminated = flight.loop.reason is not None or self._seen.moment.phase is Phase.CRASHED
-        reward = float(self._reward(self._truth, self._seen.reference, sample.speeds))
-        truncated = flight.done and not terminated
-        return (
-            self._vector(self._seen),
-            reward,
-            terminated,
-            truncated,
-            self._info(*_margins(self.limits, period, first=1)),
-        )
+        info = self._info(*self._margins.of_period(sample))
+        reward = self._reward.of_one(*self.outcome, info["margins"])
+        return self._vector(self._seen), reward, terminated, flight.done and not terminated, info
 
     def controller_action(self) -> Action:
         """Return the command of the scenario's controller at this time, computed once per period.
@@ -304,48 +303,28 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             self._camera.close()
             self._camera = None
 
-    def _assembly(self, scenario: Scenario) -> Assembly:
-        """Return the parts of an episode, with the bounds of a user's controller where a campaign varies it."""
-        assembly = Assembly(scenario)
-        return assembly if self._plan is None else assembly.audited()
-
-    def _drawn(self, seed: int | None, options: Mapping[str, Any]) -> Scenario:
-        """The scenario of the episode that starts."""
-        if self._plan is None:
-            if options:
-                raise ParameterError("", "options", options, "absent where nothing varies")
-            seed = int(self.np_random.integers(2**31)) if seed is None else seed
-            return self._base.altered(seed=seed)
-        flights = self._plan.spec.flights
-        flight = options["flight"] if "flight" in options else int(self.np_random.integers(flights))
-        if set(options) - {"flight"} or not (isinstance(flight, int | np.integer) and 0 <= flight < flights):
-            raise ParameterError("", "options", options, f"absent, or a flight from 0 to {flights - 1}")
-        return self._plan.of(int(flight))
-
     def _vector(self, seen: Observation) -> Array:
         """Return the observation; beyond its end the reference keeps its last value."""
         rows, acting = seen.preview, seen.moment.acting
         assert acting is not None
-        if len(rows) < self._preview:
+        if len(rows) < self.preview:
             last = rows[-1:] if len(rows) else seen.reference[None]
-            rows = np.concatenate([rows, np.repeat(last, self._preview - len(rows), axis=0)])
-        return self.observations.of(seen.state, rows[: self._preview], acting)
+            rows = np.concatenate([rows, np.repeat(last, self.preview - len(rows), axis=0)])
+        return self.observations.of(seen.state, rows[: self.preview], acting)
 
     def _info(self, worst: Array, sampled: Array) -> dict[str, Any]:
-        beyond = [
-            limit.required and bool(limit.violated(margin) or limit.violated(at_end, sampled=True))
-            for limit, margin, at_end in zip(self.limits, worst.tolist(), sampled.tolist(), strict=True)
-        ]
+        self.violated = beyond = violated(self._margins.tolerances, self._margins.required, worst, sampled)
         loop, names = self.started.loop, self.constraint_names
         return {
             "margins": dict(zip(names, worst.tolist(), strict=True)),
             "margins_sampled": dict(zip(names, sampled.tolist(), strict=True)),
             "constraint_values": -worst,
-            "constraint_violation": int(any(beyond)),
-            "cost": float(sum(beyond)),
+            "constraint_violation": int(beyond.any()),
+            "cost": float(beyond.sum()),
             "time": loop.time,
             "phase": str(self._seen.moment.phase),
             "reason": loop.reason or "",
+            **self._episode.info,
         }
 
 
@@ -364,90 +343,3 @@ class Agent:
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Never called: each step has a command."""
         raise NotImplementedError
-
-
-def _margins(limits: Sequence[Limit], log: FlightLog | PeriodLog, first: int = 0) -> tuple[Array, Array]:
-    """(m,) smallest margins of a log, from this row of the plant on, and at its end; inf where there is none."""
-    smallest = np.full((2, len(limits)), np.inf)
-    for i, limit in enumerate(limits):
-        t, values = limit.source.finest(log)
-        margins = np.where(limit.holds_at(t), limit.margin(values), np.inf)[first * (limit.source.plant is not None) :]
-        if margins.size:
-            smallest[:, i] = margins.min(), margins[-1]
-    return smallest[0], smallest[1]
-
-
-def environment_id(name: str) -> str:
-    """The id of a scenario of that name.
-
-    Examples:
-        >>> import quadsim.gym
-        >>> quadsim.gym.environment_id("hummingbird-figure-eight")
-        'quadsim/HummingbirdFigureEight-v0'
-    """
-    words = name.replace("_", "-").replace(".", "-").split("-")
-    return f"quadsim/{''.join(word[:1].upper() + word[1:] for word in words)}-v0"
-
-
-def register_library() -> None:
-    """Register the shipped scenarios, without checking them."""
-    for name in scenario_names():
-        scenario = Scenario.parse(read_scenario(name))
-        gymnasium.registry.setdefault(environment_id(name), _specification(scenario, scenario=name))
-
-
-def _specification(flown_scenario: Scenario, vary: str | Path | None = None, **kwargs: Any) -> EnvSpec:
-    """Describe the environment; its time limit is the duration, which a campaign gives to each episode anew."""
-    entry_point = f"{__name__}:{QuadrotorEnv.__name__}"
-    most = flown_scenario.periods if vary is None else None
-    return EnvSpec(environment_id(flown_scenario.name), entry_point, max_episode_steps=most, kwargs=kwargs)
-
-
-def make_env(scenario: Scenario | str | Path, **options: Any) -> gymnasium.Env[Any, Any]:
-    """The environment of any scenario, with the wrappers of `gymnasium.make`: its time limit is the duration.
-
-    With `vary` each episode ends at its own duration; `gymnasium.make` of a registered id keeps the limit of the
-    scenario that ships, and takes another as `max_episode_steps`.
-
-    Args:
-        scenario: it, or its name or file.
-        options: what `QuadrotorEnv` takes: `action`, `observation`, `preview`, `vary`, `reward`, `render_mode`, ...
-
-    Raises:
-        InputError: the scenario or an option is not possible.
-
-    Examples:
-        >>> import quadsim.gym
-        >>> env = quadsim.gym.make_env("hover", action="speeds", observation=("state",))
-        >>> observation, info = env.reset(seed=7)
-        >>> observation.shape, env.spec.max_episode_steps, info["constraint_violation"]
-        ((12,), 200, 0)
-        >>> env.close()
-    """
-    scenario = load_scenario(scenario)
-    return gymnasium.make(_specification(scenario, options.get("vary"), scenario=scenario), **options)
-
-
-def make_vec(scenario: Scenario | str | Path, num_envs: int, **options: Any) -> VectorEnv:
-    """The same several times over, each in a process of its own; an episode's end is reset in the next step.
-
-    Args:
-        scenario: it, or its name or file.
-        num_envs: how many.
-        options: as of `make_env`.
-
-    Raises:
-        InputError: as of `make_env`.
-
-    Examples:
-        >>> import quadsim.gym
-        >>> envs = quadsim.gym.make_vec("hover", 2)
-        >>> envs.reset(seed=7)[0].shape, str(envs.metadata["autoreset_mode"])
-        ((2, 216), 'AutoresetMode.NEXT_STEP')
-        >>> envs.close()
-    """
-    if num_envs < 1:
-        raise ParameterError("", "num_envs", num_envs, "at least 1")
-    scenario = load_scenario(scenario)
-    specification = _specification(scenario, options.get("vary"), scenario=scenario)
-    return gymnasium.make_vec(specification, num_envs, "async", **options)

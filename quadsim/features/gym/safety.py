@@ -67,6 +67,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         base = env.unwrapped
         if not isinstance(base, QuadrotorEnv):
             raise ParameterError("", "env", type(base).__name__, "an environment of quadsim.gym")
+        base.actions.require_held()
         scenario = base.scenario
         if controller is not None:
             scenario = scenario.replace({"controller": dict(controller)})

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.flight.log import ControlLog, columns_of
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.tables.bounded import Bounded
+from quadsim.rotation import euler_to_quaternion
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, Array
@@ -23,11 +25,15 @@ from quadsim.vehicle import N_ROTORS, Vehicle, span
 
 Action = NDArray[np.floating]
 
-ACTIONS: Final = ("deviations", "speeds", "rates")
+ACTIONS: Final = ("deviations", "rotors", "speeds", "thrust", "rates", "attitude")
+TARGETS: Final = ("rates", "attitude")
+"""The actions that are targets of an autopilot."""
 PARTS: Final = ("state", "preview", "ahead", "command")
 USUAL: Final = ("state", "preview", "command")
 DIVERGED: Final = 1e6  # magnitude that the plant takes for divergence
 LARGEST_RATES: Final = (6.0, 6.0, 2.0)  # body rates at an action of 1 [rad/s]
+FULL_TILT: Final = math.radians(35.0)  # roll and pitch at an action of 1 [rad]
+ACTION_ROUNDING: Final = 1e-6  # share of its range by which an action may exceed it, as it may be a float32
 GIVEN: Final = "given"
 """Status of a command that no controller computed."""
 BANDWIDTH: Final = (20.0, 20.0, 20.0)  # of the autopilot's rate loop, proportional alone [1/s]
@@ -38,9 +44,20 @@ class Actions:
     """From actions (4,) to commands and back, within the controller's bounds on rotor speeds or else the vehicle's.
 
     - `speeds`: rotor speeds [rad/s], as they are.
-    - `deviations`: in [-1, 1]; 0 is hover, -1 and 1 the lowest and the highest speed, linear on either side.
+    - `deviations`, also called `rotors`: in [-1, 1]; 0 is hover, -1 and 1 the lowest and the highest speed, linear on
+      either side.
+    - `thrust`: in [-1, 1]; the thrust of each rotor, 0 that in hover, -1 and 1 the least and the most, linear on either
+      side.
     - `rates`: in [-1, 1]; collective thrust, 0 the weight and -1 and 1 the least and the most that rotors have, and
       body rates as shares of `LARGEST_RATES`, flown by an autopilot.
+    - `attitude`: in [-1, 1]; collective thrust as with `rates`, roll and pitch as shares of `FULL_TILT`, and the yaw
+      rate as a share of the largest one, flown by the same autopilot.
+
+    Attributes:
+        kind: the kind.
+        space: of an action.
+        scale: what one vehicle's actions are multiples of; those of several can be stacked for `action_commands`.
+        numbers: of a command: 4, or 8 with an attitude.
 
     Raises:
         UnknownNameError: there is no such kind.
@@ -56,7 +73,11 @@ class Actions:
         else:
             bounds, owner = ActuatorBounds.of_vehicle(vehicle), f"vehicle {vehicle.name}"
         low, high, hover = bounds.u_min, bounds.u_max, vehicle.hover_speeds
-        self._kind = kind
+        self.kind = kind
+        self.numbers = 8 if kind == "attitude" else N_ROTORS
+        self.scale: dict[str, Array] = {}
+        self._vehicle = vehicle
+        self._settings: AutopilotSettings | None = None
         if kind == "speeds":
             self.space = Box(low, high, dtype=np.float64)
             return
@@ -64,58 +85,88 @@ class Actions:
             hover_bounds = [float(low[0]), float(high[0])]
             raise ParameterError(owner, "speed", hover_bounds, f"below and above the hover speed, {span(hover)} rad/s")
         self.space = Box(-1.0, 1.0, (N_ROTORS,), dtype=np.float32)
-        self._hover, self._down, self._up = hover, hover - low, high - hover
-        if kind == "rates":
+        if kind in TARGETS:
             timestep = scenario.plant.timestep
             rate = 1.0 / (max(1, round(INNER_PERIOD / timestep)) * timestep)
-            speeds = (float(low[0]), float(high[0]))
-            self._autopilot = _rate_loop(vehicle, BANDWIDTH, rate, speeds)
-            self._holding = _rate_loop(vehicle, _held_gains(scenario.control_period), rate, speeds)
-            self._weight = vehicle.mass * vehicle.gravity
-            self._thrusts = [vehicle.level_thrust(float(speed)) for speed in (low.max(), high.min())]
+            none = (0.0, 0.0, 0.0)
+            self._settings = AutopilotSettings(rate=rate, p=BANDWIDTH, i=none, d=none, gyro_cutoff=0.0, delay=0.0)
+            self._speeds = float(low[0]), float(high[0])
+            hover = np.array(vehicle.mass * vehicle.gravity)
+            low, high = (np.array(vehicle.level_thrust(float(speed))) for speed in (low.max(), high.min()))
+            self.scale["half_period"] = np.array(0.5 * scenario.control_period)
+        elif kind == "thrust":
+            low, hover, high = vehicle.thrusts(low), vehicle.thrusts(hover), vehicle.thrusts(high)
+            linear, quadratic = vehicle.thrust_law
+            self.scale |= {"linear": np.array(linear), "quadratic": quadratic}
+        self.scale |= {"hover": hover, "down": hover - low, "up": high - hover}
 
-    def command(self, action: Action, horizon: int) -> Command:
-        """The command, a plan of this many rows, for an action.
+    def autopilot(self) -> Autopilot | None:
+        """Return a new autopilot that flies the commands; None where they are rotor speeds."""
+        if self._settings is None:
+            return None
+        return Autopilot(self._vehicle, self._settings, speeds=self._speeds)
+
+    @cached_property
+    def _autopilot(self) -> Autopilot | None:
+        return self.autopilot()
+
+    def command(self, action: Action, horizon: int, yaw: float = 0.0, *, bounded: bool = True) -> Command:
+        """The command, a plan of this many rows, for an action at a measured yaw [rad].
 
         Raises:
-            ParameterError: it has another shape than `space`, or is not of numbers.
+            ParameterError: it has another shape than `space`, is not of numbers, or, where it is to be `bounded`, is
+                outside `space`.
         """
-        if np.shape(action) != self.space.shape:
-            raise ParameterError("", "action", np.shape(action), f"of shape {self.space.shape}")
-        kind = np.asarray(action).dtype
-        if kind.kind not in "fiub":
-            raise ParameterError("", "action", kind.name, "of numbers")
-        speeds, inner = np.array(action, np.float64), None
-        if self._kind == "rates":
-            inner, thrust = self._autopilot, float(speeds[0])
-            collective = self._weight + abs(thrust) * (self._thrusts[thrust > 0.0] - self._weight)
-            speeds = np.append(collective, speeds[1:] * LARGEST_RATES)
-        elif self._kind == "deviations":
-            speeds = self._hover + speeds * np.where(speeds < 0.0, self._down, self._up)
-        plan = np.broadcast_to(speeds, (horizon, N_ROTORS))
-        return Command(speeds=speeds, plan=plan, status=GIVEN, inner=inner)
+        numbers = check_action(action, self.space, bounded=bounded)
+        scale = {name: values[None] for name, values in self.scale.items()}
+        speeds = action_commands(self.kind, scale, numbers[None], np.array([yaw]))[0]
+        plan = np.broadcast_to(speeds, (horizon, speeds.size))
+        return Command(speeds=speeds, plan=plan, status=GIVEN, inner=self._autopilot)
+
+    @cached_property
+    def _holding(self) -> Autopilot | None:
+        """The rate loop whose first answer, held for a control period, turns as far as `BANDWIDTH` does within it."""
+        if self._settings is None:
+            return None
+        period = 2.0 * float(self.scale["half_period"])
+        gains = tuple((1.0 - math.exp(-bandwidth * period)) / period for bandwidth in BANDWIDTH)
+        return Autopilot(self._vehicle, replace(self._settings, p=gains), speeds=self._speeds)
+
+    def require_held(self) -> None:
+        """Refuse actions that are not rotor speeds to hold, and do not become any by `held_speeds`.
+
+        Raises:
+            ParameterError: they are attitudes.
+        """
+        if self.kind == "attitude":
+            allowed = [kind for kind in ACTIONS if kind != "attitude"]
+            raise ParameterError(
+                "", "action", self.kind, f"one of {', '.join(allowed)}: they become rotor speeds to hold"
+            )
 
     def held_speeds(self, action: Action, body_rates: Array) -> Array:
         """Return the rotor speeds (4,) [rad/s] that an action asks for, if they are to be held for a control period T.
 
         For `rates`, they give its thrust, and at the period's end the body rates at which its loop arrives: that turns
-        from omega to omega_c with the bandwidth b, so it covers a share 1 - exp(-b T), and a constant acceleration of
-        (1 - exp(-b T)) / T (omega_c - omega) covers the same.
+        from omega to omega_c with the bandwidth b, so it covers a share 1 - exp(-b T), as a constant acceleration of
+        (1 - exp(-b T)) / T (omega_c - omega) does.
 
         Args:
-            action: (4,) the action.
+            action: (4,) the action, which may be outside `space`, or NaN; then the speeds are, too.
             body_rates: (3,) measured omega [rad/s].
 
         Raises:
-            ParameterError: see `command`.
+            ParameterError: the action has another shape than `space`, is not of numbers, or is an attitude.
         """
-        command = self.command(action, 1)
-        if command.inner is None:
-            return command.speeds
-        if not np.isfinite(command.speeds).all():
+        self.require_held()
+        target = self.command(action, 1, bounded=False).speeds
+        if self._holding is None:
+            return target
+        if not np.isfinite(target).all():
             return np.full(N_ROTORS, np.nan)
-        rotors, level = np.zeros(N_ROTORS), np.array([1.0, 0.0, 0.0, 0.0])  # a rate loop uses neither
-        return self._holding.speeds(0.0, command.speeds, body_rates, rotors, level)
+        rotors = np.zeros(N_ROTORS)
+        level = np.array([1.0, 0.0, 0.0, 0.0])  # neither matters to body rates
+        return self._holding.speeds(0.0, target, body_rates, rotors, level)
 
     def of(self, speeds: Array) -> Action:
         """The action that commands rotor speeds (4,) [rad/s]; beyond [-1, 1] where these are beyond their bounds.
@@ -123,25 +174,86 @@ class Actions:
         Raises:
             ParameterError: actions are not rotor speeds.
         """
-        if self._kind == "rates":
-            rule = "deviations or speeds: rotor speeds are no thrust and rates to hold"
-            raise ParameterError("", "action", "rates", rule)
-        if self._kind == "speeds":
+        if self.kind in TARGETS:
+            rule = "deviations, speeds or thrust: rotor speeds are no target to hold"
+            raise ParameterError("", "action", self.kind, rule)
+        if self.kind == "speeds":
             return np.array(speeds, float)
-        deviation = speeds - self._hover
-        return (deviation / np.where(deviation < 0.0, self._down, self._up)).astype(np.float32)
+        amount = self._vehicle.thrusts(speeds) if self.kind == "thrust" else speeds
+        deviation = amount - self.scale["hover"]
+        return (deviation / np.where(deviation < 0.0, self.scale["down"], self.scale["up"])).astype(np.float32)
 
 
-def _rate_loop(vehicle: Vehicle, gains: tuple[float, ...], rate: float, speeds: tuple[float, float]) -> Autopilot:
-    """Return a proportional rate loop, about body x, y, z [1/s], without filter and delay, within rotor speeds."""
-    none = (0.0, 0.0, 0.0)
-    settings = AutopilotSettings(rate=rate, p=gains, i=none, d=none, gyro_cutoff=0.0, delay=0.0)
-    return Autopilot(vehicle, settings, speeds=speeds)
+def check_action(action: Action, space: Box, *, bounded: bool = True) -> Array:
+    """Return an action, or one for each environment, as float64.
+
+    One that is NaN ends its episode; the others have to be within the space, up to rounding, where they are `bounded`.
+
+    Raises:
+        ParameterError: it has another shape than the space, is not of numbers, or is outside.
+    """
+    if np.shape(action) != space.shape:
+        raise ParameterError("", "action", np.shape(action), f"of shape {space.shape}")
+    kind = np.asarray(action).dtype
+    if kind.kind not in "fiub":
+        raise ParameterError("", "action", kind.name, "of numbers")
+    numbers = np.array(action, np.float64)
+    if not bounded:
+        return numbers
+    room = ACTION_ROUNDING * (space.high - space.low)
+    outside = (numbers < space.low - room) | (numbers > space.high + room)  # False for NaN
+    if outside.any():
+        first = tuple(np.argwhere(outside)[0].tolist())
+        where = "".join(f"[{i}]" for i in first)
+        allowed = f"from {space.low[first]:g} to {space.high[first]:g}, the action space (gymnasium's ClipAction clips)"
+        raise ParameterError("", f"action{where}", float(numbers[first]), allowed)
+    return numbers
 
 
-def _held_gains(period: float) -> tuple[float, ...]:
-    """Return the gains [1/s] whose first answer, held for a period [s], turns as far as `BANDWIDTH` does within it."""
-    return tuple((1.0 - math.exp(-bandwidth * period)) / period for bandwidth in BANDWIDTH)
+def action_commands(kind: str, scale: Mapping[str, Array], actions: Array, yaw: Array) -> Array:
+    """Return the commands (N, 4) or (N, 8) of actions (N, 4) of a kind.
+
+    Args:
+        kind: of `ACTIONS`.
+        scale: what actions are multiples of, of N vehicles or one: `Actions.scale` with an axis before.
+        actions: within their space, or NaN.
+        yaw: (N,) measured [rad], for `attitude`.
+    """
+    if kind == "speeds":
+        return actions
+    if kind in TARGETS:
+        return _targets_of(kind, scale, actions, yaw)
+    amounts = scale["hover"] + actions * np.where(actions < 0.0, scale["down"], scale["up"])
+    if kind == "thrust":
+        return _speeds_of(scale["linear"], scale["quadratic"], amounts)
+    return amounts
+
+
+def _targets_of(kind: str, scale: Mapping[str, Array], actions: Array, yaw: Array) -> Array:
+    """Collective thrust and body rates; with `attitude` the attitude too, at the yaw of the middle of the period."""
+    share = actions[:, 0]
+    targets = np.empty((len(actions), 4 if kind == "rates" else 8))
+    targets[:, 0] = scale["hover"] + np.abs(share) * (np.where(share < 0.0, -scale["down"], scale["up"]))
+    if kind == "rates":
+        targets[:, 1:] = actions[:, 1:] * LARGEST_RATES
+        return targets
+    turning = actions[:, 3] * LARGEST_RATES[2]
+    euler = np.empty((len(actions), 3))
+    euler[:, :2] = actions[:, 1:3] * FULL_TILT
+    euler[:, 2] = yaw + scale["half_period"] * turning
+    targets[:, 1:3] = 0.0
+    targets[:, 3] = turning
+    targets[:, 4:] = euler_to_quaternion(euler)
+    return targets
+
+
+def _speeds_of(linear: Array, quadratic: Array, thrusts: Array) -> Array:
+    """Rotor speeds of thrusts linear w + quadratic w^2 [N], as `quadsim.vehicle.Vehicle.speeds`."""
+    linear = linear[:, None]
+    root = np.sqrt(np.maximum(np.square(linear) + 4.0 * quadratic * thrusts, 0.0))
+    return np.where(
+        linear > 0.0, 2.0 * thrusts / (linear + root + (linear <= 0.0)), (root - linear) / (2.0 * quadratic)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,6 +298,23 @@ class Observations:
 
     def of(self, state: Array, preview: Array, command: Array) -> Array:
         """The observation of a state (12,), a preview (n, 4) and a command (4,)."""
-        ahead = preview - state[list(REFERENCE_STATES)]
-        values = {"state": state, "preview": preview.ravel(), "ahead": ahead.ravel(), "command": command}
-        return np.concatenate([values[part] for part in self._parts])
+        return self.of_many(state[None], preview[None], command[None])[0]
+
+    def of_many(self, states: Array, previews: Array, commands: Array) -> Array:
+        """(N, n_o) observations of states (N, 12), previews (N, n, 4) and commands (N, 4)."""
+        count = len(states)
+        ahead = previews.shape[1] * len(REFERENCE_STATES)
+        observed = np.empty((count, len(self.layout)))
+        at = 0
+        for part in self._parts:
+            if part == "state":
+                values = states
+            elif part == "command":
+                values = commands
+            elif part == "preview":
+                values = previews.reshape(count, ahead)
+            else:
+                values = (previews - states[:, None, REFERENCE_STATES]).reshape(count, ahead)
+            observed[:, at : at + values.shape[1]] = values
+            at += values.shape[1]
+        return observed

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from quadsim.features.gym.environment import QuadrotorEnv
+from quadsim.features.gym.vector import QuadrotorVectorEnv
 from quadsim.state import EULER, REFERENCE_STATES, Array, wrapped
 
 PRECISION: Final = 3.0
@@ -67,6 +68,8 @@ TASKS: Final[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
 
 def register_tasks() -> None:
     """Register the tasks, without checking their scenarios."""
-    entry_point = f"{QuadrotorEnv.__module__}:{QuadrotorEnv.__name__}"
+    single = f"{QuadrotorEnv.__module__}:{QuadrotorEnv.__name__}"
+    many = f"{QuadrotorVectorEnv.__module__}:{QuadrotorVectorEnv.__name__}"
     for name, arguments in TASKS.items():
-        gymnasium.registry.setdefault(name, EnvSpec(name, entry_point, kwargs=dict(arguments)))
+        specification = EnvSpec(name, single, kwargs=dict(arguments), vector_entry_point=many)
+        gymnasium.registry.setdefault(name, specification)
