@@ -1,209 +1,414 @@
-"""PPO learns to stop and hold a place by thrust and body rates: `python examples/ppo.py`, five minutes on one core.
+"""PPO learns to fly a figure eight by thrust and body rates: `python examples/ppo.py`, two minutes on one core.
 
-    pip install -r examples/ppo-requirements.txt
+Proximal policy optimisation (Schulman et al., 2017, "Proximal policy optimization algorithms", arXiv:1707.06347) with
+generalised advantages, in NumPy, on the vector environment of `quadsim/TrackEight-v0`.  The policy and the MPC of the
+scenario then fly the campaign `track-eight` on draws of a seed that training did not use, and are audited alike.
 
-Each episode of `ppo.toml` starts tilted and on the move; its return is the sum of 200 rewards, of 1 each at the place
-itself.  The MPC of the scenario, and doing nothing, fly the same seeded episodes as the policy that was learned.
-
-`--out` gets the learning curve (`curve.csv`, `curve.png`), how all three did (`evaluation.csv`), and the policy with
-the mean and deviation of what it observes (`policy.zip`, `normalisation.pkl`).
+`--out` gets the policy (`policy.json`), the learning curve (`curve.csv`, `curve.png`), the comparison
+(`comparison.csv`), and both campaigns (`learned/`, `mpc/`).
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any
 
-import gymnasium
 import numpy as np
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
+from ppo_policy import TASK, Policy
 
+import quadsim
 import quadsim.gym
 from quadsim.palette import COLOUR
-from quadsim.report.figure import Figure, Panel, Series
+from quadsim.report.figure import Bound, Figure, Panel, Series
 from quadsim.report.to_matplotlib import write_figure
+from quadsim.state import POSITION
 
-SCENARIO, EPISODES = "hummingbird-figure-eight", Path(__file__).with_name("ppo.toml")
-ENVIRONMENTS = 8  # side by side, in one process
-GAMMA = 0.98
-FIRST_SEED = 1_000_000  # of evaluation; training counts from 0
 Array = NDArray[Any]
-Env: TypeAlias = gymnasium.Env[Any, Any]
-Row = TypeVar("Row")
-Policy = Callable[[Env, Array], Array]
-"""The action for an environment and its observation."""
+Layers = list[Array]
+"""Weights and biases of a network in turn: W_1, b_1, W_2, b_2, ..."""
+
+PREVIEW = 4 * quadsim.gym.TASKS[TASK]["preview"]  # entries of an observation before those of the state
+PLACES = [PREVIEW + i for i in POSITION]  # its entries x, y, z
+CAMPAIGN = Path(__file__).with_name("ppo_campaign.toml")
+EVALUATION_SEED = 1  # of the campaigns; the starts of training are drawn from seed 0
+STEPS = 800_000
+CLAIM = 0.1  # RMS distance from the reference that it has to get below [m]
+FLIGHTS = 40
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rollout:
+class Settings:
+    """Numbers of the algorithm."""
+
+    environments: int = 64  # side by side
+    length: int = 64  # steps of each environment between two updates
+    epochs: int = 5  # passes over these steps
+    minibatch: int = 512  # steps
+    units: tuple[int, ...] = (32, 32)  # of the hidden layers
+    learning_rate: float = 1e-3  # at the start; it falls linearly, down to `final_share` of it
+    final_share: float = 0.02
+    discount: float = 0.97  # gamma per period: 1.6 s
+    trace: float = 0.95  # lambda of the generalised advantages
+    clip: float = 0.2  # of the probability ratio
+    deviation: float = 0.2  # of the actions, at the start
+    largest_gradient: float = 0.5  # its norm is cut off there
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurvePoint:
     """A point of the learning curve."""
 
     steps: int  # so far, of all environments
-    seconds: float  # so far, of one core [s]
-    mean_return: float  # of the episodes that ended in this rollout, flown with exploration
+    reward: float  # mean of a step since the point before, with exploration
+    error: float  # RMS distance from the reference, likewise [m]
+    lost: int  # episodes that ended early, likewise
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """What a policy does in seeded episodes."""
+    """What a controller does in the campaign."""
 
-    policy: str
-    episodes: int
-    mean_return: float
-    least_return: float
-    lost: int  # episodes that ended before their time
-    error: float  # RMS distance from the place over all periods flown [m]
-
-
-def make_env(action: str = "rates") -> Env:
-    """The task: observe place and yaw relative to the next reference, and the state; command thrust and body rates."""
-    return quadsim.gym.make_env(SCENARIO, action=action, observation=("ahead", "state"), preview=1, vary=EPISODES)
+    controller: str
+    flights: int
+    lost: int
+    violated: int  # flights with a constraint violated, those that were lost among them
+    error: float  # RMS distance from the reference, over all flights [m]
+    largest_error: float  # of a flight, likewise [m]
+    peak_tilt: float  # largest angle of the thrust axis to the vertical [deg]
 
 
-def nothing(env: Env, observation: Array) -> Array:
-    """Thrust of the weight, no turn."""
-    return np.zeros(4, np.float32)
+def forward(layers: Layers, inputs: Array) -> list[Array]:
+    """Return the inputs, the hidden layers and the output (K, m) of a network for inputs (K, n)."""
+    values = [inputs]
+    for i in range(0, len(layers), 2):
+        output = values[-1] @ layers[i] + layers[i + 1]
+        is_last = i == len(layers) - 2
+        values.append(output if is_last else np.tanh(output))
+    return values
 
 
-def mpc(env: Env, observation: Array) -> Array:
-    """The scenario's controller, where actions are rotor speeds."""
-    action: Array = env.unwrapped.controller_action()
-    return action
+def backward(layers: Layers, values: list[Array], slope: Array) -> Layers:
+    """Return the gradient by weights and biases, from that by the output (K, m) and what `forward` returned."""
+    gradient: Layers = []
+    for i in range(len(layers) - 2, -1, -2):
+        inputs = values[i // 2]
+        gradient = [inputs.T @ slope, slope.sum(axis=0), *gradient]
+        if i > 0:
+            slope = (slope @ layers[i].T) * (1.0 - inputs**2)
+    return gradient
 
 
-def evaluate(name: str, policy: Policy, env: Env, episodes: int = 50) -> Score:
-    """Fly seeded episodes, the same for every policy."""
-    returns, squares, lost = [], [], 0
-    for seed in range(FIRST_SEED, FIRST_SEED + episodes):
-        observation, _ = env.reset(seed=seed)
-        total, terminated, truncated = 0.0, False, False
-        while not (terminated or truncated):
-            observation, reward, terminated, truncated, _ = env.step(policy(env, observation))
-            total += float(reward)
-        flight = env.unwrapped.flight()
-        squares.append(sum(np.square(flight.state[axis] - flight.reference[axis]) for axis in "xyz"))
-        returns.append(total)
-        lost += terminated
-    mean, error = float(np.mean(returns)), float(np.sqrt(np.concatenate(squares).mean()))
-    return Score(policy=name, episodes=episodes, mean_return=mean, least_return=min(returns), lost=lost, error=error)
+def make_layers(rng: np.random.Generator, sizes: Sequence[int], last_gain: float) -> Layers:
+    """Return orthogonal weights with a gain of sqrt(2), or `last_gain` in the last layer, and biases of zero."""
+    layers: Layers = []
+    for i in range(len(sizes) - 1):
+        rows, columns = sizes[i], sizes[i + 1]
+        orthogonal = np.linalg.qr(rng.standard_normal((max(rows, columns), min(rows, columns))))[0]
+        if rows < columns:
+            orthogonal = orthogonal.T
+        gain = last_gain if i == len(sizes) - 2 else np.sqrt(2.0)
+        layers += [(gain * orthogonal).astype(np.float32), np.zeros(columns, np.float32)]
+    return layers
 
 
-def learn(steps: int) -> tuple[Any, Any, list[Rollout]]:
-    """PPO on normalised observations and returns: the model, the normalisation, the learning curve."""
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+class Adam:
+    """Gradient descent with momentum and a step size for each parameter (Kingma and Ba, 2015, arXiv:1412.6980)."""
 
-    curve: list[Rollout] = []
-    start = time.process_time()
+    def __init__(self, parameters: Layers, largest_gradient: float) -> None:
+        self.parameters, self.largest_gradient = parameters, largest_gradient
+        self.mean = [np.zeros_like(parameter) for parameter in parameters]
+        self.square = [np.zeros_like(parameter) for parameter in parameters]
+        self.count = 0
 
-    class Curve(BaseCallback):  # type: ignore[misc]
-        """Notes the returns of the episodes that end in each rollout."""
+    def step(self, gradient: Layers, rate: float) -> None:
+        """Change the parameters in place."""
+        norm = np.sqrt(sum(float(np.square(part).sum()) for part in gradient))
+        share = min(1.0, self.largest_gradient / (norm + 1e-8))
+        self.count += 1
+        mean_share = 1.0 - 0.9**self.count
+        square_share = 1.0 - 0.999**self.count
+        for parameter, part, mean, square in zip(self.parameters, gradient, self.mean, self.square, strict=True):
+            mean += 0.1 * (share * part - mean)
+            square += 0.001 * (np.square(share * part) - square)
+            parameter -= rate * (mean / mean_share) / (np.sqrt(square / square_share) + 1e-5)
 
-        returns: list[float] = []  # noqa: RUF012
 
-        def _on_step(self) -> bool:
-            self.returns += [info["episode"]["r"] for info in self.locals["infos"] if "episode" in info]
-            return True
+class Moments:
+    """Running mean and variance of observations (n,)."""
 
-        def _on_rollout_end(self) -> None:
-            if self.returns:
-                seconds, mean = time.process_time() - start, float(np.mean(self.returns))
-                curve.append(Rollout(steps=self.num_timesteps, seconds=seconds, mean_return=mean))
-                print(f"{self.num_timesteps} steps, {seconds:.0f} s: mean return {mean:.1f}", flush=True)
-                self.returns.clear()
+    def __init__(self, size: int) -> None:
+        self.mean, self.variance, self.count = np.zeros(size), np.ones(size), 1e-4
 
-    envs = VecNormalize(VecMonitor(DummyVecEnv([make_env] * ENVIRONMENTS)), gamma=GAMMA)
-    model = PPO(
-        "MlpPolicy",
-        envs,
-        n_steps=128,
-        batch_size=256,
-        gamma=GAMMA,
-        learning_rate=lambda left: 1e-3 * max(left, 0.1),
-        policy_kwargs={"log_std_init": -2.0, "net_arch": [64, 64]},  # a seventh of 6 rad/s: more tumbles at once
-        seed=0,
-        device="cpu",
+    def include(self, observations: Array) -> None:
+        """Include observations (K, n) (Chan, Golub and LeVeque, 1983)."""
+        count = len(observations)
+        total = self.count + count
+        change = observations.mean(axis=0) - self.mean
+        self.variance = (
+            self.count * self.variance + count * observations.var(axis=0) + change**2 * self.count * count / total
+        ) / total
+        self.mean = self.mean + change * count / total
+        self.count = total
+
+
+@dataclass(kw_only=True)
+class Rollout:
+    """Steps (T,) of environments (n,) between two updates; `values` has one more, of the observation at the end."""
+
+    inputs: list[Array] = field(default_factory=list)  # (n, m) normalised observations
+    actions: list[Array] = field(default_factory=list)  # (n, 4) with exploration
+    log_probabilities: list[Array] = field(default_factory=list)  # (n,)
+    rewards: list[Array] = field(default_factory=list)  # (n,)
+    values: list[Array] = field(default_factory=list)  # (n,) what the value network expects
+    ended: list[Array] = field(default_factory=list)  # (n,) whether the step was the last of an episode
+    values_at_end: list[Array] = field(default_factory=list)  # (n,) the value beyond it: 0, unless time alone was up
+    distances: list[Array] = field(default_factory=list)  # (n,) from the reference [m]
+    lost: int = 0  # episodes that ended before their time
+
+
+class Learner:
+    """PPO on a vector environment that resets an ended episode in the same step.
+
+    Attributes:
+        curve: a point for each update.
+    """
+
+    def __init__(self, envs: VectorEnv, settings: Settings) -> None:
+        """Set up networks, and reset the environments."""
+        self.envs, self.settings = envs, settings
+        self.rng = np.random.default_rng(settings.seed)
+        self.observed, _ = envs.reset(seed=settings.seed)
+        size = self.observed.shape[1]
+        self.moments = Moments(size)
+        self.actor = make_layers(self.rng, (size, *settings.units, 4), 0.01)
+        self.critic = make_layers(self.rng, (size, *settings.units, 1), 1.0)
+        self.log_deviation = np.full(4, np.log(settings.deviation), np.float32)
+        self.actor_steps = Adam([*self.actor, self.log_deviation], settings.largest_gradient)
+        self.critic_steps = Adam(self.critic, settings.largest_gradient)
+        self.curve: list[CurvePoint] = []
+
+    def policy(self) -> Policy:
+        """Return the policy as learned so far, without exploration."""
+        pairs = tuple((self.actor[i].copy(), self.actor[i + 1].copy()) for i in range(0, len(self.actor), 2))
+        deviation = np.sqrt(self.moments.variance + 1e-8)
+        return Policy(mean=self.moments.mean.copy(), deviation=deviation, layers=pairs)
+
+    def learn(self, updates: int, *, report: bool = True) -> None:
+        """Fly and update; the learning rate falls over these updates."""
+        for update in range(updates):
+            left = 1.0 - update / updates
+            rollout = self.fly()
+            self.update(rollout, self.settings.learning_rate * max(left, self.settings.final_share))
+            self.note(rollout)
+            if report and (update % 20 == 19 or update == updates - 1):
+                print(self.curve[-1], flush=True)
+
+    def fly(self) -> Rollout:
+        """Fly `length` steps of each environment by the policy, with exploration."""
+        rollout = Rollout()
+        policy = self.policy()
+        deviation = np.exp(self.log_deviation)
+        seen = []
+        for _ in range(self.settings.length):
+            seen.append(self.observed)
+            references = self.observed[:, :3] + self.observed[:, PLACES]  # one period ahead
+            inputs = policy.normalised(self.observed).astype(np.float32)
+            noise = self.rng.standard_normal((len(inputs), 4)).astype(np.float32)
+            actions = forward(self.actor, inputs)[-1] + deviation * noise
+            rollout.inputs.append(inputs)
+            rollout.actions.append(actions)
+            rollout.log_probabilities.append(np.sum(-0.5 * noise**2 - self.log_deviation, axis=1))
+            rollout.values.append(forward(self.critic, inputs)[-1][:, 0])
+            stepped = self.envs.step(np.clip(actions, -1.0, 1.0))
+            self.observed, rewards, terminated, truncated, infos = stepped
+            ended = terminated | truncated
+            at_end = np.zeros(len(inputs))
+            last_observed = self.observed.copy()
+            for i in np.flatnonzero(ended):
+                last_observed[i] = infos["final_obs"][i]
+            if truncated.any():
+                last_inputs = policy.normalised(last_observed[truncated]).astype(np.float32)
+                at_end[truncated] = forward(self.critic, last_inputs)[-1][:, 0]
+            rollout.rewards.append(rewards)
+            rollout.ended.append(ended)
+            rollout.values_at_end.append(at_end)
+            rollout.distances.append(np.linalg.norm(last_observed[:, PLACES] - references, axis=1))
+            rollout.lost += int(terminated.sum())
+        inputs = policy.normalised(self.observed).astype(np.float32)
+        rollout.values.append(forward(self.critic, inputs)[-1][:, 0])
+        self.moments.include(np.concatenate(seen))
+        return rollout
+
+    def advantages(self, rollout: Rollout) -> Array:
+        """Return the generalised advantages (T, n) (Schulman et al., 2016, arXiv:1506.02438).
+
+            delta_t = (1 - gamma) r_t + gamma V_(t+1) - V_t,    A_t = delta_t + gamma lambda A_(t+1)
+
+        Values are thereby means of rewards over the discounted time ahead; after an episode's end there is no A.
+        """
+        discount = self.settings.discount
+        advantages = []
+        following = np.zeros(len(rollout.values[0]))
+        for t in reversed(range(len(rollout.rewards))):
+            ended = rollout.ended[t]
+            next_value = np.where(ended, rollout.values_at_end[t], rollout.values[t + 1])
+            delta = (1.0 - discount) * rollout.rewards[t] + discount * next_value - rollout.values[t]
+            following = delta + discount * self.settings.trace * np.where(ended, 0.0, following)
+            advantages.append(following)
+        return np.array(advantages[::-1])
+
+    def update(self, rollout: Rollout, rate: float) -> None:
+        """Improve both networks by what was flown."""
+        advantages = self.advantages(rollout)
+        returns = np.ravel(advantages + np.array(rollout.values[:-1])).astype(np.float32)
+        advantages = advantages.ravel().astype(np.float32)
+        inputs, actions, before = (
+            np.concatenate(parts) for parts in (rollout.inputs, rollout.actions, rollout.log_probabilities)
+        )
+        for _ in range(self.settings.epochs):
+            order = self.rng.permutation(len(inputs))
+            for first in range(0, len(order), self.settings.minibatch):
+                chosen = order[first : first + self.settings.minibatch]
+                self.improve_actor(inputs[chosen], actions[chosen], before[chosen], advantages[chosen], rate)
+                values = forward(self.critic, inputs[chosen])
+                slope = 2.0 * (values[-1] - returns[chosen, None]) / len(chosen)
+                self.critic_steps.step(backward(self.critic, values, slope), rate)
+
+    def improve_actor(self, inputs: Array, actions: Array, before: Array, advantages: Array, rate: float) -> None:
+        """Step down the gradient of -mean(min(ratio A, clipped ratio A)), A normalised over the minibatch."""
+        advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        values = forward(self.actor, inputs)
+        deviation = np.exp(self.log_deviation)
+        noise = (actions - values[-1]) / deviation
+        ratio = np.exp(np.sum(-0.5 * noise**2 - self.log_deviation, axis=1) - before)
+        clip = self.settings.clip
+        is_clipped = ((advantages > 0.0) & (ratio > 1.0 + clip)) | ((advantages < 0.0) & (ratio < 1.0 - clip))
+        weight = np.where(is_clipped, 0.0, -advantages * ratio / len(inputs))[:, None].astype(np.float32)
+        gradient = backward(self.actor, values, weight * noise / deviation)
+        by_log_deviation = np.sum(weight * (noise**2 - 1.0), axis=0)
+        self.actor_steps.step([*gradient, by_log_deviation], rate)
+
+    def note(self, rollout: Rollout) -> None:
+        """Add a point to the learning curve."""
+        steps = len(self.curve) + 1
+        steps *= self.settings.environments * self.settings.length
+        self.curve.append(
+            CurvePoint(
+                steps=steps,
+                reward=float(np.mean(rollout.rewards)),
+                error=float(np.sqrt(np.mean(np.square(rollout.distances)))),
+                lost=rollout.lost,
+            )
+        )
+
+
+def make_envs(settings: Settings) -> VectorEnv:
+    """Return the environments of the task, which reset an ended episode in the same step."""
+    return quadsim.gym.make_vec(**quadsim.gym.TASKS[TASK], num_envs=settings.environments, autoreset_mode="SameStep")
+
+
+def fly_campaigns(policy: Path, out: Path, flights: int) -> list[Score]:
+    """Fly the campaign on unseen draws by the policy of a file, and by the MPC of the scenario."""
+    options: dict[str, Any] = {"flights": flights, "seed": EVALUATION_SEED, "overwrite": True}
+    file = f"controller.settings.file={policy.resolve()}"
+    learned = quadsim.campaign(str(CAMPAIGN), out=out / "learned", changes=[file], **options)
+    mpc = quadsim.campaign("track-eight", out=out / "mpc", **options)
+    return [score("PPO", learned.table), score("MPC", mpc.table)]
+
+
+def score(controller: str, table: Any) -> Score:
+    """Return the score of a campaign's table."""
+    columns = {name: np.array(table[name].to_pylist()) for name in ("verdict", "violated", "peak_tilt")}
+    squares = [np.square(np.array(table[f"rmse.{axis}"].to_pylist(), float)) for axis in "xyz"]
+    errors = np.sqrt(np.sum(squares, axis=0))
+    return Score(
+        controller=controller,
+        flights=table.num_rows,
+        lost=int(np.sum(columns["verdict"] == "lost")),
+        violated=int(np.sum(columns["violated"])),
+        error=float(np.sqrt(np.mean(errors**2))),
+        largest_error=float(errors.max()),
+        peak_tilt=float(columns["peak_tilt"].max()),
     )
-    model.learn(steps, callback=Curve())
-    envs.training = False
-    return model, envs, curve
 
 
-def learned(model: Any, normalisation: Any) -> Policy:
-    """The mean action of a model that was trained on normalised observations."""
-
-    def policy(env: Env, observation: Array) -> Array:
-        action: Array = model.predict(normalisation.normalize_obs(observation), deterministic=True)[0]
-        return action
-
-    return policy
-
-
-def curve_figure(curve: Sequence[Rollout], scores: Sequence[Score]) -> Figure:
-    """The learning curve, with what the other policies reach."""
-    steps = np.array([rollout.steps for rollout in curve], float)
-    returns = np.array([rollout.mean_return for rollout in curve])
-    colours = {"MPC": COLOUR.reference, "nothing": COLOUR.measured}
-    others = [
-        Series(x=steps, y=np.full(steps.size, score.mean_return), colour=colours[score.policy], label=score.policy)
-        for score in scores
-        if score.policy in colours
-    ]
-    learning = Series(x=steps, y=returns, colour=COLOUR.flown, label="PPO while it learns")
+def curve_figure(curve: Sequence[CurvePoint]) -> Figure:
+    """Return the learning curve: the error while it learns, with exploration."""
+    steps = np.array([point.steps for point in curve], float)
+    errors = np.array([100.0 * point.error for point in curve])
+    series = Series(x=steps, y=errors, colour=COLOUR.flown)
     panel = Panel(
-        title="return of an episode", series=(learning, *others), x_label="steps", y_range=(0.0, 200.0), height=1.6
+        title="RMS distance from the reference while it explores [cm]",
+        series=(series,),
+        bounds=(Bound(value=100.0 * CLAIM),),
+        x_label="steps",
+        y_range=(0.0, 50.0),
+        height=1.6,
     )
     return Figure(key="ppo", title="", panels=(panel,), columns=1)
 
 
-def write_csv(path: Path, rows: Sequence[Rollout | Score]) -> None:
-    """One line each, with a header."""
+def write_csv(path: Path, rows: Sequence[CurvePoint | Score]) -> None:
+    """Write one line each, with a header."""
     with path.open("w", newline="", encoding="utf-8") as file:
         lines = csv.writer(file, lineterminator="\n")
         lines.writerow(asdict(rows[0]))
         for row in rows:
-            lines.writerow(f"{x:.4g}" if isinstance(x, float) else x for x in asdict(row).values())
+            lines.writerow(f"{value:.4g}" if isinstance(value, float) else value for value in asdict(row).values())
 
 
-def read_csv(path: Path, kind: Callable[..., Row]) -> list[Row]:
-    """What `write_csv` wrote."""
+def read_curve(path: Path) -> list[CurvePoint]:
+    """Read a learning curve that `write_csv` wrote."""
+    points = []
     with path.open(encoding="utf-8") as file:
-        lines = list(csv.DictReader(file))
-    return [kind(**{name: text if name == "policy" else number(text) for name, text in line.items()}) for line in lines]
-
-
-def number(text: str) -> int | float:
-    """A count, or another number."""
-    return int(text) if text.isdigit() else float(text)
+        for line in csv.DictReader(file):
+            counts = {name: int(line[name]) for name in ("steps", "lost")}
+            numbers = {name: float(line[name]) for name in ("reward", "error")}
+            points.append(CurvePoint(**counts, **numbers))
+    return points
 
 
 def main() -> None:
     """Learn, compare, write."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--steps", type=int, default=STEPS, help="steps of training, of all environments")
+    parser.add_argument("--flights", type=int, default=FLIGHTS, help="flights of each campaign afterwards")
+    parser.add_argument("--seed", type=int, default=0, help="of networks, exploration and starts")
     parser.add_argument("--out", type=Path, default=Path("runs/ppo"))
+    parser.add_argument("--policy", type=Path, help="file of the policy (default: OUT/policy.json)")
+    parser.add_argument("--json", type=Path, help="also write curve and comparison there")
     arguments = parser.parse_args()
     folder: Path = arguments.out
     folder.mkdir(parents=True, exist_ok=True)
-    model, normalisation, curve = learn(arguments.steps)
-    model.save(folder / "policy.zip")
-    normalisation.save(folder / "normalisation.pkl")
-    scores = [
-        evaluate("PPO", learned(model, normalisation), make_env()),
-        evaluate("MPC", mpc, make_env("speeds")),
-        evaluate("nothing", nothing, make_env()),
-    ]
-    for score in scores:
-        print(score)
-    write_csv(folder / "curve.csv", curve)
-    write_csv(folder / "evaluation.csv", scores)
-    write_figure(curve_figure(curve, scores), folder / "curve.png", width=5.5, overwrite=True)
+    settings = Settings(seed=arguments.seed)
+    envs = make_envs(settings)
+    started = time.process_time()
+    learner = Learner(envs, settings)
+    learner.learn(max(1, arguments.steps // (settings.environments * settings.length)))
+    seconds = time.process_time() - started
+    print(f"{learner.curve[-1].steps} steps took {seconds:.0f} s of one core")
+    envs.close()
+    policy = arguments.policy or folder / "policy.json"
+    learner.policy().save(policy)
+    write_csv(folder / "curve.csv", learner.curve)
+    write_figure(curve_figure(learner.curve), folder / "curve.png", width=5.5, overwrite=True)
+    scores = fly_campaigns(policy, folder, arguments.flights)
+    for each in scores:
+        print(each)
+    write_csv(folder / "comparison.csv", scores)
+    if arguments.json is not None:
+        parts: dict[str, Any] = {"curve": [asdict(point) for point in learner.curve], "seconds": seconds}
+        parts["comparison"] = [asdict(each) for each in scores]
+        arguments.json.write_text(json.dumps(parts), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,8 @@
 
     env = gymnasium.make("quadsim/PaperConstrained-v0")
 
-Importing this module registers an id for each library scenario; `make_env` makes an environment from any other.
+Importing this module registers an id for each library scenario, and for each task of `TASKS`; `make_env` makes an
+environment from any other scenario.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ if TYPE_CHECKING:
     from quadsim.features.gym.making import make_env as make_env
     from quadsim.features.gym.making import make_vec as make_vec
     from quadsim.features.gym.safety import MPCSafetyFilter as MPCSafetyFilter
+    from quadsim.features.gym.tasks import TASKS as TASKS
     from quadsim.features.gym.vector import QuadrotorVectorEnv as QuadrotorVectorEnv
 
-__all__ = ["MPCSafetyFilter", "QuadrotorEnv", "QuadrotorVectorEnv", "environment_id", "make_env", "make_vec"]
+__all__ = ["TASKS", "MPCSafetyFilter", "QuadrotorEnv", "QuadrotorVectorEnv", "environment_id", "make_env", "make_vec"]
 
 if find_spec("gymnasium") is None:
     raise MissingPackageError("quadsim.gym", "gymnasium", extra="gym")
@@ -32,6 +34,7 @@ _MODULES = {
     "MPCSafetyFilter": "safety",
     "QuadrotorEnv": "environment",
     "QuadrotorVectorEnv": "vector",
+    "TASKS": "tasks",
     "environment_id": "making",
     "make_env": "making",
     "make_vec": "making",
@@ -39,3 +42,4 @@ _MODULES = {
 for _name, _module in _MODULES.items():
     globals()[_name] = getattr(importlib.import_module(f"quadsim.features.gym.{_module}"), _name)
 importlib.import_module("quadsim.features.gym.making").register_library()
+importlib.import_module("quadsim.features.gym.tasks").register_tasks()

@@ -75,6 +75,7 @@ COMMANDS: Final[dict[str, list[list[str]]]] = {
     "fastest-courses": [[PYTHON, "tests/fastest_courses.py"]],
     "campaigns": [flown(name, name) for name in CAMPAIGNS],
     "battery": [flown(name, *arguments) for name, (_, arguments) in BATTERIES.items()],
+    "ppo": [[PYTHON, *["examples/ppo.py", "--json", "runs/numbers/ppo.json", "--policy", "examples/ppo_policy.json"]]],
     "pictures": [[PYTHON, *f"docs/tools/{script}".split()] for script in DRAWN],
 }
 """What makes the files of a name."""
@@ -376,6 +377,17 @@ def autopilots(data: Any) -> str:
     return f"Of {len(rows)} flights {held} are satisfied; RMS errors differ by at most {most:.2g} cm.\n"
 
 
+def ppo(data: Record) -> str:
+    """What a learned policy and the MPC do on the same draws, and how long the policy learned."""
+    head = ("", "flights", "lost", "violated", "RMS error, m", "largest of a flight, m", "largest tilt, deg")
+    numbers = ("flights", "lost", "violated", "error", "largest_error", "peak_tilt")
+    rows = []
+    for score in data["comparison"]:
+        rows.append([score["controller"], *(f"{score[number]:.3g}" for number in numbers)])
+    steps = data["curve"][-1]["steps"]
+    return f"{table(head, rows)}\n{steps} steps of training took {data['seconds']:.0f} s of one core.\n"
+
+
 def records(data: Any) -> list[Record]:
     """A benchmark's records, without what is no number or text."""
     lists = [data] if isinstance(data, list) else [value for value in data.values() if isinstance(value, list)]
@@ -420,7 +432,7 @@ def _survived(row: Record, key: str, near: float, far: float) -> str:
 
 
 CSV: Final[dict[str, Callable[[Any], list[Record]]]] = {
-    **dict.fromkeys((*KEPT, "autopilots", "flight", "intervals", "mismatch", "nonlinear", "stability"), records),
+    **dict.fromkeys((*KEPT, "autopilots", "flight", "intervals", "mismatch", "nonlinear", "ppo", "stability"), records),
     "papers": paper_rows,
     "peers": peer_rows,
 }
@@ -429,6 +441,7 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     **{each.__name__: each for each in (results, ablation, papers, peers, export, campaigns, solvers, nonlinear)},
     **{each.__name__: each for each in (flight, batch, campaign, film, identification, autopilots, stability, moment)},
     "mismatch": mismatch,
+    "ppo": ppo,
     "paper": both_flights,
     "first-flights": first_flights,
     "fastest-courses": fastest_courses,

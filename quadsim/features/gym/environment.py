@@ -271,8 +271,12 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         """
         low, high = self.action_space.low, self.action_space.high
         action = np.clip(self.actions.of(command.speeds), low, high)
-        self._answered = (self.started.k, action, command)
+        self.fly_instead(action, command)
         return action
+
+    def fly_instead(self, action: Action, command: Command) -> None:
+        """Let an action, if it is the next one, fly this command of rotor speeds, with its plan and status."""
+        self._answered = (self.started.k, action, command)
 
     def flight(self) -> Flight:
         """Return the episode so far as an audited flight, which can be saved and plotted."""

@@ -16,6 +16,9 @@ from quadsim.features.gym.spaces import Action
 from quadsim.mpc.laws.parts.safety_filter import safety_filter
 from quadsim.mpc.laws.robust import Robust
 from quadsim.mpc.pilot.pilot import Pilot
+from quadsim.rotation import euler_to_body_rates
+from quadsim.sim.physics import Observation
+from quadsim.state import ANGLE_RATES, ANGLES, Array
 from quadsim.vehicle import Vehicle
 
 
@@ -25,6 +28,10 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
     See `quadsim.mpc.laws.parts.safety_filter`.
 
     An action that is not finite is never flown: the fallback's command is, until the next one.
+
+    Actions `rates` are filtered as the rotor speeds that give their thrust and, at the end of the period, the body
+    rates at which their rate loop arrives (`quadsim.features.gym.spaces.Actions.held_speeds`).  Behind the filter
+    these speeds are held, whether they pass or are changed, so that what flies is what the filter has checked.
 
     `info["filter"]` at each step: `intervened`, `correction` (by how much it changed any rotor's speed at most
     [rad/s]), and `fallback` (0 while its QP had an answer; see `quadsim.controller.Command`).  The episode's flight has
@@ -47,7 +54,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], controller: Mapping[str, Any] | None = None) -> None:
-        """Wrap an environment whose actions are rotor speeds or deviations.
+        """Wrap an environment.
 
         Args:
             env: of `quadsim.gym`.
@@ -60,7 +67,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         base = env.unwrapped
         if not isinstance(base, QuadrotorEnv):
             raise ParameterError("", "env", type(base).__name__, "an environment of quadsim.gym")
-        base.actions.of(np.zeros(4))
+        base.actions.require_held()
         scenario = base.scenario
         if controller is not None:
             scenario = scenario.replace({"controller": dict(controller)})
@@ -99,9 +106,9 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         """
         if self._vehicle is None:
             raise ResetNeeded("call env.reset() first; a pickled or copied environment is without its episode")
-        requested = self._base.actions.command(action, 1, bounded=False).speeds
-        self._filter.requested = requested
         seen, horizon = self._base.started.observation, self._law.horizon
+        requested = self._base.actions.held_speeds(action, _body_rates(seen))
+        self._filter.requested = requested
         preview = seen.preview[:horizon]
         preview = np.concatenate([preview, np.repeat(preview[-1:], horizon - len(preview), axis=0)])
         command = self._law.step(seen.moment, seen.state, preview)
@@ -109,6 +116,16 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         intervened = command.status != UNCONSTRAINED
         self.steps += 1
         self.interventions += intervened
-        observed, reward, terminated, truncated, info = self.env.step(self._base.action_for(command))
+        space = self._base.action_space
+        within = np.clip(np.nan_to_num(np.asarray(action, space.dtype)), space.low, space.high)
+        self._base.fly_instead(within, command)
+        observed, reward, terminated, truncated, info = self.env.step(within)
         report = {"intervened": intervened, "correction": correction, "fallback": command.fallback}
         return observed, reward, terminated, truncated, {**info, "filter": report}
+
+
+def _body_rates(seen: Observation) -> Array:
+    """Return the body rates (3,) [rad/s] that a controller is given, or those of the state."""
+    if seen.moment.body_rates is not None:
+        return seen.moment.body_rates
+    return euler_to_body_rates(seen.state[ANGLES], seen.state[ANGLE_RATES])

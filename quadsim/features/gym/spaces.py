@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -122,6 +122,51 @@ class Actions:
         speeds = action_commands(self.kind, scale, numbers[None], np.array([yaw]))[0]
         plan = np.broadcast_to(speeds, (horizon, speeds.size))
         return Command(speeds=speeds, plan=plan, status=GIVEN, inner=self._autopilot)
+
+    @cached_property
+    def _holding(self) -> Autopilot | None:
+        """The rate loop whose first answer, held for a control period, turns as far as `BANDWIDTH` does within it."""
+        if self._settings is None:
+            return None
+        period = 2.0 * float(self.scale["half_period"])
+        gains = tuple((1.0 - math.exp(-bandwidth * period)) / period for bandwidth in BANDWIDTH)
+        return Autopilot(self._vehicle, replace(self._settings, p=gains), speeds=self._speeds)
+
+    def require_held(self) -> None:
+        """Refuse actions that are not rotor speeds to hold, and do not become any by `held_speeds`.
+
+        Raises:
+            ParameterError: they are attitudes.
+        """
+        if self.kind == "attitude":
+            allowed = [kind for kind in ACTIONS if kind != "attitude"]
+            raise ParameterError(
+                "", "action", self.kind, f"one of {', '.join(allowed)}: they become rotor speeds to hold"
+            )
+
+    def held_speeds(self, action: Action, body_rates: Array) -> Array:
+        """Return the rotor speeds (4,) [rad/s] that an action asks for, if they are to be held for a control period T.
+
+        For `rates`, they give its thrust, and at the period's end the body rates at which its loop arrives: that turns
+        from omega to omega_c with the bandwidth b, so it covers a share 1 - exp(-b T), as a constant acceleration of
+        (1 - exp(-b T)) / T (omega_c - omega) does.
+
+        Args:
+            action: (4,) the action, which may be outside `space`, or NaN; then the speeds are, too.
+            body_rates: (3,) measured omega [rad/s].
+
+        Raises:
+            ParameterError: the action has another shape than `space`, is not of numbers, or is an attitude.
+        """
+        self.require_held()
+        target = self.command(action, 1, bounded=False).speeds
+        if self._holding is None:
+            return target
+        if not np.isfinite(target).all():
+            return np.full(N_ROTORS, np.nan)
+        rotors = np.zeros(N_ROTORS)
+        level = np.array([1.0, 0.0, 0.0, 0.0])  # neither matters to body rates
+        return self._holding.speeds(0.0, target, body_rates, rotors, level)
 
     def of(self, speeds: Array) -> Action:
         """The action that commands rotor speeds (4,) [rad/s]; beyond [-1, 1] where these are beyond their bounds.

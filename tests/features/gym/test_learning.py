@@ -15,6 +15,7 @@ from gymnasium.error import ResetNeeded
 import quadsim
 import quadsim.gym
 from quadsim.errors import ParameterError
+from quadsim.state import INDEX
 
 ROOT = Path(__file__).resolve().parents[3]
 sys.path.insert(0, str(ROOT / "examples"))
@@ -114,11 +115,69 @@ def test_an_action_that_is_not_finite_is_not_flown() -> None:
     assert np.isfinite(env.unwrapped.flight().command).all()
 
 
+@pytest.mark.parametrize("action", ["deviations", "rates"])
+def test_after_an_action_that_is_not_finite_the_next_one_is_filtered(action: str) -> None:
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("robust", action=action))
+    env.reset(seed=0)
+    fallbacks = []
+    for value in (0.1, np.nan, 0.1, -0.1):
+        info = env.step(np.full(4, value, np.float32))[4]
+        fallbacks.append(info["filter"]["fallback"])
+    assert fallbacks == [0, 1, 0, 0]
+
+
+GENTLE = {
+    "controller.input_bounds.speed": [185.0, 200.0],
+    "controller.output_bounds": {
+        "roll": [-5.0, 5.0],
+        "pitch": [-5.0, 5.0],
+        "yaw_rate": [-30.0, 30.0],
+        "vz": [-1.0, 1.0],
+    },
+    "controller.tightening": {"turning": 14.0},
+    "constraints": [],
+    "lost.departure": False,
+    "duration": 10.0,
+}
+"""The scenario `robust` with bounds that the filter can hold between samples: see the page on learning."""
+
+
+def test_random_body_rates_hold_every_bound_behind_the_filter_and_not_without() -> None:
+    scenario = quadsim.load("robust").replace(GENTLE)
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(scenario, action="rates"))
+    infos, terminated = random_episode(env, seed=0)
+    assert not terminated
+    assert len(infos) == env.steps == 200
+    assert not any(info["constraint_violation"] for info in infos)
+    assert not any(info["filter"]["fallback"] for info in infos)
+    assert 0 < env.interventions <= env.steps
+    assert env.unwrapped.flight().satisfied
+    infos, terminated = random_episode(quadsim.gym.make_env(scenario, action="rates"), seed=0)
+    assert terminated or any(info["constraint_violation"] for info in infos)
+
+
+def test_gentle_body_rates_pass_and_are_reached_at_the_end_of_the_period() -> None:
+    """To the rates at which their loop arrives, without the filter, from the same state; and to its thrust."""
+    scenario = quadsim.load("robust").replace(GENTLE)
+    flown = []
+    for env in (
+        quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(scenario, action="rates")),
+        quadsim.gym.make_env(scenario, action="rates"),
+    ):
+        env.reset(seed=0)
+        info = env.step(np.array([0.05, 0.002, -0.001, 0.003], np.float32))[4]
+        state = env.unwrapped.flight().log.plant.state[-1]
+        rates = env.unwrapped.started.observation.moment.body_rates
+        flown.append([*rates, state[INDEX["vz"]]])
+        assert info.get("filter", {"intervened": False})["intervened"] is False
+    behind, alone = flown
+    assert np.abs(behind).min() > 1e-3
+    np.testing.assert_allclose(behind, alone, rtol=0.02)
+
+
 def test_what_cannot_be_filtered_is_refused() -> None:
     with pytest.raises(ParameterError, match="environment"):
         quadsim.gym.MPCSafetyFilter(gymnasium.make("Pendulum-v1"))
-    with pytest.raises(ParameterError, match="deviations"):
-        quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("robust", action="rates"))
     with pytest.raises(ParameterError, match=r"controller\.type"):
         quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("paper-constrained"))
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("forest"))

@@ -100,6 +100,8 @@ class SafetyFilter:
         query = self._preparation.prepare(now, state, reference, self._acting)
         if query is None:
             return refused(self._acting, self.horizon, INVALID_DATA)
+        if not np.isfinite(self.requested).all():  # which would stay in the QP solver
+            return refused(query.u_before, self.horizon, INVALID_DATA)
         answer, reason = self._checked(self._nearest, query)
         if answer.status not in ACCEPTED:
             answer, reason = self._checked(self._softened, query)
