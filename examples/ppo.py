@@ -371,9 +371,13 @@ def read_curve(path: Path) -> list[CurvePoint]:
     points = []
     with path.open(encoding="utf-8") as file:
         for line in csv.DictReader(file):
-            counts = {name: int(line[name]) for name in ("steps", "lost")}
-            numbers = {name: float(line[name]) for name in ("reward", "error")}
-            points.append(CurvePoint(**counts, **numbers))
+            point = CurvePoint(
+                steps=int(line["steps"]),
+                lost=int(line["lost"]),
+                reward=float(line["reward"]),
+                error=float(line["error"]),
+            )
+            points.append(point)
     return points
 
 

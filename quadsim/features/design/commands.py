@@ -129,7 +129,7 @@ def _for_vehicle(
     disturbance = stated_disturbance(path)
     first = first_scenario(vehicle, file, course=course, law=law, tilt=tilt, disturbance=disturbance)
     if fastest:
-        with reporting(progress) as report:
+        with reporting(progress, "the flights") as report:
             found = fly_fastest(first.scenario, DEFAULT_MARGIN if margin is None else margin, report)
         first = at_fastest(first, found)
     return loading.ScenarioFile(first.to_toml())
