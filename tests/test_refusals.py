@@ -65,6 +65,11 @@ BESIDES = (
     ("effects.air.rotor_drag=1e-4", "effects.rotors={rise=0.05, fall=0.05}", f"events={EVENTS}"),
     ("controller={type='pid'}", "actual.mass=4.2", "keep_in={position=[0, 0, 1], size=[9, 9, 9]}"),
     ("controller={type='lqr', output_weights={z=1}, input_weights={speed=1}}", f"obstacles={OBSTACLES}"),
+    (
+        "controller={type='robust', commands='rates', horizon=9, output_weights={x=1}, target_weights={thrust=1,"
+        " body_rate=1}}",
+        "autopilot={}",
+    ),
     ("controller={type='m:Law'}", "forces=[{type='m:force'}]"),
     ("recorded={file='lopes2011'}",),
 )

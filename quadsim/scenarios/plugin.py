@@ -245,7 +245,7 @@ class PluginController:
             return replace(answer, **parts)
         except (AttributeError, TypeError, ValueError) as error:
             what = COMMANDED_NUMBERS[self.commands]
-            problem = f"{self.name} answered {answer!r:.100}, neither {what}, nor a Command: {error}"
+            problem = f"{self.name} answered {answer!r:.100}, neither a Command nor {what}: {error}"
             raise CommandError(problem, time=now.time) from error
 
 

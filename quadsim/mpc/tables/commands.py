@@ -32,8 +32,8 @@ LEAST_THRUST, MOST_THRUST = 0.5, 0.9
 """Default bounds on a target of collective thrust: shares of the weight, and of the largest; see `TargetBounds`."""
 Rates = Positive | Annotated[tuple[Positive, ...], Len(3, 3)]
 """One largest magnitude for three body rates, or one per axis."""
-AxisWeights = Weight | Annotated[tuple[Weight, ...], Len(3, 3)]
-"""One weight for three axes, or one per axis."""
+RateWeights = Weight | Annotated[tuple[Weight, ...], Len(3, 3)]
+"""One weight for three body rates, or one per axis."""
 RotorWeights = Weight | Annotated[tuple[Weight, ...], Len(N_ROTORS, N_ROTORS)]
 """One weight for all rotors, or one per rotor."""
 
@@ -50,7 +50,7 @@ class TargetWeights:
     """Weights on deviations of an inner loop's targets from those of hover."""
 
     thrust: Annotated[Weight, doc("[1/N^2] of the collective thrust")]
-    body_rate: Annotated[AxisWeights, doc("[1/(rad/s)^2] one weight for three body rates, or about body x, y, z")]
+    body_rate: Annotated[RateWeights, doc("[1/(rad/s)^2] one weight for three body rates, or about body x, y, z")]
 
     @property
     def of_inputs(self) -> tuple[float, ...]:

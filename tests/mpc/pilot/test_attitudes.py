@@ -211,7 +211,10 @@ def test_it_is_not_exported() -> None:
 
 @pytest.mark.parametrize(
     ("commands", "words"),
-    [("rates", "neither T, p, q, r: collective thrust"), ("attitude", "neither T, p, q, r, w, x, y, z: collective")],
+    [
+        ("rates", "neither a Command nor T, p, q, r: collective thrust"),
+        ("attitude", "neither a Command nor T, p, q, r, w, x, y, z: collective"),
+    ],
 )
 def test_an_answer_of_the_wrong_size_is_told_what_the_numbers_are(commands: str, words: str) -> None:
     class Short:

@@ -158,7 +158,7 @@ def test_an_answer_that_is_no_command_ends_the_flight_with_that_reason(written: 
     assert flight.outcome == "lost"
     shown = answer.replace("[1.0] * 4", "[1.0, 1.0, 1.0, 1.0]").replace("object()", "<object object")
     assert str(flight.log.reason).startswith(f"at t = 0.000 s: Hover answered {shown}")
-    assert ", neither 4 speeds nor a Command: " in str(flight.log.reason)
+    assert ", neither a Command nor four rotor speeds [rad/s]: " in str(flight.log.reason)
 
 
 def test_speeds_that_are_no_numbers_never_reach_the_plant(written: Write) -> None:
@@ -198,7 +198,9 @@ class Answers:
 )
 def test_a_command_with_a_wrong_part_is_refused(part: str, given: Any, rule: str) -> None:
     law = PluginController(Answers(**{part: given}), 3)
-    with pytest.raises(CommandError, match=rf"Answers answered .*, neither 4 speeds nor a Command: {rule}"):
+    with pytest.raises(
+        CommandError, match=rf"Answers answered .*, neither a Command nor four rotor speeds [rad/s]: {rule}"
+    ):
         law.step(StepInputs(acting=np.ones(4)), np.zeros(12), np.zeros((3, 4)))
 
 

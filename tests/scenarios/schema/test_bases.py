@@ -83,7 +83,7 @@ def test_circular_bases_are_reported(tmp_path: Path) -> None:
         load_scenario(str(tmp_path / "a.toml"))
 
 
-MISSING = [f"controller.{name} is missing" for name in ("horizon", "output_weights", "input_weights", "input_bounds")]
+MISSING = [f"controller.{name} is missing" for name in ("horizon", "output_weights")]
 WHOLE = (
     "controller: of another type than that of its base ('constrained' in hover.toml), it replaces it whole and "
     "inherits nothing"
