@@ -478,7 +478,7 @@ def _rates_last(parts: Sequence[Stretch]) -> float:
     for part in parts:
         rates = part.record.rates
         for i, horizon in enumerate(_RATES_OVER):
-            later = round(horizon / part.record.period)
+            later = max(1, round(horizon / part.record.period))
             together[i] += float((rates[later:] * rates[:-later]).sum())
             squares[i] += float(np.square(rates[:-later]).sum())
 

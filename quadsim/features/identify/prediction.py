@@ -86,22 +86,25 @@ class PredictionErrors:
                 found[name] = tuple(of[:RATES_JUDGED] if name == "body rates" else of)
         return found
 
+    def _exceeding(self, rival: str, share: float) -> dict[str, tuple[float, ...]]:
+        """The ratios of those quantities whose geometric mean over the horizons exceeds 1 by a share."""
+        return {name: of for name, of in self.ratios(rival).items() if math.prod(of) > (1.0 + share) ** len(of)}
+
     @property
     def lost(self) -> tuple[str, ...]:
         """Where a rival predicts better by more than `TIE`, in words; empty where the identified vehicle wins."""
         return tuple(
             f"{quantity} than {rival}, {' '.join(f'{ratio:.2f}' for ratio in of)} times its error"
             for rival in RIVALS
-            for quantity, of in self.ratios(rival).items()
-            if math.prod(of) > (1.0 + TIE) ** len(of)
+            for quantity, of in self._exceeding(rival, TIE).items()
         )
 
     @property
     def at_floor(self) -> tuple[str, ...]:
-        """Quantities in which it loses with errors within `NEAR_FLOOR` of the floor: no vehicle file mends them."""
-        lost = " ".join(self.lost)
-        floored = self.ratios(NOISE_FLOOR).items()
-        return tuple(name for name, of in floored if name in lost and math.prod(of) < (1.0 + NEAR_FLOOR) ** len(of))
+        """Quantities in which it loses to thrust and drag alone, and yet is within `NEAR_FLOOR` of the floor."""
+        lost = self._exceeding(RATES_HELD, TIE) | self._exceeding(RATES_DECAY, TIE)
+        above = self._exceeding(NOISE_FLOOR, NEAR_FLOOR)
+        return tuple(name for name in QUANTITIES if name in lost and name not in above)
 
     @property
     def verdict(self) -> str:
