@@ -77,6 +77,7 @@ CONDITIONS: Final[dict[str, Table]] = {
     "raw sensors, estimator": {"yaw_steps": True, "estimator": True},
     "commands 10 ms late": {"yaw_steps": True, "late": 1},
     "commands 10 ms early": {"yaw_steps": True, "late": -1},
+    "torque and force that last": {"yaw_steps": True, "still": True, "lasting": True},
 }
 """Of each row: the flight, torque noise [N m s^0.5], and by how many periods the log's commands are late."""
 
@@ -130,6 +131,16 @@ def wrong(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
     )
 
 
+def lasting(vehicle: Vehicle, rng: np.random.Generator) -> Table:
+    """A random torque and force that last: `[effects.disturbance]`."""
+    return {
+        "torque_deviation": (rng.uniform(2.0, 8.0, 3) * vehicle.inertia).tolist(),
+        "torque_time": rng.uniform(0.08, 0.5, 3).tolist(),
+        "force_deviation": (rng.uniform(0.2, 0.8, 3) * vehicle.mass).tolist(),
+        "force_time": rng.uniform(0.1, 0.6, 3).tolist(),
+    }
+
+
 def fly(vehicle: Vehicle, condition: Mapping[str, Any], rng: np.random.Generator) -> Flight:
     """Fly what is logged."""
     course = "hover" if condition.get("hover") else "figure-eight"
@@ -148,6 +159,8 @@ def fly(vehicle: Vehicle, condition: Mapping[str, Any], rng: np.random.Generator
         changes["effects"] = {"disturbance": {"torque_noise": torque}}
     if condition.get("still"):
         changes["effects"] = {"air": {"wind": [0.0, 0.0, 0.0], "turbulence": None}}
+        if disturbance := condition.get("disturbance"):
+            changes["effects"]["disturbance"] = disturbance
     table = merged(data, SHARED, changes)
     if condition.get("estimator"):
         table |= {"sensors": RAW, "estimator": {"type": "error_state"}}
@@ -193,10 +206,12 @@ def identify(log: DrawnLog) -> Record:
     rng, condition = np.random.default_rng(seed), CONDITIONS[name]
     late, own = condition.get("late", 0), {name: name in condition for name in ("body_drag", "moments")}
     vehicle = drawn(rng, **own)
+    disturbance = lasting(vehicle, rng) if "lasting" in condition else {}
+    condition = {**condition, "disturbance": disturbance}
     flown = logged(fly(vehicle, condition, rng), late)
     found = identify_records([flown], [[slice(0, len(flown.t))]], wrong(vehicle, rng), wind="still" not in condition)
     true = truth_of(vehicle, late)
-    return {
+    judged = {
         estimate.name: {
             "passed": not estimate.refused,
             "inside": bool(estimate.low <= true[estimate.name] <= estimate.high),
@@ -204,6 +219,17 @@ def identify(log: DrawnLog) -> Record:
         }
         for estimate in found.estimates
     }
+    for estimate in found.disturbance if disturbance else ():
+        place = "xyz".index(estimate.axis)
+        for number in ("deviation", "time"):
+            truth = disturbance[f"{estimate.kind}_{number}"][place]
+            low, high = getattr(estimate, f"{number}_interval")
+            judged[f"{estimate.kind}_{number}_{estimate.axis}"] = {
+                "passed": not estimate.refused,
+                "inside": low <= truth <= high,
+                "error": getattr(estimate, number) / truth - 1.0,
+            }
+    return judged
 
 
 def summaries(condition: str, answers: Sequence[Mapping[str, Any]]) -> list[Record]:

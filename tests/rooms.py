@@ -62,6 +62,7 @@ USING: Final = {
     "features/identify/test_identify_fit.py": ("design",),
     "features/identify/test_identify_logs.py": ("design",),
     "features/identify/test_log_formats.py": ("design",),
+    "features/identify/test_noise.py": ("design",),
     "commands/test_answer_first.py": ("campaign", "design", "identify"),
     "commands/test_api.py": EVERY,
     "scenarios/test_bounded_input.py": ("campaign", "identify"),

@@ -12,21 +12,19 @@ from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.stats import t as student
 
 from quadsim.errors import InputError
+from quadsim.features.identify.disturbance import with_disturbance
 from quadsim.features.identify.estimate import (
     VECTORS,
-    DisturbanceEstimate,
     FlightNumbers,
     Identification,
     ParameterEstimate,
     field_of,
     number_in,
 )
-from quadsim.features.identify.model import INCREMENTS, Stretch, mean_voltage, stretch
-from quadsim.features.identify.noise import NoiseFit, identify_noise
+from quadsim.features.identify.model import INCREMENTS, mean_voltage, stretch
 from quadsim.features.identify.record import Record, part_of
 from quadsim.features.identify.rotor_response import RotorResponse, foretold_speeds, rotor_response
 from quadsim.features.identify.search import LEVEL_PLATE, PLATE, NormalEquations, Search
@@ -36,8 +34,6 @@ from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 INTERVAL_SHARE: Final = 0.95
 WIDEST: Final = 0.25
 """Half-width of an interval, in logarithms, above which a log is said not to excite a parameter."""
-WIDEST_NOISE: Final = 1.4  # the same of the deviation and the time constant of noise: a factor of 4
-LEAST_GAIN: Final = 5.0  # in the logarithm of the likelihood, from which noise is not that of the sensor alone
 MOST_COLOUR: Final = 0.2  # autocorrelation of the innovations above which intervals widen [-]
 CHANCE: Final = 3.7
 """The same times sqrt(N) that noise of N samples stays below in 99 %, at 8 lags of 6 axes: more than 0.2 if N < 342."""
@@ -45,8 +41,6 @@ MOST_PRIOR: Final = 0.25  # share of the information on a parameter that rules a
 UNCARRIED: Final = 0.01  # share of the weight that thrust and drag may leave over, or carry too much
 _NORMAL: Final = 1.96  # standard deviations on either side, of a normal distribution
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
-_RATES_OVER: Final = (0.1, 0.25)  # horizons [s]
-_LONGEST_RATES: Final = 100.0  # time constant of rates that do not decay [s]
 _YAW: Final = "yaw steps of 40 deg, one per second, for 10 s"
 _GUSTS: Final = 0.015  # of drag, by wind that changes faster than its knots
 _BLOWN: Final = 0.01  # of what torques show, by such wind where `rotor_moment` turns it into torque
@@ -158,10 +152,9 @@ def identify_records(
     while refused := _impossible(refined) | fit.refuse_what_moved(refined):
         held |= refused
         refined = searched(held, refined)
-    return fit.result(refined)
+    return with_disturbance(fit.result(refined), refined, _quantile)
 
 
-_UNKNOWN: Final = 50.0  # half-width in logarithms from which nothing is known
 _WEAK: Final = "not excited"
 _HOPELESS: Final = 1.1  # half-width above which its size is not told
 _SHARED: Final = 0.02  # of what all flights say together, that is added to what one says alone
@@ -421,13 +414,11 @@ class _Fit:
         first = refined.parameters(refined.x, 0)
         values, moved = self._moved_to(refined)
         estimates = {**self.estimates, **moved}.values()
-        vehicle = self._assembled(values)
-        noise = _unmodelled(refined)
         flights = tuple(self._numbers_of(refined, flight) for flight in range(refined.flights))
         delay, offset, wind = (np.mean([numbers[i] for numbers in flights], axis=0).tolist() for i in range(3))
         return Identification(
             estimates=tuple(estimates),
-            vehicle=vehicle,
+            vehicle=self._assembled(values),
             delay=delay,
             offset=tuple(offset),
             wind=tuple(wind),
@@ -436,47 +427,7 @@ class _Fit:
             voltage_exponent=self._answer("voltage_exponent", first.voltage_exponent),
             voltage=refined.voltage or None,
             yaw_trim=first.yaw_trim,
-            noise=tuple(fitted.noise for fitted in noise),
-            disturbance=tuple(self._disturbance(*pair, vehicle) for pair in zip(INCREMENTS, noise, strict=True)),
-            rates_last=_rates_last(refined.parts),
             whiteness=self.colour,
-        )
-
-    def _disturbance(self, name: str, fitted: NoiseFit, vehicle: Vehicle) -> DisturbanceEstimate:
-        """The unknown torque about a body axis, or the force along a world axis, of an axis of `INCREMENTS`."""
-        place = INCREMENTS.index(name)
-        axis = "xyz"[place % 3]
-        blocks = len(fitted.left_out)
-        scatter = np.sqrt((blocks - 1) * fitted.left_out.var(axis=0))
-        halves = np.hypot(_NORMAL * fitted.explained, _quantile(blocks) * scatter)
-        if place < 3:
-            kind, unit, sensor, scale = "torque", "N m", "gyro", vehicle.inertia[place]
-            inertia = self.estimates[f"inertia_{axis}"]
-            if not inertia.refused:
-                halves[0] = math.hypot(halves[0], 0.5 * math.log(inertia.high / inertia.low))
-        else:
-            kind, unit, sensor, scale = "force", "N", "velocity", vehicle.mass
-        factors = np.exp(np.minimum(halves, _UNKNOWN))
-        deviation = scale * fitted.noise.deviation
-        time = fitted.noise.time
-        refused = ""
-        if fitted.gain < LEAST_GAIN:
-            refused = f"none that the noise of the {sensor} does not explain"
-        elif kind == "force" and any(part.record.inertial for part in self.search.parts):
-            refused = "no velocity is logged that an accelerometer's error does not move"
-        elif time < 2.0 * self.search.parts[0].record.period:
-            refused = "it changes from sample to sample"
-        elif halves.max() > WIDEST_NOISE:
-            refused = f"{_WEAK}: an interval is a factor of {factors.max():.2g}, allowed {math.exp(WIDEST_NOISE):.2g}"
-        return DisturbanceEstimate(
-            kind=kind,
-            axis=axis,
-            unit=unit,
-            deviation=deviation,
-            deviation_interval=(float(deviation / factors[0]), float(deviation * factors[0])),
-            time=time,
-            time_interval=(float(time / factors[1]), float(time * factors[1])),
-            refused=refused,
         )
 
     def _answer(self, name: str, sought: float) -> float:
@@ -506,34 +457,6 @@ class _Fit:
         if "thrust_coefficient" in changes:
             changes |= {"thrust_of_speed": None, "thrust_of_throttle": None}
         return replace(self.vehicle, **changes)
-
-
-def _unmodelled(search: Search) -> list[NoiseFit]:
-    """The torque and force that what was found leaves over, axis by axis; what wind changes counts as a force."""
-    stretches = range(len(search.parts))
-    misfits = [search.misfit(search.x, i, steady=True)[0] for i in stretches]
-    periods = [part.record.period for part in search.parts]
-    blocks = [search.rows(i) for i in stretches]
-    return [identify_noise([of[:, axis] for of in misfits], periods, blocks) for axis in range(len(INCREMENTS))]
-
-
-def _rates_last(parts: Sequence[Stretch]) -> float:
-    """Time constant [s] with which decaying body rates predict themselves best, by least squares over `_RATES_OVER`."""
-    together = np.zeros(len(_RATES_OVER))
-    squares = np.zeros(len(_RATES_OVER))
-    for part in parts:
-        rates = part.record.rates
-        for i, horizon in enumerate(_RATES_OVER):
-            later = round(horizon / part.record.period)
-            together[i] += float((rates[later:] * rates[:-later]).sum())
-            squares[i] += float(np.square(rates[:-later]).sum())
-
-    def error(log_time: float) -> float:
-        left = np.exp(-np.array(_RATES_OVER) / math.exp(log_time))
-        return float(squares @ left**2 - 2.0 * together @ left)
-
-    bounds = (math.log(parts[0].record.period), math.log(_LONGEST_RATES))
-    return math.exp(float(minimize_scalar(error, bounds=bounds, method="bounded").x))
 
 
 def _impossible(search: Search) -> dict[str, float]:

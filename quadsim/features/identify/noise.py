@@ -31,6 +31,10 @@ _TIMES: Final = (0.03, 0.3)  # time constants that the search starts from [s]
 _STEP: Final = 1e-3  # of the slopes of innovations, in logarithms
 _LEAST_SPREAD: Final = 1e-9  # of misfits [rad/s, m/s]
 _REGULAR: Final = 1e-6 * np.eye(3)  # information without which a number that nothing shows has none
+_ENOUGH: Final = 10_000  # samples that the search begins with
+_SCORING_STEPS: Final = 8  # of Fisher's scoring, which ends it
+_SMALL: Final = 1e-3  # gain in the logarithm of the likelihood at which it ends
+_REACH: Final = 2000  # samples after which a stretch has forgotten what was wrong with its first
 _SEARCH: Final = {"xatol": 1e-3, "fatol": 1e-3, "maxiter": 1000}
 
 
@@ -59,9 +63,10 @@ class AxisNoise:
         """(N,) innovations of a misfit (N,), less what is wrong with its first sample, and their variance."""
         fading, moving, variance = self._innovations_form(period)
         innovations = lfilter(fading, moving, misfit)
-        of_start = lfilter(fading, moving, np.eye(1, len(misfit))[0])
-        share = float(of_start @ innovations) / float(of_start @ of_start)
-        return innovations - share * of_start, variance
+        of_start = lfilter(fading, moving, np.eye(1, min(len(misfit), _REACH))[0])
+        head = innovations[: len(of_start)]
+        head -= float(of_start @ head) / float(of_start @ of_start) * of_start
+        return innovations, variance
 
     def forecast(self, misfit: Array, period: float, starts: Indices, length: int) -> Array:
         """(W, length) expected misfits from W starts on, each by the misfits (N,) of the periods before it alone."""
@@ -111,23 +116,33 @@ def identify_noise(misfits: Sequence[Array], periods: Sequence[float], blocks: S
         log_time = min(max(x[1], shortest), longest)
         return AxisNoise(deviation=math.exp(x[0]), time=math.exp(log_time), sensor=math.exp(x[2]))
 
+    share = min(1.0, _ENOUGH / sum(map(len, misfits)))
+    parts = [misfit[: math.ceil(share * len(misfit))] for misfit in misfits]
+
     def cost(x: Array) -> float:
         beyond = max(shortest - x[1], x[1] - longest, 0.0)
-        return beyond + _cost(noise_of(x), misfits, periods)
+        return beyond + _cost(noise_of(x), parts, periods)
 
     searches = []
     for time in _TIMES:
         first = np.log([0.3 * spread / periods[0], time, 0.5 * spread])
         searches.append(minimize(cost, first, method="Nelder-Mead", options=_SEARCH))
-    found = min(searches, key=lambda search: float(search.fun))
-    information, gradients = _information(found.x, noise_of, misfits, periods, blocks)
-    total = information.sum(axis=0) + _REGULAR
+    x = min(searches, key=lambda search: float(search.fun)).x
+    reached = _cost(noise_of(x), misfits, periods)
+    for _ in range(_SCORING_STEPS):  # by all of it
+        information, gradients = _information(x, noise_of, misfits, periods, blocks)
+        total = information.sum(axis=0) + _REGULAR
+        moved = x - np.clip(np.linalg.solve(total, gradients.sum(axis=0)), -0.5, 0.5)
+        if (after := _cost(noise_of(moved), misfits, periods)) >= reached - _SMALL:
+            break
+        x = moved
+        reached = after
     left_out = [np.linalg.solve(total - of, g) for of, g in zip(information, gradients, strict=True)]
     return NoiseFit(
-        noise=noise_of(found.x),
+        noise=noise_of(x),
         explained=np.sqrt(np.diag(np.linalg.inv(total)))[:2],
         left_out=np.array(left_out)[:, :2],
-        gain=_cost_of_silence(misfits) - float(found.fun),
+        gain=_cost_of_silence(misfits) - reached,
     )
 
 

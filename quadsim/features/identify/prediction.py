@@ -85,22 +85,25 @@ class PredictionErrors:
                 found[name] = tuple(of[:RATES_JUDGED] if name == "body rates" else of)
         return found
 
+    def _exceeding(self, rival: str, share: float) -> dict[str, tuple[float, ...]]:
+        """The ratios of those quantities whose geometric mean over the horizons exceeds 1 by a share."""
+        return {name: of for name, of in self.ratios(rival).items() if math.prod(of) > (1.0 + share) ** len(of)}
+
     @property
     def lost(self) -> tuple[str, ...]:
         """Where a rival predicts better by more than `TIE`, in words; empty where the identified vehicle wins."""
         return tuple(
             f"{quantity} than {rival}, {' '.join(f'{ratio:.2f}' for ratio in of)} times its error"
             for rival in RIVALS
-            for quantity, of in self.ratios(rival).items()
-            if math.prod(of) > (1.0 + TIE) ** len(of)
+            for quantity, of in self._exceeding(rival, TIE).items()
         )
 
     @property
     def at_floor(self) -> tuple[str, ...]:
-        """Quantities in which it loses with errors within `NEAR_FLOOR` of the floor: no vehicle file mends them."""
-        lost = " ".join(self.lost)
-        floored = self.ratios(NOISE_FLOOR).items()
-        return tuple(name for name, of in floored if name in lost and math.prod(of) < (1.0 + NEAR_FLOOR) ** len(of))
+        """Quantities in which it loses to thrust and drag alone, and yet is within `NEAR_FLOOR` of the floor."""
+        lost = self._exceeding(RATES_HELD, TIE) | self._exceeding(RATES_DECAY, TIE)
+        above = self._exceeding(NOISE_FLOOR, NEAR_FLOOR)
+        return tuple(name for name in QUANTITIES if name in lost and name not in above)
 
     @property
     def verdict(self) -> str:
@@ -248,12 +251,24 @@ def _forecast(
     if not noises:
         return np.zeros((len(rows), rows.shape[1] - 1, len(INCREMENTS)))
     samples = slice(int(rows[0, 0]), int(rows[-1, -1]) + 1)
-    past = stretch(part_of(replace(held, speeds=None), samples), 0)
-    before = rotors.during(np.arange(samples.start, samples.stop - 1))
-    misfit = np.nan_to_num(past.increments - predicted_increments(past.motion, before, vehicle, p))
+    misfit = _misfit(p, vehicle, held, rotors, samples)
     starts = rows[:, 0] - samples.start
     forecasts = [noise.forecast(misfit[:, i], held.period, starts, rows.shape[1] - 1) for i, noise in enumerate(noises)]
     return np.stack(forecasts, axis=-1)
+
+
+def _misfit(p: Parameters, vehicle: Vehicle, held: Record, rotors: Turning, samples: slice) -> Array:
+    """(N - 1, 6) measured less predicted increments of N samples; what follows held rows is spread over their periods."""
+    past = stretch(part_of(replace(held, speeds=None), samples), 0)
+    new = np.arange(samples.stop - samples.start) if held.fresh is None else np.flatnonzero(held.fresh[samples])
+    first = int(new[0])
+    last = int(new[-1])
+    before = rotors.during(np.arange(samples.start + first, samples.start + last))
+    left_over = np.nan_to_num(past.misfit(predicted_increments(past.motion, before, vehicle, p)))
+    lasting = np.diff(new)
+    misfit = np.zeros((samples.stop - samples.start - 1, len(INCREMENTS)))
+    misfit[first:last] = np.repeat(left_over / lasting[:, None], lasting, axis=0)
+    return misfit
 
 
 def _surprises(known: Identification, period: float, shape: tuple[int, int], rng: np.random.Generator) -> Array:

@@ -121,8 +121,10 @@ class IdentifiedVehicle(Tabular):
             for horizon in JUDGED:
                 errors = [scale * float(of[HORIZONS.index(horizon), j]) for of in self.prediction.errors.values()]
                 if all(map(math.isfinite, errors)):
-                    best = min(errors[:-1])  # the floor is no prediction
-                    cells = [Cell(text=format_number(e), mark=Mark.BEST if e <= best else Mark.NONE) for e in errors]
+                    *predicted, floor = errors
+                    best = min(predicted)
+                    cells = [Cell(text=format_number(e), mark=Mark.BEST if e == best else Mark.NONE) for e in predicted]
+                    cells.append(Cell(text=format_number(floor)))  # no prediction
                     lines.append(line(f"{quantity} [{unit}]", f"{horizon:g} s", *cells))
         errors_grid = Grid(
             key="errors",
@@ -159,7 +161,7 @@ class IdentifiedVehicle(Tabular):
         return (
             *(f"check: {note}" for note in self.notes),
             *(
-                f"check: the error of {name} is at the floor, what the disturbance leaves open: the true vehicle would "
+                f"check: the error of {name} is at the floor, what the disturbance leaves open: the true vehicle may "
                 "lose, too; fly more briskly to see what the file is worth"
                 for name in self.prediction.at_floor
             ),
@@ -343,15 +345,8 @@ def _disturbance(estimate: DisturbanceEstimate) -> tuple[Cell, ...]:
     """Return a line of the table of disturbances."""
     name = f"{estimate.kind} {estimate.axis}"
     if estimate.refused:
-        return line(
-            name,
-            estimate.unit,
-            ABSENT,
-            ABSENT,
-            ABSENT,
-            ABSENT,
-            Cell(text=f"left out: {estimate.refused}", mark=Mark.TEXT),
-        )
+        why = Cell(text=f"left out: {estimate.refused}", mark=Mark.TEXT)
+        return line(name, estimate.unit, *4 * [ABSENT], why)
     return line(
         name,
         estimate.unit,

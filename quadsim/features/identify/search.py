@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -158,6 +157,14 @@ class Search:
             np.array(wind, int).reshape(-1, 3) for wind in winds
         ]  # (K, 3) where each stretch's wind is in `x`
 
+    def in_steady_wind(self, x: Array) -> Array:
+        """The same numbers with the wind of each stretch at its mean."""
+        steady = x.copy()
+        for wind in self._winds:
+            if len(wind):
+                steady[wind] = x[wind].mean(axis=0)
+        return steady
+
     def parameters(self, x: Array, part: int) -> Parameters:
         """The prediction's parameters for a stretch."""
         own: dict[str, Any] = {
@@ -180,13 +187,9 @@ class Search:
             return measured(of.foretold, of.record.period, delay=parameters.delay)
         return turning(of.record, self.vehicle, parameters)
 
-    def misfit(
-        self, x: Array, part: int, rotors: Turning | None = None, *, steady: bool = False
-    ) -> tuple[Array, Turning]:
-        """(N, 6) measured less predicted increments of a stretch, and its rotors; `steady`: in the mean wind."""
+    def misfit(self, x: Array, part: int, rotors: Turning | None = None) -> tuple[Array, Turning]:
+        """(N, 6) measured less predicted increments of a stretch, and its rotors."""
         parameters = self.parameters(x, part)
-        if steady:
-            parameters = replace(parameters, wind=parameters.wind.mean(axis=0, keepdims=True))
         rotors = rotors or self._turns(x, part)
         of = self.parts[part]
         misfit = of.misfit(predicted_increments(of.motion, rotors, self.vehicle, parameters))
