@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects, label, median_filter
 
 from quadsim.errors import InputError
-from quadsim.features.identify.series import Column
+from quadsim.features.identify.series import Column, held
 from quadsim.state import Array
 
 LONGEST_SPIKE: Final = 3  # samples
@@ -27,6 +27,7 @@ TURN_AWAY, TURN_ON = 1.0, 0.5
 LENGTH: Final = 0.02  # by which the length of a quaternion may differ from 1
 TURNING: Final = 0.5  # share of the others' usual speed above which they carry a vehicle
 LONGEST_HELD: Final = 1.0  # [s] for which a radio holds a row, and a counter a speed
+IDLE: Final = 0.1  # share of a rotor's largest command below which it may stop
 MOST_STOPPED: Final = 0.05  # share of the flight in which a counter may have stopped
 ROUNDING: Final = 1e-9  # [rad, rad/s, m/s]: below it, nothing has changed
 SLOWEST_FRESH: Final = 20.0  # [Hz] at which rows must be new
@@ -148,13 +149,13 @@ def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str
     if not still.any():
         return dict(series), ()
     period = float(np.median(np.diff(t)))
-    held = np.append(False, still & ~at_rest(still, round(LONGEST_HELD / period)))
-    if not held.any():
+    repeated = np.append(False, still & ~at_rest(still, round(LONGEST_HELD / period)))
+    if not repeated.any():
         return dict(series), ()
-    moving = int(len(held) - np.count_nonzero(still & ~held[1:]))
-    rate = (moving - int(held.sum())) / (moving * period)
-    where = f"the first at t = {t[np.argmax(held)]:.6g} s"
-    what = f"{name}: {held.mean():.0%} of its rows repeat rates and attitude of the one before, {where}"
+    moving = int(len(repeated) - np.count_nonzero(still & ~repeated[1:]))
+    rate = (moving - int(repeated.sum())) / (moving * period)
+    where = f"the first at t = {t[np.argmax(repeated)]:.6g} s"
+    what = f"{name}: {repeated.mean():.0%} of its rows repeat rates and attitude of the one before, {where}"
     if rate < SLOWEST_FRESH:
         raise InputError(
             f"{what}, as a radio does that holds them; {rate:.3g} rows per second are new, {SLOWEST_FRESH:g} are "
@@ -165,16 +166,16 @@ def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str
         if samples.t is not t or field == "voltage":
             continue
         repeats = np.abs(np.diff(samples.values, axis=0)).max(axis=1, initial=0.0) <= ROUNDING
-        if repeats[held[1:]].mean() < HELD_TOO:
+        if repeats[repeated[1:]].mean() < HELD_TOO:
             continue
         values = samples.values.copy()
         if field in ("commands", "throttle"):
-            known = [np.interp(t, t[~held], column[~held]) for column in values.T]
+            known = [np.interp(t, t[~repeated], column[~repeated]) for column in values.T]
             values = np.stack(known, axis=1)
         else:
-            values[held] = np.nan
+            values[repeated] = np.nan
         result[field] = samples._replace(values=values)
-    result["fresh"] = Column(t=t, values=(~held).astype(float)[:, None])
+    result["fresh"] = Column(t=t, values=(~repeated).astype(float)[:, None])
     return result, (f"{what}: left out",)
 
 
@@ -208,11 +209,15 @@ def without_stopped_counters(name: str, series: Mapping[str, Column]) -> tuple[d
     if np.count_nonzero(there) < 2:
         return result, ()
     longest = round(LONGEST_HELD / float(np.median(np.diff(t))))
+    sent = series.get("commands", series.get("throttle"))
     values = speeds.copy()
     notes = []
     for i in range(speeds.shape[1]):
         others = np.median(np.delete(speeds, i, axis=1), axis=1)
         turning = there & (np.nan_to_num(others) > TURNING * np.quantile(others[there], 0.9))
+        if sent is not None:
+            wanted = np.nan_to_num(held(sent, t)[:, i])
+            turning &= wanted > IDLE * wanted.max()
         stopped = turning & ((speeds[:, i] == 0.0) | _kept(speeds, i, longest))
         if not stopped.any():
             continue
