@@ -22,10 +22,10 @@ FARTHEST: Final = 1.5  # how far a sample may be from the median about it, in ra
 LOUDEST: Final = 8.0  # the same in median distances, where a column hardly changes
 COMMANDS_APART: Final = 3.0  # how far a command may be from 0, in the largest median: a real one may last one sample
 MOST_CUT: Final = 0.01  # share of a sensor's samples that may be cut
-TURN_AWAY, TURN_ON = 1.0, 0.5
+TURN_AWAY, TURNED_BACK = 1.0, 0.5
 """Angles [rad]: an attitude that is farther than the first from both neighbours, which are nearer than the second."""
 LENGTH: Final = 0.02  # by which the length of a quaternion may differ from 1
-TURNING: Final = 0.5  # share of the others' usual speed above which they carry a vehicle
+CARRYING: Final = 0.5  # share of the others' usual speed above which they carry a vehicle
 LONGEST_HELD: Final = 1.0  # [s] for which a radio holds a row, and a counter a speed
 IDLE: Final = 0.1  # share of a rotor's largest command below which it may stop
 MOST_STOPPED: Final = 0.05  # share of the flight in which a counter may have stopped
@@ -128,7 +128,7 @@ def _attitude_spikes(quaternion: Array) -> NDArray[np.bool_]:
         return np.asarray(2.0 * np.arccos(np.minimum(along, 1.0)))
 
     once, twice = turn(1), turn(2)
-    away = (once[:-1] > TURN_AWAY) & (once[1:] > TURN_AWAY) & (twice < TURN_ON)
+    away = (once[:-1] > TURN_AWAY) & (once[1:] > TURN_AWAY) & (twice < TURNED_BACK)
     spikes[rows[1:-1][away]] = True
     return spikes
 
@@ -214,7 +214,7 @@ def without_stopped_counters(name: str, series: Mapping[str, Column]) -> tuple[d
     notes = []
     for i in range(speeds.shape[1]):
         others = np.median(np.delete(speeds, i, axis=1), axis=1)
-        turning = there & (np.nan_to_num(others) > TURNING * np.quantile(others[there], 0.9))
+        turning = there & (np.nan_to_num(others) > CARRYING * np.quantile(others[there], 0.9))
         if sent is not None:
             wanted = np.nan_to_num(held(sent, t)[:, i])
             turning &= wanted > IDLE * wanted.max()
