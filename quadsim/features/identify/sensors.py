@@ -142,7 +142,8 @@ def _attitude_spikes(quaternion: Array) -> NDArray[np.bool_]:
 def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str, Column], tuple[str, ...]]:
     """Return the series of a log without rows that a radio held: rates and attitude as in the row before.
 
-    A series `fresh` says which rows are new; the others are NaN, of commands that were held with them linear.
+    A series `fresh` says which rows are new, and of which something of the rotors is known; the others are NaN, of
+    commands that were held with them linear.
 
     Raises:
         InputError: fewer than `SLOWEST_FRESH` rows per second are new.
@@ -168,6 +169,7 @@ def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str
             "needed: log faster, or on board"
         )
     result = dict(series)
+    known_rotors = np.ones(len(t), bool)
     for field, samples in series.items():
         if samples.t is not t or field == "voltage":
             continue
@@ -175,13 +177,15 @@ def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str
         if repeats[repeated[1:]].mean() < HELD_TOO:
             continue
         values = samples.values.copy()
+        if field in ("commands", "throttle", "speeds"):
+            known_rotors = ~repeated
         if field in ("commands", "throttle"):
             known = [np.interp(t, t[~repeated], column[~repeated]) for column in values.T]
             values = np.stack(known, axis=1)
         else:
             values[repeated] = np.nan
         result[field] = samples._replace(values=values)
-    result["fresh"] = Column(t=t, values=(~repeated).astype(float)[:, None])
+    result["fresh"] = Column(t=t, values=np.stack([~repeated, known_rotors], axis=1).astype(float))
     return result, (f"{what}: left out",)
 
 
