@@ -41,7 +41,7 @@ from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 Table = dict[str, Any]
 DrawnLog = tuple[str, int]  # condition and seed of a log
 VEHICLES: Final = 20
-FIRST_SEED: Final = 5000
+FIRST_SEED: Final = 422_400_000
 DURATION: Final = 20.0  # [s]
 TRACKED: Final = {
     "position": {"rate": 100.0, "noise": 0.003},

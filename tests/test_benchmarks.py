@@ -136,6 +136,26 @@ def test_the_interval_of_a_hover_s_thrust_holds_the_truth(tmp_path: Path) -> Non
     assert records["drag_to_thrust"]["passed"] == 0
 
 
+def test_intervals_goes_on_from_the_answers_that_it_kept(tmp_path: Path) -> None:
+    """A log that raised counts as failed; a line that was cut off is none; nothing is flown again."""
+    estimate = {"passed": True, "inside": True, "error": 0.01}
+    kept = [
+        {"condition": "hover", "seed": 700, "answer": {"thrust_coefficient": estimate}},
+        {"condition": "hover", "seed": 701, "answer": {"verdict": "error", "reason": "it raised"}},
+    ]
+    answers = tmp_path / "answers.jsonl"
+    answers.write_text("\n".join(map(json.dumps, kept)) + '\n{"condition": "ho')
+    code = (
+        "import sys; sys.path[:0] = ['benchmarks']; import intervals; intervals.CONDITIONS = {'hover': {}}; "
+        "intervals.main()"
+    )
+    file = tmp_path / "out.json"
+    done = script("-c", code, "--seed", "700", "--vehicles", "2", "--answers", answers, "--json", file)
+    assert done.returncode == 0, done.stderr
+    (record,) = json.loads(file.read_text())["records"]
+    assert (record["logs"], record["failed"], record["passed"], record["inside"]) == (2, 1, 1, 1)
+
+
 def test_the_margins_of_lqr_are_on_both_sides(tmp_path: Path) -> None:
     (record,) = quick("stability", tmp_path)
     assert (record["law"], record["heading [deg]"]) == ("lqr", "< -180 .. > 180")

@@ -46,6 +46,9 @@ _GUSTS: Final = 0.015  # of drag, by wind that changes faster than its knots
 _BLOWN: Final = 0.01  # of what torques show, by such wind where `rotor_moment` turns it into torque
 _MAPPED: Final = 2.0  # how much more the prediction leaves out where speeds follow from a throttle's curve
 _SPUN: Final = 0.004  # of inertia: noise of the gyro shrinks what commands explain, by 0.5 % where it is loud
+_LAG_UNKNOWN, _ANSWER_UNKNOWN, _TORQUE_UNKNOWN = 0.4, 0.15, 0.08
+"""Of a lag that is searched for, of one that measured speeds show, and of torques: deviations per share of the rows in
+which a radio held what the log says of the rotors too."""
 _TURNS: Final = "a figure eight with yaw steps, 20 s"
 _FAST: Final = "a figure eight at 2 m/s or more, 20 s"
 _CLIMBING: Final = "climbs and descents of 1 m/s while moving sideways at 2 m/s, 20 s"
@@ -180,6 +183,7 @@ class _Fit:
         self.colour = _colour(search)
         self.most_colour = max(MOST_COLOUR, CHANCE / min(map(len, search.innovations(search.x))) ** 0.5)
         self._blown = self._gusts_turn()
+        self._rotors_unknown = max(part.record.rotors_unknown for part in search.parts)
         self.set_anew: set[str] = set()
         """Numbers that are refused and yet sought once more: where the log speaks against the start."""
         self.estimates = self._every_estimate()
@@ -214,7 +218,11 @@ class _Fit:
         """Deviation of a sum of shares of x by what the prediction leaves out."""
         floor = max(_KINDS[self._kind(i)].floor for i in shares) * (_MAPPED if self._throttle else 1.0)
         turns = {*axes} <= {"roll", "pitch", "yaw"} and all(self.search.sought[i].scale is None for i in shares)
-        return math.hypot(floor, _BLOWN) if turns and self._blown else floor
+        if not turns:
+            return floor
+        lags = any(self._kind(i) in ("rotor_rise", "rotor_fall") for i in shares)
+        unknown = self._rotors_unknown * (_LAG_UNKNOWN if lags else _TORQUE_UNKNOWN)
+        return math.hypot(floor, unknown, _BLOWN if self._blown else 0.0)
 
     def _gusts_turn(self) -> bool:
         """Whether there is wind and, by two standard deviations, a moment that it makes a torque of."""
@@ -276,7 +284,8 @@ class _Fit:
         found = {}
         for name, response in self.response.items():
             kind, value = _KINDS[name], response.value
-            spread = math.hypot(response.deviation, _ANSWERS * abs(value))
+            unknown = _ANSWER_UNKNOWN * self._rotors_unknown
+            spread = math.hypot(response.deviation, _ANSWERS * abs(value), unknown * abs(value))
             half = _quantile(response.blocks) * spread
             widest = _WIDEST_ANSWER.get(name, math.expm1(WIDEST) * abs(value))
             unit = kind.unit or VEHICLE_UNITS[name]

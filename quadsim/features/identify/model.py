@@ -173,29 +173,28 @@ def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, 
     axial = air[:, 2:] + roll[:, None] * y - pitch[:, None] * x
     thrust = p.thrust_coefficient * rotors.square - p.inflow * rotors.mean * axial
     dragging = p.rotor_drag * rotors.mean
+    every = np.ones(len(spin))
+    turning_speed = rotors.mean @ every
     side = -(dragging * (air[:, :1] - yaw[:, None] * y)), -(dragging * (air[:, 1:2] + yaw[:, None] * x))
-    total = thrust.sum(axis=1)
-    force = np.stack([side[0].sum(axis=1), side[1].sum(axis=1), total], axis=1)
+    total = thrust @ every
+    force = np.stack([side[0] @ every, side[1] @ every, total], axis=1)
     momentum = -(rotors.mean @ spin) * p.rotor_inertia
     spun_up = -(rotors.change @ spin) * p.rotor_inertia
     torque = np.stack(
         [
             thrust @ y
             - p.offset[1] * total
-            + p.rotor_moment[0] * (rotors.mean.sum(axis=1) * air[:, 1] + yaw * (rotors.mean @ x))
+            + p.rotor_moment[0] * (turning_speed * air[:, 1] + yaw * (rotors.mean @ x))
             - p.inflow_moment[0] * air[:, 1] * air[:, 2]
             - momentum * pitch
             - (jz - jy) * pitch * yaw,
             p.offset[0] * total
             - thrust @ x
-            - p.rotor_moment[1] * (rotors.mean.sum(axis=1) * air[:, 0] - yaw * (rotors.mean @ y))
+            - p.rotor_moment[1] * (turning_speed * air[:, 0] - yaw * (rotors.mean @ y))
             + p.inflow_moment[1] * air[:, 0] * air[:, 2]
             + momentum * roll
             - (jx - jz) * roll * yaw,
-            p.drag_to_thrust * (thrust @ spin)
-            + (side[1] * x - side[0] * y).sum(axis=1)
-            + p.yaw_trim
-            - (jy - jx) * roll * pitch,
+            p.drag_to_thrust * (thrust @ spin) + side[1] @ x - side[0] @ y + p.yaw_trim - (jy - jx) * roll * pitch,
         ],
         axis=1,
     )

@@ -258,7 +258,7 @@ def _forecast(
 
 
 def _misfit(p: Parameters, vehicle: Vehicle, held: Record, rotors: Turning, samples: slice) -> Array:
-    """(N - 1, 6) measured less predicted increments of N samples; what follows held rows is spread over their periods."""
+    """(N - 1, 6) measured less predicted increments of N samples; those over held rows are spread evenly."""
     past = stretch(part_of(replace(held, speeds=None), samples), 0)
     new = np.arange(samples.stop - samples.start) if held.fresh is None else np.flatnonzero(held.fresh[samples])
     first = int(new[0])

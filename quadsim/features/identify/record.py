@@ -75,6 +75,7 @@ class Record:
     voltage: Array | None = None  # (N,) of the battery [V]
     flying: NDArray[np.bool_] | None = None  # (N,) whether its autopilot was armed and not landed
     fresh: NDArray[np.bool_] | None = None  # (N,) rows that a radio did not hold, where it held any
+    rotors_unknown: float = 0.0  # share of rows in which the radio held what it says of the rotors too
     inertial: bool = False
     """Whether an accelerometer stands in for the velocity, which then has its changes, but neither mean nor drift."""
     notes: tuple[str, ...] = ()  # what was derived or assumed in reading it
@@ -198,7 +199,9 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
         values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
     if fresh is not None:
-        values["fresh"] = held(fresh, grid + 0.05 * period)[:, 0]
+        fresh_rows, known_rotors = held(fresh, grid + 0.05 * period).T
+        values["fresh"] = fresh_rows
+        values["rotors_unknown"] = np.full(len(grid), 1.0 - known_rotors.mean())
     if len(grid) > 10 * (size := int(1.0 / (FASTEST_RATE * period))) > 20:
         grid, values = _thinned(grid, values, size - 1 + size % 2)
         values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
@@ -207,6 +210,7 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     aloft = None if flying is None else held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
     if "fresh" in values:
         values["fresh"] = values["fresh"] > 0.0
+        values["rotors_unknown"] = float(values["rotors_unknown"][0])
     return Record(name=name, t=grid, flying=aloft, notes=notes, inertial=inertial, **values)
 
 

@@ -20,7 +20,7 @@ from quadsim.vehicle import Vehicle
 NOTED_RATIO: Final = 1.07  # of a rotor's speed over its command to that of the others
 REFUSED_RATIO: Final = 1.15
 NOTED_SCALE: Final = 1.1  # by which one rotor's speeds alone, were they wrong, balance the torques
-BALANCED: Final = 0.35  # of the centre's distance that is left where they do
+CENTRE_LEFT: Final = 0.35  # of the centre's distance that is left where they do
 LAGGING_BETTER: Final = 1.2  # what speeds leave unexplained, over what they leave behind a rotor's lag
 SMOOTHING: Final = (0.0, 0.005, 0.01, 0.015, 0.03, 0.06)  # [s] of a filter without lag, which takes noise away too
 
@@ -83,7 +83,7 @@ def check_against_each_other(record: Record, parts: Sequence[slice], vehicle: Ve
             left[i] = centre(balanced)
     i = int(np.argmin(left))
     off = max(scales[i], 1.0 / scales[i])
-    if off > NOTED_SCALE and left[i] < BALANCED * centre(thrusts):
+    if off > NOTED_SCALE and left[i] < CENTRE_LEFT * centre(thrusts):
         raise InputError(
             f"{record.name}: the measured speed of rotor {i + 1} is {scales[i]:.3g} times what balances the torques of "
             "the others about all three axes: correct its scale, or give each rotor its own thrust_coefficient"

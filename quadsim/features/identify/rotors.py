@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 from scipy.interpolate import make_smoothing_spline
-from scipy.linalg import solve_banded
+from scipy.linalg.lapack import dtbtrs
 
 from quadsim.fields import FLOORS
 from quadsim.state import Array, Indices
@@ -49,29 +49,35 @@ def lagging(commands: Array, period: float, *, rise: float, fall: float, delay: 
     whole = int(np.floor(delay / period + 1e-9))
     late = delay - whole * period
     sent = np.arange(n - 1)[:, None] - whole + [-1, 0]  # which command is in force, before and after the new one comes
-    held = np.repeat([[late, period - late]], n - 1, axis=0).ravel()
+    held = np.tile([late, period - late], n - 1)
     pieces = 2 * (n - 1)
-    at, mean, square = np.empty((n, N_ROTORS)), np.empty((n - 1, N_ROTORS)), np.empty((n - 1, N_ROTORS))
-    for rotor in range(N_ROTORS):
-        target = commands[np.clip(sent, 0, n - 1), rotor].ravel()
-        rising = np.diff(target, prepend=target[0]) >= 0.0
-        for _ in range(_PASSES):  # a speed never passes its command: the side that it starts from holds for the piece
-            tau = np.where(rising, rise, fall)
-            decay = np.exp(-held / tau)
-            bands = np.ones((2, pieces + 1))
-            bands[1, :-1] = -decay
-            speed = solve_banded((1, 0), bands, np.append(commands[0, rotor], (1.0 - decay) * target))
-            before, rising = rising, target >= speed[:-1]
-            if np.array_equal(before, rising):
-                break
-        gap = speed[:-1] - target
-        lost = gap * tau * (1.0 - decay)
-        area = target * held + lost
-        energy = target**2 * held + 2.0 * target * lost + 0.5 * gap**2 * tau * (1.0 - decay**2)
-        at[:, rotor] = speed[::2]
-        mean[:, rotor] = area.reshape(-1, 2).sum(axis=1) / period
-        square[:, rotor] = energy.reshape(-1, 2).sum(axis=1) / period
-    return Turning(speeds=at, mean=mean, square=square)
+    targets = commands[np.clip(sent, 0, n - 1)].reshape(pieces, N_ROTORS).T  # (4, pieces)
+    rising = np.diff(targets, prepend=targets[:, :1]) >= 0.0
+    decays = np.exp(-np.outer([1.0 / fall, 1.0 / rise], held))
+    bands = np.zeros((2, N_ROTORS, pieces + 1))  # of one triangular system, rotor after rotor
+    bands[0] = 1.0
+    sides = np.empty((N_ROTORS, pieces + 1))
+    sides[:, 0] = commands[0]
+    for _ in range(_PASSES):  # a speed never passes its command: the side that it starts from holds for the piece
+        decay = np.where(rising, decays[1], decays[0])
+        bands[1, :, :-1] = -decay
+        sides[:, 1:] = (1.0 - decay) * targets
+        solution, _ = dtbtrs(bands.reshape(2, -1), sides.reshape(-1, 1), uplo="L")
+        speeds = solution.reshape(N_ROTORS, pieces + 1)
+        before = rising
+        rising = targets >= speeds[:, :-1]
+        if np.array_equal(before, rising):
+            break
+    tau = np.where(before, rise, fall)
+    gap = speeds[:, :-1] - targets
+    lost = gap * tau * (1.0 - decay)
+    area = targets * held + lost
+    energy = targets**2 * held + 2.0 * targets * lost + 0.5 * gap**2 * tau * (1.0 - decay**2)
+    return Turning(
+        speeds=np.ascontiguousarray(speeds[:, ::2].T),
+        mean=(area[:, ::2] + area[:, 1::2]).T / period,
+        square=(energy[:, ::2] + energy[:, 1::2]).T / period,
+    )
 
 
 def measured(speeds: Array, period: float, *, delay: float) -> Turning:

@@ -11,22 +11,25 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import find_objects, label, median_filter
+from scipy.ndimage import find_objects, label, maximum_filter1d, median_filter
 
 from quadsim.errors import InputError
-from quadsim.features.identify.series import Column
+from quadsim.features.identify.series import Column, held
 from quadsim.state import Array
 
-LONGEST_SPIKE: Final = 3  # samples
+LONGEST_SPIKE: Final = 3  # samples, of which a log with a sample in `SPIKE_TIME` or more has one
+SPIKE_TIME: Final = 0.03  # [s]: what lasts longer may be flown
 FARTHEST: Final = 1.5  # how far a sample may be from the median about it, in ranges of all medians
 LOUDEST: Final = 8.0  # the same in median distances, where a column hardly changes
 COMMANDS_APART: Final = 3.0  # how far a command may be from 0, in the largest median: a real one may last one sample
 MOST_CUT: Final = 0.01  # share of a sensor's samples that may be cut
-TURN_AWAY, TURN_ON = 1.0, 0.5
+TURN_AWAY, TURNED_BACK = 1.0, 0.5
 """Angles [rad]: an attitude that is farther than the first from both neighbours, which are nearer than the second."""
 LENGTH: Final = 0.02  # by which the length of a quaternion may differ from 1
-TURNING: Final = 0.5  # share of the others' usual speed above which they carry a vehicle
+CARRYING: Final = 0.5  # share of the others' usual speed above which they carry a vehicle
 LONGEST_HELD: Final = 1.0  # [s] for which a radio holds a row, and a counter a speed
+IDLE: Final = 0.1  # share of a rotor's largest command below which it may stop
+SLOWS_DOWN: Final = 0.1  # [s] for which such a command must last
 MOST_STOPPED: Final = 0.05  # share of the flight in which a counter may have stopped
 ROUNDING: Final = 1e-9  # [rad, rad/s, m/s]: below it, nothing has changed
 SLOWEST_FRESH: Final = 20.0  # [Hz] at which rows must be new
@@ -72,14 +75,15 @@ def without_spikes(name: str, series: Mapping[str, Column]) -> tuple[dict[str, C
         if field == "attitude":
             off = _attitude_spikes(samples.values)[:, None]
         else:
-            off = _spikes(samples.values, command=field == "commands")
+            off = _spikes(samples, command=field == "commands")
         if not off.any():
             continue
         for i in np.flatnonzero(off.any(axis=0)):
             row = int(np.argmax(off[:, i]))
             count = np.count_nonzero(off[:, i])
-            value = samples.values[row] if field == "attitude" else samples.values[row, i]
-            what = f"{name}: {columns[i]} is {np.array2string(value, precision=4)} {unit} at t = {samples.t[row]:.6g} s"
+            logged = samples.values[row] if field == "attitude" else samples.values[row, i : i + 1]
+            value = ", ".join(f"{number:.4g}" for number in logged)
+            what = f"{name}: {columns[i]} is {value} {unit} at t = {samples.t[row]:.6g} s"
             more = f" and in {count - 1} more samples" if count > 1 else ""
             if count > MOST_CUT * len(off):
                 raise InputError(
@@ -93,14 +97,17 @@ def without_spikes(name: str, series: Mapping[str, Column]) -> tuple[dict[str, C
     return result, tuple(notes)
 
 
-def _spikes(values: Array, *, command: bool) -> NDArray[np.bool_]:
+def _spikes(samples: Column, *, command: bool) -> NDArray[np.bool_]:
     """Samples (M, n) that are far from the median about them."""
+    t, values = samples
     off = np.zeros(values.shape, bool)
     there = np.isfinite(values).all(axis=1)
     if np.count_nonzero(there) < 4 * LONGEST_SPIKE:
         return off
     rows = values[there]
-    middle = median_filter(rows, size=(2 * LONGEST_SPIKE + 1, 1), mode="nearest")
+    longest = round(SPIKE_TIME / float(np.median(np.diff(t))))
+    size = 2 * min(max(longest, 1), LONGEST_SPIKE) + 1
+    middle = median_filter(rows, size=(size, 1), mode="nearest")
     distance = np.abs(rows - middle)
     if command:
         off[there] = np.abs(rows) > COMMANDS_APART * np.abs(middle).max()
@@ -127,7 +134,7 @@ def _attitude_spikes(quaternion: Array) -> NDArray[np.bool_]:
         return np.asarray(2.0 * np.arccos(np.minimum(along, 1.0)))
 
     once, twice = turn(1), turn(2)
-    away = (once[:-1] > TURN_AWAY) & (once[1:] > TURN_AWAY) & (twice < TURN_ON)
+    away = (once[:-1] > TURN_AWAY) & (once[1:] > TURN_AWAY) & (twice < TURNED_BACK)
     spikes[rows[1:-1][away]] = True
     return spikes
 
@@ -135,7 +142,8 @@ def _attitude_spikes(quaternion: Array) -> NDArray[np.bool_]:
 def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str, Column], tuple[str, ...]]:
     """Return the series of a log without rows that a radio held: rates and attitude as in the row before.
 
-    A series `fresh` says which rows are new; the others are NaN, of commands that were held with them linear.
+    A series `fresh` says which rows are new, and of which something of the rotors is known; the others are NaN, of
+    commands that were held with them linear.
 
     Raises:
         InputError: fewer than `SLOWEST_FRESH` rows per second are new.
@@ -148,33 +156,36 @@ def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str
     if not still.any():
         return dict(series), ()
     period = float(np.median(np.diff(t)))
-    held = np.append(False, still & ~at_rest(still, round(LONGEST_HELD / period)))
-    if not held.any():
+    repeated = np.append(False, still & ~at_rest(still, round(LONGEST_HELD / period)))
+    if not repeated.any():
         return dict(series), ()
-    moving = int(len(held) - np.count_nonzero(still & ~held[1:]))
-    rate = (moving - int(held.sum())) / (moving * period)
-    where = f"the first at t = {t[np.argmax(held)]:.6g} s"
-    what = f"{name}: {held.mean():.0%} of its rows repeat rates and attitude of the one before, {where}"
+    moving = int(len(repeated) - np.count_nonzero(still & ~repeated[1:]))
+    rate = (moving - int(repeated.sum())) / (moving * period)
+    where = f"the first at t = {t[np.argmax(repeated)]:.6g} s"
+    what = f"{name}: {repeated.mean():.0%} of its rows repeat rates and attitude of the one before, {where}"
     if rate < SLOWEST_FRESH:
         raise InputError(
             f"{what}, as a radio does that holds them; {rate:.3g} rows per second are new, {SLOWEST_FRESH:g} are "
             "needed: log faster, or on board"
         )
     result = dict(series)
+    known_rotors = np.ones(len(t), bool)
     for field, samples in series.items():
         if samples.t is not t or field == "voltage":
             continue
         repeats = np.abs(np.diff(samples.values, axis=0)).max(axis=1, initial=0.0) <= ROUNDING
-        if repeats[held[1:]].mean() < HELD_TOO:
+        if repeats[repeated[1:]].mean() < HELD_TOO:
             continue
         values = samples.values.copy()
+        if field in ("commands", "throttle", "speeds"):
+            known_rotors = ~repeated
         if field in ("commands", "throttle"):
-            known = [np.interp(t, t[~held], column[~held]) for column in values.T]
+            known = [np.interp(t, t[~repeated], column[~repeated]) for column in values.T]
             values = np.stack(known, axis=1)
         else:
-            values[held] = np.nan
+            values[repeated] = np.nan
         result[field] = samples._replace(values=values)
-    result["fresh"] = Column(t=t, values=(~held).astype(float)[:, None])
+    result["fresh"] = Column(t=t, values=np.stack([~repeated, known_rotors], axis=1).astype(float))
     return result, (f"{what}: left out",)
 
 
@@ -207,12 +218,18 @@ def without_stopped_counters(name: str, series: Mapping[str, Column]) -> tuple[d
     there = np.isfinite(speeds).all(axis=1)
     if np.count_nonzero(there) < 2:
         return result, ()
-    longest = round(LONGEST_HELD / float(np.median(np.diff(t))))
+    period = float(np.median(np.diff(t)))
+    longest = round(LONGEST_HELD / period)
+    sent = series.get("commands", series.get("throttle"))
     values = speeds.copy()
     notes = []
     for i in range(speeds.shape[1]):
         others = np.median(np.delete(speeds, i, axis=1), axis=1)
-        turning = there & (np.nan_to_num(others) > TURNING * np.quantile(others[there], 0.9))
+        turning = there & (np.nan_to_num(others) > CARRYING * np.quantile(others[there], 0.9))
+        if sent is not None:
+            wanted = np.nan_to_num(held(sent, t)[:, i])
+            lately = maximum_filter1d(wanted, 2 * round(SLOWS_DOWN / period) + 1)
+            turning &= lately > IDLE * wanted.max()
         stopped = turning & ((speeds[:, i] == 0.0) | _kept(speeds, i, longest))
         if not stopped.any():
             continue

@@ -13,11 +13,12 @@ from scipy.signal import lfilter
 import quadsim
 from quadsim.errors import InputError
 from quadsim.features.identify.estimate import Identification, ParameterEstimate
-from quadsim.features.identify.fit import MOST_COLOUR, identify_records
+from quadsim.features.identify.fit import MOST_COLOUR, _Fit, identify_records
+from quadsim.features.identify.model import stretch
 from quadsim.features.identify.prediction import predict
 from quadsim.features.identify.record import Record, to_record
 from quadsim.features.identify.rotors import lagging
-from quadsim.features.identify.search import _polynomial
+from quadsim.features.identify.search import Search, _polynomial
 from quadsim.features.identify.series import Column
 from quadsim.features.identify.windows import to_world
 from quadsim.rollout.flown import Flight
@@ -206,6 +207,25 @@ def test_hover_refuses_yaw_and_drag_and_says_what_to_fly() -> None:
     kept = found.vehicle
     assert (kept.inertia[2], kept.rotor_inertia) == (START.inertia[2], START.rotor_inertia)
     assert kept.rotor_drag == pytest.approx(TRUE.rotor_drag, rel=0.7)  # which the start lacks: a rough one is better
+
+
+def test_the_gate_judges_the_final_interval() -> None:
+    """What a later search moves far is not identified."""
+    record = record_of(flown())
+    search = Search([stretch(record, 0)], START, wind=False)
+    search.run()
+    fit = _Fit(search, {})
+    assert not fit.estimates["inertia_x"].refused
+    assert fit.refuse_what_moved(search) == {}
+    moved = Search(search.parts, START, wind=False)
+    moved.adopt(search)
+    moved.x[[number.name for number in search.sought].index("inertia_x")] += 0.4
+    held = fit.refuse_what_moved(moved)
+    assert "inertia_x" not in held  # the log speaks against the start's
+    refused = fit.estimates["inertia_x"]
+    assert refused.refused.startswith("not excited: the interval is +-")
+    assert refused.advice
+    assert refused.low < search.sought[1].value(search.x[1]) < refused.high
 
 
 @pytest.mark.parametrize("late", [1, -1])

@@ -19,6 +19,7 @@ from quadsim.commands.cli import main
 from quadsim.errors import FileError, InputError, MissingPackageError, ParameterError
 from quadsim.features.identify.checks import check_log, spans
 from quadsim.features.identify.record import Record, read_record
+from quadsim.features.identify.rotors import lagging
 from quadsim.features.identify.ulog import stated_rotors
 from quadsim.features.identify.windows import to_world
 from quadsim.flight.parquet import write_log
@@ -174,12 +175,14 @@ def test_log_without_a_whole_row(tmp_path: Path, eight: Record, hummingbird: Veh
 def test_erpm(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
     """ERPM / (poles / 2) = rpm; 65535 is a gap; poles are asked for, and a wrong count is named."""
     table = columns(eight)
-    erpm = {f"erpm{i}": 7.0 * table[f"u{i}"] * 60.0 / (2.0 * np.pi) for i in range(1, 5)}
+    assert eight.commands is not None
+    speeds = lagging(eight.commands, eight.period, rise=0.0125, fall=0.025, delay=0.0).speeds
+    erpm = {f"erpm{i}": 7.0 * speeds[:, i - 1] * 60.0 / (2.0 * np.pi) for i in range(1, 5)}
     erpm["erpm2"][50] = 65535
     path = write_csv(tmp_path / "f.csv", {**table, **erpm}, without="u1 u2 u3 u4")
     read = read_record(path, poles=14)
     assert read.speeds is not None
-    np.testing.assert_allclose(read.speeds[:50], eight.commands[:50])  # type: ignore[index]
+    np.testing.assert_allclose(read.speeds[:50], speeds[:50])
     np.testing.assert_allclose(read.speeds[50], read.speeds[[49, 51]].mean(axis=0))
     assert notes(read, hummingbird) == ()
     for poles, cause in ((28, "twice the motor's poles"), (2, "eRPM not divided")):

@@ -394,12 +394,18 @@ def blackbox(path: Path, columns: dict[str, Array], **headers: object) -> Path:
     return path
 
 
+def turning_speeds(record: Record) -> Array:
+    """Rotors of the Hummingbird behind the record's commands [rad/s]."""
+    assert record.commands is not None
+    return lagging(record.commands, record.period, rise=0.0125, fall=0.025, delay=0.0).speeds
+
+
 def betaflight(record: Record) -> dict[str, Array]:
     """Gyro in 0.1 deg/s, accelerometer of 2048 per g, the quaternion's vector, DShot, speeds in 100 eRPM."""
     falling = np.gradient(record.velocity, record.t, axis=0) + np.array([0.0, 0.0, 9.81])
     force = to_world(conjugate(record.attitude), falling)
     turn = record.attitude * np.sign(record.attitude[:, :1])
-    speeds = throttle(record) * FULL * 60.0 / (2.0 * np.pi) * 6.0 / 100.0
+    speeds = turning_speeds(record) * 60.0 / (2.0 * np.pi) * 6.0 / 100.0
     groups = {"gyroADC": 10.0 * np.degrees(record.rates), "accSmooth": force * 2048.0 / 9.80665}
     groups |= {
         "imuQuaternion": 32767.0 * turn[:, 1:],
@@ -433,7 +439,7 @@ def test_blackbox(tmp_path: Path, eight: Record) -> None:
     check_flight(read, eight, exact=2e-3, shift=3.0)
     assert read.voltage == pytest.approx(15.87)
     assert read.speeds is not None
-    np.testing.assert_allclose(read.speeds, FULL * np.asarray(read.throttle), atol=2.0)
+    np.testing.assert_allclose(read.speeds, turning_speeds(eight), atol=2.0)
     path.write_bytes(whole[: len(whole) * 3 // 4])
     assert 0.6 * len(eight.t) < len(read_record(path).t) < 0.9 * len(eight.t)
 
