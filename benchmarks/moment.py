@@ -3,8 +3,8 @@
 The vehicle is the shipped Crazyflie with rotors that lag by 38 ms, as brushless ones do, or by 72 ms as its own, and
 numbers of the size that flights of small quadrotors show: at hover it is turned by 43 rad/s^2 per m/s.
 
-"With": its file states them, and `quadsim scenario --for` makes the scenario of that file.  "Without": the controller is
-made for a file that lacks them; vehicle, course and constraints are the same.
+"With": its file states them, and `quadsim scenario --for` makes the scenario of that file.  "Without": the controller
+is made for a file that lacks them; vehicle, course and constraints are the same.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def turned_vehicle(lag: float) -> Vehicle:
 
 
 def scenario_of(lag: float, law: str, course: str, *, known: bool) -> tuple[Scenario, float]:
-    """The first scenario of a law, its controller made for a file with the moment or without; and the course's size [m].
+    """The first scenario of a law, its controller made for a file with the moment or without; the course's size [m].
 
     The vehicle that flies has the moment either way, and its course is the same.
     """
