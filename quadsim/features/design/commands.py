@@ -42,8 +42,8 @@ def scenario(
         seed: replace the seed of everything random in the scenario.
         vehicle: print a first scenario for this vehicle instead.
         course: its course: hover, step (of 1 m) or figure-eight, at 60 % of the vehicle's limits (default: hover).
-        controller: its controller: robust, lqr, pid or geometric, or rates for nonlinear MPC of thrust and body rates
-            through its autopilot (default: robust).
+        controller: its controller: robust, lqr, pid, geometric or nonlinear, or rates for nonlinear MPC of thrust and
+            body rates through its autopilot (default: robust).
         tilt: its tilt bound [deg] (default: by rule, at most 40).
         schema: print the JSON Schema of scenario files instead.
 

@@ -156,14 +156,15 @@ def test_the_file_states_what_is_flown(course: str, law: str) -> None:
     assert tomllib.loads(text) == made.to_data()
     assert max(map(len, text.splitlines())) <= 160
     scenario = parse_scenario(made.to_data())
-    assert scenario.controller.type == ("nonlinear" if law == "rates" else law)
+    predictive = law in ("nonlinear", "rates")
+    assert scenario.controller.type == ("nonlinear" if predictive else law)
     stated = {limit.signal: (limit.lower, limit.upper) for limit in scenario.constraints}
     limits = Assembly(scenario, ALL["hummingbird"]).limits
     bounds = {limit.signal: (limit.lower, limit.upper) for limit in limits}
     if isinstance(scenario.controller, Robust):
         assert bounds["roll"] == tuple(scenario.controller.output_bounds["roll"])
         assert bounds["slew"] == tuple(scenario.controller.input_bounds.slew)
-    elif law == "rates":
+    elif predictive:
         assert made.to_data()["controller"]["tilt"] == bounds["tilt"][1]
         assert "slew" not in bounds
     else:
@@ -184,7 +185,7 @@ def test_a_tilt_bound_of_ones_own_is_in_the_design_and_in_the_audit(law: str) ->
     limits = {limit.signal: limit.upper for limit in Assembly(parse_scenario(made.to_data())).limits}
     assert {limits[name] for name in ("roll", "pitch", "tilt") if name in limits} == {22.5}
     commanded = made.to_data()["controller"].get("tilt", 22.5)
-    assert commanded == (22.5 if law in ("robust", "rates") else BASELINE_SHARE * 22.5)
+    assert commanded == (22.5 if law in ("robust", "nonlinear", "rates") else BASELINE_SHARE * 22.5)
     deviation = ALL["hummingbird"].gravity * math.tan(math.radians(22.5)) / 6.0**2  # m, at w = 6 rad/s
     if law == "robust":
         assert made.to_data()["controller"]["output_weights"]["x"] == pytest.approx(deviation**-2.0, rel=5e-3)
