@@ -3,8 +3,8 @@
 The vehicle is the shipped Crazyflie with rotors that lag by 38 ms, as brushless ones do, or by 72 ms as its own, and
 numbers of the size that flights of small quadrotors show: at hover it is turned by 43 rad/s^2 per m/s.
 
-"With": its file states them, and `quadsim scenario --for` makes the scenario of that file.  "Without": the file lacks
-them, the vehicle has them.
+"With": its file states them, and `quadsim scenario --for` makes the scenario of that file.  "Without": the controller
+is made for a file that lacks them; vehicle, course and constraints are the same.
 """
 
 from __future__ import annotations
@@ -43,18 +43,19 @@ def turned_vehicle(lag: float) -> Vehicle:
 
 
 def scenario_of(lag: float, law: str, course: str, *, known: bool) -> tuple[Scenario, float]:
-    """The first scenario of a law, made for a file with the moment or without, and the course's size [m].
+    """The first scenario of a law, its controller made for a file with the moment or without; the course's size [m].
 
-    The vehicle that flies has the moment either way.
+    The vehicle that flies has the moment either way, and its course is the same.
     """
-    modelled = turned_vehicle(lag) if known else altered(turned_vehicle(lag), dict.fromkeys(AIR))
-    made = first_scenario(modelled, BASE, course=course, law=law)
+    vehicle = turned_vehicle(lag)
+    made = first_scenario(vehicle, BASE, course=course, law=law)
     numbers = {"rotor_rise": lag, "rotor_fall": lag}
     air = {name: [*value] if isinstance(value, tuple) else value for name, value in AIR.items()}
     data = made.to_data()
     data["vehicle"] = {"file": BASE, **numbers, **(air if known else {})}
     if not known:
-        data["actual"] = air
+        ignorant = first_scenario(altered(vehicle, dict.fromkeys(AIR)), BASE, course=course, law=law)
+        data |= {"actual": air, "controller": ignorant.to_data()["controller"]}
     return parse_scenario(data), made.size
 
 

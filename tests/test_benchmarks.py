@@ -104,6 +104,13 @@ def test_the_heavier_vehicle_ends_farther_away(tmp_path: Path) -> None:
         assert flights[controller, "mass +30 %"]["end_error"] > 2.0 * flights[controller, "nominal"]["end_error"]
 
 
+def test_a_pid_that_knows_the_moment_of_the_air_holds_what_another_does_not(tmp_path: Path) -> None:
+    flights = {(record["course"], record["moment"]): record for record in quick("moment", tmp_path)}
+    for course in ("step", "figure-eight"):
+        assert flights[course, "with"]["outcome"] == "satisfied"
+        assert flights[course, "with"]["largest"] < 0.6 * flights[course, "without"]["largest"]
+
+
 def test_nonlinear_mpc_follows_where_lqr_does_not(tmp_path: Path) -> None:
     errors = {record["controller"]: record["error"] for record in quick("speed", tmp_path)}
     assert errors["nonlinear"] < 0.2 * errors["LQR"]

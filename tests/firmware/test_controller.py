@@ -77,6 +77,22 @@ def test_other_flights_too(name: str, precision: Precision) -> None:
     assert np.abs(np.array([reply.command for reply in result]) - desired.command)[optimal].max() <= allowed
 
 
+AIR = {
+    **{"controller.moment": True, "controller.tightening": None, "constraints": [], "duration": 4.0, "effects.air": {}},
+    **{"vehicle.rotor_moment": [2e-4, 3e-4], "vehicle.inflow_moment": [0.02, 0.03], "vehicle.inflow": 4e-4},
+    "vehicle.rate_damping": [0.02, 0.03, 0.01],
+}
+"""A vehicle that the air turns and slows, and a law that knows it."""
+
+
+@pytest.mark.parametrize("precision", TOLERANCE)
+def test_a_law_that_knows_the_air_flies_as_recorded(precision: Precision) -> None:
+    scenario = load_scenario("robust-lag50").replace(AIR)
+    desired = record(scenario)
+    commands = [reply.command for reply in replay(Host(scenario, precision), desired)]
+    assert np.abs(np.array(commands) - desired.command).max() <= TOLERANCE[precision]
+
+
 def test_recorded_flights_have_every_way() -> None:
     assert set(recording("paper-constrained").status) == {0, 1, 2}
     assert REFUSED in recording("paper-constrained-lag20").status

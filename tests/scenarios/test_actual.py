@@ -52,6 +52,7 @@ ACTUAL: dict[str, Any] = {
     "rotor_inertia": 1e-4,
     "rotor_radius": 0.15,
     "rotor_drag": 1e-3,
+    "inflow": 1e-3,
     "rotor_moment": [1e-4, 1e-4],
     "inflow_moment": [0.01, 0.01],
     "rate_damping": [0.01, 0.01, 0.01],

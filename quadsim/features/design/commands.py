@@ -49,8 +49,8 @@ def scenario(
         vehicle: print a first scenario for this vehicle instead.
         course: its course, at 60 % of the vehicle's limits: hover, step (of 1 m), figure-eight, a scenario of the
             library or a path to one (.toml), or a path to a trajectory (.csv) (default: hover).
-        controller: its controller: robust, lqr, pid or geometric, or rates for nonlinear MPC of thrust and body rates
-            through its autopilot (default: robust).
+        controller: its controller: robust, lqr, pid, geometric or nonlinear, or rates for nonlinear MPC of thrust and
+            body rates through its autopilot (default: robust).
         tilt: its tilt bound [deg] (default: by rule, at most 40).
         size: longest side of the course [m] (default: by rule; of a scenario by the vehicles' extents, of a trajectory
             as it is).

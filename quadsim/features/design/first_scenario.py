@@ -47,9 +47,9 @@ EIGHT_RATIO: Final = 0.3
 """Turns of a figure eight per time [rad/s] over the loop's bandwidth: across it moves twice as fast."""
 STEP_RATIO: Final = 0.28  # bandwidth of the filter of steps over the loop's
 STEP: Final = 1.0  # [m]
-TURNED: Final = 5.0
+TURNED_FROM: Final = 5.0
 """Angular acceleration by `rotor_moment` at hover [rad/s^2 per m/s] from which first flights count on it: it makes
-hover unstable, with poles of size (g TURNED)^(1/3), 3.7 rad/s, of about the loop's own bandwidth."""
+hover unstable, with poles of size (g TURNED_FROM)^(1/3), 3.7 rad/s, of about the loop's own bandwidth."""
 BALANCED_SPEED: Final = 0.01
 BALANCED_MOVE: Final = 0.25
 """Weights of speeds and of their changes, over those by rule, where the hover model has the moment: what balances it in
@@ -467,7 +467,7 @@ def _robust(vehicle: Vehicle, tuning: Design) -> str:
     move = in_digits(tuning.move_weight)
     why_move = f"as much as speed costs at {MOVE_RATIO:g} w, speed / ({MOVE_RATIO:g} w tau)^2"
     moment = ""
-    if vehicle.turned_by_air >= TURNED:
+    if vehicle.turned_by_air >= TURNED_FROM:
         turned = f"{vehicle.turned_by_air:.3g} rad/s^2 per m/s"
         moment = f"moment = true  # the air's torque is in the model: at hover {turned}\n"
         speed, why = in_digits(BALANCED_SPEED * speed), f"{BALANCED_SPEED:g} of that by rule: motion needs torque"
@@ -513,7 +513,7 @@ tilt = {tilt}  # deg, largest that it commands; below the audit's, which it over
 horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for the reference's velocity: \
 {PREVIEW:g} / w = {PREVIEW / w:.3g} s
 """
-    turned = vehicle.turned_by_air >= TURNED
+    turned = vehicle.turned_by_air >= TURNED_FROM
     observed = law == "geometric" and turned and not course.lasts
     if law != "lqr":
         lag = lag_to_allow_for(vehicle, tuning.period)
@@ -553,9 +553,9 @@ def _constraints(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse
     )
     note = f"m, {course.why_allowed}: the same for every controller"
     entries = ["\n# Audited without an entry: every bound of the controller.\n"]
-    if law in ("nonlinear", "rates"):  # it bounds the thrust of all rotors together
+    if law == "rates":  # it bounds the thrust of all rotors together
         entries += [entry("speed", "speed", vehicle.speed_min, vehicle.speed_max, "rad/s, what the rotors hold")]
-    elif law != "robust":  # baselines bound the tilt that they command, and overshoot it
+    elif law not in ("robust", "nonlinear"):  # baselines bound the tilt that they command, and overshoot it
         why = "deg, the tilt bound, at every instant"
         entries += [entry(name, name, -tilt, tilt, why) for name in ("roll", "pitch")]
     if not course.has_floor:

@@ -266,7 +266,9 @@ class _Fit:
             }
         if self._throttle:
             why = f"a log of the throttle shows it only for the highest speed of {self.vehicle.speed_max:g} rad/s, kept"
-            found |= {name: replace(found[name], refused=why, advice=_MEASURE) for name in _PER_SPEED}
+            for name in _PER_SPEED:
+                if name in found:  # it is not where it was held, as below 0
+                    found[name] = replace(found[name], refused=why, advice=_MEASURE)
         inertia = [found[f"inertia_{axis}"] for axis in "xyz"]
         used = [e.start if e.refused and e.start else e.value for e in inertia]
         if not inertia[2].refused and not _is_body(used):

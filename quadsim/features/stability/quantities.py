@@ -157,7 +157,8 @@ def _set_drag(assembly: Assembly, value: float) -> FieldValues:
     drag = [axis + added for axis in stated]
     changes: FieldValues = {"effects.air.linear_drag": drag}
     if air is None:  # that drag alone, whatever else the vehicle states
-        changes |= {"effects.air.rotor_drag": 0.0, "effects.air.rate_damping": [0.0, 0.0, 0.0]}
+        changes |= {"effects.air.rotor_drag": 0.0, "effects.air.inflow": 0.0}
+        changes |= {"effects.air.rotor_moment": [0.0, 0.0], "effects.air.rate_damping": [0.0, 0.0, 0.0]}
     return changes
 
 

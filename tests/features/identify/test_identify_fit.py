@@ -312,7 +312,7 @@ def test_an_accelerometer_takes_the_place_of_velocity() -> None:
     assert read.notes == ("imu: no velocity is logged; the accelerometer stands in for it",)
     found = identify(read)
     moments = {f"{name}_{axis}": v for name, of in MOMENTS.items() for axis, v in zip("xyz", of, strict=False)}
-    assert not wrong(found, **moments)
+    assert not wrong(found, **moments, inflow=INFLOW)
     known = by_name(found)
     assert not [name for name in ("thrust_coefficient", "inertia_x", "inertia_y") if known[name].refused]
     errors = predict([read], [[slice(100, 900)]], found, START).errors["identified"]
