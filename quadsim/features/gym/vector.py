@@ -80,7 +80,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             vary: what each environment draws anew at each reset.
             reward: of arrays: states (N, 12), references (N, 4), speeds (N, 4) and, if it takes them, `margins`, (N,)
                 each by name; returns (N,).
-            margins: whether `info` has margins, violations and cost: they take an eighth of a step's time.
+            margins: whether `info` has margins, violations and cost, which take time.
             autoreset_mode: when an ended episode is reset: `NextStep`, `SameStep` or `Disabled`.
             max_episode_steps: truncates episodes before the scenario's duration.
             threads: how many of them fly the vehicles.
@@ -233,6 +233,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             return [None] * self.num_envs
         if isinstance(seed, int | np.integer):
             self._episodes.check_seed(seed)
+            self._episodes.check_seed(int(seed) + self.num_envs - 1)
             return [int(seed) + place for place in range(self.num_envs)]
         seeds = list(seed)
         if len(seeds) != self.num_envs:
