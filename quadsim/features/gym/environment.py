@@ -193,11 +193,12 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if self._flight is not None:
             self._flight.close()
         self.scenario, self._episode = scenario, episode
+        assembly = self.episodes.assembly(scenario)
         if self.episodes.varied:
-            self.actions = Actions(self._action, scenario, Assembly(scenario).vehicle)
+            self.actions = Actions(self._action, scenario, assembly.vehicle)
         # events that change the controller need a real one
         law: Any = None if scenario.controller_changes else Agent(scenario.controller.horizon)
-        self._flight = Rollout(self.episodes.assembly(scenario), law)
+        self._flight = Rollout(assembly, law)
         self.limits = self._flight.limits
         self._margins = Margins(self.limits, scenario.plant.timestep)
         self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
