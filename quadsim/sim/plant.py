@@ -126,8 +126,10 @@ class Plant:
             mujoco.set_mju_user_warning(_discard)
         pushed = any(isinstance(change, PushChange) for change in changes)
         self._follows_motion = effects.follows_state or wind is not None or bool(self._own) or pushed
-        self._forced = self._follows_motion or bool(self._moving)
-        self._follows_motion = self._forced or integrator == "rk4"
+        self._follows_motion = self._follows_motion or bool(self._moving) or integrator == "rk4"
+        self._forced = self._follows_motion
+        if integrator == "rk4":  # which adds disturbances and forces of the user to those that follow from the motion
+            self._forced = replace(effects, disturbance=None).follows_state
         self._steps_type = steps_type(
             wrench=self._follows_motion, wind=wind is not None, battery=effects.battery is not None
         )
