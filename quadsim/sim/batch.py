@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from quadsim.controller import check_command
+from quadsim.controller import LARGEST_SPEED, check_command
 from quadsim.core.inner import CompiledLoop
 from quadsim.core.mirror import Struct, core_library
 from quadsim.core.structs import End, FlightStruct
@@ -135,6 +135,8 @@ class PlantBatch:
         flight.sensing = None if sensing is None else ctypes.addressof(sensing)
         flight.bounds, flight.bounded = None, 0
         if margins is not None:
+            assert margins.compiled
+            assert len(margins.limits) == self.smallest.shape[1]
             flight.bounds, flight.bounded = ctypes.addressof(margins.bounds), len(margins.limits)
             flight.smallest, flight.at_end = self.smallest[place].ctypes.data, self.at_end[place].ctypes.data
             self.smallest[place], self.at_end[place] = margins.of_start(plant.physics, speeds)
@@ -245,11 +247,12 @@ class PlantBatch:
                 ended[place] = error
 
     def _refuse(self, commands: Array, ended: dict[int, FlightError]) -> None:
-        """End the flights whose command is not of finite numbers."""
-        if np.isfinite(commands).all() and np.abs(commands).max(initial=0.0) <= 1e6:
+        """End the flights whose rotor speeds are no valid command; inner loops answer for their targets."""
+        if np.abs(commands).max(initial=0.0) <= LARGEST_SPEED:  # False for NaN
             return
         for place in np.flatnonzero(self._fields["steps"]).tolist():
-            problem = check_command(commands[place, :N_ROTORS])
+            at = self._places[place]
+            problem = check_command(commands[place]) if at is not None and at.loop is None else None
             if problem is not None:
                 ended[place] = CommandError(problem, time=self.plant(place).time)
                 self._fields["steps"][place] = 0

@@ -279,6 +279,9 @@ class Together:
             if (obstacle := obstacle_to_batch(episode.scenario)) is not None:
                 raise InputError(f"flight {key} of the campaign has {obstacle}, which its scenario does not have")
             setup = Setup(self._episodes.assembly(episode.scenario), self._action, self._preview)
+            scenario = episode.scenario
+            if (scenario.control_period, scenario.steps_per_period) != (self._period, self._batch.steps):
+                raise InputError(f"flight {key} of the campaign has another control period or physics step than others")
             names = tuple(limit.name for limit in setup.margins.limits)
             if names != self._names:
                 raise InputError(f"flight {key} of the campaign has the constraints {names}, others {self._names}")
