@@ -390,7 +390,7 @@ MISTAKES = {
     "initial.cold=true": "initial.cold must be false where effects.ground gives no floor to stand on; got true",
     "initial.rotor_speeds=[9, 9, 9, 251]": "initial.rotor_speeds must be at most 250 rad/s each, the speed_max of @",
     "obstacles=[{type='sphere', name='a', position=[0, 0, 1], radius=1}]": "initial.position must be clear of a, by @",
-    "effects.load.centre_of_mass.0=0.01 plant.integrator=rk4": "plant.integrator must be mujoco with effects.load."
+    "effects.load.centre_of_mass=[0.01,0,0] plant.integrator=rk4": "plant.integrator must be mujoco with effects.load."
     "centre_of_mass; got 'rk4'",
     "effects.load.payloads=[{mass=0.1}] plant.integrator=rk4": "plant.integrator must be mujoco with a payload; got "
     "'rk4'",

@@ -263,7 +263,8 @@ def _not_started_for(event: Event) -> InputError:
 def prepared(assembly: Assembly) -> Scenario:
     """Return a scenario whose flight is prepared for every event that its vehicle allows.
 
-    Wind needs drag to push; the integrator rk4 needs a fixed mass, and an estimator a fixed set of sensors.
+    Wind needs drag to push; with the integrator rk4 only a file schedules another mass; an estimator needs a fixed set
+    of sensors.
     """
     scenario, air = assembly.scenario, assembly.effects.air
     sensed = {} if scenario.sensors is None else scenario.sensors.present()

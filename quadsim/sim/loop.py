@@ -255,6 +255,7 @@ class ClosedLoop:
             FlightError: the flight has ended in this period, which is not part of it.
             InputError: it had ended before.
         """
+        self._require_going_on()
         observation = self.observation
         try:
             sample = self._fly(observation, command)

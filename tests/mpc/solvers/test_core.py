@@ -233,7 +233,7 @@ def test_piqp_answers_infeasible_abandoned_and_invalid_problems(monkeypatch: pyt
         assert core.solve(Query(*given)).status == "invalid_data"
     optimum = core.solve(climb)
     core.reset()
-    monkeypatch.setattr(core._shared.struct, "changes", 2)
+    monkeypatch.setattr(core.shared.struct, "changes", 2)
     answer = core.solve(climb)
     assert (answer.status, answer.answered_by, answer.method) == (SOLVED, PIQP, Method.WHOLE)
     np.testing.assert_allclose(answer.plan[0], optimum.plan[0], atol=1e-3)
