@@ -5,7 +5,7 @@ constraints on position, velocity, heading and their errors.  All of it scales b
 (`quadsim.scenarios.scaling`):
 
 - *Lengths* by the vehicles' bounding balls, so that a gap is as many vehicles wide as before; those of a table, or of
-  a scenario of the same vehicle, stay.
+  a scenario file of the same vehicle, stay.
 - *Times* such that the course asks for `SHARE` of the vehicle's limits: of the acceleration within the tilt bound, of
   climb and sink, of the fastest level speed, of the rates at which its loops follow, and of its turning.  Among
   obstacles it asks for no more acceleration than is stated: what it takes to avoid them is not known beforehand.
@@ -143,7 +143,7 @@ def fitted_course(
     _require_upright(name, base, assembly)
     if (base.obstacles or base.regions) and not avoids:
         raise ParameterError("", "--controller", name, "robust or rates: a course with obstacles or regions")
-    own = is_trajectory(name) or _same(base, assembly, vehicle, file)
+    own = is_trajectory(name) or (name.endswith(".toml") and _same(base, assembly, vehicle, file))
     samples = _sampled(base, assembly)
     length = _length_factor(name, samples, size, 1.0 if own else vehicle.enclosing_radius / _radius(assembly))
     time, response = _time_factor(samples, length, vehicle, tuning)

@@ -135,7 +135,7 @@ def test_a_table_keeps_its_lengths_and_starts_at_its_first_row(tmp_path: Path) -
         ("hover", {"size": 2.0}, "--size must be absent with --course hover"),
         ("lost-rotor", {"size": 2.0}, "--size must be absent with --course lost-rotor, which does not move"),
         ("step", {"size": 0.0}, "--size must be between"),
-        ("gone.csv", {}, "gone.csv cannot be read"),
+        ("gone.csv", {}, "gone.csv: cannot be read"),
         ("gone.toml", {}, "gone.toml"),
     ],
 )
