@@ -21,8 +21,8 @@ import tomlkit
 from tomlkit.items import AoT
 
 from quadsim.console.progress import Progress, silent
-from quadsim.errors import InputError, ParameterError
-from quadsim.features.design.first_scenario import FirstScenario
+from quadsim.errors import InputError, ParameterError, printable
+from quadsim.features.design.first_scenario import SHARE, FirstScenario
 from quadsim.flight.audit import Finding, Limit, worst_finding
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
@@ -149,7 +149,12 @@ def at_fastest(first: FirstScenario, found: FastestCourse) -> FirstScenario:
     """Return a first scenario at the pace that was found, with a comment at each number that it changes."""
     document = tomlkit.parse(first.text)
     _restate(document, paced(first.scenario, 1.0).tables, found.scenario.tables)
-    title, made_by, rest = document.as_string().split("\n", 2)
+    by_rule = f" at {100.0 * SHARE:g} % of "
+    what = first.scenario.description.partition(by_rule)[0]
+    about = f"{what}, as fast as its bounds permit"
+    document["description"] = about
+    _, made_by, rest = document.as_string().split("\n", 2)
+    title = f"# A first flight of {printable(about)}."
     lines = "".join(f"# {line}\n" for text in found.lines for line in textwrap.wrap(text, WIDTH - 2))
     return replace(first, text=f"{title}\n{made_by} --fastest --margin {found.margin:g}\n{lines}{rest}")
 

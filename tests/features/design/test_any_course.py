@@ -178,6 +178,7 @@ def test_its_file_says_what_stops_it_and_flies_that_pace() -> None:
     assert found.stopped.worst is not None
     assert found.stopped.worst.limit.name in head
     tables = tomllib.loads(text)
+    assert tables["description"] == "hummingbird: a figure eight, as fast as its bounds permit"
     assert tables["reference"]["period"] == found.scenario.reference.period
     assert tables["reference"]["length"] == first.scenario.reference.length
     changed = [line for line in text.splitlines() if line.endswith("# at the fastest pace")]
