@@ -104,7 +104,7 @@ FEATURES: Final[dict[str, Feature]] = {
                 help="Print a scenario with all defaults and comments, as a start for your own.",
                 examples=(
                     "quadsim scenario hover > mine.toml",
-                    "quadsim scenario --for hummingbird --course figure-eight > mine.toml",
+                    "quadsim scenario --for hummingbird --course figure-eight --fastest > mine.toml",
                 ),
             ),
             "vehicle": FeatureCommand(

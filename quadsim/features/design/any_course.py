@@ -5,7 +5,7 @@ constraints on position, velocity, heading and their errors.  All of it scales b
 (`quadsim.scenarios.scaling`):
 
 - *Lengths* by the vehicles' bounding balls, so that a gap is as many vehicles wide as before; those of a table, or of
-  a scenario of the same vehicle, stay.
+  a scenario file of the same vehicle, stay.
 - *Times* such that the course asks for `SHARE` of the vehicle's limits: of the acceleration within the tilt bound, of
   climb and sink, of the fastest level speed, of the rates at which its loops follow, and of its turning.  Among
   obstacles it asks for no more acceleration than is stated: what it takes to avoid them is not known beforehand.
@@ -142,10 +142,12 @@ def fitted_course(
     assembly = Assembly(base)
     _require_upright(name, base, assembly)
     if (base.obstacles or base.regions) and not avoids:
-        raise ParameterError("", "--controller", name, "robust or rates: a course with obstacles or regions")
-    own = is_trajectory(name) or _same(base, assembly, vehicle, file)
+        rule = f"flown by --controller {' or '.join(AVOIDING)}, which keep clear of its obstacles and regions"
+        raise ParameterError("", "--course", name, rule)
+    own = is_trajectory(name) or (name.endswith(".toml") and _same(base, assembly, vehicle, file))
     samples = _sampled(base, assembly)
-    length = _length_factor(name, samples, size, 1.0 if own else vehicle.enclosing_radius / _radius(assembly))
+    by_extent = 1.0 if own else vehicle.enclosing_radius / assembly.vehicle.enclosing_radius
+    length = _length_factor(name, samples, size, by_extent)
     time, response = _time_factor(samples, length, vehicle, tuning)
     if base.obstacles or base.regions:
         time = max(time, math.sqrt(length))
@@ -189,10 +191,6 @@ def _same(base: Scenario, assembly: Assembly, vehicle: Vehicle, file: str) -> bo
     if base.vehicle.file == file:
         return True
     return Path(base.vehicle.file).name == Path(file).name and assembly.vehicle == vehicle
-
-
-def _radius(assembly: Assembly) -> float:
-    return assembly.vehicle.enclosing_radius
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,9 +21,9 @@ import tomlkit
 from tomlkit.items import AoT
 
 from quadsim.console.progress import Progress, silent
-from quadsim.errors import InputError, ParameterError
-from quadsim.features.design.first_scenario import FirstScenario
-from quadsim.flight.audit import Finding, worst_finding
+from quadsim.errors import InputError, ParameterError, printable
+from quadsim.features.design.first_scenario import SHARE, FirstScenario
+from quadsim.flight.audit import Finding, Limit, worst_finding
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly
@@ -96,20 +96,16 @@ def paced(scenario: Scenario, pace: float) -> Scenario:
         if shapes:
             tables[name] = [plain(scaled_table(shape, scale)) for shape in shapes]
     if scenario.constraints:
-        tables["constraints"] = [_retimed(tables["constraints"][i], scenario, i, scale) for i in _places(scenario)]
+        entries = zip(tables["constraints"], scenario.constraints, strict=True)
+        tables["constraints"] = [_retimed(entry, limit, scale) for entry, limit in entries]
     if not scenario.ends_with_course:
         periods = math.ceil(scenario.duration / pace / scenario.control_period - 1e-6)
         tables["duration"] = round(periods * scenario.control_period, 9)
     return scenario.derive(tables)
 
 
-def _places(scenario: Scenario) -> range:
-    return range(len(scenario.constraints))
-
-
-def _retimed(entry: dict[str, Any], scenario: Scenario, i: int, scale: Scale) -> dict[str, Any]:
+def _retimed(entry: dict[str, Any], limit: Limit, scale: Scale) -> dict[str, Any]:
     """Return an entry of `[[constraints]]` with its window at another pace; its bounds stay."""
-    limit = scenario.constraints[i]
     timed = scaled_limit(replace(limit, lower=-math.inf, upper=math.inf), scale)
     window = {name: getattr(timed, name) for name in ("start", "stop")}
     return {**entry, **{name: value for name, value in window.items() if name in entry}}
@@ -153,7 +149,12 @@ def at_fastest(first: FirstScenario, found: FastestCourse) -> FirstScenario:
     """Return a first scenario at the pace that was found, with a comment at each number that it changes."""
     document = tomlkit.parse(first.text)
     _restate(document, paced(first.scenario, 1.0).tables, found.scenario.tables)
-    title, made_by, rest = document.as_string().split("\n", 2)
+    by_rule = f" at {100.0 * SHARE:g} % of "
+    what = first.scenario.description.partition(by_rule)[0]
+    about = f"{what}, as fast as its bounds permit"
+    document["description"] = about
+    _, made_by, rest = document.as_string().split("\n", 2)
+    title = f"# A first flight of {printable(about)}."
     lines = "".join(f"# {line}\n" for text in found.lines for line in textwrap.wrap(text, WIDTH - 2))
     return replace(first, text=f"{title}\n{made_by} --fastest --margin {found.margin:g}\n{lines}{rest}")
 

@@ -131,11 +131,11 @@ def test_a_table_keeps_its_lengths_and_starts_at_its_first_row(tmp_path: Path) -
     [
         ("power-loop", {}, "--course must be one that stays upright"),
         ("inverted-start", {}, "--course must be one that stays upright"),
-        ("slalom", {"law": "pid"}, "--controller must be robust or rates"),
+        ("slalom", {"law": "pid"}, "--course must be flown by --controller robust or rates"),
         ("hover", {"size": 2.0}, "--size must be absent with --course hover"),
         ("lost-rotor", {"size": 2.0}, "--size must be absent with --course lost-rotor, which does not move"),
         ("step", {"size": 0.0}, "--size must be between"),
-        ("gone.csv", {}, "gone.csv cannot be read"),
+        ("gone.csv", {}, "gone.csv: cannot be read"),
         ("gone.toml", {}, "gone.toml"),
     ],
 )
@@ -178,6 +178,7 @@ def test_its_file_says_what_stops_it_and_flies_that_pace() -> None:
     assert found.stopped.worst is not None
     assert found.stopped.worst.limit.name in head
     tables = tomllib.loads(text)
+    assert tables["description"] == "hummingbird: a figure eight, as fast as its bounds permit"
     assert tables["reference"]["period"] == found.scenario.reference.period
     assert tables["reference"]["length"] == first.scenario.reference.length
     changed = [line for line in text.splitlines() if line.endswith("# at the fastest pace")]

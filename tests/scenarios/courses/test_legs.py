@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from quadsim.errors import ParameterError
 from quadsim.scenarios.courses.course import Path, begin
 from quadsim.scenarios.courses.legs import Turn, Waypoint, Waypoints, YawTurns, polyline
 
@@ -68,3 +69,26 @@ def test_a_course_is_the_initial_pose_then_the_path_then_its_end() -> None:
     assert course.jumps == (0.35,)
     assert course.kinks == pytest.approx((0.35, 2.35))
     assert begin(path, start=0.35, initial=np.array([5.0, 0.0, 0.0, 0.0])).jumps == ()
+
+
+def test_times_take_the_place_of_every_speed() -> None:
+    points = (Waypoint(position=(4.0, 4.0, 2.0), hold=1.0), Waypoint(position=(4.0, 4.0, 0.0)))
+    path = Waypoints(type="waypoints", points=points, times=(2.0, 5.0)).path(START, 9.81)
+    assert path.kinks == (0.0, 2.0, 3.0, 5.0)
+    np.testing.assert_allclose(path.pose(np.array([1.0, 2.5, 4.0]))[:, :3], [[2.5, 2.0, 2.0], [4, 4, 2], [4, 4, 1]])
+
+
+@pytest.mark.parametrize(
+    ("times", "fields", "message"),
+    [
+        ((2.0,), {}, "times must be a list of 2 times, one for each point"),
+        ((2.0, 2.5), {}, r"times\.1 must be 3\.001 s or later"),
+        ((2.0, 5.0), {"speed": 3.0}, r"points\.0\.speed must be absent where times are given; got 3\.0"),
+    ],
+)
+def test_times_that_do_not_fit_the_points_are_refused(
+    times: tuple[float, ...], fields: dict[str, float], message: str
+) -> None:
+    points = (Waypoint(position=(4.0, 4.0, 2.0), hold=1.0, **fields), Waypoint(position=(4.0, 4.0, 0.0)))
+    with pytest.raises(ParameterError, match=message):
+        Waypoints(type="waypoints", points=points, times=times)
