@@ -9,6 +9,7 @@ import re
 import textwrap
 from base64 import b64encode
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -75,6 +76,8 @@ _WIDTH, _ROW, _HEAD = 9.6, 1.95, 0.7  # of a figure, of a row of panels and of w
 _LETTERS: Final = 26  # characters beside a vertical axis
 _JOURNAL_ROW, _JOURNAL_HEAD, _JOURNAL_LETTERS = 1.2, 0.5, 17  # the same of a figure of a stated width
 _LARGEST_SVG, _NOTEBOOK_DPI = 40_000, 55
+_READ_LATE: Final[tuple[RcKeyType, ...]] = ("pdf.fonttype", "ps.fonttype")
+"""Settings that matplotlib reads when a figure is saved; its default is Type 3."""
 _MOST_COLUMNS: Final = 6  # of a legend
 _LINE: Final = 1.25  # height of a line of text [font size]
 _DASHES: Final = (0, (5, 2))
@@ -234,9 +237,8 @@ def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
     if interactive:
         from matplotlib import pyplot
 
-        from quadsim.report.journal_figure import JournalFigure
-
-        canvas = pyplot.figure(figsize=size, layout="constrained", FigureClass=JournalFigure)
+        canvas = pyplot.figure(figsize=size, layout="constrained")
+        _keep_fonts(canvas)
     else:
         canvas = Canvas(figsize=size, layout="constrained")
     grid = canvas.subplots(len(rows), figure.columns, squeeze=False, height_ratios=heights)
@@ -264,6 +266,29 @@ def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
         rows_of_labels = -(-len(shown) // ncols)
         canvas.set_figheight(size[1] + (rows_of_labels - 1) * _legend_line())  # which panels would lose otherwise
     return canvas
+
+
+def _keep_fonts(canvas: Canvas) -> None:
+    """Have a figure saved, at whatever later time, with the fonts that it is drawn with."""
+    from matplotlib import rcParams
+
+    fonts = {name: rcParams[name] for name in _READ_LATE}
+    vars(canvas).update(savefig=partial(_save, canvas, fonts))
+
+
+def _save(canvas: Canvas, fonts: dict[RcKeyType, Any], *args: Any, **options: Any) -> None:
+    """Save a figure, see `matplotlib.figure.Figure.savefig`, with settings that matplotlib reads when it saves."""
+    from matplotlib import rc_context
+
+    with rc_context(fonts):
+        type(canvas).savefig(canvas, *args, **options)
+
+
+def shows_itself() -> bool:
+    """Whether the figures of a cell are shown at its end, as in a notebook."""
+    from matplotlib import get_backend
+
+    return "inline" in get_backend()
 
 
 def _legend_size() -> float:

@@ -11,7 +11,7 @@ from quadsim.errors import InputError, ParameterError
 from quadsim.flight.record import FlightRecord
 from quadsim.report.comparison import check_names
 from quadsim.report.flight_figures import signals as draw_signals
-from quadsim.report.to_matplotlib import Style, draw, figure_file, show_window, write_figure
+from quadsim.report.to_matplotlib import Style, draw, figure_file, show_window, shows_itself, write_figure
 
 PAGE_WIDTH: Final = 7.16  # of a figure across both columns of a journal's page [in]; 3.5 is one column
 _WIDTHS: Final = (2.0, 20.0)  # smallest and largest [in]
@@ -36,11 +36,9 @@ class Overlay(list[Any], Result):
 
     def _ipython_display_(self) -> None:
         """Print the axes, or where the file is; a notebook itself shows a figure of pyplot, once."""
-        from matplotlib import get_backend
-
         if self.path is not None:
             super().show()
-        elif "inline" not in get_backend():
+        elif not shows_itself():
             print(list(self))
 
     def shown(self) -> Shown:

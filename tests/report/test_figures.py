@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -337,7 +338,8 @@ def test_a_figure_that_is_saved_later_has_fonts_that_journals_accept(tmp_path: P
     series = (Series(x=np.arange(3.0), y=np.arange(3.0), colour="#000000", label="one"),)
     figure = Figure(key="k", title="", panels=(Panel(title="x", series=series),))
     with matplotlib.rc_context({"backend": "agg"}):
-        draw(figure, interactive=True, width=3.5).savefig(tmp_path / "later.pdf")
+        drawn = draw(figure, interactive=True, width=3.5)
+    pickle.loads(pickle.dumps(drawn)).savefig(tmp_path / "later.pdf")
     content = (tmp_path / "later.pdf").read_bytes()
     assert b"/CIDFontType2" in content
     assert b"/Type3" not in content

@@ -227,7 +227,7 @@ class PairedComparison(Tabular):
         """Return the verdict on failures, and on tracking."""
         return [self.sentence, *filter(None, [self.tracking])]
 
-    def small_plot(self) -> Figure:
+    def small_plot(self) -> Figure | None:
         """See `Result.small_plot`: differences of the metrics with their intervals."""
         return metrics_figure(self)
 
@@ -260,12 +260,10 @@ class PairedComparison(Tabular):
         Raises:
             OutputError: the directory cannot be written, or holds something else.
         """
+        drawn = [figure for figure in (events_figure(self), metrics_figure(self)) if figure is not None]
+        plots = tuple(map(to_plot, drawn))
         sections = [
-            Section(
-                title="Which is better",
-                plots=(to_plot(events_figure(self)), to_plot(metrics_figure(self))),
-                tables=self.tables,
-            ),
+            Section(title="Which is better", plots=plots, tables=self.tables),
             Section(title="What is compared", text=(self.pairing,), tables=self.difference_tables),
         ]
         title = f"{self.names[1]} against {self.names[0]}"
@@ -478,8 +476,8 @@ def _is_minor(difference: tuple[str, Any, Any]) -> bool:
     return any(value is None or (isinstance(value, str) and Path(value).is_absolute()) for value in values)
 
 
-def metrics_figure(comparison: PairedComparison) -> Figure:
-    """Plot the differences of the metrics, with their intervals, as shares of the first campaign's means."""
+def metrics_figure(comparison: PairedComparison) -> Figure | None:
+    """Plot the metrics' differences, with intervals, as shares of the first campaign's means; None without any."""
     names: list[str] = []
     curves: list[Series] = []
     for metric in comparison.metrics:
@@ -498,7 +496,10 @@ def metrics_figure(comparison: PairedComparison) -> Figure:
         curves.append(Series(x=np.repeat(place, 2), y=ends, colour=colour, width=2.0))
         curves.append(Series(x=place, y=mean, colour=colour, label=label, style="points", width=6.0))
         names.append(metric.name)
-    (a, b), level = comparison.names, 100.0 * CONFIDENCE
+    if not names:
+        return None
+    a, b = comparison.names
+    level = 100.0 * CONFIDENCE
     title = f"{b} less {a}, in % of {a}'s mean, with {level:g} % interval"
     panel = Panel(
         title=title, y_label="difference [%]", x_label="metric", x_names=tuple(names), series=tuple(curves),
@@ -507,9 +508,11 @@ def metrics_figure(comparison: PairedComparison) -> Figure:
     return Figure(key="metrics", title="Tracking and commands", panels=(panel,), columns=1)
 
 
-def events_figure(comparison: PairedComparison) -> Figure:
-    """Plot the shares of the pairs in which events happened to each campaign's flight."""
+def events_figure(comparison: PairedComparison) -> Figure | None:
+    """Plot the shares of the pairs in which events happened to each campaign's flight; None where none did."""
     happened = [event for event in comparison.events if any(event.counts)][:_MOST_EVENTS]
+    if not happened:
+        return None
     curves = []
     for i, name in enumerate(comparison.names):
         values = np.array([100.0 * event.counts[i] / event.pairs for event in happened])

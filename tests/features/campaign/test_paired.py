@@ -191,7 +191,8 @@ def test_the_answer_says_who_tracks_closer_and_a_plot_shows_by_how_much(thousand
                 verdict = "farther"
             (told,) = [part for part in result.tracking.split(";") if f"{verdict} in" in part]
             assert f" {metric.name[-1]}" in told
-    (events,), (metrics,) = events_figure(result).panels, result.small_plot().panels
+    drawn = [events_figure(result), result.small_plot()]
+    (events,), (metrics,) = [figure.panels for figure in drawn if figure is not None]
     assert "failure" in events.x_names
     assert events.series[0].y[0] == pytest.approx(3.0)
     first = result.metrics[0]
@@ -199,6 +200,15 @@ def test_the_answer_says_who_tracks_closer_and_a_plot_shows_by_how_much(thousand
     assert first.mean_a is not None
     assert first.difference.mean is not None
     assert points[0].y[0] == pytest.approx(100.0 * first.difference.mean / abs(first.mean_a))
+
+
+def test_a_comparison_without_an_event_has_a_page_without_their_plot(
+    make_campaign: MakeCampaign, tmp_path: Path
+) -> None:
+    calm = make_campaign(5, severity=0.0)
+    result = compare_pairs(calm, calm, NAMES)
+    assert events_figure(result) is None
+    assert 'id="metrics"' in result.write_report(tmp_path / "out").read_text()
 
 
 def test_the_page_stands_with_its_files(thousand: pa.Table, better: pa.Table, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
     exported, refused, seen = 0, {}, set()
     for name in read_catalogue().scenarios:
         scenario = load_scenario(name)
-        key = repr(scenario.controller), repr(Assembly(scenario).vehicle), bool(scenario.obstacles)
+        key = repr(scenario.controller), repr(asdict(Assembly(scenario).vehicle)), bool(scenario.obstacles)
         if key in seen:
             continue
         seen.add(key)
