@@ -39,7 +39,7 @@ PREVIEW = 4 * quadsim.gym.TASKS[TASK]["preview"]  # entries of an observation be
 PLACES = [PREVIEW + i for i in POSITION]  # its entries x, y, z
 CAMPAIGN = Path(__file__).with_name("ppo_campaign.toml")
 EVALUATION_SEED = 1  # of the campaigns; the starts of training are drawn from seed 0
-STEPS = 800_000
+STEPS = 400_000
 CLAIM = 0.1  # RMS distance from the reference that it has to get below [m]
 FLIGHTS = 40
 
@@ -58,7 +58,7 @@ class Settings:
     discount: float = 0.97  # gamma per period: 1.6 s
     trace: float = 0.95  # lambda of the generalised advantages
     clip: float = 0.2  # of the probability ratio
-    deviation: float = 0.2  # of the actions, at the start
+    deviation: float = 0.3  # of the actions, at the start
     largest_gradient: float = 0.5  # its norm is cut off there
     seed: int = 0
 

@@ -169,6 +169,10 @@ def follow_turns(references: Array, yaws: Array, firsts: Array) -> Array:
         firsts: (M,) each flight's first row's yaw in the period before [rad], NaN before the first; updated in place.
     """
     first = references[:, 0, 3]
+    near = np.abs(references[:, :, 3] - yaws[:, None]) < 0.2 * TURN  # so near that no two differ by half a turn
+    if near.all() and (np.abs(first - firsts) < 0.4 * TURN).all():
+        firsts[:] = first
+        return references
     known = ~np.isnan(firsts)
     start = first - TURN * np.where(known, whole_turns(first - np.where(known, firsts, first)), 0.0)
     anew = ~known | (np.abs(yaws - start) > KEPT)

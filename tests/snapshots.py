@@ -206,7 +206,8 @@ SESSIONS: Final[dict[str, Session]] = {
         files=FLIGHTS,
     ),
     "doctor": Session(
-        lines=("doctor --help", "doctor"), measured=("machine", "packages", "rendering", "viewer", "solvers")
+        lines=("doctor --help", "doctor"),
+        measured=("machine", "packages", "rendering", "viewer", "many vehicles", "solvers"),
     ),
     "scenario": Session(
         lines=(

@@ -159,3 +159,9 @@ def test_moments_that_each_suit_the_log_make_a_body_together() -> None:
     done = script("-c", log % "('torque 0.01, eight', 5901)")
     assert done.returncode == 0, done.stderr
     assert "inertia_z" in done.stdout
+
+
+def test_many_environments_at_once_take_a_fraction_of_a_single_ones_time(tmp_path: Path) -> None:
+    rates = {record["environment"]: record["steps_per_cpu_s"] for record in quick("batch", tmp_path)}
+    assert rates["own method"] > 4.0 * rates["one environment, own method"]
+    assert rates["own method"] > 3.0 * rates["MuJoCo's step"] > 0.0

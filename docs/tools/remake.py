@@ -43,7 +43,7 @@ BATTERIES: Final = {
 MEMBERS: Final = {"campaigns": CAMPAIGNS, "battery": tuple(BATTERIES)}
 BENCHMARKS: Final = (
     *("solvers", "flight", "nonlinear", "film", "campaign", "mismatch", "speed", "autopilots", "interfaces"),
-    *("identification", "intervals", "stability"),
+    *("identification", "intervals", "stability", "batch"),
 )
 KEPT: Final = ("solvers", "mismatch", "speed", "interfaces", "identification")
 """Benchmarks whose figure is kept in docs/."""
@@ -56,7 +56,7 @@ COLOURS: Final = 128
 SOLVERS: Final = ("piqp-multistage", "piqp-dense", "daqp", "core", "clarabel")
 """The solvers that `make setup` installs."""
 DRAWN: Final = ("drawings.py", "live_picture.py", "figures.py", "film.py", "gallery.py thumbnails")
-WITHOUT_SOLVER: Final = ("film", "nonlinear")
+WITHOUT_SOLVER: Final = ("film", "nonlinear", "batch")
 """Tables whose numbers come from no QP."""
 Record = dict[str, Any]
 
@@ -283,6 +283,14 @@ def flight(data: Any) -> str:
     return f"A second of flight takes {ends}, {bare} ms of it without the controller ([flight.csv](data/flight.csv)).\n"
 
 
+def batch(data: Any) -> str:
+    """Environment steps per second of processor time."""
+    rows = []
+    for row in records(data):
+        rows.append((row["environment"], row["vehicles"], f"{row['steps_per_cpu_s']:.0f}", f"{row['real_time']:.0f}"))
+    return table(("environment", "vehicles", "steps per CPU-second", "times real time"), rows)
+
+
 def campaign(data: Any) -> str:
     """How many flights a core flies."""
     return f"A campaign flies {span((row['per_core_hour'] for row in records(data)), '.0f')} flights per core-hour.\n"
@@ -348,7 +356,7 @@ CSV: Final[dict[str, Callable[[Any], list[Record]]]] = {
 """What docs/data keeps, and how its rows are read."""
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     **{each.__name__: each for each in (results, ablation, papers, peers, export, campaigns, solvers, nonlinear)},
-    **{each.__name__: each for each in (flight, campaign, film, identification, autopilots, ppo, stability)},
+    **{each.__name__: each for each in (flight, batch, campaign, film, identification, autopilots, ppo, stability)},
     "paper": both_flights,
     "first-flights": first_flights,
     "battery": batteries,

@@ -7,9 +7,13 @@ import time as clock
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
+
 from quadsim.errors import FlightError, QuadsimError
 from quadsim.rollout.machine import machine, usable_cores, versions
 from quadsim.scenarios.loading import assemble
+from quadsim.sim.physics import Integrator
+from quadsim.state import N_STATES
 
 
 def capabilities() -> dict[str, dict[str, str]]:
@@ -27,6 +31,10 @@ def capabilities() -> dict[str, dict[str, str]]:
         "packages": versions(),
         "rendering": {"video": _tried(_rendering)},
         "viewer": {"native": viewer_problem() or "can be opened", "browser": "quadsim view RUN --web"},
+        "many vehicles": {
+            "own method": _tried(partial(_speed_of_many, "rk4", 40)),
+            "MuJoCo's step": _tried(partial(_speed_of_many, "mujoco", 5)),
+        },
         "solvers": {
             name: _tried(partial(_try_solver, name)) if entry.installed else entry.line
             for name, entry in solver_entries().items()
@@ -38,6 +46,33 @@ def _rendering() -> str:
     from quadsim.report.film.video import rendering_backend
 
     return f"renders off screen through {rendering_backend().upper()}"
+
+
+def _speed_of_many(integrator: Integrator, periods: int) -> str:
+    """Fly 32 vehicles at once by thrust and body rates, with the margins of a bound, and measure the time."""
+    from quadsim.assets import vehicle_path
+    from quadsim.flight.audit import Limit
+    from quadsim.sim.autopilot import Autopilot
+    from quadsim.sim.batch import PlantBatch
+    from quadsim.sim.margins import Margins
+    from quadsim.sim.plant import Plant
+    from quadsim.vehicle import load_vehicle
+
+    count, steps, timestep = 32, 50, 1e-3
+    vehicle = load_vehicle(vehicle_path("hummingbird"))
+    margins = Margins([Limit(name="tilt", signal="tilt", upper=30.0)], timestep)
+    batch = PlantBatch(count, steps=steps, limits=1)
+    for place in range(count):
+        plant = Plant(vehicle, timestep=timestep, integrator=integrator)
+        batch.put(place, plant, np.zeros(N_STATES), vehicle.hover_speeds, loop=Autopilot(vehicle), margins=margins)
+    targets = np.tile([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.1], (count, 1))
+    started = clock.process_time()
+    for _ in range(periods):
+        batch.fly(targets)
+    rate = count * periods / (clock.process_time() - started)
+    batch.close()
+    share = rate * steps * timestep
+    return f"{rate:.0f} steps of {1e3 * steps * timestep:.0f} ms per second of one core, {share:.0f} times real time"
 
 
 def _tried(call: Callable[[], str]) -> str:

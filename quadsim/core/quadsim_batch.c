@@ -219,7 +219,7 @@ static void end_period(quadsim_flight *f)
 static void fly_part(quadsim_flight *f)
 {
     quadsim_vehicle *v = f->vehicle;
-    if (f->rows->row == 0 || f->rows->row == f->period) {
+    if (f->rows->row == 0 || f->rows->row + f->steps > f->period) { /* also after one that ended within a period */
         begin_period(f);
     }
     f->why = quadsim_fly(v, f->loop, f->sensing, f->rows, f->command, v->now + f->steps);

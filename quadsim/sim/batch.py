@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from quadsim.controller import check_command
+from quadsim.controller import LARGEST_SPEED, check_command
 from quadsim.core.inner import CompiledLoop
 from quadsim.core.mirror import Struct, core_library
 from quadsim.core.structs import End, FlightStruct
@@ -33,7 +33,6 @@ class _Place:
     loop: CompiledLoop | None
     struct: Struct | None  # of the loop
     margins: Margins | None
-    unattended: bool  # whether the core flies it without anything in Python
 
 
 class PlantBatch:
@@ -77,7 +76,8 @@ class PlantBatch:
         self._flights = (FlightStruct * count)()
         self._places: list[_Place | None] = [None] * count
         self.steps, self._count = steps, count
-        self._attended: list[int] = []
+        self._attended: set[int] = set()  # places where something changes or is drawn
+        self._watched: set[int] = set()  # places where MuJoCo steps
         self._fields = _fields_of(self._flights)
         self.state, self.acting = self._fields["state"], self._fields["acting"]
         self.reference, self.measured = self._fields["reference"], self._fields["measured"]
@@ -135,6 +135,8 @@ class PlantBatch:
         flight.sensing = None if sensing is None else ctypes.addressof(sensing)
         flight.bounds, flight.bounded = None, 0
         if margins is not None:
+            assert margins.compiled
+            assert len(margins.limits) == self.smallest.shape[1]
             flight.bounds, flight.bounded = ctypes.addressof(margins.bounds), len(margins.limits)
             flight.smallest, flight.at_end = self.smallest[place].ctypes.data, self.at_end[place].ctypes.data
             self.smallest[place], self.at_end[place] = margins.of_start(plant.physics, speeds)
@@ -148,8 +150,11 @@ class PlantBatch:
         )
         self.acting[place] = speeds
         self.measured[place] = self.state[place]
-        self._places[place] = _Place(plant, loop, struct, margins, plant.unattended)
-        self._attended = [i for i, other in enumerate(self._places) if other is not None and not other.unattended]
+        self._places[place] = _Place(plant, loop, struct, margins)
+        for places, listed in ((self._attended, not plant.unattended), (self._watched, plant.watched)):
+            places.discard(place)
+            if listed:
+                places.add(place)
 
     def sense(self, place: int, sensing: Struct) -> None:
         """Let this take samples at a place in the periods to come."""
@@ -195,7 +200,7 @@ class PlantBatch:
     def _stage_first(self, ended: dict[int, FlightError]) -> dict[int, int]:
         """Stage the first part of the period where something changes or is drawn; return what is left of it."""
         left: dict[int, int] = {}
-        for place in self._attended:
+        for place in sorted(self._attended):
             if self._fields["steps"][place]:
                 self.plant(place).structs[1].row = 0
                 left[place] = self.steps
@@ -230,9 +235,10 @@ class PlantBatch:
     def _check(self, ended: dict[int, FlightError]) -> None:
         """Note what ended a flight in the last call."""
         fields = self._fields
-        suspects = fields["why"] != End.DONE
-        for place, at in enumerate(self._places):
-            if at is None or not fields["steps"][place] or not (suspects[place] or at.plant.watched):
+        suspects = np.flatnonzero(fields["why"] != End.DONE).tolist()
+        for place in {*suspects, *self._watched}:
+            at = self._places[place]
+            if at is None or not fields["steps"][place]:
                 continue
             flight = self._flights[place]
             try:
@@ -241,11 +247,12 @@ class PlantBatch:
                 ended[place] = error
 
     def _refuse(self, commands: Array, ended: dict[int, FlightError]) -> None:
-        """End the flights whose command is not of finite numbers."""
-        if np.isfinite(commands).all() and np.abs(commands).max(initial=0.0) <= 1e6:
+        """End the flights whose rotor speeds are no valid command; inner loops answer for their targets."""
+        if np.abs(commands).max(initial=0.0) <= LARGEST_SPEED:  # False for NaN
             return
         for place in np.flatnonzero(self._fields["steps"]).tolist():
-            problem = check_command(commands[place, :N_ROTORS])
+            at = self._places[place]
+            problem = check_command(commands[place]) if at is not None and at.loop is None else None
             if problem is not None:
                 ended[place] = CommandError(problem, time=self.plant(place).time)
                 self._fields["steps"][place] = 0

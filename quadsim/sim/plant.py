@@ -45,6 +45,7 @@ _NUMERICAL_WARNINGS: Final = (
     mujoco.mjtWarning.mjWARN_BADQACC,
     mujoco.mjtWarning.mjWARN_BADCTRL,
 )
+_BLOCK: Final = 2048  # normal numbers that are drawn at a time
 _CALM: Final = Effects()
 _AS_IN_THE_FILE: Final = Load()
 
@@ -134,6 +135,7 @@ class Plant:
             assert self.model.body_mocapid[bodies].tolist() == list(range(len(bodies)))  # the core writes them in order
         self._changes = self._scheduled(changes)
         rng = rng if rng is not None else np.random.default_rng(0)
+        self._reset_to: tuple[bytes, Array] = b"", np.zeros(_MOTION)
         self._seed(rng)
         self._struct = self._make_struct()
         self.reset(np.zeros(N_STATES))
@@ -182,6 +184,7 @@ class Plant:
         # A generator each, so that neither draw changes the other's, however time is cut.
         self._generators = rng, rng.spawn(1)[0]
         self._starts = [generator.bit_generator.state for generator in self._generators]
+        self._ahead = [NormalsAhead(generator) for generator in self._generators]
 
     def redraw(self, rng: np.random.Generator, wind: WindField | None) -> None:
         """Take other draws from the next reset on: of noise and disturbances, and of the wind if there is one."""
@@ -197,10 +200,8 @@ class Plant:
         state = np.asarray(state, float)
         if state.shape != (N_STATES,) or not np.all(np.isfinite(state)):
             raise ParameterError("plant", "state", state.tolist(), f"{N_STATES} finite numbers")
-        euler = state[ANGLES]
-        rates = euler_to_body_rates(euler, state[ANGLE_RATES])
-        motion = np.concatenate([state[POSITIONS], euler_to_quaternion(euler), state[VELOCITIES], rates])
-        self._yaw = YawTurns(float(euler[2]))
+        motion = self._motion_of(state)
+        self._yaw = YawTurns(float(state[EULER[2]]))
         self._pending = deque(self._changes)
         self._rotors = self.effects.rotors or RotorDynamics()
         self._efficiency = np.array(self._rotors.efficiency)
@@ -221,10 +222,21 @@ class Plant:
             self._carry(self._load.payloads, self._load.mass_factor)
         for generator, start in zip(self._generators, self._starts, strict=True):
             generator.bit_generator.state = start
+        self._ahead = [NormalsAhead(generator) for generator in self._generators]
         if self._wind is not None:
             self._wind.reset()
         for force in self._own:
             getattr(force, "reset", lambda: None)()
+
+    def _motion_of(self, state: Array) -> Array:
+        """Return the motion (13,) of a state, kept for the next reset to the same one."""
+        text = state.tobytes()
+        if text != self._reset_to[0]:
+            euler = state[ANGLES]
+            rates = euler_to_body_rates(euler, state[ANGLE_RATES])
+            parts = [state[POSITIONS], euler_to_quaternion(euler), state[VELOCITIES], rates]
+            self._reset_to = text, np.concatenate(parts)
+        return self._reset_to[1]
 
     def _make_struct(self) -> Struct:
         """Return the core's vehicle, with all that does not change."""
@@ -432,7 +444,7 @@ class Plant:
     def _draw(self, steps: int) -> None:
         """Draw for the next steps of the period."""
         rows, drawn = slice(self._rows.row, self._rows.row + steps), self._drawn
-        of_noise, of_disturbance = self._generators
+        of_noise, of_disturbance = self._ahead
         if self._wind is not None:
             self.flown["wind"][rows] = self._wind.advance(steps)
         if "noise" in drawn:
@@ -514,6 +526,23 @@ class Plant:
         counts = self._data.warning.number
         if counts.any() and (raised := [kind.name for kind in _NUMERICAL_WARNINGS if counts[int(kind)]]):
             raise DivergenceError(f"the plant diverged: MuJoCo reports {', '.join(raised)}", time=self.time)
+
+
+class NormalsAhead:
+    """Standard normal numbers of a generator, in its order, drawn in blocks: many small calls are slow."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng, self._block, self._used = rng, np.empty(0), 0
+
+    def standard_normal(self, size: tuple[int, int]) -> Array:
+        """As of `numpy.random.Generator`."""
+        count = size[0] * size[1]
+        if self._used + count > self._block.size:
+            fresh = self._rng.standard_normal(max(_BLOCK, count))
+            self._block, self._used = np.concatenate([self._block[self._used :], fresh]), 0
+        numbers = self._block[self._used : self._used + count]
+        self._used += count
+        return numbers.reshape(size)
 
 
 def check_free(effects: Effects, changes: Sequence[Change], obstacles: Sequence[Obstacle] = ()) -> None:

@@ -151,7 +151,10 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 def test_doctor_tries_every_solver(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json"]) == EXIT_DONE
     result = json.loads(capsys.readouterr().out)
-    assert list(result) == ["machine", "packages", "rendering", "viewer", "solvers"]
+    assert list(result) == ["machine", "packages", "rendering", "viewer", "many vehicles", "solvers"]
+    assert [*result["many vehicles"]] == ["own method", "MuJoCo's step"]
+    for line in result["many vehicles"].values():
+        assert int(line.split(" steps of 50 ms")[0]) > 100
     assert list(result["solvers"]) == list(solver_entries())
     for name, line in result["solvers"].items():
         installed = solver_entries()[name].installed

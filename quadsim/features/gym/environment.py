@@ -176,7 +176,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._require_open()
         self.start(episode)
         for action in actions:
-            if self.started.done:
+            if self._over:
                 break
             self.step(action)
         return self.flight()
@@ -196,22 +196,23 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._margins = Margins(self.limits, scenario.plant.timestep)
         self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
         self._seen = self._flight.observation
-        self._truth, self._rotors = self._flight.loop.truth, self._flight.loop.rotors
-        return self._vector(self._seen), self._info(*self._margins.of_start(self._flight.loop.physics, self._rotors))
+        self._truth, self._over = self._seen.truth, False
+        loop = self._flight.loop
+        return self._vector(self._seen), self._info(*self._margins.of_start(loop.physics, loop.rotors))
 
     def step(self, action: Action) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Fly one control period.
 
-        An action that is not finite ends the flight, as a controller's would.
+        An action that is NaN ends the flight, as a controller's would.
 
         Raises:
-            ParameterError: the action has another shape than `action_space`, or is not of numbers.
+            ParameterError: the action has another shape than `action_space`, is not of numbers, or is outside of it.
             ResetNeeded: there is no episode, or it has ended.
             ClosedEnvironmentError: `close` has been called.
         """
         self._require_open()
         flight = self.started
-        if flight.done:
+        if self._over:
             raise ResetNeeded(f"the episode has ended ({flight.loop.reason or 'the scenario is over'}); call reset()")
         seen = self._seen
         if self._answered and self._answered[0] == flight.k and np.array_equal(self._answered[1], action):
@@ -222,18 +223,21 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         try:
             sample = flight.loop.step(command)
         except FlightError:
+            self._over = True
             return self._vector(seen), 0.0, True, False, self._info(nothing, nothing)
-        self._truth, self._rotors = flight.loop.truth, flight.loop.rotors
         try:
             self._seen = flight.loop.observation
+            self._truth = self._seen.truth
         except FlightError:  # lost: no controller would be called any more
+            self._truth = flight.loop.truth
             rows = flight.loop.followed(float(self._truth[INDEX["yaw"]]))
             moment = replace(seen.moment, acting=sample.speeds)
             self._seen = replace(seen, state=self._truth, reference=rows[0], preview=rows[1:], moment=moment)
         terminated = flight.loop.reason is not None or self._seen.moment.phase is Phase.CRASHED
         info = self._info(*self._margins.of_period(sample))
         reward = self._reward.of_one(*self.outcome, info["margins"])
-        return self._vector(self._seen), reward, terminated, flight.done and not terminated, info
+        self._over = flight.done
+        return self._vector(self._seen), reward, terminated, self._over and not terminated, info
 
     def controller_action(self) -> Action:
         """Return the command of the scenario's controller at this time, computed once per period.
@@ -292,7 +296,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if self._camera is None:
             width, height = self._size
             self._camera = Camera(self.started.actual, self.scenario.obstacles, width=width, height=height)
-        return self._camera.picture(self._truth, self._rotors, self._seen.reference, self.started.loop.time)
+        loop = self.started.loop
+        return self._camera.picture(self._truth, loop.rotors, self._seen.reference, loop.time)
 
     def close(self) -> None:
         """Free native memory and the renderer; only `flight` remains."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
@@ -86,11 +87,11 @@ class StepResults:
 class Fleet(Protocol):
     """N environments, each somewhere in its episode."""
 
-    def reset(self, place: int, episode: Episode, frame: StepResults) -> None:
-        """Start an episode at a place; fill in its row.
+    def reset(self, episodes: Mapping[int, Episode], frame: StepResults) -> None:
+        """Start episodes at their places; fill in these rows.
 
         Raises:
-            QuadsimError: it cannot be flown.
+            QuadsimError: one cannot be flown.
         """
         ...
 
@@ -115,10 +116,13 @@ class Apart:
         self._names = single.constraint_names
         self._state, self._reference, self._speeds = np.zeros((count, 12)), np.zeros((count, 4)), np.zeros((count, 4))
 
-    def reset(self, place: int, episode: Episode, frame: StepResults) -> None:
+    def reset(self, episodes: Mapping[int, Episode], frame: StepResults) -> None:
         """See `Fleet`."""
-        frame.observations[place], info = self._environments[place].start(episode)
-        self._fill(place, info, frame)
+        for place, episode in episodes.items():
+            frame.observations[place], info = self._environments[place].start(episode)
+            frame.rewards[place] = 0.0
+            frame.terminated[place] = frame.truncated[place] = False
+            self._fill(place, info, frame)
 
     def step(self, actions: Array, flying: Flags, frame: StepResults) -> None:
         """See `Fleet`."""
@@ -164,6 +168,7 @@ class Setup:
         loss: (4,) limits of `quadsim.flight.phase.CRITERIA`, infinite where there is none.
         sensed: whether sensors give the state.
         drawn: whether an episode's seed matters.
+        spares: what has flown such episodes, and flies nothing now.
     """
 
     def __init__(self, assembly: Assembly, action: str, preview: int) -> None:
@@ -181,6 +186,7 @@ class Setup:
         effects = assembly.effects
         disturbed = effects.disturbance is not None or effects.thrust_noise is not None
         self.drawn = disturbed or self.sensed or assembly.moving_air is not None or bool(scenario.forces)
+        self.spares: list[_Slot] = []
 
 
 @dataclass
@@ -232,8 +238,22 @@ class Together:
 
     # --- reset -------------------------------------------------------------------------------------------------------
 
-    def reset(self, place: int, episode: Episode, frame: StepResults) -> None:
+    def reset(self, episodes: Mapping[int, Episode], frame: StepResults) -> None:
         """See `Fleet`."""
+        for place, episode in episodes.items():
+            self._put(place, episode)
+        places = np.array([*episodes])
+        self._follow(places)
+        for error in self._lost(places).values():
+            raise error
+        frame.observations[places] = self._observe(places)
+        frame.rewards[places], frame.time[places] = 0.0, 0.0
+        frame.terminated[places] = frame.truncated[places] = False
+        frame.phases[places], frame.reasons[places] = str(Phase.FLYING), ""
+        self._fill_margins(places, frame)
+
+    def _put(self, place: int, episode: Episode) -> None:
+        """Put what flies an episode at its start."""
         setup = self._setup(episode, key=episode.flight)
         slot = self._slot(place, setup, episode)
         margins = setup.margins if self._margined else None
@@ -251,15 +271,6 @@ class Together:
         if slot.navigation is not None:
             slot.navigation.reset(slot.plant.physics, setup.speeds, yaw=float(setup.state[_YAW]))
             self._state[place] = slot.navigation.state()
-        only = np.array([place])
-        self._follow(only)
-        for error in self._lost(only).values():
-            raise error
-        frame.observations[place] = self._observe(only)[0]
-        frame.rewards[place], frame.time[place] = 0.0, 0.0
-        frame.terminated[place] = frame.truncated[place] = False
-        frame.phases[place], frame.reasons[place] = str(Phase.FLYING), ""
-        self._fill_margins(only, frame)
 
     def _setup(self, episode: Episode, key: int | None) -> Setup:
         """Return what an episode's scenario has in common with others of its kind, kept from before where it is."""
@@ -268,6 +279,9 @@ class Together:
             if (obstacle := obstacle_to_batch(episode.scenario)) is not None:
                 raise InputError(f"flight {key} of the campaign has {obstacle}, which its scenario does not have")
             setup = Setup(self._episodes.assembly(episode.scenario), self._action, self._preview)
+            scenario = episode.scenario
+            if (scenario.control_period, scenario.steps_per_period) != (self._period, self._batch.steps):
+                raise InputError(f"flight {key} of the campaign has another control period or physics step than others")
             names = tuple(limit.name for limit in setup.margins.limits)
             if names != self._names:
                 raise InputError(f"flight {key} of the campaign has the constraints {names}, others {self._names}")
@@ -280,12 +294,13 @@ class Together:
         """Return what flies an episode at a place: what flew there, where that is built the same, with other draws."""
         slot = self._slots[place]
         assembly = setup.assembly.of(episode.scenario)
-        if slot is None or slot.setup is not setup or episode.scenario.forces:
-            if slot is not None:
-                slot.plant.close()
-            slot = _Slot(setup, assembly.plant(), setup.actions.autopilot())
+        forces = bool(episode.scenario.forces)  # which are made with draws of their own
+        if slot is None or slot.setup is not setup or forces:
+            if slot is not None and not forces:
+                slot.setup.spares.append(slot)
+            slot = setup.spares.pop() if setup.spares else _Slot(setup, assembly.plant(), setup.actions.autopilot())
             self._slots[place] = slot
-        elif setup.drawn:
+        if setup.drawn:
             slot.plant.redraw(assembly.generator("disturbance"), assembly.wind())
         if slot.autopilot is not None:
             slot.autopilot.reset()

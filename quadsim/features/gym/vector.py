@@ -80,7 +80,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             vary: what each environment draws anew at each reset.
             reward: of arrays: states (N, 12), references (N, 4), speeds (N, 4) and, if it takes them, `margins`, (N,)
                 each by name; returns (N,).
-            margins: whether `info` has margins, violations and cost: they take an eighth of a step's time.
+            margins: whether `info` has margins, violations and cost, which take time.
             autoreset_mode: when an ended episode is reset: `NextStep`, `SameStep` or `Disabled`.
             max_episode_steps: truncates episodes before the scenario's duration.
             threads: how many of them fly the vehicles.
@@ -233,6 +233,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             return [None] * self.num_envs
         if isinstance(seed, int | np.integer):
             self._episodes.check_seed(seed)
+            self._episodes.check_seed(int(seed) + self.num_envs - 1)
             return [int(seed) + place for place in range(self.num_envs)]
         seeds = list(seed)
         if len(seeds) != self.num_envs:
@@ -264,11 +265,12 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
     def _start(self, episodes: Mapping[int, Episode], frame: StepResults) -> None:
         """Start episodes; fill in their rows."""
         self._of_episodes = deepcopy(self._of_episodes)  # users keep the last one's arrays
+        self._fleet.reset(episodes, frame)
         for place, episode in episodes.items():
-            self._fleet.reset(place, episode, frame)
             self._log.start(place, episode)
             self._started[place], self._ended[place] = True, False
             self._note(place, episode)
+        self._log.trim()
 
     def _note(self, place: int, episode: Episode) -> None:
         """Note what `info` has of an episode."""
@@ -332,6 +334,9 @@ class _ActionLog:
     def start(self, place: int, episode: Episode) -> None:
         """Start an episode with the next step."""
         self._present[place] = episode, self._next
+
+    def trim(self) -> None:
+        """Drop the steps of episodes that are no longer kept."""
         kept = [present[1] for present in self._present if present is not None]
         kept += [ended[1] for ended in self._ended if ended is not None]
         while self._dropped < min(kept):

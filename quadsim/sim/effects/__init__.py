@@ -109,6 +109,14 @@ class ThrustNoise:
     ] = 0.0
 
 
+class Normals(Protocol):
+    """A generator of standard normal numbers."""
+
+    def standard_normal(self, size: tuple[int, int]) -> Array:
+        """As of `numpy.random.Generator`."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
     """An unmodelled force and torque, with a constant and a random part."""
@@ -120,7 +128,7 @@ class Disturbance:
     ] = 0.0
     torque_noise: Annotated[NonNegative, doc("[N m s^0.5] as force_noise, for the torque")] = 0.0
 
-    def draw(self, steps: int, timestep: float, rng: np.random.Generator) -> Array:
+    def draw(self, steps: int, timestep: float, rng: Normals) -> Array:
         """(steps, 6) force, world [N], and torque, body [N m], over each step of `timestep` [s]."""
         constant = np.array([*self.force, *self.torque])
         density = np.repeat([self.force_noise, self.torque_noise], 3)

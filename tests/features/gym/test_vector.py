@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import quadsim
 import quadsim.gym
@@ -281,6 +282,43 @@ def test_a_campaign_varies_them_by_its_name() -> None:
     envs.close()
 
 
+def test_what_cannot_be_flown_together_is_refused() -> None:
+    scenario = short("hummingbird-figure-eight", 0.2, **{"plant.integrator": "rk4"})
+    period = {"name": "period", "fields": ["control_period"], "distribution": "grid", "values": [0.05, 0.1]}
+    envs = quadsim.gym.make_vec(scenario, 1, vary=[period])
+    envs.reset(options={"flight": 0})
+    with pytest.raises(InputError, match="another control period"):
+        envs.reset(options={"flight": 1})
+    with pytest.raises(ParameterError, match="options"):
+        envs.reset(options={"flights": 1})
+    envs.close()
+
+
+@pytest.mark.parametrize("action", ["rates", "attitude", "speeds"])
+def test_a_bad_number_has_the_reason_that_a_single_environment_gives(action: str) -> None:
+    scenario = short("hummingbird-figure-eight", 0.2, **{"plant.integrator": "rk4"})
+    envs = quadsim.gym.make_vec(scenario, 2, action=action)
+    env = quadsim.gym.QuadrotorEnv(scenario, action=action)
+    envs.reset(seed=0)
+    env.reset(seed=0)
+    wrong = np.full((2, 4), np.nan)
+    info, infos = env.step(wrong[0])[4], envs.step(wrong)[4]
+    assert infos["reason"][0] == info["reason"]
+    assert "not finite" in info["reason"]
+    envs.close()
+
+
+def test_gymnasiums_wrappers_take_them() -> None:
+    scenario = short("hummingbird-figure-eight", 0.2, **{"plant.integrator": "rk4"})
+    envs = quadsim.gym.make_vec(scenario, 2, action="rates", autoreset_mode="SameStep")
+    recorded = RecordEpisodeStatistics(envs)
+    recorded.reset(seed=0)
+    for _ in range(4):
+        *_, infos = recorded.step(ZERO[:2])
+    assert infos["episode"]["l"].tolist() == [4, 4]
+    recorded.close()
+
+
 def test_rewards_may_use_margins() -> None:
     def reward(state: Array, reference: Array, speeds: Array, margins: dict[str, Any]) -> Any:
         return -np.abs(state[..., 4] - reference[..., 2]) + np.minimum(margins["roll"], 0.0)
@@ -380,7 +418,7 @@ def test_a_wrong_option_is_named(options: dict[str, Any], message: str) -> None:
 
 def test_wrong_seeds_are_named() -> None:
     envs = quadsim.gym.make_vec("hummingbird-figure-eight", 2)
-    for seed in (-1, [1], [1, -2], [0.5, 1]):
+    for seed in (-1, [1], [1, -2], [0.5, 1], 2**63 - 1):
         with pytest.raises(ParameterError, match="seed"):
             envs.reset(seed=seed)
     first = envs.reset(seed=[7, None])[1]["seed"].tolist()
