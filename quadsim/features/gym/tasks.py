@@ -15,12 +15,12 @@ from quadsim.features.gym.environment import QuadrotorEnv
 from quadsim.features.gym.vector import QuadrotorVectorEnv
 from quadsim.state import EULER, REFERENCE_STATES, Array, wrapped
 
-PRECISION: Final = 2.0
+PRECISION: Final = 3.0
 """Decrease of the logarithm of the reward per metre of distance from the reference [1/m]."""
-GENTLE_TILT: Final = math.radians(14.0)
+GENTLE_TILT: Final = math.radians(13.5)
 """Roll and pitch up to which the reward is free [rad]; the scenario's bound is 15 deg, and the course needs 13."""
-TILT_COST: Final = math.degrees(0.3)
-"""Decrease of the logarithm of the reward per radian beyond `GENTLE_TILT`: 0.3 per degree."""
+TILT_COST: Final = math.degrees(1.0)
+"""Decrease of the logarithm of the reward per radian beyond `GENTLE_TILT`: 1 per degree."""
 
 
 def tracking(state: Array, reference: Array, speeds: Array) -> Array:
