@@ -350,11 +350,12 @@ def curve_figure(curve: Sequence[CurvePoint]) -> Figure:
     errors = np.array([100.0 * point.error for point in curve])
     series = Series(x=steps, y=errors, colour=COLOUR.flown)
     panel = Panel(
-        title="RMS distance from the reference while it explores [cm]",
+        title="RMS error while it explores [cm]",
         series=(series,),
         bounds=(Bound(value=100.0 * CLAIM),),
         x_label="steps",
-        y_range=(0.0, 50.0),
+        y_log=True,
+        y_range=(3.0, 200.0),
         height=1.6,
     )
     return Figure(key="ppo", title="", panels=(panel,), columns=1)
