@@ -17,6 +17,7 @@ from quadsim.state import (
     ReferenceTurns,
     State,
     YawTurns,
+    follow_turns,
     nearest_turn,
     unwrapped,
     whole_turns,
@@ -115,3 +116,24 @@ def test_a_loop_leaves_the_yaw_however_it_turns_upside_down() -> None:
     turns, flown = YawTurns(0.0), ((math.pi, -2.78), (math.pi, 2.9), (0.1, 0.1))
     yaws = [turns.unwrapped(np.array([roll, 0.0, yaw])) for roll, yaw in flown]
     assert yaws == pytest.approx([-2.78, 2.9 - TURN, 0.1])
+
+
+def test_many_references_follow_their_vehicles_turns_as_single_ones_do() -> None:
+    """Turning references and vehicles, noise, leaps of the vehicle, and yaws that are no number."""
+    rng = np.random.default_rng(3)
+    count, rows, periods = 6, 5, 200
+    rates = np.array([0.0, 0.3, -0.5, 2.0, 1.0, 0.2])
+    firsts = np.full(count, np.nan)
+    singles = [ReferenceTurns() for _ in range(count)]
+    moved = 0
+    for k in range(periods):
+        instants = k + np.arange(rows)
+        references = rng.standard_normal((count, rows, 4))
+        references[:, :, 3] = wrapped(rates[:, None] * instants)
+        yaws = rates * k + 0.5 * rng.standard_normal(count) + 7.0 * (rng.random(count) < 0.05)
+        yaws[rng.random(count) < 0.02] = np.nan
+        together = follow_turns(references, yaws, firsts)
+        alone = np.stack([one.follow(references[i], float(yaws[i])) for i, one in enumerate(singles)])
+        assert np.array_equal(together, alone)
+        moved += not np.array_equal(together, references)
+    assert moved > periods // 2

@@ -274,7 +274,10 @@ static void derive(const quadsim_vehicle *v, const double *x, const rotor_state 
     const double *q = x + 3, *w = x + 10, *T = rotors->thrust, *J = v->inertia, m = v->mass;
     double torque[3], load[WRENCH], momentum[3], gyroscopic[3], axis[3];
     const double lift = T[0] + T[1] + T[2] + T[3];
-    forces_at(v, x, x + 7, rotors, wind, wrench);
+    memset(wrench, 0, WRENCH * sizeof *wrench);
+    if (v->follows_motion) {
+        forces_at(v, x, x + 7, rotors, wind, wrench);
+    }
     for (int i = 0; i < 3; i++) {
         const double *row = v->torque_of_thrust[i];
         torque[i] = row[0] * T[0] + row[1] * T[1] + row[2] * T[2] + row[3] * T[3];

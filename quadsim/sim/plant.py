@@ -127,6 +127,9 @@ class Plant:
         pushed = any(isinstance(change, PushChange) for change in changes)
         self._follows_motion = effects.follows_state or wind is not None or bool(self._own) or pushed
         self._follows_motion = self._follows_motion or bool(self._moving) or integrator == "rk4"
+        self._forced = self._follows_motion
+        if integrator == "rk4":  # which adds disturbances and forces of the user to those that follow from the motion
+            self._forced = replace(effects, disturbance=None).follows_state
         self._steps_type = steps_type(
             wrench=self._follows_motion, wind=wind is not None, battery=effects.battery is not None
         )
@@ -256,7 +259,6 @@ class Plant:
         v.spin[:] = [float(spin) for spin in vehicle.rotor_spins]
         fill(v.place, vehicle.hubs)
         fill(v.torque_of_thrust, vehicle.allocation[1:] / vehicle.coefficients)
-        v.follows_motion = self._follows_motion
         if effects.rotors is not None:
             v.rotor_inertia = effects.rotors.inertia or 0.0
         if (air := effects.air) is not None:
@@ -297,6 +299,7 @@ class Plant:
         v.rise, v.fall, v.acceleration = rotors.rise or 0.0, rotors.fall or 0.0, rotors.acceleration or 0.0
         v.at_once, v.efficiency[:] = rotors.at_once, self._efficiency
         v.pushes, v.pushing = self._pushes.ctypes.data, len(self._pushes)
+        v.follows_motion = self._forced or len(self._pushes) > 0
 
     def state(self) -> Array:
         """(12,) the true state now, yaw unwrapped since the last reset."""

@@ -45,12 +45,17 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     - `constraint_violation`: 1 where a required constraint was violated beyond its tolerances, else 0.
     - `cost`: number of required constraints violated.
     - `time` [s], `phase` (`flying`, `landed`, ...), `reason` (why the flight ended; empty until then).
+    - `seed` of the episode; where something varies also `flight`, its number in the campaign, and `draw`, the values
+      drawn by the names of the campaign's entries.
 
     Attributes:
         scenario: the scenario of this episode.
         limits: the limits of its audit.
         actions: what an action means.
         observations: what an observation has, with the unit of each entry.
+        preview: observed periods of the reference.
+        episodes: what draws the episodes.
+        violated: (m,) which required constraints the last step violated beyond their tolerances.
 
     Examples:
         >>> import numpy as np
@@ -82,11 +87,12 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
         Args:
             scenario: the scenario, or its name or file.
-            action: `deviations` from hover, rotor `speeds` [rad/s], or collective thrust and body `rates`.
+            action: what an action means: `deviations` from hover, also called `rotors`, rotor `speeds` [rad/s], rotors'
+                `thrust`, or collective thrust and `rates` or `attitude`; see `quadsim.features.gym.spaces.Actions`.
             observation: parts, of `state`, `preview`, `ahead` and `command`.
             preview: observed periods of the reference, at most the controller's horizon (default).
             vary: a campaign, its name or file, whose `[set]` changes the scenario and whose `[[vary]]` is drawn anew
-                at each reset.
+                at each reset; or a list of such entries.
             reward: reward of a step; see `Reward`.
             render_mode: `rgb_array` or None; `human` by the wrapper that `gymnasium.make` adds, with pygame.
             width: width of pictures [pixels].
@@ -187,11 +193,12 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if self._flight is not None:
             self._flight.close()
         self.scenario, self._episode = scenario, episode
+        assembly = self.episodes.assembly(scenario)
         if self.episodes.varied:
-            self.actions = Actions(self._action, scenario, Assembly(scenario).vehicle)
+            self.actions = Actions(self._action, scenario, assembly.vehicle)
         # events that change the controller need a real one
         law: Any = None if scenario.controller_changes else Agent(scenario.controller.horizon)
-        self._flight = Rollout(self.episodes.assembly(scenario), law)
+        self._flight = Rollout(assembly, law)
         self.limits = self._flight.limits
         self._margins = Margins(self.limits, scenario.plant.timestep)
         self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from quadsim.scenarios.assembly import Assembly, preferring_core
 from quadsim.scenarios.loading import load_scenario
 from quadsim.scenarios.schema.base import LARGEST_WHOLE
 from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.vehicle import Vehicle
 
 Variation = str | Path | Sequence[Mapping[str, Any]]
 """A campaign's name or file, or entries as of its `[[vary]]`."""
@@ -104,5 +106,10 @@ class Episodes:
 
     def assembly(self, scenario: Scenario) -> Assembly:
         """Return the parts of an episode, with the bounds of a user's controller where a campaign varies it."""
-        assembly = Assembly(scenario)
+        as_in_base = (scenario.vehicle, scenario.recorded) == (self.base.vehicle, self.base.recorded)
+        assembly = Assembly(scenario, self._vehicle if as_in_base else None)  # its file is read once
         return assembly.audited() if self.varied else assembly
+
+    @cached_property
+    def _vehicle(self) -> Vehicle:
+        return Assembly(self.base).vehicle

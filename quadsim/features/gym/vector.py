@@ -68,6 +68,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         threads: int = 1,
+        render_mode: str | None = None,
     ) -> None:
         """Set up; nothing is flown before `reset`.
 
@@ -84,6 +85,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             autoreset_mode: when an ended episode is reset: `NextStep`, `SameStep` or `Disabled`.
             max_episode_steps: truncates episodes before the scenario's duration.
             threads: how many of them fly the vehicles.
+            render_mode: None; `flight` has episodes that can be filmed.
 
         Raises:
             InputError: an argument is not allowed.
@@ -93,6 +95,9 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         for name, number in (("num_envs", num_envs), ("threads", threads), ("max_episode_steps", max_episode_steps)):
             if number is not None and not (isinstance(number, int | np.integer) and number >= 1):
                 raise ParameterError("", name, number, "a whole number of at least 1")
+        if render_mode is not None:
+            rule = "None: envs.flight(i).save(directory) films an episode of environment i"
+            raise ParameterError("", "render_mode", render_mode, rule)
         try:
             self._autoreset = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -186,7 +191,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         self._log.end(ended)
         if self._autoreset is not AutoresetMode.SAME_STEP or not ended.any():
             self._ended = ended
-            info = self._info(self._started)
+            info = self._info(self._started.copy())
             return frame.observations.copy(), frame.rewards, frame.terminated, frame.truncated, info
         return self._reset_at_once(ended)
 
@@ -246,7 +251,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
     def _mask(self, mask: Any) -> Flags:
         if mask is None:
             return np.ones(self.num_envs, bool)
-        flags = np.asarray(mask)
+        flags = np.array(mask)
         if flags.shape != (self.num_envs,) or flags.dtype != np.bool_ or not flags.any():
             raise ParameterError("options", "reset_mask", mask, f"{self.num_envs} flags, one of them true at least")
         return flags
@@ -311,7 +316,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             final["final_obs"][place] = frame.observations[place].copy()
         self._start({place: self._drawn(place, None, {}) for place in places}, frame)
         self._ended = np.zeros(self.num_envs, bool)
-        return frame.observations.copy(), *results, {**self._info(self._started), **final}
+        return frame.observations.copy(), *results, {**self._info(self._started.copy()), **final}
 
 
 class _ActionLog:

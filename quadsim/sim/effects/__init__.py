@@ -41,6 +41,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated, Literal, Protocol
 
 import numpy as np
@@ -130,12 +131,15 @@ class Disturbance:
 
     def draw(self, steps: int, timestep: float, rng: Normals) -> Array:
         """(steps, 6) force, world [N], and torque, body [N m], over each step of `timestep` [s]."""
-        constant = np.array([*self.force, *self.torque])
-        density = np.repeat([self.force_noise, self.torque_noise], 3)
+        constant, density = self._constant_and_density
         if not density.any():
             return np.tile(constant, (steps, 1))
         drawn: Array = constant + density / math.sqrt(timestep) * rng.standard_normal((steps, 6))
         return drawn
+
+    @cached_property
+    def _constant_and_density(self) -> tuple[Array, Array]:
+        return np.array([*self.force, *self.torque]), np.repeat([self.force_noise, self.torque_noise], 3)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -405,6 +405,7 @@ def test_bad_actions_are_refused_and_a_bad_number_ends_its_own_episode() -> None
         ({"num_envs": 1.5}, "num_envs must be a whole number"),
         ({"threads": 0}, "threads must be a whole number"),
         ({"autoreset_mode": "later"}, "autoreset_mode must be one of"),
+        ({"render_mode": "rgb_array"}, "render_mode must be None: .* films an episode"),
         ({"action": "torque"}, "no action named 'torque'"),
         ({"vary": [{**MASS, "low": 0.9}]}, "low must be below high"),
         ({"vary": [{**MASS, "fields": ["actual.mas"]}]}, "mas"),
