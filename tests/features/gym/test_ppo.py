@@ -13,7 +13,7 @@ import pytest
 import quadsim
 import quadsim.gym
 from quadsim.features.campaign.plan import load_plan
-from quadsim.features.gym.tasks import tracking
+from quadsim.features.gym.tasks import tracking_reward
 from quadsim.report.to_matplotlib import draw
 from quadsim.state import INDEX
 
@@ -57,7 +57,7 @@ def test_the_reward_of_tracking_is_largest_on_the_reference_and_never_negative()
     states[2, INDEX["yaw"]] = -0.2
     states[3, INDEX["roll"]] = np.radians(-14.5)
     states[4] = 100.0
-    rewards = tracking(states, np.zeros((5, 4)), np.zeros((5, 4)))
+    rewards = tracking_reward(states, np.zeros((5, 4)), np.zeros((5, 4)))
     assert rewards[:4] == pytest.approx([1.0, np.exp(-0.3), np.exp(-0.2), np.exp(-1.0)])
     assert rewards[4] >= 0.0
 
