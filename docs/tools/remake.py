@@ -379,11 +379,12 @@ def autopilots(data: Any) -> str:
 
 def ppo(data: Record) -> str:
     """What a learned policy and the MPC do on the same draws, and how long the policy learned."""
-    head = ("", "flights", "lost", "violated", "RMS error, m", "largest of a flight, m", "largest tilt, deg")
-    numbers = ("flights", "lost", "violated", "error", "largest_error", "peak_tilt")
+    events = {"flights": "flights", "lost": "lost", "violated": "violated", "tilted": "roll or pitch violated"}
+    sizes = {"error": "RMS error, m", "largest_error": "largest of a flight, m", "peak_tilt": "largest tilt, deg"}
+    head = ("", *events.values(), *sizes.values())
     rows = []
     for score in data["comparison"]:
-        rows.append([score["controller"], *(f"{score[number]:.3g}" for number in numbers)])
+        rows.append([score["controller"], *(f"{score[number]:.3g}" for number in (*events, *sizes))])
     steps = data["curve"][-1]["steps"]
     return f"{table(head, rows)}\n{steps} steps of training took {data['seconds']:.0f} s of one core.\n"
 

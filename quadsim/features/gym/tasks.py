@@ -23,7 +23,7 @@ TILT_COST: Final = math.degrees(1.0)
 """Decrease of the logarithm of the reward per radian beyond `GENTLE_TILT`: 1 per degree."""
 
 
-def tracking(state: Array, reference: Array, speeds: Array) -> Array:
+def tracking_reward(state: Array, reference: Array, speeds: Array) -> Array:
     """Return the reward of tracking, in (0, 1]: less by distance, error of yaw, and roll or pitch beyond a bound.
 
         exp(-PRECISION |p - p_ref| - |yaw - yaw_ref| - TILT_COST (excess of |roll| + excess of |pitch|)),
@@ -37,8 +37,8 @@ def tracking(state: Array, reference: Array, speeds: Array) -> Array:
 
     Examples:
         >>> import numpy as np
-        >>> from quadsim.features.gym.tasks import tracking
-        >>> tracking(np.zeros((2, 12)), np.zeros((2, 4)), np.zeros((2, 4)))
+        >>> from quadsim.features.gym.tasks import tracking_reward
+        >>> tracking_reward(np.zeros((2, 12)), np.zeros((2, 4)), np.zeros((2, 4)))
         array([1., 1.])
     """
     error = state[..., list(REFERENCE_STATES)] - reference
@@ -58,7 +58,7 @@ TASKS: Final[Mapping[str, Mapping[str, Any]]] = MappingProxyType(
                 "observation": ("ahead", "state"),
                 "preview": 10,
                 "vary": "track-eight",
-                "reward": tracking,
+                "reward": tracking_reward,
             }
         )
     }

@@ -175,7 +175,28 @@ def test_gentle_body_rates_pass_and_are_reached_at_the_end_of_the_period() -> No
     np.testing.assert_allclose(behind, alone, rtol=0.02)
 
 
+def test_a_vector_of_filtered_environments_is_each_of_them_to_the_bit() -> None:
+    def make() -> gymnasium.Env[Any, Any]:
+        return quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("robust", action="rates"))
+
+    actions = np.array([[0.1, 0.5, 0.0, 0.0], [0.0, 0.0, -0.01, 0.01]], np.float32)
+    envs = gymnasium.vector.SyncVectorEnv([make, make])
+    observed, _ = envs.reset(seed=4)
+    for _ in range(5):
+        observed, *_, infos = envs.step(actions)
+    for place in range(2):
+        env = make()
+        env.reset(seed=4 + place)
+        for _ in range(5):
+            alone, *_, info = env.step(actions[place])
+        np.testing.assert_array_equal(observed[place], alone)
+        assert infos["filter"]["intervened"][place] == info["filter"]["intervened"]
+        assert infos["filter"]["correction"][place] == info["filter"]["correction"]
+
+
 def test_what_cannot_be_filtered_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"action must be one of .*rates.* become rotor speeds"):
+        quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("robust", action="attitude"))
     with pytest.raises(ParameterError, match="environment"):
         quadsim.gym.MPCSafetyFilter(gymnasium.make("Pendulum-v1"))
     with pytest.raises(ParameterError, match=r"controller\.type"):
