@@ -77,6 +77,7 @@ USING: Final = {
     "rollout/test_logged.py": ("campaign",),
     "rollout/test_piloted.py": ("design",),
     "rollout/test_velocity_weights.py": ("export",),
+    "console/test_notebook.py": ("campaign",),
     "console/test_progress.py": ("campaign",),
     "rollout/test_verdicts.py": ("campaign",),
     "commands/test_versions.py": ("campaign",),

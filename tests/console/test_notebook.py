@@ -10,8 +10,6 @@ nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 pytest.importorskip("ipykernel")
 
-pytestmark = pytest.mark.slow("console")
-
 SETUP = """
 %matplotlib inline
 import quadsim
