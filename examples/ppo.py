@@ -375,9 +375,14 @@ def read_curve(path: Path) -> list[CurvePoint]:
     points = []
     with path.open(encoding="utf-8") as file:
         for line in csv.DictReader(file):
-            counts = {name: int(line[name]) for name in ("steps", "lost")}
-            numbers = {name: float(line[name]) for name in ("reward", "error")}
-            points.append(CurvePoint(**counts, **numbers))
+            points.append(
+                CurvePoint(
+                    steps=int(line["steps"]),
+                    reward=float(line["reward"]),
+                    error=float(line["error"]),
+                    lost=int(line["lost"]),
+                )
+            )
     return points
 
 
