@@ -375,13 +375,14 @@ def read_curve(path: Path) -> list[CurvePoint]:
     points = []
     with path.open(encoding="utf-8") as file:
         for line in csv.DictReader(file):
-            point = CurvePoint(
-                steps=int(line["steps"]),
-                lost=int(line["lost"]),
-                reward=float(line["reward"]),
-                error=float(line["error"]),
+            points.append(
+                CurvePoint(
+                    steps=int(line["steps"]),
+                    reward=float(line["reward"]),
+                    error=float(line["error"]),
+                    lost=int(line["lost"]),
+                )
             )
-            points.append(point)
     return points
 
 
