@@ -65,9 +65,10 @@ def _estimate(
     halves: Array = np.hypot(quantile(_MANY) * fit.explained, quantile(blocks) * scatter)
     if place < 3:
         kind, unit, sensor, scale = "torque", "N m", "gyro", known.vehicle.inertia[place]
-        for inertia in known.estimates:
-            if inertia.name == f"inertia_{axis}" and not inertia.refused:
-                halves[0] = math.hypot(halves[0], 0.5 * math.log(inertia.high / inertia.low))
+        (inertia,) = (estimate for estimate in known.estimates if estimate.name == f"inertia_{axis}")
+        # The vehicle may keep another inertia than was found.
+        farthest = max(math.log(inertia.high / scale), math.log(scale / inertia.low))
+        halves[0] = math.hypot(halves[0], farthest)
     else:
         kind, unit, sensor, scale = "force", "N", "velocity", known.vehicle.mass
     factors = np.exp(np.minimum(halves, _UNKNOWN))
