@@ -43,7 +43,8 @@ class _UserCode:
     def __init__(
         self, error_of: Callable[[BaseException], QuadsimError], passing: tuple[type[QuadsimError], ...]
     ) -> None:
-        self._error_of, self._passing = error_of, passing
+        self._error_of = error_of
+        self._passing = passing
 
     def __enter__(self) -> None:
         pass
@@ -69,7 +70,8 @@ def numbers_of(answer: Any) -> Array:
 def printing_to_stderr() -> Iterator[None]:
     """Send to stderr what is printed inside, also by compiled libraries and child processes: stdout has a result."""
     try:
-        stdout, stderr = sys.stdout.fileno(), sys.stderr.fileno()
+        stdout = sys.stdout.fileno()
+        stderr = sys.stderr.fileno()
     except (OSError, AttributeError, ValueError):  # in a notebook, or in a test, they may be no files
         with contextlib.redirect_stdout(sys.stderr):
             yield

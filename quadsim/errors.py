@@ -68,7 +68,10 @@ class ParameterError(InputError):
 
     def __init__(self, owner: str, name: str, value: object, rule: str) -> None:
         super().__init__(f"{owner + '.' if owner else ''}{name} must be {rule}; got {value!r}")
-        self.owner, self.name, self.value, self.rule = owner, name, value, rule
+        self.owner = owner
+        self.name = name
+        self.value = value
+        self.rule = rule
 
 
 class ExportError(InputError):
@@ -95,7 +98,9 @@ class UnknownNameError(InputError):
         meant: Sequence[str] = (),
         successor: str | None = None,
     ) -> None:
-        self.kind, self.name, self.allowed = kind, name, tuple(sorted(allowed))
+        self.kind = kind
+        self.name = name
+        self.allowed = tuple(sorted(allowed))
         if successor is not None:
             super().__init__(f"the {kind} {name!r} was removed: use {successor!r}")
             return
@@ -114,7 +119,8 @@ class FileError(InputError):
 
     def __init__(self, path: Path | str, problem: str) -> None:
         super().__init__(f"{printable(str(path))}: {problem}")
-        self.path, self.problem = Path(path), problem
+        self.path = Path(path)
+        self.problem = problem
 
 
 class MissingPackageError(InputError):
@@ -122,7 +128,9 @@ class MissingPackageError(InputError):
 
     def __init__(self, what: str, package: str, *, extra: str) -> None:
         super().__init__(f"{what} needs the package {package!r}: pip install 'quadsim[{extra}]'")
-        self.what, self.package, self.extra = what, package, extra
+        self.what = what
+        self.package = package
+        self.extra = extra
 
 
 class MissingProgramError(InputError):
@@ -130,7 +138,9 @@ class MissingProgramError(InputError):
 
     def __init__(self, what: str, program: str, *, packages: str) -> None:
         super().__init__(f"{what} needs {program!r}: apt-get install --no-install-recommends {packages}")
-        self.what, self.program, self.packages = what, program, packages
+        self.what = what
+        self.program = program
+        self.packages = packages
 
 
 class OutputError(QuadsimError, OSError):
@@ -138,7 +148,8 @@ class OutputError(QuadsimError, OSError):
 
     def __init__(self, path: Path | str, problem: str) -> None:
         super().__init__(f"cannot write {printable(str(path))}: {problem}")
-        self.path, self.problem = Path(path), problem
+        self.path = Path(path)
+        self.problem = problem
 
 
 class RenderingUnavailableError(QuadsimError):
@@ -178,7 +189,9 @@ class LostError(FlightError):
     def __init__(self, criterion: str, quantity: str, unit: str, *, value: float, limit: float, time: float) -> None:
         message = f"lost: {quantity} {value:.5g} {unit}, beyond lost.{criterion} = {limit:g} {unit}"
         super().__init__(message, time=time)
-        self.criterion, self.value, self.limit = criterion, value, limit
+        self.criterion = criterion
+        self.value = value
+        self.limit = limit
 
 
 class CommandError(FlightError):

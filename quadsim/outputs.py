@@ -142,7 +142,8 @@ def adding(directory: Path, **changes: Any) -> Iterator[Path]:
     """
     with _beside(directory) as work:
         yield work
-        hashes, listed = file_hashes(work), _listed(directory) or set()
+        hashes = file_hashes(work)
+        listed = _listed(directory) or set()
         for name in hashes:
             if os.path.lexists(directory / name) and name not in listed:
                 raise OutputError(directory / name, f"{SUMMARY_FILE} does not list it; move it away first")
@@ -269,7 +270,8 @@ def _require_replaceable(target: Path, *, overwrite: bool, first: Sequence[str] 
         if target.samefile(Path.cwd()):
             raise OutputError(target, "it is the current directory; name one to be made")
     with _errors(target):
-        there, listed = _below(target), _listed(target)
+        there = _below(target)
+        listed = _listed(target)
     if S_ISREG(there.get(LOCK_FILE, 0)):
         with _locked(target):
             content = (target / LOCK_FILE).read_bytes()[: len(_LOCK_MARK) + 1]

@@ -280,14 +280,16 @@ def _explanation(vehicle: Vehicle) -> str | None:
 
     Every ratio that was off and that the unit changes must then be usual.
     """
-    before, best = _misfit(vehicle), None
+    before = _misfit(vehicle)
+    best = None
     off = [ratio for ratio in RATIOS if ratio.misfit(vehicle) > 0.0]
     for name, unit, other in _converted(vehicle):
         misfit = _misfit(other)
         changed = [ratio for ratio in off if ratio.value(other) != ratio.value(vehicle)]
         usual = all(ratio.is_usual(other) for ratio in changed)
         if usual and misfit < 0.2 * before and (best is None or misfit < best[0] - 1e-9):
-            given, fits = _shown(getattr(vehicle, name)), _shown(getattr(other, name))
+            given = _shown(getattr(vehicle, name))
+            fits = _shown(getattr(other, name))
             best = misfit, f"is {name} = {given} given in {unit}? {fits} {VEHICLE_UNITS[name]} would fit"
     return None if best is None else best[1]
 

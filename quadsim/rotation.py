@@ -24,7 +24,8 @@ Vector3 = tuple[float, float, float]
 _WITH: Final = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
 """Component of b that multiplies each of a, row by row, in each component of Hamilton's product."""
 _SIGNS: Final = np.array([[1.0, 1.0, 1.0, 1.0], [-1.0, 1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]])
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+_NEXT = np.array([1, 2, 0])
+_LAST = np.array([2, 0, 1])
 
 
 @overload
@@ -150,7 +151,8 @@ def _euler_rates(
 
 def euler_to_body_rates(euler: Array, euler_rates: Array) -> Array:
     """Body rates (p, q, r) [rad/s] from Euler-angle rates; the inverse of `body_to_euler_rates`."""
-    roll, pitch = euler[..., 0], euler[..., 1]
+    roll = euler[..., 0]
+    pitch = euler[..., 1]
     rates = np.moveaxis(np.asarray(euler_rates, float), -1, 0)
     return np.stack(_body_rates(np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch), rates), axis=-1)
 
@@ -173,7 +175,8 @@ def _body_rates(sin_roll: Any, cos_roll: Any, sin_pitch: Any, cos_pitch: Any, eu
 
 def body_to_world(euler: Array) -> Array:
     """Rotation matrices (..., 3, 3) from body to world for roll, pitch, yaw (..., 3) [rad]."""
-    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(euler), -1, 0), np.moveaxis(np.sin(euler), -1, 0)
+    cr, cp, cy = np.moveaxis(np.cos(euler), -1, 0)
+    sr, sp, sy = np.moveaxis(np.sin(euler), -1, 0)
     rows = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],

@@ -44,7 +44,8 @@ def _clearance(kind: str, size: Array, centre: Array, turn: Array, points: Array
 
 def _excess(kind: str, size: Array, local: Array) -> tuple[Array, Array]:
     """How far points exceed each of the surfaces (..., K, j), orthogonal to each other, and the ways out."""
-    a, b = size[..., 0], size[..., 1]
+    a = size[..., 0]
+    b = size[..., 1]
     sides = np.where(local < 0.0, -1.0, 1.0)
     if kind == "box":
         return np.abs(local) - size, sides[..., None] * np.eye(3)
@@ -189,7 +190,8 @@ class Solids:
         for i, obstacle in enumerate(self._obstacles):
             if obstacle.moves:
                 origins[i] = obstacle.positions(t)
-        distance, normal = np.empty((self.count, len(t))), np.empty((self.count, len(t), 3))
+        distance = np.empty((self.count, len(t)))
+        normal = np.empty((self.count, len(t), 3))
         for kind, at, owners, size, centre, turn in self._groups:
             distance[at], normal[at] = _clearance(kind, size, centre, turn, points - origins[owners])
         return distance, normal
@@ -197,7 +199,8 @@ class Solids:
 
 def _upright(yaw: float) -> Array:
     """(3, 3) turn by a yaw [deg]."""
-    c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
+    c = math.cos(math.radians(yaw))
+    s = math.sin(math.radians(yaw))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -296,8 +299,10 @@ class Wall(Obstacle):
         for i, (opening, middle) in enumerate(zip(self.window, self.window_centre, strict=True)):
             reach = 0.5 * (width, height)[i]
             for low, high in ((-reach, middle - 0.5 * opening), (middle + 0.5 * opening, reach)):
-                half, centre = np.array([thickness, width, height]) / 2.0, np.zeros(3)
-                half[1 + i], centre[1 + i] = 0.5 * (high - low), 0.5 * (high + low)
+                half = np.array([thickness, width, height]) / 2.0
+                centre = np.zeros(3)
+                half[1 + i] = 0.5 * (high - low)
+                centre[1 + i] = 0.5 * (high + low)
                 solids.append(Solid("box", (half[0], half[1], half[2]), turn @ centre, turn))
         return tuple(solids)
 
@@ -321,7 +326,8 @@ class Region:
     required: Annotated[bool, doc("false: reported only, without effect on the verdict")] = True
 
     def __post_init__(self) -> None:
-        box, polytope = (self.position, self.size), (self.rows, self.upper)
+        box = (self.position, self.size)
+        polytope = (self.rows, self.upper)
         stated = [part is not None for part in (*box, *polytope)]
         if stated not in ([True, True, False, False], [False, False, True, True]):
             raise InputError("position must be given with size, or rows with upper, and not both")
@@ -336,7 +342,8 @@ class Region:
     def half_spaces(self) -> tuple[Array, Array]:
         """A (m, 3), rows of unit length, and b (m,) [m]: inside is A p <= b."""
         if self.rows is not None:
-            rows, upper = np.array(self.rows, float), np.array(self.upper, float)
+            rows = np.array(self.rows, float)
+            upper = np.array(self.upper, float)
             lengths = np.linalg.norm(rows, axis=1)
             return rows / lengths[:, None], upper / lengths
         axes = _upright(self.yaw).T
@@ -409,7 +416,8 @@ class Corridor(Region):
             rule = f"within the {gone[-1]:.4g} m of the reference's path that are flown"
             raise ParameterError(f"corridors.{self.name}", "path", list(self.path), rule)
         # Where the reference rests at the window's begin or end, the window has all of that rest.
-        first, last = np.searchsorted(gone, path_start - _ROUNDING), np.searchsorted(gone, end + _ROUNDING, "right") - 1
+        first = np.searchsorted(gone, path_start - _ROUNDING)
+        last = np.searchsorted(gone, end + _ROUNDING, "right") - 1
 
         def passed(k: np.intp, at: float) -> float:
             return float(t[k] + (at - gone[k]) / steps[k] * (t[k + 1] - t[k]))

@@ -145,7 +145,8 @@ class ReferenceTurns:
         Call it once per period, one period apart.
         """
         yaws = reference[:, 3]
-        first, known = yaws.item(0), not math.isnan(self._first)
+        first = yaws.item(0)
+        known = not math.isnan(self._first)
         start = nearest_turn(first, self._first) if known else first
         if not math.isfinite(start + yaw):
             return reference

@@ -219,13 +219,18 @@ class Vehicle:
         if (name := stated[0]) == THRUST[0]:
             return
         a1, a2 = getattr(self, name)
-        u, (low, top), unit = "u", (0.0, 1.0), ""
+        u = "u"
+        low, top = (0.0, 1.0)
+        unit = ""
         if name == "thrust_of_speed":
-            u, (low, top), unit = "w", (self.speed_min, self.speed_max), " rad/s"
+            u = "w"
+            low, top = (self.speed_min, self.speed_max)
+            unit = " rad/s"
         if a1 + a2 * low < 0.0 or a1 + 2.0 * a2 * low < 0.0 or a1 + 2.0 * a2 * top <= 0.0:
             rule = f"such that a1 {u} + a2 {u}^2 is not negative and rises from {u} = {low:g} to {top:g}{unit}"
             self._refuse(name, rule)
-        largest, carried = a1 * top + a2 * top**2, float(self.thrust_shares.max()) * self.mass * self.gravity
+        largest = a1 * top + a2 * top**2
+        carried = float(self.thrust_shares.max()) * self.mass * self.gravity
         if largest < carried:
             rule = f"such that a rotor lifts {carried:.4g} N or more, or it cannot hover: it lifts {largest:.4g} N at"
             self._refuse(name, f"{rule} {u} = {top:g}{unit}")
@@ -233,7 +238,8 @@ class Vehicle:
     def _check_hover(self) -> None:
         weight = self.mass * self.gravity
         for name, sign, side in (("speed_max", 1.0, "no lower than"), ("speed_min", -1.0, "no higher than")):
-            speed, hover = getattr(self, name), sign * float((sign * self.hover_speeds).max())
+            speed = getattr(self, name)
+            hover = sign * float((sign * self.hover_speeds).max())
             if sign * (hover - speed) > 0.0:
                 lift = self.level_thrust(speed)
                 self._refuse(
@@ -317,7 +323,8 @@ class Vehicle:
     @property
     def inertia_matrix(self) -> Array:
         """(3, 3) J, body axes [kg m^2]."""
-        (xx, yy, zz), (xy, xz, yz) = self.inertia, self.products_of_inertia or (0.0, 0.0, 0.0)
+        xx, yy, zz = self.inertia
+        xy, xz, yz = self.products_of_inertia or (0.0, 0.0, 0.0)
         return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
     def momentum(self, rates: Array) -> Array:
@@ -346,7 +353,8 @@ class Vehicle:
             velocity: (3,) v through the air, body axes [m/s].
             rates: (3,) omega, body axes [rad/s].
         """
-        (m_x, m_y), (k_x, k_y) = self.rotor_moment or (0.0, 0.0), self.inflow_moment or (0.0, 0.0)
+        m_x, m_y = self.rotor_moment or (0.0, 0.0)
+        k_x, k_y = self.inflow_moment or (0.0, 0.0)
         v_x, v_y, v_z = velocity
         across = np.array([(m_x * turning - k_x * v_z) * v_y, -(m_y * turning - k_y * v_z) * v_x, 0.0])
         return np.asarray(across - np.array(self.rate_damping or (0.0, 0.0, 0.0)) * rates)
@@ -378,7 +386,8 @@ class Vehicle:
     @property
     def turn_damping(self) -> Array:
         """(3,) torque that opposes each body rate [N m s/rad]: `rate_damping`, and that of `inflow` in hover."""
-        units, still = np.eye(3), np.zeros(3)
+        units = np.eye(3)
+        still = np.zeros(3)
         lost = [self.lost_to_inflow(self.hover_speeds, still, unit)[1:] for unit in units]
         return np.asarray(np.array(self.rate_damping or (0.0, 0.0, 0.0)) + np.diagonal(lost))
 
@@ -449,13 +458,15 @@ class Vehicle:
     @property
     def allocation(self) -> Array:
         """(4, 4) matrix that maps squared rotor speeds to [U, tau_x, tau_y, tau_z], in N and N m (Sec. 2.2)."""
-        b, (x, y, _) = self.coefficients, self.hubs.T
+        b = self.coefficients
+        x, y, _ = self.hubs.T
         return np.stack([b, b * y, -b * x, self.drag_to_thrust * b * np.array(self.rotor_spins, float)])
 
 
 def span(speeds: Array) -> str:
     """Return speeds as text: from the least to the largest, or the one that all have."""
-    low, high = f"{speeds.min():.4g}", f"{speeds.max():.4g}"
+    low = f"{speeds.min():.4g}"
+    high = f"{speeds.max():.4g}"
     return low if low == high else f"{low} to {high}"
 
 
@@ -532,7 +543,8 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
 
 def overridden(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Return parameters with some replaced; another form of placing the rotors, or of their thrust, is then dropped."""
-    placed, thrust = "rotor_positions" in overrides, {*THRUST} & {*overrides}
+    placed = "rotor_positions" in overrides
+    thrust = {*THRUST} & {*overrides}
     replaced: tuple[str, ...] = ARMS if placed else ("rotor_positions",) if set(ARMS) <= {*overrides} else ()
     replaced += THRUST if thrust else ()
     return {**values, **dict.fromkeys(name for name in replaced if name in values), **overrides}
@@ -616,7 +628,8 @@ def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]
             texts[key] = entry
             continue
         if key not in VEHICLE_UNITS:
-            hint, meant = f"in {path}", MEANT.get(key, ())
+            hint = f"in {path}"
+            meant = MEANT.get(key, ())
             raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS, hint=hint, meant=meant)
         if not isinstance(entry, dict) or set(entry) != {"value", "unit", "source"}:
             raise ParameterError("vehicle", key, entry, "a table with exactly value, unit and source")

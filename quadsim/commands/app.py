@@ -645,7 +645,8 @@ def film(
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
     with reporting(progress, "the film") as report:
-        make, estimate = render_video if path.suffix == ".mp4" else render_gif, Estimate()
+        make = render_video if path.suffix == ".mp4" else render_gif
+        estimate = Estimate()
 
         def follow(done: int, total: int) -> None:
             estimate(done, total)

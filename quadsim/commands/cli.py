@@ -23,7 +23,8 @@ from quadsim.commands.app import app
 from quadsim.console.results import EXIT_FAILED, EXIT_WRONG_INPUT, Document, Result
 from quadsim.errors import QuadsimError, printable
 
-_MOST_LINES, _LONGEST_LINE = 21, 1000  # of a message: one with many problems has a line for each
+_MOST_LINES = 21
+_LONGEST_LINE = 1000  # of a message: one with many problems has a line for each
 _HOME: Final = re.compile(r"(--[\w-]+=)?(~.*)", re.DOTALL)
 
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False  # otherwise Ctrl-C ends it silently
@@ -162,7 +163,8 @@ class _Notices(logging.Handler):
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
     """Show notices on stderr, each once: which user code was imported, and what failed."""
-    logger, handler = logging.getLogger("quadsim"), _Notices()
+    logger = logging.getLogger("quadsim")
+    handler = _Notices()
     before = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

@@ -58,7 +58,9 @@ def _speed_of_many(integrator: Integrator, periods: int) -> str:
     from quadsim.sim.plant import Plant
     from quadsim.vehicle import load_vehicle
 
-    count, steps, timestep = 32, 50, 1e-3
+    count = 32
+    steps = 50
+    timestep = 1e-3
     vehicle = load_vehicle(vehicle_path("hummingbird"))
     margins = Margins([Limit(name="tilt", signal="tilt", upper=30.0)], timestep)
     batch = PlantBatch(count, steps=steps, limits=1)
@@ -100,5 +102,6 @@ def _try_solver(name: str) -> str:
     except FlightError as error:
         return f"fails: {error}"
     verdict = "works" if command.status == SOLVED else f"answers {command.status}"
-    setup_ms, step_ms = 1e3 * (built - started), 1e3 * (clock.perf_counter() - built)
+    setup_ms = 1e3 * (built - started)
+    step_ms = 1e3 * (clock.perf_counter() - built)
     return f"{verdict}: set up in {setup_ms:.0f} ms, first step in {step_ms:.1f} ms"

@@ -88,7 +88,8 @@ def _wrapped(text: Text, width: int) -> Text:
         return text
     lines: list[Text] = []
     for line in text.split(allow_blank=True):
-        starts, plain = [0], line.plain
+        starts = [0]
+        plain = line.plain
         for word in re.finditer(r"\S+", plain):
             if plain[starts[-1] : word.start()].strip() and cell_len(plain[starts[-1] : word.end()]) > width:
                 starts.append(word.start())
@@ -160,7 +161,9 @@ def table(
     table = _SparingTable(
         title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=0, pad_edge=False
     )
-    table.caption, table.caption_justify, table.spare = caption, "left", spare
+    table.caption = caption
+    table.caption_justify = "left"
+    table.spare = spare
     for i, name in enumerate(head):
         justify: JustifyMethod = "right" if i and name not in left else "left"
         table.add_column(name, justify=justify, overflow="fold", no_wrap=bool(i) if spare else not i)

@@ -77,7 +77,8 @@ def write_cases(suite: str, cases: Cases, path: Path) -> Path:
 
     Characters that XML forbids, and others that steer a terminal, become escapes.
     """
-    name, results = printable(f"quadsim.{suite}"), [passed for _, passed, _ in cases]
+    name = printable(f"quadsim.{suite}")
+    results = [passed for _, passed, _ in cases]
     counts = {"tests": len(cases), "failures": results.count(False), "skipped": results.count(None)}
     root = ElementTree.Element("testsuite", {"name": name, **{key: str(count) for key, count in counts.items()}})
     for case_name, passed, sentence in cases:

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 Shown: TypeAlias = "Iterable[RenderableType]"
 
-EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
+EXIT_DONE = 0
+EXIT_FAILED = 1
+EXIT_WRONG_INPUT = 2
 
 
 class Result:

@@ -144,7 +144,8 @@ def _verdict(finding: Finding) -> Text:
 
 
 def _tracking_table(flight: FlightRecord) -> Table:
-    channels, lines = [*flight.numbers["tracking"]["unit"]], []
+    channels = [*flight.numbers["tracking"]["unit"]]
+    lines = []
     for measure in ("rmse", "max_error", "final_error", "overshoot"):
         columns = [tracking_values([flight], measure, channel) for channel in channels]
         head = ["", *(f"{channel} [{unit}]" for channel, (unit, _) in zip(channels, columns, strict=True))]
@@ -155,8 +156,10 @@ def _tracking_table(flight: FlightRecord) -> Table:
 
 
 def _controller_lines(numbers: Mapping[str, Any]) -> Iterator[str]:
-    control, controller = numbers["control"], numbers["controller"]
-    times, usual = controller["step_ms"], OPTIMAL | {Phase.LANDED, Phase.CRASHED}
+    control = numbers["control"]
+    controller = numbers["controller"]
+    times = controller["step_ms"]
+    usual = OPTIMAL | {Phase.LANDED, Phase.CRASHED}
     refused = ", ".join(f"{n} {status}" for status, n in controller["statuses"].items() if status not in usual)
     where = f" ({controller['solver']})" if controller["solver"].startswith("C99") else ""
     yield (

@@ -23,7 +23,8 @@ class CompiledLoop:
 
     def __init__(self, struct: Struct, *, delay: int = 0) -> None:
         """Take over a struct whose constants are filled in; `delay` calls pass before an answer comes out."""
-        self._struct, self._queue = struct, np.zeros((max(delay, 1), 4))
+        self._struct = struct
+        self._queue = np.zeros((max(delay, 1), 4))
         struct.delay = delay
 
     def engage(self, command: Array, rotors: Array) -> Struct | None:

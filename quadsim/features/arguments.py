@@ -55,13 +55,15 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
             raise ValueError(f"must be a whole number; got {text!r:.100}")
         return int(text)
 
-    File, Files = Path, Sequence[Path]
+    File = Path
+    Files = Sequence[Path]
     VehicleName = one_of(vehicle_names)
     ComparedName = ScenarioName = one_of(scenario_names)
     Changes = Annotated[Sequence[str], Parameter(name="--set")]
     Names = Annotated[Sequence[str], Parameter(name="--name")]
     Labels = Annotated[Sequence[str], Parameter(consume_multiple=True)]
-    Plotted, Inches = Files, float
+    Plotted = Files
+    Inches = float
     SignalName = Annotated[str, Parameter(name="--signals", consume_multiple=True)]
     StyleName = str
     Whole = Annotated[int, Parameter(converter=_whole)]

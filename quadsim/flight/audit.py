@@ -399,7 +399,8 @@ class Finding:
 
         It is taken at the physics rate, unless only the samples violate the limit.
         """
-        sampled, margin = self.worst_margin_sampled, self.worst_margin
+        sampled = self.worst_margin_sampled
+        margin = self.worst_margin
         tolerance, tolerance_sampled = self.limit.tolerances
         if self.limit.violated(sampled, sampled=True) and margin >= -tolerance:
             return sampled, tolerance_sampled
@@ -511,7 +512,8 @@ def audit(log: FlightLog, limits: Sequence[Limit]) -> tuple[Finding, ...]:
 
 
 def _find(log: FlightLog, limit: Limit) -> Finding:
-    t, values = log.control.t, limit.source.sampled(log.control)
+    t = log.control.t
+    values = limit.source.sampled(log.control)
     sampled = peak, margin, time = _worst(limit, t, values)
     if t.size:  # a flight can end before its first period
         t, values = limit.source.finest(log)

@@ -184,7 +184,8 @@ def assess(
 
 def _attitudes(pushed: Array, yaw: Array) -> Array:
     """(M, 3) roll, pitch, yaw [rad] with body z along the specific force (M, 3) [m/s^2]."""
-    cos, sin = np.cos(yaw), np.sin(yaw)
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
     forward = cos * pushed[:, 0] + sin * pushed[:, 1]
     left = cos * pushed[:, 1] - sin * pushed[:, 0]
     pitch = np.unwrap(np.arctan2(forward, pushed[:, 2]))  # upside down, pitch continues beyond 180 deg
@@ -199,7 +200,8 @@ def _problems(
     tightened: Mapping[str, tuple[float, float]],
 ) -> tuple[str, ...]:
     """Return one line per side of a limit or bound that the demands exceed."""
-    least, most = vehicle.speed_min, vehicle.speed_max
+    least = vehicle.speed_min
+    most = vehicle.speed_max
     problems = _beyond("rotor speed", "rad/s", needed.speeds, (least, most), "limit")
     thrust = float(needed.thrusts.min())
     if thrust < -DIFFERENCE_ROUNDING * vehicle.mass * vehicle.gravity:
@@ -230,7 +232,9 @@ def _problems(
 def _beyond(name: str, unit: str, values: Array, allowed: tuple[float, float], kind: str) -> list[str]:
     if not values.size:
         return []
-    (lower, upper), low, high = allowed, float(values.min()), float(values.max())
+    lower, upper = allowed
+    low = float(values.min())
+    high = float(values.max())
     problems = []
     if high > upper + DIFFERENCE_ROUNDING * (1.0 + abs(upper)):
         problems.append(f"{name} up to {high:.4g} {unit} ({kind} {upper:.4g})")

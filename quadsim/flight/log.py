@@ -30,7 +30,9 @@ from quadsim.state import (
 from quadsim.vehicle import N_ROTORS
 
 Counts = np.ndarray[Any, np.dtype[np.int64]]
-NUMBER, TEXT, COUNT = "number", "text", "count"
+NUMBER = "number"
+TEXT = "text"
+COUNT = "count"
 """Kinds of columns."""
 
 
@@ -131,7 +133,8 @@ class Sampled:
         error = self.state - self.truth
         error[:, INDEX["yaw"]] = wrapped(error[:, INDEX["yaw"]])
         if self.attitude is not None and self.body_rates is not None:
-            angles, rates = self.truth[:, ANGLES], self.truth[:, ANGLE_RATES]
+            angles = self.truth[:, ANGLES]
+            rates = self.truth[:, ANGLE_RATES]
             turn = multiply(conjugate(euler_to_quaternion(angles)), self.attitude)
             error[:, ANGLES] = 2.0 * np.copysign(1.0, turn[:, :1]) * turn[:, 1:]
             error[:, ANGLE_RATES] = self.body_rates - euler_to_body_rates(angles, rates)

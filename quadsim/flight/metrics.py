@@ -95,7 +95,8 @@ def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict
         error = outputs[in_window, REFERENCE_NAMES.index(step.channel)] - step.after
         size = step.after - step.before
         if step.channel == "yaw":
-            error, size = wrapped(error), wrapped(size)
+            error = wrapped(error)
+            size = wrapped(size)
         outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(size))
         first = outside[-1] + 1 if outside.size else 0
         reached_end = t.size > 1 and t[-1] + period > step.until - 1e-9
@@ -220,7 +221,8 @@ def estimation(log: ControlLog) -> dict[str, Any]:
     """
     error = log.measured_error
     finite = np.isfinite(error)
-    known, counted = np.where(finite, error, 0.0), np.maximum(finite.sum(axis=0), 1)
+    known = np.where(finite, error, 0.0)
+    counted = np.maximum(finite.sum(axis=0), 1)
     return {
         "unit": dict(zip(STATE_NAMES, STATE_UNITS, strict=True)),
         "rmse": dict(zip(STATE_NAMES, np.sqrt((known**2).sum(axis=0) / counted).tolist(), strict=True)),

@@ -59,7 +59,8 @@ def _logged(log: ControlLog) -> Iterator[_Column]:
 
 
 def _table(columns: Iterable[_Column], metadata: Mapping[str, str]) -> pa.Table:
-    arrays, schema = [], []
+    arrays = []
+    schema = []
     for name, unit, gaps, array in columns:
         arrays.append(array)
         schema.append(pa.field(name, array.type, nullable=gaps, metadata={"unit": unit}))
@@ -143,14 +144,16 @@ def _read_bounded(path: Path, file: pq.ParquetFile) -> pa.Table:
     so small that even then each fits.
     """
     known = file.metadata
-    rows, columns = known.num_rows, known.num_columns
+    rows = known.num_rows
+    columns = known.num_columns
     if rows > MOST_ROWS or columns > MOST_COLUMNS:
         raise FileError(path, f"must have at most {MOST_ROWS} rows and {MOST_COLUMNS} columns; got {rows}, {columns}")
     groups = [known.row_group(i) for i in range(known.num_row_groups)]
     chunks = [group.column(i) for group in groups for i in range(columns)]
     numbers = 8 * sum(chunk.num_values for chunk in chunks)
     texts = sum(chunk.total_uncompressed_size for chunk in chunks if chunk.physical_type.endswith("BYTE_ARRAY"))
-    most, batches = numbers + LARGEST_TEXTS, []
+    most = numbers + LARGEST_TEXTS
+    batches = []
     if numbers <= LARGEST_TABLE and rows * texts <= LARGEST_TEXTS:
         return file.read(use_threads=False)
     if numbers <= LARGEST_TABLE:
@@ -210,7 +213,8 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
             if field.name not in COLUMNS
         }
         control = ControlLog(**values, logged=logged, speeds_before=before)
-        plant_log, timing_log = PlantLog(**_fields(plant, PlantLog)), TimingLog(**_fields(timing, TimingLog))
+        plant_log = PlantLog(**_fields(plant, PlantLog))
+        timing_log = TimingLog(**_fields(timing, TimingLog))
         predicted = _read_predicted(directory / HORIZON_FILE)
         rows = {control.t.size, timing_log.t.size, *(() if predicted is None else (len(predicted),))}
         if len(rows) > 1 or not plant_log.t.size:

@@ -128,7 +128,8 @@ class TakeoffLead:
     """
 
     def __init__(self, period: float) -> None:
-        self._period, self._slowest_decay = period, math.exp(-period / FADING_TIME)
+        self._period = period
+        self._slowest_decay = math.exp(-period / FADING_TIME)
         self.reset()
 
     def reset(self) -> None:
@@ -140,15 +141,18 @@ class TakeoffLead:
     def push(self, height: float, climb: float, thrust: float) -> float:
         """Return the lead of a period on the ground [m], from height [m], vertical speed [m/s] and thrust, any unit."""
         if thrust > MORE_THRUST * self._most or climb > RISING:
-            self._most, self._idle = max(thrust, self._most), 0.0
+            self._most = max(thrust, self._most)
+            self._idle = 0.0
         else:
             self._idle += self._period
         standing = self._idle > STANDSTILL - 1e-9
         if not self._pushing:
-            self._pushing, self._idle = standing, 0.0 if standing else self._idle
+            self._pushing = standing
+            self._idle = 0.0 if standing else self._idle
         elif not standing and climb <= RISING:
             self.lead = min(self.lead + LEAD_RATE * self._period, LARGEST_LEAD)
-        self._height, self._at_liftoff = height, self.lead
+        self._height = height
+        self._at_liftoff = self.lead
         return self.lead
 
     def fade(self, height: float, course: float) -> float:
@@ -160,7 +164,9 @@ class TakeoffLead:
             self.lead = min(self.lead, max(faded, self._slowest_decay * self.lead))
             if self.lead < NO_LEAD:
                 self.lead = 0.0
-        self._most, self._idle, self._pushing = 0.0, 0.0, False
+        self._most = 0.0
+        self._idle = 0.0
+        self._pushing = False
         return self.lead
 
 
@@ -184,7 +190,9 @@ class PhaseMonitor:
     def __init__(
         self, outline: Outline | None, *, period: float, obstacles: Sequence[Obstacle] = (), radius: float = 0.0
     ) -> None:
-        self._outline, self._obstacles, self._radius = outline, Solids(obstacles), radius
+        self._outline = outline
+        self._obstacles = Solids(obstacles)
+        self._radius = radius
         if outline is not None:
             self._takeoff_height = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + TAKEOFF_RISE
             self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # nothing can touch above it
@@ -238,7 +246,8 @@ class PhaseMonitor:
         """
         if self._outline is None:
             return 0.0
-        height, climb = float(state[INDEX["z"]]), float(state[INDEX["vz"]])
+        height = float(state[INDEX["z"]])
+        climb = float(state[INDEX["vz"]])
         if self._phase is Phase.FLYING and self._touched < self._periods_of_rest:
             return self._takeoff.fade(height, course)
         if course > self._takeoff_height and np.degrees(tilt(state[None])[0]) <= LEVEL:

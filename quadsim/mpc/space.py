@@ -125,8 +125,12 @@ class Space:
         largest: bool = False,
     ) -> None:
         self._largest = largest
-        self.settings, self.penalty, self.period, self.positions = settings, penalty, period, list(positions)
-        self._shapes, self._distance = tuple(shapes), radius + settings.margin
+        self.settings = settings
+        self.penalty = penalty
+        self.period = period
+        self.positions = list(positions)
+        self._shapes = tuple(shapes)
+        self._distance = radius + settings.margin
         self._margins = np.zeros((horizon, 3)) if margins is None else margins
         self._solids = Solids([shape for shape in self._shapes if isinstance(shape, Obstacle)])
         counts = [len(s.solids) if isinstance(s, Obstacle) else len(s.half_spaces[1]) for s in self._shapes]
@@ -143,9 +147,11 @@ class Space:
 
     def half_spaces(self, t: Array, positions: Array) -> tuple[Array, Array]:
         """Normals (S, N, 3) and bounds (S, N) [m] of normal . p >= bound, at times (N,) along positions (N, 3)."""
-        normals, bounds = np.empty((len(self._names), len(t), 3)), np.empty((len(self._names), len(t)))
+        normals = np.empty((len(self._names), len(t), 3))
+        bounds = np.empty((len(self._names), len(t)))
         distance, normal = self._solids.clearances(t, positions)
-        normals[self._of_solids], bounds[self._of_solids] = normal, (normal * positions).sum(axis=2) - distance
+        normals[self._of_solids] = normal
+        bounds[self._of_solids] = (normal * positions).sum(axis=2) - distance
         for region, at in self._regions:
             rows, upper = region.half_spaces
             normals[at] = -rows[:, None, :]
@@ -158,7 +164,8 @@ class Space:
         """Return half-spaces (m, N, 3), (m, N) as rows on `states` states."""
         C = np.zeros((bounds.shape[1], len(bounds), states))
         C[:, :, self.positions] = normals.transpose(1, 0, 2)
-        lower, (l1, l2) = bounds.T, (0.0, 0.0) if self.penalty is None else self.penalty
+        lower = bounds.T
+        l1, l2 = (0.0, 0.0) if self.penalty is None else self.penalty
         penalty = Penalty(l1=np.full(len(bounds), l1), l2=np.full(len(bounds), l2), largest=self._largest)
         return Constraint(
             name=name,
@@ -174,7 +181,8 @@ class Space:
         constraints = []
         for shape in self._shapes:
             kind = "obstacle" if isinstance(shape, Obstacle) else "corridor" if isinstance(shape, Corridor) else ""
-            at, name = self._names == shape.name, f"{kind} {shape.name}".strip()
+            at = self._names == shape.name
+            name = f"{kind} {shape.name}".strip()
             constraints.append(self.constraint(normals[at], bounds[at], states, name=name))
         return tuple(constraints)
 
@@ -190,7 +198,9 @@ class ObstacleQP:
     """
 
     def __init__(self, problem: Problem, solver: Solver, space: Space) -> None:
-        self.problem, self._solver, self._space = problem, solver, space
+        self.problem = problem
+        self._solver = solver
+        self._space = space
         self.reset()
 
     def reset(self) -> None:
@@ -208,8 +218,10 @@ class ObstacleQP:
         """
         turn = np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         t = time + self._space.period * np.arange(1, self.problem.horizon + 1, dtype=np.float64)
-        last, self._last = self._last, None
-        problem, answer = self.problem, self._solver.solve(query)
+        last = self._last
+        self._last = None
+        problem = self.problem
+        answer = self._solver.solve(query)
         if answer.status not in ACCEPTED:
             return answer, problem
         planned = self._positions(query, answer, turn)

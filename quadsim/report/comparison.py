@@ -111,7 +111,8 @@ def _holding_mark(run: FlightRecord) -> Mark:
 
 def _who_holds(runs: Sequence[FlightRecord], names: Sequence[str]) -> str:
     """Name the flights that hold their constraints, and what the others do instead."""
-    holds, others = list[str](), list[str]()
+    holds = list[str]()
+    others = list[str]()
     for run, name in zip(runs, names, strict=True):
         failing = [finding.limit.name for finding in run.findings if finding.verdict == "violated"]
         missed = [finding.limit.name for finding in run.findings if finding.verdict == "incomplete"]
@@ -296,7 +297,8 @@ def failure_sentences(flight: FlightRecord) -> list[str]:
 
 def optimum_sentences(flight: FlightRecord) -> list[str]:
     """Return why there was no optimum: permanent fallback, and the reason for the first QP without an answer."""
-    periods, diagnosis = flight.numbers["controller"].get("unrecovered"), flight.diagnosis
+    periods = flight.numbers["controller"].get("unrecovered")
+    diagnosis = flight.diagnosis
     sentences = [fallback_sentence(periods)] if periods else []
     if diagnosis is None:
         return sentences
@@ -312,7 +314,8 @@ def event_sentences(events: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def verdict_cell(flight: FlightRecord) -> Cell:
     """Return the verdict, and whether the scenario expects it; runs of older versions state no expectation."""
-    word, expected = flight.outcome, flight.numbers.get("expected")
+    word = flight.outcome
+    expected = flight.numbers.get("expected")
     if expected is None:
         return Cell(text=word)
     if flight.numbers.get("as_expected"):
@@ -353,7 +356,8 @@ def _present_keys(runs: Sequence[FlightRecord], *path: str) -> list[str]:
 def _bounds(finding: Finding) -> Cell:
     """Format the bounds of a constraint and its window, e.g. `-5 .. 5`, `at least -0.5` or `0 .. 1, from 59 s`."""
     limit = finding.limit
-    lower, upper = format_number(limit.lower), format_number(limit.upper)
+    lower = format_number(limit.lower)
+    upper = format_number(limit.upper)
     bounds = f"{lower} .. {upper}"
     if math.isinf(limit.lower) or math.isinf(limit.upper):
         bounds = f"at least {lower}" if math.isinf(limit.upper) else f"at most {upper}"
@@ -477,7 +481,8 @@ def _lowest_speed(flight: FlightRecord) -> Cell:
 
 def mismatch(flight: FlightRecord) -> tuple[str, ...]:
     """Return the vehicle parameters that the controller has wrong, as one text; none if there are none."""
-    actual, modelled = flight.numbers.get("actual", {}), flight.numbers["vehicle"]
+    actual = flight.numbers.get("actual", {})
+    modelled = flight.numbers["vehicle"]
     wrong = [f"{name} {modelled[name]} for {value}" for name, value in actual.items() if value != modelled[name]]
     return (", ".join(wrong),) if wrong else ()
 

@@ -71,7 +71,8 @@ def write_comparison(
         require_inside(run.directory)  # copying follows links
         if run.directory.resolve().is_relative_to(target):
             raise OutputError(directory, f"it holds the run {run.directory}, which must stay; choose another --out")
-    names, rows = run_names(runs), comparison_rows(runs)
+    names = run_names(runs)
+    rows = comparison_rows(runs)
     with writing(directory, overwrite=overwrite) as partial:
         (partial / TABLE_FILE).write_text(to_markdown(rows, names), encoding="utf-8")
         with optional(OVERVIEW_FILE):
@@ -153,7 +154,8 @@ def _copied(source: Path, place: Path, folder: str) -> dict[str, str]:
 
 def _made_with(run: FlightRecord) -> str:
     """Versions and machine: what timings, and the last digits, depend on."""
-    versions, machine = run.numbers.get("versions", {}), run.numbers.get("machine", {})
+    versions = run.numbers.get("versions", {})
+    machine = run.numbers.get("machine", {})
     packages = [f"{name} {versions[name]}" for name in ("quadsim", "mujoco", "piqp") if name in versions]
     where = f"{machine['processor']}, {machine['cores']} cores" if {"processor", "cores"} <= machine.keys() else ""
     return " on ".join(filter(None, (", ".join(packages), where)))

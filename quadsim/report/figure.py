@@ -120,7 +120,8 @@ def commanded_speeds(log: FlightLog) -> Array | None:
 
     They differ where rotors lag or saturate, and where commands take time to compute.
     """
-    plant, control = log.plant, log.control
+    plant = log.plant
+    control = log.control
     if not control.t.size:
         return None
     period = np.searchsorted(control.t, plant.t, side="right") - 1

@@ -141,7 +141,9 @@ def states(runs: Sequence[FlightRecord]) -> Figure:
     elif len(runs) > 1:
         panels = [_signal(runs, name) for name in ("x", "tilt", "y", "roll", "z", "pitch", "yaw")]
     else:
-        t, attitude, rates = plants[0].t, plants[0].attitude, plants[0].body_rates
+        t = plants[0].t
+        attitude = plants[0].attitude
+        rates = plants[0].body_rates
         assert attitude is not None
         assert rates is not None
         more = (
@@ -173,12 +175,14 @@ def inputs(runs: Sequence[FlightRecord]) -> Figure:
 
 def targets(run: FlightRecord) -> list[Figure]:
     """Plot thrust and body rates that an autopilot was to fly, and what it flew; no figure without one."""
-    target, plant = run.log.control.target, run.log.plant
+    target = run.log.control.target
+    plant = run.log.plant
     if target is None or plant.thrust is None:
         return []
     panels = []
     for i, name in enumerate(("thrust", "body_rate_x", "body_rate_y", "body_rate_z")):
-        signal, scale = SIGNALS[name], 1.0 if i == 0 else math.degrees(1.0)
+        signal = SIGNALS[name]
+        scale = 1.0 if i == 0 else math.degrees(1.0)
         curves = (
             Series(x=plant.t, y=signal.finest(run.log)[1], colour=COLOUR.flown, label="flown"),
             Series(x=run.log.control.t, y=scale * target[:, i], colour=COLOUR.reference, label="target", style="steps"),
@@ -203,7 +207,8 @@ def times(runs: Sequence[FlightRecord]) -> Figure:
 
 def _clock(runs: Sequence[FlightRecord], key: str) -> Panel:
     """Plot a computation time per period, and the deadline of a whole step."""
-    curves, title = [], _CLOCKS[key]
+    curves = []
+    title = _CLOCKS[key]
     for i, label, run in _flown(runs):
         values = getattr(run.log.timing, key)
         # a clock may read 0, which a logarithmic axis cannot show
@@ -221,7 +226,8 @@ def _clock(runs: Sequence[FlightRecord], key: str) -> Panel:
 
 def effects(run: FlightRecord) -> list[Figure]:
     """Plot, as far as recorded: commanded and actual rotor speeds, forces, wind, battery, measurement errors."""
-    plant, control = run.log.plant, run.log.control
+    plant = run.log.plant
+    control = run.log.control
     commanded = commanded_speeds(run.log)
     panels = (
         [] if commanded is None else [_acting(rotor, plant.t, commanded, plant.speeds) for rotor in range(N_ROTORS)]
@@ -265,7 +271,8 @@ def xy(run: FlightRecord) -> list[Figure]:
 
 def _above(runs: Sequence[FlightRecord]) -> Panel:
     """Plot flights and their courses from above, with obstacles and the edges of regions."""
-    areas, regions = [], []
+    areas = []
+    regions = []
     for run in {run.limits: run for run in reversed(runs)}.values():  # the first run with these limits
         for limit in run.limits:
             if not isinstance(limit, SpaceLimit) or not isinstance(limit.shape, Obstacle):
@@ -301,7 +308,8 @@ def _point(place: Array, label: str, colour: str, **looks: Any) -> Series:
 
 def path(runs: Sequence[FlightRecord]) -> Scene:
     """Draw flights and courses in space, with obstacles at their start and the edges of regions."""
-    solids, paths = [], []
+    solids = []
+    paths = []
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
     for limits in dict.fromkeys(run.limits for run in runs if has_space(run.limits)):
         for obstacle in obstacles_in(limits):
@@ -324,7 +332,9 @@ def _signal(runs: Sequence[FlightRecord], name: str) -> Panel:
 
     What every rotor has is a curve per rotor for a single run, and for several the range over the rotors of each.
     """
-    signal, curves, bands = {**TERM_SIGNALS, **SIGNALS}[name], [], []
+    signal = {**TERM_SIGNALS, **SIGNALS}[name]
+    curves = []
+    bands = []
     for run in distinct_courses(runs) if name in REFERENCE_NAMES else ():
         curves.append(Series(x=run.log.control.t, y=reference_curve(run.log.control, name), **_REFERENCE))
     for i, label, run in _flown(runs):
@@ -334,7 +344,8 @@ def _signal(runs: Sequence[FlightRecord], name: str) -> Panel:
             t, values = break_at_wraps(control.t, signal.sampled(replace(control, truth=control.state)), signal.unit)
             curves.append(Series(x=t, y=values, colour=COLOUR.measured, label="measured", width=0.7))
         if sampled.ndim == 2 and len(runs) > 1:
-            low, high = sampled.min(axis=1), sampled.max(axis=1)
+            low = sampled.min(axis=1)
+            high = sampled.max(axis=1)
             bands.append(Band(x=control.t, low=low, high=high, colour=line_colour(i), label=label, opacity=0.6))
         elif sampled.ndim == 2:
             for j, values in enumerate(sampled.T):  # equal curves of several rotors stay visible beneath one another
@@ -366,7 +377,8 @@ def _error(runs: Sequence[FlightRecord], name: str) -> Panel:
 
 def _margin(runs: Sequence[FlightRecord], name: str) -> Panel:
     """Plot the signed margin to a constraint, negative beyond its bound, at the highest rate of its signal."""
-    curves, units = [], []
+    curves = []
+    units = []
     for i, label, run in _flown(runs):
         for limit in run.limits:
             if f"{_MARGIN}{limit.name}" == name:

@@ -69,7 +69,8 @@ def line(*cells: Cell | str) -> tuple[Cell, ...]:
 
 def to_markdown(rows: Sequence[QuantityRow], names: Sequence[str]) -> str:
     """A Markdown table of the rows: headlines and the best values in bold type."""
-    lines, group = [], ""
+    lines = []
+    group = ""
     for row in rows:
         cells = [replace(cell, mark=Mark.BEST) if row.headline else cell for cell in row.cells]
         label = f"{row.label} [{row.unit}]" if row.unit else row.label

@@ -72,10 +72,15 @@ JOURNAL: Final[dict[RcKeyType, Any]] = {
 """What a figure of a stated width has besides: texts of 8 pt, and fonts that journals accept, Type 42."""
 JOURNAL_DPI: Final = 300
 SUFFIXES: Final = (".pdf", ".svg", ".png")
-_WIDTH, _ROW, _HEAD = 9.6, 1.95, 0.7  # of a figure, of a row of panels and of what stands above and below them [in]
+_WIDTH = 9.6
+_ROW = 1.95
+_HEAD = 0.7  # of a figure, of a row of panels and of what stands above and below them [in]
 _LETTERS: Final = 26  # characters beside a vertical axis
-_JOURNAL_ROW, _JOURNAL_HEAD, _JOURNAL_LETTERS = 1.2, 0.5, 17  # the same of a figure of a stated width
-_LARGEST_SVG, _NOTEBOOK_DPI = 40_000, 55
+_JOURNAL_ROW = 1.2
+_JOURNAL_HEAD = 0.5
+_JOURNAL_LETTERS = 17  # the same of a figure of a stated width
+_LARGEST_SVG = 40_000
+_NOTEBOOK_DPI = 55
 _READ_LATE: Final[tuple[RcKeyType, ...]] = ("pdf.fonttype", "ps.fonttype")
 """Settings that matplotlib reads when a figure is saved; its default is Type 3."""
 _MOST_COLUMNS: Final = 6  # of a legend
@@ -382,7 +387,8 @@ def _draw_panel(axes: Axes, panel: Panel, letters: int) -> dict[str, Artist]:
 
 
 def _draw_series(axes: Axes, series: Series) -> Artist:
-    x, y = series.x, series.y
+    x = series.x
+    y = series.y
     looks: dict[str, Any] = {"color": series.colour, "alpha": series.opacity}
     if series.style == "bars":
         width = float(np.diff(x).min()) if x.size > 1 else 0.8

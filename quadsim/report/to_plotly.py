@@ -17,8 +17,11 @@ from quadsim.state import Array
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure as Canvas
 
-_ROW, _TOP, _BOTTOM = 210, 34, 46  # of a row of panels, and above and below them all [px]
-_GAP, _LABELLED_GAP = 56, 76  # between rows of panels, and where each has a label [px]
+_ROW = 210
+_TOP = 34
+_BOTTOM = 46  # of a row of panels, and above and below them all [px]
+_GAP = 56
+_LABELLED_GAP = 76  # between rows of panels, and where each has a label [px]
 _SCENE: Final = 560  # [px]
 _LEAST_SHARE: Final = 0.4  # of the longest axis of a scene: how long the others are at least
 _MOST_POINTS: Final = 3000
@@ -66,7 +69,8 @@ def to_plot(figure: Figure, *, labelled: bool = True, note: str = "") -> Plot:
     """A figure for a page, which explains its labels unless toggles of the page do."""
     from plotly.subplots import make_subplots
 
-    count, columns = len(figure.panels), min(figure.columns, len(figure.panels))
+    count = len(figure.panels)
+    columns = min(figure.columns, len(figure.panels))
     rows = -(-count // columns)
     heights = [max(panel.height for panel in figure.panels[i : i + columns]) for i in range(0, count, columns)]
     timed = figure.end is not None
@@ -123,8 +127,10 @@ def scene_to_plot(scene: Scene) -> Plot:
         canvas.add_trace(Scatter3d(x=x, y=y, z=z, mode="lines", line=line, name=html.escape(label), legendgroup=group))
     drawn = np.concatenate([points for points, *_ in (*scene.solids, *scene.paths)])
     drawn = drawn[np.isfinite(drawn).all(axis=1)]
-    low, high = drawn.min(axis=0), drawn.max(axis=0)
-    middle, half = 0.5 * (low + high), 0.55 * (high - low)
+    low = drawn.min(axis=0)
+    high = drawn.max(axis=0)
+    middle = 0.5 * (low + high)
+    half = 0.55 * (high - low)
     half = np.maximum(half, max(_LEAST_SHARE * half.max(), 1e-3))  # equal scales, and room beside a straight path
     axes = {
         f"{name}axis": {"title": {"text": f"{name} [m]"}, "range": [middle[i] - half[i], middle[i] + half[i]]}
@@ -162,7 +168,8 @@ def _draw_panel(canvas: Canvas, panel: Panel, place: dict[str, int], points: int
         look = {"fill": "toself", "fillcolor": area.colour, "opacity": area.opacity, "line": {"width": 0}}
         canvas.add_trace(Scatter(x=x, y=y, mode="lines", name=html.escape(area.label), **look), **place)
     for band in panel.bands:
-        x, y = np.concatenate([band.x, band.x[::-1]]), np.concatenate([band.high, band.low[::-1]])
+        x = np.concatenate([band.x, band.x[::-1]])
+        y = np.concatenate([band.high, band.low[::-1]])
         look = {"fill": "toself", "fillcolor": band.colour, "opacity": band.opacity, "line": {"width": 0}}
         canvas.add_trace(Scatter(x=x, y=y, mode="lines", hoverinfo="skip", **look), **place)
     for series in panel.series:
@@ -174,7 +181,8 @@ def _draw_panel(canvas: Canvas, panel: Panel, place: dict[str, int], points: int
         elif not np.isfinite([bound.start, bound.stop]).all():
             canvas.add_hline(bound.value, line=line, **place)
         else:
-            x, y = [bound.start, bound.stop], [bound.value, bound.value]
+            x = [bound.start, bound.stop]
+            y = [bound.value, bound.value]
             canvas.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="bound", hoverinfo="skip"), **place)
     for label in panel.labels:
         shown = f"<b>{html.escape(label.text)}</b>" if label.bold else html.escape(label.text)
@@ -217,7 +225,8 @@ def _draw_series(canvas: Canvas, series: Series, place: dict[str, int], points: 
         if series.style != "points" or series.flights is None
         else np.arange(series.y.size)
     )
-    x, y = series.x[drawn].astype(np.float32), series.y[drawn].astype(np.float32)
+    x = series.x[drawn].astype(np.float32)
+    y = series.y[drawn].astype(np.float32)
     if series.style == "points":
         shared["marker"] = {"color": series.colour, "size": 1.5 * series.width, "symbol": series.marker}
         if series.flights is not None:

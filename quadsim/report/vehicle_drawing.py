@@ -38,7 +38,8 @@ def write_drawing(vehicle: Vehicle, path: Path, *, overwrite: bool = False) -> N
 def vehicle_figure(vehicle: Vehicle) -> Figure:
     """The drawing; propellers of unknown size are drawn as large as they fit."""
     hubs = vehicle.hubs
-    places, arms = on_page(hubs), np.hypot(*hubs[:, :2].T)
+    places = on_page(hubs)
+    arms = np.hypot(*hubs[:, :2].T)
     radius = vehicle.rotor_radius or 0.5 * vehicle.closest_rotors
     reach = vehicle.longest_arm + radius
     level = not np.any(hubs[:, 2])

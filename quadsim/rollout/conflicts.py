@@ -75,14 +75,15 @@ class Conflict:
 
 def find_conflict(infeasible_period: InfeasiblePeriod) -> Conflict | None:
     """Return which constraints conflict; None if the elastic problem cannot be solved either."""
-    problem, query, parts = (
-        infeasible_period.problem,
-        infeasible_period.query,
-        infeasible_period.problem.every_constraint,
-    )
-    sides, scales = _sides(problem), _scales(problem)
+    problem = infeasible_period.problem
+    query = infeasible_period.query
+    parts = infeasible_period.problem.every_constraint
+    sides = _sides(problem)
+    scales = _scales(problem)
     of_inputs = {side for side in sides if (C := parts[side.place].C) is None or not C.any()}
-    total, violated, held = 0.0, dict[Side, Violation](), set[Side]()
+    total = 0.0
+    violated = dict[Side, Violation]()
+    held = set[Side]()
     for elastic in filter(None, (of_inputs, sides.keys() - of_inputs)):
         present = {side: one for side, one in sides.items() if side in of_inputs or side in elastic}
         relaxed = _relaxed(problem, query, present, elastic)
@@ -93,7 +94,8 @@ def find_conflict(infeasible_period: InfeasiblePeriod) -> Conflict | None:
             continue
         giving = {side: slack for side, slack in relaxed.slacks.items() if (slack > FEASIBLE).any()}
         for side, slack in giving.items():
-            steps, share = np.flatnonzero(slack > FEASIBLE), float(slack.max())
+            steps = np.flatnonzero(slack > FEASIBLE)
+            share = float(slack.max())
             of_inputs_too = (parts[side.place].D, parts[side.place].E)
             later = int(not any(matrix is not None and matrix[side.row].any() for matrix in of_inputs_too))
             violated[side] = Violation(
@@ -102,7 +104,8 @@ def find_conflict(infeasible_period: InfeasiblePeriod) -> Conflict | None:
                 first=int(steps[0]) + later,
                 last=int(steps[-1]) + later,
             )
-            one, wider = sides[side], share + FEASIBLE  # widened for the next pass by the violation
+            one = sides[side]
+            wider = share + FEASIBLE  # widened for the next pass by the violation
             sides[side] = replace(one, lower=one.lower - wider, upper=one.upper + wider)
         held |= _needed(problem, query, present, elastic, relaxed, giving)
     return Conflict(total=total, violated=violated, blocking=tuple(sorted(held - violated.keys())))
@@ -113,7 +116,8 @@ def smallest_widening(infeasible_period: InfeasiblePeriod, sides: Collection[Sid
 
     None if no amount does.
     """
-    problem, query = infeasible_period.problem, infeasible_period.query
+    problem = infeasible_period.problem
+    query = infeasible_period.query
     scales = {side: _scales(problem)[side.place][side.row] for side in sides}
     relaxed = _relaxed(problem, query, _sides(problem), sides, together=scales)
     return None if relaxed is None else relaxed.total
@@ -126,8 +130,10 @@ def has_answer(problem: Problem, query: Query) -> bool:
 
 def recovery(infeasible_period: InfeasiblePeriod, plan: Array) -> int | None:
     """Return after how many periods of a plan (N, nu) the model predicts an answer; None if not within the plan."""
-    problem, query = infeasible_period.problem, infeasible_period.query
-    is_solved, state = _set_up(problem, query), query.state
+    problem = infeasible_period.problem
+    query = infeasible_period.query
+    is_solved = _set_up(problem, query)
+    state = query.state
     for i, (u, A, B, c) in enumerate(zip(plan, *steps_of(problem, query), strict=True)):
         state = A @ state + B @ u + c
         if is_solved(query._replace(state=state, u_before=u)):
@@ -140,7 +146,8 @@ def _set_up(problem: Problem, query: Query) -> Callable[[Query], bool]:
     if query.steps is None:
         solver = QPSolver(DIAGNOSIS_SOLVER, problem)
         return lambda query: solver.solve(query).status == SOLVED
-    form, backend = Staged(problem), Piqp()
+    form = Staged(problem)
+    backend = Piqp()
     backend.setup(form.assemble(query))
     return lambda query: backend.solve(form.assemble(query)).status == SOLVED
 
@@ -157,7 +164,8 @@ def _scales(problem: Problem) -> list[Array]:
     """Return the scale of each row (m,): half the gap between its bounds; the size of a single bound, or 1."""
     scales = []
     for part in problem.every_constraint:
-        lower, upper = np.atleast_2d(part.lower), np.atleast_2d(part.upper)
+        lower = np.atleast_2d(part.lower)
+        upper = np.atleast_2d(part.upper)
         half = 0.5 * (upper - lower).max(axis=0)
         size = np.where(np.isfinite(lower), np.abs(lower), np.where(np.isfinite(upper), np.abs(upper), 0.0)).max(axis=0)
         scales.append(np.where(np.isfinite(half), half, np.where(size > 0.0, size, 1.0)))
@@ -225,16 +233,21 @@ def _relaxed(
     form = Staged(replace(problem, bounds=None, constraints=rows))
     qp = form.assemble(query)
     named = [side for side in sides if side in elastic]
-    columns, scale = form.slack_columns, form.slack_scale
-    basis, cost, box = sparse.identity(qp.c.size, format="csc"), np.zeros(qp.c.size), np.stack([qp.x_l, qp.x_u], 1)
+    columns = form.slack_columns
+    scale = form.slack_scale
+    basis = sparse.identity(qp.c.size, format="csc")
+    cost = np.zeros(qp.c.size)
+    box = np.stack([qp.x_l, qp.x_u], 1)
     cost[columns] = 1.0 / scale
     if together is not None:
         weights = np.zeros(qp.c.size)
         weights[columns] = scale / np.array([together[side] for side in named])
         others = np.setdiff1d(np.arange(qp.c.size), columns)
         basis = sparse.hstack([basis[:, others], sparse.csc_matrix(weights[:, None])], format="csc")
-        cost, box = np.append(np.zeros(others.size), 1.0), np.vstack([box[others], [0.0, math.inf]])
-    above, below = np.isfinite(qp.h_u), np.isfinite(qp.h_l)
+        cost = np.append(np.zeros(others.size), 1.0)
+        box = np.vstack([box[others], [0.0, math.inf]])
+    above = np.isfinite(qp.h_u)
+    below = np.isfinite(qp.h_l)
     for method in ("highs-ds", "highs-ipm"):  # the simplex fails now and then where the optimum is degenerate
         optimum = linprog(
             cost,

@@ -85,9 +85,13 @@ class FlightEvents:
         build: Callable[[AnyController], Controller] | None,
     ) -> None:
         """Prepare for the first period; `build` makes a controller, None if the user's own controller flies."""
-        self.assembly, scenario = assembly, assembly.scenario
+        self.assembly = assembly
+        scenario = assembly.scenario
         self._spec = scenario.controller
-        self._plant, self._navigation, self._reference, self._loop = plant, navigation, reference, loop
+        self._plant = plant
+        self._navigation = navigation
+        self._reference = reference
+        self._loop = loop
         self._build = build
         self._recent: list[Event] = [*scenario.events]  # those still pending in the plant, and others
         self.infeasible_period: InfeasiblePeriod | None = None
@@ -142,7 +146,8 @@ class FlightEvents:
 
     def leave_course(self) -> None:
         """End the constraints on the tracking error, and drop those that would begin later."""
-        scenario, now = self.scenario, round(self._loop.k * self.scenario.control_period, 9)
+        scenario = self.scenario
+        now = round(self._loop.k * self.scenario.control_period, 9)
         kept = []
         for limit in scenario.constraints:
             if limit.signal not in TRACKING_ERRORS:
@@ -153,7 +158,8 @@ class FlightEvents:
 
     def flown(self) -> Scenario:
         """Return the scenario up to now, unless the flight has ended otherwise, or nothing has been flown."""
-        scenario, k = self.scenario, self._loop.k
+        scenario = self.scenario
+        k = self._loop.k
         if k in (0, scenario.periods) or self._loop.reason is not None:
             return scenario
         duration = round(k * scenario.control_period, 9)
@@ -166,7 +172,8 @@ class FlightEvents:
 
     def _stamped(self, event: Event | Mapping[str, Any]) -> Event:
         """Return an event with its time, effective from the first period not yet observed."""
-        step, first = self.scenario.plant.timestep, self._loop.k + self._loop.observed
+        step = self.scenario.plant.timestep
+        first = self._loop.k + self._loop.observed
         at = round(first * self.scenario.control_period, 9)
         if isinstance(event, Mapping):
             event = parse_table(_Listed, {"events": [{**event, "at": at}]}, "event").events[0]
@@ -178,7 +185,8 @@ class FlightEvents:
 
     def _with(self, event: Event) -> Scenario:
         """Return the scenario with one more event, extended to its time."""
-        before, events = self.scenario, [*self.scenario.events, event]
+        before = self.scenario
+        events = [*self.scenario.events, event]
         if len(events) > MOST_EVENTS:
             raise ParameterError("scenario", "events", len(events), f"of {MOST_EVENTS} or fewer entries")
         changes: dict[str, Any] = {"events": events}
@@ -266,7 +274,8 @@ def prepared(assembly: Assembly) -> Scenario:
     Wind needs drag to push; with the integrator rk4 only a file schedules another mass; an estimator needs a fixed set
     of sensors.
     """
-    scenario, air = assembly.scenario, assembly.effects.air
+    scenario = assembly.scenario
+    air = assembly.effects.air
     sensed = {} if scenario.sensors is None else scenario.sensors.present()
     names = [*sensed] if scenario.estimator is not None else [*get_args(SensorText)]
     possible: list[Event] = [

@@ -291,11 +291,13 @@ class Flight(Result):
         At the rate of `plant`, in the constraint's unit; NaN outside its time window.  The smallest of all is the
         audit's `worst_margin`. See `docs/conventions.md`.
         """
-        plant, t = self.log.plant, self.time
+        plant = self.log.plant
+        t = self.time
         starts = np.minimum(np.searchsorted(plant.t, t - 1e-9), max(plant.t.size - 1, 0))
         margins: dict[str, Array] = {}
         for finding in self.findings:
-            limit, signal = finding.limit, finding.limit.source
+            limit = finding.limit
+            signal = finding.limit.source
             if signal.plant is None or not t.size:
                 margins[limit.name] = margins_sampled(limit, self.log)
             else:
@@ -602,7 +604,8 @@ def require_film(video: bool | None, fps: int | None = None) -> None:
 
 def summarise(flight: Flight) -> dict[str, Any]:
     """Return `summary.json` of a flight, without the hashes of its files and the total wall time."""
-    scenario, log = flight.scenario, flight.log
+    scenario = flight.scenario
+    log = flight.log
     ground = scenario.effects.ground
     flown = log.control.t.size > 0
     samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}

@@ -133,8 +133,11 @@ class _Case:
     """One period's problem and its scenario file."""
 
     def __init__(self, infeasible_period: InfeasiblePeriod, scenario: Scenario, spec: Any, vehicle: Vehicle) -> None:
-        self._infeasible_period, self._spec, self._vehicle = infeasible_period, spec, vehicle
-        self._period, self._scenario = scenario.control_period, scenario
+        self._infeasible_period = infeasible_period
+        self._spec = spec
+        self._vehicle = vehicle
+        self._period = scenario.control_period
+        self._scenario = scenario
 
     def origin(self, side: Side) -> Origin:
         """Return where a side comes from."""
@@ -154,7 +157,8 @@ class _Case:
 
         Bounds whose shares are tied (`quadsim.ties`) are in the order of the problem's constraints.
         """
-        delay, period = self._infeasible_period.delay, self._period
+        delay = self._infeasible_period.delay
+        period = self._period
         declared = sorted(conflict.violated.items())
         for i in in_order([-violation.share for _, violation in declared]):
             side, violation = declared[i]
@@ -248,7 +252,8 @@ class _Case:
         if fallback is not None and fallback.enabled:
             return
         settings: Settings = {"controller.fallback": {}}
-        changed, query = self._changed(settings), self._infeasible_period.query
+        changed = self._changed(settings)
+        query = self._infeasible_period.query
         assert changed is not None
         pilot = build(changed, self._vehicle, self._period)
         guard = pilot.guard
@@ -278,7 +283,8 @@ class _OwnCase(_Case):
         widenings = []
         for sides in alike:
             side = next(iter(sides))
-            least, origin = smallest_widening(self._infeasible_period, sides), self.origin(side)
+            least = smallest_widening(self._infeasible_period, sides)
+            origin = self.origin(side)
             if least is not None:
                 amount = f"{least * origin.factor:.3g} {origin.unit.replace('-', '')}".rstrip()
                 widenings.append(f"{origin.name} {_which(side)} wider by {amount}")
@@ -354,7 +360,8 @@ def _advice(report: Mapping[str, Any]) -> str:
 
 def change_text(change: Mapping[str, Any]) -> str:
     """Return a change as after `--set`, with what has to be known about it."""
-    settings, after = change["settings"], change["after"]
+    settings = change["settings"]
+    after = change["after"]
     fields = fields_text(settings)
     fields += " (without the field solver)" if settings.get("controller.type") == "robust" else ""
     if (count := settings.get("controller.iterations")) is not None:

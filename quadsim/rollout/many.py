@@ -31,7 +31,10 @@ from quadsim.rollout.machine import code_digest, usable_cores, versions
 Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
 FlownRows = Generator[tuple[int, Row]]
 Fly = Callable[[Any], Row]
-ERROR, TIMEOUT, MEMORY, DIED = "error", "timeout", "memory", "died"
+ERROR = "error"
+TIMEOUT = "timeout"
+MEMORY = "memory"
+DIED = "died"
 """Verdicts of flights without a row: an exception, a timeout, too much memory, or a dead process."""
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _PRELOAD: Final = (
@@ -107,7 +110,8 @@ def _require(workers: int | None, cluster: str | None) -> None:
 
 
 def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory: float, isolate: bool) -> FlownRows:
-    todo, workers = enumerate(flights), list[_Worker]()
+    todo = enumerate(flights)
+    workers = list[_Worker]()
     try:
         flight = next(todo, None)
         while flight is not None or workers:
@@ -115,7 +119,8 @@ def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory
                 workers.append(_Worker(fly, timeout, memory))
                 workers[-1].hand(*flight)
                 flight = next(todo, None)
-            left, rows = min(worker.deadline for worker in workers) - clock.monotonic(), []
+            left = min(worker.deadline for worker in workers) - clock.monotonic()
+            rows = []
             ready = connection.wait([end for running in workers for end in running.ends], max(left, 0.0))
             for worker in workers[:]:
                 if (row := worker.row(ready)) is None:
@@ -137,7 +142,10 @@ class _Worker:
     """A process that flies one flight at a time."""
 
     def __init__(self, fly: bytes, timeout: float, memory: float) -> None:
-        self._timeout, self.place, self.usable, self.deadline = timeout, -1, True, 0.0
+        self._timeout = timeout
+        self.place = -1
+        self.usable = True
+        self.deadline = 0.0
         self._start_s = _START_S
         context = multiprocessing.get_context("forkserver")
         draws = [
@@ -151,7 +159,8 @@ class _Worker:
         self.ends = (self.pipe, self.process.sentinel)  # either becomes ready when there is news
 
     def hand(self, place: int, flight: Any) -> None:
-        self.place, self.deadline = place, clock.monotonic() + self._timeout + self._start_s
+        self.place = place
+        self.deadline = clock.monotonic() + self._timeout + self._start_s
         with suppress(OSError):  # it is dead already, which its sentinel shows
             self.pipe.send(flight)
 
@@ -161,7 +170,8 @@ class _Worker:
             with suppress(Exception):  # it died while sending it
                 row = self.pipe.recv()
                 if row is None:  # it has started: its first flight begins now
-                    self._start_s, self.deadline = 0.0, clock.monotonic() + self._timeout
+                    self._start_s = 0.0
+                    self.deadline = clock.monotonic() + self._timeout
                     return None
                 if isinstance(row, dict):
                     self.usable = row.get("verdict") != MEMORY
@@ -194,7 +204,8 @@ def _starting() -> Iterator[None]:
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         before = {name: os.environ.get(name) for name in _ONE_THREAD}
         os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-        script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+        script = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
         try:
             yield
         finally:
@@ -254,7 +265,8 @@ def _limit_memory(megabytes: float) -> None:
 
 
 def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float, memory: float) -> FlownRows:
-    todo, places = enumerate(flights), dict[str, int]()
+    todo = enumerate(flights)
+    places = dict[str, int]()
     with _client(address) as client:
         distributed = _distributed()
         work = distributed.as_completed(loop=client.loop)

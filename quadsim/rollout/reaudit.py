@@ -97,7 +97,9 @@ def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
 def _inconsistencies(flight: Flight) -> Iterator[str]:
     """Yield contradictions among a run's tables, or with the scenario's rates."""
     scenario = flight.scenario
-    control, timing, plant = flight.log.control, flight.log.timing, flight.log.plant
+    control = flight.log.control
+    timing = flight.log.timing
+    plant = flight.log.plant
     for name, columns, rows, t in (
         (FLIGHT_FILE, STATE_NAMES, control.truth, control.t),
         (FLIGHT_FILE, REFERENCE_NAMES, control.reference, control.t),
@@ -106,8 +108,11 @@ def _inconsistencies(flight: Flight) -> Iterator[str]:
         (PLANT_FILE, _TURNING, plant.speeds, plant.t),
     ):
         yield from _where(~np.isfinite(rows), columns, t, f"of {name} is no finite number")
-    stride, steps, count = scenario.plant_stride, scenario.steps_per_period, control.t.size
-    period, row = scenario.control_period, stride * scenario.plant.timestep
+    stride = scenario.plant_stride
+    steps = scenario.steps_per_period
+    count = control.t.size
+    period = scenario.control_period
+    row = stride * scenario.plant.timestep
     for name, t, spacing, expected in (
         (FLIGHT_FILE, control.t, period, count),
         (TIMING_FILE, timing.t, period, count),
@@ -144,12 +149,14 @@ def _in_force(
 
     They do not have the steps of a plan that bridge the time from when a command is due to when it arrives.
     """
-    timestep, starts = scenario.plant.timestep, scenario.steps_per_period * np.arange(control.t.size)
+    timestep = scenario.plant.timestep
+    starts = scenario.steps_per_period * np.arange(control.t.size)
     due = starts + (0 if scenario.computation is None else physics_steps(scenario.computation.delay, timestep))
     waits = [physics_steps(delay, timestep) for delay in control.delay.tolist()]
     missed = [status == MISSED for status in control.status]  # their rows have what acts from when they were due
     arrives = np.where(missed, due, starts + np.array(waits, dtype=np.int64))
-    assembly, laws = Assembly(scenario), [(0.0, scenario.controller), *scenario.controller_changes]
+    assembly = Assembly(scenario)
+    laws = [(0.0, scenario.controller), *scenario.controller_changes]
     settings = [assembly.computation(spec) for _, spec in laws]
     law = np.searchsorted([time for time, _ in laws], control.t + ARITHMETIC_TOLERANCE, side="right") - 1
     planning = np.array([entry is not None and bool(entry.plan) for entry in settings])[law]
@@ -168,8 +175,12 @@ def _holds_commands(scenario: Scenario) -> bool:
 
 def _differences(flight: Flight, findings: Sequence[Finding], course: Sequence[metrics.CourseStep]) -> Iterator[str]:
     """Yield differences of a flight's summary from its scenario, its tables and the audit made of them."""
-    summary, scenario, log = flight.summary, flight.scenario, flight.log
-    periods, completed, reason = log.control.t.size, summary["status"] == "completed", summary["reason"]
+    summary = flight.summary
+    scenario = flight.scenario
+    log = flight.log
+    periods = log.control.t.size
+    completed = summary["status"] == "completed"
+    reason = summary["reason"]
     duration = round(periods * scenario.control_period, 9)
     stated = {"scenario": scenario.name, "seed": scenario.seed, "expected": scenario.expect, "duration": duration}
     for key, again in stated.items():
@@ -184,7 +195,8 @@ def _differences(flight: Flight, findings: Sequence[Finding], course: Sequence[m
     for key, again in leaves(numbers):
         yield from _recorded(key, before.get(key, again), again, "the tables give", ARITHMETIC_TOLERANCE)
     entries = summary["constraints"]
-    names, expected = [entry["name"] for entry in entries], [finding.limit.name for finding in findings]
+    names = [entry["name"] for entry in entries]
+    expected = [finding.limit.name for finding in findings]
     if names != expected:
         yield f"the constraints recorded are {', '.join(names) or 'none'}, and the scenario's {', '.join(expected)}"
         return
@@ -218,7 +230,8 @@ def _constraint_differences(
     entry: Mapping[str, Any], finding: Finding, scenario: Scenario, log: FlightLog
 ) -> Iterator[str]:
     """Yield differences of a summary from the tables in one constraint."""
-    again, limit = limit_to_json(finding), finding.limit
+    again = limit_to_json(finding)
+    limit = finding.limit
     for key in _DEMANDS:
         if entry.get(key) != again.get(key):
             yield f"{key} is recorded as {entry.get(key)!r:.80}, and is {again.get(key)!r:.80} in the scenario"
@@ -230,7 +243,8 @@ def _constraint_differences(
         yield from _recorded(key, entry[key], again[key], "the tables give", rounding)
     if whole and not _is_worst_time(entry["worst_time"], finding, log):
         yield f"worst_time is recorded as {entry['worst_time']!r:.40}, and the tables give {again['worst_time']}"
-    margin, there = entry["worst_margin"], again["worst_margin"]
+    margin = entry["worst_margin"]
+    there = again["worst_margin"]
     milder = there is not None and (margin is None or margin > there + rounding * max(1.0, abs(there)))
     if not whole and milder:
         yield f"worst_margin is recorded as {margin}, and the tables go down to {there:.6g}"
@@ -263,7 +277,9 @@ def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[
 
     Rows at the log rate cover at least one physics step each, and the last of them may come before the end.
     """
-    signal, limit, seen = finding.limit.source, finding.limit, finding.time_violated
+    signal = finding.limit.source
+    limit = finding.limit
+    seen = finding.time_violated
     row = 1.0 / scenario.log_rate if scenario.plant_stride > 1 else 0.0
     if signal.plant is None or not log.control.t.size or scenario.plant_stride == 1:
         return seen - ARITHMETIC_TOLERANCE, seen + row + ARITHMETIC_TOLERANCE

@@ -57,7 +57,9 @@ def tried(explanation: Mapping[str, Any], flight: Flight, fly: FlyUntil, measure
         fly: flies an assembly until a time [s].
         measure: measures the loop of a scenario.
     """
-    report, scenario, assembly = {**explanation, "rejected": []}, flight.scenario, flight.assembly
+    report = {**explanation, "rejected": []}
+    scenario = flight.scenario
+    assembly = flight.assembly
     notes = hover_notes(assembly)
     report["sentence"] = "; ".join([*notes, report["sentence"]])
     until = min(report["time"] + AFTER, scenario.duration)
@@ -120,7 +122,8 @@ def _trial(scenario: Scenario, assembly: Assembly, settings: Settings, until: fl
         return _Trial(why=str(error))
     if flight.log.interrupted:
         raise KeyboardInterrupt
-    unanswered, period = flight.infeasible_period, scenario.control_period
+    unanswered = flight.infeasible_period
+    period = scenario.control_period
     if flight.log.reason is not None:
         return _Trial(why=f"{flight.outcome} at t = {flight.time.size * period:.4g} s")
     if unanswered is not None and unanswered.converges is None and "controller.fallback" not in settings:
@@ -159,11 +162,13 @@ def _loop_report(assembly: Assembly, measure: MeasureGrowth) -> dict[str, Any]:
 
     Where it does not grow as stated, nothing else is measured.
     """
-    scenario, heading = assembly.scenario, worst_heading(assembly)
+    scenario = assembly.scenario
+    heading = worst_heading(assembly)
     report = {"heading": heading, **_grows(scenario, heading, measure), "without": [], "with": []}
     if _cures(report):
         return report
-    lacking, effects = unmodelled(assembly), unpredicted(assembly)
+    lacking = unmodelled(assembly)
+    effects = unpredicted(assembly)
     for entry in (*lacking, *effects)[:MOST_PAIRS]:
         level = 0.0 if entry.quantity == "heading" else heading
         grows = _grows(_replaced(scenario, entry.absent), level, measure)
@@ -234,7 +239,9 @@ def _rate_text(entry: Mapping[str, Any]) -> str:
 
 def _reaching_hover(scenario: Scenario, assembly: Assembly) -> list[dict[str, Any]]:
     """Return the change that gives the bound on rotor speeds room about hover, as far as the rotors have it."""
-    spec, vehicle, hover = scenario.controller, assembly.vehicle, hover_speeds(assembly)
+    spec = scenario.controller
+    vehicle = assembly.vehicle
+    hover = hover_speeds(assembly)
     if not isinstance(spec, Constrained | Robust) or spec.input_bounds is None:
         return []
     lower, upper = spec.input_bounds.speed

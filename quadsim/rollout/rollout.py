@@ -141,7 +141,9 @@ class Rollout:
         controller = assembly.controller() if law is None else law
         check_measured(scenario.computation, controller)
         assembly = assembly.with_law_bounds(controller)
-        self.vehicle, self.actual, self.limits = assembly.vehicle, assembly.actual, assembly.limits
+        self.vehicle = assembly.vehicle
+        self.actual = assembly.actual
+        self.limits = assembly.limits
         self._started = scenario = assembly.scenario
         if assembly.user_autopilot is not None and not takes_targets(controller):
             rule = 'given with a controller that commands thrust and body rates, e.g. commands = "rates"'
@@ -150,7 +152,8 @@ class Rollout:
             assembly.controller(spec)  # checked before the flight, one by one, as each may take megabytes
         self._law = controller.name, controller.solver
         self._own_code = law is not None or forces is not None or assembly.user_autopilot is not None
-        self._plant, self._navigation = assembly.plant(forces), assembly.navigation()
+        self._plant = assembly.plant(forces)
+        self._navigation = assembly.navigation()
         started = clock.perf_counter()
         self._reference = reference = assembly.followed()
         self.loop = closed_loop(
@@ -221,7 +224,8 @@ class Rollout:
         """
         if self.loop.before is None:
             raise InputError("the flight is closed")
-        period, self._longest = self._started.control_period, max(self._longest, self.loop.controller.horizon)
+        period = self._started.control_period
+        self._longest = max(self._longest, self.loop.controller.horizon)
         most = MOST_STEPS // max(self._started.steps_per_period, self._longest)
         if self.k >= min(most, math.floor(LONGEST_FLIGHT / period + 1e-6)):
             raise InputError(f"a flight has at most {self.k} control periods of {period} s")
@@ -247,7 +251,8 @@ class Rollout:
             until: [s] ends it earlier, rounded up to whole control periods.
         """
         with self:
-            started, periods = clock.perf_counter(), self.scenario.periods
+            started = clock.perf_counter()
+            periods = self.scenario.periods
             periods = min(periods, math.ceil(min(until, LONGEST_FLIGHT) / self.scenario.control_period - 1e-6))
             progress("flight", self.k, periods)
             complete(self.loop, periods=periods, progress=lambda done: progress("flight", done, periods))
@@ -257,7 +262,8 @@ class Rollout:
     @property
     def core_law(self) -> CoreController | None:
         """The controller in the core, where a flight of this scenario needs nothing else; see `fly_in_core`."""
-        scenario, controller = self._events.scenario, self.loop.controller
+        scenario = self._events.scenario
+        controller = self.loop.controller
         changing = any(isinstance(event, SetpointEvent | ControllerEvent) for event in scenario.events)
         attended = changing or scenario.forces or self._own_code or self.loop.attends or needs_quaternions(scenario)
         if attended or not isinstance(controller, Pilot):
@@ -269,7 +275,8 @@ class Rollout:
 
         The flight lacks predictions and KKT residuals; all other numbers are those of `fly`.
         """
-        scenario, started = self.scenario, clock.perf_counter()
+        scenario = self.scenario
+        started = clock.perf_counter()
         with self:
             log = fly_in_core(
                 law,

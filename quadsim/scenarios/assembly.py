@@ -332,7 +332,8 @@ class Assembly:
 
         Courses without an end are never cut, nor is a function of time, which is sampled for the flight.
         """
-        reference, end = self.scenario.reference, self.course.end
+        reference = self.scenario.reference
+        end = self.course.end
         if isinstance(reference, Csv) and reference.content is not None:
             return None
         return round(end, 9) if self.scenario.duration < end - 1e-9 and math.isfinite(end) else None
@@ -345,7 +346,8 @@ class Assembly:
 
     def followed(self, course: Course | None = None) -> FollowedCourse:
         """Return the filtered reference row by row, with set-points in flight; `course` replaces the scenario's."""
-        course, response_time = self.course if course is None else course, self.scenario.reference.response_time
+        course = self.course if course is None else course
+        response_time = self.scenario.reference.response_time
         return FollowedCourse(course, response_time=response_time, period=self.scenario.control_period)
 
     def reference(self, samples: int) -> Array:
@@ -355,7 +357,8 @@ class Assembly:
     @cached_property
     def motion(self) -> Motion | None:
         """The reference motion at t_k = k tau_s, to the end of the course; None if the course states only positions."""
-        course, period = self.course, self.scenario.control_period
+        course = self.course
+        period = self.scenario.control_period
         if course.derivatives is None:
             return None
         t = np.arange(max(math.floor(course.end / period + 1e-6), 1) + 1, dtype=np.float64) * period
@@ -426,7 +429,8 @@ class Assembly:
         events = [event for event in self.scenario.events if isinstance(event, ControllerEvent)]
         ordered = sorted(events, key=attrgetter("at"))
         for event, (_, spec) in zip(ordered, self.scenario.controller_changes, strict=True):
-            before, law = law, self._stated_law(spec)
+            before = law
+            law = self._stated_law(spec)
             if "type" in event.fields:  # a whole table, which states itself as the first does
                 continue
             solver = _solver_of(law)
@@ -515,7 +519,8 @@ class Assembly:
     @property
     def space_limits(self) -> tuple[SpaceLimit, ...]:
         """Those of obstacles and regions alone."""
-        scenario, regions = self.scenario, self.regions
+        scenario = self.scenario
+        regions = self.regions
         if not scenario.obstacles and not regions:
             return ()
         return space_limits(scenario.obstacles, regions, self.actual.enclosing_radius)
@@ -563,7 +568,8 @@ class Assembly:
         Raises:
             InputError: effects exclude each other, or a force cannot be imported.
         """
-        scenario, rng = self.scenario, self.generator("forces")
+        scenario = self.scenario
+        rng = self.generator("forces")
         if forces is None:
             forces = [make_force(import_plugin(spec), spec, self.actual, rng) for spec in scenario.forces]
         return Plant(
@@ -581,11 +587,13 @@ class Assembly:
 
     def ground(self) -> PhaseMonitor | None:
         """Return the monitor of contact with ground and obstacles; None if there are none."""
-        ground, obstacles = self.scenario.effects.ground, self.scenario.obstacles
+        ground = self.scenario.effects.ground
+        obstacles = self.scenario.obstacles
         there = ground is not None and ground.contact
         if not there and not obstacles:
             return None
-        shape, radius = outline(self.actual) if there else None, self.actual.enclosing_radius
+        shape = outline(self.actual) if there else None
+        radius = self.actual.enclosing_radius
         return PhaseMonitor(shape, period=self.scenario.control_period, obstacles=obstacles, radius=radius)
 
     @property
@@ -650,10 +658,13 @@ class Assembly:
         Raises:
             ParameterError: a fault of a sensor that the estimator does not have.
         """
-        sensors, faults, estimator = self.sensors, self.faults, self.scenario.estimator
+        sensors = self.sensors
+        faults = self.faults
+        estimator = self.scenario.estimator
         if not sensors and not faults and estimator is None:
             return None
-        step, rng = self.scenario.plant.timestep, self.generator("sensors")
+        step = self.scenario.plant.timestep
+        rng = self.generator("sensors")
         return Navigation(self.vehicle, timestep=step, sensors=sensors, rng=rng, faults=faults, estimator=estimator)
 
     @property

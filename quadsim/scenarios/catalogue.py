@@ -57,7 +57,8 @@ def read_variants(path: Path) -> dict[str, Variant]:
     Raises:
         FileError: a row is malformed, has the name of a file, or a base that is none.
     """
-    files, rows = _names(FLIGHTS), {}
+    files = _names(FLIGHTS)
+    rows = {}
     for name, row in read_toml(path).items():
         if name in files:
             raise FileError(path, f"{name} must not have the name of a file in {FLIGHTS.name}/")
@@ -113,8 +114,10 @@ def source_label(source: Source) -> str:
     return f"{VARIANTS.name}, {changes['name']}" if changes else file.name
 
 
-campaign_names, campaign_path = partial(_names, CAMPAIGNS), partial(_path, "campaign", CAMPAIGNS)
-paper_names, paper_path = partial(_names, PAPERS), partial(_path, "paper", PAPERS)
+campaign_names = partial(_names, CAMPAIGNS)
+campaign_path = partial(_path, "campaign", CAMPAIGNS)
+paper_names = partial(_names, PAPERS)
+paper_path = partial(_path, "paper", PAPERS)
 
 
 @dataclass(frozen=True, kw_only=True)

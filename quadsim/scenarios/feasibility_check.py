@@ -41,9 +41,11 @@ def report(assembly: Assembly) -> Feasibility:
     Raises:
         InputError: the course cannot be built.
     """
-    scenario, course = assembly.scenario, assembly.course
+    scenario = assembly.scenario
+    course = assembly.course
     required = _required(course, assembly, duration=scenario.duration)
-    sentence, until = required.sentence, _left(assembly)
+    sentence = required.sentence
+    until = _left(assembly)
     if until < course.end < math.inf and not _sampled(scenario):
         sentence += f" It lasts until {course.end:g} s, but the flight follows it for {until:g} s."
     advice = fitting(assembly) if required.problems else ""
@@ -52,7 +54,8 @@ def report(assembly: Assembly) -> Feasibility:
 
 def hover_speeds(assembly: Assembly) -> Array:
     """Return the rotor speeds (4,) [rad/s] at which the actual vehicle hovers, with its load at the start."""
-    vehicle, load = assembly.actual, assembly.effects.load or Load()
+    vehicle = assembly.actual
+    load = assembly.effects.load or Load()
     return vehicle.hover_speeds * math.sqrt(mass_properties(vehicle, load, load.payloads).mass / vehicle.mass)
 
 
@@ -71,7 +74,8 @@ def leftover_notes(assembly: Assembly) -> tuple[str, ...]:
 
 def hover_notes(assembly: Assembly) -> tuple[str, ...]:
     """Return a note if hover needs rotor speeds outside the controller's bounds."""
-    hover, (lower, upper) = hover_speeds(assembly), assembly.bounds.get("speed", (0.0, math.inf))
+    hover = hover_speeds(assembly)
+    lower, upper = assembly.bounds.get("speed", (0.0, math.inf))
     if lower <= hover.min() and hover.max() <= upper:
         return ()
     bound, side = (upper, "") if hover.max() > upper else (lower, "at least ")
@@ -116,8 +120,10 @@ def fitting(assembly: Assembly) -> str:
     Returns:
         A sentence; empty if the course fits as it is, or not even at a tenth.
     """
-    scenario, course = assembly.scenario, assembly.course
-    duration, filtered_by = scenario.duration, scenario.reference.response_time
+    scenario = assembly.scenario
+    course = assembly.course
+    duration = scenario.duration
+    filtered_by = scenario.reference.response_time
 
     def slower(share: float) -> bool:
         return not _required(_scaled(course, pace=share), assembly, duration=duration / share, pace=share).problems
@@ -149,7 +155,8 @@ def _setpoints(scenario: Scenario) -> list[SetpointEvent]:
 
 def _left(assembly: Assembly) -> float:
     """Time for which the course is followed [s]: until set-points have replaced it on every axis that it moves."""
-    scenario, course = assembly.scenario, assembly.course
+    scenario = assembly.scenario
+    course = assembly.course
     t = scenario.control_period * np.arange(scenario.periods + 1, dtype=np.float64)
     moving = [n for n, values in zip(REFERENCE_NAMES, course.sample(t).T, strict=True) if np.ptp(values) > 0.0]
     taken = {name: event.at for event in reversed(_setpoints(scenario)) for name in event.values}
@@ -158,7 +165,8 @@ def _left(assembly: Assembly) -> float:
 
 def _largest(fits: Callable[[float], bool]) -> float | None:
     """Return the largest whole percentage that fits, as a share, by bisection; None if a tenth does not fit."""
-    low, high = 10, 100
+    low = 10
+    high = 100
     if not fits(0.01 * low):
         return None
     while high - low > 1:
@@ -185,21 +193,25 @@ def _scaled(course: Course, *, pace: float = 1.0, size: float = 1.0) -> Course:
 
 def _required(course: Course, assembly: Assembly, *, duration: float, pace: float = 1.0) -> Feasibility:
     """Return the demands of a course that replaces the scenario's for this duration [s]; set-points come at a pace."""
-    scenario, vehicle = assembly.scenario, assembly.vehicle
+    scenario = assembly.scenario
+    vehicle = assembly.vehicle
     period = scenario.control_period
     samples = round(duration / period) + 1
     given = [(event.at / pace, event.values) for event in _setpoints(scenario)]
     changes = [(first_period(at, period), values) for at, values in given]
-    before, count = np.tile(course.initial, (STENCIL, 1)), samples + STENCIL  # the vehicle is at rest before the flight
+    before = np.tile(course.initial, (STENCIL, 1))
+    count = samples + STENCIL  # the vehicle is at rest before the flight
     unfiltered, poses_along = assembly.followed(course).flown(count, changes)
-    poses, raw = np.vstack([before, poses_along]), np.vstack([before, unfiltered])
+    poses = np.vstack([before, poses_along])
+    raw = np.vstack([before, unfiltered])
     t: Array = period * np.arange(-STENCIL, samples + STENCIL, dtype=np.float64)
     changed = np.any(raw[1:] != raw[:-1], axis=1)
     away = () if np.allclose(assembly.initial_pose, course.initial, rtol=0.0, atol=1e-9) else (0.0,)
     replaced = np.zeros_like(changed)  # by a set-point, between a sample and the next
     replaced[[STENCIL + k for k, _ in changes if k + 1 < count]] = True
     jumps = sorted({time for time in (*course.jumps, *away, *(at for at, _ in given)) if time < duration})
-    jumped, kinked = (replaced | _touched(t, course.jumps)) & changed, _touched(t, _isolated(course.kinks, period))
+    jumped = (replaced | _touched(t, course.jumps)) & changed
+    kinked = _touched(t, _isolated(course.kinks, period))
     channels = zip(poses.T, course.resolution, strict=True)
     smooth = np.column_stack([within_rounding(values, unit, jumped | kinked) for values, unit in channels])
     needed = demand(smooth, period, vehicle, jumps=jumped, kinks=kinked)

@@ -31,7 +31,8 @@ def law_limits(law: object, taken: Iterable[str] = ()) -> list[Limit]:
             `[[constraints]]`.
         taken: names that are not free.
     """
-    names, limits = set(taken), dict[tuple[Any, ...], Limit]()
+    names = set(taken)
+    limits = dict[tuple[Any, ...], Limit]()
     for source in _SOURCES:
         try:
             found = list(_limits(getattr(law, source, None), source))
@@ -91,7 +92,8 @@ def _rows(constraint: Constraint) -> Iterator[Limit]:
 
 def _alike(matrix: Array, constraint: Constraint) -> tuple[float, float] | None:
     """Return the bounds of rows that bound every rotor alike, None of others."""
-    lower, upper = constraint.lower, constraint.upper
+    lower = constraint.lower
+    upper = constraint.upper
     if matrix.shape != (N_ROTORS, N_ROTORS) or (matrix != np.eye(N_ROTORS)).any():
         return None
     return (float(lower[0]), float(upper[0])) if (lower == lower[0]).all() and (upper == upper[0]).all() else None
@@ -101,7 +103,8 @@ def _row(constraint: Constraint, i: int, C: Array, D: Array) -> Iterator[Limit]:
     scale = [shown_unit(unit)[1] for unit in STATE_UNITS]
     terms = {name: float(c / s) for name, c, s in zip(STATE_NAMES, C[:N_STATES], scale, strict=False) if c}
     terms |= {name: float(d) for name, d in zip(_SPEEDS, D, strict=False) if d}
-    lower, upper = float(constraint.lower[i]), float(constraint.upper[i])
+    lower = float(constraint.lower[i])
+    upper = float(constraint.upper[i])
     if not terms or (math.isinf(lower) and math.isinf(upper)):
         return
     if len(terms) == 1 and next(iter(terms)) in STATE_NAMES:

@@ -80,7 +80,8 @@ def audit_notes(scenario: Scenario, vehicle: Vehicle, bounds: Mapping[str, Range
 def flyable(bounds: Mapping[str, Range], vehicle: Vehicle) -> dict[str, Range]:
     """Return a controller's bounds, those on speeds within the range that the actual vehicle's rotors have."""
     if "speed" in bounds:
-        lower, upper = max(bounds["speed"][0], vehicle.speed_min), min(bounds["speed"][1], vehicle.speed_max)
+        lower = max(bounds["speed"][0], vehicle.speed_min)
+        upper = min(bounds["speed"][1], vehicle.speed_max)
         bounds = {**bounds, "speed": (lower, upper) if lower < upper else (vehicle.speed_min, vehicle.speed_max)}
     return dict(bounds)
 

@@ -62,7 +62,8 @@ def assemble(
 
 
 def _read(name: str, settings: Sequence[str]) -> Scenario:
-    data, (file, changes) = read_scenario(name), scenario_source(name)
+    data = read_scenario(name)
+    file, changes = scenario_source(name)
     label = source_label((file, changes))
     unchanged = copy.deepcopy(data)
     apply_settings(data, settings, file.parent)

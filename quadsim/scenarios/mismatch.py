@@ -79,7 +79,8 @@ def _law_with(assembly: Assembly, name: str) -> dict[str, Any]:
 
     That is to `robust` where weights and bounds can be kept, and to `nonlinear` with the rotors' lag otherwise.
     """
-    spec, lag = assembly.scenario.controller, _stated_lag(assembly)
+    spec = assembly.scenario.controller
+    lag = _stated_lag(assembly)
     if name in vars(spec):
         return {}
     if isinstance(spec, Bounded):
@@ -97,7 +98,8 @@ def _as_written(settings: Mapping[str, Any]) -> str:
 
 def _delay(assembly: Assembly) -> list[Unmodelled]:
     """Return the delay that the law does not bridge."""
-    computation, spec = assembly.scenario.computation, assembly.scenario.controller
+    computation = assembly.scenario.computation
+    spec = assembly.scenario.controller
     delay = 0.0 if computation is None else computation.delay
     fields = vars(spec)
     known = fields.get("delay", 0.0)
@@ -205,7 +207,9 @@ def _moments(spec: AnyController, assembly: Assembly) -> list[Unmodelled]:
 
     An inner loop balances them where a law commands rates or an attitude.
     """
-    air, vehicle, fields = assembly.effects.air, assembly.vehicle, vars(spec)
+    air = assembly.effects.air
+    vehicle = assembly.vehicle
+    fields = vars(spec)
     modelled = any(np.any(getattr(vehicle, name) or 0.0) for name in AIR_MOMENT)
     if air is None or not modelled or fields.get("moment", False) or fields.get("commands", ROTORS) != ROTORS:
         return []
@@ -224,7 +228,9 @@ def _moments(spec: AnyController, assembly: Assembly) -> list[Unmodelled]:
 
 def _forces(spec: Nonlinear | Bounded, assembly: Assembly) -> list[Unmodelled]:
     """Return wind and disturbance that the law does not estimate."""
-    fields, air, disturbance = vars(spec), assembly.effects.air, assembly.effects.disturbance
+    fields = vars(spec)
+    air = assembly.effects.air
+    disturbance = assembly.effects.disturbance
     if fields.get("offset_free") is not None or fields.get("disturbance") is not None:
         return []
     absent: dict[str, Any] = {}

@@ -164,7 +164,9 @@ class PluginController:
     iterates: Final = frozenset({LAW})
 
     def __init__(self, law: Any, horizon: int) -> None:
-        self.law, self.horizon, kind = law, horizon, type(law).__name__
+        self.law = law
+        self.horizon = horizon
+        kind = type(law).__name__
         with user_code(lambda error: InputError(f"controller: {kind} cannot be used: {reason_of(error)}")):
             self.name = printable(str(_optional(lambda: law.name, kind)))[:200]
             self.solver = printable(str(_optional(lambda: law.solver, "")))[:200]
@@ -172,7 +174,8 @@ class PluginController:
             self._predicting = law if isinstance(law, Predicting) else None
         if not isinstance(self.commands, str) or self.commands not in TARGET_SIZES:
             raise ParameterError("controller", f"{self.name}.commands", self.commands, f"one of {[*TARGET_SIZES]}")
-        self._size, self._warned = TARGET_SIZES[self.commands], False
+        self._size = TARGET_SIZES[self.commands]
+        self._warned = False
 
     @property
     def infeasible_period(self) -> object:
@@ -324,7 +327,8 @@ def import_plugin(spec: Plugin | PluginForce) -> Any:
     """
     place = spec.type if ":" in spec.type else metadata.entry_points(group=ENTRY_POINTS)[spec.type].value
     module, _, attribute = place.partition(":")
-    folders, top = [*filter(None, [spec.folder]), str(Path.cwd())], module.partition(".")[0]
+    folders = [*filter(None, [spec.folder]), str(Path.cwd())]
+    top = module.partition(".")[0]
     imported: Any = _import(module, folders, _table(spec))
     file = getattr(sys.modules[top], "__file__", None) or "Python"
     files = [Path(folder, name) for folder in folders for name in (f"{top}.py", f"{top}/__init__.py")]
@@ -352,7 +356,9 @@ def _import(module: str, folders: Sequence[str], table: str) -> Any:
     Raises:
         InputError: it cannot be imported.
     """
-    path, top, writes = list(sys.path), module.partition(".")[0], sys.dont_write_bytecode
+    path = list(sys.path)
+    top = module.partition(".")[0]
+    writes = sys.dont_write_bytecode
     search = [*path, *folders]  # last, so that installed modules take precedence
     importlib.invalidate_caches()
     if getattr(sys.modules.get(top), "__file__", None) in _imported:
@@ -371,7 +377,8 @@ def _import(module: str, folders: Sequence[str], table: str) -> Any:
         with user_code(lambda error: _no_module(module, folders, table, error)):
             return importlib.import_module(module)
     finally:
-        sys.path[:], sys.dont_write_bytecode = path, writes
+        sys.path[:] = path
+        sys.dont_write_bytecode = writes
         new = [name for name in sys.modules if name not in before or name.partition(".")[0] == top]
         files = {getattr(sys.modules[name], "__file__", None) or "" for name in new}
         installed = (*_INSTALLED, *OUR_FOLDERS)
@@ -393,7 +400,8 @@ def _no_module(module: str, folders: Sequence[str], table: str, error: BaseExcep
 def refer_to(law: object, horizon: int = 1) -> Plugin:
     """Return how a scenario file names a controller or force object: by the place of its code."""
     code: Any = _code_of(law)
-    file, folder = getattr(sys.modules.get(code.__module__), "__file__", None), None
+    file = getattr(sys.modules.get(code.__module__), "__file__", None)
+    folder = None
     if file is not None and not file.startswith(_INSTALLED):
         folder = str(Path(file).resolve().parents[code.__module__.count(".") + file.endswith("__init__.py")])
     place = f"{code.__module__}:{code.__qualname__.replace('<locals>.', '').replace('<lambda>', 'law')}"
@@ -426,7 +434,8 @@ def _table(spec: Plugin | PluginForce) -> str:
 
 def reason_of(error: BaseException) -> str:
     """Format an exception in one line, with the user's line that raised it."""
-    last, text = traceback.extract_tb(error.__traceback__)[-1], described(error)
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    text = described(error)
     ours = last.filename in (__file__, border.__file__, inspect.__file__, importlib.__file__)
     ours = ours or "<frozen" in last.filename
     return text if ours or isinstance(error, SyntaxError) else f"{text} ({last.filename}, line {last.lineno})"

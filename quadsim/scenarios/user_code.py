@@ -90,7 +90,9 @@ def set_up(
     """
     assembly = assembly if reference is None else following(assembly, reference)
     assembly.user_autopilot = autopilot
-    scenario, law, acting = assembly.scenario, None, None
+    scenario = assembly.scenario
+    law = None
+    acting = None
     flown = named(scenario, controller, forces)
     if controller is not None and not isinstance(controller, str):
         spec = refer_to(controller, scenario.controller.horizon)

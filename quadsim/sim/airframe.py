@@ -102,9 +102,11 @@ def compile_model(
     spec.option.timestep = timestep
     spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
     body = spec.body(BODY)
-    body.mass, body.inertia = vehicle.mass, list(vehicle.inertia)
+    body.mass = vehicle.mass
+    body.inertia = list(vehicle.inertia)
     if vehicle.products_of_inertia is not None:
-        body.inertia, body.fullinertia = np.zeros(3), [*vehicle.inertia, *vehicle.products_of_inertia]
+        body.inertia = np.zeros(3)
+        body.fullinertia = [*vehicle.inertia, *vehicle.products_of_inertia]
     if reweighed:
         body.simple = 0
     ranges = vehicle.thrusts(np.array([[vehicle.speed_min], [vehicle.speed_max]])).T
@@ -113,7 +115,8 @@ def compile_model(
         spec.site(name).pos = position
         actuator = spec.actuator(name)
         actuator.gear = [0.0, 0.0, 1.0, 0.0, 0.0, spin * vehicle.drag_to_thrust]
-        actuator.ctrlrange, actuator.ctrllimited = thrust_range, int(limit_speeds)
+        actuator.ctrlrange = thrust_range
+        actuator.ctrllimited = int(limit_speeds)
     _fit_drawing(spec, vehicle)
     if contact:
         _ground(spec)
@@ -148,7 +151,8 @@ def _fit_drawing(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
         spec.geom(f"cap{i}").pos[2] += z
         spec.body(f"propeller{i}").pos[0] *= share
         spec.body(f"propeller{i}").pos[2] += z
-        disc, blades = spec.geom(f"disc{i}"), spec.geom(f"blades{i}")
+        disc = spec.geom(f"disc{i}")
+        blades = spec.geom(f"blades{i}")
         disc.size[0] = blades.size[0] = radius
         if x > 0.1 * vehicle.longest_arm:
             spec.geom(f"arm{i}").material = "front"
@@ -198,8 +202,11 @@ def _add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[Obstacle], radius: f
             geom.rgba = rgba(COLOUR.obstacle)
             meeting.append((geom, _MEETS_OBSTACLES, 0))
     for geom, contype, conaffinity in meeting:
-        geom.mass, geom.contype, geom.conaffinity = 0.0, contype, conaffinity
-        geom.solref[: len(_STIFFNESS)], geom.friction = _STIFFNESS, _FRICTION
+        geom.mass = 0.0
+        geom.contype = contype
+        geom.conaffinity = conaffinity
+        geom.solref[: len(_STIFFNESS)] = _STIFFNESS
+        geom.friction = _FRICTION
 
 
 def obstacle_body(obstacle: Obstacle) -> str:
@@ -244,7 +251,8 @@ def added_mass(areas: Sequence[float], density: float) -> Array:
     from scipy.special import elliprd  # whose package takes a while to load, and what draws the vehicle needs none
 
     r = semi_axes(areas)
-    squares, product = np.square(r), float(np.prod(r))
+    squares = np.square(r)
+    product = float(np.prod(r))
     alpha = 2.0 / 3.0 * product * elliprd(np.roll(squares, -1), np.roll(squares, -2), squares)
     return np.asarray(density * 4.0 / 3.0 * np.pi * product * alpha / (2.0 - alpha))
 

@@ -41,7 +41,9 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 Gains = Annotated[tuple[NonNegative, ...], Len(3, 3)]
 
-RATE, GYRO_CUTOFF, D_CUTOFF = 1000.0, 100.0, 60.0  # [Hz]
+RATE = 1000.0
+GYRO_CUTOFF = 100.0
+D_CUTOFF = 60.0  # [Hz]
 LARGEST_RATE: Final = (500.0, 500.0, 200.0)  # [deg/s]
 RATE_LOOP_DAMPING: Final = 0.7
 """Damping of the rate loop that the default gains aim at."""
@@ -106,11 +108,13 @@ class AutopilotSettings:
         filtering = 1.0 / (math.tau * usual.gyro_cutoff) if usual.gyro_cutoff else 0.0
         lag = (vehicle.rotor_rise or 0.0) + filtering + (usual.delay or 0.0) + 0.5 / rate
         w = min(FASTEST_RATE_LOOP, (1.0 + LARGEST_D) / (2.0 * RATE_LOOP_DAMPING * lag))
-        p, d = w * max(w * lag, 0.5 / RATE_LOOP_DAMPING), max(2.0 * RATE_LOOP_DAMPING * w * lag - 1.0, 0.0)
+        p = w * max(w * lag, 0.5 / RATE_LOOP_DAMPING)
+        d = max(2.0 * RATE_LOOP_DAMPING * w * lag - 1.0, 0.0)
         gains = filled(usual, p=(p, p, min(0.5 * p, 0.5 / lag)), d=(d, d, 0.0))
         assert gains.p is not None
         effect = np.abs(vehicle.allocation[1:]).sum(axis=1) / np.array(vehicle.inertia)
-        slowest, fastest = float(vehicle.hover_speeds.min()), float(vehicle.hover_speeds.max())
+        slowest = float(vehicle.hover_speeds.min())
+        fastest = float(vehicle.hover_speeds.max())
         reserve = min(slowest**2 - vehicle.speed_min**2, vehicle.speed_max**2 - fastest**2)
         return filled(
             gains,
@@ -146,7 +150,8 @@ class Autopilot(CompiledLoop):
         assert settings.delay is not None
         assert settings.largest_rate is not None
         assert settings.idle is not None
-        self.rate, step = settings.rate, 1.0 / settings.rate
+        self.rate = settings.rate
+        step = 1.0 / settings.rate
         rule = f"a whole number of periods of {step:g} s"
         delay = whole("autopilot", "delay", settings.delay, settings.delay * settings.rate, rule, smallest=0)
         if settings.idle * vehicle.speed_max >= (hover := float(vehicle.hover_speeds.min())):
@@ -154,18 +159,28 @@ class Autopilot(CompiledLoop):
             raise ParameterError("autopilot", "idle", settings.idle, rule)
         slowest, fastest = speeds or (settings.idle * vehicle.speed_max, vehicle.speed_max)
         a = InnerStruct(kind=LoopKind.AUTOPILOT, measures=1, step=step, airmode=bool(settings.airmode))
-        a.p[:], a.i[:], a.d[:], a.i_max[:] = settings.p, settings.i, settings.d, settings.i_max
-        a.attitude[:], a.largest[:] = settings.attitude, np.radians(settings.largest_rate)
+        a.p[:] = settings.p
+        a.i[:] = settings.i
+        a.d[:] = settings.d
+        a.i_max[:] = settings.i_max
+        a.attitude[:] = settings.attitude
+        a.largest[:] = np.radians(settings.largest_rate)
         a.gyro_share, a.d_share = (
             1.0 - math.exp(-math.tau * cutoff * step) if cutoff else 1.0
             for cutoff in (settings.gyro_cutoff, settings.d_cutoff)
         )
-        a.inertia[:], a.products[:] = vehicle.inertia, vehicle.products_of_inertia or (0.0, 0.0, 0.0)
+        a.inertia[:] = vehicle.inertia
+        a.products[:] = vehicle.products_of_inertia or (0.0, 0.0, 0.0)
         share = N_ROTORS * vehicle.thrust_shares
         fill(a.to_thrusts, np.linalg.inv(vehicle.allocation / vehicle.coefficients) / share[:, None])
-        b, (linear, quadratic) = vehicle.coefficients / share, vehicle.square_law
+        b = vehicle.coefficients / share
+        linear, quadratic = vehicle.square_law
         low, high = (b * (linear * speed + quadratic * speed**2) for speed in (slowest, fastest))
-        a.coefficient[:], a.low[:], a.high[:], a.linear[:], a.quadratic[:] = b, low, high, linear, quadratic
+        a.coefficient[:] = b
+        a.low[:] = low
+        a.high[:] = high
+        a.linear[:] = linear
+        a.quadratic[:] = quadratic
         super().__init__(a, delay=delay)
         self._hover = vehicle.hover_speeds
         self.reset()
@@ -179,16 +194,19 @@ class Autopilot(CompiledLoop):
         """Settle the filters at body rates (3,) [rad/s], and the commands under way at rotor speeds (4,) [rad/s]."""
         fill(self._struct.filtered, rates)
         fill(self._struct.slope, 0.0)
-        self._queue[:], self._struct.oldest = rotors, 0
+        self._queue[:] = rotors
+        self._struct.oldest = 0
 
 
 STEPS: Final = (0.1, 1.0, 1.0, 0.5)
 """Steps by which lags are identified: of the weight, and of body rates [rad/s]."""
 FIT_WINDOW: Final = 0.3  # time of a step response that is fitted [s]
-SHORTEST_FITTED_LAG, LONGEST_FITTED_LAG = 1e-4, 0.6  # [s]
+SHORTEST_FITTED_LAG = 1e-4
+LONGEST_FITTED_LAG = 0.6  # [s]
 ATTITUDE_STEP: Final = 0.1
 """Step by which lags of an attitude are identified [rad]."""
-SHORTEST_ATTITUDE_LAG, LONGEST_ATTITUDE_LAG = 0.01, 5.0  # [s]
+SHORTEST_ATTITUDE_LAG = 0.01
+LONGEST_ATTITUDE_LAG = 5.0  # [s]
 
 
 def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float = 1e-3) -> tuple[float, ...]:

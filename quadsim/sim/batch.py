@@ -75,12 +75,15 @@ class PlantBatch:
         """
         self._flights = (FlightStruct * count)()
         self._places: list[_Place | None] = [None] * count
-        self.steps, self._count = steps, count
+        self.steps = steps
+        self._count = count
         self._attended: set[int] = set()  # places where something changes or is drawn
         self._watched: set[int] = set()  # places where MuJoCo steps
         self._fields = _fields_of(self._flights)
-        self.state, self.acting = self._fields["state"], self._fields["acting"]
-        self.reference, self.measured = self._fields["reference"], self._fields["measured"]
+        self.state = self._fields["state"]
+        self.acting = self._fields["acting"]
+        self.reference = self._fields["reference"]
+        self.measured = self._fields["measured"]
         self.smallest, self.at_end = np.full((2, count, limits), np.inf)
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self._ranges = _ranges(count, threads)
@@ -123,22 +126,28 @@ class PlantBatch:
             plant.begin(self.steps)
         flight = self._flights[place]
         vehicle, rows = plant.structs
-        flight.vehicle, flight.rows = ctypes.addressof(vehicle), ctypes.addressof(rows)
+        flight.vehicle = ctypes.addressof(vehicle)
+        flight.rows = ctypes.addressof(rows)
         struct: Struct | None = None
         flight.loop = None
         if loop is not None:
             struct = loop.engage(np.zeros(N_ROTORS), speeds)
             assert struct is not None
-            struct.stride, struct.until = inner_steps(loop.rate, plant.timestep), 0
+            struct.stride = inner_steps(loop.rate, plant.timestep)
+            struct.until = 0
             flight.loop = ctypes.addressof(struct)
-        rows.row, flight.period = 0, self.steps
+        rows.row = 0
+        flight.period = self.steps
         flight.sensing = None if sensing is None else ctypes.addressof(sensing)
-        flight.bounds, flight.bounded = None, 0
+        flight.bounds = None
+        flight.bounded = 0
         if margins is not None:
             assert margins.compiled
             assert len(margins.limits) == self.smallest.shape[1]
-            flight.bounds, flight.bounded = ctypes.addressof(margins.bounds), len(margins.limits)
-            flight.smallest, flight.at_end = self.smallest[place].ctypes.data, self.at_end[place].ctypes.data
+            flight.bounds = ctypes.addressof(margins.bounds)
+            flight.bounded = len(margins.limits)
+            flight.smallest = self.smallest[place].ctypes.data
+            flight.at_end = self.at_end[place].ctypes.data
             self.smallest[place], self.at_end[place] = margins.of_start(plant.physics, speeds)
         flight.yaw = flight.upright = float(state[INDEX["yaw"]])
         physics = plant.physics

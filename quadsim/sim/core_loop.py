@@ -82,9 +82,13 @@ class _Flight:
         periods: int,
         steps: int,
     ) -> None:
-        self._law, self._plant, self._navigation, self._steps = law, plant, navigation, steps
+        self._law = law
+        self._plant = plant
+        self._navigation = navigation
+        self._steps = steps
         self._reference = np.ascontiguousarray(reference)
-        self._start, self._rotors = plant.physics, plant.speeds
+        self._start = plant.physics
+        self._rotors = plant.speeds
         self._truth = np.empty((periods, N_STATES))
         self._state = self._truth if navigation is None else np.empty_like(self._truth)
         self._step_s = np.zeros(periods)
@@ -104,7 +108,9 @@ class _Flight:
 
     def step(self, k: int, loss: Mapping[str, float]) -> bool:
         """Fly a control period; return whether it was as usual."""
-        plant, navigation, reference = self._plant, self._navigation, self._reference
+        plant = self._plant
+        navigation = self._navigation
+        reference = self._reference
         truth = plant.state()
         state = truth if navigation is None else navigation.state()
         self._truth[k] = truth
@@ -129,7 +135,9 @@ class _Flight:
 
     def log(self) -> FlightLog:
         """Return the log of all periods."""
-        law, plant, count = self._law, self._plant, len(self._truth)
+        law = self._law
+        plant = self._plant
+        count = len(self._truth)
         t = instants(count, self._steps * plant.timestep)
         statistics: dict[str, Any] = {name: np.full(count, np.nan) for name in RESIDUALS}
         statistics |= law.statistics

@@ -149,10 +149,12 @@ class ErrorStateFilter:
             if min(noise) <= 0.0:
                 rule = "positive on every axis, for the estimator to weigh it"
                 raise ParameterError(f"sensors.{name}", "noise", sensors[name].noise, rule)
-        self.settings, self._names = settings, tuple(sensors)
+        self.settings = settings
+        self._names = tuple(sensors)
         self._horizon = max(sensor.latency(name, timestep) for name, sensor in sensors.items())
         f = self.struct = FilterStruct(timestep=timestep, mass=vehicle.mass, gravity=vehicle.gravity)
-        f.inertia[:], f.products[:] = vehicle.inertia, vehicle.products_of_inertia or (0.0, 0.0, 0.0)
+        f.inertia[:] = vehicle.inertia
+        f.products[:] = vehicle.products_of_inertia or (0.0, 0.0, 0.0)
         fill(f.inverse, np.linalg.inv(vehicle.inertia_matrix))
         if settings.moment:
             vehicle.require_moment("estimator")
@@ -189,14 +191,17 @@ class ErrorStateFilter:
         a, b, c = error[6:9].tolist()
         moved[MEAN_QUATERNION] = normalise(multiply((w, x, y, z), exponential((a, b, c))))
         t.mean[:] = moved
-        self._step, self._base = 0, 0
-        self._commands, self._grounded = np.empty((0, N_ROTORS)), np.empty(0, np.uint8)
+        self._step = 0
+        self._base = 0
+        self._commands = np.empty((0, N_ROTORS))
+        self._grounded = np.empty(0, np.uint8)
         self._waiting = np.empty(0, SAMPLE)
 
     @property
     def tallies(self) -> dict[SensorName, Tally]:
         """Counts of each sensor's samples; those after the fusion horizon are not yet included."""
-        t, kinds = self.track, {name: KINDS[name] for name in self._names}
+        t = self.track
+        kinds = {name: KINDS[name] for name in self._names}
         return {name: Tally(accepted=t.accepted[k], rejected=t.rejected[k], nis=t.nis[k]) for name, k in kinds.items()}
 
     def advance(self, commands: Array, samples: Sequence[NDArray[np.void]], *, on_ground: bool = False) -> None:
@@ -216,7 +221,8 @@ class ErrorStateFilter:
         self._run(self.track, waiting[:ripe], until=-1)
         self._waiting = waiting[ripe:]
         used = self.track.step - self._base
-        self._commands, self._grounded = self._commands[used:], self._grounded[used:]
+        self._commands = self._commands[used:]
+        self._grounded = self._grounded[used:]
         self._base = self.track.step
 
     def estimate(self) -> tuple[Array, Array]:

@@ -140,8 +140,11 @@ class ClosedLoop:
         plant.reset(initial_state, initial_speeds)
         controller.reset(initial_speeds)
         _begin(controller, plant)
-        self.k, self.period = 0, steps_per_period * plant.timestep
-        self.controller, self.computation, self.motion = controller, computation, motion
+        self.k = 0
+        self.period = steps_per_period * plant.timestep
+        self.controller = controller
+        self.computation = computation
+        self.motion = motion
         self.answered = 0.0
         self.before: Callable[[int], None] | None = None
         self.reason: str | None = None
@@ -153,10 +156,14 @@ class ClosedLoop:
             navigation.reset(plant.physics, initial_speeds, yaw=self._yaw)
         if ground is not None:
             ground.reset()
-        self._plant, self._navigation, self._ground = plant, navigation, ground
+        self._plant = plant
+        self._navigation = navigation
+        self._ground = ground
         self._turns = ReferenceTurns()
         self.course: Reference = Rows(values=reference) if isinstance(reference, np.ndarray) else reference
-        self._steps, self._loss, self.quaternions = steps_per_period, loss, quaternions
+        self._steps = steps_per_period
+        self._loss = loss
+        self.quaternions = quaternions
         self._draws = rng if rng is not None else np.random.default_rng(0)
         self._start = plant.physics
         self._initial_speeds = np.array(initial_speeds, float)
@@ -169,7 +176,8 @@ class ClosedLoop:
         self._schedule: deque[list[Hold]] = deque([held] * self._under_way)
         self._speeds = self._initial_speeds  # the rotor speeds commanded last
         self._flying: _Flying | None = None  # the inner loop called last
-        self._plan, self._age = self._acting[None], 0  # the last plan that came in time, and how many periods ago
+        self._plan = self._acting[None]
+        self._age = 0  # the last plan that came in time, and how many periods ago
         self._observed: Observation | None = None
         self._samples: list[Period] | None = [] if recorded else None
         self.last: Period | None = None
@@ -210,7 +218,8 @@ class ClosedLoop:
                 controller.adopt(self.controller)
         if self.k > self._switched:
             self._predicted.append(self._predict())
-        self.controller, self._switched = controller, self.k
+        self.controller = controller
+        self._switched = self.k
 
     @property
     def truth(self) -> Array:
@@ -262,7 +271,9 @@ class ClosedLoop:
         except FlightError as error:
             self._end(error)
             raise
-        self.k, self._observed, self.last = self.k + 1, None, sample
+        self.k = self.k + 1
+        self._observed = None
+        self.last = sample
         if self._samples is not None:
             self._samples.append(sample)
         return sample
@@ -280,7 +291,8 @@ class ClosedLoop:
         """
         if self._samples is None:
             raise InputError("no period of this flight was recorded: it was begun with recorded=False")
-        timestep, start = self._plant.timestep, self._start
+        timestep = self._plant.timestep
+        start = self._start
         log = flight_log(
             self._samples, start, self._initial_speeds, self._yaw, self.period, timestep, quaternions=self.quaternions
         )
@@ -306,14 +318,17 @@ class ClosedLoop:
         self._traceback = error.traceback if isinstance(error, RaisedError) else ()
 
     def _observe(self) -> Observation:
-        k, plant, navigation = self.k, self._plant, self._navigation
+        k = self.k
+        plant = self._plant
+        navigation = self._navigation
         if self.before is not None:
             self.before(k)
         truth = plant.state()
         state = truth.copy() if navigation is None else navigation.state()
         attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
         rows = self.followed(float(state[INDEX["yaw"]]))
-        row, preview = rows[0], rows[1:]
+        row = rows[0]
+        preview = rows[1:]
         phase = Phase.FLYING
         if self._ground is not None:
             since = self._start[None] if self.last is None else self.last.steps["physics"]
@@ -334,7 +349,8 @@ class ClosedLoop:
 
     def _predict(self) -> _Prediction:
         """Predict the controller's periods; nothing where it has no model, or raised."""
-        controller, samples = self.controller, (self._samples or [])[self._switched :]
+        controller = self.controller
+        samples = (self._samples or [])[self._switched :]
         nothing = _Prediction(len(samples), None, None)
         if not samples or not isinstance(controller, Predicting | Foreseeing):
             return nothing
@@ -355,7 +371,9 @@ class ClosedLoop:
 
     def _asked(self, observed: Observation) -> tuple[StepInputs, Array, Array]:
         """Return a controller's inputs; the reference is raised where it has to be for the vehicle to take off."""
-        now, state, preview = observed.moment, observed.state, observed.preview
+        now = observed.moment
+        state = observed.state
+        preview = observed.preview
         if self._ground is None or now.phase in GROUNDED:
             return now, state, preview
         thrust = float(np.sum(np.square(self._plant.speeds)))
@@ -368,7 +386,10 @@ class ClosedLoop:
         return replace(now, motion=None if now.motion is None else now.motion.raised(lead)), state, raised
 
     def _fly(self, observed: Observation, command: Command | None) -> Period:
-        plant, computation, steps, now = self._plant, self.computation, self._steps, observed.moment
+        plant = self._plant
+        computation = self.computation
+        steps = self._steps
+        now = observed.moment
         step_s = 0.0
         if command is None:
             started = clock.perf_counter()
@@ -390,10 +411,14 @@ class ClosedLoop:
             self._age += 1
             acting = planned if holds[1][2] else self._acting
         else:
-            acting, self._plan, self._age, self._inner = command.speeds, command.plan, 0, command.inner
+            acting = command.speeds
+            self._plan = command.plan
+            self._age = 0
+            self._inner = command.inner
             holds.append((self._inner, acting, steps - wait))
         self._schedule.append(holds)
-        before, on_ground = plant.physics, now.phase in (Phase.LANDED, Phase.ARMED)
+        before = plant.physics
+        on_ground = now.phase in (Phase.LANDED, Phase.ARMED)
         plant.begin(steps)
         sensing = None if self._navigation is None else self._navigation.begin(steps)
         for loop, row, count in self._schedule.popleft():
@@ -428,7 +453,8 @@ class ClosedLoop:
             plant.hold(row, steps, sensing=sensing)
             return
         with _ending_flight(plant.time):
-            flying, fresh = self._flying, self._flying is None or self._flying.inner is not inner
+            flying = self._flying
+            fresh = self._flying is None or self._flying.inner is not inner
             if fresh:
                 self._flying = flying = _Flying(inner, inner_steps(inner.rate, plant.timestep))
             assert flying is not None
@@ -450,7 +476,9 @@ class _Flying:
     """An inner loop in force: its stride, whether it measures, and its place in the core where that does not answer."""
 
     def __init__(self, inner: InnerLoop, stride: int) -> None:
-        self.inner, self.stride, self.struct = inner, stride, InnerStruct()
+        self.inner = inner
+        self.stride = stride
+        self.struct = InnerStruct()
         self.measures = takes_targets(inner)
         self.engage = inner.engage if isinstance(inner, Engaging) else None
 

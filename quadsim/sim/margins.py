@@ -48,9 +48,11 @@ class Margins:
             bound = self.bounds[i]
             if not _translate(limit, bound):
                 self._others.append(i)
-                bound.first, bound.last = 0, -1
+                bound.first = 0
+                bound.last = -1
                 continue
-            bound.lower, bound.upper = limit.lower, limit.upper
+            bound.lower = limit.lower
+            bound.upper = limit.upper
             bound.first = _step_at(limit.start, timestep, after=True)
             bound.last = _step_at(limit.stop, timestep, after=False)
         self.compiled = not self._others
@@ -70,7 +72,9 @@ class Margins:
         physics = np.ascontiguousarray(physics, np.float64)
         rotors = np.ascontiguousarray(rotors, np.float64)
         truth = physics_to_state(physics[None])[0]
-        start.before, start.rotors, start.truth = physics.ctypes.data, rotors.ctypes.data, truth.ctypes.data
+        start.before = physics.ctypes.data
+        start.rotors = rotors.ctypes.data
+        start.truth = truth.ctypes.data
         smallest, at_end = self._compute(start)
         if self._others:
             plant = PlantLog(t=np.zeros(1), state=truth[None], speeds=rotors[None])
@@ -80,7 +84,9 @@ class Margins:
 
     def of_period(self, period: Period) -> tuple[Array, Array]:
         """(m,) smallest margins within a control period, its start left out, and at its end; inf where none applies."""
-        observed, moment, steps = period.observation, period.observation.moment, period.steps
+        observed = period.observation
+        moment = period.observation.moment
+        steps = period.steps
         assert moment.acting is not None
         assert steps.dtype.fields is not None
         flown = PeriodStruct()
@@ -99,7 +105,8 @@ class Margins:
         at = steps.ctypes.data
         for name in ("physics", "speeds", "thrust"):
             setattr(flown, name, at + steps.dtype.fields[name][1])
-        flown.width, flown.count = steps.itemsize // 8, len(steps)
+        flown.width = steps.itemsize // 8
+        flown.count = len(steps)
         flown.start = round(moment.time / self._timestep)
         flown.targeted = period.target is not None
         smallest, at_end = self._compute(flown)
@@ -162,20 +169,26 @@ def _translate(limit: Limit, bound: Any) -> bool:
             bound.terms = k + 1
         bound.signal = constant("SIGNAL_SUM")
     elif name in INDEX:
-        bound.signal, bound.terms = constant("SIGNAL_SUM"), 1
-        bound.index[0], bound.factor[0] = INDEX[name], _scale(INDEX[name])
+        bound.signal = constant("SIGNAL_SUM")
+        bound.terms = 1
+        bound.index[0] = INDEX[name]
+        bound.factor[0] = _scale(INDEX[name])
     elif name in ("tilt", "thrust", "speed", "slew"):
         bound.signal = constant(f"SIGNAL_{name.upper()}")
         bound.factor[0] = _DEGREE if name == "tilt" else 1.0
     elif name.startswith("body_rate_"):
-        bound.signal, bound.axis = constant("SIGNAL_BODY_RATE"), "xyz".index(name[-1])
+        bound.signal = constant("SIGNAL_BODY_RATE")
+        bound.axis = "xyz".index(name[-1])
         bound.factor[0] = _DEGREE
     elif name.endswith("_estimate_error"):
         state = INDEX[name.removesuffix("_estimate_error")]
-        bound.signal, bound.axis, bound.factor[0] = constant("SIGNAL_ESTIMATE"), state, _scale(state)
+        bound.signal = constant("SIGNAL_ESTIMATE")
+        bound.axis = state
+        bound.factor[0] = _scale(state)
     elif name.endswith("_error"):
         tracked = name.removesuffix("_error")
-        bound.signal, bound.axis = constant("SIGNAL_ERROR"), REFERENCE_NAMES.index(tracked)
+        bound.signal = constant("SIGNAL_ERROR")
+        bound.axis = REFERENCE_NAMES.index(tracked)
         bound.factor[0] = _scale(INDEX[tracked])
     else:
         return False

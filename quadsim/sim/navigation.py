@@ -99,7 +99,9 @@ class Navigation:
 
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
         """Restart at MuJoCo's state (14,) and rotor speeds [rad/s] with the same draws; yaw is near `yaw` [rad]."""
-        self._step, self._yaw, self._physics = 0, YawTurns(yaw), physics.copy()
+        self._step = 0
+        self._yaw = YawTurns(yaw)
+        self._physics = physics.copy()
         self._prepared = 0  # physics steps for whose samples there is room
         self.attitude: tuple[Array, Array] = physics[PHYSICS["attitude"]].copy(), physics[PHYSICS["body_rates"]].copy()
         samplers = self._samplers
@@ -110,7 +112,9 @@ class Navigation:
         self._passed = [0] * len(samplers)  # samples that the filter has
         for sampler, struct in zip(samplers, self._structs, strict=False):
             sampler.reset()
-            struct.kind, struct.stride, struct.latency = KINDS[sampler.name], sampler.stride, sampler.latency
+            struct.kind = KINDS[sampler.name]
+            struct.stride = sampler.stride
+            struct.latency = sampler.latency
             struct.held[:] = truth(sampler.name, physics[None])[0]
         if self.filter is not None:
             known = [physics[PHYSICS[name]] for name in ("position", "velocity", "attitude", "body_rates")]
@@ -131,7 +135,8 @@ class Navigation:
         """Record the flight since `begin`; `on_ground` is the land detector's state at its start."""
         if not len(flown):
             return
-        self._step, self._physics = self._step + len(flown), flown["physics"][-1].copy()
+        self._step = self._step + len(flown)
+        self._physics = flown["physics"][-1].copy()
         self._hear(self._step, self._physics)
         if self.filter is not None:
             self.filter.advance(flown["commands"], self._arrived(), on_ground=on_ground)
@@ -147,7 +152,8 @@ class Navigation:
 
     def state(self) -> Array:
         """Return (12,) the state that the controller receives now: the paper's order, yaw unwrapped."""
-        row, angles = self._physics.copy(), None
+        row = self._physics.copy()
+        angles = None
         if self.filter is not None:
             mean, _ = self.filter.estimate()
             self._sensing.bias[:] = mean[MEAN_GYRO_BIAS]
@@ -159,7 +165,8 @@ class Navigation:
                     row[PHYSICS["attitude"]] = euler_to_quaternion(angles)
                 else:
                     row[MEASURED[sampler.name]] = struct.held
-        quaternion, rates = row[PHYSICS["attitude"]], row[PHYSICS["body_rates"]]
+        quaternion = row[PHYSICS["attitude"]]
+        rates = row[PHYSICS["body_rates"]]
         sign = -1.0 if quaternion @ self.attitude[0] < 0.0 else 1.0
         self.attitude = sign * quaternion, rates
         if angles is None:
@@ -185,17 +192,23 @@ class Navigation:
         """
         if stop <= self._prepared:
             return
-        start, stop = self._prepared, stop + _AHEAD
+        start = self._prepared
+        stop = stop + _AHEAD
         self._prepared = stop
         for k, sampler in enumerate(self._samplers):
-            struct, (values, fates) = self._structs[k], self._samples[k]
-            first, end = -(-start // struct.stride), -(-stop // struct.stride)
+            struct = self._structs[k]
+            values, fates = self._samples[k]
+            first = -(-start // struct.stride)
+            end = -(-stop // struct.stride)
             heard = struct.heard if self.filter is None else min(struct.heard, self._passed[k])
             drop = max(min(heard, first) - struct.first, 0)
             errors, fresh = sampler.draw(first, end - first)
-            values, fates = np.concatenate([values[drop:], errors]), np.concatenate([fates[drop:], fresh])
-            self._samples[k], struct.first = (values, fates), struct.first + drop
-            struct.values, struct.fate = values.ctypes.data, fates.ctypes.data
+            values = np.concatenate([values[drop:], errors])
+            fates = np.concatenate([fates[drop:], fresh])
+            self._samples[k] = (values, fates)
+            struct.first = struct.first + drop
+            struct.values = values.ctypes.data
+            struct.fate = fates.ctypes.data
 
     def _hear(self, step: int, physics: Array) -> None:
         """Hold the newest sample of each sensor to arrive by a physics step, at MuJoCo's state (14,)."""
@@ -206,13 +219,15 @@ class Navigation:
         """Return the samples that have arrived since the last call, without lost ones."""
         arrived = []
         for k, (values, fates) in enumerate(self._samples):
-            struct, passed = self._structs[k], self._passed[k]
+            struct = self._structs[k]
+            passed = self._passed[k]
             last = (self._step - struct.latency) // struct.stride + 1
             if last <= passed:
                 continue
             rows = slice(passed - struct.first, last - struct.first)
             fresh = np.empty(last - passed, SAMPLE)
-            fresh["taken"], fresh["kind"] = struct.stride * np.arange(passed, last), struct.kind
+            fresh["taken"] = struct.stride * np.arange(passed, last)
+            fresh["kind"] = struct.kind
             fresh["value"] = values[rows]
             arrived.append(fresh[fates[rows] & Fate.LOST == 0])
             self._passed[k] = last

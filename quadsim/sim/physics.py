@@ -183,7 +183,8 @@ def flight_log(
         rates = np.array([moment.body_rates for moment in moments], float).reshape(-1, 3)
         control = replace(control, attitude=attitudes, body_rates=rates)
         physics = np.concatenate([start[None], *(sample.steps["physics"] for sample in samples)])
-        attitude, body_rates = physics[:, PHYSICS["attitude"]], physics[:, PHYSICS["body_rates"]]
+        attitude = physics[:, PHYSICS["attitude"]]
+        body_rates = physics[:, PHYSICS["body_rates"]]
         plant = replace(plant, attitude=attitude, body_rates=body_rates)
     if control.target is not None:
         thrust = np.concatenate([_thrusts(sample) for sample in samples])
@@ -193,7 +194,9 @@ def flight_log(
 
 def one_period(sample: Period, timestep: float) -> PeriodLog:
     """Return what the margins of a control period take."""
-    observed, moment, steps = sample.observation, sample.observation.moment, sample.steps
+    observed = sample.observation
+    moment = sample.observation.moment
+    steps = sample.steps
     assert moment.acting is not None
     target = None if sample.target is None else sample.target[None, :4]
     t = moment.time + timestep * np.arange(len(steps) + 1)

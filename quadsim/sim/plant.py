@@ -99,12 +99,14 @@ class Plant:
         self.vehicle = vehicle
         self.timestep = timestep
         self.effects = effects
-        self._load, air = effects.load or _AS_IN_THE_FILE, effects.air or Air()
+        self._load = effects.load or _AS_IN_THE_FILE
+        air = effects.air or Air()
         self._reweighed = self._load != _AS_IN_THE_FILE or any(isinstance(change, LOADING) for change in changes)
         self._moving = [obstacle for obstacle in obstacles if obstacle.moves]
         self._speed_range = (vehicle.speed_min, vehicle.speed_max) if limit_speeds else (0.0, math.inf)
         self._yaw = YawTurns(0.0)
-        self._wind, self._own = wind, tuple(forces)
+        self._wind = wind
+        self._own = tuple(forces)
         self._integrator = integrator
         self._motion: Array = np.zeros(_MOTION)
         self._velocity = self._motion[_POSE:]
@@ -124,7 +126,8 @@ class Plant:
                 obstacles=obstacles,
             )
             self._data = mujoco.MjData(self.model)
-            self._motion, self._velocity = self._data.qpos, self._data.qvel
+            self._motion = self._data.qpos
+            self._velocity = self._data.qvel
             mujoco.set_mju_user_warning(_discard)
         pushed = any(isinstance(change, PushChange) for change in changes)
         self._follows_motion = effects.follows_state or wind is not None or bool(self._own) or pushed
@@ -249,17 +252,26 @@ class Plant:
 
     def _make_struct(self) -> Struct:
         """Return the core's vehicle, with all that does not change."""
-        v, vehicle, effects, data = VehicleStruct(), self.vehicle, self.effects, self._data
-        v.timestep, v.plausible, v.fastest_valid = self.timestep, _PLAUSIBLE, LARGEST_SPEED
+        v = VehicleStruct()
+        vehicle = self.vehicle
+        effects = self.effects
+        data = self._data
+        v.timestep = self.timestep
+        v.plausible = _PLAUSIBLE
+        v.fastest_valid = LARGEST_SPEED
         v.gravity = vehicle.gravity
         _weigh(v, vehicle.mass, vehicle.inertia_matrix)
         v.linear, quadratic = vehicle.thrust_law
-        v.coefficient[:], v.hover = quadratic, vehicle.hover_speed
+        v.coefficient[:] = quadratic
+        v.hover = vehicle.hover_speed
         # Power is torque times speed, (a_1 w + a_2 w^2) w; of each rotor at hover speed, over the mean rotor's.
-        ratios, mean = vehicle.hover_speeds / vehicle.hover_speed, vehicle.mean_coefficient
-        power, linear_power = quadratic / mean, v.linear / (mean * vehicle.hover_speed)
+        ratios = vehicle.hover_speeds / vehicle.hover_speed
+        mean = vehicle.mean_coefficient
+        power = quadratic / mean
+        linear_power = v.linear / (mean * vehicle.hover_speed)
         total = float(power @ ratios**3) + linear_power * float((ratios**2).sum())
-        v.demand[:], v.linear_demand = N_ROTORS * power / total, N_ROTORS * linear_power / total
+        v.demand[:] = N_ROTORS * power / total
+        v.linear_demand = N_ROTORS * linear_power / total
         v.slowest, v.fastest = self._speed_range
         v.spin[:] = [float(spin) for spin in vehicle.rotor_spins]
         fill(v.place, vehicle.hubs)
@@ -268,43 +280,61 @@ class Plant:
             v.rotor_inertia = effects.rotors.inertia or 0.0
         if (air := effects.air) is not None:
             v.rotor_drag = air.rotor_drag or 0.0
-            v.rotor_moment[:], v.rate_damping[:] = air.rotor_moment or (0.0, 0.0), air.rate_damping or (0.0, 0.0, 0.0)
+            v.rotor_moment[:] = air.rotor_moment or (0.0, 0.0)
+            v.rate_damping[:] = air.rate_damping or (0.0, 0.0, 0.0)
             if air.inflow_moment is not None:  # of which MuJoCo's ellipsoid gives a part
                 by_body = (0.0, 0.0) if air.body_drag is None else munk_moment(air.body_drag, air.density)
                 v.inflow_moment[:] = np.subtract(air.inflow_moment, by_body)
             v.inflow = air.inflow or 0.0
-            v.linear_drag[:], v.quadratic_drag[:] = air.linear_drag, air.quadratic_drag
+            v.linear_drag[:] = air.linear_drag
+            v.quadratic_drag[:] = air.quadratic_drag
         if (ground := effects.ground) is not None and ground.effect:
             shape = outline(vehicle)
-            v.floor, v.disc, v.radius = shape.floor, shape.disc, ground.rotor_radius
+            v.floor = shape.floor
+            v.disc = shape.disc
+            v.radius = ground.rotor_radius
         if (noise := effects.thrust_noise) is not None:
-            v.loss, v.deviation = noise.loss, noise.deviation
+            v.loss = noise.loss
+            v.deviation = noise.deviation
             v.largest[:] = vehicle.thrusts(np.full(N_ROTORS, vehicle.speed_max))
         if (battery := effects.battery) is not None:
             self._curve = np.array(battery.curve)
-            v.curve, v.points = self._curve.ctypes.data, len(self._curve)
-            v.cells, v.capacity, v.resistance = battery.cells, battery.capacity, battery.resistance
-            v.hover_current, v.idle_current = battery.hover_current, battery.idle_current
-            v.reference_voltage, v.exponent = battery.reference_voltage, battery.exponent
-        v.motion, v.velocity = self._motion.ctypes.data, self._velocity.ctypes.data
+            v.curve = self._curve.ctypes.data
+            v.points = len(self._curve)
+            v.cells = battery.cells
+            v.capacity = battery.capacity
+            v.resistance = battery.resistance
+            v.hover_current = battery.hover_current
+            v.idle_current = battery.idle_current
+            v.reference_voltage = battery.reference_voltage
+            v.exponent = battery.exponent
+        v.motion = self._motion.ctypes.data
+        v.velocity = self._velocity.ctypes.data
         if self._integrator == "rk4":
             return v
         v.step = step_address()
         v.model, v.data = addresses(self.model, data)
-        v.applied, v.control = data.qfrc_applied.ctypes.data, data.ctrl.ctypes.data
+        v.applied = data.qfrc_applied.ctypes.data
+        v.control = data.ctrl.ctypes.data
         if air is not None and air.body_drag is not None:
             v.fluid = data.qfrc_fluid.ctypes.data
             v.wind = self.model.opt.wind.ctypes.data if self._wind is not None else None
         if self._moving:
-            v.obstacles, v.mocaps = data.mocap_pos.ctypes.data, len(self._moving)
+            v.obstacles = data.mocap_pos.ctypes.data
+            v.mocaps = len(self._moving)
         return v
 
     def _tell(self) -> None:
         """Tell the core what events change."""
-        v, rotors = self._struct, self._rotors
-        v.rise, v.fall, v.acceleration = rotors.rise or 0.0, rotors.fall or 0.0, rotors.acceleration or 0.0
-        v.at_once, v.efficiency[:] = rotors.at_once, self._efficiency
-        v.pushes, v.pushing = self._pushes.ctypes.data, len(self._pushes)
+        v = self._struct
+        rotors = self._rotors
+        v.rise = rotors.rise or 0.0
+        v.fall = rotors.fall or 0.0
+        v.acceleration = rotors.acceleration or 0.0
+        v.at_once = rotors.at_once
+        v.efficiency[:] = self._efficiency
+        v.pushes = self._pushes.ctypes.data
+        v.pushing = len(self._pushes)
         v.follows_motion = self._forced or len(self._pushes) > 0
 
     def state(self) -> Array:
@@ -331,7 +361,8 @@ class Plant:
 
     def begin(self, steps: int) -> None:
         """Begin a period of M physics steps: `hold` fills its rows."""
-        flown, rows = np.empty(steps, self._steps_type), StepsStruct()
+        flown = np.empty(steps, self._steps_type)
+        rows = StepsStruct()
         assert flown.dtype.fields is not None
         at = flown.ctypes.data
         for name, (_, offset, *_) in flown.dtype.fields.items():
@@ -346,7 +377,9 @@ class Plant:
             drawn["obstacles"] = np.empty((steps, 3 * len(self._moving)))
         for name, array in drawn.items():
             setattr(rows, name, array.ctypes.data)
-        self.flown, self._rows, self._drawn = flown, rows, drawn
+        self.flown = flown
+        self._rows = rows
+        self._drawn = drawn
 
     def hold(
         self,
@@ -373,7 +406,8 @@ class Plant:
         """
         if loop is None and (problem := check_command(command)) is not None:
             raise CommandError(problem, time=self.time)
-        command, end = np.ascontiguousarray(command, dtype=np.float64), self._step + steps
+        command = np.ascontiguousarray(command, dtype=np.float64)
+        end = self._step + steps
         while self._step < end:
             staged = self.stage(end - self._step)
             self._fly(self._step + staged, command, loop, sensing, ask)
@@ -387,7 +421,9 @@ class Plant:
         ask: Answers | None,
     ) -> None:
         """Let the core fly to a physics step while only vehicle and air change."""
-        v, rows, fly = self._struct, self._rows, core_library().quadsim_fly
+        v = self._struct
+        rows = self._rows
+        fly = core_library().quadsim_fly
         while self._step < end:
             why = fly(v, loop, sensing, rows, command.ctypes.data, end)
             complaint = core_library().quadsim_complaint() if why == End.FAILED else b""
@@ -452,7 +488,8 @@ class Plant:
 
     def _draw(self, steps: int) -> None:
         """Draw for the next steps of the period."""
-        rows, drawn = slice(self._rows.row, self._rows.row + steps), self._drawn
+        rows = slice(self._rows.row, self._rows.row + steps)
+        drawn = self._drawn
         of_noise, of_disturbance = self._ahead
         if self._wind is not None:
             self.flown["wind"][rows] = self._wind.advance(steps)
@@ -509,7 +546,8 @@ class Plant:
         self._tell()
 
     def _carry(self, payloads: tuple[Payload, ...], mass_factor: float) -> None:
-        self._payloads, self._mass_factor = payloads, mass_factor
+        self._payloads = payloads
+        self._mass_factor = mass_factor
         load = replace(self._load, mass_factor=mass_factor)
         properties = mass_properties(self.vehicle, load, payloads)
         if self._integrator == "rk4":
@@ -524,7 +562,8 @@ class Plant:
             ForceError: a force is not six finite numbers.
             RaisedError: a force raised an exception.
         """
-        time, total = self.time, np.zeros(6)
+        time = self.time
+        total = np.zeros(6)
         state = physics_to_state(self.physics[None])[0]
         for force in self._own:
             name = getattr(force, "__name__", type(force).__name__)
@@ -548,14 +587,17 @@ class NormalsAhead:
     """Standard normal numbers of a generator, in its order, drawn in blocks: many small calls are slow."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._rng, self._block, self._used = rng, np.empty(0), 0
+        self._rng = rng
+        self._block = np.empty(0)
+        self._used = 0
 
     def standard_normal(self, size: tuple[int, int]) -> Array:
         """As of `numpy.random.Generator`."""
         count = size[0] * size[1]
         if self._used + count > self._block.size:
             fresh = self._rng.standard_normal(max(_BLOCK, count))
-            self._block, self._used = np.concatenate([self._block[self._used :], fresh]), 0
+            self._block = np.concatenate([self._block[self._used :], fresh])
+            self._used = 0
         numbers = self._block[self._used : self._used + count]
         self._used += count
         return numbers.reshape(size)

@@ -159,10 +159,12 @@ class Sampler:
         faults: tuple[SensorFault, ...],
         rng: np.random.Generator,
     ) -> None:
-        self.name, self._sensor = name, sensor
+        self.name = name
+        self._sensor = sensor
         self.stride = sensor.stride(name, timestep)
         self.latency = sensor.latency(name, timestep)
-        self._noise, self._bias = np.array(in_si(name, sensor.noise)), np.array(in_si(name, sensor.bias))
+        self._noise = np.array(in_si(name, sensor.noise))
+        self._bias = np.array(in_si(name, sensor.bias))
         self._step = np.array(in_si(name, sensor.bias_walk)) * math.sqrt(self.stride * timestep)
         self._timestep = timestep
         self.reschedule(faults)
@@ -181,7 +183,8 @@ class Sampler:
             generator.bit_generator.state = state
         self._walked: Array | None = None
         self._first = 0  # of the samples whose draws are kept
-        self._errors, self._fates = np.empty((0, 3)), np.empty(0, np.uint8)
+        self._errors = np.empty((0, 3))
+        self._fates = np.empty(0, np.uint8)
 
     def draw(self, first: int, count: int) -> tuple[Array, Fates]:
         """Draw the errors (count, 3) of the samples from number `first` on, and what befalls each (count,).
@@ -191,14 +194,16 @@ class Sampler:
         """
         past = first - self._first
         self._first = first
-        self._errors, self._fates = self._errors[past:], self._fates[past:]
+        self._errors = self._errors[past:]
+        self._fates = self._fates[past:]
         missing = count - len(self._errors)
         if missing > 0:
             errors = self._walk(missing) + self._draw_noise(missing) + 0.0  # turns -0 into 0
             lost = self._of_dropout.random(missing) < self._sensor.dropout
             self._errors = np.concatenate([self._errors, errors])
             self._fates = np.concatenate([self._fates, lost.astype(np.uint8) * np.uint8(Fate.LOST)])
-        errors, fates = self._errors[:count].copy(), self._fates[:count].copy()
+        errors = self._errors[:count].copy()
+        fates = self._fates[:count].copy()
         if not self._faults:
             return errors, fates
         taken = self.stride * np.arange(first, first + count)
@@ -228,7 +233,8 @@ class Sampler:
 
     def _draw_noise(self, count: int) -> Array:
         noise = self._noise * self._of_noise.standard_normal((count, 3))
-        draws, outliers = self._of_outliers.random(count), self._sensor.outliers
+        draws = self._of_outliers.random(count)
+        outliers = self._sensor.outliers
         if outliers is not None:
             noise[draws < outliers.probability] *= outliers.size
         return noise

@@ -39,7 +39,8 @@ def judged_by(
         )
     held_all = np.ones(table.num_rows, bool)
     for limit in limits:
-        margin, sampled = numbers(table, MARGIN + limit.name), numbers(table, SAMPLED + limit.name)
+        margin = numbers(table, MARGIN + limit.name)
+        sampled = numbers(table, SAMPLED + limit.name)
         unknown = null(table, SATISFIED + limit.name)
         held = ~unknown & np.isfinite(margin) & ~limit.violated(margin) & ~limit.violated(sampled, sampled=True)
         table = _put(table, SATISFIED + limit.name, pa.array(held.tolist(), mask=unknown))

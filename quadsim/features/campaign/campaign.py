@@ -158,7 +158,8 @@ def fly_campaign(
             records.write(manifest, files)
 
         table, times = progress.store.close(progress.wanted)
-        spec, directory = plan.spec, files.path
+        spec = plan.spec
+        directory = files.path
         about = {"campaign": spec.name, "scenario": plan.scenario.name, "failure": [*spec.failure]}
         summary = about | estimate(table, plan.limits)
         # flights by the processor that flew them; those that raised, or that no process came back from, have none
@@ -182,9 +183,13 @@ class _Progress:
     """A session of flying: rows on disk, missing flights, and rows not yet written."""
 
     def __init__(self, plan: Plan, files: Growing, *, until_width: float | None, watch: Watch) -> None:
-        self._plan, self._width, self._watch = plan, until_width, watch
+        self._plan = plan
+        self._width = until_width
+        self._watch = watch
         self.store = Store(files, plan.schema)
-        self.wanted, self.flown, self._checked = plan.spec.flights, 0, 0
+        self.wanted = plan.spec.flights
+        self.flown = 0
+        self._checked = 0
         self.started = clock.perf_counter()
         self.outcomes = np.full(plan.spec.flights, -1, np.int8)  # not flown, passed, failed
         there = self.store.table()
@@ -202,7 +207,8 @@ class _Progress:
         Raises:
             InputError: it is so before flights that a finished campaign has.
         """
-        missing, counted = self.missing, self.store.counted()
+        missing = self.missing
+        counted = self.store.counted()
         if self._is_sure() and self.wanted < counted:
             narrow = f"the interval is as narrow after {self.wanted} of the {counted} flights that are there"
             raise InputError(f"--until-width would leave out flights: {narrow}; go on without it")
@@ -271,7 +277,8 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
     flights = table["flight"].to_pylist()
     if number not in flights:
         raise ParameterError("", "--flight", number, f"one of the flights 0 to {flights[-1]} of {directory}")
-    row, notes = table.slice(flights.index(number), 1).to_pylist()[0], []
+    row = table.slice(flights.index(number), 1).to_pylist()[0]
+    notes = []
     if differing := other_than_flew(read_manifest(directory), plan):
         notes.append(f"other {', '.join(differing)} flew that campaign, so numbers may differ")
     if row["verdict"] in (TIMEOUT, MEMORY):
@@ -301,7 +308,8 @@ class Replay(Result):
         """See `Result.outputs`; before them, whether the numbers are the campaign's."""
         from quadsim.console import console
 
-        number, count = self.recorded.number, len(self.recorded.row)
+        number = self.recorded.number
+        count = len(self.recorded.row)
         if self.differing:
             yield console.styled((f"flight {number} differs from the campaign's in {', '.join(self.differing)}", "red"))
         else:

@@ -96,7 +96,8 @@ def definition_sentence(summary: CampaignSummary, failure: Sequence[str]) -> str
     """Return what counts as failure, and how many flights violated a constraint where that alone does not count."""
     units = {name: metric["unit"] for name, metric in summary["metrics"].items()}
     units |= {MARGIN + name: constraint["unit"] for name, constraint in summary["constraints"].items()}
-    events, violation = [parse_event(text) for text in failure], summary["events"]["violation"]
+    events = [parse_event(text) for text in failure]
+    violation = summary["events"]["violation"]
     listed = [text.rstrip(" -") for text in (f"{event.text} {units.get(event.column_name, '')}" for event in events)]
     sentence = f"Counted as failure: {', '.join(listed)}."
     if violation["count"] and "violation" not in (event.text for event in events):
@@ -143,9 +144,11 @@ def event_table(summary: CampaignSummary) -> Grid:
 
 def constraint_table(summary: CampaignSummary) -> Grid:
     """Return the number of violations and the worst margin of each constraint."""
-    sure, lines = f"{100.0 * summary['confidence']:g} % interval", []
+    sure = f"{100.0 * summary['confidence']:g} % interval"
+    lines = []
     for name, constraint in summary["constraints"].items():
-        failed, worst = constraint["not_satisfied"], (ABSENT, ABSENT)
+        failed = constraint["not_satisfied"]
+        worst = (ABSENT, ABSENT)
         if constraint["worst_margin"] is not None:
             worst = f"{format_number(constraint['worst_margin'])} {constraint['unit']}", str(constraint["worst_flight"])
         count = Cell(text=str(failed["count"]), mark=Mark.BAD if failed["count"] else Mark.NONE)
@@ -254,12 +257,14 @@ def _association(related: Mapping[str, Any] | None) -> tuple[Cell, ...]:
     if related is None:
         return line(*[ABSENT] * 4)
     sure = [Mark.BEST if related[p] < ALPHA else Mark.NONE for p in ("p_holm", "p_xi_holm")]
-    rho, xi = Cell(text=f"{related['rho']:+.2f}", mark=sure[0]), Cell(text=f"{related['xi']:.2f}", mark=sure[1])
+    rho = Cell(text=f"{related['rho']:+.2f}", mark=sure[0])
+    xi = Cell(text=f"{related['xi']:.2f}", mark=sure[1])
     return line(rho, p_value(related["p_holm"]), xi, p_value(related["p_xi_holm"]))
 
 
 def _group(group: Mapping[str, Any]) -> str:
-    low, high = format_number(group["low"]), format_number(group["high"])
+    low = format_number(group["low"])
+    high = format_number(group["high"])
     return f"{low if low == high else f'{low} to {high}'}: {percent(group['share'])}"
 
 
@@ -362,11 +367,14 @@ def histograms(table: pa.Table) -> list[Panel]:
         low, high = _ends(finite)
         width = (high - low or 1.0) / min(_BINS, max(8, int(2.0 * np.sqrt(finite.size))))
         edges = width * np.arange(np.floor(low / width), np.ceil(high / width) + 1.0)  # 0 is one, where it is inside
-        inside, below, bars = np.clip(values, edges[0], edges[-1]), np.zeros(edges.size - 1), []
+        inside = np.clip(values, edges[0], edges[-1])
+        below = np.zeros(edges.size - 1)
+        bars = []
         for verdict, rows in verdicts(table).items():
             counts = np.histogram(inside[rows & np.isfinite(values)], edges)[0].astype(float)
             if counts.any():
-                middles, colour = 0.5 * (edges[:-1] + edges[1:]), VERDICTS[verdict].colour
+                middles = 0.5 * (edges[:-1] + edges[1:])
+                colour = VERDICTS[verdict].colour
                 bars.append(Series(x=middles, y=counts, base=below, colour=colour, label=verdict, style="bars"))
             below = below + counts
         beyond = int(np.count_nonzero((finite < edges[0]) | (finite > edges[-1])))
@@ -379,13 +387,16 @@ def histograms(table: pa.Table) -> list[Panel]:
 
 def scatters(table: pa.Table) -> list[Panel]:
     """The worst margin of each flight over each varied parameter; triangles are beyond the axes, or have no margin."""
-    margins, names = numbers(table, "worst_margin"), draw_names(table)
+    margins = numbers(table, "worst_margin")
+    names = draw_names(table)
     if not np.isfinite(margins).any():
         return []
     low, high = _ends(margins[np.isfinite(margins)])
-    low, high = min(0.0, low), max(0.0, high)  # 0, the end of what is allowed, is among them
+    low = min(0.0, low)
+    high = max(0.0, high)  # 0, the end of what is allowed, is among them
     y, beyond_y = _clip(np.where(np.isfinite(margins), margins, -np.inf), low, high, "down", "up")
-    padding, panels = 0.6 * _GAP * ((high - low) or 1.0), []
+    padding = 0.6 * _GAP * ((high - low) or 1.0)
+    panels = []
     for name in names:
         kinds: tuple[str, ...] = ()
         if is_number(table, DRAW + name):
@@ -396,13 +407,16 @@ def scatters(table: pa.Table) -> list[Panel]:
             spread = np.random.default_rng(0).uniform(-0.3, 0.3, listed.size)  # the same every time
             values = np.array([kinds.index(value) for value in listed], float) + spread
         x, beyond_x = _clip(values, *_ends(values[np.isfinite(values)]), "left", "right")
-        beyond, points = np.where(beyond_y == "", beyond_x, beyond_y), list[Series]()
+        beyond = np.where(beyond_y == "", beyond_x, beyond_y)
+        points = list[Series]()
         for verdict, flown in verdicts(table).items():
-            rows, (_, colour, symbol) = np.flatnonzero(flown), VERDICTS[verdict]
+            rows = np.flatnonzero(flown)
+            _, colour, symbol = VERDICTS[verdict]
             even = np.linspace(0.0, rows.size - 1.0, min(rows.size, _MOST_POINTS // len(names)))
             rows = rows[np.unique(even.astype(int))]
             for edge in ("", "down", "up", "left", "right"):
-                there, marker = rows[beyond[rows] == edge], f"triangle-{edge}" if edge else symbol
+                there = rows[beyond[rows] == edge]
+                marker = f"triangle-{edge}" if edge else symbol
                 if there.size:
                     points.append(
                         Series(x=x[there], y=y[there], flights=numbers(table, "flight")[there], colour=colour,

@@ -332,8 +332,10 @@ def compare_pairs(
             f"campaigns {names[0]!r} and {names[1]!r} have no pair of flights of which both reached every required "
             "constraint: fly them for longer"
         )
-    a, b = a.filter(complete), b.filter(complete)
-    draws_a, draws_b = draw_names(a), draw_names(b)
+    a = a.filter(complete)
+    b = b.filter(complete)
+    draws_a = draw_names(a)
+    draws_b = draw_names(b)
     shared_draws = tuple(name for name in draws_a if name in draws_b)
     for column in ("seed", *(DRAW + name for name in shared_draws)):
         for flight, *values in zip(
@@ -415,9 +417,11 @@ def _by_audit(event: str) -> bool:
 
 
 def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: FlightFlags) -> MetricComparison:
-    first, second = numbers(a, name), numbers(b, name)
+    first = numbers(a, name)
+    second = numbers(b, name)
     valid = completed & np.isfinite(first) & np.isfinite(second)
-    first, second = first[valid], second[valid]
+    first = first[valid]
+    second = second[valid]
     return MetricComparison(
         name=name,
         unit=unit_of(a, name),
@@ -453,7 +457,9 @@ def _metric_table(comparison: PairedComparison) -> Grid:
     a, b = comparison.names
     lines = []
     for metric in comparison.metrics:
-        difference, ends, mark = metric.difference, ABSENT, Mark.NONE
+        difference = metric.difference
+        ends = ABSENT
+        mark = Mark.NONE
         if difference.lower is not None and difference.upper is not None:
             ends = f"{format_number(difference.lower)} to {format_number(difference.upper)}"
             mark = Mark.BEST if metric.is_beyond_chance else Mark.NONE
@@ -487,7 +493,8 @@ def metrics_figure(comparison: PairedComparison) -> Figure | None:
         scale = 100.0 / abs(metric.mean_a)
         place = np.array([float(len(names))])
         better = difference.mean > 0.0 if metric.name == "worst_margin" else difference.mean < 0.0
-        colour, label = COLOUR.measured, "not beyond chance"
+        colour = COLOUR.measured
+        label = "not beyond chance"
         if metric.is_beyond_chance:
             colour = COLOUR.satisfied if better else COLOUR.violated
             label = "better" if better else "worse"

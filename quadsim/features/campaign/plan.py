@@ -144,7 +144,8 @@ class Plan:
         except QuadsimError as error:
             return self.failed(flight, str(error))
         if raised := flown.log.traceback:  # no more of such a flight is kept than that it raised
-            reason, limit = str(flown.log.reason), f"(it may take {self.spec.limits.memory:g} MB)"
+            reason = str(flown.log.reason)
+            limit = f"(it may take {self.spec.limits.memory:g} MB)"
             short = raised[-1].startswith(MemoryError.__name__)
             return self.failed(flight, f"{reason} {limit}", MEMORY) if short else self.failed(flight, reason)
         return self.row_of(flight, flown, clock.perf_counter() - started)
@@ -205,7 +206,8 @@ def read_campaign(name: str) -> dict[str, Any]:
 
 def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = None, seed: int | None = None) -> Plan:
     """Read and check a campaign that ships, or a file, with the scenario it names; the other arguments change it."""
-    path, data = campaign_path(name), read_campaign(name)
+    path = campaign_path(name)
+    data = read_campaign(name)
     data |= {key: value for key, value in (("flights", flights), ("seed", seed)) if value is not None}
     spec = parse_campaign(data, source=path.name)
     plan = Plan(spec, flown_scenario(spec, path, settings))
@@ -228,7 +230,8 @@ def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignFile:
 
 def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ()) -> Scenario:
     """The scenario of a campaign's file, with its changes and then those of the command line."""
-    data, (file, _) = merge(read_scenario(spec.scenario), spec.set), scenario_source(spec.scenario)
+    data = merge(read_scenario(spec.scenario), spec.set)
+    file, _ = scenario_source(spec.scenario)
     note_changes(data, spec.set)
     owners = {"seed": "give --seed"}
     owners |= {
@@ -251,7 +254,8 @@ def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], .
 
     Fields of the scenario that both draw are left out: their draws are compared.
     """
-    tables, drawn = [], []
+    tables = []
+    drawn = []
     for plan in (first, second):
         left_out = (*NOT_DESCRIBED, RECORDED)
         scenario = {key: value for key, value in plain(plan.scenario).items() if key not in left_out}

@@ -26,10 +26,14 @@ from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
 
 DRAW: Final = "draw."  # how the columns of drawn values begin
 VIOLATION: Final = "violation"  # the event
-MARGIN, SAMPLED, TIME_VIOLATED, SATISFIED = "margin.", "margin_sampled.", "time_violated.", "satisfied."
+MARGIN = "margin."
+SAMPLED = "margin_sampled."
+TIME_VIOLATED = "time_violated."
+SATISFIED = "satisfied."
 """Prefixes of the columns of a constraint."""
 _MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
-_FLOAT, _WHOLE = pa.float64(), pa.int64()
+_FLOAT = pa.float64()
+_WHOLE = pa.int64()
 
 
 def _fields(kind: pa.DataType, unit: str, *names: str) -> list[pa.Field]:
@@ -119,7 +123,8 @@ def flown_row(
         unknown = finding.verdict == "incomplete" and verdict != "lost"  # a lost flight had to get there
         row[SATISFIED + name] = None if unknown else finding.satisfied
     if (worst := worst_finding(findings)) is not None:
-        row["worst_margin"], row["worst_constraint"] = worst_share(findings), worst.limit.name
+        row["worst_margin"] = worst_share(findings)
+        row["worst_constraint"] = worst.limit.name
     return row | (_numbers(log) if log.control.t.size else {})
 
 

@@ -104,7 +104,8 @@ def upper_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFI
     In closed form, as scipy's `proportion_ci` searches to 1e-12 alone, which is too coarse for shares near 1e-9.
     Source: Clopper and Pearson, Biometrika 26 (1934); 1 where all happened, and of no trials.
     """
-    counts, trials = np.asarray(counts, float), np.asarray(trials, float)
+    counts = np.asarray(counts, float)
+    trials = np.asarray(trials, float)
     some = counts < trials
     bounds = scipy.special.betaincinv(counts + 1.0, np.where(some, trials - counts, 1.0), confidence)
     return np.where(some, bounds, 1.0)
@@ -191,7 +192,8 @@ def dependence(x: Array, y: Array, rng: np.random.Generator) -> Dependence | Non
     Source: Chatterjee, Journal of the American Statistical Association 116 (2021).
     """
     there = ~(np.isnan(x) | np.isnan(y))
-    x, y = scipy.stats.rankdata(x[there]), scipy.stats.rankdata(y[there])
+    x = scipy.stats.rankdata(x[there])
+    y = scipy.stats.rankdata(y[there])
     if x.size < _FEWEST or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return None
     ranked = scipy.stats.spearmanr(x, y)
@@ -378,7 +380,8 @@ def _levels(table: pa.Table, name: str, failed: FlightFlags) -> dict[str, Any]:
 def _groups(values: Array, failed: FlightFlags) -> list[dict[str, Any]]:
     """Failures by thirds or fifths of a varied parameter, or by its values if no more; none of few flights."""
     there = np.isfinite(values)
-    values, failed = values[there], failed[there]
+    values = values[there]
+    failed = failed[there]
     size = next((groups for flights, groups in _GROUPS if values.size >= flights), 0)
     if not size:
         return []
@@ -466,7 +469,8 @@ def parse_requirement(text: str) -> Requirement:
         ParameterError: a number is outside what is allowed.
     """
     text = " ".join(text.split())
-    owner, form = f"requirement {text!r}", _FORM.fullmatch(text)
+    owner = f"requirement {text!r}"
+    form = _FORM.fullmatch(text)
     if form is None:
         raise InputError(
             f"{owner} must read P(EVENT) OP SHARE @ CONFIDENCE%, with one of < <= > >=, such as {EXAMPLE!r}"
@@ -493,9 +497,11 @@ def judge(table: pa.Table, requirement: Requirement) -> Judgement:
     """
     counted = is_counted(table, requirement.event)
     happened = requirement.event.column(table)[counted]
-    count, flights = int(happened.sum()), happened.size
+    count = int(happened.sum())
+    flights = happened.size
     bound = _bound(requirement, count, flights)
-    holds, least = flights > 0 and requirement.supported_by(bound), least_flights(requirement)
+    holds = flights > 0 and requirement.supported_by(bound)
+    least = least_flights(requirement)
     return Judgement(
         requirement=requirement,
         count=count,

@@ -69,7 +69,9 @@ class Store:
     """The rows of a campaign on disk, in the columns of `quadsim.features.campaign.rows.make_schema`."""
 
     def __init__(self, files: Growing, schema: pa.Schema) -> None:
-        self._files, self._directory, self._schema = files, files.path, schema
+        self._files = files
+        self._directory = files.path
+        self._schema = schema
         self._waiting: list[Row] = []
         self._flushed = clock.perf_counter()
 
@@ -81,7 +83,8 @@ class Store:
         """
         tables = [self._schema.empty_table()]
         if (path := self._directory / FLIGHTS_FILE).is_file():
-            table, times = read_flights(path, self._schema), read_table(self._directory / TIMES_FILE)
+            table = read_flights(path, self._schema)
+            times = read_table(self._directory / TIMES_FILE)
             same = times["flight"].equals(table["flight"])  # else the process died between the two files
             for name in TIMES:
                 absent = pa.nulls(table.num_rows, self._schema.field(name).type)

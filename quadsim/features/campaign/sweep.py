@@ -97,11 +97,9 @@ class Sweep(Result):
         names = [name for name in self.fields if is_number(self.table, name)]
         if not names:
             return None
-        x, y, satisfied = (
-            numbers(self.table, names[0]),
-            numbers(self.table, "worst_margin"),
-            self["verdict"] == "satisfied",
-        )
+        x = numbers(self.table, names[0])
+        y = numbers(self.table, "worst_margin")
+        satisfied = self["verdict"] == "satisfied"
         points = tuple(
             Series(x=x[chosen], y=y[chosen], colour=colour, label=label, style="points", width=5.0, marker=marker)
             for chosen, colour, label, marker in (
@@ -110,7 +108,8 @@ class Sweep(Result):
             )
             if chosen.any()
         )
-        label, zero = "worst margin, as a share of half its band", Bound(value=0.0)
+        label = "worst margin, as a share of half its band"
+        zero = Bound(value=0.0)
         panel = Panel(title=label, y_label="share", x_label=names[0], series=points, bounds=(zero,), height=1.4)
         return Figure(key="sweep", title="", panels=(panel,), columns=1)
 
@@ -169,7 +168,8 @@ def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> GridValues:
         raise ParameterError("sweep", owner, tried, "a list of values to try")
     values = [value.tolist() if hasattr(value, "tolist") else value for value in tried]
     if isinstance(fields, str):
-        values, fields = [list(value) if isinstance(value, tuple) else value for value in values], (fields,)
+        values = [list(value) if isinstance(value, tuple) else value for value in values]
+        fields = (fields,)
     else:
         values = [tuple(separate({fields: value}, source="sweep").values()) for value in values]
     try:

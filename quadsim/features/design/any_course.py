@@ -66,7 +66,8 @@ _SHARPEST: Final = 0.05
 """Change of velocity between two samples, over the largest velocity, that is a corner and not a bend."""
 _FREQUENCY_RATIO: Final = 1.5 * EIGHT_RATIO
 """Largest acceleration over largest speed of a course [rad/s], over w: of a figure eight 1.5 times its turns."""
-_SLOWEST, _FASTEST = 1e-3, 1e3
+_SLOWEST = 1e-3
+_FASTEST = 1e3
 """Range in which the factor of times is looked for."""
 _HALVINGS: Final = 40
 _YAW_ALLOWED: Final = 90.0 * ALLOWED_SHARE
@@ -282,7 +283,8 @@ def _time_factor(samples: SampledCourse, length: float, vehicle: Vehicle, tuning
 
 def _where_one(share: Callable[[float], float]) -> float:
     """Return the least factor of times, within `_SLOWEST` to `_FASTEST`, at which a falling share is at most 1."""
-    low, high = math.log(_SLOWEST), math.log(_FASTEST)
+    low = math.log(_SLOWEST)
+    high = math.log(_FASTEST)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         if share(math.exp(middle)) > 1.0:

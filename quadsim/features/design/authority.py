@@ -76,7 +76,8 @@ def _munk(vehicle: Vehicle) -> float:
     inflow = vehicle.inflow_moment
     if inflow is None and vehicle.body_drag is not None:
         inflow = munk_moment(vehicle.body_drag, SEA_LEVEL_DENSITY)
-    (about_x, about_y), (ixx, iyy, _) = inflow or (0.0, 0.0), vehicle.inertia
+    about_x, about_y = inflow or (0.0, 0.0)
+    ixx, iyy, _ = vehicle.inertia
     return math.sqrt(max(0.0, about_x / ixx, about_y / iyy))
 
 

@@ -35,7 +35,8 @@ from quadsim.scenarios.schema.writing import WIDTH, plain
 DEFAULT_MARGIN: Final = 0.1  # default share of half a band that is left
 LARGEST_MARGIN: Final = 0.9
 _STEP: Final = 1.3  # from one pace to the next, until one holds and one does not
-_LOWEST, _HIGHEST = 0.05, 50.0
+_LOWEST = 0.05
+_HIGHEST = 50.0
 """Paces that are looked at."""
 _RESOLUTION: Final = 0.01  # between the pace that holds and the one that does not, as a share
 _USUAL_FLIGHTS: Final = 9  # that the progress is stated in, until it is known

@@ -56,7 +56,8 @@ BALANCED_MOVE: Final = 0.25
 steady motion would otherwise cost as much as a deviation, and the vehicle would lag."""
 OBSERVED_LAG_SHARE: Final = 0.3
 """`LAG_SHARE` where the torque of the air is observed: the loop then has to be faster than that torque grows."""
-LEAST_SIZE, LARGEST_SIZE = 0.01, 1e4
+LEAST_SIZE = 0.01
+LARGEST_SIZE = 1e4
 """Range of a course's size that is stated [m]."""
 ALLOWED_SHARE: Final = 0.15
 """The tracking requirement, the same for every controller: the largest error along x, y and z over the course's size.
@@ -222,13 +223,15 @@ def _notes(vehicle: Vehicle, tuning: Design, course: FirstCourse, law: str) -> s
         "period": f"what a period of {1e3 * tuning.period:g} ms can serve",
     }
     stated = f" --tilt {_tilt(tuning):g}" if tuning.tilt_stated else ""
-    option, what = "", "The loop's bandwidth for x and y"
+    option = ""
+    what = "The loop's bandwidth for x and y"
     then = (
         f"Without bounds it tolerates {1e3 * delay_margin(vehicle, tuning):.3g} ms more delay than it knows of.\n"
         "# Weights by Bryson's rule, 1 / (largest accepted deviation)^2; sources: quadsim/features/design/rules.py."
     )
     if law != "robust":
-        option, what = f" --controller {law}", "The course is made for a robust MPC, whose bandwidth for x and y"
+        option = f" --controller {law}"
+        what = "The course is made for a robust MPC, whose bandwidth for x and y"
         then = "The controller's own rules: docs/own-vehicle.md."
     about = "".join(f"# {line}\n" for line in course.notes)
     return f"""# A first flight of {printable(f"{vehicle.name}: {course.about}")}.
@@ -352,10 +355,12 @@ def _eight(vehicle: Vehicle, tuning: Design, options: str, size: float | None) -
     acceleration = SHARE * largest_eight(vehicle, tuning)[0]
     by_rule = eight_length(vehicle, tuning)
     limit = _eight_limit(vehicle, tuning)
-    length, why = by_rule, f"such that it turns with {EIGHT_RATIO:g} w"
+    length = by_rule
+    why = f"such that it turns with {EIGHT_RATIO:g} w"
     about = f"a figure eight at {100.0 * SHARE:g} % of {limit}"
     if size is not None:
-        length, why = size, "as --size states it"
+        length = size
+        why = "as --size states it"
         rate = min(
             EIGHT_RATIO * tuning.bandwidth,
             math.sqrt(2.0 * SHARE * vehicle.gravity * tuning.acceleration / (_EIGHT_PEAK * length)),
@@ -462,7 +467,9 @@ def _why_tilt(tuning: Design) -> str:
 
 def _robust(vehicle: Vehicle, tuning: Design) -> str:
     place, height, heading = (in_digits(weight) for weight in tuning.weights)
-    speed, w, tilt = in_digits(tuning.speed_weight), tuning.bandwidth, _tilt(tuning)
+    speed = in_digits(tuning.speed_weight)
+    w = tuning.bandwidth
+    tilt = _tilt(tuning)
     why = f"1 / ({speed**-0.5:.3g} rad/s)^2: with it four integrators have the bandwidth w, (g beta)^2 x / w^8"
     move = in_digits(tuning.move_weight)
     why_move = f"as much as speed costs at {MOVE_RATIO:g} w, speed / ({MOVE_RATIO:g} w tau)^2"
@@ -470,8 +477,10 @@ def _robust(vehicle: Vehicle, tuning: Design) -> str:
     if vehicle.turned_by_air >= TURNED_FROM:
         turned = f"{vehicle.turned_by_air:.3g} rad/s^2 per m/s"
         moment = f"moment = true  # the air's torque is in the model: at hover {turned}\n"
-        speed, why = in_digits(BALANCED_SPEED * speed), f"{BALANCED_SPEED:g} of that by rule: motion needs torque"
-        move, why_move = in_digits(BALANCED_MOVE * move), f"{BALANCED_MOVE:g} of those by rule, likewise"
+        speed = in_digits(BALANCED_SPEED * speed)
+        why = f"{BALANCED_SPEED:g} of that by rule: motion needs torque"
+        move = in_digits(BALANCED_MOVE * move)
+        why_move = f"{BALANCED_MOVE:g} of those by rule, likewise"
     lag, known = _predicted_lag(vehicle)
     return f"""[controller]
 type = "robust"
@@ -505,7 +514,8 @@ pitch = {[-tilt, tilt]}  # as roll
 
 def _baseline(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
     rules = "  # weights by Bryson's rule, its defaults; it tracks pose and velocity, not acceleration"
-    steepest, w = BASELINE_SHARE * _tilt(tuning), tuning.bandwidth
+    steepest = BASELINE_SHARE * _tilt(tuning)
+    w = tuning.bandwidth
     tilt = round(min(LQR_TILT, steepest) if law == "lqr" else steepest, 3)
     text = f"""[controller]
 type = {_text(law)}{rules if law == "lqr" else ""}
@@ -542,7 +552,8 @@ def _turns_in_air(vehicle: Vehicle) -> bool:
 
 def _constraints(law: str, vehicle: Vehicle, tuning: Design, course: FirstCourse) -> str:
     """Return the audited constraints that are not bounds of the controller."""
-    tilt, off = _tilt(tuning), in_digits(course.allowed)
+    tilt = _tilt(tuning)
+    off = in_digits(course.allowed)
 
     def entry(name: str, signal: str, lower: float, upper: float | None, why: str) -> str:
         text = f'\n[[constraints]]\nname = "{name}"\nsignal = "{signal}"\nlower = {lower}  # {why}\n'

@@ -12,11 +12,14 @@ import numpy as np
 
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-LIGHTEST, HEAVIEST = 0.03, 25.0
+LIGHTEST = 0.03
+HEAVIEST = 25.0
 """[kg]"""
-LEAST_RATIO, MOST_RATIO = 1.6, 6.0
+LEAST_RATIO = 1.6
+MOST_RATIO = 6.0
 """Thrust to weight."""
-QUICKEST, SLOWEST = 0.01, 0.12
+QUICKEST = 0.01
+SLOWEST = 0.12
 """Time constant of the rotors [s]."""
 
 

@@ -44,7 +44,8 @@ LAG_RATIO: Final = 2.5  # 1 / w over the lag and half a period
 FASTEST_LOOP: Final = 6.0  # largest bandwidth [rad/s]
 STEEPEST: Final = math.radians(40.0)
 """Largest tilt bound [rad]: at hover the model takes tan(tilt) for tilt, 20 % less at 40 deg."""
-LEAST_TILT, LARGEST_TILT = 1.0, 80.0
+LEAST_TILT = 1.0
+LARGEST_TILT = 80.0
 """Range of a tilt bound that replaces that of the rules [deg]."""
 THRUST_SHARE: Final = 0.85  # share of the thrust that holds the vehicle at the tilt bound; the rest is for torques
 PERIOD_SHARE: Final = 0.16  # largest w tau
@@ -179,7 +180,8 @@ def gain(vehicle: Vehicle, tuning: Design) -> Array:
     place, height, heading = tuning.weights
     for name, weight in (("x", place), ("y", place), ("z", height), ("yaw", heading)):
         Q[INDEX[name], INDEX[name]] = weight
-    D, R = tuning.move_weight * np.eye(N_ROTORS), tuning.speed_weight * np.eye(N_ROTORS)
+    D = tuning.move_weight * np.eye(N_ROTORS)
+    R = tuning.speed_weight * np.eye(N_ROTORS)
     A = scipy.linalg.block_diag(A, np.zeros((N_ROTORS, N_ROTORS)))
     B = np.vstack([B, np.eye(N_ROTORS)])
     cross = np.vstack([np.zeros((n, N_ROTORS)), -D])
@@ -190,7 +192,8 @@ def gain(vehicle: Vehicle, tuning: Design) -> Array:
 def is_stable(vehicle: Vehicle, tuning: Design, K: Array, delay: float) -> bool:
     """Whether the loop of a gain is stable where commands act some time [s] later than it knows of."""
     A_c, B_c = continuous_model(vehicle, vehicle.rotor_rise or 0.0)
-    n, period = len(A_c), tuning.period
+    n = len(A_c)
+    period = tuning.period
     whole = int(delay / period + 1e-9)
     late = max(delay - whole * period, 0.0)
     A, _ = discretise(A_c, B_c, period)
@@ -198,7 +201,8 @@ def is_stable(vehicle: Vehicle, tuning: Design, K: Array, delay: float) -> bool:
     older = rest @ discretise(A_c, B_c, late)[1]
     # States: x, u(k-1) .. u(k-whole-1); u(k-whole-1) acts until `late`, then u(k-whole).
     size = n + N_ROTORS * (whole + 1)
-    closed, entry = np.zeros((size, size)), np.zeros((size, N_ROTORS))
+    closed = np.zeros((size, size))
+    entry = np.zeros((size, N_ROTORS))
     closed[:n, :n] = A
     closed[:n, size - N_ROTORS :] = older
     if whole == 0:
@@ -214,9 +218,11 @@ def is_stable(vehicle: Vehicle, tuning: Design, K: Array, delay: float) -> bool:
 def delay_margin(vehicle: Vehicle, tuning: Design) -> float:
     """Shortest delay [s] beyond what the model knows of at which the loop is no longer stable, to a thousandth."""
     K = gain(vehicle, tuning)
-    low, high = 0.0, 1e-3
+    low = 0.0
+    high = 1e-3
     while high < LONGEST and is_stable(vehicle, tuning, K, high):
-        low, high = high, 1.5 * high
+        low = high
+        high = 1.5 * high
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if is_stable(vehicle, tuning, K, middle) else (low, middle)

@@ -21,7 +21,8 @@ SLOWEST_ANSWER: Final = 1.0
 
 def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
     """Return a line for each bound of a scenario that the vehicle cannot meet."""
-    spec, can = scenario.controller, authority(vehicle)
+    spec = scenario.controller
+    can = authority(vehicle)
     missed: list[str] = []
     if isinstance(spec, Bounded | Baseline) and spec.input_bounds is not None:
         missed += _inputs(spec.input_bounds, vehicle, scenario.control_period)
@@ -33,7 +34,8 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
         missed += _tilt("controller.tilt", spec.tilt, can)
     if isinstance(spec, Robust) and spec.rotor_lag == "vehicle" and vehicle.rotor_rise is None:
         missed.append("controller.rotor_lag is the vehicle's, whose file gives no rotor_rise: give a number of seconds")
-    slowest, fastest = float(vehicle.hover_speeds.min()), float(vehicle.hover_speeds.max())
+    slowest = float(vehicle.hover_speeds.min())
+    fastest = float(vehicle.hover_speeds.max())
     for limit in scenario.constraints:
         if limit.signal == "speed" and not (limit.lower <= slowest and fastest <= limit.upper):
             sides = f"{limit.lower:g} to {limit.upper:g}"
@@ -50,7 +52,9 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
 
 def _inputs(bounds: InputBounds, vehicle: Vehicle, period: float) -> list[str]:
     lower, upper = bounds.speed
-    speed, hover, missed = "controller.input_bounds.speed", vehicle.hover_speeds, []
+    speed = "controller.input_bounds.speed"
+    hover = vehicle.hover_speeds
+    missed = []
     if hover.max() > upper:
         missed.append(f"{speed}: hover is {span(hover)} rad/s, the scenario allows {upper:g}")
     elif hover.min() < lower:

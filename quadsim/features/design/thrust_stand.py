@@ -151,7 +151,8 @@ def _of_one_rotor(path: Path, table: StandTable, rotors: int, diameter: float | 
 def _rising(columns: Mapping[str, Array], table: StandTable) -> tuple[Array, tuple[str, ...]]:
     """Return which rows to fit, those below saturation, and a note of the rows that are left out."""
     by = "speed" if "speed" in columns else "throttle"
-    x, thrust = columns[by], columns["thrust"]
+    x = columns[by]
+    thrust = columns["thrust"]
     order = np.argsort(x, kind="stable")
     kept = np.ones(len(x), bool)
     for above, below in zip(order[:0:-1], order[-2::-1], strict=True):
@@ -174,7 +175,8 @@ def _require_of_one(fit: StandFit, weight: float) -> None:
     strongest = float(fit.columns["thrust"].max()) / weight
     if strongest < _STRONGEST - TIE_SHARE:
         return
-    each, together = N_ROTORS * strongest, strongest
+    each = N_ROTORS * strongest
+    together = strongest
     raise InputError(
         f"--rotors must be stated, 1 or {N_ROTORS}, the rotors that the stand's table is of: the vehicle would lift "
         f"{each:.1f} times its weight with a table of one, {together:.1f} times with a table of {N_ROTORS}"

@@ -205,7 +205,8 @@ def _trim(sheet: VehicleSheet) -> list[tuple[int, float]]:
 
 def vehicle_tables(report: VehicleReport) -> list[Grid]:
     """All of it as tables: figures, torques, what a controller can do, linear model, parameters, shortfalls."""
-    vehicle, sheet = report.vehicle, report.figures
+    vehicle = report.vehicle
+    sheet = report.figures
     spans = [
         (torque.axis, *(f"{format_number(low)} .. {format_number(high)}" for low, high in _ranges(torque)))
         for torque in sheet.torques

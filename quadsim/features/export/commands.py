@@ -53,7 +53,8 @@ def export(
     from quadsim.outputs import run_directory
     from quadsim.scenarios import loading
 
-    flown, options = loading.load_scenario(scenario, changes, seed), {"precision": precision, "target": target}
+    flown = loading.load_scenario(scenario, changes, seed)
+    options = {"precision": precision, "target": target}
     with reporting(progress, "the export") as report:
         report("export", 0, 1)
         directory = exporter.export(flown, out, overwrite=overwrite, rows=rows, **options)  # type: ignore[arg-type]

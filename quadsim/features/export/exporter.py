@@ -77,13 +77,16 @@ class LinearSearch:
 
     def __init__(self, controller: CController, room: int, changes: int) -> None:
         problem = controller.law.problem
-        self._library, self._shared = core_library(), CoreProblem(problem)
+        self._library = core_library()
+        self._shared = CoreProblem(problem)
         struct = self._struct = type(self._shared.struct).from_buffer_copy(self._shared.struct)
-        struct.room, struct.changes = room or struct.room, changes or struct.changes
+        struct.room = room or struct.room
+        struct.changes = changes or struct.changes
         self._work = WorkStruct()
         self._memory = np.zeros(self._library.quadsim_work_reals(struct))
         self._library.quadsim_work_start(self._work, struct, self._memory.ctypes.data)
-        rest, speeds = np.zeros(problem.model.n), np.array(problem.model.u_bar)
+        rest = np.zeros(problem.model.n)
+        speeds = np.array(problem.model.u_bar)
         rest[N_STATES:] = speeds[: rest.size - N_STATES]
         self._query = np.zeros((problem.horizon, len(problem.objective.C_r))), rest, speeds, speeds
 
@@ -100,7 +103,8 @@ class LinearSearch:
 def nonlinear_search(controller: CNonlinear, room: int, changes: int) -> Solves:
     """Return the same of a nonlinear controller's first programs, along a reference at rest."""
     law = replace(controller).law
-    program, hover = law.program.struct, law.problem.model.u_bar
+    program = law.program.struct
+    hover = law.problem.model.u_bar
     law.resize(room or program.room, changes or program.changes)
     states = np.zeros((program.horizon + 1, N_BODY))
     thrusts = np.tile(np.array(law.numbers.lifts), (program.horizon, 1))
@@ -108,7 +112,8 @@ def nonlinear_search(controller: CNonlinear, room: int, changes: int) -> Solves:
 
     def solves(offset: Array) -> bool:
         measured = np.concatenate([states[0], hover[: program.actuators]])
-        measured[P], measured[V] = offset[:3], offset[3:]
+        measured[P] = offset[:3]
+        measured[V] = offset[3:]
         law.stored_plan = None
         return law.solve(measured, hover, states, thrusts) <= SQPStatus.UNCONVERGED
 
@@ -123,7 +128,8 @@ def reach(whole: Solves, limited: Solves, draws: int = DRAWS) -> Reach:
     Raises:
         FileError: the library cannot be compiled or loaded.
     """
-    rng, reached = np.random.default_rng(0), Reach(distance=0.0, drawn=0, feasible=0)
+    rng = np.random.default_rng(0)
+    reached = Reach(distance=0.0, drawn=0, feasible=0)
     for distance in DISTANCES:
         feasible = lost = 0
         for offset in rng.uniform(-distance, distance, (draws, 6)):
@@ -207,7 +213,8 @@ def c_controller(scenario: Scenario | Assembly, precision: Precision = "double",
     """
     assembly = scenario if isinstance(scenario, Assembly) else Assembly(scenario)
     scenario = assembly.scenario
-    table, title = scenario.controller, _title(scenario)
+    table = scenario.controller
+    title = _title(scenario)
     if not isinstance(table, Nonlinear | Geometric):
         return CController(law=exported_law(scenario), precision=precision, title=title, asked=rows)
     if isinstance(table, Nonlinear) and table.avoidance is not None and (scenario.obstacles or assembly.regions):
@@ -231,7 +238,8 @@ def exported_law(scenario: Scenario) -> Exportable:
     Raises:
         ExportError: it cannot be exported.
     """
-    controller, shapes = scenario.controller, (*scenario.obstacles, *scenario.regions)
+    controller = scenario.controller
+    shapes = (*scenario.obstacles, *scenario.regions)
     if not isinstance(controller, Weighted):
         how = "" if controller.commands == ROTORS else f' with commands = "{controller.commands}"'
         exported = "exported are unconstrained, constrained, robust, nonlinear, and geometric of rates"
@@ -240,7 +248,8 @@ def exported_law(scenario: Scenario) -> Exportable:
 
 
 def _facts(controller: CSource) -> dict[str, Any]:
-    room, size = controller.rows + 1, {"precision": controller.precision, "memory_bytes": controller.memory_bytes}
+    room = controller.rows + 1
+    size = {"precision": controller.precision, "memory_bytes": controller.memory_bytes}
     if isinstance(controller, CGeometric):
         return size
     if isinstance(controller, CNonlinear):
@@ -295,8 +304,10 @@ def vector_files(recording: Recording, controller: CSource) -> dict[str, str]:
 
 
 def _readme(scenario: Scenario, controller: CSource, room: str) -> str:
-    precision, law = controller.precision, controller.law_name
-    solves_none, flags = isinstance(controller, CGeometric), f"-ffp-contract=off {controller.defines}".strip()
+    precision = controller.precision
+    law = controller.law_name
+    solves_none = isinstance(controller, CGeometric)
+    flags = f"-ffp-contract=off {controller.defines}".strip()
     what = "geometric" if solves_none else "model predictive"
     files = *controller.law_files, *BODY_FILES
     sources = ", ".join(f"`{name}`" for name in files if not name.startswith(("quadsim_guard", law)))

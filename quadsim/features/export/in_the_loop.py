@@ -115,7 +115,8 @@ class Program:
     def receive(self, count: int) -> bytes:
         """Return `count` bytes; fewer if the program has ended, or sends nothing for `LONGEST_ANSWER`."""
         assert self._process.stdout is not None
-        line, data = self._process.stdout.fileno(), b""
+        line = self._process.stdout.fileno()
+        data = b""
         while len(data) < count and select.select([line], [], [], LONGEST_ANSWER)[0]:
             more = os.read(line, count - len(data))
             if not more:
@@ -193,12 +194,16 @@ class SerialMPC:
     """An exported controller at the other end of a serial line, by its numbers' bytes."""
 
     def __init__(self, line: Line, frames: Frames) -> None:
-        self._line, self._frames = line, frames
-        self._number, self._window, self._speeds = 0, np.zeros((0, 0)), np.zeros(N_ROTORS)
+        self._line = line
+        self._frames = frames
+        self._number = 0
+        self._window = np.zeros((0, 0))
+        self._speeds = np.zeros(N_ROTORS)
 
     def reset(self, speeds: Array) -> None:
         """Restart after u(-1) (4,) [rad/s]."""
-        self._speeds, self._window = np.array(speeds, float), np.zeros((0, 0))
+        self._speeds = np.array(speeds, float)
+        self._window = np.zeros((0, 0))
 
     def step(self, time: float, state: Array, reference: Array, acting: Array, kind: Solving = QueryKind.STEP) -> Reply:
         """The answer at t_k [s] to x(k), the reference and u(k-1) (4,), as the exported controller takes them.
@@ -240,15 +245,21 @@ class MPCInTheLoop:
     predict: Callable[[Array, Array], Array]  # there is none: plans stay where they are made
 
     def __init__(self, line: Line, source: CSource, name: str, target: Machine) -> None:
-        self.name, self.solver, self.horizon = name, f"C99 on {target.title}", source.horizon
-        self.commands, self.ways = source.commands, [0] * len(STATUSES)
+        self.name = name
+        self.solver = f"C99 on {target.title}"
+        self.horizon = source.horizon
+        self.commands = source.commands
+        self.ways = [0] * len(STATUSES)
         self._serial = SerialMPC(line, Frames(source.precision, source.state, source.reference[1]))
-        self._before, self._bounds, self._whole = np.zeros(N_ROTORS), source.bounds, source.state > N_STATES
+        self._before = np.zeros(N_ROTORS)
+        self._bounds = source.bounds
+        self._whole = source.state > N_STATES
         self._rows = source.motion_rows
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
-        self._before, self.ways = np.array(speeds, float), [0] * len(STATUSES)
+        self._before = np.array(speeds, float)
+        self.ways = [0] * len(STATUSES)
         self._serial.reset(speeds)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
@@ -264,9 +275,11 @@ class MPCInTheLoop:
             return stopped(self._before.copy(), self.horizon, now.phase)
         kind: Solving = QueryKind.STEP if now.phase is Phase.FLYING else QueryKind.STAND
         if self._whole:
-            state, reference = measured_state(now, state), reference_rows(now, reference, self._rows)
+            state = measured_state(now, state)
+            reference = reference_rows(now, reference, self._rows)
         reply = self._serial.step(now.time, state, reference, acting, kind)
-        self._before, status = reply.command, STATUSES[reply.status]
+        self._before = reply.command
+        status = STATUSES[reply.status]
         self.ways[reply.status] += 1
         return Command(
             speeds=reply.command.copy(),
@@ -309,7 +322,8 @@ def fly_exported(
         >>> import quadsim
         >>> flight = quadsim.fly_exported("hover", target="cortex-m4f", precision="float")  # doctest: +SKIP
     """
-    assembly, machine = Assembly(load_scenario(scenario)), TARGETS[target]
+    assembly = Assembly(load_scenario(scenario))
+    machine = TARGETS[target]
     assembly.user_autopilot = autopilot
     source = c_controller(assembly, precision)
     files = source.files | programs(source, machine)

@@ -58,14 +58,20 @@ class Recorder:
     """A law whose questions are noted: from where the flight begins to where it ends, or where a measurement lacks."""
 
     def __init__(self, inner: RecordedLaw) -> None:
-        self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
+        self.inner = inner
+        self.name = inner.name
+        self.solver = inner.solver
+        self.horizon = inner.horizon
         self.commands = inner.commands if isinstance(inner, QUATERNIONS) else ROTORS
         self.asked: list[_Asked] = []
-        self._before, self._ended = np.zeros(4), False
+        self._before = np.zeros(4)
+        self._ended = False
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
-        self.asked, self._before, self._ended = [], np.array(speeds, float), False
+        self.asked = []
+        self._before = np.array(speeds, float)
+        self._ended = False
         self.inner.reset(speeds)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
@@ -149,6 +155,7 @@ def _found(law: LinearMPC | NonlinearMPC | GeometricController, command: Command
 
 def _free_commands(law: UnconstrainedMPC, asked: list[_Asked]) -> Array:
     """(K, 4) from the core: the one gain of Eq. (24) has lost half its digits at N = 100."""
-    core, desired = Core(with_constraints(law.problem)), law.problem.desired
+    core = Core(with_constraints(law.problem))
+    desired = law.problem.desired
     queries = (Query(state, desired(path), acting) for state, acting, path, _ in asked)
     return np.array([core.solve(query).plan[0] for query in queries])

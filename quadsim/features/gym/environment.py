@@ -112,9 +112,13 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._base.control_period))}
         self.observations = Observations(observation, preview)
         self.actions = Actions(action, self._base, Assembly(self._base).vehicle)
-        self.action_space, self.observation_space = self.actions.space, self.observations.space
-        self.render_mode, self._size = render_mode, (width, height)
-        self.preview, self._reward, self._action = preview, RewardHook(reward), action
+        self.action_space = self.actions.space
+        self.observation_space = self.observations.space
+        self.render_mode = render_mode
+        self._size = (width, height)
+        self.preview = preview
+        self._reward = RewardHook(reward)
+        self._action = action
         self._flight: Rollout | None = None
         self._camera: Camera | None = None
         self._closed = False
@@ -192,7 +196,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         scenario = episode.scenario
         if self._flight is not None:
             self._flight.close()
-        self.scenario, self._episode = scenario, episode
+        self.scenario = scenario
+        self._episode = episode
         assembly = self.episodes.assembly(scenario)
         if self.episodes.varied:
             self.actions = Actions(self._action, scenario, assembly.vehicle)
@@ -203,7 +208,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._margins = Margins(self.limits, scenario.plant.timestep)
         self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
         self._seen = self._flight.observation
-        self._truth, self._over = self._seen.truth, False
+        self._truth = self._seen.truth
+        self._over = False
         loop = self._flight.loop
         return self._vector(self._seen), self._info(*self._margins.of_start(loop.physics, loop.rotors))
 
@@ -276,7 +282,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         Raises:
             ParameterError: actions are thrust and rates.
         """
-        low, high = self.action_space.low, self.action_space.high
+        low = self.action_space.low
+        high = self.action_space.high
         action = np.clip(self.actions.of(command.speeds), low, high)
         self.fly_instead(action, command)
         return action
@@ -317,7 +324,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
     def _vector(self, seen: Observation) -> Array:
         """Return the observation; beyond its end the reference keeps its last value."""
-        rows, acting = seen.preview, seen.moment.acting
+        rows = seen.preview
+        acting = seen.moment.acting
         assert acting is not None
         if len(rows) < self.preview:
             last = rows[-1:] if len(rows) else seen.reference[None]
@@ -326,7 +334,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
     def _info(self, worst: Array, sampled: Array) -> dict[str, Any]:
         self.violated = beyond = violated(self._margins.tolerances, self._margins.required, worst, sampled)
-        loop, names = self.started.loop, self.constraint_names
+        loop = self.started.loop
+        names = self.constraint_names
         return {
             "margins": dict(zip(names, worst.tolist(), strict=True)),
             "margins_sampled": dict(zip(names, sampled.tolist(), strict=True)),
@@ -343,7 +352,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 class Agent:
     """Placeholder for a controller where actions fly; the scenario's controller is built when first needed."""
 
-    name, solver = "agent", ""
+    name = "agent"
+    solver = ""
 
     def __init__(self, horizon: int) -> None:
         self.horizon = horizon

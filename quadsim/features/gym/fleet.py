@@ -112,9 +112,12 @@ class Apart:
     ) -> None:
         """Set up as `single` is, by its options; `most` steps end an episode."""
         self._environments = [QuadrotorEnv(single.episodes, **options) for _ in range(count)]
-        self._rewards, self._most = rewards, most
+        self._rewards = rewards
+        self._most = most
         self._names = single.constraint_names
-        self._state, self._reference, self._speeds = np.zeros((count, 12)), np.zeros((count, 4)), np.zeros((count, 4))
+        self._state = np.zeros((count, 12))
+        self._reference = np.zeros((count, 4))
+        self._speeds = np.zeros((count, 4))
 
     def reset(self, episodes: Mapping[int, Episode], frame: StepResults) -> None:
         """See `Fleet`."""
@@ -134,7 +137,8 @@ class Apart:
             diverged[place] = environment.started.k == before
             cut = self._most is not None and before + 1 >= self._most
             frame.observations[place] = observed
-            frame.terminated[place], frame.truncated[place] = terminated, truncated or (cut and not terminated)
+            frame.terminated[place] = terminated
+            frame.truncated[place] = truncated or (cut and not terminated)
             self._fill(place, info, frame)
         margins = dict(zip(self._names, frame.smallest.T, strict=False))
         rewards = self._rewards.of_many(self._state.copy(), self._reference.copy(), self._speeds.copy(), margins)
@@ -146,7 +150,9 @@ class Apart:
             environment.close()
 
     def _fill(self, place: int, info: dict[str, Any], frame: StepResults) -> None:
-        frame.time[place], frame.phases[place], frame.reasons[place] = info["time"], info["phase"], info["reason"]
+        frame.time[place] = info["time"]
+        frame.phases[place] = info["phase"]
+        frame.reasons[place] = info["reason"]
         self._state[place], self._reference[place], self._speeds[place] = self._environments[place].outcome
         if frame.smallest.shape[1]:
             frame.smallest[place] = -info["constraint_values"]
@@ -207,8 +213,12 @@ class Together:
     ) -> None:
         """Set up as `single` is; `most` periods end an episode where that is before its scenario's end."""
         base = single.episodes.base
-        self._episodes, self._action, self._preview = single.episodes, single.actions.kind, single.preview
-        self._observations, self._rewards, self._most = single.observations, rewards, most
+        self._episodes = single.episodes
+        self._action = single.actions.kind
+        self._preview = single.preview
+        self._observations = single.observations
+        self._rewards = rewards
+        self._most = most
         self._names = single.constraint_names
         self._margined = margins
         self._period = base.control_period
@@ -247,9 +257,11 @@ class Together:
         for error in self._lost(places).values():
             raise error
         frame.observations[places] = self._observe(places)
-        frame.rewards[places], frame.time[places] = 0.0, 0.0
+        frame.rewards[places] = 0.0
+        frame.time[places] = 0.0
         frame.terminated[places] = frame.truncated[places] = False
-        frame.phases[places], frame.reasons[places] = str(Phase.FLYING), ""
+        frame.phases[places] = str(Phase.FLYING)
+        frame.reasons[places] = ""
         self._fill_margins(places, frame)
 
     def _put(self, place: int, episode: Episode) -> None:
@@ -259,14 +271,17 @@ class Together:
         margins = setup.margins if self._margined else None
         self._batch.put(place, slot.plant, setup.state, setup.speeds, loop=slot.autopilot, margins=margins)
         if margins is not None:
-            self._tolerances[:, place], self._required[place] = margins.tolerances, margins.required
+            self._tolerances[:, place] = margins.tolerances
+            self._required[place] = margins.required
         if self._episodes.varied:
             for name, values in setup.actions.scale.items():
                 self._scale[name][place] = values
             self._keep_rows(place, setup.rows)
-        self._k[place], self._turns[place] = 0, np.nan
+        self._k[place] = 0
+        self._turns[place] = np.nan
         self._periods[place] = setup.periods if self._most is None else min(setup.periods, self._most)
-        self._lowest[place], self._loss[place] = setup.state[_HEIGHT], setup.loss
+        self._lowest[place] = setup.state[_HEIGHT]
+        self._loss[place] = setup.loss
         self._state[place] = self._batch.state[place]
         if slot.navigation is not None:
             slot.navigation.reset(slot.plant.physics, setup.speeds, yaw=float(setup.state[_YAW]))
@@ -323,7 +338,8 @@ class Together:
         """See `Fleet`."""
         batch = self._batch
         commands = action_commands(self._action, self._scale, actions, self._state[:, _YAW])
-        batch.reference[:], batch.measured[:] = self._followed[:, 0], self._state
+        batch.reference[:] = self._followed[:, 0]
+        batch.measured[:] = self._state
         sensed = [i for i in self._sensed if flying[i]]
         for place in sensed:
             batch.sense(place, self._navigation(place).begin(batch.steps))
@@ -345,7 +361,8 @@ class Together:
         for place, error in lost.items():
             self._state[place] = batch.state[place]
             self._follow(np.array([place]))
-            frame.terminated[place], frame.reasons[place] = True, str(error)
+            frame.terminated[place] = True
+            frame.reasons[place] = str(error)
         frame.observations[places] = self._observe(places)
         frame.time[:] = self._k * self._period
         self._fill_margins(places, frame)
@@ -357,14 +374,18 @@ class Together:
     def _end(self, place: int, error: FlightError, frame: StepResults) -> None:
         """Fill in the row of a place whose flight ended within the period, which is not part of it."""
         frame.observations[place] = self._observe(np.array([place]))[0]
-        frame.terminated[place], frame.reasons[place] = True, str(error)
+        frame.terminated[place] = True
+        frame.reasons[place] = str(error)
 
     def _fill_margins(self, places: NDArray[np.intp], frame: StepResults) -> None:
         if not self._margined:
             return
-        smallest, at_end = self._batch.smallest[places], self._batch.at_end[places]
-        frame.smallest[places], frame.at_end[places] = smallest, at_end
-        tolerances, required = self._tolerances[:, places], self._required[places]
+        smallest = self._batch.smallest[places]
+        at_end = self._batch.at_end[places]
+        frame.smallest[places] = smallest
+        frame.at_end[places] = at_end
+        tolerances = self._tolerances[:, places]
+        required = self._required[places]
         frame.violated[places] = violated(tolerances, required, smallest, at_end)
 
     def _navigation(self, place: int) -> Navigation:
@@ -382,7 +403,8 @@ class Together:
 
     def _lost(self, places: NDArray[np.intp]) -> dict[int, FlightError]:
         """Return what of the places is lost, with the reason; a period's lowest reference counts from it on."""
-        states, references = self._batch.state[places], self._followed[places, 0]
+        states = self._batch.state[places]
+        references = self._followed[places, 0]
         lowest = np.minimum(self._lowest[places], references[:, 2])
         self._lowest[places] = lowest
         values = np.empty((len(places), len(CRITERIA)))
@@ -404,5 +426,6 @@ class Together:
         return lost
 
     def _observe(self, places: NDArray[np.intp]) -> Array:
-        previews, acting = self._followed[places, 1:], self._batch.acting[places]
+        previews = self._followed[places, 1:]
+        acting = self._batch.acting[places]
         return self._observations.of_many(self._state[places], previews, acting)

@@ -73,7 +73,8 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
             scenario = scenario.replace({"controller": dict(controller)})
         if not isinstance(scenario.controller, Robust):
             raise ParameterError("controller", "type", scenario.controller.type, "robust, for a safety filter")
-        self._base, self._spec = base, scenario.controller
+        self._base = base
+        self._spec = scenario.controller
         self._vehicle: Vehicle | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -86,7 +87,8 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         observed = self.env.reset(seed=seed, options=options)
         started = self._base.started
         if started.vehicle != self._vehicle:
-            vehicle, period = started.vehicle, started.scenario.control_period
+            vehicle = started.vehicle
+            period = started.scenario.control_period
             self._filter = safety_filter(self._spec, vehicle, period)
             self._law = Pilot(self._filter, vehicle, guard=self._spec.guard(vehicle, period))
             self._vehicle = started.vehicle
@@ -106,7 +108,8 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         """
         if self._vehicle is None:
             raise ResetNeeded("call env.reset() first; a pickled or copied environment is without its episode")
-        seen, horizon = self._base.started.observation, self._law.horizon
+        seen = self._base.started.observation
+        horizon = self._law.horizon
         requested = self._base.actions.held_speeds(action, _body_rates(seen))
         self._filter.requested = requested
         preview = seen.preview[:horizon]

@@ -69,10 +69,14 @@ class Actions:
             raise UnknownNameError("action", str(kind), ACTIONS)
         spec = scenario.controller
         if isinstance(spec, Bounded):
-            bounds, owner = spec.input_bounds.actuators(vehicle), "controller.input_bounds"
+            bounds = spec.input_bounds.actuators(vehicle)
+            owner = "controller.input_bounds"
         else:
-            bounds, owner = ActuatorBounds.of_vehicle(vehicle), f"vehicle {vehicle.name}"
-        low, high, hover = bounds.u_min, bounds.u_max, vehicle.hover_speeds
+            bounds = ActuatorBounds.of_vehicle(vehicle)
+            owner = f"vehicle {vehicle.name}"
+        low = bounds.u_min
+        high = bounds.u_max
+        hover = vehicle.hover_speeds
         self.kind = kind
         self.numbers = 8 if kind == "attitude" else N_ROTORS
         self.scale: dict[str, Array] = {}
@@ -95,7 +99,9 @@ class Actions:
             low, high = (np.array(vehicle.level_thrust(float(speed))) for speed in (low.max(), high.min()))
             self.scale["half_period"] = np.array(0.5 * scenario.control_period)
         elif kind == "thrust":
-            low, hover, high = vehicle.thrusts(low), vehicle.thrusts(hover), vehicle.thrusts(high)
+            low = vehicle.thrusts(low)
+            hover = vehicle.thrusts(hover)
+            high = vehicle.thrusts(high)
             linear, quadratic = vehicle.thrust_law
             self.scale |= {"linear": np.array(linear), "quadratic": quadratic}
         self.scale |= {"hover": hover, "down": hover - low, "up": high - hover}

@@ -109,7 +109,8 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         self.scenario = self._episodes.base
         self.observations = self._single.observations
         self.constraint_names = self._single.constraint_names if margins else ()
-        self.single_action_space, self.single_observation_space = self._single.action_space, self.observations.space
+        self.single_action_space = self._single.action_space
+        self.single_observation_space = self.observations.space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.render_mode = None
@@ -273,7 +274,8 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         self._fleet.reset(episodes, frame)
         for place, episode in episodes.items():
             self._log.start(place, episode)
-            self._started[place], self._ended[place] = True, False
+            self._started[place] = True
+            self._ended[place] = False
             self._note(place, episode)
         self._log.trim()
 
@@ -292,7 +294,8 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
 
     def _info(self, mask: Flags) -> dict[str, Any]:
         """Return `info` of the last frame, where a mask holds."""
-        frame, names = self._frame, self.constraint_names
+        frame = self._frame
+        names = self.constraint_names
         info: dict[str, Any] = {}
         if names:
             info["margins"] = _masked(dict(zip(names, frame.smallest.T.copy(), strict=True)), mask)
@@ -300,7 +303,9 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             info["constraint_values"] = -frame.smallest
             info["constraint_violation"] = frame.violated.any(axis=1).astype(np.int64)
             info["cost"] = frame.violated.sum(axis=1, dtype=np.float64)
-        info["time"], info["phase"], info["reason"] = frame.time.copy(), frame.phases.copy(), frame.reasons.copy()
+        info["time"] = frame.time.copy()
+        info["phase"] = frame.phases.copy()
+        info["reason"] = frame.reasons.copy()
         for name, values in self._of_episodes.items():
             info[name] = _masked(values, mask) if isinstance(values, dict) else values
         return _masked(info, mask)
@@ -310,7 +315,8 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         frame = self._frame
         results = frame.rewards.copy(), frame.terminated.copy(), frame.truncated.copy()
         final: dict[str, Any] = {"final_info": self._info(ended), "_final_info": ended}
-        final["final_obs"], final["_final_obs"] = np.full(self.num_envs, None, object), ended
+        final["final_obs"] = np.full(self.num_envs, None, object)
+        final["_final_obs"] = ended
         places = np.flatnonzero(ended).tolist()
         for place in places:
             final["final_obs"][place] = frame.observations[place].copy()
@@ -357,7 +363,8 @@ class _ActionLog:
 
     def recorded(self, place: int, *, ended: bool) -> tuple[Episode, list[Array]] | None:
         """Return an episode and its actions (4,): the last that ended, or the present one."""
-        last, present = self._ended[place], self._present[place]
+        last = self._ended[place]
+        present = self._present[place]
         if ended or (last is not None and present is not None and last[1] == present[1]):
             found = last
         else:

@@ -59,9 +59,11 @@ def turning_pairs(record: Record, parts: Sequence[slice], meant: Callable[[Array
 
 def lateral_motion(record: Record, parts: Sequence[slice]) -> Lateral:
     """What `tilt_fit` fits."""
-    step, motion = stride(record.period), []
+    step = stride(record.period)
+    motion = []
     for part in parts:
-        velocity, axis = record.velocity[part], body_z(record.attitude[part])
+        velocity = record.velocity[part]
+        axis = body_z(record.attitude[part])
         rows = [rate_over_window(velocity, record.period, SLOW_WINDOW)]
         rows += [mean(values, record.period, SLOW_WINDOW) for values in (axis, velocity)]
         acceleration, axis, velocity = (x[::step, 0] + 1j * x[::step, 1] for x in rows)
@@ -75,14 +77,16 @@ def tilt_fit(motion: Lateral, *, mirrored: bool = False, shift: int = 0) -> tupl
     Returns:
         The share of dv/dt that it explains, and c [m/s^2]: its angle is that from tilt to acceleration.
     """
-    rows, sides = [], []
+    rows = []
+    sides = []
     for acceleration, axis, velocity in motion:
         b, a = aligned(axis.conj() if mirrored else axis, acceleration, shift)
         _, v = aligned(axis, velocity, shift)
         *known, side = (np.concatenate([x.real, x.imag]) for x in (x - x.mean() for x in (b, 1j * b, v, a)))
         rows.append(np.stack(known, axis=1))
         sides.append(side)
-    matrix, side = np.concatenate(rows), np.concatenate(sides)
+    matrix = np.concatenate(rows)
+    side = np.concatenate(sides)
     solution = np.linalg.lstsq(matrix, side, rcond=None)[0]
     total = float(np.square(side).sum())
     explained = 1.0 - float(np.square(side - matrix @ solution).sum()) / total if total else 0.0
@@ -168,7 +172,8 @@ def _better(readings: Mapping[str, Pairs], names: Sequence[str], period: float) 
 
     `readings` has the pairs of each reading of the first. A reading, a change and a shift count against an explanation.
     """
-    best, better = -9.0, ("", 0.0)
+    best = -9.0
+    better = ("", 0.0)
     for shift in shifts(period):
         usual = float(np.trace(correlations(readings[""], shift)))
         cost = abs(shift) * stride(period) * period / 0.3
@@ -176,7 +181,8 @@ def _better(readings: Mapping[str, Pairs], names: Sequence[str], period: float) 
             for change, score in _changes(correlations(pairs, shift), names):
                 total = score - 0.7 * bool(reading) - cost
                 if total > best:
-                    best, better = total, ("; ".join(filter(None, (reading, change))), score - usual)
+                    best = total
+                    better = ("; ".join(filter(None, (reading, change))), score - usual)
     return better[0] if better[1] > LEAST_RISE else ""
 
 

@@ -41,7 +41,8 @@ def read_blackbox(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     log = Parser.load(str(path), allow_invalid_header=True)
     begins = [*log.reader.log_pointers, path.stat().st_size]
     log = Parser.load(str(path), 1 + int(np.argmax(np.diff(begins))), allow_invalid_header=True)
-    names, headers = log.field_names, log.headers
+    names = log.field_names
+    headers = log.headers
     try:
         for frame in log.frames():
             rows.append(frame.data[: len(names)])

@@ -88,7 +88,8 @@ def between(path: Path, what: str, low: ArrayLike, high: ArrayLike) -> dict[str,
     Raises:
         FileError: the ends are not in order.
     """
-    zero, full = np.asarray(low, float), np.asarray(high, float)
+    zero = np.asarray(low, float)
+    full = np.asarray(high, float)
     if not (zero < full).all():
         raise FileError(path, f"states {what} from {zero} to {full}; the longest must be above the shortest")
     return {"zero": zero, "scale": 1.0 / (full - zero)}

@@ -25,7 +25,8 @@ from quadsim.vehicle import Vehicle
 SHORTEST_SPAN: Final = 2.0  # [s] of a span that is used
 LEAST: Final = 4.0  # [s] that the longest must have
 GROUND_MARGIN: Final = 0.5  # [s] cut beside the ground, where it still acts through the air and the legs
-SLOW, CALM = 0.3, 0.5
+SLOW = 0.3
+CALM = 0.5
 """Speed [m/s] and turn rate [rad/s] below which a vehicle may stand on the ground."""
 CONSTANT: Final = 3e-3  # share of the outputs below which their change in a second is none
 STILL: Final = 1e-3  # share of the largest output below which a rotor's outputs do not change
@@ -182,7 +183,8 @@ def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
         rows = getattr(record, field)
         if rows is None:
             continue
-        squares, loads = [], []
+        squares = []
+        loads = []
         for part in parts:
             rate = rate_over_window(record.velocity[part], record.period, 0.2) + np.array([0.0, 0.0, vehicle.gravity])
             loads.append((rate * body_z(record.attitude[part])).sum(axis=1) / vehicle.gravity)
@@ -211,7 +213,8 @@ def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
 def _note_gaps(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
     logged = _logged(record)
     if not logged.all():
-        share, first = 100.0 * (1.0 - logged.mean()), record.t[np.argmin(logged)]
+        share = 100.0 * (1.0 - logged.mean())
+        first = record.t[np.argmin(logged)]
         yield f"{record.name}: {share:.2g} % of its samples, left out, are in gaps, the first at t = {first:.4g} s"
 
 
@@ -225,7 +228,8 @@ def _note_limits(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
     for field in INPUTS[:2]:
         if (rows := getattr(record, field)) is not None:
             flown = np.concatenate([rows[part] for part in parts])
-            low, high = flown.min(), flown.max()
+            low = flown.min()
+            high = flown.max()
             near = 2e-3 * (high - low)
             share = float(((flown <= low + near) | (flown >= high - near)).any(axis=1).mean())
             if share > CLIPPED:

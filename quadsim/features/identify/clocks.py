@@ -25,14 +25,16 @@ def check_clocks(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
     Raises:
         InputError: a shift is above `REFUSED_SHIFT`.
     """
-    ticks, tick = shifts(record.period), stride(record.period) * record.period
+    ticks = shifts(record.period)
+    tick = stride(record.period) * record.period
     turns = turning_pairs(record, parts)
     like = np.array([likeness(turns, shift) for shift in ticks])
     if like.max() > 0.7:
         yield from _note(record.name, "rates are", _peak(like) * tick)
     lateral = lateral_motion(record, parts)
     unlike = 1.0 - np.array([tilt_fit(lateral, shift=shift)[0] for shift in ticks])
-    now, least = unlike[len(ticks) // 2], unlike.min()
+    now = unlike[len(ticks) // 2]
+    least = unlike.min()
     if least < 0.7 and now > 1.3 * least and now > least + 4e-3:
         yield from _note(record.name, "velocity is", _peak(-unlike) * tick)
 

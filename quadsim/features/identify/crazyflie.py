@@ -53,14 +53,17 @@ def _columns(data: bytes) -> dict[str, Column]:
     def name() -> str:
         nonlocal at
         end = data.index(0, at)
-        text, at = data[at:end].decode("ascii"), end + 1
+        text = data[at:end].decode("ascii")
+        at = end + 1
         return text
 
     events: dict[int, tuple[list[str], struct.Struct, list[Any]]] = {}
     for _ in range(count):
-        (number,), at = struct.unpack_from("<H", data, at), at + 2
+        (number,) = struct.unpack_from("<H", data, at)
+        at = at + 2
         name()  # of the event
-        (size,), at = struct.unpack_from("<H", data, at), at + 2
+        (size,) = struct.unpack_from("<H", data, at)
+        at = at + 2
         variables = [name() for _ in range(size)]
         values = struct.Struct("<" + "".join(variable[-2] for variable in variables))
         events[number] = ([variable[:-3] for variable in variables], values, [])

@@ -64,7 +64,8 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
             while (message := log.recv_match(type=[*used, "PARM"])) is not None:
                 clock = next((name for name in _CLOCKS if name in message.get_fieldnames()), None)
                 if (kind := message.get_type()) in used and clock is not None:
-                    of, row = message.fmt.instance_field, message.to_dict()
+                    of = message.fmt.instance_field
+                    row = message.to_dict()
                     name = f"{kind}[{row[of]}]" if of and row[of] else kind
                     fields.setdefault(name, [key for key, value in row.items() if isinstance(value, int | float)])
                     rows.setdefault(name, []).append(tuple(row[key] for key in fields[name]))

@@ -64,13 +64,19 @@ def _estimate(
     scatter = np.sqrt((blocks - 1) * fit.left_out.var(axis=0))
     halves: Array = np.hypot(quantile(_MANY) * fit.explained, quantile(blocks) * scatter)
     if place < 3:
-        kind, unit, sensor, scale = "torque", "N m", "gyro", known.vehicle.inertia[place]
+        kind = "torque"
+        unit = "N m"
+        sensor = "gyro"
+        scale = known.vehicle.inertia[place]
         (inertia,) = (estimate for estimate in known.estimates if estimate.name == f"inertia_{axis}")
         # The vehicle may keep another inertia than was found.
         farthest = max(math.log(inertia.high / scale), math.log(scale / inertia.low))
         halves[0] = math.hypot(halves[0], farthest)
     else:
-        kind, unit, sensor, scale = "force", "N", "velocity", known.vehicle.mass
+        kind = "force"
+        unit = "N"
+        sensor = "velocity"
+        scale = known.vehicle.mass
     factors = np.exp(np.minimum(halves, _UNKNOWN))
     deviation = scale * fit.noise.deviation
     time = fit.noise.time

@@ -46,7 +46,9 @@ _GUSTS: Final = 0.015  # of drag, by wind that changes faster than its knots
 _BLOWN: Final = 0.01  # of what torques show, by such wind where `rotor_moment` turns it into torque
 _MAPPED: Final = 2.0  # how much more the prediction leaves out where speeds follow from a throttle's curve
 _SPUN: Final = 0.004  # of inertia: noise of the gyro shrinks what commands explain, by 0.5 % where it is loud
-_LAG_UNKNOWN, _ANSWER_UNKNOWN, _TORQUE_UNKNOWN = 0.4, 0.15, 0.08
+_LAG_UNKNOWN = 0.4
+_ANSWER_UNKNOWN = 0.15
+_TORQUE_UNKNOWN = 0.08
 """Of a lag that is searched for, of one that measured speeds show, and of torques: deviations per share of the rows in
 which a radio held what the log says of the rotors too."""
 _TURNS: Final = "a figure eight with yaw steps, 20 s"
@@ -168,8 +170,11 @@ class _Fit:
     """What a search found, judged; of numbers that it held, what another found `before`."""
 
     def __init__(self, search: Search, response: Mapping[str, RotorResponse], before: _Fit | None = None) -> None:
-        self.search, self.vehicle, self.response = search, search.vehicle, response
-        blocks, prior = search.blocks(instrumented=True), search.prior(search.x)[1].H
+        self.search = search
+        self.vehicle = search.vehicle
+        self.response = response
+        blocks = search.blocks(instrumented=True)
+        prior = search.prior(search.x)[1].H
         whole = _together(blocks, prior)
         H = whole.H
         self.cov = _covariance(whole)
@@ -226,7 +231,8 @@ class _Fit:
 
     def _gusts_turn(self) -> bool:
         """Whether there is wind and, by two standard deviations, a moment that it makes a torque of."""
-        sought, deviations = self.search.sought, np.sqrt(np.diag(self.cov))
+        sought = self.search.sought
+        deviations = np.sqrt(np.diag(self.cov))
         moments = [i for i, number in enumerate(sought) if number.name.startswith("rotor_moment")]
         blows = any(number.name == "wind" for number in sought)
         return blows and any(
@@ -242,7 +248,8 @@ class _Fit:
         if self.response:
             found |= self._response()
         elif "rotor_rise" not in found:
-            why, lag = "the log has the rotors' speeds but not their commands", self.vehicle.rotor_rise or 0.0
+            why = "the log has the rotors' speeds but not their commands"
+            lag = self.vehicle.rotor_rise or 0.0
             found |= {name: self._judged(name, lag, lag, lag, why) for name in ("rotor_rise", "rotor_fall")}
         return self._judged_together(found)
 
@@ -285,7 +292,8 @@ class _Fit:
         """How the rotors answer, where the log has both speeds and commands."""
         found = {}
         for name, response in self.response.items():
-            kind, value = _KINDS[name], response.value
+            kind = _KINDS[name]
+            value = response.value
             unknown = _ANSWER_UNKNOWN * self._rotors_unknown
             spread = math.hypot(response.deviation, _ANSWERS * abs(value), unknown * abs(value))
             half = _quantile(response.blocks) * spread
@@ -303,8 +311,10 @@ class _Fit:
 
     def _estimate(self, name: str, places: Sequence[int]) -> ParameterEstimate:
         """One number, or the mean of those of each flight with an interval that holds each."""
-        search, kind = self.search, _KINDS[name]
-        x, number = search.x[list(places)], search.sought[places[0]]
+        search = self.search
+        kind = _KINDS[name]
+        x = search.x[list(places)]
+        number = search.sought[places[0]]
         if len(places) == 1 and self._speaks_against_the_start(places[0]):
             self.set_anew.add(name)
         halves = np.array([self._half_width({i: 1.0}, kind.axes) for i in places])
@@ -321,7 +331,8 @@ class _Fit:
 
     def _speaks_against_the_start(self, i: int) -> bool:
         """Whether a number is two standard deviations of what the innovations explain from the start's, or from 0."""
-        number, deviation = self.search.sought[i], math.sqrt(self.cov[i, i])
+        number = self.search.sought[i]
+        deviation = math.sqrt(self.cov[i, i])
         if number.name in ("body_drag", *_PER_FLIGHT):
             return False
         absent = number.scale is None and number_in(self.vehicle, number.name) is None
@@ -329,7 +340,8 @@ class _Fit:
 
     def _weak(self, name: str, places: Sequence[int], half: float, value: float) -> str:
         """Why a number that is searched for tells nothing, or nothing."""
-        number, kind = self.search.sought[places[0]], _KINDS[name]
+        number = self.search.sought[places[0]]
+        kind = _KINDS[name]
         scale = number.scale
         if name.startswith("inertia_") and not self.search.settled:
             return f"{_WEAK}: the commands explain too little of the measured speeds"
@@ -487,7 +499,8 @@ def _impossible(search: Search) -> dict[str, float]:
 def _moved(estimate: ParameterEstimate, value: float) -> ParameterEstimate:
     """What the second search found, its interval that of both: what they differ by is not known either."""
     moved = value - estimate.value
-    low, high = estimate.low + min(moved, 0.0), estimate.high + max(moved, 0.0)
+    low = estimate.low + min(moved, 0.0)
+    high = estimate.high + max(moved, 0.0)
     return replace(estimate, value=value, low=low, high=high)
 
 

@@ -106,7 +106,8 @@ def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, RATES_HELD))
 
 def horizon_figure(prediction: PredictionErrors) -> Figure:
     """Return the mean errors over the horizon."""
-    x, panels = np.array((0.0, *HORIZONS)), []
+    x = np.array((0.0, *HORIZONS))
+    panels = []
     for j, (quantity, si) in enumerate(QUANTITIES.items()):
         unit, scale = shown_unit(si)
         series = tuple(

@@ -59,7 +59,8 @@ def levelled_attitude(t: Array, rates: Array, force: Array) -> Array:
     q_{k+1} = q_k exp(dt w), turned towards f = g e_z in the world with a time constant of `_LEVELLING`: where a flight
     ends as fast as it began, the mean of f is the weight.
     """
-    rates, there = np.nan_to_num(rates), np.asarray(np.isfinite(force).all(axis=1))
+    rates = np.nan_to_num(rates)
+    there = np.asarray(np.isfinite(force).all(axis=1))
     force = np.where(there[:, None], force, np.nan)
     fx, fy, fz = np.nanmean(force[t <= t[0] + _AT_FIRST], axis=0)
     level = np.array([np.arctan2(fy, fz), np.arctan2(-fx, np.hypot(fy, fz)), 0.0])

@@ -40,8 +40,12 @@ JUDGED: Final = (0.1, 0.25, 0.5)  # horizons of the verdict [s]
 RATES_JUDGED: Final = 2  # of them for body rates: later, what is not known of the torque is most of the error
 TIE: Final = 0.05  # by which the errors of a quantity may exceed a rival's, in their geometric mean over the horizons
 NEAR_FLOOR: Final = 0.25  # by which they may exceed the floor to be said to reach it
-IDENTIFIED, NO_DISTURBANCE, START = "identified", "undisturbed", "start"
-RATES_HELD, RATES_DECAY, NOISE_FLOOR = "rates held", "rates decay", "floor"
+IDENTIFIED = "identified"
+NO_DISTURBANCE = "undisturbed"
+START = "start"
+RATES_HELD = "rates held"
+RATES_DECAY = "rates decay"
+NOISE_FLOOR = "floor"
 RIVALS: Final = (START, RATES_HELD, RATES_DECAY)
 QUANTITIES: Final = {"position": "m", "velocity": "m/s", "attitude": "rad", "body rates": "rad/s"}
 ROTOR_FIELDS: Final = ("commands", "throttle", "speeds", "voltage")  # what a record may say of them
@@ -126,7 +130,8 @@ def hold_out(record: Record, spans: Sequence[slice]) -> tuple[list[slice], list[
     Where what is left of a span is too short to be fitted, all of it is held out.
     """
     left = round((1.0 - _HELD_OUT) * sum(span.stop - span.start for span in spans))
-    fitted, held = [], []
+    fitted = []
+    held = []
     for span in spans:
         cut = min(span.start + left, span.stop)
         left -= cut - span.start
@@ -152,7 +157,9 @@ def predict(
     """
     errors: dict[str, list[Array]] = {}
     residuals: dict[str, list[Array]] = {}
-    traces, ends, begun = [], [], 0.0
+    traces = []
+    ends = []
+    begun = 0.0
     rng = np.random.default_rng(0)
     for flight, record, span in (
         (i, record, span) for i, (record, own) in enumerate(zip(records, spans, strict=True)) for span in own
@@ -340,7 +347,8 @@ class _Windows:
             change = changes(periods, ahead, rates + begun[:, :3], velocity + begun[:, 3:], extra)
             position = position + period * (velocity + 0.5 * change[:, 3:])
             attitude = attitude * Rotation.from_rotvec(period * (rates + 0.5 * change[:, :3]))
-            velocity, rates = velocity + change[:, 3:], rates + change[:, :3]
+            velocity = velocity + change[:, 3:]
+            rates = rates + change[:, :3]
             states.append(np.concatenate([position, velocity, attitude.as_quat(scalar_first=True), rates], axis=1))
         return np.stack(states, axis=1)
 

@@ -33,7 +33,9 @@ _LISTED: Final = 40  # names in a message
 _DEGREE: Final = math.pi / 180.0
 _LENGTHS: Final = {"m": (0.0, 1.0), "cm": (0.0, 0.01), "mm": (0.0, 1e-3)}
 _SPEEDS: Final = {"rad/s": (0.0, 1.0), "rpm": (0.0, RPM)}
-_WORLDS, _BODIES, _BOTH = ("ENU", "NED"), ("FLU", "FRD"), ("ENU/FLU", "NED/FRD")
+_WORLDS = ("ENU", "NED")
+_BODIES = ("FLU", "FRD")
+_BOTH = ("ENU/FLU", "NED/FRD")
 
 
 class Quantity(NamedTuple):
@@ -220,7 +222,8 @@ def _check_samples(name: str, columns: Mapping[str, Column], one: NamedQuantity)
     """Refuse a quantity with a finite sample that no vehicle has, in whatever unit: by its column, time and value."""
     largest = LARGEST_SAMPLES.get(one.quantity, math.inf)
     size = len(one.columns)
-    zeros, scales = np.broadcast_to(one.zero, size), np.broadcast_to(one.scale, size)
+    zeros = np.broadcast_to(one.zero, size)
+    scales = np.broadcast_to(one.scale, size)
     for column, zero, scale in zip(one.columns, zeros, scales, strict=True):
         t, logged = columns[column]
         beyond = np.isfinite(logged) & (np.abs(logged - zero) > largest / scale)

@@ -216,7 +216,9 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
 
 def _thinned(grid: Array, values: Mapping[str, Array], size: int) -> tuple[Array, dict[str, Any]]:
     """The mean of every `size` samples, odd, about their middle; of what is held, from there to the next middle."""
-    count, half, means = len(grid) // size - 1, size // 2, {}
+    count = len(grid) // size - 1
+    half = size // 2
+    means = {}
     for field, rows in values.items():
         begin = half if field in INPUTS[:2] else 0
         blocks = rows[begin : begin + count * size]
@@ -310,7 +312,8 @@ def _clock(name: str, series: Mapping[str, Column]) -> Array:
             f"{name}: {1.0 / period:.3g} samples per second, period {period:.4g} s; at least {SLOWEST_RATE:g} Hz are "
             "needed and 100 Hz or more are good (is t in seconds?)"
         )
-    start, stop = max(s.t[0] for s in series.values()), min(s.t[-1] for s in series.values())
+    start = max(s.t[0] for s in series.values())
+    stop = min(s.t[-1] for s in series.values())
     if stop - start < 2.0 * period:
         raise InputError(f"{name}: its fields share no time: the last starts at {start:.6g} s, one ends at {stop:.6g}")
     if all(s.t is slower for s in series.values()):
@@ -332,7 +335,8 @@ def _sampled(series: Column, grid: Array, *, held: bool) -> Array:
         return series.values
     if np.count_nonzero(there) < 2:
         return np.full((grid.size, series.values.shape[1]), np.nan)
-    t, values = series.t[there], series.values[there]
+    t = series.t[there]
+    values = series.values[there]
     period = max(_usual_period(series.t), float(grid[1] - grid[0]))
     near = 0.05 * period  # a stamp's jitter must neither hold a command for a period too long nor open a gap
     before = np.clip(np.searchsorted(t, grid + near, side="right") - 1, 0, t.size - 1)

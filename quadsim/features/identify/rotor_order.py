@@ -43,15 +43,20 @@ def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) 
     blocks = [_moments(record, parts, lag) for lag in (LAGS if record.speeds is None else LAGS[:1])]
     x, y, _ = vehicle.hubs.T / vehicle.longest_arm
     usual = _best(blocks, np.stack([y, -x]))
-    best, order, turn = usual, tuple(range(N_ROTORS)), 0.0
+    best = usual
+    order = tuple(range(N_ROTORS))
+    turn = 0.0
     for angle in (0.0, math.pi / 4.0):
-        turned_x, turned_y = x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
+        turned_x = x * math.cos(angle) - y * math.sin(angle)
+        turned_y = x * math.sin(angle) + y * math.cos(angle)
         for columns in permutations(range(N_ROTORS)):
             arms = np.empty((2, N_ROTORS))
             arms[:, columns] = np.stack([turned_y, -turned_x])
             explained = _best(blocks, arms)
             if explained.mean() > best.mean() + 1e-9:
-                best, order, turn = explained, columns, angle
+                best = explained
+                order = columns
+                turn = angle
     if best.mean() > EXPLAINED and usual.mean() < INFERIOR * best.mean() and (best > usual).mean() >= AGREEING:
         raise InputError(
             f"{record.name}: {_named(order, turn, vehicle, record)}, which explains {100.0 * best.mean():.0f} % of the "
@@ -68,8 +73,10 @@ def explained_at_lag(record: Record, parts: Sequence[slice], vehicle: Vehicle, l
 
 def _moments(record: Record, parts: Sequence[slice], lag: float) -> Moments:
     """Moments of the blocks of all parts, the mean of each block removed, the commands behind a lag [s]."""
-    period, size = record.period, max(round(BLOCK / record.period), 8)
-    speeds, accelerations = [], []
+    period = record.period
+    size = max(round(BLOCK / record.period), 8)
+    speeds = []
+    accelerations = []
     for part in parts:
         inputs = driver(record)[part]
         if lag:
@@ -82,7 +89,8 @@ def _moments(record: Record, parts: Sequence[slice], lag: float) -> Moments:
             rate_over_window(record.rates[part], period, ACCELERATION_WINDOW)[:whole].reshape(-1, size, 3)
         )
     x, a = (np.concatenate(rows) for rows in (speeds, accelerations))
-    x, a = x - x.mean(axis=1, keepdims=True), a - a.mean(axis=1, keepdims=True)
+    x = x - x.mean(axis=1, keepdims=True)
+    a = a - a.mean(axis=1, keepdims=True)
     return Moments(xx=x.transpose(0, 2, 1) @ x, xa=x.transpose(0, 2, 1) @ a, aa=np.square(a).sum(axis=1))
 
 
@@ -120,7 +128,8 @@ def _check_spins(name: str, blocks: Sequence[Moments], vehicle: Vehicle) -> None
     spins = np.array(vehicle.rotor_spins, float)
     shares = []
     for xx, xa, aa in blocks:
-        along, power = xa[:, :, 2] @ spins, float((xx @ spins @ spins).sum())
+        along = xa[:, :, 2] @ spins
+        power = float((xx @ spins @ spins).sum())
         gain = float(along.sum()) / max(power, 1e-30)
         shares.append((gain * float(along.sum()) / max(float(aa[:, 2].sum()), 1e-30), gain, (along < 0.0).mean()))
     explained, gain, against = max(shares)

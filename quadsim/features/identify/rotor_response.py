@@ -53,7 +53,8 @@ def rotor_response(parts: Sequence[Stretch], vehicle: Vehicle, voltage: float) -
     voltages = [part.record.voltage for part in parts if part.record.voltage is not None]
     sags = bool(voltages) and np.ptp(np.concatenate(voltages)) > _SAG * voltage
     start |= {"voltage_exponent": 1.0} if sags else {}
-    period, edge = record.period, round(_EDGE / record.period)
+    period = record.period
+    edge = round(_EDGE / record.period)
     low_pass = butter(2, min(CORNER, 0.1 / period), fs=1.0 / period, output="sos")
     speeds = [np.asarray(part.record.speeds) for part in parts]
     known = []
@@ -69,7 +70,8 @@ def rotor_response(parts: Sequence[Stretch], vehicle: Vehicle, voltage: float) -
         p = Parameters.of(vehicle, voltage=voltage, **numbers)
         rows = []
         for part, (slow, change) in zip(parts, known, strict=True):
-            target, n = commanded(part.record, vehicle, p), np.arange(len(slow))
+            target = commanded(part.record, vehicle, p)
+            n = np.arange(len(slow))
             late = n - delay / period - 0.5  # a command that is held is half a period late in the mean
             target = np.stack([np.interp(late, n, column) for column in target.T], axis=1) * np.exp(x[len(start) :])
             left = slow + np.where(change > 0.0, rise, fall) * change

@@ -71,7 +71,8 @@ def check_against_each_other(record: Record, parts: Sequence[slice], vehicle: Ve
     def centre(of: Array) -> float:
         return float(np.linalg.norm(arms.T @ of) / of.sum())
 
-    scales, left = np.ones(len(spins)), np.full(len(spins), np.inf)
+    scales = np.ones(len(spins))
+    left = np.full(len(spins), np.inf)
     for i, spin in enumerate(spins):
         others = spins * thrusts
         others[i] = 0.0
@@ -101,7 +102,8 @@ def check_not_commands(record: Record, parts: Sequence[slice], vehicle: Vehicle)
     lagging = [explained_at_lag(record, parts, vehicle, lag) for lag in LAGS[1:]]
     best = int(np.argmax([of.mean() for of in lagging]))
     as_they_are = [explained_at_lag(_smoothed(record, parts, tau), parts, vehicle, 0.0) for tau in SMOOTHING]
-    behind, beside = lagging[best], max(as_they_are, key=lambda of: float(of.mean()))
+    behind = lagging[best]
+    beside = max(as_they_are, key=lambda of: float(of.mean()))
     gain = (1.0 - beside.mean()) / max(1.0 - behind.mean(), 1e-9)
     if behind.mean() > EXPLAINED and gain > LAGGING_BETTER and (behind > beside).mean() >= AGREEING - 0.05:
         raise InputError(

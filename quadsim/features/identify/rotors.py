@@ -32,7 +32,8 @@ class Turning:
 
     def during(self, periods: Indices) -> Turning:
         """The same in some periods alone, as if one followed the other."""
-        change, speeds = self.change[periods], np.zeros((len(periods) + 1, N_ROTORS))
+        change = self.change[periods]
+        speeds = np.zeros((len(periods) + 1, N_ROTORS))
         np.cumsum(change, axis=0, out=speeds[1:])
         return Turning(speeds=speeds, mean=self.mean[periods], square=self.square[periods])
 
@@ -85,7 +86,8 @@ def measured(speeds: Array, period: float, *, delay: float) -> Turning:
     n = len(speeds)
     when = np.arange(n) + delay / period
     at = np.stack([np.interp(when, np.arange(n), column) for column in speeds.T], axis=1)
-    before, after = at[:-1], at[1:]
+    before = at[:-1]
+    after = at[1:]
     square = (before**2 + before * after + after**2) / 3.0
     return Turning(speeds=at, mean=0.5 * (before + after), square=square)
 

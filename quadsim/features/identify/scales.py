@@ -25,7 +25,8 @@ _TOLERANCE: Final = 0.07
 _OF_ONE: Final = 0.25  # by which one column alone may
 _WINDOW: Final = 0.2  # [s] over which motions are compared
 _ALIKE: Final = 0.9  # least correlation of two motions whose scales are compared
-_SAME, _NEAR = 0.03, 0.05
+_SAME = 0.03
+_NEAR = 0.05
 """Within which the factors of three columns are one, and a factor is a clock's or a unit's."""
 _UNITS: Final = {
     "gyro": ((180.0 / math.pi, "deg/s"), (2.0, "a gyro at twice the full scale that was assumed"),
@@ -74,7 +75,8 @@ def check_scales(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> No
             lambda part: rate_over_window(position[part], record.period, _WINDOW),
             lambda part: mean(record.velocity[part], record.period, _WINDOW),
         ))  # fmt: skip
-    turn, move = _common(turns), _common(moves)
+    turn = _common(turns)
+    move = _common(moves)
     name = record.name
     if turn is not None and turn.off():
         moved = move is not None and move.like(turn.value, _NEAR)
@@ -116,12 +118,14 @@ def _refuse(
 ) -> None:
     """Refuse three columns together, or those of them that are off."""
     if common is not None and common.off():
-        names, value = ", ".join(columns.split()), common.value
+        names = ", ".join(columns.split())
+        value = common.value
     else:
         wrong = {of: f for of, f in zip(columns.split(), factors, strict=True) if f is not None and f.off(_OF_ONE)}
         if not wrong:
             return
-        names, value = ", ".join(wrong), next(iter(wrong.values())).value
+        names = ", ".join(wrong)
+        value = next(iter(wrong.values())).value
     verb = "are" if "," in names else "is"
     raise InputError(f"{name}: {names} {verb} {value:.3g} times {what}{_likely(value, kind)}; give {unit}")
 
@@ -160,7 +164,8 @@ def _turned(rates: Array, period: float) -> Array:
     half = half_window(period, _WINDOW)
     if np.abs(rates).max() * _WINDOW > math.pi:  # it turns as often as it likes
         return mean(rates, period, _WINDOW)
-    steps, count = 0.5 * period * (rates[1:] + rates[:-1]), len(rates) - 2 * half
+    steps = 0.5 * period * (rates[1:] + rates[:-1])
+    count = len(rates) - 2 * half
     turn = Rotation.identity(count)
     for k in range(2 * half):
         turn = turn * Rotation.from_rotvec(steps[k : k + count])

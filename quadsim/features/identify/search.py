@@ -47,9 +47,13 @@ LEVEL_PLATE: Final = (1.0, 1.0, 2.0)  # drag areas along x, y, z to each other, 
 _LAG_RATIO: Final = 0.5  # standard deviation of log(rise / fall)
 _WIND: Final = (2.0, 2.0, 0.7)  # standard deviation of the mean wind of a stretch, world axes [m/s]
 _WIND_STEP: Final = 0.2  # of its change in one second, over that of the mean
-_STEPS, _TRIES, _SMALL = 60, 8, 5e-3  # of the search: how many, shortened how often, until the likelihood gains less
+_STEPS = 60
+_TRIES = 8
+_SMALL = 5e-3  # of the search: how many, shortened how often, until the likelihood gains less
 _LOG_STEP: Final = 1e-4  # of a logarithm, for slopes
-_NEWTON_STEPS, _LONGEST_STEP, _SETTLED = 30, 0.5, 2e-3
+_NEWTON_STEPS = 30
+_LONGEST_STEP = 0.5
+_SETTLED = 2e-3
 """Of the search with instruments: how many, how long at most, and how short a step of the inertia ends it."""
 ROTOR_PARAMETERS: Final = ("rotor_rise", "rotor_fall", "delay", "throttle_curve", "voltage_exponent")
 """Parameters that the rotors' speeds depend on."""
@@ -80,7 +84,9 @@ class Sought(NamedTuple):
 
 def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterator[Sought]:
     """What is searched for, from the vehicle of the start file on."""
-    weight, arm, hover = vehicle.mass * vehicle.gravity, vehicle.longest_arm, vehicle.hover_speed
+    weight = vehicle.mass * vehicle.gravity
+    arm = vehicle.longest_arm
+    hover = vehicle.hover_speed
     record = parts[0].record
     lag = vehicle.rotor_rise or vehicle.rotor_fall or 0.03
     yield Sought("thrust_coefficient", vehicle.mean_coefficient, None, None)
@@ -137,7 +143,9 @@ class Search:
     def __init__(
         self, parts: Sequence[Stretch], vehicle: Vehicle, *, wind: bool, fixed: Mapping[str, float] | None = None
     ) -> None:
-        self.parts, self.vehicle, self.fixed = parts, vehicle, fixed or {}
+        self.parts = parts
+        self.vehicle = vehicle
+        self.fixed = fixed or {}
         self.sought = [number for number in _sought(vehicle, parts, wind=wind) if number.name not in self.fixed]
         self.voltage = mean_voltage(parts)
         self.flights = 1 + parts[-1].flight
@@ -174,7 +182,8 @@ class Search:
         } | dict(self.fixed)
         if len(self._winds[part]):
             own["wind"] = x[self._winds[part]] * _WIND
-        area, given = own.pop("body_drag"), self.vehicle.body_drag or LEVEL_PLATE
+        area = own.pop("body_drag")
+        given = self.vehicle.body_drag or LEVEL_PLATE
         for name, axes in {**VECTORS, "offset": "xy"}.items():
             own[name] = np.array([own.pop(f"{name}_{axis}") for axis in axes])
         own.setdefault("throttle_curve", self.vehicle.throttle_share)
@@ -182,7 +191,8 @@ class Search:
 
     def _turns(self, x: Array, part: int, *, foretold: bool = False) -> Turning:
         """A stretch's rotors, as they were measured or as the commands foretell them."""
-        of, parameters = self.parts[part], self.parameters(x, part)
+        of = self.parts[part]
+        parameters = self.parameters(x, part)
         if foretold and of.foretold is not None:
             return measured(of.foretold, of.record.period, delay=parameters.delay)
         return turning(of.record, self.vehicle, parameters)
@@ -207,7 +217,8 @@ class Search:
 
     def _innovations_of(self, misfit: Array, x: Array, part: int, axis: int) -> Array:
         """(N,) innovations of one axis: e = A(z) / C(z) d, the first d less what is wrong with its sample."""
-        (noise, start), driven = self._noise(part, axis), misfit[:, axis].copy()
+        noise, start = self._noise(part, axis)
+        driven = misfit[:, axis].copy()
         driven[0] += x[start] * self.sigma[self.parts[part].flight, axis]
         return np.asarray(lfilter(*self._polynomials(x[noise.start : noise.stop], axis), driven))
 
@@ -228,7 +239,8 @@ class Search:
 
     def prior(self, x: Array) -> tuple[float, NormalEquations]:
         """Half the squares of what the priors add, and their normal equations."""
-        H, g = np.diag(self._weights), self._weights * x
+        H = np.diag(self._weights)
+        g = self._weights * x
         cost = 0.5 * float(self._weights @ x**2)
         for row, residual, deviation in self._rules(x):
             slope = np.zeros(len(x))
@@ -252,7 +264,8 @@ class Search:
                 PLATE[1],
             )
         if {"rotor_rise", "rotor_fall"} <= {*place}:
-            rise, fall = place["rotor_rise"], place["rotor_fall"]
+            rise = place["rotor_rise"]
+            fall = place["rotor_fall"]
             ratio = self.sought[rise].value(x[rise]) / self.sought[fall].value(x[fall])
             yield [(rise, 1.0), (fall, -1.0)], float(np.log(ratio)), _LAG_RATIO
         for part, wind in zip(self.parts, self._winds, strict=True):
@@ -384,7 +397,8 @@ class Search:
     def _orthogonal(self) -> bool:
         """Make the innovations orthogonal to the instruments, by Newton's steps; return whether that settles."""
         for _ in range(_NEWTON_STEPS):
-            blocks, (_, prior) = self.blocks(instrumented=True), self.prior(self.x)
+            blocks = self.blocks(instrumented=True)
+            _, prior = self.prior(self.x)
             H = sum(block.H for block in blocks) + prior.H
             g = sum(block.g for block in blocks) + prior.g
             try:
@@ -398,14 +412,18 @@ class Search:
 
     def _most_likely(self) -> None:
         """Gauss-Newton steps, damped by Levenberg and Marquardt."""
-        damping, cost = 1e-2, self.cost(self.x)
+        damping = 1e-2
+        cost = self.cost(self.x)
         for _ in range(_STEPS):
-            scale, every = self.sigma, self._by_flight(self.innovations(self.x))
+            scale = self.sigma
+            every = self._by_flight(self.innovations(self.x))
             self.sigma = np.stack([np.sqrt((e**2).mean(axis=0)) for e in every])
             starts = self.x[self._starts :].reshape(-1, len(INCREMENTS))
             starts *= (scale / self.sigma)[[part.flight for part in self.parts]]  # they count in sigma
-            blocks, (_, prior) = self.blocks(), self.prior(self.x)
-            H, g = sum(b.H for b in blocks) + prior.H, sum(b.g for b in blocks) + prior.g
+            blocks = self.blocks()
+            _, prior = self.prior(self.x)
+            H = sum(b.H for b in blocks) + prior.H
+            g = sum(b.g for b in blocks) + prior.g
             cost = self.cost(self.x)
             for _ in range(_TRIES):
                 step = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)

@@ -23,7 +23,8 @@ FARTHEST: Final = 1.5  # how far a sample may be from the median about it, in ra
 LOUDEST: Final = 8.0  # the same in median distances, where a column hardly changes
 COMMANDS_APART: Final = 3.0  # how far a command may be from 0, in the largest median: a real one may last one sample
 MOST_CUT: Final = 0.01  # share of a sensor's samples that may be cut
-TURN_AWAY, TURNED_BACK = 1.0, 0.5
+TURN_AWAY = 1.0
+TURNED_BACK = 0.5
 """Angles [rad]: an attitude that is farther than the first from both neighbours, which are nearer than the second."""
 LENGTH: Final = 0.02  # by which the length of a quaternion may differ from 1
 CARRYING: Final = 0.5  # share of the others' usual speed above which they carry a vehicle
@@ -133,7 +134,8 @@ def _attitude_spikes(quaternion: Array) -> NDArray[np.bool_]:
         along = np.abs((unit[step:] * unit[:-step]).sum(axis=1))
         return np.asarray(2.0 * np.arccos(np.minimum(along, 1.0)))
 
-    once, twice = turn(1), turn(2)
+    once = turn(1)
+    twice = turn(2)
     away = (once[:-1] > TURN_AWAY) & (once[1:] > TURN_AWAY) & (twice < TURNED_BACK)
     spikes[rows[1:-1][away]] = True
     return spikes

@@ -127,6 +127,7 @@ def _by_pulses(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
         stated = [[stated_number(path, parameters, way, -1.0) for way in ways] for ways in names]
         return np.array([next((pulse for pulse in of if pulse >= 0.0), usual) for of in stated])
 
-    low, high = pulses("MIN", 1000.0), pulses("MAX", 2000.0)
+    low = pulses("MIN", 1000.0)
+    high = pulses("MAX", 2000.0)
     columns = tuple(f"actuator_outputs.output[{i}]" for i in outputs)
     return {"columns": columns, **between(path, "pulses of PWM_MAIN", low, high)}

@@ -30,7 +30,8 @@ def mean(values: Array, period: float, window: float) -> Array:
 
 def turn_rate(quaternion: Array, period: float, window: float) -> Array:
     """Body rates (N, 3) [rad/s] by which attitudes (N, 4) turn over a window [s] about each sample."""
-    half, attitude = half_window(period, window), Rotation.from_quat(quaternion, scalar_first=True)
+    half = half_window(period, window)
+    attitude = Rotation.from_quat(quaternion, scalar_first=True)
     turn = attitude[: -2 * half].inv() * attitude[2 * half :]
     return _padded(turn.as_rotvec() / (2 * half * period), half)
 

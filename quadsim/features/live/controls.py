@@ -44,7 +44,9 @@ class Widgets:
     """
 
     def __init__(self, gui: Any, session: Session, drives: Callable[[int], bool]) -> None:
-        self.gui, self.session, self._drives = gui, session, drives
+        self.gui = gui
+        self.session = session
+        self._drives = drives
         self._starts: list[tuple[Any, Any]] = []  # widgets, and what they are at the start of a flight
         self._shown: dict[str, tuple[Any, Callable[[Disturbances], Any], _Input]] = {}  # by label: see `shows`
         self._given: dict[str, int] = {}  # likewise, the period in which a person changed it last
@@ -116,7 +118,8 @@ class Widgets:
         self._submit(widget)
 
     def _submit(self, widget: Any) -> None:
-        label, acts = widget.label, self.session.disturbances
+        label = widget.label
+        acts = self.session.disturbances
         self._given[label] = self.session.k
         self.session.submit(self._shown[label][2](widget.value, acts), subject=label)
 
@@ -126,10 +129,13 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
 
     `use` takes a hint away.
     """
-    gui, session, mass = widgets.gui, widgets.session, widgets.session.flights[0].actual.mass
+    gui = widgets.gui
+    session = widgets.session
+    mass = widgets.session.flights[0].actual.mass
     acts = session.disturbances
     gust = {"type": "gust", "velocity": [1.0, 0.0, 0.0], "duration": 1.0}
-    load, lag = {"type": "mass", "factor": 1.1}, {"type": "rotor_lag", "rise": 0.01}
+    load = {"type": "mass", "factor": 1.1}
+    lag = {"type": "rotor_lag", "rise": 0.01}
     sensors = [{"type": "sensor_fault", "sensor": name, "fault": "nan", "duration": 1.0} for name in _SENSORS]
     no_wind, no_load, no_lag, *blind = session.refusals([gust, load, lag, *sensors])
 
@@ -173,7 +179,8 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     )
     gui.add_html(readout.says(f"No wind: {no_wind}" if no_wind else "", "why"))
     off = {"disabled": bool(no_load)}
-    least, most = min(0.7, acts.mass_factor), max(1.5, acts.mass_factor)
+    least = min(0.7, acts.mass_factor)
+    most = max(1.5, acts.mass_factor)
     widgets.shows(
         gui.add_slider("Mass factor", least, most, 0.01, acts.mass_factor, **off),
         lambda acts: acts.mass_factor,
@@ -211,7 +218,10 @@ class Steering:
 
     def __init__(self, widgets: Widgets, scene: Any, stage: Stage, use: Callable[[str], None]) -> None:
         """Fill the tab; `use` takes a hint away."""
-        self._session, self._stage, self._use, gui = widgets.session, stage, use, widgets.gui
+        self._session = widgets.session
+        self._stage = stage
+        self._use = use
+        gui = widgets.gui
         self._velocity = np.zeros(3)
         gui.add_html(readout.block(readout.STEER, "why"))
         here = np.asarray(self._session.flights[0].loop.course.row(0)[:3])
@@ -237,7 +247,8 @@ class Steering:
 
     def clicked(self, event: Any) -> None:
         """Fly to the point of the ground that was clicked, at the set-point's height."""
-        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        origin = np.array(event.ray_origin)
+        direction = np.array(event.ray_direction)
         above = origin[2] - self._stage.ground
         if above * direction[2] < 0.0:  # it meets the ground
             meets = origin - above / direction[2] * direction
@@ -249,8 +260,10 @@ class Steering:
     def _set_point(self, at: Any) -> None:
         self.stop()
         x, y, z = (round(float(number), 2) for number in at)
-        self._handle.position, self._place.value = np.array([x, y, z]), (x, y, z)
-        self._stage.mark.position, self._stage.mark.visible = (x, y, self._stage.ground), True
+        self._handle.position = np.array([x, y, z])
+        self._place.value = (x, y, z)
+        self._stage.mark.position = (x, y, self._stage.ground)
+        self._stage.mark.visible = True
         self._session.submit({"type": "setpoint", "x": x, "y": y, "z": z}, subject="setpoint")
 
     def stop(self) -> None:
@@ -283,7 +296,9 @@ class ControllerTab:
     """
 
     def __init__(self, widgets: Widgets, others: Mapping[str, AnyController], doing: Callable[[str], Any]) -> None:
-        self._widgets, self._session, self._doing = widgets, widgets.session, doing
+        self._widgets = widgets
+        self._session = widgets.session
+        self._doing = doing
         self._laws = {"initial": self._session.scenario.controller, **others}
         self._values: dict[str, KnobValue] = {}  # by path, as they fly
         self._groups: list[Any] = []  # folders of fields
@@ -318,7 +333,10 @@ class ControllerTab:
 
     def _input(self, knob: Knob, label: str) -> Any:
         """The widget of a field."""
-        gui, look, low, high = self._widgets.gui, {"hint": knob.about}, knob.minimum, knob.maximum
+        gui = self._widgets.gui
+        look = {"hint": knob.about}
+        low = knob.minimum
+        high = knob.maximum
         match knob.value:
             case bool(value):
                 return gui.add_checkbox(label, value, **look)
@@ -332,7 +350,9 @@ class ControllerTab:
                 return gui.add_number(label, value, step=step, min=low, max=high, **look)
 
     async def _turn(self, path: str, event: Any) -> None:
-        handle, value, before = event.target, event.target.value, self._values.get(path)
+        handle = event.target
+        value = event.target.value
+        before = self._values.get(path)
         if before is None or value == before:  # of a controller that was replaced meanwhile, or put back
             return
         if await self._replace(event, {path: value}, f"{path} = {value}, was {before}"):

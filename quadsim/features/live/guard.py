@@ -41,14 +41,17 @@ class Guard:
     """
 
     def __init__(self, host: str) -> None:
-        self._host, self.token = host, secrets.token_urlsafe(24)
+        self._host = host
+        self.token = secrets.token_urlsafe(24)
 
     def refusal(self, headers: Any, path: str, port: int) -> str | None:
         """Return why a request with these headers, path and query, to this port, is refused, or None."""
-        hosts, origins = _values(headers, "Host"), _values(headers, "Origin")
+        hosts = _values(headers, "Host")
+        origins = _values(headers, "Origin")
         if len(hosts) > 1 or len(origins) > 1:
             return "a header is there twice"
-        host, origin = next(iter(hosts), ""), next(iter(origins), None)
+        host = next(iter(hosts), "")
+        origin = next(iter(origins), None)
         if not self._is_ours(host, port):
             return "this server goes by another name"
         if origin is not None and not self._is_ours(origin.partition("://")[2], port):
@@ -116,7 +119,8 @@ class Guard:
         """Whether `HOST:PORT` is this server."""
         try:
             parts = urlsplit(f"//{netloc}")
-            host, its_port = parts.hostname or "", parts.port
+            host = parts.hostname or ""
+            its_port = parts.port
         except ValueError:
             return False
         if its_port != port or host in LOOPBACK or host == self._host:

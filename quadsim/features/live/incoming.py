@@ -59,7 +59,8 @@ class Incoming:
     """
 
     def __init__(self, server: Any, drives: Callable[[int], bool]) -> None:
-        self._server, self._drives = server, drives
+        self._server = server
+        self._drives = drives
         connection = server._websock_server
         self._guard(connection, self._check_shared)
         connection.on_client_connect(lambda client: self._guard(client, lambda number, message: True))
@@ -131,7 +132,8 @@ def offers(widget: Any, value: Any) -> bool:
         return isinstance(value, bool)
     if isinstance(present, str):
         return isinstance(value, str)
-    low, high = getattr(props, "min", None), getattr(props, "max", None)
+    low = getattr(props, "min", None)
+    high = getattr(props, "max", None)
     if isinstance(present, tuple):
         if not isinstance(value, list | tuple) or len(value) != len(present):
             return False

@@ -59,7 +59,8 @@ def knobs(spec: AnyController) -> tuple[Knob, ...]:
 
 
 def _walk(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterator[Knob]:
-    below, entries = f"{path}." if path else "", [entry for kind in kinds for entry in kind.entries]
+    below = f"{path}." if path else ""
+    entries = [entry for kind in kinds for entry in kind.entries]
     pair = isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(n, int | float) for n in value)
     if is_table(type(value)):
         for name, field in fields_of(type(value)).items():

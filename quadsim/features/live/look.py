@@ -87,11 +87,13 @@ def airframe(model: mujoco.MjModel) -> Iterator[tuple[str, tuple[float, ...], tr
     """Yield the airframe level at the origin: each material, its colour (4,) and all parts made of it."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    body, parts = model.body(BODY).id, defaultdict[int, list[trimesh.Trimesh]](list)
+    body = model.body(BODY).id
+    parts = defaultdict[int, list[trimesh.Trimesh]](list)
     for geom in range(model.ngeom):
         if model.body_rootid[model.geom_bodyid[geom]] == body and model.geom_group[geom] <= 2:
             kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
-            place, turn = data.geom_xpos[geom] - data.xpos[body], data.geom_xmat[geom].reshape(3, 3)
+            place = data.geom_xpos[geom] - data.xpos[body]
+            turn = data.geom_xmat[geom].reshape(3, 3)
             parts[model.geom_matid[geom]].append(_solid(kind, model.geom_size[geom], place, turn))
     for material, meshes in parts.items():
         yield model.material(material).name, tuple(model.mat_rgba[material].tolist()), trimesh.util.concatenate(meshes)
@@ -109,7 +111,9 @@ def floor(square: float) -> bytes:
     far below, lets the floor be the first.
     """
     picture = np.empty((128, 128, 3), np.uint8)  # of two by two squares
-    picture[:], picture[:64, :64], picture[64:, 64:] = _SQUARES[1], _SQUARES[0], _SQUARES[0]
+    picture[:] = _SQUARES[1]
+    picture[:64, :64] = _SQUARES[0]
+    picture[64:, 64:] = _SQUARES[0]
     picture[[0, -1]] = picture[:, [0, -1]] = _SEAM
     around = np.linspace(0.0, 2.0 * np.pi, 33)
     points = _REACH * np.pad(np.stack([np.cos(around), np.sin(around)], axis=1), ((1, 0), (0, 1)))
@@ -167,5 +171,6 @@ def _solid(kind: str, size: Any, centre: Any, turn: Any) -> trimesh.Trimesh:
         case _:
             mesh = trimesh.creation.icosphere(2).apply_scale((a, b, c) if kind == "ellipsoid" else a)
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, centre
+    pose[:3, :3] = turn
+    pose[:3, 3] = centre
     return mesh.apply_transform(pose)

@@ -29,14 +29,21 @@ class Pace:
     """
 
     def __init__(self, now: Callable[[], float] = clock.monotonic, *, waiting: bool = False) -> None:
-        self._now, self._stop, self._single = now, threading.Event(), threading.Semaphore(0)
+        self._now = now
+        self._stop = threading.Event()
+        self._single = threading.Semaphore(0)
         self._orders: deque[Callable[[Session], None]] = deque()
-        self.speed, self.paused, self.waiting = 1.0, waiting, waiting
-        self.single, self.stop, self.order = self._single.release, self._stop.set, self._orders.append
+        self.speed = 1.0
+        self.paused = waiting
+        self.waiting = waiting
+        self.single = self._single.release
+        self.stop = self._stop.set
+        self.order = self._orders.append
 
     def drive(self, session: Session, view: Any, until: Callable[[Frame], bool] = lambda frame: False) -> None:
         """Fly until `stop` or the last frame, shown by a `Page`; a flight that ended waits for a reset."""
-        due, recent = self._now(), deque[float](maxlen=round(2.0 / session.period) + 1)  # two seconds
+        due = self._now()
+        recent = deque[float](maxlen=round(2.0 / session.period) + 1)  # two seconds
         while not self._stop.is_set():
             while self._orders:
                 self._orders.popleft()(session)

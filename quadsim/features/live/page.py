@@ -97,7 +97,9 @@ class Page:
         port: int = 0,
         others: Mapping[str, AnyController],
     ) -> None:
-        self._session, self._pace, self._save = session, pace, save
+        self._session = session
+        self._pace = pace
+        self._save = save
         guard = Guard(host)
         silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
         title = f"quadsim live: {session.scenario.name}"
@@ -131,8 +133,11 @@ class Page:
         self._server.gui.main_panel.dock_right()
         self.stage = Stage(self._server.scene, session)
         self._away = self.stage.unit * VIEW
-        start, camera = np.asarray(session.flights[0].loop.course.row(0)[:3]), self._server.initial_camera
-        camera.position, camera.look_at, camera.fov = start + self._away, start, FIELD
+        start = np.asarray(session.flights[0].loop.course.row(0)[:3])
+        camera = self._server.initial_camera
+        camera.position = start + self._away
+        camera.look_at = start
+        camera.fov = FIELD
         self._widgets = Widgets(self._server.gui, session, self._drives)
         self._build(others)
         self._server.on_client_connect(self._connected)
@@ -147,7 +152,8 @@ class Page:
 
     def show(self, frame: Frame, factor: float) -> None:
         """Show a flown period."""
-        self._frame, self._factor = frame, factor
+        self._frame = frame
+        self._factor = factor
         values = [None if sample is None else _values(sample) for sample in frame.samples]
         if values[0] is not None:
             self._history.append((frame.time, *values[0]))
@@ -169,7 +175,8 @@ class Page:
                 self._margins.content = self._constraints.rows(frame, audited)
             if (frame.k % (2 * _EVERY) == 0 or self._pace.paused) and len(self._history) > 1:
                 time, *rows = np.array(self._history)[::2].T  # plots are the most of what is sent
-                left, ends = iter(rows), {limit.name: limit.stop for limit in self._session.limits}
+                left = iter(rows)
+                ends = {limit.name: limit.stop for limit in self._session.limits}
                 for plot, bounds, (title, names) in zip(self._plots, self._bounds, _PLOTS.items(), strict=True):
                     lines = [bound.curve(time, ends) for bound in bounds]
                     curves = [*islice(left, len(names)), *lines]
@@ -412,7 +419,8 @@ def _lines_of(session: Session, title: str) -> list[_Line]:
 
 def _values(sample: Period) -> tuple[float, ...]:
     """Return what is plotted of a period, in the order of `_PLOTS`; angles at their largest."""
-    observed, (_, x, y, _) = sample.observation, sample.attitude.T
+    observed = sample.observation
+    _, x, y, _ = sample.attitude.T
     up = 1.0 - 2.0 * (x**2 + y**2)
     tilt = math.degrees(math.acos(np.clip(up.min(), -1.0, 1.0)))
     euler = quaternion_to_euler(sample.attitude)

@@ -100,7 +100,8 @@ def readings(frame: Frame | None, states: Sequence[tuple[float, float]] = (), lo
     sample = None if frame is None else frame.samples[0]
     if frame is None or sample is None:
         return block("&nbsp;", "line") * 4
-    command, late = sample.command, ' <span class="bad">late</span>' if sample.missed else ""
+    command = sample.command
+    late = ' <span class="bad">late</span>' if sample.missed else ""
     solved = f"QP {escape(command.status)} by {escape(command.answered_by)}"
     if command.status not in OPTIMAL or command.fallback:
         solved = f'<span class="bad">QP {escape(command.status)}, fallback {command.fallback}</span>'
@@ -185,7 +186,8 @@ def _number(limit: Limit, margin: float) -> str:
 
 def _mark(limit: Limit, margin: float, vehicle: int) -> str:
     """Return a vehicle's mark: the first one's bar grows towards the bound, the other's is a stroke at its end."""
-    share, colour = min(max(1.0 - margin / limit.half_band, 0.0), _SHOWN) / _SHOWN, line_colour(vehicle)
+    share = min(max(1.0 - margin / limit.half_band, 0.0), _SHOWN) / _SHOWN
+    colour = line_colour(vehicle)
     if vehicle:
         return f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{colour};z-index:1"></i>'
     colour = COLOUR.violated if limit.violated(margin) else colour

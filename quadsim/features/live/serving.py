@@ -54,7 +54,9 @@ def fly_live(
         closing(Session(scenario, against)) as session,
         SignalHold() as hold,
     ):
-        replaced, refused, one = overwrite, list[str](), threading.Lock()
+        replaced = overwrite
+        refused = list[str]()
+        one = threading.Lock()
         saved: Flight | None = None
 
         def save(flight: Flight) -> str:
@@ -81,7 +83,8 @@ def fly_live(
             hold.flown = True
             if session.k:
                 save(session.flight())
-        text, seconds = "", session.k * session.period
+        text = ""
+        seconds = session.k * session.period
         if saved is not None:
             text = "".join(f"{line}\n" for line in (next(iter(saved.shown())), *saved.outputs()))
         status = EXIT_DONE if session.reason is None and not refused else EXIT_FAILED
@@ -113,7 +116,8 @@ def _serve(session: Session, save: Callable[[Flight], str], *, host: str, port: 
             f"listening on {host}: anyone on that network with the address below can fly this session; "
             "the connection is not encrypted"
         )
-    scenario, others = session.scenario, dict[str, AnyController]()
+    scenario = session.scenario
+    others = dict[str, AnyController]()
     for name in scenario_names():
         other = load_scenario(name)
         same = (other.vehicle, other.control_period) == (scenario.vehicle, scenario.control_period)

@@ -137,7 +137,8 @@ class Session:
     """
 
     def __init__(self, scenario: Scenario, against: AnyController | None = None) -> None:
-        self.scenario, self._against = looping(preferring_core(scenario)), against
+        self.scenario = looping(preferring_core(scenario))
+        self._against = against
         self._effects = Assembly(self.scenario).effects
         repeat = self.scenario.reference.repeat
         self._round = None if repeat is None else round(repeat / self.period)  # periods until the course starts again
@@ -153,7 +154,8 @@ class Session:
         if self._against is not None:
             flown.append(Assembly(self.scenario).with_bounds.altered(controller=self._against))
         self.flights = tuple(Rollout(scenario, live=True) for scenario in flown)
-        self._held, self._steered = _Hand(), False
+        self._held = _Hand()
+        self._steered = False
         self.reason: str | None = None
 
     def close(self) -> None:
@@ -179,9 +181,14 @@ class Session:
     @property
     def disturbances(self) -> Disturbances:
         """What acts now; after `reset`, what the scenario starts with."""
-        flight, effects = self.flights[0], self._effects
-        air, load, rotors = effects.air or Air(), effects.load or Load(), effects.rotors or RotorDynamics()
-        wind, factor, lag = air.wind, load.mass_factor, (rotors.rise or 0.0, rotors.fall or 0.0)
+        flight = self.flights[0]
+        effects = self._effects
+        air = effects.air or Air()
+        load = effects.load or Load()
+        rotors = effects.rotors or RotorDynamics()
+        wind = air.wind
+        factor = load.mass_factor
+        lag = (rotors.rise or 0.0, rotors.fall or 0.0)
         changes = [event for event in flight.scenario.events if isinstance(event, WindChange | MassChange | LagChange)]
         for change in sorted(changes, key=lambda change: change.at):
             match change if change.at <= flight.loop.time + 1e-9 else None:
@@ -223,7 +230,8 @@ class Session:
         if not self._steered and self.k == self._round:  # an arrival, say, was one at the end of the first round
             for flight in self.flights:
                 flight.leave_course()
-        pull, shown = self._hold(refused), []
+        pull = self._hold(refused)
+        shown = []
         for flight in self.flights:
             entry: tuple[Period | None, Mapping[str, float], Array | None] = None, {}, None
             if flight.loop.reason is None:
@@ -319,7 +327,8 @@ class Session:
 
     def _left(self, *, by_hand: bool = False) -> Array:
         """Return the share of its thrust that each rotor has left (4,) by the scenario, or with the person's `Wear`."""
-        now, left = self.flights[0].loop.time + 1e-9, np.array((self._effects.rotors or RotorDynamics()).efficiency)
+        now = self.flights[0].loop.time + 1e-9
+        left = np.array((self._effects.rotors or RotorDynamics()).efficiency)
         for event in self.scenario.events:
             if isinstance(event, RotorLoss) and event.at <= now < event.at + (event.duration or math.inf):
                 left[event.rotor - 1] *= 1.0 - event.loss
@@ -329,7 +338,9 @@ class Session:
 
     def _hold(self, refused: list[str]) -> Array:
         """Apply the inputs in force for one more period; return the force of the pull (3,) [N]."""
-        held, force, last = self._held, np.zeros(3), self.flights[0].loop.last
+        held = self._held
+        force = np.zeros(3)
+        last = self.flights[0].loop.last
         if last is None:  # where the vehicle is shows once a period has been flown
             return force
         events: list[dict[str, Any]] = []
@@ -361,7 +372,8 @@ def looping(scenario: Scenario) -> Scenario:
 
     Courses that never end, do not move, or state velocities stay as they are.
     """
-    course, period = Assembly(scenario).course, scenario.control_period
+    course = Assembly(scenario).course
+    period = scenario.control_period
     moves = bool(np.ptp(course.sample(period * np.arange(scenario.periods + 1, dtype=np.float64)), axis=0).any())
     end = max((scenario.duration, *course.jumps, *course.kinks)) if math.isinf(course.end) else course.end
     if scenario.reference.repeat is not None or course.derivatives is not None or not moves or math.isinf(end):
@@ -385,7 +397,8 @@ def read_script(path: str | Path) -> Script:
 
 
 def _horizon(flight: Rollout, sample: Period) -> Array | None:
-    controller, state = flight.loop.controller, sample.observation.state
+    controller = flight.loop.controller
+    state = sample.observation.state
     if not isinstance(controller, Predicting) or len(sample.command.plan) < 1:
         return None
     predicted = controller.predict(state[None], sample.command.plan[None])

@@ -52,7 +52,8 @@ class Stage:
     """
 
     def __init__(self, scene: Any, session: Session) -> None:
-        self._scene, self._session = scene, session
+        self._scene = scene
+        self._session = session
         scene.set_up_direction("+z")
         scene.configure_environment_map(hdri=None)
         scene.configure_default_lights(enabled=False)
@@ -60,9 +61,12 @@ class Stage:
         scene.add_light_directional("/light/sun", intensity=2.0, position=(0.35, -0.25, 0.9))
         self._root = scene.add_frame(_ROOT, show_axes=False)
         vehicle = session.flights[0].actual
-        self.unit, self._weight = vehicle.longest_arm, vehicle.mass * vehicle.gravity
-        self._rotors, self._thrusts = vehicle.hubs, vehicle.thrusts
-        model, alone = compile_model(vehicle, visuals=True), len(session.flights) == 1
+        self.unit = vehicle.longest_arm
+        self._weight = vehicle.mass * vehicle.gravity
+        self._rotors = vehicle.hubs
+        self._thrusts = vehicle.thrusts
+        model = compile_model(vehicle, visuals=True)
+        alone = len(session.flights) == 1
         self._drop = float(model.geom(FLOOR).pos[2])  # from a vehicle to the floor that it stands on [m]
         self._square = look.square_side(self.unit)
         self._floor = scene.add_glb(f"{_ROOT}/floor", look.floor(self._square))
@@ -71,9 +75,15 @@ class Stage:
         self._goal = self._line("goal", _octahedron(0.5 * self.unit), target, 2.5)
         self._hand = self._line("hand", np.zeros((1, 2, 3)), rgb(COLOUR.disturbance), 5.0)
         self._colours: list[Rgb] = []
-        self._frames, self._arrows, self._horizons, self._paths, self._shadows = [], [], [], [], []
+        self._frames = []
+        self._arrows = []
+        self._horizons = []
+        self._paths = []
+        self._shadows = []
         for i, flight in enumerate(session.flights):
-            name, length, colour = f"vehicle{i}", flight.loop.controller.horizon, rgb(line_colour(i))
+            name = f"vehicle{i}"
+            length = flight.loop.controller.horizon
+            colour = rgb(line_colour(i))
             self._frames.append(scene.add_frame(f"{_ROOT}/{name}", show_axes=False))
             for material, (*paint, alpha), mesh in look.airframe(model):
                 tint = tuple(paint) if alone or material not in _TINTED else colour
@@ -89,7 +99,8 @@ class Stage:
             plumb = self._line(f"shadow{i}/plumb", np.array([[(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)]]), _SHADOW, 1.0)
             self._shadows.append((shadow, plumb))
             if not alone:
-                title, top = law_name(flight.loop.controller.name), (0.0, 0.0, (1.4 + 0.5 * i) * self.unit)
+                title = law_name(flight.loop.controller.name)
+                top = (0.0, 0.0, (1.4 + 0.5 * i) * self.unit)
                 scene.add_label(f"{_ROOT}/{name}/label", title, position=top, anchor="bottom-center")
                 self._line(f"{name}/pole", np.array([[(0.0, 0.0, 0.0), top]]), colour, 1.5)
         self.mark = self._add("mark", look.disc(0.5 * self.unit), target, visible=False)
@@ -99,7 +110,8 @@ class Stage:
         self._moving: list[tuple[Obstacle, Any]] = []
         self._regions: list[tuple[SpaceLimit, Any]] = []
         course = _course(session).reshape(-1, 3)
-        low, high = course.min(axis=0) - 1.5, course.max(axis=0) + 1.5
+        low = course.min(axis=0) - 1.5
+        high = course.max(axis=0) + 1.5
         for limit in session.limits:
             match limit:
                 case SpaceLimit(shape=Region() as region):
@@ -110,7 +122,8 @@ class Stage:
                     handle.position = body.position
                     if body.moves:
                         self._moving.append((body, handle))
-        self.ground, self._events = 0.0, 0
+        self.ground = 0.0
+        self._events = 0
         self.reset()
 
     def show(self, frame: Frame) -> None:
@@ -158,14 +171,16 @@ class Stage:
                 at = handle.position = sample.position[step]
                 handle.wxyz = sample.attitude[step]
                 foot = self.ground + 0.01 * self.unit
-                shadow.position, plumb.scale = (*at[:2], foot), (1.0, 1.0, float(at[2] - foot))
+                shadow.position = (*at[:2], foot)
+                plumb.scale = (1.0, 1.0, float(at[2] - foot))
         return np.asarray(self._frames[0].position)
 
     def reset(self) -> None:
         """Clear the scene for a new flight."""
         course = self._ahead.points = _course(self._session)
         self.ground = min(0.0, float(course[..., 2].min())) + self._drop
-        self._events, self.mark.visible = 0, False  # those that have been seen
+        self._events = 0
+        self.mark.visible = False  # those that have been seen
         self._shown.clear()
         for trail, path in zip(self._trails, self._paths, strict=True):
             trail.clear()
@@ -180,10 +195,13 @@ class Stage:
         tape.get_message_buffer = lambda: SimpleNamespace(push=lambda message: None)
         record = tape.get_message_serializer(lambda message: message.include_in_scene_serialization)
         camera = viser.InitialCameraConfig(tape.queue_message)
-        camera.position, camera.look_at, camera.fov = self.unit * VIEW, np.zeros(3), FIELD
+        camera.position = self.unit * VIEW
+        camera.look_at = np.zeros(3)
+        camera.fov = FIELD
         lock = SimpleNamespace(_scene_lifecycle_lock=threading.RLock())
         owner: Any = SimpleNamespace(_websock_connection=tape, client_id="", _viser_server=lock)
-        frames, idle = list(self._shown), SimpleNamespace()
+        frames = list(self._shown)
+        idle = SimpleNamespace()
         stage = Stage(viser.SceneApi(owner, idle, idle), self._session)
         for frame in frames:
             stage.show(frame)

@@ -156,7 +156,8 @@ class Paper(PaperFile):
         beside = self.path.parent / number.scenario
         own_file = number.scenario.endswith(".toml") and beside.is_file()
         name = str(beside) if own_file else number.scenario
-        data, (file, _) = merge(read_scenario(name), number.set), scenario_source(name)
+        data = merge(read_scenario(name), number.set)
+        file, _ = scenario_source(name)
         scenario = parse_scenario(data, source=f"{number.name}: {number.scenario}", directory=file.parent)
         checked(Assembly(scenario))
         return scenario
@@ -203,7 +204,9 @@ class Reproduced:
     @property
     def sentence(self) -> str:
         """The verdict for a report."""
-        unit, ours, difference = self.spec.unit, self._shown(self.ours), self._shown(self.difference, "+")
+        unit = self.spec.unit
+        ours = self._shown(self.ours)
+        difference = self._shown(self.difference, "+")
         role = "" if self.spec.role == "number" else f", a {self.spec.role}"
         theirs = f"{NUMBER_KINDS[self.spec.kind]}{role}: {self._theirs} {unit}"
         text = f"{theirs}; ours {ours} (difference {difference}, tolerance {self._tolerance})"
@@ -348,7 +351,9 @@ def reproduce_paper(paper: Paper, progress: Progress = silent) -> Reproduction:
     """Fly a paper's numbers, every flight only once; see `quadsim.reproduce`."""
     scenarios = [paper.scenario_of(number) for number in paper.numbers]
     summaries: dict[str, dict[str, Any]] = {}
-    reproduced, what, count = [], f"{paper.name}: numbers", len(scenarios)
+    reproduced = []
+    what = f"{paper.name}: numbers"
+    count = len(scenarios)
     for done, (number, scenario) in enumerate(zip(paper.numbers, scenarios, strict=True)):
         progress(what, done, count)
         key = json.dumps([number.scenario, number.set], sort_keys=True, default=str)
@@ -371,7 +376,8 @@ def _measured(spec: PaperNumber, summary: dict[str, Any]) -> Reproduced:
         if key not in there:
             has = f" ({path or 'summary.json'} has: {', '.join(there)})" if there else ""
             raise InputError(f"{spec.name}: {_RULE}; got {spec.measure!r}{has}")
-        path, value = f"{path}.{key}".lstrip("."), there[key]
+        path = f"{path}.{key}".lstrip(".")
+        value = there[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{spec.name}: {_RULE}; got {spec.measure!r}")
     return Reproduced(spec=spec, ours=float(value))

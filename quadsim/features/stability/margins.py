@@ -157,7 +157,8 @@ def find_side(at: Callable[[float], LoopPoint], value_at: Callable[[float], floa
         geometric: whether the value is a factor.
     """
     points: list[LoopPoint] = []
-    inner, outer = 0.0, None
+    inner = 0.0
+    outer = None
     for share in _SHARES:
         points.append(at(value_at(share)))
         if points[-1].state != "stable":
@@ -173,7 +174,8 @@ def find_side(at: Callable[[float], LoopPoint], value_at: Callable[[float], floa
         if points[-1].state == "stable":
             inner = middle
         else:
-            outer, last = middle, points[-1]
+            outer = middle
+            last = points[-1]
     return MarginSide(
         stable=value_at(inner), unstable=value_at(outer), state=last.state, why=last.why, points=tuple(points)
     )
@@ -183,7 +185,8 @@ def _is_wide(value_at: Callable[[float], float], inner: float, outer: float, *, 
     """Return whether a bracket, in shares of the way, is wider than `WIDTH`."""
     if outer - inner < _NARROWEST:
         return False
-    low, high = value_at(inner), value_at(outer)
+    low = value_at(inner)
+    high = value_at(outer)
     if value_at(0.5 * (inner + outer)) in (low, high):
         return False
     if geometric:

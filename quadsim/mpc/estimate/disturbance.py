@@ -128,7 +128,8 @@ class RampObserver:
         thrust_lag: float | None = None,
         late: float = 0.0,
     ) -> None:
-        self._library, self._period = core_library(), period
+        self._library = core_library()
+        self._period = period
         self.numbers = RampNumbers()
         _fill(self.numbers, settings, vehicle, period, thrust_lag, late)
         self.numbers.moment = moment
@@ -156,7 +157,9 @@ class RampObserver:
         """Take over the state of another observer, as far as it estimates the same."""
         same_commands = self.numbers.targets == other.numbers.targets
         shared = np.array([True, True, self.numbers.scaled == other.numbers.scaled, *[same_commands] * 3])
-        largest, acting, command = np.array(self.numbers.largest), self._acting.copy(), np.array(self.state.command)
+        largest = np.array(self.numbers.largest)
+        acting = self._acting.copy()
+        command = np.array(self.state.command)
         ctypes.memmove(ctypes.byref(self.state), ctypes.byref(other.state), ctypes.sizeof(RampState))
         self._value[:] = np.where(shared, np.clip(self._value, -largest, largest), 0.0)
         self._change[:] = np.where(shared, self._change, 0.0)
@@ -177,7 +180,8 @@ class RampObserver:
 
     def follows(self, time: float) -> bool:
         """Return whether an update at a time [s] follows the one before by a period, and remember the time."""
-        before, self._time = self._time, time
+        before = self._time
+        self._time = time
         return abs(time - before - self._period) <= SAME_TIME
 
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
@@ -216,7 +220,8 @@ def _fill(
     """Fill in all numbers but what the model knows of the air."""
     bandwidths = settings.force or FORCE_SHARE / period, settings.torque or TORQUE_SHARE / period
     pole = np.exp(-period * np.repeat(bandwidths, 3))
-    gain, gain_of_change = 1.0 - pole**2, (1.0 - pole) ** 2 / period
+    gain = 1.0 - pole**2
+    gain_of_change = (1.0 - pole) ** 2 / period
     largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
     numbers.targets = thrust_lag is not None
     numbers.scaled = numbers.targets if settings.thrust_scale is None else settings.thrust_scale
@@ -224,7 +229,9 @@ def _fill(
         largest[2] = LARGEST_CHANGE * vehicle.gravity
     if numbers.targets:
         gain[3:] = gain_of_change[3:] = 0.0
-    numbers.period, numbers.mass, numbers.gravity = period, vehicle.mass, vehicle.gravity
+    numbers.period = period
+    numbers.mass = vehicle.mass
+    numbers.gravity = vehicle.gravity
     numbers.least_lift = OBSERVABLE_THRUST * vehicle.gravity
     lag = (settings.rotor_lag or 0.0) if thrust_lag is None else thrust_lag
     numbers.lag = lag / period

@@ -71,7 +71,8 @@ def observer_gain(period: float, *, noise: float, walk: float, change: float) ->
 
     `noise`, `walk` and `change` are the standard deviations of the measurement, w_v and w_d.
     """
-    A, C = np.array([[1.0, period], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+    A = np.array([[1.0, period], [0.0, 1.0]])
+    C = np.array([[1.0, 0.0]])
     P = scipy.linalg.solve_discrete_are(A.T, C.T, np.diag([walk**2, change**2]), np.array([[noise**2]]))
     gain = (P @ C.T / (C @ P @ C.T + noise**2)).ravel()
     return float(gain[0]), float(gain[1])

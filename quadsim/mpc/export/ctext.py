@@ -43,7 +43,8 @@ class CText:
 
     def array(self, name: str, values: Array) -> str:
         """Return a constant array of bytes or numbers, row by row; an empty one gets a single zero."""
-        kind, text = _KINDS.get(values.dtype, "quadsim_real"), str if values.dtype in _KINDS else self.number
+        kind = _KINDS.get(values.dtype, "quadsim_real")
+        text = str if values.dtype in _KINDS else self.number
         entries = ", ".join(map(text, values.ravel().tolist() or [0]))
         return self._array(kind, name, values.size, textwrap.wrap(entries, 116, break_on_hyphens=False))
 
@@ -80,7 +81,8 @@ class CText:
 
     def members(self, values: Mapping[str, Any], suffix: str = "") -> tuple[list[str], dict[str, str]]:
         """Return the arrays that a struct's members point to, with names ending in `suffix`, and its initialisers."""
-        blocks, initialisers = list[str](), dict[str, str]()
+        blocks = list[str]()
+        initialisers = dict[str, str]()
         for name, value in values.items():
             initialisers[name] = f"{self.prefix}{name}{suffix}"
             if isinstance(value, list):

@@ -51,7 +51,8 @@ class CGeometric(CFollower):
 
     def numbers(self, text: CText) -> list[str]:
         """See `CSource`."""
-        law, prefix = self.law, text.prefix
+        law = self.law
+        prefix = text.prefix
         settings = USUAL_FALLBACK.within({})
         fallback = fallback_numbers(law.model, law.bounds, settings)
         blocks = [text.array(name, array) for name, array in law.pointed.items()]

@@ -58,7 +58,8 @@ class CNonlinear(CFollower):
     @cached_property
     def law(self) -> NonlinearMPC:
         """The controller, of whose numbers these are."""
-        table, vehicle = self.table, self.vehicle
+        table = self.table
+        vehicle = self.vehicle
         return NonlinearMPC(
             vehicle,
             period=self.control_period,
@@ -104,9 +105,11 @@ class CNonlinear(CFollower):
 
     def numbers(self, text: CText) -> list[str]:
         """See `CSource`."""
-        law, program = self.law, self.law.program
+        law = self.law
+        program = self.law.program
         fallback = fallback_numbers(self._model(), self.bounds, self.table.fallback.within({}))
-        prefix, blocks = text.prefix, []
+        prefix = text.prefix
+        blocks = []
         pointers = {"terms": f"{prefix}terms"}
         for name, array in program.pointed.items():
             blocks.append(text.array(name, np.clip(array, -NO_BOUND, NO_BOUND) if array.dtype == np.double else array))

@@ -140,7 +140,8 @@ class CSource(abc.ABC):
     def filled(self, template: str) -> str:
         """Fill in the names between @ of a C file."""
         count, width, what = self.reference
-        name, ints = self.law_name, self.ints
+        name = self.law_name
+        ints = self.ints
         fits = f"{name}_reals(&QUADSIM_CONTROLLER) == QUADSIM_MEMORY"
         values = {
             "LAW": name,
@@ -209,12 +210,15 @@ class CController(CSource):
     @property
     def reals(self) -> int:
         """See `CSource`: as counted by `quadsim_mpc_reals`."""
-        N, problem, room = self.horizon, self.tables.problem, self.rows + 1
+        N = self.horizon
+        problem = self.tables.problem
+        room = self.rows + 1
         rows = N * len(self.tables.rows)
         packed = 4 * room + 3 * rows  # bytes of integers
         widest = max(len(axis.B) for axis in self.tables.axes)
         work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + room * (room - 1) // 2
-        settings, period = self.law.settings, self.law.problem.model.period
+        settings = self.law.settings
+        period = self.law.problem.model.period
         sent = 0 if settings is None else N_ROTORS * split_delay(settings.delay, period)[0]
         return work + packed // self.real_bytes + 1 + N * (len(problem.objective.C_r) + N_ROTORS) + sent
 
@@ -232,7 +236,8 @@ def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
 
 def _controller(text: CText, law: Exportable, bounds: ActuatorBounds | None) -> list[str]:
     """Return the numbers apart from those of the optimisation, with the `quadsim_controller` last."""
-    problem, robust = law.problem, "NULL"
+    problem = law.problem
+    robust = "NULL"
     model = hover_model(law.vehicle, problem.model.period)
     members = fallback_numbers(model, bounds, law.fallback)
     fallback = {name: text.value(value) for name, value in members.items()}

@@ -46,17 +46,27 @@ class CondensedCost:
 
 def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
     """Return the cost of a problem from its prediction map."""
-    objective, N, n, nu = problem.objective, problem.horizon, problem.model.n, problem.model.nu
+    objective = problem.objective
+    N = problem.horizon
+    n = problem.model.n
+    nu = problem.model.nu
     terms = cost(maps, objective)
-    H, F_x, F_y, F_d = terms.H, terms.F1, terms.F2, np.zeros((N * nu, nu))
+    H = terms.H
+    F_x = terms.F1
+    F_y = terms.F2
+    F_d = np.zeros((N * nu, nu))
     if objective.Q_d is not None:
         steps = slew_matrix(N, nu)
         H = H + 2.0 * steps.T @ np.kron(np.eye(N), objective.Q_d) @ steps
         F_d[:nu] = -2.0 * objective.Q_d
     if objective.P is not None:
-        (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
-        last, free = maps.Psi[-n:], maps.Phi[-n:]
-        H, F_x, F_y = H + 2.0 * last.T @ (Q_end - Q) @ last, F_x + 2.0 * last.T @ (Q_end - Q) @ free, F_y.copy()
+        Q, W = objective.weights
+        Q_end, W_end = objective.terminal_weights
+        last = maps.Psi[-n:]
+        free = maps.Phi[-n:]
+        H = H + 2.0 * last.T @ (Q_end - Q) @ last
+        F_x = F_x + 2.0 * last.T @ (Q_end - Q) @ free
+        F_y = F_y.copy()
         F_y[:, -W.shape[1] :] -= 2.0 * last.T @ (W_end - W)
     return CondensedCost(H=0.5 * (H + H.T), F_x=F_x, F_y=F_y, F_d=F_d)
 
@@ -71,7 +81,8 @@ class RowMaps:
 
 def states_rows(C: Array, of_states: RowFlags, maps: Prediction, N: int) -> RowMaps:
     """Return rows C (m, n) at x(k+1) .. x(k+N) if they depend on states alone, otherwise at x(k) .. x(k+N-1)."""
-    n, columns = C.shape[1], maps.Psi.shape[1]
+    n = C.shape[1]
+    columns = maps.Psi.shape[1]
     Psi = np.concatenate([np.zeros((1, n, columns)), maps.Psi.reshape(N, n, columns)])
     Phi = np.concatenate([np.eye(n)[None], maps.Phi.reshape(N, n, n)])
     return RowMaps(of_inputs=_on_states(C, of_states, Psi), of_state=_on_states(C, of_states, Phi))
@@ -92,7 +103,8 @@ def _on_states(C: Array, of_states: RowFlags, S: Array) -> Array:
 
 def _with_inputs(values: Array, rows: QPRows) -> Array:
     """Return the rows' slopes (N, m, N nu) with the direct terms D u + E du added."""
-    N, nu = len(values), rows.D.shape[1]
+    N = len(values)
+    nu = rows.D.shape[1]
     by_step = values.reshape(N, len(rows.D), N, nu)
     by_step[range(N), :, range(N)] += rows.D + rows.E
     by_step[range(1, N), :, range(N - 1)] -= rows.E
@@ -106,14 +118,19 @@ class Condensed:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self._rows = problem, QPRows(problem)
-        model, N, nu = problem.model, problem.horizon, problem.model.nu
+        self._problem = problem
+        self._rows = QPRows(problem)
+        model = problem.model
+        N = problem.horizon
+        nu = problem.model.nu
         maps = prediction(model, N)
         self.cost, self._values = condensed_cost(problem, maps), row_maps(self._rows, maps)
         rows = self._rows
-        self._inputs, m_s = N * nu, rows.slack.shape[1]
+        self._inputs = N * nu
+        m_s = rows.slack.shape[1]
         soft = problem.rows.slacks
-        l1, l2 = np.tile(problem.rows.l1[soft], N), np.tile(problem.rows.l2[soft], N)
+        l1 = np.tile(problem.rows.l1[soft], N)
+        l2 = np.tile(problem.rows.l2[soft], N)
         self._linear = np.concatenate([np.zeros(self._inputs), l1])
         G = np.zeros((N, len(rows.C), self._inputs + N * m_s))
         G[:, :, : self._inputs] = self._values.of_inputs
@@ -141,7 +158,8 @@ class Condensed:
         """Return the condensed QP of any problem; one without constraints has infinite bounds on its inputs."""
         if problem.every_constraint:
             return cls(problem)
-        none, anything = np.zeros(0), np.full(problem.model.nu, math.inf)
+        none = np.zeros(0)
+        anything = np.full(problem.model.nu, math.inf)
         free = Bounds(
             C_c=np.zeros((0, problem.model.n)),
             y_min=none,
@@ -163,7 +181,8 @@ class Condensed:
         """
         problem = self._problem
         state, reference, u_before = (np.asarray(array, float) for array in (state, reference, u_before))
-        n, u_bar = problem.model.n, problem.model.u_bar
+        n = problem.model.n
+        u_bar = problem.model.u_bar
         check_shape("u_before", u_before, u_bar.shape)
         if state.shape == (N_STATES,):
             state = np.concatenate([state, u_before])[:n]
@@ -181,7 +200,8 @@ class Condensed:
 
     def gradient(self, query: Query) -> Array:
         """Return the linear term c of the cost."""
-        terms, C_r = self.cost, self._problem.objective.C_r
+        terms = self.cost
+        C_r = self._problem.objective.C_r
         x_s, u_s = query.equilibrium or self._problem.equilibrium
         of_state = terms.F_x @ (query.state - x_s)
         of_desired = terms.F_y @ (query.desired - C_r @ x_s).ravel()
@@ -192,7 +212,8 @@ class Condensed:
 
     def row_bounds(self, query: Query) -> tuple[Array, Array]:
         """Return h_l and h_u: rows refer to absolute inputs u = u_s + v and states x_s + dx(v)."""
-        values, rows = self._values, self._rows
+        values = self._values
+        rows = self._rows
         x_s, u_s = query.equilibrium or self._problem.equilibrium
         shift = rows.C @ x_s + rows.D @ u_s + values.of_state @ (query.state - x_s) - self._of_rest @ u_s
         shift[0] += rows.E @ (u_s - query.u_before)
@@ -215,15 +236,19 @@ class Condensed:
 
         Multipliers are positive at upper bounds and negative at lower ones.
         """
-        (z, z_box), x, rows = self._rows.split(multipliers), plan.ravel(), self._problem.rows
+        z, z_box = self._rows.split(multipliers)
+        x = plan.ravel()
+        rows = self._problem.rows
         if rows.soft.size:
-            l1, l2 = rows.l1[rows.slacks], rows.l2[rows.slacks]
+            l1 = rows.l1[rows.slacks]
+            l2 = rows.l2[rows.slacks]
             slacks = slacks * rows.slack_scale
             normalised = multipliers[:, rows.soft] / rows.scale[rows.soft]
             prices = np.abs(normalised) @ (rows.slack[rows.soft][:, None] == np.arange(l1.size))
             # Stationarity of a slack: l1 + 2 l2 e - sum |z| + z_box = 0.
             z_slacks = np.minimum(prices - l1 - 2.0 * l2 * slacks, 0.0)
-            x, z_box = np.concatenate((x, slacks.ravel())), np.concatenate((z_box, z_slacks.ravel()))
+            x = np.concatenate((x, slacks.ravel()))
+            z_box = np.concatenate((z_box, z_slacks.ravel()))
         return Solution(x, self._blank.b, z, z_box)
 
 
@@ -258,8 +283,10 @@ class FreeOptimum:
 
     def solve(self, query: Query) -> Solution | None:
         """Return the condensed QP's solution without constraints; None if it violates one."""
-        qp, c = self.form.qp, self.form.gradient(query)
-        x, m = np.zeros(c.size), len(self._factor)
+        qp = self.form.qp
+        c = self.form.gradient(query)
+        x = np.zeros(c.size)
+        m = len(self._factor)
         x[:m], failed = lapack.dpotrs(self._factor, -c[:m])
         if failed or not ((qp.x_l <= x) & (x <= qp.x_u)).all():
             return None

@@ -40,7 +40,9 @@ class Pattern:
         columns = np.concatenate([np.tile(block.columns, block.rows.shape[1]).ravel() for block in blocks])
         kept = np.flatnonzero(values)
         places = csc_matrix((kept, (rows[kept], columns[kept])), shape=shape)
-        self._order, self._rows, self._starts = places.data, places.indices, places.indptr
+        self._order = places.data
+        self._rows = places.indices
+        self._starts = places.indptr
         self._shape = shape
 
     def matrix(self, blocks: Sequence[Block]) -> csc_matrix:
@@ -59,8 +61,12 @@ def steps_of(problem: Problem, query: Query) -> tuple[Array, Array, Array]:
     """A (N, n, n), B (N, n, nu), c (N, n) of the predicted steps."""
     if query.steps is not None:
         return query.steps
-    model, N, (x_s, u_s) = problem.model, problem.horizon, query.equilibrium or problem.equilibrium
-    A, B, c = model.A, model.B, x_s - model.A @ x_s - model.B @ u_s
+    model = problem.model
+    N = problem.horizon
+    x_s, u_s = query.equilibrium or problem.equilibrium
+    A = model.A
+    B = model.B
+    c = x_s - model.A @ x_s - model.B @ u_s
     return np.broadcast_to(A, (N, *A.shape)), np.broadcast_to(B, (N, *B.shape)), np.broadcast_to(c, (N, *c.shape))
 
 
@@ -70,7 +76,10 @@ class Staged:
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._rows = rows = QPRows(problem)
-        N, n, nu, slacks = problem.horizon, problem.model.n, problem.model.nu, rows.slack.shape[1]
+        N = problem.horizon
+        n = problem.model.n
+        nu = problem.model.nu
+        slacks = rows.slack.shape[1]
         starts = np.arange(N)[:, None] * (slacks + nu + n)
         self._e = starts + np.arange(slacks)
         self._u = starts + slacks + np.arange(nu)
@@ -82,7 +91,8 @@ class Staged:
         self._inequality = Pattern(inequalities, (rows.lower.size, self._size))
         self._G = self._inequality.matrix(inequalities)
         self._x_l, self._x_u = np.full(self._size, -math.inf), np.full(self._size, math.inf)
-        self._x_l[self._u], self._x_u[self._u] = rows.u_min, rows.u_max
+        self._x_l[self._u] = rows.u_min
+        self._x_u[self._u] = rows.u_max
         self._x_l[self._e] = 0.0
 
     @cached_property
@@ -92,7 +102,8 @@ class Staged:
 
     @property
     def _at_rest(self) -> Query:
-        model, objective = self._problem.model, self._problem.objective
+        model = self._problem.model
+        objective = self._problem.objective
         return Query(np.zeros(model.n), np.zeros((self._problem.horizon, len(objective.C_r))), model.u_bar)
 
     @cached_property
@@ -103,7 +114,8 @@ class Staged:
 
     def assemble(self, query: Query, problem: Problem | None = None) -> QP:
         """Return the QP of a period; `problem` may differ in the numbers of its rows, apart from bounds on inputs."""
-        rows, G = self._rows, self._G
+        rows = self._rows
+        G = self._G
         if problem is not None:
             rows = QPRows(problem)
             G = self._inequality.matrix(self._inequalities(rows))
@@ -127,8 +139,11 @@ class Staged:
 
     def _costs(self) -> list[Block]:
         """Return the blocks of P."""
-        objective, rows = self._problem.objective, self._problem.rows
-        (Q, _), (Q_end, _), move = objective.weights, objective.terminal_weights, objective.move_weight
+        objective = self._problem.objective
+        rows = self._problem.rows
+        Q, _ = objective.weights
+        Q_end, _ = objective.terminal_weights
+        move = objective.move_weight
         return [
             Block(self._x[:-1], self._x[:-1], 2.0 * Q),
             Block(self._x[-1:], self._x[-1:], 2.0 * Q_end),
@@ -141,8 +156,11 @@ class Staged:
 
     def _gradient(self, query: Query) -> Array:
         """Return the cost's linear term."""
-        objective, rows = self._problem.objective, self._problem.rows
-        (_, W), (Q_end, W_end), move = objective.weights, objective.terminal_weights, objective.move_weight
+        objective = self._problem.objective
+        rows = self._problem.rows
+        _, W = objective.weights
+        Q_end, W_end = objective.terminal_weights
+        move = objective.move_weight
         x_s, u_s = query.equilibrium or self._problem.equilibrium
         gradient = np.zeros(self._size)
         gradient[self._x[:-1]] = -2.0 * query.desired[:-1] @ W.T
@@ -167,7 +185,8 @@ class Staged:
     def _inequalities(self, rows: QPRows) -> list[Block]:
         """Return the blocks of G."""
         numbers = np.arange(rows.lower.size).reshape(rows.lower.shape)
-        of_ends, of_starts = rows.C * rows.of_states[:, None], rows.C * ~rows.of_states[:, None]
+        of_ends = rows.C * rows.of_states[:, None]
+        of_starts = rows.C * ~rows.of_states[:, None]
         return [
             Block(numbers, self._x, of_ends),
             Block(numbers[1:], self._x[:-1], of_starts if of_starts.ndim == 2 else of_starts[1:]),
@@ -207,14 +226,17 @@ class Staged:
 
         States follow the plan, and their multipliers are those for which the Lagrangian is stationary in them.
         """
-        x, z_box = np.zeros(self._size), np.zeros(self._size)
-        x[self._u], x[self._x] = plan, predicted(self._problem, query, plan)
+        x = np.zeros(self._size)
+        z_box = np.zeros(self._size)
+        x[self._u] = plan
+        x[self._x] = predicted(self._problem, query, plan)
         x[self._e] = slacks * self.slack_scale
         z, z_inputs = self._rows.split(multipliers)
         z_box[self._u] = z_inputs.reshape(plan.shape)
         gradient = qp.P @ x + qp.c + qp.G.T @ z
         z_box[self._e] = -np.maximum(gradient[self._e], 0.0)
-        (A, _, _), y = steps_of(self._problem, query), -gradient[self._x]
+        A, _, _ = steps_of(self._problem, query)
+        y = -gradient[self._x]
         for i in range(len(y) - 2, -1, -1):
             y[i] += A[i + 1].T @ y[i + 1]
         return Solution(x, y.ravel(), z, z_box)

@@ -67,13 +67,16 @@ class ActuatorBounds:
     @classmethod
     def of_problem(cls, problem: Problem) -> ActuatorBounds:
         """Return the hard rows on single inputs and single steps, as bounds that hold in every period."""
-        rows, nu = problem.rows, problem.model.nu
+        rows = problem.rows
+        nu = problem.model.nu
         sides = []
         for at in (rows.input, rows.step):
-            lower, upper = np.full(nu, -math.inf), np.full(nu, math.inf)
+            lower = np.full(nu, -math.inf)
+            upper = np.full(nu, math.inf)
             for i in np.flatnonzero(at >= 0):
                 j = at[i]
-                lower[j], upper[j] = max(lower[j], rows.lower[0, i]), min(upper[j], rows.upper[0, i])
+                lower[j] = max(lower[j], rows.lower[0, i])
+                upper[j] = min(upper[j], rows.upper[0, i])
             sides += [lower, upper]
         least, most, down, up = sides
         targets = problem.model.targets
@@ -124,9 +127,13 @@ class AnswerCheck:
     """
 
     def __init__(self, problem: Problem, kkt_every: int) -> None:
-        self._problem, self._every, self._periods = problem, kkt_every, 0
+        self._problem = problem
+        self._every = kkt_every
+        self._periods = 0
         self._map: tuple[Indices | slice, Array, Array, Array] | None = None
-        rows, N, nu = problem.rows, problem.horizon, problem.model.nu
+        rows = problem.rows
+        N = problem.horizon
+        nu = problem.model.nu
         at = np.flatnonzero(rows.on_states)
         if rows.C.ndim == 2 and at.size * N**2 * nu <= LARGEST_MAP:
             maps = states_rows(rows.C[at], rows.of_states[at], prediction(problem.model, N), N)
@@ -144,7 +151,8 @@ class AnswerCheck:
 
         A reason in `refused` takes precedence.
         """
-        due, self._periods = self._periods % self._every == 0, self._periods + 1
+        due = self._periods % self._every == 0
+        self._periods = self._periods + 1
         if answer.certificate is None:
             return answer, refused
         violation = self._infeasibility(problem, query, answer)
@@ -182,7 +190,9 @@ class AnswerCheck:
             slacks: (..., N, m_s) of the soft rows.
         """
         assert self._map is not None
-        (at, C, of_inputs, of_state), (x_s, u_s), rows = self._map, equilibrium, self._problem.rows
+        at, C, of_inputs, of_state = self._map
+        x_s, u_s = equilibrium
+        rows = self._problem.rows
         steps = plans - np.concatenate((before[..., None, :], plans[..., :-1, :]), axis=-2)
         values = plans @ rows.D.T + steps @ rows.E.T
         inputs = (plans - u_s[..., None, :]).reshape(*plans.shape[:-2], -1, 1)
@@ -193,7 +203,8 @@ class AnswerCheck:
 
     def _infeasibility(self, problem: Problem, query: Query, answer: Answer) -> float:
         """See `violations`, of an answer; slower of another problem than this object's."""
-        rows, plan = problem.rows, answer.plan
+        rows = problem.rows
+        plan = answer.plan
         if self._map is not None and problem is self._problem and query.steps is None:
             equilibrium = query.equilibrium or problem.equilibrium
             return float(self.violations(query.state, equilibrium, query.u_before, plan, answer.slacks))
@@ -240,7 +251,8 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
     """Return speeds (4,) and a plan (N, 4) as a command, with its status and the statistics of the answer."""
-    accepted, stats = status in ACCEPTED, answer.stats
+    accepted = status in ACCEPTED
+    stats = answer.stats
     if not accepted:
         stats = stats._replace(active=0, sqp_defect=math.nan, sqp_step=math.nan)
     elif answer.slacks.size:

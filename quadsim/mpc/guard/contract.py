@@ -186,7 +186,8 @@ class Guard:
 
     def _trim_of(self, law: Controller) -> object:
         if law is not self._law:  # asked once: a runtime protocol takes as long as ten array operations
-            self._law, self._trimmed = law, law if isinstance(law, Trimmed) else None
+            self._law = law
+            self._trimmed = law if isinstance(law, Trimmed) else None
         return None if self._trimmed is None else self._trimmed.trim
 
     def predict(self, law: Controller, states: Array, plans: Array) -> Array:

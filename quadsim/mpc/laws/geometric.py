@@ -89,7 +89,8 @@ def geometric_gains(vehicle: Vehicle, period: float, settings: Geometric) -> Geo
     `lag`.
     """
     require_positive("period", period)
-    lag, targets = settings.lag, settings.commands != ROTORS
+    lag = settings.lag
+    targets = settings.commands != ROTORS
     allowed = lag_to_allow_for(vehicle, period) if lag is None else lag
     k_Omega = 1.0 / (2.0 * (0.5 * period + allowed)) / (1.0 + SEPARATION**-2)
     k_v = k_Omega / SEPARATION**2
@@ -156,9 +157,11 @@ class GeometricController(FeedbackLaw):
     name: Final = "geometric"
 
     def __init__(self, vehicle: Vehicle, period: float, settings: Geometric) -> None:
-        self.commands, self._targets = settings.commands, settings.commands != ROTORS
+        self.commands = settings.commands
+        self._targets = settings.commands != ROTORS
         self.gains = gains = geometric_gains(vehicle, period, settings)
-        self._feedforward, lags = settings.feedforward, settings.inner_lag or NO_LAG
+        self._feedforward = settings.feedforward
+        lags = settings.inner_lag or NO_LAG
         if settings.moment:
             vehicle.require_moment("controller")
         self.observer: RampObserver | None = None
@@ -181,7 +184,8 @@ class GeometricController(FeedbackLaw):
         self.numbers = geometric_numbers(vehicle, period, settings, gains)
         set_members(self.numbers, k_R=self.k_R, k_Omega=self.k_Omega)
         self.numbers.preview, self.numbers.course = (array.ctypes.data for array in self.pointed.values())
-        self.delay, self.delay_bodies = None, Bodies()
+        self.delay = None
+        self.delay_bodies = Bodies()
         if settings.delay:
             self.delay, self.delay_bodies = _delay_of(settings, vehicle, period)
             self.numbers.delay = ctypes.addressof(self.delay)
@@ -234,7 +238,8 @@ class GeometricController(FeedbackLaw):
         if self._targets:
             return self._held_for_a_period(command)
         speeds = allocate(self._allocation, command, *self.bounds.reach(before))
-        given, smallest = self._allocation.wrench(speeds), 1e-6 * self._allocation.scale.max()
+        given = self._allocation.wrench(speeds)
+        smallest = 1e-6 * self._allocation.scale.max()
         if flying and np.allclose(given, command, rtol=0.0, atol=smallest):
             self._library.quadsim_geometric_integrate(self._law, self._motion, self._target)
         return self._held_for_a_period(speeds)
@@ -264,7 +269,8 @@ class GeometricController(FeedbackLaw):
         that they agree with the flown path.  Near the end of the course fewer samples give fewer derivatives.
         """
         self._aim(reference, motion)
-        path, yaw = np.array(self._target.path), list(self._target.yaw)
+        path = np.array(self._target.path)
+        yaw = list(self._target.yaw)
         return Target(
             position=path[0],
             velocity=path[1],
@@ -318,7 +324,8 @@ class GeometricController(FeedbackLaw):
 
     def integrate(self, integrals: Integrals, motion: Measured, target: Target, desired: DesiredAttitude) -> Integrals:
         """Return the integrals of e_v + c_1 e_x and e_Omega + c_2 e_R one period later, saturated."""
-        law, (measured, wanted) = self._copy(integrals), _structs(motion, target)
+        law = self._copy(integrals)
+        measured, wanted = _structs(motion, target)
         set_members(law.desired, **vars(desired))
         self._library.quadsim_geometric_integrate(law, measured, wanted)
         return _integrals_of(law)
@@ -332,7 +339,9 @@ class GeometricController(FeedbackLaw):
         integrals: Integrals,
         disturbance: ForeseenDisturbance,
     ) -> tuple[Array, DesiredAttitude]:
-        law, structs, result = self._copy(integrals), _structs(motion, target), np.empty(size)
+        law = self._copy(integrals)
+        structs = _structs(motion, target)
+        result = np.empty(size)
         d = DisturbanceStruct()
         set_members(d, **dict(zip(("force", "change", "torque"), disturbance, strict=True)))
         law_in_c(law, *structs, d, result.ctypes.data)
@@ -357,7 +366,8 @@ def _integrals_of(law: Struct) -> Integrals:
 
 def _structs(motion: Measured, target: Target) -> tuple[Struct, Struct]:
     """Return both as C takes them."""
-    measured, wanted = MotionStruct(), TargetStruct()
+    measured = MotionStruct()
+    wanted = TargetStruct()
     measured.yaw = motion.yaw
     set_members(measured, **{name: getattr(motion, name) for name in ("position", "velocity", "attitude", "rates")})
     path = (target.position, target.velocity, target.acceleration, target.jerk, target.snap)
@@ -407,18 +417,28 @@ def previews(settings: Geometric, period: float) -> dict[str, Array]:
 
 def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gains: GeometricGains) -> Struct:
     """Return the law's numbers for C but for `k_R`, `k_Omega`, and what they point to."""
-    numbers, targets, bounds = GeometricNumbersStruct(), settings.commands != ROTORS, settings.actuators(vehicle)
-    lags, half, weight = settings.inner_lag or NO_LAG, 0.5 * period, vehicle.mass * vehicle.gravity
+    numbers = GeometricNumbersStruct()
+    targets = settings.commands != ROTORS
+    bounds = settings.actuators(vehicle)
+    lags = settings.inner_lag or NO_LAG
+    half = 0.5 * period
+    weight = vehicle.mass * vehicle.gravity
     numbers.commands = list(TARGET_SIZES).index(settings.commands)
-    numbers.feedforward, numbers.moment, numbers.horizon = settings.feedforward, settings.moment, settings.horizon
+    numbers.feedforward = settings.feedforward
+    numbers.moment = settings.moment
+    numbers.horizon = settings.horizon
     numbers.exact = settings.feedforward or settings.disturbance is not None
     numbers.orders = (PREVIEW_DEGREE if settings.feedforward else 2) + 1
-    numbers.period, numbers.mass, numbers.gravity = period, vehicle.mass, vehicle.gravity
+    numbers.period = period
+    numbers.mass = vehicle.mass
+    numbers.gravity = vehicle.gravity
     for name in ("k_x", "k_v", "k_i", "k_I", "c_1", "c_2", "sigma", "sigma_R"):
         setattr(numbers, name, getattr(gains, name))
-    numbers.least_lift, numbers.slope = LEAST_THRUST_SHARE * weight, math.tan(math.radians(settings.tilt))
+    numbers.least_lift = LEAST_THRUST_SHARE * weight
+    numbers.slope = math.tan(math.radians(settings.tilt))
     numbers.ahead = half + (lags[0] if targets else 0.0)
-    numbers.turning, numbers.loss = float(vehicle.hover_speeds.sum()), vehicle.inflow or 0.0
+    numbers.turning = float(vehicle.hover_speeds.sum())
+    numbers.loss = vehicle.inflow or 0.0
     set_members(
         numbers,
         k_attitude=gains.k_attitude,

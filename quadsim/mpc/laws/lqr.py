@@ -133,7 +133,8 @@ class LQR(FeedbackLaw):
         if settings.moment:
             vehicle.require_moment("controller")
         super().__init__(vehicle, period, settings, hover_model(vehicle, period, moment=settings.moment))
-        self._heading, self._largest_tilt = settings.heading, math.radians(settings.tilt)
+        self._heading = settings.heading
+        self._largest_tilt = math.radians(settings.tilt)
         self.objective = settings.objective(vehicle, period)
         self.gain = lqr_gain(self.model, self.objective)
         self._allocation = make_allocation(vehicle)
@@ -149,10 +150,8 @@ class LQR(FeedbackLaw):
         xi = state
         if self._heading:
             turn = -float(state[INDEX["yaw"]])
-            xi, targets = (
-                turn_horizontally(state, np.array(turn)),
-                turn_horizontally(targets, np.full(len(targets), turn)),
-            )
+            xi = turn_horizontally(state, np.array(turn))
+            targets = turn_horizontally(targets, np.full(len(targets), turn))
         plan = np.empty((self.horizon, N_ROTORS))
         for i in range(self.horizon):
             balanced = self.model.u_bar - self._balance @ targets[i, _MOVING]
@@ -166,7 +165,8 @@ class LQR(FeedbackLaw):
 
     def _targets(self, reference: Array) -> Array:
         """(N, 12) reference states at t_k .. t_{k+N-1}."""
-        (value, rate, acceleration), period = self._operator @ reference, self._period
+        value, rate, acceleration = self._operator @ reference
+        period = self._period
         poses = np.concatenate([value[None], reference[:-1]])
         rates = rate + period * np.arange(self.horizon)[:, None] * acceleration
         targets = np.zeros((self.horizon, N_STATES))

@@ -282,7 +282,8 @@ class Nonlinear(ControllerTable):
         if self.avoidance is None:
             return None
         stride = self.stride(period)
-        step, nodes = stride * period, self.horizon // stride
+        step = stride * period
+        nodes = self.horizon // stride
         return self.avoidance.space(shapes, vehicle, period=step, horizon=nodes, positions=(0, 1, 2), largest=True)
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
@@ -296,7 +297,8 @@ class Nonlinear(ControllerTable):
 
     def outputs(self) -> tuple[Array, Array]:
         """Return C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
-        weights, difference = self.weights, self.attitude_error == "difference"
+        weights = self.weights
+        difference = self.attitude_error == "difference"
         rows = np.eye(13) if difference else np.delete(np.eye(13), 3, axis=0)
         attitude = np.full(4, weights.attitude) if difference else 4.0 * _three(weights.attitude)
         parts = (_three(weights.position), attitude, _three(weights.velocity), _three(weights.body_rates))

@@ -80,10 +80,12 @@ class CascadedPID(FeedbackLaw):
     name: Final = "pid"
 
     def __init__(self, vehicle: Vehicle, period: float, settings: PID) -> None:
-        self.gains, self._vehicle = pid_gains(vehicle, period=period, lag=settings.lag), vehicle
+        self.gains = pid_gains(vehicle, period=period, lag=settings.lag)
+        self._vehicle = vehicle
         if settings.moment:
             vehicle.require_moment("controller")
-        self._largest_velocity, self._largest_tilt = settings.velocity, math.radians(settings.tilt)
+        self._largest_velocity = settings.velocity
+        self._largest_tilt = math.radians(settings.tilt)
         self._moment = settings.moment
         super().__init__(vehicle, period, settings)
         self.allocation = make_allocation(vehicle)
@@ -102,7 +104,8 @@ class CascadedPID(FeedbackLaw):
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """Run all loops for one period; the integrals hold until the vehicle flies."""
-        target, reach = target_of(reference, self._operator), self.bounds.reach(before)
+        target = target_of(reference, self._operator)
+        reach = self.bounds.reach(before)
         speeds, after = self.fly(self._memory, state, target, *reach)
         if now.phase is not Phase.FLYING:
             memory = self._memory
@@ -116,7 +119,9 @@ class CascadedPID(FeedbackLaw):
         Returns:
             (4,) rotor speeds [rad/s], and the loops' new state.
         """
-        motion, k, period = motion_of(state), self.gains.bandwidths, self._period
+        motion = motion_of(state)
+        k = self.gains.bandwidths
+        period = self._period
         force, velocity_integral = self._velocity_loop(memory, motion, target)
         turning = np.zeros(3) if memory.rates is None else (motion.rates - memory.rates) / period
         desired = self._desired_rates(motion, force, target)
@@ -155,8 +160,11 @@ class CascadedPID(FeedbackLaw):
 
     def _velocity_loop(self, memory: Memory, motion: Measured, target: Target) -> tuple[Array, Array]:
         """Return the force (3,) [N] to command, world, and the velocity integral (3,) [m/s^2] of the next period."""
-        gains, mass, gravity = self.gains, self._vehicle.mass, self._vehicle.gravity
-        period, proportional = self._period, gains.bandwidths.velocity
+        gains = self.gains
+        mass = self._vehicle.mass
+        gravity = self._vehicle.gravity
+        period = self._period
+        proportional = gains.bandwidths.velocity
         desired = desired_velocity(gains.bandwidths.position, self._largest_velocity, motion.position, target)
         error = desired - motion.velocity
         measured = np.zeros(3) if memory.velocity is None else (motion.velocity - memory.velocity) / period
@@ -176,7 +184,8 @@ class CascadedPID(FeedbackLaw):
 
     def _desired_rates(self, motion: Measured, force: Array, target: Target) -> Array:
         """Return the body rates (3,) [rad/s] that the attitude loop demands."""
-        k, limit = self.gains.bandwidths, np.radians(LARGEST_RATES)
+        k = self.gains.bandwidths
+        limit = np.radians(LARGEST_RATES)
         error = prioritised_error(motion.attitude, attitude_for(force, target.yaw), YAW_WEIGHT)
         heading = motion.attitude[2] * target.yaw_rate  # a rotation about world z, in body axes
         return np.clip(np.array([k.attitude, k.attitude, k.yaw]) * error + heading, -limit, limit)

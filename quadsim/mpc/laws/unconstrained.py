@@ -54,7 +54,8 @@ class UnconstrainedMPC:
     solver: Final = ""
 
     def __init__(self, problem: Problem) -> None:
-        self.problem, self.horizon = problem, problem.horizon
+        self.problem = problem
+        self.horizon = problem.horizon
         self.gains = sequence_gains(problem)
         self._offset = self.gains.L @ problem.model.u_bar
         self._turns = ReferenceTurns()

@@ -69,8 +69,11 @@ def allocation_struct(allocation: Allocation, lower: Array, upper: Array) -> Str
     struct = InnerStruct()
     fill(struct.effect, allocation.M)
     fill(struct.inverse, allocation.inverse)
-    struct.linear[:], struct.quadratic[:] = allocation.linear, allocation.quadratic
-    struct.scale[:], struct.least[:], struct.most[:] = allocation.scale, lower, upper
+    struct.linear[:] = allocation.linear
+    struct.quadratic[:] = allocation.quadratic
+    struct.scale[:] = allocation.scale
+    struct.least[:] = lower
+    struct.most[:] = upper
     return struct
 
 
@@ -80,7 +83,8 @@ def allocate(allocation: Allocation, wrench: Array, lower: Array, upper: Array) 
     The wrench (4,) is thrust [N] along body z and torques [N m] about the body axes; the bounds are finite.  The core
     computes it; stage 2 is the best of all choices of rotors at their lower or upper bound.
     """
-    demanded, speeds = np.ascontiguousarray(wrench, np.float64), np.empty(N_ROTORS)
+    demanded = np.ascontiguousarray(wrench, np.float64)
+    speeds = np.empty(N_ROTORS)
     struct = allocation_struct(allocation, lower, upper)
     core_library().quadsim_allocate(struct, demanded.ctypes.data, speeds.ctypes.data)
     return speeds

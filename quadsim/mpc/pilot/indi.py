@@ -64,7 +64,9 @@ class TorqueIncrement(CompiledLoop):
     def __init__(self, vehicle: Vehicle, settings: INDISettings, bounds: ActuatorBounds) -> None:
         self.rate = settings.rate
         struct = allocation_struct(make_allocation(vehicle), bounds.u_min, bounds.u_max)
-        struct.kind, struct.inertia[:], struct.omega = LoopKind.INDI, vehicle.inertia, 2.0 * math.pi * settings.cutoff
+        struct.kind = LoopKind.INDI
+        struct.inertia[:] = vehicle.inertia
+        struct.omega = 2.0 * math.pi * settings.cutoff
         struct.products[:] = vehicle.products_of_inertia or (0.0, 0.0, 0.0)
         super().__init__(struct)
 

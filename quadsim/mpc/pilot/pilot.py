@@ -60,11 +60,16 @@ class Pilot:
         inner: TorqueIncrement | AutopilotLoop | None = None,
         attitudes: AttitudeTargets | None = None,
     ) -> None:
-        self.law, self.guard, self.inner, self.attitudes = law, guard, inner, attitudes
-        self.takes_targets, self.rate = takes_targets(inner), 0.0 if inner is None else inner.rate
+        self.law = law
+        self.guard = guard
+        self.inner = inner
+        self.attitudes = attitudes
+        self.takes_targets = takes_targets(inner)
+        self.rate = 0.0 if inner is None else inner.rate
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._slowest = np.full(4, vehicle.speed_min)
-        self._target, self._fresh = self._hover, True  # the target in force; whether the autopilot is to be reset
+        self._target = self._hover
+        self._fresh = True  # the target in force; whether the autopilot is to be reset
         # Body rates at which it starts then, with the rotors as they turn [rad/s]; None from the ground: as at hover.
         self._rates: Array | None = np.zeros(3)
 
@@ -108,7 +113,9 @@ class Pilot:
 
         The target before the first is hover.
         """
-        self._target, self._fresh, self._rates = self._hover, True, np.zeros(3)
+        self._target = self._hover
+        self._fresh = True
+        self._rates = np.zeros(3)
         if self.attitudes is not None:
             self.attitudes.reset()
         before = self._hover.copy() if self.takes_targets else speeds
@@ -135,7 +142,9 @@ class Pilot:
             if isinstance(before.inner, TorqueIncrement):
                 self.inner.adopt(before.inner)
         elif self.inner is not None and isinstance(before.inner, type(self.inner)):
-            self.inner, self._target, self._fresh = before.inner, before._target, before._fresh
+            self.inner = before.inner
+            self._target = before._target
+            self._fresh = before._fresh
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the law's or the contract's command, with its inner loop; that is off on the ground."""
@@ -155,7 +164,9 @@ class Pilot:
         if isinstance(self.inner, TorqueIncrement):
             self.inner.reset()
             return command
-        self._target, self._fresh, self._rates = self._hover, True, None
+        self._target = self._hover
+        self._fresh = True
+        self._rates = None
         return stopped(self._slowest.copy(), self.horizon, now.phase)
 
     def _acting(self, now: StepInputs, state: Array) -> Array:
@@ -184,7 +195,8 @@ class Pilot:
             self.inner.reset()
             if self._rates is not None and isinstance(self.inner, Settling):
                 self.inner.settle(self._rates, rotors)
-        self._target, self._fresh = command, False
+        self._target = command
+        self._fresh = False
         return self.inner.engage(command, rotors) if isinstance(self.inner, CompiledLoop) else None
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:

@@ -132,7 +132,8 @@ def tightened(constraint: Constraint, margins: Array) -> Constraint:
     m = constraint.lower.shape[-1]
     if np.ndim(margins) != 2 or margins.shape[1] != m or not (np.isfinite(margins) & (margins >= 0.0)).all():
         raise ParameterError("controller", "margins", margins, f"finite numbers >= 0 of shape (N, {m})")
-    lower, upper = constraint.lower + margins, constraint.upper - margins
+    lower = constraint.lower + margins
+    upper = constraint.upper - margins
     if not np.all(lower < upper):
         raise ParameterError("controller", "margins", margins.max(0), "less than half of the gap between the bounds")
     return replace(constraint, lower=lower, upper=upper)
@@ -167,7 +168,8 @@ class Bounds:
             penalty=self.penalty,
             origins=tuple(map(self.output, range(len(self.C_c)))),
         )
-        each, rotors = np.eye(self.u_min.size), range(1, self.u_min.size + 1)
+        each = np.eye(self.u_min.size)
+        rotors = range(1, self.u_min.size + 1)
         slews, speeds = (
             tuple(Origin(name, "rad/s", rotor=rotor, field=f"{_INPUTS}.{name}") for rotor in rotors)
             for name in ("slew", "speed")
@@ -193,7 +195,8 @@ def selection(names: Sequence[str]) -> Array:
 
 def origin_of_state(index: int) -> Origin:
     """Return the origin of a bound on one of the paper's states."""
-    name, (unit, factor) = STATE_NAMES[index], shown_unit(STATE_UNITS[index])
+    name = STATE_NAMES[index]
+    unit, factor = shown_unit(STATE_UNITS[index])
     return Origin(name, unit, factor, field=f"controller.output_bounds.{name}", soft="controller.soft")
 
 

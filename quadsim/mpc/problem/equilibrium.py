@@ -19,7 +19,8 @@ from quadsim.state import INDEX, N_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
 
 LEAST_LIFT: Final = 0.1  # least thrust at rest as a share of the weight, so that no equilibrium is upside down
-_ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]
+_ROLL = INDEX["roll"]
+_PITCH = INDEX["pitch"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +43,10 @@ class Trim:
     def lean(self, yaw: float) -> tuple[float, float]:
         """Roll and pitch at rest for a yaw [rad]."""
         x, y, up = self.lift.tolist()
-        cosine, sine = math.cos(yaw), math.sin(yaw)
-        forward, left = cosine * x + sine * y, cosine * y - sine * x
+        cosine = math.cos(yaw)
+        sine = math.sin(yaw)
+        forward = cosine * x + sine * y
+        left = cosine * y - sine * x
         return -math.atan2(left, math.hypot(forward, up)), math.atan2(forward, up)
 
     def state(self, yaw: float = 0.0, n: int = N_STATES) -> Array:

@@ -71,7 +71,9 @@ def attitudes(acceleration: Array, *, period: float, gravity: float, yaw: Array 
         turn = _turn_to(least, yaw)
     attitude = multiply(least, _about_z(turn))
     rates = _body_rates(attitude, period)
-    cos, sin, (wx, wy, wz) = np.cos(turn[0]), np.sin(turn[0]), least_rates[0]
+    cos = np.cos(turn[0])
+    sin = np.sin(turn[0])
+    wx, wy, wz = least_rates[0]
     rates[0] = cos * wx + sin * wy, cos * wy - sin * wx, wz  # the first sample has no step before it
     return attitude, rates
 
@@ -103,7 +105,8 @@ def _pushed(acceleration: Array, gravity: float) -> Array:
 def _turn_to(least: Array, yaw: Array) -> Array:
     """(K,) angle about body z [rad], without jumps, that makes body y perpendicular to the direction of a yaw."""
     w, x, y, z = least.T
-    cos, sin = np.cos(yaw), np.sin(yaw)
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
     of_x = cos * (1.0 - 2.0 * (y * y + z * z)) + sin * 2.0 * (x * y + w * z)
     of_y = cos * 2.0 * (x * y - w * z) + sin * (1.0 - 2.0 * (x * x + z * z))
     turn: Array = np.unwrap(np.arctan2(of_y, of_x))
@@ -112,5 +115,6 @@ def _turn_to(least: Array, yaw: Array) -> Array:
 
 def _about_z(angle: Array) -> Array:
     """(K, 4) quaternions of rotations about z by angles (K,) [rad]."""
-    half, zero = 0.5 * angle, np.zeros_like(angle)
+    half = 0.5 * angle
+    zero = np.zeros_like(angle)
     return np.column_stack([np.cos(half), zero, zero, np.sin(half)])

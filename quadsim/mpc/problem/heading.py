@@ -27,10 +27,13 @@ def turn_horizontally(states: Array, angles: Array | float) -> Array:
     cosine: Array | float
     sine: Array | float
     if isinstance(angles, float):
-        cosine, sine = math.cos(angles), math.sin(angles)
+        cosine = math.cos(angles)
+        sine = math.sin(angles)
     else:
-        cosine, sine = np.cos(angles)[..., None], np.sin(angles)[..., None]
-    along, across = states[..., 0:2], states[..., 2:4]  # x and vx, then y and vy
+        cosine = np.cos(angles)[..., None]
+        sine = np.sin(angles)[..., None]
+    along = states[..., 0:2]
+    across = states[..., 2:4]  # x and vx, then y and vy
     turned[..., 0:2] = cosine * along - sine * across
     turned[..., 2:4] = sine * along + cosine * across
     return turned
@@ -65,7 +68,8 @@ def predict_in_heading_frame(model: LinearModel, states: Array, plans: Array, tr
     With a trim, the model is `anchored` there; otherwise it is the model of level hover.
     """
     yaws = states[:, _YAW]
-    seen, trim = turn_horizontally(states, -yaws), trim or Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
+    seen = turn_horizontally(states, -yaws)
+    trim = trim or Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
     rest = np.array([trim.state(yaw) for yaw in yaws.tolist()])
     predicted = rollout(replace(model, u_bar=trim.speeds), seen - rest, plans) + rest[:, None]
     return turn_horizontally(predicted, yaws[:, None])

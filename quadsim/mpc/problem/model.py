@@ -57,7 +57,8 @@ def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0, *, moment: bool =
     Returns:
         (12, 12) and (12, 4): d(xi)/dt = A_c (xi - xi_bar) + B_c (u - u_bar); with lag (16, 16) and (16, 4).
     """
-    A, B = np.zeros((N_STATES, N_STATES)), np.zeros((N_STATES, N_ROTORS))
+    A = np.zeros((N_STATES, N_STATES))
+    B = np.zeros((N_STATES, N_ROTORS))
     for name in ("x", "y", "z", "roll", "pitch", "yaw"):
         A[INDEX[name], INDEX[name] + 1] = 1.0
     A[INDEX["vx"], INDEX["pitch"]] = vehicle.gravity
@@ -77,7 +78,8 @@ def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0, *, moment: bool =
 
 def air_slopes(vehicle: Vehicle) -> Array:
     """(4, 6) what air adds to U / m and J^-1 tau in hover, per velocity [1/s, rad/(m s)] and rate [m/s, 1/s]."""
-    units, still = np.eye(3), np.zeros(3)
+    units = np.eye(3)
+    still = np.zeros(3)
     by_velocity = [vehicle.air_accelerations(unit, still) for unit in units]
     by_rate = [vehicle.air_accelerations(still, unit) for unit in units]
     return np.array(by_velocity + by_rate).T
@@ -87,7 +89,8 @@ def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
     """Exact zero-order-hold discretisation, by the exponential of [[A_c, B_c], [0, 0]] tau_s."""
     n, nu = B_c.shape
     block = np.zeros((n + nu, n + nu))
-    block[:n, :n], block[:n, n:] = A_c, B_c
+    block[:n, :n] = A_c
+    block[:n, n:] = B_c
     exponential = scipy.linalg.expm(block * period)
     return exponential[:n, :n], exponential[:n, n:]
 

@@ -174,7 +174,8 @@ class Problem:
     def __post_init__(self) -> None:
         if not isinstance(self.horizon, int) or self.horizon < 1:
             raise ParameterError("controller", "horizon", self.horizon, "a whole number >= 1")
-        n, nu = self.model.n, self.model.nu
+        n = self.model.n
+        nu = self.model.nu
         check_shape("C_r", self.objective.C_r, (self.objective.C_r.shape[0], n))
         check_shape("Q_u", self.objective.Q_u, (nu, nu))
         for name, matrix, shape in (("Q_d", self.objective.Q_d, (nu, nu)), ("P", self.objective.P, (n, n))):
@@ -269,7 +270,9 @@ class Problem:
         constraints = self.every_constraint
         if not constraints:
             raise ValueError("a constrained MPC needs a problem with bounds")
-        N, n, nu = self.horizon, self.model.n, self.model.nu
+        N = self.horizon
+        n = self.model.n
+        nu = self.model.nu
         parts = [(part, part.lower.shape[-1]) for part in constraints]
         differing = (N,) if any(part.C is not None and part.C.ndim == 3 for part in constraints) else ()
 
@@ -277,7 +280,9 @@ class Problem:
             matrices = [(0.0 if getattr(part, name) is None else getattr(part, name), m) for part, m in parts]
             return np.concatenate([np.broadcast_to(M, (*steps, m, columns)) for M, m in matrices], axis=-2)
 
-        C, D, E = stacked("C", n, differing), stacked("D", nu), stacked("E", nu)
+        C = stacked("C", n, differing)
+        D = stacked("D", nu)
+        E = stacked("E", nu)
         lower = np.concatenate([np.broadcast_to(part.lower, (N, m)) for part, m in parts], axis=1)
         upper = np.concatenate([np.broadcast_to(part.upper, (N, m)) for part, m in parts], axis=1)
         l1 = np.concatenate([np.full(m, math.inf) if part.penalty is None else part.penalty.l1 for part, m in parts])
@@ -294,9 +299,13 @@ class Problem:
         for first_row in np.unique(slack[slack >= 0]):
             shared = slack == first_row
             scale[shared] = scale[shared].min()
-        C, D, E = C * scale[:, None], D * scale[:, None], E * scale[:, None]
-        lower, upper = lower * scale, upper * scale
-        l1, l2 = l1 / scale, l2 / scale**2
+        C = C * scale[:, None]
+        D = D * scale[:, None]
+        E = E * scale[:, None]
+        lower = lower * scale
+        upper = upper * scale
+        l1 = l1 / scale
+        l2 = l2 / scale**2
         of_states = C.any(axis=-1) if C.ndim == 2 else C.any(axis=(0, 2))
 
         def alone(of: Array, other: Array) -> Indices:
@@ -345,7 +354,8 @@ class Query(NamedTuple):
 
 def predicted(problem: Problem, query: Query, plan: Array) -> Array:
     """(N, n) the predicted states of a plan (N, nu)."""
-    states, state = np.empty((len(plan), query.state.size)), query.state
+    states = np.empty((len(plan), query.state.size))
+    state = query.state
     if query.steps is not None:
         A, B, c = query.steps
         pushes = np.matmul(B, plan[:, :, None])[:, :, 0]
@@ -354,7 +364,8 @@ def predicted(problem: Problem, query: Query, plan: Array) -> Array:
             np.add(state, push, state)
             np.add(state, c_i, state)
         return states
-    model, (x_s, u_s) = problem.model, query.equilibrium or problem.equilibrium
+    model = problem.model
+    x_s, u_s = query.equilibrium or problem.equilibrium
     state = state - x_s
     for i, push in enumerate((plan - u_s) @ model.B.T):
         states[i] = state = model.A @ state + push
@@ -388,7 +399,8 @@ def _check_definite(name: str, matrix: Array, *, least: float) -> None:
     symmetric = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix.T)
     strict = least == 0.0
     if symmetric and np.all(np.isfinite(matrix)):
-        smallest, limit = np.linalg.eigvalsh(matrix).min(initial=math.inf), least * np.abs(matrix).max(initial=0.0)
+        smallest = np.linalg.eigvalsh(matrix).min(initial=math.inf)
+        limit = least * np.abs(matrix).max(initial=0.0)
         if smallest > limit or (not strict and smallest >= limit):
             return
     kind = "definite" if strict else "semidefinite"

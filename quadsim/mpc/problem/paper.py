@@ -24,7 +24,8 @@ class Prediction:
 
 def prediction(model: LinearModel, horizon: int) -> Prediction:
     """Build Phi and Psi for a horizon of N steps, from A^i and A^i B."""
-    n, nu = model.n, model.nu
+    n = model.n
+    nu = model.nu
     Phi = np.empty((horizon, n, n))
     responses = np.empty((horizon, n, nu))  # A^i B
     power = np.eye(n)

@@ -81,8 +81,10 @@ class Polytope:
 
     def constraint(self) -> Constraint:
         """Return the rows over the 12 states and four rotor speeds, in SI units."""
-        rows, count = np.array(self.rows, float), len(self.rows)
-        C, D = np.zeros((count, N_STATES)), np.zeros((count, N_ROTORS))
+        rows = np.array(self.rows, float)
+        count = len(self.rows)
+        C = np.zeros((count, N_STATES))
+        D = np.zeros((count, N_ROTORS))
         for name, column in zip(self.of, rows.T, strict=True):
             if name in INDEX:
                 C[:, INDEX[name]] = column * (math.degrees(1.0) if name in IN_DEGREES else 1.0)

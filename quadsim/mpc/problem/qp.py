@@ -57,9 +57,12 @@ class QPRows:
         self.origin = origin = np.concatenate([hard, above, below])
         of_rows = (rows.slack[:, None] == np.arange(rows.slacks.size)).astype(float)
         self.slack = np.concatenate([np.zeros((hard.size, rows.slacks.size)), 0.0 - of_rows[above], of_rows[below]])
-        self.C, self.D, self.E = rows.C[..., origin, :], rows.D[origin], rows.E[origin]
+        self.C = rows.C[..., origin, :]
+        self.D = rows.D[origin]
+        self.E = rows.E[origin]
         self.of_states = rows.of_states[origin]
-        self.lower, self.upper = rows.lower[:, origin].copy(), rows.upper[:, origin].copy()
+        self.lower = rows.lower[:, origin].copy()
+        self.upper = rows.upper[:, origin].copy()
         self.lower[:, hard.size : hard.size + above.size] = -np.inf
         self.upper[:, hard.size + above.size :] = np.inf
         self.u_min, self.u_max = (np.full((problem.horizon, problem.model.nu), side) for side in (-np.inf, np.inf))
@@ -81,7 +84,8 @@ class QPRows:
         left = z_inputs.reshape(N, -1).copy()
         for row in self._boxed:  # the first of several rows at the same bound takes the whole multiplier
             j = self._whole.input[row]
-            upper, lower = self._whole.upper[:, row] == self.u_max[:, j], self._whole.lower[:, row] == self.u_min[:, j]
+            upper = self._whole.upper[:, row] == self.u_max[:, j]
+            lower = self._whole.lower[:, row] == self.u_min[:, j]
             active_side = np.where(left[:, j] > 0.0, upper, lower)
             multipliers[active_side, row] = left[active_side, j]
             left[active_side, j] = 0.0
@@ -140,7 +144,8 @@ def kkt_residuals(qp: QP, solution: Solution) -> KKTResiduals:
     gradient = qp.P @ x + qp.c + qp.A.T @ y + qp.G.T @ z + z_box
     values = np.concatenate([qp.G @ x, x])
     multipliers = np.concatenate([z, z_box])
-    lower, upper = np.concatenate([qp.h_l, qp.x_l]), np.concatenate([qp.h_u, qp.x_u])
+    lower = np.concatenate([qp.h_l, qp.x_l])
+    upper = np.concatenate([qp.h_u, qp.x_u])
     bound = np.where(multipliers >= 0.0, upper, lower)
     bounded = np.isfinite(bound)
     distance = np.where(bounded, np.abs(np.where(bounded, bound, 0.0) - values), 0.0)

@@ -52,13 +52,17 @@ SUBSTEPS: Final = constant("QUADSIM_SUBSTEPS")
 """Runge-Kutta steps of a prediction."""
 N_BODY: Final = 13
 """States of the body; rotor states follow."""
-P, Q, V, W = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
+P = slice(0, 3)
+Q = slice(3, 7)
+V = slice(7, 10)
+W = slice(10, 13)
 RATE_SCALE: Final = 1.5
 """The body rate [rad/s] that is a share of 1, where inputs are targets, beside the weight as thrust.  Shares of the
 largest would be penalised too little: where noise reaches the controller, rates then move by hundreds of deg/s, for
 which the mixer raises the thrust."""
 # R(q), row by row: 1 - 2 (yy + zz), 2 (xy - wz), 2 (xz + wy), ..., by the places of its products in q q'.
-_FIRST, _SECOND = np.array([10, 6, 7, 6, 5, 11, 7, 11, 5]), np.array([15, 3, 2, 3, 15, 1, 2, 1, 10])
+_FIRST = np.array([10, 6, 7, 6, 5, 11, 7, 11, 5])
+_SECOND = np.array([15, 3, 2, 3, 15, 1, 2, 1, 10])
 _SIGN: Final = np.array([1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
 _EYE: Final = np.eye(3).ravel()
 _OUTER: Final = 1.0 - 2.0 * _EYE
@@ -175,7 +179,8 @@ def air_maps(vehicle: Vehicle, speed: float) -> AirMaps:
 
     Of the thrust that rotors lose to their own motion as the vehicle turns, `damping` has the torque, in hover.
     """
-    still, units = np.zeros(3), np.eye(3)
+    still = np.zeros(3)
+    units = np.eye(3)
     across = [vehicle.air_moment(speed, unit, still) for unit in units[:2]]
     climbing = [vehicle.air_moment(0.0, unit + units[2], still) for unit in units[:2]]
     damped = [vehicle.air_moment(0.0, still, unit) for unit in units]
@@ -239,11 +244,9 @@ def thrust_axis(q: Array) -> Array:
     """R(q) e_z (..., 3) of quaternions (..., 4) of any length."""
     w, x, y, z = (q[..., i] for i in range(4))
     axis = np.empty((*q.shape[:-1], 3))
-    axis[..., 0], axis[..., 1], axis[..., 2] = (
-        2.0 * (x * z + w * y),
-        2.0 * (y * z - w * x),
-        1.0 - 2.0 * (x * x + y * y),
-    )
+    axis[..., 0] = 2.0 * (x * z + w * y)
+    axis[..., 1] = 2.0 * (y * z - w * x)
+    axis[..., 2] = 1.0 - 2.0 * (x * x + y * y)
     return axis
 
 

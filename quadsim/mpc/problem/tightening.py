@@ -103,7 +103,8 @@ def margins(
     half_band = 0.5 * (bounds.y_max - bounds.y_min)
     for i in np.flatnonzero(~np.isfinite(half_band)):
         output = bounds.output(int(i))
-        name, scale = output.name, output.factor
+        name = output.name
+        scale = output.factor
         sides = [scale * float(bounds.y_min[i]), scale * float(bounds.y_max[i])]
         raise ParameterError("controller.output_bounds", name, sides, "finite on both sides, to be tightened")
     A, B, C, E, K = _corrected(
@@ -125,7 +126,9 @@ def margins(
         sizes = np.array([*causes.values()]) / half_band[worst]
         most = [*causes][first_smallest(-sizes)]
         output = bounds.output(worst)
-        name, scale, unit = output.name, output.factor, output.unit
+        name = output.name
+        scale = output.factor
+        unit = output.unit
         rule = (
             f"smaller, or the bounds on {name} wider: these leave {scale * half_band[worst]:.3g} {unit} on either side "
             f"of their middle, of which {scale * margins[-1, worst]:.3g} {unit} would be given up and at most "
@@ -151,7 +154,8 @@ def position_margins(
     The correction weights an error of `POSITION_ERROR` like one of `ERROR_SHARE` of an output's half-width.  Arguments
     and errors as in `margins`.
     """
-    rows, sizes = np.eye(N_STATES)[list(POSITION)], np.full(3, POSITION_ERROR)
+    rows = np.eye(N_STATES)[list(POSITION)]
+    sizes = np.full(3, POSITION_ERROR)
     A, B, C, E, K = _corrected(vehicle, rotor_lag, moment, period, rows, sizes, settings, estimated)
     return read_only(growth(A, B, C, E, K, period=period, horizon=horizon, delay=delay))
 
@@ -170,7 +174,10 @@ def _corrected(
     A, B, E = disturbed_model(vehicle, rotor_lag, moment=moment)
     C = np.hstack([rows, np.zeros((len(rows), len(A) - N_STATES))])
     basis = observed(A, C)
-    A, B, C, E = basis.T @ A @ basis, basis.T @ B, C @ basis, basis.T @ E
+    A = basis.T @ A @ basis
+    B = basis.T @ B
+    C = C @ basis
+    E = basis.T @ E
     K = correction(*discretise(A, B, period), C / sizes[:, None], SPEED_SHARE * vehicle.hover_speed)
     largest = (2.0 if estimated else 1.0) * np.repeat([settings.acceleration, settings.angular_acceleration], 3)
     return A, B, C, E * largest, K

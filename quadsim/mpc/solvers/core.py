@@ -42,10 +42,12 @@ class CoreProblem:
     """
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self.tables = problem, tables(problem)
+        self._problem = problem
+        self.tables = tables(problem)
         self._kept: list[object] = []
         # Independent hard rows are at most as many as inputs; violated soft rows may add their number.
-        N, rows = problem.horizon, self.tables.rows
+        N = problem.horizon
+        rows = self.tables.rows
         at_most = N * (N_ROTORS + sum(math.isfinite(row.l1) for row in rows))
         room = min(N * len(rows), at_most) + 1
         self.struct = self._filled(struct("quadsim_problem"), members(self.tables, room=room, changes=MOST_CHANGES))
@@ -112,11 +114,16 @@ class Optimum:
     """
 
     def __init__(self, problem: Problem, shared: CoreProblem, work: Struct) -> None:
-        self._problem, self._shared, self._work = problem, shared, work
+        self._problem = problem
+        self._shared = shared
+        self._work = work
         self._piqp: QPSolver | None = None
         rows = problem.rows
-        self._upper, self._lower, self._soft = rows.upper, rows.lower, rows.soft
-        self._scale, self._slack_scale = rows.scale, rows.slack_scale
+        self._upper = rows.upper
+        self._lower = rows.lower
+        self._soft = rows.soft
+        self._scale = rows.scale
+        self._slack_scale = rows.slack_scale
         self._no_slacks, self._no_multipliers = (
             read_only(np.zeros((problem.horizon, count))) for count in (rows.soft.size, len(rows.D))
         )
@@ -143,9 +150,11 @@ class Optimum:
         method = Method(found)
         plan = self.plan.copy()
         slacks = self.slacks(method)
-        multipliers, active = self._no_multipliers, 0
+        multipliers = self._no_multipliers
+        active = 0
         if method is not Method.FREE:
-            multipliers, active = self._multiplier * self._scale, self.active
+            multipliers = self._multiplier * self._scale
+            active = self.active
         return Answer(
             plan,
             slacks,
@@ -203,7 +212,8 @@ class Core:
     iterates: Final = frozenset({CORE, CORES_SECOND})
 
     def __init__(self, problem: Problem) -> None:
-        self._library, self.shared = core_library(), core_problem(problem)
+        self._library = core_library()
+        self.shared = core_problem(problem)
         self._equilibrium = problem.equilibrium
         p = self.shared.struct
         # The work struct and its views point into this memory.
@@ -234,7 +244,8 @@ class Core:
 
     def solve(self, query: Query) -> Answer:
         """See `quadsim.mpc.solvers.Solver.solve`."""
-        started, (state, desired, u_before, rest, _) = clock.perf_counter(), query
+        started = clock.perf_counter()
+        state, desired, u_before, rest, _ = query
         x_s, u_s = self._equilibrium if rest is None else rest
         self._state[:] = state
         self._desired[:] = desired

@@ -48,9 +48,12 @@ def axes(problem: Problem) -> list[Axis]:
     row of constraints or of C_r involves no state, or the problem does not separate, the whole problem is the only
     axis.
     """
-    rows, model, objective = problem.rows, problem.model, problem.objective
+    rows = problem.rows
+    model = problem.model
+    objective = problem.objective
     bounded: NDArray[np.bool_] = np.asarray(rows.C.any(axis=1))
-    C_r, C = np.abs(objective.C_r), np.abs(rows.C)
+    C_r = np.abs(objective.C_r)
+    C = np.abs(rows.C)
     root = np.linalg.cholesky(objective.Q_u)
     reach = _normalised(np.linalg.solve(root, model.B.T))
     tied = (C_r.T @ np.abs(objective.Q_y) @ C_r + C.T @ C) > 0.0
@@ -66,7 +69,8 @@ def axes(problem: Problem) -> list[Axis]:
         return [whole]
     parts = []
     for states in (np.flatnonzero(label == g) for g in range(count)):
-        regulated, outputs = C_r[:, states].any(axis=1), bounded & C[:, states].any(axis=1)
+        regulated = C_r[:, states].any(axis=1)
+        outputs = bounded & C[:, states].any(axis=1)
         if reach[:, states].any() and regulated.any():
             directions, sizes, _ = np.linalg.svd(reach[:, states], full_matrices=False)
             T = _normalised(np.linalg.solve(root.T, directions[:, sizes > COUPLING_ROUNDING]))
@@ -74,7 +78,8 @@ def axes(problem: Problem) -> list[Axis]:
         elif outputs.any():
             return [whole]
     if objective.Q_d is not None:
-        T, of = np.hstack([axis.T for axis in parts]), np.repeat(range(len(parts)), [axis.T.shape[1] for axis in parts])
+        T = np.hstack([axis.T for axis in parts])
+        of = np.repeat(range(len(parts)), [axis.T.shape[1] for axis in parts])
         moves = np.abs(T.T @ objective.Q_d @ T)
         if T.shape[0] != T.shape[1] or (moves[of[:, None] != of] > COUPLING_ROUNDING * moves.max()).any():
             return [whole]
@@ -83,7 +88,8 @@ def axes(problem: Problem) -> list[Axis]:
 
 def axis_of(problem: Problem, T: Array, states: Indices, regulated: Indices, outputs: Indices) -> Axis:
     """Return the axis of inputs along T, with these states, rows of C_r and rows."""
-    model, objective = problem.model, problem.objective
+    model = problem.model
+    objective = problem.objective
     return Axis(
         problem=Problem(
             model=LinearModel(

@@ -105,7 +105,8 @@ def tables(problem: Problem) -> Tables:
         ParameterError: the core cannot take it: too large, rows that differ from step to step, or shared slacks.
     """
     problem = with_constraints(problem)
-    N, modes = problem.horizon, np.eye(problem.model.nu)
+    N = problem.horizon
+    modes = np.eye(problem.model.nu)
     if rotor_states(problem):
         modes = _modes(problem)
         problem = _in_modes(problem, modes)
@@ -154,7 +155,8 @@ def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
 
     `room` is the capacity for active rows, less one; a search stops after `changes` changes of the active set.
     """
-    problem, rows = tables.problem, tables.rows
+    problem = tables.problem
+    rows = tables.rows
     past = np.cumsum([len(row.terms) for row in rows]).tolist()
     reals = {name: getattr(tables, name) for name in ("modes", "T", "T_inverse", "scale", "tolerance")}
     reals["C_r"] = problem.objective.C_r
@@ -228,7 +230,9 @@ def rotor_states(problem: Problem) -> int:
 
 def _modes(problem: Problem) -> Array:
     """T^-1 of the problem without rotor lag, which separates rotor speeds that follow their inputs alike into axes."""
-    model, objective, n = problem.model, problem.objective, N_STATES
+    model = problem.model
+    objective = problem.objective
+    n = N_STATES
     without = Problem(
         model=replace(model, A=model.A[:n, :n], B=model.B[:n]),
         horizon=problem.horizon,
@@ -242,10 +246,12 @@ def _modes(problem: Problem) -> Array:
 
 def _in_modes(problem: Problem, modes: Array) -> Problem:
     """Return the problem with `modes` times the rotor speeds as its last states."""
-    model, objective = problem.model, problem.objective
+    model = problem.model
+    objective = problem.objective
     to = scipy.linalg.block_diag(np.eye(N_STATES), modes)
     back = np.linalg.inv(to)
-    A, B = to @ model.A @ back, to @ model.B
+    A = to @ model.A @ back
+    B = to @ model.B
     for matrix in (A, B):
         matrix[np.abs(matrix) < ROW_ROUNDING * np.abs(matrix).max()] = 0.0
     P = None if objective.P is None else symmetric(back.T @ objective.P @ back)
@@ -259,7 +265,8 @@ def _in_modes(problem: Problem, modes: Array) -> Problem:
 
 def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:
     """Return the axes, the last perhaps without effect, and T (nu, nu) of all of them."""
-    parts, nu = axes(problem), problem.model.nu
+    parts = axes(problem)
+    nu = problem.model.nu
     T = np.hstack([part.T for part in parts])
     T[np.abs(T) < ROW_ROUNDING] = 0.0
     missing = nu - T.shape[1]
@@ -272,15 +279,25 @@ def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:
 
 
 def _axis(rows: Rows, part: Axis, first: int, N: int) -> AxisTables:
-    (n, m), objective, model = (part.states.size, part.T.shape[1]), part.problem.objective, part.problem.model
-    A, B, R, S, C = model.A, model.B, objective.Q_u, np.zeros((m, n)), rows.C[np.ix_(part.outputs, part.states)]
-    (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
+    n, m = (part.states.size, part.T.shape[1])
+    objective = part.problem.objective
+    model = part.problem.model
+    A = model.A
+    B = model.B
+    R = objective.Q_u
+    S = np.zeros((m, n))
+    C = rows.C[np.ix_(part.outputs, part.states)]
+    Q, W = objective.weights
+    Q_end, W_end = objective.terminal_weights
     if objective.Q_d is not None:
-        A, B = scipy.linalg.block_diag(A, np.zeros((m, m))), np.vstack([B, np.eye(m)])
-        Q, Q_end = scipy.linalg.block_diag(Q, objective.Q_d), scipy.linalg.block_diag(Q_end, np.zeros((m, m)))
+        A = scipy.linalg.block_diag(A, np.zeros((m, m)))
+        B = np.vstack([B, np.eye(m)])
+        Q = scipy.linalg.block_diag(Q, objective.Q_d)
+        Q_end = scipy.linalg.block_diag(Q_end, np.zeros((m, m)))
         W, W_end = (np.vstack([weight, np.zeros((m, weight.shape[1]))]) for weight in (W, W_end))
         C = np.hstack([C, np.zeros((len(C), m))])
-        R, S = R + objective.Q_d, np.hstack([S, -objective.Q_d])
+        R = R + objective.Q_d
+        S = np.hstack([S, -objective.Q_d])
     K, inverse = _gains(A, B, Q, Q_end, R, S, N)
     maps = prediction(model, N)
     G = states_rows(rows.C[np.ix_(part.outputs, part.states)], rows.of_states[part.outputs], maps, N).of_inputs
@@ -307,7 +324,9 @@ def _axis(rows: Rows, part: Axis, first: int, N: int) -> AxisTables:
 
 def _gains(A: Array, B: Array, Q: Array, Q_end: Array, R: Array, S: Array, N: int) -> tuple[Array, Array]:
     """K_i (N, m, n) and (R + B' P_{i+1} B)^-1 (N, m, m) of the Riccati recursion, costs x'Qx + 2 u'Sx + u'Ru."""
-    K, inverse, P = np.zeros((N, *B.T.shape)), np.zeros((N, *R.shape)), Q_end
+    K = np.zeros((N, *B.T.shape))
+    inverse = np.zeros((N, *R.shape))
+    P = Q_end
     for i in reversed(range(N)):
         inverse[i] = symmetric(np.array(np.linalg.inv(R + B.T @ P @ B), float))
         M = B.T @ P @ A + S
@@ -318,10 +337,12 @@ def _gains(A: Array, B: Array, Q: Array, Q_end: Array, R: Array, S: Array, N: in
 
 def _row(rows: Rows, i: int, axes: list[AxisTables]) -> RowTables:
     axis = next((g for g, part in enumerate(axes) if i in part.rows), -1)
-    now, before = rows.D[i] + rows.E[i], -rows.E[i]
+    now = rows.D[i] + rows.E[i]
+    before = -rows.E[i]
     terms = [(float(now[j]), j, 0) for j in np.flatnonzero(now).tolist()]
     terms += [(float(before[j]), j, 1) for j in np.flatnonzero(before).tolist()]
-    l1, l2 = float(rows.l1[i]), float(rows.l2[i])
+    l1 = float(rows.l1[i])
+    l2 = float(rows.l2[i])
     hard = math.isinf(l1)
     return RowTables(
         axis=axis,

@@ -44,7 +44,8 @@ class DaqpDense:
         self._model.settings = DAQP_SETTINGS
         sense = np.zeros(qp.c.size + qp.h_l.size + qp.b.size, dtype=np.intc)
         sense[qp.c.size + qp.h_l.size :] = 5  # always active
-        rows, bounds = np.concatenate([_dense(qp.G), _dense(qp.A)]), _bounds(qp)
+        rows = np.concatenate([_dense(qp.G), _dense(qp.A)])
+        bounds = _bounds(qp)
         self._finite = np.isfinite(bounds)
         self._model.setup(_dense(qp.P), qp.c.copy(), rows, *bounds, sense)
 

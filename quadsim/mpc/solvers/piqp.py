@@ -54,7 +54,8 @@ class Piqp:
         if not dense:
             settings.kkt_solver = piqp.KKTSolver.sparse_multistage
         settings.max_iter = MAX_ITERATIONS
-        settings.eps_abs, settings.eps_rel = TOLERANCE, 0.1 * TOLERANCE
+        settings.eps_abs = TOLERANCE
+        settings.eps_rel = 0.1 * TOLERANCE
         settings.eps_duality_gap_abs = settings.eps_duality_gap_rel = GAP
         if changing:
             settings.preconditioner_iter = CHANGING_SCALINGS
@@ -66,7 +67,8 @@ class Piqp:
 
         Rows without a finite side are left out: PIQP would set them to zero in `G` for good.
         """
-        self._kept, self._last = _bounded(qp), qp
+        self._kept = _bounded(qp)
+        self._last = qp
         G, h_l, h_u = (self._of_rows(part) for part in (qp.G, qp.h_l, qp.h_u))
         self._solver.setup(qp.P, qp.c, qp.A, qp.b, G, h_l, h_u, qp.x_l, qp.x_u)
 
@@ -79,21 +81,25 @@ class Piqp:
         """
         started = clock.perf_counter()
         if np.array_equal(_bounded(qp), self._kept):
-            last, self._last = self._last, qp
+            last = self._last
+            self._last = qp
             changed: dict[str, Any] = {}
             if qp.P is not last.P or qp.A is not last.A or qp.G is not last.G:
                 changed = {"P": qp.P, "A": qp.A, "G": self._of_rows(qp.G)}
             if qp.x_l is not last.x_l or qp.x_u is not last.x_u:
                 changed |= {"x_l": qp.x_l, "x_u": qp.x_u}
-            h_l, h_u = self._of_rows(qp.h_l), self._of_rows(qp.h_u)
+            h_l = self._of_rows(qp.h_l)
+            h_u = self._of_rows(qp.h_u)
             self._solver.update(**changed, c=qp.c, b=qp.b, h_l=h_l, h_u=h_u)
         else:
             self.setup(qp)
         status = self._solver.solve()
         elapsed = clock.perf_counter() - started
-        result, info = self._solver.result, self._solver.result.info
+        result = self._solver.result
+        info = self._solver.result.info
         # At an interior-point optimum, a constraint is active if its slack is small and below its multiplier.
-        lower, upper = (result.z_l, result.s_l), (result.z_u, result.s_u)
+        lower = (result.z_l, result.s_l)
+        upper = (result.z_u, result.s_u)
         box = (result.z_bl, result.s_bl), (result.z_bu, result.s_bu)
         z = np.zeros(len(self._kept))
         z[self._kept] = result.z_u - result.z_l

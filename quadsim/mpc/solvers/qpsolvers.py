@@ -43,8 +43,10 @@ class AnyOfQpsolvers:
         """See `Backend.solve`; a two-sided row or box entry becomes two, without infinite sides."""
         started = clock.perf_counter()
         rows = np.concatenate([np.eye(qp.c.size), qp.G])
-        lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
-        above, below = np.isfinite(upper), np.isfinite(lower)
+        lower = np.concatenate([qp.x_l, qp.h_l])
+        upper = np.concatenate([qp.x_u, qp.h_u])
+        above = np.isfinite(upper)
+        below = np.isfinite(lower)
         one_sided = np.concatenate([rows[above], -rows[below]])
         equalities = (self._matrix(qp.A), qp.b) if qp.b.size else (None, None)
         problem = qpsolvers.Problem(
@@ -60,14 +62,17 @@ class AnyOfQpsolvers:
         except qpsolvers.QPError:
             answer = qpsolvers.Solution(problem)
         elapsed = clock.perf_counter() - started
-        multipliers, y = np.zeros(upper.size), np.full(qp.b.size, np.nan)
+        multipliers = np.zeros(upper.size)
+        y = np.full(qp.b.size, np.nan)
         if answer.found and answer.x is not None and answer.z is not None:
             y = y if answer.y is None else answer.y
-            x, (of_upper, of_lower) = answer.x, np.split(answer.z, [np.count_nonzero(above)])
+            x = answer.x
+            of_upper, of_lower = np.split(answer.z, [np.count_nonzero(above)])
             multipliers[above] += of_upper
             multipliers[below] -= of_lower
         else:
-            x, multipliers = np.full_like(qp.c, np.nan), multipliers * np.nan
+            x = np.full_like(qp.c, np.nan)
+            multipliers = multipliers * np.nan
         z_box, z = np.split(multipliers, [qp.c.size])
         return Solution(
             x=x,

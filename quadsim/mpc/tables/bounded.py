@@ -78,7 +78,8 @@ class Weighted(ControllerTable):
         Raises:
             InputError: no problem can be built from these numbers.
         """
-        model, objective = hover_model(vehicle, period), self.objective()
+        model = hover_model(vehicle, period)
+        objective = self.objective()
         if self.terminal == "lqr":
             objective = replace(objective, P=lqr_terminal_weight(model, objective))
         return Problem(model=model, horizon=self.horizon, objective=objective)

@@ -28,7 +28,8 @@ COMMANDS: Final = (
 """Meaning of the field `commands` of laws that command all of these."""
 TARGET_BOUNDS: Final = "only where an autopilot flies; of an attitude, bounds on the body rates that its error commands"
 """Meaning of the field `target_bounds` of such laws."""
-LEAST_THRUST, MOST_THRUST = 0.5, 0.9
+LEAST_THRUST = 0.5
+MOST_THRUST = 0.9
 """Default bounds on a target of collective thrust: shares of the weight, and of the largest; see `TargetBounds`."""
 Rates = Positive | Annotated[tuple[Positive, ...], Len(3, 3)]
 """One largest magnitude for three body rates, or one per axis."""
@@ -115,7 +116,8 @@ class TargetBounds:
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """Return the bounds on collective thrust [N] and on each body rate [deg/s]."""
-        largest, weight = vehicle.level_thrust(vehicle.speed_max), vehicle.mass * vehicle.gravity
+        largest = vehicle.level_thrust(vehicle.speed_max)
+        weight = vehicle.mass * vehicle.gravity
         lower, upper = self.thrust or (LEAST_THRUST * weight, thrust_to_command(largest, weight, MOST_THRUST))
         if not lower < weight < upper:
             rule = f"below and above the weight, {weight:.4g} N"

@@ -35,7 +35,8 @@ class Camera:
         for name, value in (("width", width), ("height", height)):
             if not 16 <= value <= 4096:
                 raise ParameterError("", name, value, "from 16 to 4096 pixels")
-        self._shape, self._turned = (height, width, 3), np.zeros(4)
+        self._shape = (height, width, 3)
+        self._turned = np.zeros(4)
         self._backend = rendering_backend()
         self._process: subprocess.Popen[bytes] = worker_process("serve", self._backend)
         self._send(pickle.dumps((vehicle, tuple(obstacles), width, height)))

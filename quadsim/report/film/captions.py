@@ -45,10 +45,12 @@ class Overlay:
     """
 
     def __init__(self, run: Filmed, footage: Footage, *, width: int, height: int, speed: float = 1.0) -> None:
-        self._run, self._footage = run, footage
+        self._run = run
+        self._footage = footage
         self._speed = speed  # simulated seconds per second of film
         self._scale = min(width / 1280.0, height / 720.0)
-        self._width, self._height = width / self._scale, height / self._scale
+        self._width = width / self._scale
+        self._height = height / self._scale
         self._subtitle = law_name(run.controller)
         self._grounded = any(phase != Phase.FLYING for phase in run.log.control.phase)
         self._ranked = ranked_tracks(footage.margins)  # fixed, so that rows keep their place
@@ -87,7 +89,8 @@ class Overlay:
 
     def _headlines(self, i: int) -> list[tuple[str, float, str]]:
         """Text, size and colour of the lines in the corner."""
-        control, k = self._run.log.control, self._footage.period[i]
+        control = self._run.log.control
+        k = self._footage.period[i]
         time = self._footage.times[i]
         lines: list[tuple[str, float, str]] = [(self._run.name, 21, ink.WHITE)]
         faster = "" if self._speed == 1.0 else f"   {self._speed:g} times real speed"
@@ -114,7 +117,9 @@ class Overlay:
     def _answer(self, k: int) -> tuple[str, float, str]:
         """Phase, where the flight has a ground, and what the controller answered in period k; red for a failure."""
         control = self._run.log.control
-        status, phase, fallback = control.status[k], control.phase[k], control.fallback[k]
+        status = control.status[k]
+        phase = control.phase[k]
+        fallback = control.fallback[k]
         phrases = [phase] if self._grounded and status != phase else []
         phrases.append(status + (f" (fallback {fallback})" if fallback else ""))
         if not fallback and control.answered_by[k] not in (LAW, STOPPED):
@@ -133,7 +138,9 @@ class Overlay:
         for j, (name, state) in enumerate(zip(REFERENCE_NAMES, REFERENCE_STATES, strict=True)):
             angle = state == INDEX["yaw"]
             factor, digits = (math.degrees(1.0), 1) if angle else (1.0, 2)
-            now, target, row = factor * values[j], factor * reference[j], y + 24 + 27 * j
+            now = factor * values[j]
+            target = factor * reference[j]
+            row = y + 24 + 27 * j
             painter.text(x, row, f"{name} [{'deg' if angle else 'm'}]", colour=ink.GREY)
             unknown = angle and self._footage.tilt is not None and self._footage.tilt[i] > 0.5 * math.pi
             columns = (118, now, ink.WHITE), (192, target, ON_DARK.reference), (262, now - target, ink.GREY)
@@ -146,18 +153,23 @@ class Overlay:
 
     def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:
         painter.text(x, y, "attitude [deg]", size=13, colour=ink.GREY)
-        signals, tilted = dict(zip(("roll", "pitch"), self._footage.euler[i], strict=False)), self._footage.tilt
+        signals = dict(zip(("roll", "pitch"), self._footage.euler[i], strict=False))
+        tilted = self._footage.tilt
         if tilted is not None:  # past the vertical roll jumps by 180 deg
             signals = {"tilt": tilted[i], "pitch": signals["pitch"]}
         for j, (name, angle) in enumerate(signals.items()):
-            value, limit, row = math.degrees(angle), self._limit(name, i), y + 32 + 50 * j
+            value = math.degrees(angle)
+            limit = self._limit(name, i)
+            row = y + 32 + 50 * j
             whole = {"tilt": 180.0, "pitch": 90.0}
             span = 2.0 * max(map(abs, _bounds(limit)), default=15.0) if tilted is None else whole[name]
-            broken, shown = _breaks(limit, value), f"{round(value, 2) + 0.0:+.2f}"
+            broken = _breaks(limit, value)
+            shown = f"{round(value, 2) + 0.0:+.2f}"
             painter.text(x, row, name, size=17)
             painter.text(x + 262, row, shown, size=17, colour=ON_DARK.violated if broken else ink.WHITE, anchor="ra")
             painter.box(x, row + 25, 262, 9, ink.FAINT)
-            centre, unit = x + 131, 131 / span
+            centre = x + 131
+            unit = 131 / span
             painter.box(
                 centre,
                 row + 25,
@@ -196,7 +208,8 @@ class Overlay:
         zero = top + height + unit * min(low, 0.0)
         for j, value in enumerate(values):
             broken = _breaks(limit, value, sampled=limit is not None and limit.source.plant is None)
-            left, shown = x + 50 * j, form.format(round(value, 1) + 0.0)
+            left = x + 50 * j
+            shown = form.format(round(value, 1) + 0.0)
             colour = ON_DARK.violated if broken else ink.WHITE
             painter.box(left, top, 34, height, ink.FAINT)
             painter.box(
@@ -213,8 +226,10 @@ class Overlay:
         shown, rest = margin_rows(self._ranked, i)
         pitch = 18.5 if len(self._ranked) <= _MOST_MARGINS else 16.0
         for j, track in enumerate(shown):
-            worst, row = track.worst[i], y + 22 + pitch * j
-            now_broken, once_broken = track.violated[i], track.violated_before[i]
+            worst = track.worst[i]
+            row = y + 22 + pitch * j
+            now_broken = track.violated[i]
+            once_broken = track.violated_before[i]
             painter.text(x, row, track.limit.name, size=14, colour=ON_DARK.violated if now_broken else ink.GREY)
             phrases = f"{round(worst, 2) + 0.0:+.2f} {track.limit.unit}"
             painter.text(

@@ -138,14 +138,16 @@ class Footage:
 
 def make_footage(run: Filmed, times: Array) -> Footage:
     """Read a flight at frame times; times beyond the flight show its ends."""
-    plant, control = run.log.plant, run.log.control
+    plant = run.log.plant
+    control = run.log.control
     times = np.clip(times, 0.0, run.end)
     row = np.clip(np.searchsorted(plant.t, times + 1e-9, side="right") - 1, 0, max(plant.t.size - 2, 0))
     after = np.minimum(row + 1, plant.t.size - 1)
     share = ((times - plant.t[row]) / np.where(after > row, plant.t[after] - plant.t[row], 1.0))[:, None]
     positions = plant.state[:, POSITION]
     attitudes = euler_to_quaternion(plant.state[:, EULER])
-    here, there = attitudes[row], attitudes[after]
+    here = attitudes[row]
+    there = attitudes[after]
     there = np.where((here * there).sum(axis=1, keepdims=True) < 0.0, -there, there)
     quaternion = (1.0 - share) * here + share * there
     position = (1.0 - share) * positions[row] + share * positions[after]
@@ -184,11 +186,14 @@ def _row_before(t: Array, times: Array) -> np.ndarray[Any, np.dtype[np.intp]]:
 def _track(run: Filmed, limit: Limit, times: Array) -> MarginTrack:
     t, values = limit.source.finest(run.log)
     margin = margins_at(limit, t, values)
-    violated, sampled = limit.violated(margin), margins_sampled(limit, run.log)
+    violated = limit.violated(margin)
+    sampled = margins_sampled(limit, run.log)
     rows = _row_before(t, run.log.control.t)
     np.fmin.at(margin, rows, sampled)  # a violating command does not show in saturated rotors
     np.logical_or.at(violated, rows, limit.violated(sampled, sampled=True))
-    row, worst, violated_before = _row_before(t, times), np.fmin.accumulate(margin), np.logical_or.accumulate(violated)
+    row = _row_before(t, times)
+    worst = np.fmin.accumulate(margin)
+    violated_before = np.logical_or.accumulate(violated)
     share = float(worst[-1]) / limit.half_band
     return MarginTrack(
         limit=limit,
@@ -215,10 +220,12 @@ def _smooth(t: Array, values: Array) -> Array:
 
 def thin(points: Array, tolerance: float) -> np.ndarray[Any, np.dtype[np.intp]]:
     """Rows of a path (n, 3) that show it within `tolerance` [m], first and last included (Ramer-Douglas-Peucker)."""
-    thinned, open_spans = {0, len(points) - 1}, [(0, len(points) - 1)]
+    thinned = {0, len(points) - 1}
+    open_spans = [(0, len(points) - 1)]
     while open_spans:
         first, last = open_spans.pop()
-        inner, chord = points[first + 1 : last] - points[first], points[last] - points[first]
+        inner = points[first + 1 : last] - points[first]
+        chord = points[last] - points[first]
         if not len(inner):
             continue
         along = np.clip(inner @ chord / max(float(chord @ chord), np.finfo(float).tiny), 0.0, 1.0)

@@ -23,7 +23,8 @@ class Painter:
     """Draws on one picture; lengths are design pixels, of `scale` real ones each."""
 
     def __init__(self, image: Image.Image, scale: float) -> None:
-        self._canvas, self._scale = ImageDraw.Draw(image), scale
+        self._canvas = ImageDraw.Draw(image)
+        self._scale = scale
 
     def text(self, x: float, y: float, text: str, *, size: float = 15, colour: str = WHITE, anchor: str = "la") -> None:
         """Write at a place; `anchor` is Pillow's, `ra` for right-aligned."""

@@ -50,14 +50,16 @@ def _camera(arm: float) -> mujoco.MjvCamera:
     """The camera that follows a vehicle of an arm length [m]."""
     camera = mujoco.MjvCamera()
     camera.distance = CAMERA_DISTANCE * arm
-    camera.azimuth, camera.elevation = CAMERA_AZIMUTH, CAMERA_ELEVATION
+    camera.azimuth = CAMERA_AZIMUTH
+    camera.elevation = CAMERA_ELEVATION
     return camera
 
 
 def _renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
     """A quick renderer: without multisampling, shadows and reflections."""
     model.vis.quality.offsamples = 0
-    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    model.vis.global_.offwidth = width
+    model.vis.global_.offheight = height
     renderer = mujoco.Renderer(model, height, width, max_geom=_MOST_GEOMS)
     for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
         renderer.scene.flags[flag] = 0
@@ -95,7 +97,8 @@ class FilmStage:
     """
 
     def __init__(self, run: Filmed, footage: Footage, *, width: int, height: int) -> None:
-        self._run, self._footage = run, footage
+        self._run = run
+        self._footage = footage
         self._arm = run.vehicle.longest_arm
         self._obstacles = obstacles_in(run.limits)
         self._model = compile_model(run.vehicle, visuals=True, obstacles=self._obstacles)
@@ -151,7 +154,8 @@ class FilmStage:
             self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, width * self._arm, start, stop, colour)
 
     def _draw_trail(self, i: int) -> None:
-        now, times = self._footage.times[i], self._footage.path_times
+        now = self._footage.times[i]
+        times = self._footage.path_times
         first, last = np.searchsorted(times, (now - TRAIL_SECONDS, now), side="right")
         points = np.concatenate([self._footage.path[first:last], self._footage.position[i : i + 1]])
         for j, (start, stop) in enumerate(itertools.pairwise(points)):
@@ -214,8 +218,10 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
     """Draw one state after the other, as `quadsim.report.film.camera.Camera` requests them, until there are no more."""
     vehicle, obstacles, width, height = pickle.load(requests)
     model = compile_model(vehicle, visuals=True, obstacles=obstacles)
-    data, camera = mujoco.MjData(model), _camera(vehicle.longest_arm)
-    floor, lowest = float(model.geom(FLOOR).pos[2]), 0.0
+    data = mujoco.MjData(model)
+    camera = _camera(vehicle.longest_arm)
+    floor = float(model.geom(FLOOR).pos[2])
+    lowest = 0.0
     with _renderer(model, width, height) as renderer:
         while len(request := requests.read(REQUEST.size)) == REQUEST.size:
             time, *numbers = REQUEST.unpack(request)
@@ -225,7 +231,8 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
             camera.lookat = numbers[:3]
             renderer.update_scene(data, camera)
             scene = renderer.scene
-            sphere, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.15 * vehicle.longest_arm)
+            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+            size = np.full(3, 0.15 * vehicle.longest_arm)
             colour = np.array(_COURSE_COLOUR, np.float32)
             goal = np.array(numbers[7:10])
             mujoco.mjv_initGeom(scene.geoms[scene.ngeom], sphere, size, goal, np.eye(3).ravel(), colour)

@@ -129,7 +129,10 @@ class Estimate:
     """
 
     def __init__(self, frames: Sequence[int] = (), note: str = "") -> None:
-        self._frames, self._note, self._film, self._told = frames, note, 0, False
+        self._frames = frames
+        self._note = note
+        self._film = 0
+        self._told = False
         self._begun = clock.monotonic()
         self._first: tuple[float, int] | None = None  # when frames of this film were first reported, and how many
 
@@ -142,12 +145,16 @@ class Estimate:
             self._first = now, done
         since, before = self._first
         if done == total:
-            self._film, self._begun, self._first = self._film + 1, now, None
+            self._film = self._film + 1
+            self._begun = now
+            self._first = None
         elif done > before and now - since >= _TIMED:
-            starts, per_frame = since - self._begun, (now - since) / (done - before)
+            starts = since - self._begun
+            per_frame = (now - since) / (done - before)
             further = self._frames[self._film + 1 :]
             seconds = (total - done + sum(further)) * per_frame + len(further) * starts
-            name, note = "films" if len(self._frames) > 1 else "film", self._note and f"; {self._note}"
+            name = "films" if len(self._frames) > 1 else "film"
+            note = self._note and f"; {self._note}"
             _log.info("%s: about %s%s", name, rough_time(seconds), note)
             self._told = True
 
@@ -201,7 +208,8 @@ def render_gif(
     It is rendered at twice its size and scaled down, which smooths its edges.  Its `fps` is 8 by default.
     """
     run = filmed(flight)
-    speed, rate = 6.0, frame_rate(0.0, 8 if fps is None else fps)
+    speed = 6.0
+    rate = frame_rate(0.0, 8 if fps is None else fps)
     count = frame_count(run.end, rate, speed)
     shot = Shot(width=960, height=540, fps=rate, speed=speed, count=count, captions=False)
     with _making(path, overwrite) as new:

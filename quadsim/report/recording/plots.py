@@ -48,8 +48,10 @@ def send_plots(recording: rr.RecordingStream, run: FlightRecord) -> rrb.Tabs:
     A view names only what was sent, and one without content is left out.
     """
     reached = [limit for limit in run.limits if _send_limit(recording, limit, run)]
-    signals, margins = _send_signals(recording, run, reached), _send_margins(recording, run, reached)
-    effects, events = _send_effects(recording, run), rrb.TextLogView(name="Events", origin="/events")
+    signals = _send_signals(recording, run, reached)
+    margins = _send_margins(recording, run, reached)
+    effects = _send_effects(recording, run)
+    events = rrb.TextLogView(name="Events", origin="/events")
     times, solver = _send_solver(recording, run)
     lanes = [f"verdicts/{limit.name}" for limit in reached if limit.start == 0.0]
     verdicts = [rrb.StateTimelineView(name="Constraints on the whole flight", contents=lanes)] if lanes else []
@@ -65,9 +67,11 @@ def _send_signals(
     recording: rr.RecordingStream, run: FlightRecord, reached: Sequence[Limit]
 ) -> list[rrb.TimeSeriesView]:
     """Every signal there is, and the reference; of flights that may turn upside down quaternion and body rates too."""
-    log, views = run.log, list[rrb.TimeSeriesView]()
+    log = run.log
+    views = list[rrb.TimeSeriesView]()
     for title, names in panels(log).items():
-        contents, values = list[str](), list[Array]()
+        contents = list[str]()
+        values = list[Array]()
         for colour, name in zip(SERIES, names, strict=False):
             unit = SIGNALS[name].unit
             t, curve = SIGNALS[name].finest(log)
@@ -106,9 +110,11 @@ def _send_margins(
     for unit in dict.fromkeys(limit.unit for limit in reached):
         contents = list[str]()
         for i, limit in enumerate(limit for limit in reached if limit.unit == unit):
-            margins, labels = margins_sampled(limit, run.log), {f"{limit.name} [{unit}]": on_screen(line_colour(i))}
+            margins = margins_sampled(limit, run.log)
+            labels = {f"{limit.name} [{unit}]": on_screen(line_colour(i))}
             inside = np.isfinite(margins)
-            t, values = run.log.control.t[inside], margins[inside]
+            t = run.log.control.t[inside]
+            values = margins[inside]
             contents += _send_curves(recording, f"margins/{limit.name}", t, values, labels)
         views += _view(f"Margins [{unit}]", contents, run)
     return views
@@ -116,7 +122,8 @@ def _send_margins(
 
 def _send_limit(recording: rr.RecordingStream, limit: Limit, run: FlightRecord) -> bool:
     """Send a limit's bounds over its time window and its verdicts; return whether the flight reached the window."""
-    t, margins = run.log.control.t, margins_sampled(limit, run.log)
+    t = run.log.control.t
+    margins = margins_sampled(limit, run.log)
     inside = np.isfinite(margins)
     if not inside.any():
         return False
@@ -125,7 +132,8 @@ def _send_limit(recording: rr.RecordingStream, limit: Limit, run: FlightRecord) 
     labels = {f"{limit.name} {sign} {bound:g} {limit.unit}": BOUND for sign, bound in bounds.items()}
     _send_curves(recording, f"limits/{limit.name}", window, np.tile([*bounds.values()], (2, 1)), labels)
 
-    names, entity = list(VERDICT_COLOURS), f"verdicts/{limit.name}"
+    names = list(VERDICT_COLOURS)
+    entity = f"verdicts/{limit.name}"
     band = limit.upper - limit.lower
     near = max(limit.tolerances[1], _ACTIVE * band if math.isfinite(band) else 0.0)
     violated = limit.violated(margins, sampled=True)
@@ -145,7 +153,8 @@ def _send_solver(
 ) -> tuple[list[rrb.TimeSeriesView], list[rrb.TimeSeriesView]]:
     """Clock times, and what is known of the answers."""
     sent = list[str]()
-    control, timing = run.log.control, run.log.timing
+    control = run.log.control
+    timing = run.log.timing
     first, second = SERIES[:2]
     for name, values, label, colour in (
         ("solve_ms", timing.solve_ms, "optimum alone [ms]", first),
@@ -173,7 +182,8 @@ def _send_solver(
 
 def _send_effects(recording: rr.RecordingStream, run: FlightRecord) -> list[rrb.TimeSeriesView]:
     """Send commands that rotors do not follow at once, external force, wind, and battery, where they exist."""
-    t, views = run.log.plant.t, list[rrb.TimeSeriesView]()
+    t = run.log.plant.t
+    views = list[rrb.TimeSeriesView]()
     commanded = commanded_speeds(run.log)
     if commanded is not None:
         labels = {f"rotor {i}, commanded [rad/s]": REFERENCE for i in range(1, N_ROTORS + 1)}

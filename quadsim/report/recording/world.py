@@ -84,7 +84,8 @@ def time_column(t: Array) -> rr.TimeColumn:
 
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
-_DASH, _MOST_DASHES = 0.8, 500  # length of a dash of the reference, in arm lengths, and of dashes and gaps together
+_DASH = 0.8
+_MOST_DASHES = 500  # length of a dash of the reference, in arm lengths, and of dashes and gaps together
 _WIND_LENGTH: Final = 1.5  # how long a flight's strongest wind is drawn, in arm lengths
 
 
@@ -127,7 +128,8 @@ def _part(solid: Solid, colour: Any) -> rr.AsComponents:
 
 def send_scene(recording: rr.RecordingStream, run: FlightRecord) -> None:
     """Axes and paths, how the vehicle moves through them, and what the controller predicts."""
-    control, plant = run.log.control, run.log.plant
+    control = run.log.control
+    plant = run.log.plant
     position = plant.state[:, POSITION]
     thickness = min(0.02, 0.06 * run.actual.longest_arm)
     axes = rr.Arrows3D(
@@ -207,20 +209,26 @@ def scene_views(run: FlightRecord) -> rrb.Vertical:
 
 def _overview(run: FlightRecord) -> tuple[Array, Array]:
     """Where the eye is and where it looks [m] to see the whole course."""
-    path, course = run.log.plant.state[:, POSITION], run.log.control.reference[:, :3]
+    path = run.log.plant.state[:, POSITION]
+    course = run.log.control.reference[:, :3]
     path = path[np.isfinite(path).all(axis=1)]  # a flight that diverged ends in anything
     course = course if len(course) else path
-    low, high, least = course.min(axis=0), course.max(axis=0), 10 * run.actual.longest_arm
+    low = course.min(axis=0)
+    high = course.max(axis=0)
+    least = 10 * run.actual.longest_arm
     slack = max(float((high - low).max()), least)
     path = np.clip(path, low - slack, high + slack)  # a lost vehicle leaves the picture
-    low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
-    centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), least)
+    low = np.minimum(low, path.min(axis=0))
+    high = np.maximum(high, path.max(axis=0))
+    centre = (low + high) / 2
+    size = max(float(np.linalg.norm(high - low)), least)
     return centre + size * np.array([0.35, -0.9, 0.3]), centre
 
 
 def _view(name: str, origin: str, eye: Array, target: Array) -> rrb.Spatial3DView:
     """The scene seen from a point at rest in the frame of `origin`, and the ground, in the frame of the world."""
-    start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    start = rrb.TimeRangeBoundary.infinite()
+    now = rrb.TimeRangeBoundary.cursor_relative()
     return rrb.Spatial3DView(
         name=name,
         origin=origin,
@@ -235,7 +243,8 @@ def _send_arrows(
     recording: rr.RecordingStream, run: FlightRecord, name: str, vectors: Array, colour: Colour, *, behind: float
 ) -> None:
     """Arrows (M, 3) above the rotor discs that move with the vehicle, begun by `behind` of their length before it."""
-    entity, unit = f"world/vehicle/{name}", run.actual.longest_arm / DRAWN_ARM
+    entity = f"world/vehicle/{name}"
+    unit = run.actual.longest_arm / DRAWN_ARM
     recording.log(entity, rr.Arrows3D.from_fields(radii=0.01 * unit, colors=colour), static=True)
     origins = np.array([0.0, 0.0, 0.08 * unit]) - behind * vectors
     columns = rr.Arrows3D.columns(vectors=vectors, origins=origins)

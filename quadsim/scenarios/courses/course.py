@@ -194,7 +194,8 @@ class Point:
 
 def poses_of(points: Sequence[Point], initial: Array) -> Array:
     """Return x, y, z [m], yaw [rad] of points (n, 4), yaw on the turn nearest that of the point before, or that yaw."""
-    poses, yaw = [], float(initial[3])
+    poses = []
+    yaw = float(initial[3])
     for point in points:
         yaw = yaw if point.yaw is None else nearest_turn(math.radians(point.yaw), yaw)
         poses.append([*point.position, yaw])

@@ -42,10 +42,14 @@ LARGEST_NUMBER: Final = 1e6  # largest magnitude of a number in the table, as in
 MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
 ROUNDED: Final = range(2, 8)
 """Decimals of a rounded column: with fewer its numbers are exact, with more rounding cannot be detected."""
-FAR, FAST, FASTEST = 50.0, 50.0, 340.0
+FAR = 50.0
+FAST = 50.0
+FASTEST = 340.0
 """Distance of the first row from the vehicle [m] and mean speed [m/s] above which a table is doubted, those at which a
 flight is lost by default, and mean speed above which it is refused, that of sound."""
-TURNS, TURNING, FASTEST_TURNING = 5.0, 180.0, 2000.0
+TURNS = 5.0
+TURNING = 180.0
+FASTEST_TURNING = 2000.0
 """The same for yaw: turns in all, and mean rates [deg/s]; the last is the full scale of the usual gyroscopes."""
 DISAGREEMENT: Final = 0.25
 """Mean difference between stated and covered velocity, over the larger of both, above which a table is doubted."""
@@ -411,7 +415,8 @@ def _yaw_notes(path: FilePath, t: Array, yaw: Array) -> Iterator[str]:
             f"{math.radians(rate):.4g} deg/s"
         )
     elif many:
-        low, high = float(yaw.min()), float(yaw.max())
+        low = float(yaw.min())
+        high = float(yaw.max())
         yield (
             f"column yaw goes from {math.degrees(low):.4g} to {math.degrees(high):.4g} deg; if it is in degrees "
             f"instead of radians, from {low:.4g} to {high:.4g} deg"
@@ -431,8 +436,11 @@ def _velocity_notes(
         return float(periods @ np.abs(values) / periods.sum())
 
     for name, place, velocity, unit in zip("xyz", poses.T, velocities.T, resolution, strict=False):
-        covered, stated = np.diff(place) / periods, 0.5 * (velocity[1:] + velocity[:-1])
-        moved, said, off = mean(covered), mean(stated), mean(stated - covered)
+        covered = np.diff(place) / periods
+        stated = 0.5 * (velocity[1:] + velocity[:-1])
+        moved = mean(covered)
+        said = mean(stated)
+        off = mean(stated - covered)
         rounding = 2.0 * unit * periods.size / float(periods.sum())
         if off <= DISAGREEMENT * max(moved, said) or off <= SMALL + rounding:
             continue

@@ -26,7 +26,9 @@ class FollowedCourse:
 
     def __init__(self, course: Course, *, response_time: float, period: float) -> None:
         """Set up at t = 0, with tau_r [s], 0 for no filter, and tau_s [s]."""
-        self._course, self._response_time, self._period = course, response_time, period
+        self._course = course
+        self._response_time = response_time
+        self._period = period
         self._samples = self._rows = np.empty((0, len(REFERENCE_NAMES)))
         self._setpoint: dict[int, float] = {}
 
@@ -54,7 +56,8 @@ class FollowedCourse:
         Samples are those before the filter.  Nothing here changes.
         """
         self._extend(count)
-        samples, places = self._samples[:count].copy(), np.arange(count)
+        samples = self._samples[:count].copy()
+        places = np.arange(count)
         for channel, name in enumerate(REFERENCE_NAMES):
             given = [(k, values[name]) for k, values in setpoints if name in values]
             if given:

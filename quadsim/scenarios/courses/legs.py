@@ -71,7 +71,8 @@ class Waypoints(Travelled):
 
     def path(self, initial: Array, gravity: float) -> Path:
         """The legs, yaw turning evenly along each; by speed, a first point at the initial position takes no time."""
-        times, poses = [0.0], [initial]
+        times = [0.0]
+        poses = [initial]
         for i, (point, pose) in enumerate(zip(self.points, poses_of(self.points, initial), strict=True)):
             length = float(np.linalg.norm(pose[:3] - poses[-1][:3]))
             if self.times is not None:
@@ -111,7 +112,8 @@ class YawTurns(Filtered):
 
     def build(self, initial: Array, gravity: float) -> Course:
         """As `Filtered.build`; a turn cuts off one that is not over."""
-        times, yaws = [0.0], [float(initial[3])]
+        times = [0.0]
+        yaws = [float(initial[3])]
         for turn in self.turns:
             target = math.radians(turn.yaw)
             yaw = float(np.interp(turn.start, times, yaws))

@@ -49,10 +49,12 @@ def figure_eight(
     It begins in the centre (3,) [m], where it crosses itself; clockwise, seen from above, is its first half.
     """
     sign = 1.0 if clockwise else -1.0
-    cos, sin = math.cos(angle), math.sin(angle)
+    cos = math.cos(angle)
+    sin = math.sin(angle)
 
     def position(theta: Array) -> Array:
-        along, across = half_length * np.sin(theta), sign * half_width * np.sin(2.0 * theta)
+        along = half_length * np.sin(theta)
+        across = sign * half_width * np.sin(2.0 * theta)
         return centre + np.stack([cos * along - sin * across, sin * along + cos * across, np.zeros_like(theta)], axis=1)
 
     return Loop(position=position)
@@ -78,7 +80,8 @@ def fly_round(loop: Loop, *, turn_time: float, turns: float, ramp: float, yaw: f
 
     Yaw [rad] is held.
     """
-    rate, total = math.tau / turn_time, math.tau * turns
+    rate = math.tau / turn_time
+    total = math.tau * turns
 
     def pose(t: Array) -> Array:
         theta = ramped(t, rate=rate, total=total, ramp=ramp)
@@ -165,7 +168,8 @@ class _Circular(_Round):
         angle = math.radians(self.angle)
         from_centre = (self.radius * math.cos(angle), self.radius * math.sin(angle))
         centre = np.array([*(initial[:2] - from_centre if self.centre is None else self.centre), height])
-        clockwise, climb = self.turns < 0.0, self.climb_per_turn
+        clockwise = self.turns < 0.0
+        climb = self.climb_per_turn
         return circle(centre=centre, radius=self.radius, angle=angle, clockwise=clockwise, climb_per_turn=climb)
 
 

@@ -86,7 +86,8 @@ def smoothest(times: Array, values: Array, order: int) -> BPoly:
     """
     from scipy.interpolate import BPoly
 
-    n, unit = times.size - 1, (times[-1] - times[0]) / (times.size - 1)
+    n = times.size - 1
+    unit = (times[-1] - times[0]) / (times.size - 1)
     durations = np.diff(times) / unit
     # Coefficients of one segment on s in [0, 1] from derivatives 0 .. order - 1 at s = 0 and at s = 1.
     from_ends = np.linalg.inv(np.vstack([_derivatives_at(0.0, order), _derivatives_at(1.0, order)]))
@@ -103,7 +104,8 @@ def smoothest(times: Array, values: Array, order: int) -> BPoly:
     stacked = derivatives.reshape((n + 1) * order, -1)  # a view
     free = np.setdiff1d(np.arange(order, n * order), order * np.arange(1, n))
     if free.size:
-        R_PP, gradient = R[np.ix_(free, free)], R[free] @ stacked
+        R_PP = R[np.ix_(free, free)]
+        gradient = R[free] @ stacked
         unit_diagonal = 1.0 / np.sqrt(np.diag(R_PP))
         R_PP = unit_diagonal[:, None] * R_PP * unit_diagonal
         stacked[free] = -unit_diagonal[:, None] * np.linalg.solve(R_PP, unit_diagonal[:, None] * gradient)
@@ -112,7 +114,8 @@ def smoothest(times: Array, values: Array, order: int) -> BPoly:
 
 def minimum_snap(start: Array, poses: Array, times: Sequence[float]) -> Path:
     """Least snap of x, y, z and angular acceleration of yaw through poses (n, 4) at times (n,) [s], rest to rest."""
-    knots, through = np.array([0.0, *times]), np.vstack([start, poses])
+    knots = np.array([0.0, *times])
+    through = np.vstack([start, poses])
     position = smoothest(knots, through[:, :3], SNAP)
     yaw = smoothest(knots, through[:, 3:], ACCELERATION_ORDER)
     return Path(pose=lambda t: np.hstack([position(t), yaw(t)]), duration=float(knots[-1]))

@@ -51,12 +51,15 @@ def ramped_phase(*, rate: float, acceleration: float, ramp: float, step: float) 
         ramp: T [s], less than rate / acceleration.
         step: D, of the rectangle sums [s].
     """
-    bend, full = 0.5 * math.pi / ramp, rate / acceleration - ramp
+    bend = 0.5 * math.pi / ramp
+    full = rate / acceleration - ramp
 
     def within(length: float) -> Array:
         return step * np.arange(math.ceil(length / step - 1e-9), dtype=np.float64)
 
-    rising, turning, constant = within(ramp), within(2.0 * ramp), np.ones(len(within(full)))
+    rising = within(ramp)
+    turning = within(2.0 * ramp)
+    constant = np.ones(len(within(full)))
     risen = np.square(np.sin(bend * rising))
     share = np.concatenate([risen, constant, np.cos(bend * turning), -constant, risen - 1.0])
     alpha = acceleration * share
@@ -68,7 +71,8 @@ def circle_curve(radius: float) -> Curve:
     """A level circle, clockwise seen from above, begun at its northernmost point (y) towards x; radius [m]."""
 
     def curve(theta: Array, omega: Array, alpha: Array) -> tuple[Array, Array, Array]:
-        sin, cos = np.sin(theta), np.cos(theta)
+        sin = np.sin(theta)
+        cos = np.cos(theta)
         position = _level(radius * sin, radius * cos - radius)
         velocity = _level(radius * omega * cos, -radius * omega * sin)
         acceleration = _level(alpha * cos - omega**2 * sin, -alpha * sin - omega**2 * cos)
@@ -83,8 +87,10 @@ def upright_circle_curve(radius: float, yaw: float) -> Curve:
     def curve(theta: Array, omega: Array, alpha: Array) -> tuple[Array, Array, Array]:
         ahead = np.array([math.cos(yaw), math.sin(yaw), 0.0])
         up = np.array([0.0, 0.0, 1.0])
-        sin, cos = np.sin(theta)[:, None], np.cos(theta)[:, None]
-        square, change = np.square(omega)[:, None], alpha[:, None]
+        sin = np.sin(theta)[:, None]
+        cos = np.cos(theta)[:, None]
+        square = np.square(omega)[:, None]
+        change = alpha[:, None]
         position = sin * ahead + (1.0 - cos) * up
         velocity = omega[:, None] * (cos * ahead + sin * up)
         acceleration = (change * cos - square * sin) * ahead + (change * sin + square * cos) * up
@@ -97,7 +103,10 @@ def lemniscate_curve(radius: float) -> Curve:
     """A level lemniscate of Gerono, begun at its tip in x towards y; radius is half its length [m]."""
 
     def curve(theta: Array, omega: Array, alpha: Array) -> tuple[Array, Array, Array]:
-        sin, cos, sin2, cos2 = np.sin(theta), np.cos(theta), np.sin(2.0 * theta), np.cos(2.0 * theta)
+        sin = np.sin(theta)
+        cos = np.cos(theta)
+        sin2 = np.sin(2.0 * theta)
+        cos2 = np.cos(2.0 * theta)
         position = _level(radius * cos - radius, radius * sin * cos)
         velocity = _level(-radius * omega * sin, radius * omega * cos2)
         acceleration = _level(-alpha * sin - omega**2 * cos, alpha * cos2 - 2.0 * omega**2 * sin2)
@@ -185,9 +194,11 @@ class _Ramped(Travelled):
 
     def path(self, initial: Array, gravity: float) -> Path:
         """The curve by its phase."""
-        rate, acceleration = self.speed / self.radius, self.acceleration / self.radius
+        rate = self.speed / self.radius
+        acceleration = self.acceleration / self.radius
         phase = ramped_phase(rate=rate, acceleration=acceleration, ramp=self.ramp, step=self.sampling)
-        curve, free = self.curve(float(initial[3])), self.heading == "free"
+        curve = self.curve(float(initial[3]))
+        free = self.heading == "free"
         return fly_ramped(curve, phase, initial=initial, gravity=gravity, free_heading=free)
 
 

@@ -40,7 +40,8 @@ class _SchemaOfToml(GenerateJsonSchema):
 
     def dataclass_schema(self, schema: core_schema.DataclassSchema) -> dict[str, Any]:
         """The same with a settings dataclass's description of its fields; see `quadsim.fields`."""
-        json_schema, table = super().dataclass_schema(schema), schema["cls"]
+        json_schema = super().dataclass_schema(schema)
+        table = schema["cls"]
         json_schema["description"] = f"{headline(table)}."
         for name, field in fields_of(table).items():
             if field.description:

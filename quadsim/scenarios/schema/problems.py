@@ -66,7 +66,8 @@ class Kind:
     @property
     def entries(self) -> tuple[Kind, ...]:
         """Kinds of the entries of a list, or of a table with free names."""
-        origin, arguments = get_origin(self.type), get_args(self.type)
+        origin = get_origin(self.type)
+        arguments = get_args(self.type)
         return kinds_of(arguments[0] if origin is tuple else arguments[-1]) if origin in (*_LISTS, dict) else ()
 
     @property
@@ -99,7 +100,8 @@ class Kind:
         if self.choices:
             *rest, last = ("false" if choice is False else repr(choice) for choice in self.choices)
             return f"one of {', '.join(rest)} or {last}" if rest else last
-        limits, count = self.limits, _count(*self.lengths)
+        limits = self.limits
+        count = _count(*self.lengths)
         if self.is_list:
             held = {entry.type for entry in self.entries}
             return f"a list of {count}{'numbers' if held <= {float, int} else 'texts' if held == {str} else 'entries'}"
@@ -207,7 +209,8 @@ class ScenarioError(InputError):
         unsaid = len(problems) - _MOST_LINES
         lines = [*problems[:_MOST_LINES], *([f"and {unsaid} more"] if unsaid > 0 else [])]
         super().__init__(f"{source}: " + "\n  ".join(lines))
-        self.source, self.problems = source, tuple(problems)
+        self.source = source
+        self.problems = tuple(problems)
 
 
 def parse_table(kind: type[TableType], data: Mapping[str, Any], source: str, *, file: str = "scenario") -> TableType:
@@ -318,7 +321,9 @@ def describe_all(
 def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *, file: str = "scenario") -> str:
     """Return one line about a field of a file of type `root`: its name, the allowed and the given value."""
     place = find(details["loc"], data, root)
-    field, kind, given = ".".join(place.names), details["type"], place.given
+    field = ".".join(place.names)
+    kind = details["type"]
+    given = place.given
     if kind == "missing":
         return f"{field} is missing"
     if kind in ("extra_forbidden", "unexpected_keyword_argument") and field in _GONE:
@@ -348,7 +353,8 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *,
         )
         choices = expected.strip("'").split("', '")
         given = given.get(name) if isinstance(given, Mapping) else given
-        field, rule = f"{field}.{name}", f"one of {expected}"
+        field = f"{field}.{name}"
+        rule = f"one of {expected}"
     return f"{field} must be {rule if kind in _KNOWN else details['msg']}; got {shown(given)}{_guess(given, choices)}"
 
 

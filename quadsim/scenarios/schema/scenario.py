@@ -350,7 +350,8 @@ class Scenario:
         return names + [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
 
     def _check_events(self) -> None:
-        carried, controller = len(self.effects.load.payloads) if self.effects.load is not None else 0, self.controller
+        carried = len(self.effects.load.payloads) if self.effects.load is not None else 0
+        controller = self.controller
         for i, event in sorted(enumerate(self.events), key=lambda entry: entry[1].at):
             if event.at >= self.duration:
                 raise ValueError(f"events.{i}.at must be before the flight's end, {self.duration} s; got {event.at}")

@@ -145,7 +145,8 @@ def separate(changes: Mapping[Any, Any], *, source: str) -> dict[str, Any]:
 
 def state_bounds(data: dict[str, Any], controller: Any) -> None:
     """Write the bounds that constraints took from a controller into them, when a law without these replaces it."""
-    before, after = data.get("controller"), {"type": controller} if isinstance(controller, str) else controller
+    before = data.get("controller")
+    after = {"type": controller} if isinstance(controller, str) else controller
     if not (isinstance(before, dict) and isinstance(after, dict)) or after.get("type") in (None, before.get("type")):
         return
     names = ("output_bounds", "input_bounds")
@@ -189,7 +190,8 @@ def _note(data: dict[str, Any], changes: Iterable[tuple[str, Any]]) -> None:
 
 def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     """Return fields in which nested tables differ: dotted path and both values, None where one lacks the field."""
-    a, b = dict(leaves(first, entries=True)), dict(leaves(second, entries=True))
+    a = dict(leaves(first, entries=True))
+    b = dict(leaves(second, entries=True))
     return [(path, a.get(path), b.get(path)) for path in {**a, **b} if a.get(path) != b.get(path)]
 
 

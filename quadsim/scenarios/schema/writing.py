@@ -104,7 +104,8 @@ def _lines(
     """Yield the lines of a table: numbers, texts and small lists, then its subtables, in order of declaration."""
     below: list[tuple[str, Any, str]] = []
     for name, field in sorted(fields_of(type(model)).items(), key=_type_first):
-        value, kinds = getattr(model, name), tables_in(field.annotation)
+        value = getattr(model, name)
+        kinds = tables_in(field.annotation)
         is_new = (type(model), name) not in explained
         explained.add((type(model), name))
         comment = " ".join((field.description or "").split()) if is_new else ""

@@ -30,9 +30,11 @@ from annotated_types import Ge, Le, doc
 from quadsim.core.mirror import core_library
 from quadsim.state import Array
 
-LOWEST_HEIGHT, HIGHEST_HEIGHT = 3.048, 304.8
+LOWEST_HEIGHT = 3.048
+HIGHEST_HEIGHT = 304.8
 """Heights [m] between which the low-altitude model holds: 10 and 1000 ft (Figs. 10 and 11)."""
-SLOWEST_AIRSPEED, FASTEST_AIRSPEED = 0.01, 200.0
+SLOWEST_AIRSPEED = 0.01
+FASTEST_AIRSPEED = 200.0
 """[m/s] at which turbulence may pass; at the slower one, it takes hours."""
 _METRES_PER_FOOT: Final = 0.3048
 _BLOCK: Final = 4096
@@ -100,7 +102,8 @@ class Turbulence:
         self._rng.bit_generator.state = self._initial
         first, second = self._rng.standard_normal((2, 3))
         self._state = np.stack([first, 0.5 * (first + second)])  # of the stationary covariance [[1, 1/2], [1/2, 1/2]]
-        self._block, self._used = np.empty((0, 3)), 0
+        self._block = np.empty((0, 3))
+        self._used = 0
 
     def advance(self, steps: int) -> Array:
         """(steps, 3) the next samples of u, v, w [m/s]."""
@@ -108,10 +111,12 @@ class Turbulence:
         made = 0
         while made < steps:
             if self._used == len(self._block):
-                self._block, self._used = self._next_block(), 0
+                self._block = self._next_block()
+                self._used = 0
             taken = min(steps - made, len(self._block) - self._used)
             samples[made : made + taken] = self._block[self._used : self._used + taken]
-            self._used, made = self._used + taken, made + taken
+            self._used = self._used + taken
+            made = made + taken
         return samples
 
     def _next_block(self) -> Array:

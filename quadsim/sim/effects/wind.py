@@ -189,7 +189,8 @@ class WindField:
     def reset(self) -> None:
         """Rewind: the same wind again."""
         self._step = self._start = 0
-        self._turbulent, self._wind = np.empty((0, 3)), np.empty((0, 3))
+        self._turbulent = np.empty((0, 3))
+        self._wind = np.empty((0, 3))
         if self._turbulence is not None:
             self._turbulence.reset()
 

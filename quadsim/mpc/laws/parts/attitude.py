@@ -51,7 +51,8 @@ def limit_force(force: Array, *, least: float, tilt: float) -> Array:
 
     The limit changes the vertical part only if it is too small; the horizontal part keeps its direction.
     """
-    force, limited = np.ascontiguousarray(force, np.float64), np.empty(3)
+    force = np.ascontiguousarray(force, np.float64)
+    limited = np.empty(3)
     core_library().quadsim_geometric_limit(force.ctypes.data, least, math.tan(tilt), limited.ctypes.data)
     return limited
 
@@ -80,14 +81,18 @@ def prioritised_error(attitude: Array, desired: Array, yaw_weight: float) -> Arr
     cosine = float(np.clip(thrust[2], -1.0, 1.0))
     if cosine > -1.0 + 1e-9:
         w = math.sqrt(0.5 * (1.0 + cosine))
-        x, y = -thrust[1] / (2.0 * w), thrust[0] / (2.0 * w)
+        x = -thrust[1] / (2.0 * w)
+        y = thrust[0] / (2.0 * w)
         cross = hat(np.array([-thrust[1], thrust[0], 0.0]))
         tilting = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
     else:  # upside down: all axes are equally short, so roll is chosen
-        w, x, y = 0.0, 1.0, 0.0
+        w = 0.0
+        x = 1.0
+        y = 0.0
         tilting = np.diag([1.0, -1.0, -1.0])
     tilted = attitude @ tilting
     turn = math.atan2(desired[:, 0] @ tilted[:, 1], desired[:, 0] @ tilted[:, 0])
     half = 0.5 * yaw_weight * turn
-    c, s = math.cos(half), math.sin(half)
+    c = math.cos(half)
+    s = math.sin(half)
     return 2.0 * np.array([x * c + y * s, y * c - x * s, w * s / yaw_weight])

@@ -42,8 +42,13 @@ def body_of(model: RigidBody) -> tuple[Struct, Array]:
 
 def body_numbers(model: RigidBody, p: Struct) -> Array:
     """Fill in the rigid body's numbers; return (2 substeps + 1, 8) what p.left points to, which the caller keeps."""
-    p.actuators, p.targets, p.speeds = model.actuators, model.targets, model.inputs is Inputs.SPEED
-    p.moments, p.substeps, p.step, p.gravity = model.moments, model.substeps, model.step, model.gravity
+    p.actuators = model.actuators
+    p.targets = model.targets
+    p.speeds = model.inputs is Inputs.SPEED
+    p.moments = model.moments
+    p.substeps = model.substeps
+    p.step = model.step
+    p.gravity = model.gravity
     p.largest = model.mass * model.gravity if model.targets else model.largest_thrust
     ixx, iyy, izz = model.inertia.tolist()
     gyration = (0.0, 0.0, 0.0) if model.targets else ((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz)
@@ -114,10 +119,14 @@ def unpacked(slopes: Array, n: int, befores: int, left: Array) -> tuple[Array, A
     `left` (8,) begins with what a step leaves of actuators.  The core's states may end with `befores` more, the inputs
     before.
     """
-    M, inputs = len(slopes), n - 3 + befores
-    A, B = np.zeros((M, n, n)), np.zeros((M, n, N_ROTORS))
+    M = len(slopes)
+    inputs = n - 3 + befores
+    A = np.zeros((M, n, n))
+    B = np.zeros((M, n, N_ROTORS))
     A[:, :3, :3] = np.eye(3)
-    A[:, :N_BODY, 3:], B[:, :N_BODY] = slopes[:, :, : n - 3], slopes[:, :, inputs : inputs + N_ROTORS]
+    A[:, :N_BODY, 3:] = slopes[:, :, : n - 3]
+    B[:, :N_BODY] = slopes[:, :, inputs : inputs + N_ROTORS]
     for a in range(n - N_BODY):
-        A[:, N_BODY + a, N_BODY + a], B[:, N_BODY + a, a] = left[a], 1.0 - left[a]
+        A[:, N_BODY + a, N_BODY + a] = left[a]
+        B[:, N_BODY + a, a] = 1.0 - left[a]
     return A, B

@@ -46,5 +46,6 @@ def stated(table: AnyTable, vehicle: Vehicle, period: float, shapes: Sequence[Sh
     """
     if not isinstance(table, Bounded):
         return table
-    problem, space = table.problem(vehicle, period), table.space(shapes, vehicle, period)
+    problem = table.problem(vehicle, period)
+    space = table.space(shapes, vehicle, period)
     return replace(table, solver=table.solver_name(problem, space))

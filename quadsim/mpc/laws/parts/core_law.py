@@ -52,7 +52,8 @@ class CoreLaw:
             check: of each answer against the problem.
             fallback: the contract's `quadsim_fallback`.
         """
-        self._problem, self._check = problem, check
+        self._problem = problem
+        self._check = check
         self._kept = solver.shared, numbers, fallback  # the controller points to them
         self._library = core_library()
         self._controller = type(numbers.controller).from_buffer_copy(numbers.controller)
@@ -75,7 +76,8 @@ class CoreLaw:
 
     def start(self, periods: int, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], with room for K periods."""
-        n, N = self._problem.model.n, self._problem.horizon
+        n = self._problem.model.n
+        N = self._problem.horizon
         self.commands = np.empty((periods + 1, N_ROTORS))
         self.commands[0] = speeds
         self._library.quadsim_mpc_reset(self._mpc, self.commands.ctypes.data)

@@ -28,7 +28,9 @@ class FeedbackLaw(ABC):
     solver: Final = ""
 
     def __init__(self, vehicle: Vehicle, period: float, settings: Baseline, model: LinearModel | None = None) -> None:
-        self.bounds, self.horizon, self._period = settings.actuators(vehicle), settings.horizon, period
+        self.bounds = settings.actuators(vehicle)
+        self.horizon = settings.horizon
+        self._period = period
         self.model = hover_model(vehicle, period) if model is None else model
         self._operator = differentiator(self.horizon, period)
         self._turns = ReferenceTurns()

@@ -111,7 +111,8 @@ class NominalPreparation:
     trim = disturbance = memory = numbers = None
 
     def __init__(self, problem: Problem) -> None:
-        self.problem, self._turns = problem, ReferenceTurns()
+        self.problem = problem
+        self._turns = ReferenceTurns()
 
     def reset(self, speeds: Array) -> None:
         """Forget the turn of the heading, its only state."""
@@ -176,10 +177,14 @@ class LinearMPC:
             kkt_every: interval of KKT checks [periods].
             commands: what it commands.
         """
-        self.preparation, self.problem = preparation, preparation.problem
-        self.name, self.solver, self.horizon = name, solver.name, self.problem.horizon
+        self.preparation = preparation
+        self.problem = preparation.problem
+        self.name = name
+        self.solver = solver.name
+        self.horizon = self.problem.horizon
         self.commands = commands
-        self._solver, self._holds = solver, holds
+        self._solver = solver
+        self._holds = holds
         self._obstacles = None if space is None else ObstacleQP(self.problem, solver, space)
         self._bounds, self._check = ActuatorBounds.of_problem(self.problem), AnswerCheck(self.problem, kkt_every)
         self.reset(self.problem.model.u_bar)
@@ -200,7 +205,8 @@ class LinearMPC:
         """Take over what the previous law has learnt, and its plan, to hold if a QP has no answer."""
         law = previous if isinstance(previous, LinearMPC) else None
         if law is not None and law._plan is not None and self._holds:
-            self._plan, self._held = resized(law._plan, self.horizon), law._held
+            self._plan = resized(law._plan, self.horizon)
+            self._held = law._held
         self.preparation.adopt(None if law is None else law.preparation.memory, disturbance_of(previous))
 
     @property
@@ -232,7 +238,9 @@ class LinearMPC:
             self._acting = np.array(now.acting, float)
         if now.phase in GROUNDED:
             self.preparation.stand(now, self._acting)
-            self._acting, self._plan, self._held = self._bounds.lowest(self._acting), None, 0
+            self._acting = self._bounds.lowest(self._acting)
+            self._plan = None
+            self._held = 0
             return stopped(self._acting.copy(), self.horizon, now.phase)
         query = self.preparation.prepare(now, state, reference, self._acting)
         if query is None:
@@ -242,7 +250,8 @@ class LinearMPC:
         answer, reason = self._check(problem, query, answer, reason)
         self.answer = answer
         if reason is None:
-            self._plan, self._held = answer.plan if self._holds else None, 0
+            self._plan = answer.plan if self._holds else None
+            self._held = 0
             self._acting = self._bounds.clip(answer.plan[0], self._acting)
             return command_of(self._acting, answer.plan, answer.status, answer)
         if reason != INVALID_DATA and self.infeasible_period is None:

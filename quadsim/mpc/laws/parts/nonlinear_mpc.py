@@ -137,7 +137,9 @@ class NonlinearMPC:
         kkt_every: int = KKT_EVERY,
         tolerance: float = STEP_TOLERANCE,
     ) -> None:
-        self.settings, self._vehicle, self._period = settings, vehicle, period
+        self.settings = settings
+        self._vehicle = vehicle
+        self._period = period
         self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
         self.commands: str = settings.commands
         self.horizon = settings.horizon
@@ -163,7 +165,8 @@ class NonlinearMPC:
             faces=0 if space is None else space.count,
             price=None if space is None else space.penalty,
         )
-        self.delay, self.delay_bodies = None, Bodies()
+        self.delay = None
+        self.delay_bodies = Bodies()
         if settings.delay:
             require_delay(settings.delay, period, min(settings.horizon, MOST_LATE))
             if self.model.targets and settings.delay >= period:
@@ -189,7 +192,8 @@ class NonlinearMPC:
         raise TypeError("a law in C cannot be copied or pickled: make another")
 
     def _make_ramp(self) -> RampObserver | None:
-        settings, model = self.settings, self.model
+        settings = self.settings
+        model = self.model
         if settings.disturbance is None:
             return None
         lag = self._lag if settings.disturbance.rotor_lag is None else settings.disturbance.rotor_lag
@@ -205,7 +209,9 @@ class NonlinearMPC:
         )
 
     def _make_numbers(self, stride: int) -> Struct:
-        vehicle, model, observer = self._vehicle, self.model, self._observer
+        vehicle = self._vehicle
+        model = self.model
+        observer = self._observer
         numbers = _NumbersStruct(
             problem=ctypes.addressof(self.program.struct),
             stride=stride,
@@ -240,7 +246,8 @@ class NonlinearMPC:
 
     def _start(self) -> None:
         """Start a law in new memory, with views of what Python reads and writes there."""
-        p, N = self.program.struct, self._nodes
+        p = self.program.struct
+        N = self._nodes
         reals, ints = self.memory()
         self._memory = np.zeros(reals), np.zeros(ints, np.intc)
         self.struct = law = _LawStruct()
@@ -255,12 +262,18 @@ class NonlinearMPC:
         self._asked = measured, before, core_view(law.states, N + 1, N_BODY), core_view(law.thrusts, N, N_ROTORS)
         self._arguments = work, law.world, *(array.ctypes.data for array in self._asked)
         size = self.model.n + N_ROTORS * bool(p.moves)
-        self._x, self._u = core_view(work.x, N + 1, size), core_view(work.u, N, N_ROTORS)
-        self._s, self._v = core_view(work.s, N + 1, size), core_view(work.v, N, N_ROTORS)
-        self._goal, self._aim = core_view(work.goal, N + 1, size)[:, : self.model.n], core_view(work.aim, N, N_ROTORS)
-        self._face, self._beyond = core_view(work.face, N, p.faces, 3), core_view(work.beyond, N, p.faces)
-        self._map, self._offset = core_view(work.map, N, N_BODY, width_of(size)), core_view(work.offset, N, size)
-        self._axis, self._known = core_view(work.axis, N * p.tilts, 2, 4), core_view(work.known, N * p.tilts, 2)
+        self._x = core_view(work.x, N + 1, size)
+        self._u = core_view(work.u, N, N_ROTORS)
+        self._s = core_view(work.s, N + 1, size)
+        self._v = core_view(work.v, N, N_ROTORS)
+        self._goal = core_view(work.goal, N + 1, size)[:, : self.model.n]
+        self._aim = core_view(work.aim, N, N_ROTORS)
+        self._face = core_view(work.face, N, p.faces, 3)
+        self._beyond = core_view(work.beyond, N, p.faces)
+        self._map = core_view(work.map, N, N_BODY, width_of(size))
+        self._offset = core_view(work.offset, N, size)
+        self._axis = core_view(work.axis, N * p.tilts, 2, 4)
+        self._known = core_view(work.known, N * p.tilts, 2)
         self._trim = np.ctypeslib.as_array(law.trim.commands), np.ctypeslib.as_array(law.trim.lift)
         self._start_state = np.ctypeslib.as_array(work.start)[: self.model.n]
         A, B = unpacked(np.zeros_like(self._map), self.model.n, size - self.model.n, self.program.pointed["left"][-1])
@@ -268,7 +281,8 @@ class NonlinearMPC:
         self._constant_steps = np.zeros((*shape, shape[1])), np.zeros((*shape, N_ROTORS)), np.zeros(shape)
         self._constant_steps[0][:, : self.model.n, : self.model.n] = A
         self._constant_steps[1][:, : self.model.n] = B
-        self._origin, self._price = core_view(work.origin, N, p.slacks), core_view(work.price, N, p.slacks)
+        self._origin = core_view(work.origin, N, p.slacks)
+        self._price = core_view(work.price, N, p.slacks)
         self._free = core_view(work.free, N, p.slacks, kind=ctypes.c_int)
         self._held = core_view(work.held, N, N_ROTORS, kind=ctypes.c_int)
         self._state, self._attitude, self._rates, self._acting = (np.zeros(size) for size in (N_STATES, 4, 3, N_ROTORS))
@@ -320,10 +334,13 @@ class NonlinearMPC:
             self.learn(estimate)
 
     def _adopt_memory(self, law: NonlinearMPC) -> None:
-        mine, its = self.struct, law.struct
+        mine = self.struct
+        its = law.struct
         alike = self.model.inputs is law.model.inputs
         self._called_at = law._called_at
-        mine.quaternion, mine.turned, mine.side = its.quaternion, its.turned, its.side
+        mine.quaternion = its.quaternion
+        mine.turned = its.turned
+        mine.side = its.side
         mine.called = its.called
         if self.model.targets is law.model.targets:
             for name in ("rotors", "rotors_before"):
@@ -331,7 +348,8 @@ class NonlinearMPC:
                 if not alike:
                     rotors = self._shares(inputs_to_commands(law.model, law._vehicle, rotors))
                 set_members(mine, **{name: rotors})
-            mine.learns, mine.last[:N_BODY] = its.learns, its.last[:N_BODY]
+            mine.learns = its.learns
+            mine.last[:N_BODY] = its.last[:N_BODY]
             adopt_sent(mine.delay, self.delay, its.delay, law.delay)
             if self.delay is not None:
                 set_members(mine.delay, rotors=mine.rotors, rotors_before=mine.rotors_before)
@@ -406,7 +424,8 @@ class NonlinearMPC:
             x = next_states(body, self.struct.world, x, self._shares(plans[:, i]))
             x[:, Q] /= np.linalg.norm(x[:, Q], axis=1, keepdims=True)
             euler = quaternion_to_euler(x[:, Q])
-            predicted[:, i, POSITIONS], predicted[:, i, VELOCITIES] = x[:, P], x[:, V]
+            predicted[:, i, POSITIONS] = x[:, P]
+            predicted[:, i, VELOCITIES] = x[:, V]
             predicted[:, i, ANGLES] = euler
             predicted[:, i, ANGLE_RATES] = body_to_euler_rates(euler, x[:, W])
         return predicted
@@ -446,7 +465,8 @@ class NonlinearMPC:
         if plan is None:
             self._library.quadsim_nmpc_reset(self._work)
             return
-        n, before = self.model.n, self._asked[1]
+        n = self.model.n
+        before = self._asked[1]
         self._x[:, :n], self._u[:] = plan
         if self._x.shape[1] > n:
             self._x[0, n:], self._x[1:, n:] = before, self._u
@@ -514,11 +534,13 @@ class NonlinearMPC:
                 normals, bounds = space.half_spaces(t, along)
                 if i and (distances(normals, bounds, along) >= -HALF_SPACE_ROUNDING).all():
                     break
-                self._face[:], self._beyond[:] = -normals.transpose(1, 0, 2), -bounds.T
+                self._face[:] = -normals.transpose(1, 0, 2)
+                self._beyond[:] = -bounds.T
                 status = SQPStatus(self._library.quadsim_nmpc_solve(self._work))
                 if status not in _OPTIMA:
                     break
-                before, along = along, self.positions
+                before = along
+                along = self.positions
                 if np.abs(along - before).max() < SETTLED:
                     break
             status, goes_on = self._keep(status, deadline)
@@ -526,7 +548,8 @@ class NonlinearMPC:
 
     def _iterate(self, time: float) -> tuple[Answer, int]:
         """Take SQP steps from the stored plan; return the last program's optimum and the plan's status in the core."""
-        work, started = self._work, clock.perf_counter()
+        work = self._work
+        started = clock.perf_counter()
         found = self.solve() if self._space is None else self._among(self._space, time)
         code: int = self._library.quadsim_nonlinear_end(self.struct, found)
         spent_s = clock.perf_counter() - started
@@ -590,7 +613,8 @@ class NonlinearMPC:
 
     def _steps(self) -> tuple[Array, Array, Array]:
         """A (N, n, n), B (N, n, 4), c (N, n) of the program; under `tilt`, the thrust axis is two further states."""
-        n, inputs = self.model.n, self._offset.shape[1] - 3
+        n = self.model.n
+        inputs = self._offset.shape[1] - 3
         A, B, c = (part.copy() for part in self._constant_steps)
         A[:, :N_BODY, 3:n] = self._map[:, :, : n - 3]
         B[:, :N_BODY] = self._map[:, :, inputs : inputs + N_ROTORS]
@@ -603,7 +627,8 @@ class NonlinearMPC:
 
     def _certificate(self) -> tuple[QP, Solution]:
         """Return the last step's program, and its optimum with multipliers."""
-        problem, query = self._rows(), self._query()
+        problem = self._rows()
+        query = self._query()
         form = self._form if problem is self.problem else Staged(problem)
         qp = form.assemble(query)
         groups = self._groups if problem is self.problem else slack_groups(problem)
@@ -626,7 +651,8 @@ class NonlinearMPC:
 def _body(states: Array) -> Array:
     """(..., 13) states of the rigid body from states (..., 12)."""
     x = np.empty((*states.shape[:-1], N_BODY))
-    x[..., P], x[..., V] = states[..., POSITIONS], states[..., VELOCITIES]
+    x[..., P] = states[..., POSITIONS]
+    x[..., V] = states[..., VELOCITIES]
     x[..., Q] = euler_to_quaternion(states[..., ANGLES])
     x[..., W] = euler_to_body_rates(states[..., ANGLES], states[..., ANGLE_RATES])
     return x

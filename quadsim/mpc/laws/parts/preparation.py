@@ -45,7 +45,8 @@ class RobustPreparation:
     """
 
     def __init__(self, vehicle: Vehicle, problem: Problem, settings: Robust) -> None:
-        self.problem, self.delay = problem, settings.delay
+        self.problem = problem
+        self.delay = settings.delay
         self._library = core_library()
         if settings.commands == ROTORS:
             self._nominal = hover_model(vehicle, problem.model.period, moment=settings.moment)
@@ -69,7 +70,10 @@ class RobustPreparation:
         self._memory = np.zeros(self._library.quadsim_mpc_reals(self._controller))
         self._mpc = mpc = struct("quadsim_mpc")()
         self._library.quadsim_mpc_start(mpc, self._controller, self._memory.ctypes.data)
-        n, N, n_r, under_way = problem.model.n, problem.horizon, len(self._C_r), self._robust.under_way
+        n = problem.model.n
+        N = problem.horizon
+        n_r = len(self._C_r)
+        under_way = self._robust.under_way
         self._x = np.ctypeslib.as_array(mpc.state)[:n]
         self._x_s = np.ctypeslib.as_array(mpc.rest)[:n]
         self._u_s = np.ctypeslib.as_array(mpc.resting)
@@ -79,7 +83,9 @@ class RobustPreparation:
         self._turning = np.ctypeslib.as_array(mpc.turning)
         self._ahead = np.ctypeslib.as_array(mpc.ahead)
         self._estimate = np.ctypeslib.as_array(mpc.estimate)
-        self._state, self._reference, self._acting = np.zeros(N_STATES), np.zeros((N, 4)), np.zeros(N_ROTORS)
+        self._state = np.zeros(N_STATES)
+        self._reference = np.zeros((N, 4))
+        self._acting = np.zeros(N_ROTORS)
         self._inputs = [array.ctypes.data for array in (self._state, self._reference, self._acting)]
         self.reset(problem.model.u_bar)
 
@@ -116,10 +122,12 @@ class RobustPreparation:
     def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
         """Take over the rotor speeds, the commands under way and the disturbance of the previous law."""
         if memory is not None:
-            self._rotors[:], self._turning[:] = memory.rotors, memory.turning
+            self._rotors[:] = memory.rotors
+            self._turning[:] = memory.turning
             for row, sent in zip(self._sent[::-1], memory.sent[::-1], strict=False):
                 row[:] = sent
-            self._called_at, self._measured = memory.called_at, memory.measured
+            self._called_at = memory.called_at
+            self._measured = memory.measured
             if memory.ahead is not None and memory.delay == self.delay:
                 self._ahead[:] = memory.ahead
                 self._mpc.known = 1
@@ -145,7 +153,8 @@ class RobustPreparation:
         first measured state after more than `LONGEST_SPAN` of such states, or a state after a pause: `now.time` must be
         one period later than last time.
         """
-        flying, learns = now.phase is Phase.FLYING, self._may_learn(now)
+        flying = now.phase is Phase.FLYING
+        learns = self._may_learn(now)
         self._state[:] = state
         self._reference[:] = reference
         self._acting[:] = acting

@@ -69,14 +69,16 @@ class SafetyFilter:
     iterates: Final = frozenset({solver})
 
     def __init__(self, preparation: RobustPreparation) -> None:
-        self._preparation, self.horizon = preparation, preparation.problem.horizon
+        self._preparation = preparation
+        self.horizon = preparation.problem.horizon
         steady_rows = _steady_rows(preparation.problem)
         self.problem = _feasibility(preparation.problem, steady_rows)
         self._actuators = ActuatorBounds.of_problem(self.problem)
         # The same with soft constraints on states, except for the terminal one.
         parts = self.problem.constraints
         soft = replace(self.problem, constraints=tuple(p if p.C is None or p.name == END else _soft(p) for p in parts))
-        self._nearest, self._softened = _Nearest(self.problem), _Nearest(soft)
+        self._nearest = _Nearest(self.problem)
+        self._softened = _Nearest(soft)
         self._acting = self.requested = self.problem.model.u_bar.copy()
 
     @property
@@ -107,7 +109,8 @@ class SafetyFilter:
             answer, reason = self._checked(self._softened, query)
         if reason is not None:
             return refused(query.u_before, self.horizon, reason, answer)
-        plan, status = answer.plan, answer.status
+        plan = answer.plan
+        status = answer.status
         plan = plan.copy()
         passed = np.abs(plan[0] - self.requested).max() <= PASS_TOLERANCE
         plan[0] = self._actuators.clip(self.requested if passed else plan[0], query.u_before)
@@ -140,8 +143,10 @@ class _Nearest:
     """The QP of a problem whose first input should be close to a request."""
 
     def __init__(self, problem: Problem) -> None:
-        self._problem, self._form = problem, Staged(problem)
-        self.check, form = AnswerCheck(problem, KKT_EVERY), self._form
+        self._problem = problem
+        self._form = Staged(problem)
+        self.check = AnswerCheck(problem, KKT_EVERY)
+        form = self._form
         self._first = form.inputs(np.arange(form.qp.c.size, dtype=np.float64))[0].astype(np.intp)
         self._P = form.qp.P.copy()
         self._P[self._first, self._first] += 2.0
@@ -176,7 +181,8 @@ class _Nearest:
 
 def _feasibility(problem: Problem, steady_rows: Array) -> Problem:
     """Return a problem's constraints, all hard, with the terminal condition (m, n) and a cost of inputs alone."""
-    C_r, nu = problem.objective.C_r, problem.model.nu
+    C_r = problem.objective.C_r
+    nu = problem.model.nu
     objective = Objective(C_r=C_r, Q_y=LATER**2 * np.eye(len(C_r)), Q_u=LATER * np.eye(nu))
     constraints = [replace(part, penalty=None) for part in problem.every_constraint]
     if len(steady_rows):
@@ -187,7 +193,8 @@ def _feasibility(problem: Problem, steady_rows: Array) -> Problem:
 
 
 def _soft(part: Constraint) -> Constraint:
-    lower, upper = np.atleast_2d(part.lower)[-1], np.atleast_2d(part.upper)[-1]
+    lower = np.atleast_2d(part.lower)[-1]
+    upper = np.atleast_2d(part.upper)[-1]
     both = np.isfinite(lower) & np.isfinite(upper)
     one = np.abs(np.where(np.isfinite(lower), lower, upper))
     half_band = np.where(both, 0.5 * (upper - lower), np.where(one > 0.0, one, 1.0))
@@ -196,7 +203,8 @@ def _soft(part: Constraint) -> Constraint:
 
 def _steady_rows(problem: Problem) -> Array:
     """(m, n) orthonormal rows, zero times x - x_s where the part of the state that the bounds involve is steady."""
-    rows, A = problem.rows, problem.model.A
+    rows = problem.rows
+    A = problem.model.A
     bounded = rows.C[rows.on_states]
     if not len(bounded):
         return np.empty((0, len(A)))

@@ -303,7 +303,9 @@ def _bounds(rows: list[_StatedRow], horizon: int) -> Array:
 
 def slack_groups(problem: Problem, *, faces: bool = False) -> Indices:
     """Return which slack of a node each of the problem's slacks is, and last that of `faces`, which have one."""
-    rows, groups, count = problem.rows, dict[int, int](), len(_OWN_SLACKS)
+    rows = problem.rows
+    groups = dict[int, int]()
+    count = len(_OWN_SLACKS)
     for i, name in enumerate(rows.names):
         slack = int(rows.slack[i])
         if slack < 0 or slack in groups:
@@ -311,5 +313,6 @@ def slack_groups(problem: Problem, *, faces: bool = False) -> Indices:
         if name in _OWN_SLACKS:
             groups[slack] = _OWN_SLACKS[name]
         else:
-            groups[slack], count = count, count + 1
+            groups[slack] = count
+            count = count + 1
     return np.array([groups[slack] for slack in range(len(groups))] + [_OWN_SLACKS["space"]] * faces, int)
