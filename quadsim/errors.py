@@ -105,7 +105,10 @@ class UnknownNameError(InputError):
             super().__init__(f"the {kind} {name!r} was removed: use {successor!r}")
             return
         near = meant or difflib.get_close_matches(name, self.allowed, n=1)
-        guess = f"; did you mean {' and '.join(map(repr, near))}?" if near else ""
+        if near:
+            guess = f"; did you mean {' and '.join(map(repr, near))}?"
+        else:
+            guess = ""
         tail = f"; {hint}" if hint else ""
         listed = f"there are: {', '.join(self.allowed)}"
         if len(listed) > _LONGEST_LIST:
@@ -226,8 +229,15 @@ class InterruptedFlightError(FlightError):
 
 def failure_line(error: BaseException) -> str:
     """Return why something was not made, in one line: `failed: ValueError: no`."""
-    text = str(error) if isinstance(error, QuadsimError) else described(error)
-    text = error.problem if isinstance(error, OutputError) else text  # its path is that of what was to be made
+    if isinstance(error, QuadsimError):
+        text = str(error)
+    else:
+        text = described(error)
+    # its path is that of what was to be made
+    if isinstance(error, OutputError):
+        text = error.problem
+    else:
+        text = text
     return f"failed: {printable(' '.join(text.split()))}"[:_LONGEST]
 
 
@@ -245,7 +255,9 @@ def _of_user(frames: TracebackType | None) -> TracebackType | None:
     first = frames
     while first is not None and first.tb_frame.f_code.co_filename.startswith(OUR_FOLDERS):
         first = first.tb_next
-    return frames if first is None else first
+    if first is None:
+        return frames
+    return first
 
 
 def _restore(kind: type[QuadsimError], arguments: tuple[object, ...], values: dict[str, object]) -> QuadsimError:

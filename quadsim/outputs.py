@@ -156,9 +156,15 @@ def adding(directory: Path, **changes: Any) -> Iterator[Path]:
 def amend(directory: Path, changes: Mapping[str, Any]) -> None:
     """Change entries of a directory's summary atomically; in a nested table, only the entries given."""
     path = directory / SUMMARY_FILE
-    summary = json.loads(path.read_bytes()) if path.exists() else {}
+    if path.exists():
+        summary = json.loads(path.read_bytes())
+    else:
+        summary = {}
     for key, value in changes.items():
-        summary[key] = {**summary.get(key, {}), **value} if isinstance(value, Mapping) else value
+        if isinstance(value, Mapping):
+            summary[key] = {**summary.get(key, {}), **value}
+        else:
+            summary[key] = value
     summary["files"] = dict(sorted(summary.pop("files", {}).items()))
     with writing_file(path, overwrite=True) as new:
         new.write_text(to_json(summary), encoding="utf-8")

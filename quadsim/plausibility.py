@@ -54,7 +54,9 @@ class Ratio:
         if value is None:
             return 0.0
         if value <= 0.0:
-            return math.inf if self.low > 0.0 else 0.0
+            if self.low > 0.0:
+                return math.inf
+            return 0.0
         return max(math.log(value / self.high), math.log(self.low / value) if self.low > 0.0 else 0.0, 0.0)
 
     def is_usual(self, vehicle: Vehicle) -> bool:
@@ -71,11 +73,15 @@ class Ratio:
 
 
 def _radius(vehicle: Vehicle) -> float:
-    return UNKNOWN_RADIUS * vehicle.longest_arm if vehicle.rotor_radius is None else vehicle.rotor_radius
+    if vehicle.rotor_radius is None:
+        return UNKNOWN_RADIUS * vehicle.longest_arm
+    return vehicle.rotor_radius
 
 
 def _over(value: float | None, other: float) -> float | None:
-    return None if value is None else value / other
+    if value is None:
+        return None
+    return value / other
 
 
 def _thrust_coefficient(vehicle: Vehicle) -> float:
@@ -258,7 +264,10 @@ def implausible(vehicle: Vehicle) -> list[str]:
     """Return a line per ratio outside its range, or one about the unit that would explain all of them."""
     off = [ratio for ratio in RATIOS if ratio.misfit(vehicle) > 0.0]
     if off and (explanation := _explanation(vehicle)) is not None:
-        more = "" if len(off) == 1 else f", and {len(off) - 1} more ratios are off"
+        if len(off) == 1:
+            more = ""
+        else:
+            more = f", and {len(off) - 1} more ratios are off"
         return [f"vehicle: {explanation}; as it is, {_line(off[0], vehicle)}{more}"]
     return [f"vehicle: {_line(ratio, vehicle)}; check {', '.join(_stated(ratio.of, vehicle))}" for ratio in off]
 
@@ -291,7 +300,9 @@ def _explanation(vehicle: Vehicle) -> str | None:
             given = _shown(getattr(vehicle, name))
             fits = _shown(getattr(other, name))
             best = misfit, f"is {name} = {given} given in {unit}? {fits} {VEHICLE_UNITS[name]} would fit"
-    return None if best is None else best[1]
+    if best is None:
+        return None
+    return best[1]
 
 
 def _misfit(vehicle: Vehicle) -> float:
@@ -321,8 +332,12 @@ def _converted(vehicle: Vehicle) -> Iterator[tuple[str, str, Vehicle]]:
 def _scaled(value: Any, factor: float | tuple[float, ...]) -> Any:
     if isinstance(factor, tuple):
         return tuple(_scaled(entry, one) for entry, one in zip(value, factor, strict=True))
-    return tuple(_scaled(entry, factor) for entry in value) if isinstance(value, tuple) else factor * value
+    if isinstance(value, tuple):
+        return tuple(_scaled(entry, factor) for entry in value)
+    return factor * value
 
 
 def _shown(value: Any) -> str:
-    return ", ".join(_shown(entry) for entry in value) if isinstance(value, tuple) else f"{value:.4g}"
+    if isinstance(value, tuple):
+        return ", ".join(_shown(entry) for entry in value)
+    return f"{value:.4g}"

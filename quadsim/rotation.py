@@ -62,7 +62,9 @@ def conjugate(q: Quaternion) -> Quaternion: ...
 def conjugate(q: Array) -> Array: ...
 def conjugate(q: Any) -> Any:
     """The inverse rotation of a unit quaternion: a tuple of plain numbers, or (..., 4)."""
-    return (q[0], -q[1], -q[2], -q[3]) if isinstance(q, tuple) else q * [1.0, -1.0, -1.0, -1.0]
+    if isinstance(q, tuple):
+        return (q[0], -q[1], -q[2], -q[3])
+    return q * [1.0, -1.0, -1.0, -1.0]
 
 
 def normalise(q: Quaternion) -> Quaternion:
@@ -76,15 +78,24 @@ def exponential(vector: Vector3) -> Quaternion:
     x, y, z = vector
     angle = math.sqrt(x * x + y * y + z * z)
     # sin(a/2)/a by its series where the quotient loses precision; the terms omitted are below 1e-17 there.
-    scale = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
+    if angle < 1e-4:
+        scale = 0.5 - angle * angle / 48.0
+    else:
+        scale = math.sin(0.5 * angle) / angle
     return math.cos(0.5 * angle), scale * x, scale * y, scale * z
 
 
 def logarithm(q: Quaternion) -> Vector3:
     """The shortest rotation vector [rad] of a unit quaternion, at most pi long; q and -q are one rotation."""
-    w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
+    if q[0] >= 0.0:
+        w, x, y, z = q
+    else:
+        w, x, y, z = (-q[0], -q[1], -q[2], -q[3])
     sine = math.sqrt(x * x + y * y + z * z)
-    scale = 2.0 if sine < 1e-8 else 2.0 * math.atan2(sine, w) / sine
+    if sine < 1e-8:
+        scale = 2.0
+    else:
+        scale = 2.0 * math.atan2(sine, w) / sine
     return scale * x, scale * y, scale * z
 
 

@@ -422,7 +422,10 @@ class Corridor(Region):
         def passed(k: np.intp, at: float) -> float:
             return float(t[k] + (at - gone[k]) / steps[k] * (t[k + 1] - t[k]))
 
-        start = float(t[0]) if first == 0 else passed(first - 1, path_start)
+        if first == 0:
+            start = float(t[0])
+        else:
+            start = passed(first - 1, path_start)
         return replace(self, path=None, start=start, stop=passed(last, end) if last < len(steps) else math.inf)
 
 
@@ -468,7 +471,9 @@ def shape_from_json(entry: Mapping[str, Any]) -> Constraining:
 
 
 def _frozen(value: Any) -> Any:
-    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+    if isinstance(value, list):
+        return tuple(map(_frozen, value))
+    return value
 
 
 def footprint(solid: Solid) -> Array:

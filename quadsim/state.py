@@ -85,11 +85,15 @@ class State(np.ndarray[tuple[int], np.dtype[np.float64]]):
 
     def __getitem__(self, key: Any) -> Any:
         part = super().__getitem__(key)
-        return part.view(np.ndarray) if isinstance(part, State) else part
+        if isinstance(part, State):
+            return part.view(np.ndarray)
+        return part
 
     def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
         """What NumPy makes of a result: as of any array."""
-        return array[()] if return_scalar else array.view(np.ndarray)
+        if return_scalar:
+            return array[()]
+        return array.view(np.ndarray)
 
 
 _Angle = TypeVar("_Angle", float, Array)
@@ -120,7 +124,9 @@ def unwrapped(angles: Array, before: float) -> Array:
     steps[:1] = angles[:1] - before
     np.subtract(angles[1:], angles[:-1], out=steps[1:])
     turns = whole_turns(steps)
-    return angles - TURN * turns.cumsum() if np.count_nonzero(turns) else angles
+    if np.count_nonzero(turns):
+        return angles - TURN * turns.cumsum()
+    return angles
 
 
 class ReferenceTurns:
@@ -147,7 +153,10 @@ class ReferenceTurns:
         yaws = reference[:, 3]
         first = yaws.item(0)
         known = not math.isnan(self._first)
-        start = nearest_turn(first, self._first) if known else first
+        if known:
+            start = nearest_turn(first, self._first)
+        else:
+            start = first
         if not math.isfinite(start + yaw):
             return reference
         if not known or abs(yaw - start) > KEPT:

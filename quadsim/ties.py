@@ -61,4 +61,6 @@ def in_order(values: ArrayLike, window: float = TIE_SHARE) -> Indices:
         stop = max(int(np.searchsorted(numbers[by_size], reach, side="right")), start + 1)
         groups.append(np.sort(by_size[start:stop]))
         start = stop
-    return np.concatenate(groups) if groups else by_size
+    if groups:
+        return np.concatenate(groups)
+    return by_size

@@ -169,7 +169,10 @@ class Vehicle:
             f"hover at {self.hover_speed:.4g} of {self.speed_max:.4g} rad/s",
             f"thrust {lift:.3g} times the weight",
         ]
-        about = f"\n {self.description}" if self.description else ""
+        if self.description:
+            about = f"\n {self.description}"
+        else:
+            about = ""
         return f"<Vehicle {self.name}: {', '.join(parts)}{about}>"
 
     def _refuse(self, name: str, rule: str) -> NoReturn:
@@ -318,7 +321,9 @@ class Vehicle:
     @property
     def throttle_share(self) -> float:
         """Share a of (w / speed_max)^2 = (1 - a) u + a u^2, u the throttle; 1, where no map states it: w ~ u."""
-        return 1.0 if self.thrust_of_throttle is None else self.thrust_of_throttle[1] / sum(self.thrust_of_throttle)
+        if self.thrust_of_throttle is None:
+            return 1.0
+        return self.thrust_of_throttle[1] / sum(self.thrust_of_throttle)
 
     @property
     def inertia_matrix(self) -> Array:
@@ -467,7 +472,9 @@ def span(speeds: Array) -> str:
     """Return speeds as text: from the least to the largest, or the one that all have."""
     low = f"{speeds.min():.4g}"
     high = f"{speeds.max():.4g}"
-    return low if low == high else f"{low} to {high}"
+    if low == high:
+        return low
+    return f"{low} to {high}"
 
 
 def _shares(effect: Array) -> Array:
@@ -545,7 +552,13 @@ def overridden(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[
     """Return parameters with some replaced; another form of placing the rotors, or of their thrust, is then dropped."""
     placed = "rotor_positions" in overrides
     thrust = {*THRUST} & {*overrides}
-    replaced: tuple[str, ...] = ARMS if placed else ("rotor_positions",) if set(ARMS) <= {*overrides} else ()
+    replaced: tuple[str, ...]
+    if placed:
+        replaced = ARMS
+    elif set(ARMS) <= {*overrides}:
+        replaced = ("rotor_positions",)
+    else:
+        replaced = ()
     replaced += THRUST if thrust else ()
     return {**values, **dict.fromkeys(name for name in replaced if name in values), **overrides}
 

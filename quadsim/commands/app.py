@@ -519,7 +519,10 @@ def compare(
     owner = next(filter(None, owners), None)
     products = {"video": video, "recording": recording, "figures": figures}
     if (page is None or owner) and (asked := [name for name, wanted in products.items() if wanted]):
-        rule = "absent where campaigns are compared" if owner else "absent without --out: nothing is written"
+        if owner:
+            rule = "absent where campaigns are compared"
+        else:
+            rule = "absent without --out: nothing is written"
         raise ParameterError("", f"--{asked[0]}", True, rule)
     compared: Any
     if owner is not None:
@@ -532,7 +535,9 @@ def compare(
         first = None if markdown else flown
         with reporting(progress, "the comparison") as report:
             compared = compare_flights(targets, page, report, overwrite=overwrite, flown=first, **options)
-    return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared
+    if markdown:
+        return Document(compared.to_markdown() + "\n", compared.to_json())
+    return compared
 
 
 @app.command(
@@ -690,7 +695,10 @@ def view(run: File, /, *, web: Flag = False) -> None:
     from quadsim.report.recording import open_viewer
 
     path = Path(run)
-    recording = path / rundir.RECORDING_FILE if path.is_dir() else path
+    if path.is_dir():
+        recording = path / rundir.RECORDING_FILE
+    else:
+        recording = path
     if not path.exists():
         raise FileError(path, "no such run or recording")
     if not recording.is_file():

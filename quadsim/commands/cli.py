@@ -130,7 +130,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _at_home(word: str) -> str:
     """Expand `~` in a word as a shell does, also in `--out=~/x`."""
     match = _HOME.fullmatch(word)
-    return word if match is None else (match[1] or "") + os.path.expanduser(match[2])  # noqa: PTH111
+    if match is None:
+        return word  # noqa: PTH111
+    return (match[1] or "") + os.path.expanduser(match[2])  # noqa: PTH111
 
 
 def _complain(error: Exception) -> None:
@@ -139,7 +141,10 @@ def _complain(error: Exception) -> None:
 
     lines = printable(f"quadsim: {error}", keep="\n").split("\n")
     shown = [line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]} ..." for line in lines[:_MOST_LINES]]
-    more = [f"... and {len(lines) - _MOST_LINES} more"] if len(lines) > _MOST_LINES else []
+    if len(lines) > _MOST_LINES:
+        more = [f"... and {len(lines) - _MOST_LINES} more"]
+    else:
+        more = []
     console.show([*shown, *more], console.stderr())
 
 

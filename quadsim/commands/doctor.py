@@ -101,7 +101,10 @@ def _try_solver(name: str) -> str:
         command = controller.step(StepInputs(), assembly.initial_state(), reference)
     except FlightError as error:
         return f"fails: {error}"
-    verdict = "works" if command.status == SOLVED else f"answers {command.status}"
+    if command.status == SOLVED:
+        verdict = "works"
+    else:
+        verdict = f"answers {command.status}"
     setup_ms = 1e3 * (built - started)
     step_ms = 1e3 * (clock.perf_counter() - built)
     return f"{verdict}: set up in {setup_ms:.0f} ms, first step in {step_ms:.1f} ms"

@@ -77,7 +77,9 @@ class _Stops:
         """What a user calls the first one."""
         if self.first is None:
             return ""
-        return "Ctrl-C" if self.first == signal.SIGINT else self.first.name
+        if self.first == signal.SIGINT:
+            return "Ctrl-C"
+        return self.first.name
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self.first is None:

@@ -64,7 +64,9 @@ def styled(*parts: str | tuple[str, str]) -> Text:
 def stdout() -> PlainConsole:
     """Return stdout, wide enough for the tables if it is a file or a pipe."""
     console = PlainConsole()
-    return console if console.is_terminal else PlainConsole(width=CONSOLE_WIDTH)
+    if console.is_terminal:
+        return console
+    return PlainConsole(width=CONSOLE_WIDTH)
 
 
 def stderr() -> PlainConsole:
@@ -165,7 +167,11 @@ def table(
     table.caption_justify = "left"
     table.spare = spare
     for i, name in enumerate(head):
-        justify: JustifyMethod = "right" if i and name not in left else "left"
+        justify: JustifyMethod
+        if i and name not in left:
+            justify = "right"
+        else:
+            justify = "left"
         table.add_column(name, justify=justify, overflow="fold", no_wrap=bool(i) if spare else not i)
     for line in lines:
         table.add_row(*line)

@@ -106,7 +106,9 @@ def plot_html(figure: Figure | None) -> str:
     from quadsim.report.to_matplotlib import figure_html
 
     try:
-        return "" if figure is None else figure_html(figure)
+        if figure is None:
+            return ""
+        return figure_html(figure)
     except Exception as error:
         return f"<p>the plot {escape(failure_line(error))}</p>"
 
@@ -152,7 +154,9 @@ class Document(Result):
 
     def to_json(self) -> Any:
         """Return its data, or its text if it has none."""
-        return self.content if self.data is None else self.data
+        if self.data is None:
+            return self.content
+        return self.data
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(self.content)}</pre>"

@@ -68,8 +68,14 @@ def outcome_line(flight: FlightRecord) -> Text:
     as_expected = flight.numbers.get("as_expected", True)
     remark = ""
     if expected != "satisfied":
-        remark = ", as the scenario expects" if as_expected else f"; the scenario expects: {expected}"
-    colour = "green" if as_expected and (remark or verdict == "satisfied") else "red"
+        if as_expected:
+            remark = ", as the scenario expects"
+        else:
+            remark = f"; the scenario expects: {expected}"
+    if as_expected and (remark or verdict == "satisfied"):
+        colour = "green"
+    else:
+        colour = "red"
     if flight.reason is not None:
         return console.styled((f"{verdict}{remark}", colour), f": {flight.reason}")
     line = _judged(flight, colour, remark)
@@ -82,10 +88,19 @@ def _judged(flight: FlightRecord, colour: str, remark: str) -> Text:
     """Return the verdict on the required constraints of a flight that was flown to its end."""
     verdict = flight.outcome
     if verdict in ("incomplete", "unaudited"):
-        colour = "green" if remark and flight.numbers.get("as_expected", True) else "yellow"
-        what = required(flight).text if verdict == "incomplete" else "no constraint was audited"
+        if remark and flight.numbers.get("as_expected", True):
+            colour = "green"
+        else:
+            colour = "yellow"
+        if verdict == "incomplete":
+            what = required(flight).text
+        else:
+            what = "no constraint was audited"
         return console.styled((f"{verdict}, {what}{remark}", colour))
-    phrase = "every required constraint holds" if verdict == "satisfied" else _violations(flight.findings)
+    if verdict == "satisfied":
+        phrase = "every required constraint holds"
+    else:
+        phrase = _violations(flight.findings)
     phrase = violated_otherwise(flight) or phrase
     line = console.styled((f"{crash(flight) or 'completed'}, {phrase}{remark}", colour))
     if violated := violated_unrequired(flight.findings):
@@ -101,10 +116,16 @@ def _violations(findings: Sequence[Finding]) -> str:
             margin, _ = finding.deciding
             by = ""
             if math.isfinite(margin):
-                when = f"{finding.worst_time:.2f} s" if margin == finding.worst_margin else "the samples"
+                if margin == finding.worst_margin:
+                    when = f"{finding.worst_time:.2f} s"
+                else:
+                    when = "the samples"
                 by = f" by {short_number(-margin)} {finding.limit.unit} at {when}"
             violated.append(f"{finding.limit.name}{by}")
-    more = f" and {len(violated) - _NAMED} more" if len(violated) > _NAMED else ""
+    if len(violated) > _NAMED:
+        more = f" and {len(violated) - _NAMED} more"
+    else:
+        more = ""
     return ": ".join(filter(None, ["a required constraint is violated", ", ".join(violated[:_NAMED]) + more]))
 
 
@@ -161,7 +182,10 @@ def _controller_lines(numbers: Mapping[str, Any]) -> Iterator[str]:
     times = controller["step_ms"]
     usual = OPTIMAL | {Phase.LANDED, Phase.CRASHED}
     refused = ", ".join(f"{n} {status}" for status, n in controller["statuses"].items() if status not in usual)
-    where = f" ({controller['solver']})" if controller["solver"].startswith("C99") else ""
+    if controller["solver"].startswith("C99"):
+        where = f" ({controller['solver']})"
+    else:
+        where = ""
     yield (
         f"{law_name(controller['name'])}{where}: {counts(controller['answered_by'])}"
         f"{f' ({refused})' if refused else ''}"
@@ -186,7 +210,10 @@ def _effect_lines(numbers: Mapping[str, Any]) -> Iterator[str]:
         yield f"events: {'; '.join(event_sentences(events))}"
     if "ground" in numbers:
         ground = numbers["ground"]
-        left = "started in the air" if ground["started"] == "flying" else "never left it"
+        if ground["started"] == "flying":
+            left = "started in the air"
+        else:
+            left = "never left it"
         if ground["takeoff_time"] is not None:
             left = f"left it at {ground['takeoff_time']:.2f} s"
         touch = ground["touchdown"]

@@ -108,7 +108,9 @@ def to_publish() -> str:
 
 def requirements() -> list[str]:
     """Return the packages needed to compile: none if the system's compiler is used."""
-    return [ZIG] if to_publish() or not system_compiler() else []
+    if to_publish() or not system_compiler():
+        return [ZIG]
+    return []
 
 
 def compiler() -> list[str]:

@@ -346,7 +346,10 @@ class _File:
 
     def _parameter(self, at: int, text: str) -> Variable:
         found = _MEMBER.fullmatch(text)
-        declarator = None if found is None else _DECLARATOR.fullmatch(found[2])
+        if found is None:
+            declarator = None
+        else:
+            declarator = _DECLARATOR.fullmatch(found[2])
         if found is None or declarator is None:
             raise self._error(at, f"{text!r} is not a parameter that can be mirrored")
         kind = self._type(at, found[1])
@@ -383,7 +386,9 @@ class _File:
 
     def _shown(self, at: int) -> str:
         line = self._text[at:].split("\n", 1)[0]
-        return line if len(line) <= 60 else f"{line[:57]}..."
+        if len(line) <= 60:
+            return line
+        return f"{line[:57]}..."
 
     def _error(self, at: int, problem: str) -> HeaderError:
         return HeaderError(self._path, self._text.count("\n", 0, at) + 1, problem)

@@ -33,7 +33,9 @@ class CompiledLoop:
         Returns:
             the struct that answers in the core; None where a subclass has `speeds` of its own, which is to be asked.
         """
-        return self._engaged(command) if type(self).speeds is CompiledLoop.speeds else None
+        if type(self).speeds is CompiledLoop.speeds:
+            return self._engaged(command)
+        return None
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
         """See `quadsim.controller.InnerLoop`."""

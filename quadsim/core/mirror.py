@@ -192,5 +192,9 @@ def _kind_of_parameter(parameter: Variable, structs: Mapping[str, type[Struct]])
 def _returned(function: Function) -> Any:
     returned = function.returned
     if returned.pointer:
-        return ctypes.c_char_p if returned.type == "char" else ctypes.c_void_p
-    return None if returned.type == "void" else _KINDS[returned.type]
+        if returned.type == "char":
+            return ctypes.c_char_p
+        return ctypes.c_void_p
+    if returned.type == "void":
+        return None
+    return _KINDS[returned.type]

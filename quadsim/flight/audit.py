@@ -118,7 +118,9 @@ def _body_rate(axis: int) -> Signal:
         return np.degrees(euler_to_body_rates(states[:, EULER], states[:, EULER_RATE])[:, axis])
 
     def plant(log: PlantLog) -> Array:  # Euler rates lose precision near the vertical
-        return rates(log.state) if log.body_rates is None else np.degrees(log.body_rates[:, axis])
+        if log.body_rates is None:
+            return rates(log.state)
+        return np.degrees(log.body_rates[:, axis])
 
     return Signal(unit="deg/s", sampled=lambda log: rates(log.truth), plant=plant)
 
@@ -134,7 +136,9 @@ def _climb_acceleration(t: Array, states: Array) -> Array:
 
 def _present(values: Array | None, t: Array) -> Array:
     """The values (K,), or NaN where there are none."""
-    return np.full(t.shape, math.nan) if values is None else values
+    if values is None:
+        return np.full(t.shape, math.nan)
+    return values
 
 
 SIGNALS: Final[dict[str, Signal]] = {
@@ -244,7 +248,10 @@ class Limit:
 
     def _check_signal(self) -> None:
         if (self.signal == SUM) != bool(self.terms):
-            rule = "the factors of a sum" if self.signal == SUM else f'absent where signal is not "{SUM}"'
+            if self.signal == SUM:
+                rule = "the factors of a sum"
+            else:
+                rule = f'absent where signal is not "{SUM}"'
             raise ParameterError(f"constraints.{self.name}", "terms", self.terms, rule)
         if self.signal not in (*SIGNALS, SUM):
             raise UnknownNameError("signal", self.signal, [*SIGNALS, SUM])
@@ -255,7 +262,9 @@ class Limit:
     @property
     def source(self) -> Signal:
         """The bounded quantity."""
-        return sum_signal(self.terms) if self.terms else SIGNALS[self.signal]
+        if self.terms:
+            return sum_signal(self.terms)
+        return SIGNALS[self.signal]
 
     @property
     def unit(self) -> str:
@@ -289,7 +298,9 @@ class Limit:
         plant, sampled = self.source.tolerance.of(self.half_band)
         if self.tolerance is None:
             stated = self.tolerance_sampled
-            return (plant, sampled) if stated is None else (max(plant, stated), stated)
+            if stated is None:
+                return (plant, sampled)
+            return (max(plant, stated), stated)
         if self.tolerance_sampled is not None:
             return self.tolerance, self.tolerance_sampled
         return self.tolerance, self.tolerance * (sampled / plant if plant else 1.0)
@@ -306,7 +317,9 @@ class Limit:
     def margin(self, values: Array) -> Array:
         """Return (K,) the signed distance to the nearer bound, the smallest over rotors; negative = beyond it."""
         margin = np.minimum(values - self.lower, self.upper - values)
-        return margin if margin.ndim == 1 else margin.min(axis=1)
+        if margin.ndim == 1:
+            return margin
+        return margin.min(axis=1)
 
     def excess(self, margin: ArrayLike, *, sampled: bool = False) -> Array:
         """Return how far margins are beyond bound and tolerance, in the limit's unit: positive where it is violated.
@@ -374,7 +387,10 @@ class Finding:
         if math.isnan(self.worst_time):
             return "incomplete"
         margin, tolerance = self.deciding
-        return "satisfied" if margin >= -tolerance else "violated"  # NaN: violated
+        # NaN: violated
+        if margin >= -tolerance:
+            return "satisfied"
+        return "violated"
 
     @property
     def satisfied(self) -> bool:
@@ -452,12 +468,16 @@ def flight_verdict(findings: Sequence[Finding], *, aborted: bool, lost: bool, fa
     """
     verdicts = {finding.verdict for finding in findings if finding.limit.required}
     if aborted or lost:
-        return "aborted" if aborted else "lost"
+        if aborted:
+            return "aborted"
+        return "lost"
     if failed or "violated" in verdicts:
         return "violated"
     if "incomplete" in verdicts:
         return "incomplete"
-    return "satisfied" if findings else "unaudited"
+    if findings:
+        return "satisfied"
+    return "unaudited"
 
 
 _COMPARED: Final = ("signal", "terms", "lower", "upper", "start", "stop", "tolerances", "shape")
@@ -488,7 +508,9 @@ def _plain(value: object) -> str:
     """Return a part of a limit for a message: tolerances at the physics rate and at the samples."""
     if isinstance(value, tuple):
         return " / ".join(f"{number:.4g}" for number in value)
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return str(value)
 
 
 def margins_sampled(limit: Limit, log: FlightLog) -> Array:

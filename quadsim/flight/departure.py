@@ -67,7 +67,9 @@ class Departure:
     def sentence(self) -> str:
         """What a reader is told of a flight that left its course."""
         text = f"at its end {self.distance:.3g} m off its course and leaving it (growth {self.growth:.2g} 1/s)"
-        return f"{text}, beyond lost.{DEPARTURE} = {self.limit:g} m" if self.lost else text
+        if self.lost:
+            return f"{text}, beyond lost.{DEPARTURE} = {self.limit:g} m"
+        return text
 
     @property
     def _grows(self) -> bool:
@@ -100,7 +102,9 @@ def departure_numbers(log: ControlLog) -> dict[str, float] | None:
 
 def departure_of(numbers: Mapping[str, Any] | None, limit: float | None) -> Departure | None:
     """Return the departure with these numbers; None where there are none, as in a run of an earlier version."""
-    return None if numbers is None else Departure(**numbers, limit=limit)
+    if numbers is None:
+        return None
+    return Departure(**numbers, limit=limit)
 
 
 def _course(log: ControlLog, period: float) -> Array:

@@ -104,7 +104,10 @@ def demand(
         kinks: (K + 3,) whether its velocity, or the derivative of that, may jump there.
     """
     intervals = course.shape[0] - 1
-    jumps = np.zeros(intervals, bool) if jumps is None else jumps
+    if jumps is None:
+        jumps = np.zeros(intervals, bool)
+    else:
+        jumps = jumps
     kinks = jumps if kinks is None else jumps | kinks
     velocity = np.diff(course, axis=0) / period
     usable = ~(jumps[1:] | jumps[:-1])
@@ -251,12 +254,24 @@ def _sentence(
     problems: Sequence[str],
 ) -> str:
     if problems:
-        more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
+        if len(problems) > 1:
+            more = f" and {len(problems) - 1} more"
+        else:
+            more = ""
         return f"The course cannot be followed exactly: {problems[0]}{more}."
-    bound = "" if allowed is None else f" (bound {allowed:.4g} deg)"
+    if allowed is None:
+        bound = ""
+    else:
+        bound = f" (bound {allowed:.4g} deg)"
     times = ", ".join(f"{time:g}" for time in jumps[:4]) + (", ..." if len(jumps) > 4 else "")
-    turned = f", a yaw of {round(peaks['yaw'], 1):g} deg" if peaks["yaw"] > 0.5 else ""
-    subject = f"The course steps (at {times} s); the rest requires" if jumps else "The course requires"
+    if peaks["yaw"] > 0.5:
+        turned = f", a yaw of {round(peaks['yaw'], 1):g} deg"
+    else:
+        turned = ""
+    if jumps:
+        subject = f"The course steps (at {times} s); the rest requires"
+    else:
+        subject = "The course requires"
     return (
         f"{subject} up to {round(peaks['tilt'], 2):g} deg of tilt{bound}, "
         f"{round(peaks['velocity'], 2):g} m/s{turned}, "

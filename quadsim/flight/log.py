@@ -296,4 +296,6 @@ class FlightLog:
     @property
     def status(self) -> str:
         """`completed` or `aborted`."""
-        return "completed" if self.reason is None else "aborted"
+        if self.reason is None:
+            return "completed"
+        return "aborted"

@@ -100,7 +100,10 @@ def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict
         outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(size))
         first = outside[-1] + 1 if outside.size else 0
         reached_end = t.size > 1 and t[-1] + period > step.until - 1e-9
-        settled = round(float(t[in_window][first] - step.time), 9) if reached_end and first < error.size else None
+        if reached_end and first < error.size:
+            settled = round(float(t[in_window][first] - step.time), 9)
+        else:
+            settled = None
         step_taken = {name: getattr(step, name) for name in ("channel", "time", "before", "after")}
         entries.append({**step_taken, "settled": settled})
     return entries
@@ -177,8 +180,13 @@ def unrecovered(log: ControlLog) -> int:
     """
     good = np.flatnonzero(log.fallback == 0)
     periods = log.t.size - (int(good[-1]) + 1 if good.size else 0)
-    period = float(log.t[1] - log.t[0]) if log.t.size > 1 else math.inf
-    return periods if periods and (not good.size or periods * period >= UNRECOVERED - 1e-9) else 0
+    if log.t.size > 1:
+        period = float(log.t[1] - log.t[0])
+    else:
+        period = math.inf
+    if periods and (not good.size or periods * period >= UNRECOVERED - 1e-9):
+        return periods
+    return 0
 
 
 def failure(log: ControlLog) -> str | None:
@@ -190,7 +198,9 @@ def failure(log: ControlLog) -> str | None:
         return "crash"
     if never_took_off(log) is not None:
         return "no take-off"
-    return "permanent fallback" if unrecovered(log) else None
+    if unrecovered(log):
+        return "permanent fallback"
+    return None
 
 
 def never_took_off(log: ControlLog) -> float | None:
@@ -206,7 +216,9 @@ def never_took_off(log: ControlLog) -> float | None:
     heights = log.truth[start:, INDEX["z"]]
     told = np.flatnonzero(log.reference[start:, REFERENCE_NAMES.index("z")] > heights.min() + TAKEOFF_RISE)
     lasted = told.size * float(log.t[1] - log.t[0])
-    return float(log.t[start + told[0]]) if lasted >= TAKEOFF_PATIENCE - 1e-9 else None
+    if lasted >= TAKEOFF_PATIENCE - 1e-9:
+        return float(log.t[start + told[0]])
+    return None
 
 
 def computation(log: ControlLog) -> dict[str, Any]:

@@ -74,7 +74,10 @@ def require_format(found: object, path: Path, again: str) -> None:
         FileError: its format is not `FORMAT`.
     """
     if str(found) != str(FORMAT):
-        was = "an unnumbered format" if found is None else f"format {str(found)[:20]!r}"
+        if found is None:
+            was = "an unnumbered format"
+        else:
+            was = f"format {str(found)[:20]!r}"
         problem = f"was made by another version of quadsim ({was}, this one has {FORMAT}); fly it again: {again}"
         raise FileError(path, problem)
 
@@ -82,7 +85,9 @@ def require_format(found: object, path: Path, again: str) -> None:
 def format_of(table: pa.Table) -> str | None:
     """The format that a table states."""
     stated: bytes | None = (table.schema.metadata or {}).get(b"format")
-    return None if stated is None else stated.decode("utf-8", "replace")
+    if stated is None:
+        return None
+    return stated.decode("utf-8", "replace")
 
 
 def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, str]) -> dict[str, pa.Table]:
@@ -174,8 +179,15 @@ def _fields(table: pa.Table, log: type[Any], *, optional: str = "") -> dict[str,
     for name, stated in columns_of(log).items():
         may_lack = stated.optional or name == optional
         there = not may_lack or set(stated.units) <= set(table.column_names)
-        columns: list[Any] = [_values(table, column, stated) for column in stated.units] if there else [None]
-        values[name] = columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
+        columns: list[Any]
+        if there:
+            columns = [_values(table, column, stated) for column in stated.units]
+        else:
+            columns = [None]
+        if len(columns) == 1:
+            values[name] = columns[0]
+        else:
+            values[name] = np.stack(columns, axis=1)
     return values
 
 

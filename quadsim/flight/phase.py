@@ -82,7 +82,9 @@ def touchdown(t: Array, states: Array, clearances: Array) -> dict[str, float] | 
 def takeoff_time(t: Array, clearances: Array) -> float | None:
     """Return when a vehicle that starts on the ground takes off [s]; None if it starts in the air or stays down."""
     airborne = np.flatnonzero(clearances > AIRBORNE)
-    return float(t[airborne[0]]) if airborne.size and airborne[0] > 0 else None
+    if airborne.size and airborne[0] > 0:
+        return float(t[airborne[0]])
+    return None
 
 
 TAKEOFF_RISE: Final = 0.05  # rise of the reference above the resting height that calls for a take-off [m]
@@ -159,7 +161,10 @@ class TakeoffLead:
         """Return the lead of a period in the air [m], from the heights of the vehicle and its course [m]."""
         if self.lead > 0.0:
             span = min(FADING, course - self._height)
-            climbed = (height - self._height) / span if span > 0.0 else 1.0
+            if span > 0.0:
+                climbed = (height - self._height) / span
+            else:
+                climbed = 1.0
             faded = max(1.0 - climbed, 0.0) * self._at_liftoff
             self.lead = min(self.lead, max(faded, self._slowest_decay * self.lead))
             if self.lead < NO_LEAD:
@@ -222,7 +227,10 @@ class PhaseMonitor:
         self._touched = self._touched + 1 if gap <= TOUCH else 0
         flight_required = bool(preview[:, REFERENCE_NAMES.index("z")].max() > self._takeoff_height)
         if self._phase is None:
-            self._phase = Phase.FLYING if gap > AIRBORNE else Phase.LANDED
+            if gap > AIRBORNE:
+                self._phase = Phase.FLYING
+            else:
+                self._phase = Phase.LANDED
         if self._crashed(self._outline, states):
             self._phase = Phase.CRASHED
         elif self._phase is Phase.FLYING:
@@ -231,7 +239,10 @@ class PhaseMonitor:
         elif self._phase is Phase.ARMED and gap > AIRBORNE:
             self._phase = Phase.FLYING
         elif self._phase is not Phase.CRASHED:
-            self._phase = Phase.ARMED if flight_required else Phase.LANDED
+            if flight_required:
+                self._phase = Phase.ARMED
+            else:
+                self._phase = Phase.LANDED
         if self._phase in GROUNDED:
             self._takeoff.reset()
         return self._phase

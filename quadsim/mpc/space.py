@@ -131,7 +131,10 @@ class Space:
         self.positions = list(positions)
         self._shapes = tuple(shapes)
         self._distance = radius + settings.margin
-        self._margins = np.zeros((horizon, 3)) if margins is None else margins
+        if margins is None:
+            self._margins = np.zeros((horizon, 3))
+        else:
+            self._margins = margins
         self._solids = Solids([shape for shape in self._shapes if isinstance(shape, Obstacle)])
         counts = [len(s.solids) if isinstance(s, Obstacle) else len(s.half_spaces[1]) for s in self._shapes]
         places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
@@ -165,7 +168,10 @@ class Space:
         C = np.zeros((bounds.shape[1], len(bounds), states))
         C[:, :, self.positions] = normals.transpose(1, 0, 2)
         lower = bounds.T
-        l1, l2 = (0.0, 0.0) if self.penalty is None else self.penalty
+        if self.penalty is None:
+            l1, l2 = (0.0, 0.0)
+        else:
+            l1, l2 = self.penalty
         penalty = Penalty(l1=np.full(len(bounds), l1), l2=np.full(len(bounds), l2), largest=self._largest)
         return Constraint(
             name=name,
@@ -180,7 +186,12 @@ class Space:
         """Return all half-spaces as one constraint per obstacle or region, by its name."""
         constraints = []
         for shape in self._shapes:
-            kind = "obstacle" if isinstance(shape, Obstacle) else "corridor" if isinstance(shape, Corridor) else ""
+            if isinstance(shape, Obstacle):
+                kind = "obstacle"
+            elif isinstance(shape, Corridor):
+                kind = "corridor"
+            else:
+                kind = ""
             at = self._names == shape.name
             name = f"{kind} {shape.name}".strip()
             constraints.append(self.constraint(normals[at], bounds[at], states, name=name))
@@ -225,7 +236,10 @@ class ObstacleQP:
         if answer.status not in ACCEPTED:
             return answer, problem
         planned = self._positions(query, answer, turn)
-        along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
+        if last is None:
+            along = planned
+        else:
+            along = np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
         for _ in range(self._space.settings.iterations):
             normals, bounds = self._space.half_spaces(t, along)
             inside = distances(normals, bounds, planned)

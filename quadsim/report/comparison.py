@@ -34,7 +34,10 @@ _Line = tuple[str, str, Callable[[FlightRecord], Cell]]  # a row's label, its un
 def nested(data: Any, *keys: str) -> Any:
     """Return a nested value, or None if a key is missing: a run that ended at once has no numbers."""
     for key in keys:
-        data = data.get(key) if isinstance(data, Mapping) else None
+        if isinstance(data, Mapping):
+            data = data.get(key)
+        else:
+            data = None
     return data
 
 
@@ -56,7 +59,9 @@ def run_names(runs: Sequence[FlightRecord]) -> tuple[str, ...]:
 
 def _folder_name(run: FlightRecord) -> str:
     """Return the name of a flight's directory, or of its scenario where it has none."""
-    return run.name if run.directory is None else run.directory.name
+    if run.directory is None:
+        return run.name
+    return run.directory.name
 
 
 def check_names(names: Sequence[str], count: int, field: str = "names") -> None:
@@ -106,7 +111,9 @@ def _holding_mark(run: FlightRecord) -> Mark:
         return Mark.BAD
     if not run.findings:
         return Mark.NONE
-    return Mark.GOOD if all(finding.verdict == "satisfied" for finding in run.findings) else Mark.WARN
+    if all(finding.verdict == "satisfied" for finding in run.findings):
+        return Mark.GOOD
+    return Mark.WARN
 
 
 def _who_holds(runs: Sequence[FlightRecord], names: Sequence[str]) -> str:
@@ -117,7 +124,10 @@ def _who_holds(runs: Sequence[FlightRecord], names: Sequence[str]) -> str:
         failing = [finding.limit.name for finding in run.findings if finding.verdict == "violated"]
         missed = [finding.limit.name for finding in run.findings if finding.verdict == "incomplete"]
         verdict = run.outcome
-        deeds = [f"was {verdict}"] if verdict in ("lost", "aborted") else []
+        if verdict in ("lost", "aborted"):
+            deeds = [f"was {verdict}"]
+        else:
+            deeds = []
         deeds += [f"violates {_joined(failing)}"] if failing else []
         deeds += [f"does not reach {_joined(missed)}"] if missed and not deeds else []
         if verdict == "violated" and not failing and (reason := violated_otherwise(run)):
@@ -128,13 +138,21 @@ def _who_holds(runs: Sequence[FlightRecord], names: Sequence[str]) -> str:
         else:
             holds.append(name)
     alike = not any(limit_differences(runs[0].limits, run.limits, demands=False) for run in runs[1:])
-    one = "holds every constraint" if alike else "holds its own constraints"
-    held = one if len(holds) == 1 else one.replace("holds its", "hold their").replace("holds", "hold")
+    if alike:
+        one = "holds every constraint"
+    else:
+        one = "holds its own constraints"
+    if len(holds) == 1:
+        held = one
+    else:
+        held = one.replace("holds its", "hold their").replace("holds", "hold")
     if not others:
         text = {1: _joined(holds), 2: "both flights"}.get(len(holds), f"all {len(holds)} flights") + f" {held}"
     else:
         text = ", ".join([*([f"{_joined(holds)} {held}"] if holds else []), _joined(others)])
-    return text if text.startswith(tuple(names)) else text[0].upper() + text[1:]
+    if text.startswith(tuple(names)):
+        return text
+    return text[0].upper() + text[1:]
 
 
 def _who_is_closer(runs: Sequence[FlightRecord], names: Sequence[str]) -> str | None:
@@ -150,7 +168,10 @@ def _who_is_closer(runs: Sequence[FlightRecord], names: Sequence[str]) -> str | 
     shown, other = map(_metres, (least, second))
     if shown == other or len(tied([least, second], TIE_SHARE * second)) > 1:
         return f"position errors are equal: {shown} RMS"
-    closer, whose = ("closer", "") if len(errors) == 2 else ("closest", " of the next")
+    if len(errors) == 2:
+        closer, whose = ("closer", "")
+    else:
+        closer, whose = ("closest", " of the next")
     less = 100.0 * (1.0 - least / second)
     return f"{first} tracks {closer}: {shown} RMS position error against {other}{whose} ({less:.0f} % less)"
 
@@ -158,7 +179,9 @@ def _who_is_closer(runs: Sequence[FlightRecord], names: Sequence[str]) -> str | 
 def _metres(length: float) -> str:
     """A length [m] with its unit, also one that is only rounding."""
     shown = short_number(length, "m")
-    return shown if shown.startswith("<") else f"{shown} m"
+    if shown.startswith("<"):
+        return shown
+    return f"{shown} m"
 
 
 def _joined(names: Sequence[str]) -> str:
@@ -235,13 +258,17 @@ def _worst_constraint(flight: FlightRecord) -> Cell:
 
 def _position_error(flight: FlightRecord) -> float | None:
     errors = [nested(flight.numbers, "tracking", "rmse", axis) for axis in "xyz"]
-    return None if None in errors else math.hypot(*errors)
+    if None in errors:
+        return None
+    return math.hypot(*errors)
 
 
 def _highest_speed(run: FlightRecord) -> Cell:
     speeds = np.linalg.norm(run.log.plant.state[:, VELOCITY], axis=1)
     speeds = speeds[np.isfinite(speeds)]
-    return Cell(text=format_number(float(speeds.max()))) if speeds.size else Cell()
+    if speeds.size:
+        return Cell(text=format_number(float(speeds.max())))
+    return Cell()
 
 
 def _step_time(flight: FlightRecord) -> Cell:
@@ -262,7 +289,9 @@ def violated_otherwise(flight: FlightRecord) -> str | None:
         return None
     if failed_takeoff(flight):
         return "but it never took off"
-    return "but in permanent fallback" if flight.numbers["controller"].get("unrecovered") else None
+    if flight.numbers["controller"].get("unrecovered"):
+        return "but in permanent fallback"
+    return None
 
 
 def fallback_sentence(periods: int) -> str:
@@ -278,7 +307,9 @@ def takeoff_sentence(told: float) -> str:
 def failed_takeoff(flight: FlightRecord) -> str | None:
     """Say when a vehicle that never left the ground was told to; None if it need not, or did."""
     told = flight.numbers["controller"].get("never_took_off")
-    return None if told is None else takeoff_sentence(told)
+    if told is None:
+        return None
+    return takeoff_sentence(told)
 
 
 def crash(flight: FlightRecord) -> str | None:
@@ -287,7 +318,9 @@ def crash(flight: FlightRecord) -> str | None:
         return None
     violated = [finding.limit for finding in flight.findings if finding.verdict == "violated"]
     touched = [limit.name for limit in violated if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Obstacle)]
-    return f"crashed, touched {', '.join(touched)}" if touched else "crashed"
+    if touched:
+        return f"crashed, touched {', '.join(touched)}"
+    return "crashed"
 
 
 def failure_sentences(flight: FlightRecord) -> list[str]:
@@ -299,7 +332,10 @@ def optimum_sentences(flight: FlightRecord) -> list[str]:
     """Return why there was no optimum: permanent fallback, and the reason for the first QP without an answer."""
     periods = flight.numbers["controller"].get("unrecovered")
     diagnosis = flight.diagnosis
-    sentences = [fallback_sentence(periods)] if periods else []
+    if periods:
+        sentences = [fallback_sentence(periods)]
+    else:
+        sentences = []
     if diagnosis is None:
         return sentences
     loop = diagnosis.get("loop", {})
@@ -336,7 +372,9 @@ def required(flight: FlightRecord) -> Cell:
     }
     if parts := [f"{text}: {', '.join(names)}" for text, names in failing.items() if names]:
         return Cell(text="; ".join(parts), mark=Mark.BAD if failing["violated"] else Mark.WARN)
-    return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none required")
+    if demanded:
+        return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD)
+    return Cell(text="none required")
 
 
 def tracking_values(runs: Sequence[FlightRecord], measure: str, channel: str) -> tuple[str, list[float | None]]:
@@ -360,8 +398,14 @@ def _bounds(finding: Finding) -> Cell:
     upper = format_number(limit.upper)
     bounds = f"{lower} .. {upper}"
     if math.isinf(limit.lower) or math.isinf(limit.upper):
-        bounds = f"at least {lower}" if math.isinf(limit.upper) else f"at most {upper}"
-    window = f", from {limit.start:g} s" if limit.start or math.isfinite(limit.stop) else ""
+        if math.isinf(limit.upper):
+            bounds = f"at least {lower}"
+        else:
+            bounds = f"at most {upper}"
+    if limit.start or math.isfinite(limit.stop):
+        window = f", from {limit.start:g} s"
+    else:
+        window = ""
     return Cell(text=bounds + window + (f" to {limit.stop:g} s" if math.isfinite(limit.stop) else ""))
 
 
@@ -370,7 +414,9 @@ def tolerance_text(limit: Limit) -> str:
     plant, sampled = limit.tolerances
     if limit.source.plant is None:
         return f"{sampled:.3g}"
-    return f"{plant:.3g}" if plant == sampled else f"{plant:.3g}, {sampled:.3g} at the samples"
+    if plant == sampled:
+        return f"{plant:.3g}"
+    return f"{plant:.3g}, {sampled:.3g} at the samples"
 
 
 def _tracking_rows(runs: Sequence[FlightRecord]) -> Iterator[QuantityRow]:
@@ -441,7 +487,10 @@ def _verdict(finding: Finding) -> Cell:
         text = NOT_REQUIRED
     if finding.verdict != "incomplete":
         margin, tolerance = finding.deciding
-        at_samples = " at the samples" if margin != finding.worst_margin else ""
+        if margin != finding.worst_margin:
+            at_samples = " at the samples"
+        else:
+            at_samples = ""
         shown = rounded_margin(margin, tolerance)
         text += f" (margin {format_number(shown)} {finding.limit.unit}{at_samples}, tolerance {tolerance:.3g})"
     return Cell(text=text, mark=_verdict_mark(finding))
@@ -449,18 +498,25 @@ def _verdict(finding: Finding) -> Cell:
 
 def rounded_margin(margin: float, tolerance: float) -> float:
     """Return a margin, or 0 if it is far smaller than its tolerance."""
-    return 0.0 if abs(margin) < _ROUNDING * tolerance else margin
+    if abs(margin) < _ROUNDING * tolerance:
+        return 0.0
+    return margin
 
 
 def _verdict_mark(finding: Finding) -> Mark:
     if finding.verdict == "satisfied":
         return Mark.GOOD
-    return Mark.BAD if finding.verdict == "violated" and finding.limit.required else Mark.WARN
+    if finding.verdict == "violated" and finding.limit.required:
+        return Mark.BAD
+    return Mark.WARN
 
 
 def _margin(*, sampled: bool) -> Callable[[Finding], Cell]:
     def cell(finding: Finding) -> Cell:
-        margin = finding.worst_margin_sampled if sampled else finding.worst_margin
+        if sampled:
+            margin = finding.worst_margin_sampled
+        else:
+            margin = finding.worst_margin
         violated = finding.limit.violated(margin, sampled=sampled)
         return Cell(text=format_number(margin), mark=_verdict_mark(finding) if violated else Mark.NONE)
 
@@ -484,7 +540,9 @@ def mismatch(flight: FlightRecord) -> tuple[str, ...]:
     actual = flight.numbers.get("actual", {})
     modelled = flight.numbers["vehicle"]
     wrong = [f"{name} {modelled[name]} for {value}" for name, value in actual.items() if value != modelled[name]]
-    return (", ".join(wrong),) if wrong else ()
+    if wrong:
+        return (", ".join(wrong),)
+    return ()
 
 
 def _text(value: Callable[[FlightRecord], object]) -> Callable[[FlightRecord], Cell]:
@@ -496,7 +554,10 @@ def _number(*keys: str, unit: str = "", wrong: Mark = Mark.NONE) -> Callable[[Fl
 
     def cell(flight: FlightRecord) -> Cell:
         value = nested(flight.numbers, *keys)
-        shown = math.degrees(value) if unit == "deg" and value is not None else value
+        if unit == "deg" and value is not None:
+            shown = math.degrees(value)
+        else:
+            shown = value
         return Cell(text=format_number(shown), mark=wrong if value else Mark.NONE)
 
     return cell
@@ -505,7 +566,9 @@ def _number(*keys: str, unit: str = "", wrong: Mark = Mark.NONE) -> Callable[[Fl
 def _counts(key: str) -> Callable[[FlightRecord], Cell]:
     def cell(flight: FlightRecord) -> Cell:
         counts = flight.numbers["controller"].get(key)
-        return Cell(text=", ".join(f"{name}: {count}" for name, count in counts.items())) if counts else Cell()
+        if counts:
+            return Cell(text=", ".join(f"{name}: {count}" for name, count in counts.items()))
+        return Cell()
 
     return cell
 
@@ -526,7 +589,9 @@ def _listed(key: str, form: str, mark: Mark) -> Callable[[FlightRecord], Cell]:
     def cell(flight: FlightRecord) -> Cell:
         entries = nested(flight.numbers, "course", key)
         if not entries:
-            return Cell() if entries is None else Cell(text="none")
+            if entries is None:
+                return Cell()
+            return Cell(text="none")
         return Cell(text="; ".join(map(form.format, entries)), mark=mark)
 
     return cell

@@ -88,7 +88,10 @@ def write_comparison(
             for figure in page_figures(runs)
         ]
         plots = Section(title="Plots", plots=tuple(figures))
-        title = " and ".join(names) if len(names) < 3 else f"{len(names)} runs: {', '.join(names)}"
+        if len(names) < 3:
+            title = " and ".join(names)
+        else:
+            title = f"{len(names)} runs: {', '.join(names)}"
         files = {"overlay of all runs (PNG)": OVERVIEW_FILE, "table (Markdown)": TABLE_FILE}
         files = {label: name for label, name in files.items() if (partial / name).exists()}
         notes = (*notes, *([warning] if courses > 1 else []))
@@ -124,7 +127,10 @@ def _place(run: FlightRecord, name: str, folder: str, colour: str, page_director
 
         video = f"{folder}.mp4"
         shutil.copyfile(source / VIDEO_FILE, page_directory / video)
-        poster = f"{folder}.jpg" if write_poster(page_directory / video, page_directory / f"{folder}.jpg") else None
+        if write_poster(page_directory / video, page_directory / f"{folder}.jpg"):
+            poster = f"{folder}.jpg"
+        else:
+            poster = None
     vehicle = f"Vehicle: {run.actual.description or run.actual.name}"
     return RunView(
         name=name,
@@ -157,5 +163,8 @@ def _made_with(run: FlightRecord) -> str:
     versions = run.numbers.get("versions", {})
     machine = run.numbers.get("machine", {})
     packages = [f"{name} {versions[name]}" for name in ("quadsim", "mujoco", "piqp") if name in versions]
-    where = f"{machine['processor']}, {machine['cores']} cores" if {"processor", "cores"} <= machine.keys() else ""
+    if {"processor", "cores"} <= machine.keys():
+        where = f"{machine['processor']}, {machine['cores']} cores"
+    else:
+        where = ""
     return " on ".join(filter(None, (", ".join(packages), where)))

@@ -26,7 +26,10 @@ def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | Non
 
     Numbers that are not finite do not count.
     """
-    values = np.concatenate([np.ravel(curve) for curve in curves]) if curves else np.empty(0)
+    if curves:
+        values = np.concatenate([np.ravel(curve) for curve in curves])
+    else:
+        values = np.empty(0)
     values = values[np.isfinite(values)]
     span = LEAST_SPANS.get(unit, 0.0)
     if not values.size or values.max() - values.min() >= span:
@@ -51,15 +54,22 @@ def _later(x: Array, y: Array) -> Array:
 
 def _extent(curves: Sequence[Array]) -> tuple[float, float] | None:
     """Return the lowest and the highest finite value; None without any."""
-    values = np.concatenate([np.ravel(curve) for curve in curves]) if curves else np.empty(0)
+    if curves:
+        values = np.concatenate([np.ravel(curve) for curve in curves])
+    else:
+        values = np.empty(0)
     values = values[np.isfinite(values)]
-    return (float(values.min()), float(values.max())) if values.size else None
+    if values.size:
+        return (float(values.min()), float(values.max()))
+    return None
 
 
 def reference_curve(log: ControlLog, name: str) -> Array:
     """(K,) filtered reference of x, y, z or yaw, in the unit of its signal."""
     values = log.reference[:, REFERENCE_NAMES.index(name)]
-    return np.degrees(values) if SIGNALS[name].unit == "deg" else values
+    if SIGNALS[name].unit == "deg":
+        return np.degrees(values)
+    return values
 
 
 def bounds_of(limits: Iterable[Limit], signal: str, end: float) -> list[tuple[float, float, float]]:
@@ -78,7 +88,10 @@ def break_at_wraps(t: Array, values: Array, unit: str) -> tuple[Array, Array]:
 
     Times [s] and values (K,) become (K + wraps,), with a NaN in each gap; values of another unit than `deg` never wrap.
     """
-    after = np.flatnonzero(np.abs(np.diff(values)) > _HALF_TURN) + 1 if unit == "deg" else np.empty(0, int)
+    if unit == "deg":
+        after = np.flatnonzero(np.abs(np.diff(values)) > _HALF_TURN) + 1
+    else:
+        after = np.empty(0, int)
     return np.insert(t, after, 0.5 * (t[after - 1] + t[after])), np.insert(values, after, np.nan)
 
 
@@ -99,9 +112,18 @@ class EffectCurves:
 
 def effect_curves(log: FlightLog) -> list[EffectCurves]:
     """Return external force, torque, wind, voltage and charge, unless zero throughout."""
-    wrench = np.zeros((1, 6)) if log.plant.wrench is None else log.plant.wrench
-    wind = np.zeros((1, 3)) if log.plant.wind is None else log.plant.wind
-    battery = np.zeros((1, 2)) if log.plant.battery is None else log.plant.battery
+    if log.plant.wrench is None:
+        wrench = np.zeros((1, 6))
+    else:
+        wrench = log.plant.wrench
+    if log.plant.wind is None:
+        wind = np.zeros((1, 3))
+    else:
+        wind = log.plant.wind
+    if log.plant.battery is None:
+        battery = np.zeros((1, 2))
+    else:
+        battery = log.plant.battery
     units = {name: unit for one in columns_of(PlantLog).values() for name, unit in one.units.items()}
     curves = (
         EffectCurves(key="force", title="external force, world", unit=units["force_x"], values=wrench[:, :3]),
@@ -126,7 +148,9 @@ def commanded_speeds(log: FlightLog) -> Array | None:
         return None
     period = np.searchsorted(control.t, plant.t, side="right") - 1
     commanded: Array = control.speeds[period]
-    return commanded if np.abs(commanded - plant.speeds).max() > _VISIBLE_SPEED else None
+    if np.abs(commanded - plant.speeds).max() > _VISIBLE_SPEED:
+        return commanded
+    return None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,7 +242,10 @@ class Panel:
     def heading(self) -> str:
         """Title and unit, and the value of a start outside the axis."""
         unit = self.unit.replace(" ", "\u00a0")  # no line break within it
-        heading = f"{self.title} [{unit}]" if unit else self.title
+        if unit:
+            heading = f"{self.title} [{unit}]"
+        else:
+            heading = self.title
         if self.settled_range is None:
             return heading
         low, high = self.settled_range

@@ -187,7 +187,10 @@ def targets(run: FlightRecord) -> list[Figure]:
             Series(x=plant.t, y=signal.finest(run.log)[1], colour=COLOUR.flown, label="flown"),
             Series(x=run.log.control.t, y=scale * target[:, i], colour=COLOUR.reference, label="target", style="steps"),
         )
-        title = "collective thrust" if i == 0 else f"body rate about {name[-1]}"
+        if i == 0:
+            title = "collective thrust"
+        else:
+            title = f"body rate about {name[-1]}"
         panels.append(Panel(title=title, unit=signal.unit, series=curves, bounds=_bounds([run], name), legend=True))
     return [_timed("targets", "targets of the autopilot", tuple(panels), [run])]
 
@@ -229,16 +232,19 @@ def effects(run: FlightRecord) -> list[Figure]:
     plant = run.log.plant
     control = run.log.control
     commanded = commanded_speeds(run.log)
-    panels = (
-        [] if commanded is None else [_acting(rotor, plant.t, commanded, plant.speeds) for rotor in range(N_ROTORS)]
-    )
+    if commanded is None:
+        panels = []
+    else:
+        panels = [_acting(rotor, plant.t, commanded, plant.speeds) for rotor in range(N_ROTORS)]
     panels += [_several(each.title, each.unit, plant.t, each.values, each.names) for each in effect_curves(run.log)]
     if not control.measured_perfectly:
         for what, names in {"position": ("x", "y", "z"), "attitude": ("roll", "pitch", "yaw")}.items():
             errors = [SIGNALS[f"{name}_estimate_error"] for name in names]
             values = np.stack([error.sampled(control) for error in errors], axis=1)
             panels.append(_several(f"error of the measured {what}", errors[0].unit, control.t, values, names))
-    return [_timed("effects", "effects", tuple(panels), [run])] if panels else []
+    if panels:
+        return [_timed("effects", "effects", tuple(panels), [run])]
+    return []
 
 
 def space(run: FlightRecord) -> list[Figure]:
@@ -254,7 +260,10 @@ def space(run: FlightRecord) -> list[Figure]:
         label = limit.name if len(limits) <= _MOST_NAMED else ""
         curves.append(Series(x=t, y=shown, colour=line_colour(i), label=label, width=1.0))
     drawn = np.concatenate([curve.y[np.isfinite(curve.y)] for curve in curves])
-    low, high = (float(drawn.min()), float(drawn.max())) if drawn.size else (0.0, 0.0)
+    if drawn.size:
+        low, high = (float(drawn.min()), float(drawn.max()))
+    else:
+        low, high = (0.0, 0.0)
     ends = (min(0.0, low) - 0.1, min(high, _NEAR) + 0.1)
     clear = Panel(title="clearance", unit="m", series=tuple(curves), bounds=(Bound(value=0.0),), y_range=ends,
                   legend=True, height=1.5)  # fmt: skip
@@ -266,7 +275,9 @@ def xy(run: FlightRecord) -> list[Figure]:
     course = run.log.control.reference[:, :3]
     spans = course.max(axis=0) - course.min(axis=0)
     planar = spans[:2].min() > _MOVES and spans[2] < LEAST_SPANS["m"]
-    return [_timed("xy", "path", (_above([run]),), [run], columns=1)] if planar and not space(run) else []
+    if planar and not space(run):
+        return [_timed("xy", "path", (_above([run]),), [run], columns=1)]
+    return []
 
 
 def _above(runs: Sequence[FlightRecord]) -> Panel:

@@ -92,4 +92,6 @@ def _environment() -> Environment:
 def _shown(value: Any) -> Any:
     """Text and paths without what steers a reader's eye, or what no file can hold; markup of ours as it is."""
     is_text = isinstance(value, str | Path) and not hasattr(value, "__html__")
-    return printable(str(value), keep="\n") if is_text else value
+    if is_text:
+        return printable(str(value), keep="\n")
+    return value

@@ -73,7 +73,10 @@ def to_markdown(rows: Sequence[QuantityRow], names: Sequence[str]) -> str:
     group = ""
     for row in rows:
         cells = [replace(cell, mark=Mark.BEST) if row.headline else cell for cell in row.cells]
-        label = f"{row.label} [{row.unit}]" if row.unit else row.label
+        if row.unit:
+            label = f"{row.label} [{row.unit}]"
+        else:
+            label = row.label
         lines.append(line(f"**{row.group}**" if row.group != group else "", label, *cells))
         group = row.group
     return _markdown(("", "", *names), 2, lines)
@@ -103,7 +106,9 @@ def format_number(value: float | None) -> str:
     size = abs(value)
     if 1e4 <= size < 1e7:
         return f"{value:.0f}"
-    return f"{value:.4g}" if size == 0.0 or 1e-3 <= size < 1e7 else f"{value:.1e}"
+    if size == 0.0 or 1e-3 <= size < 1e7:
+        return f"{value:.4g}"
+    return f"{value:.1e}"
 
 
 def short_number(value: float, unit: str = "") -> str:
@@ -113,4 +118,6 @@ def short_number(value: float, unit: str = "") -> str:
     least, text = _NEGLIGIBLE.get(unit, (0.0, "0"))
     if value and abs(value) < least:
         return text
-    return f"{value + 0.0:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value + 0.0:.3g}".replace("e-0", "e-")
+    if 1e3 <= abs(value) < 1e5:
+        return f"{value + 0.0:.0f}"
+    return f"{value + 0.0:.3g}".replace("e-0", "e-")

@@ -237,7 +237,10 @@ def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
 
     rows = [figure.panels[i : i + figure.columns] for i in range(0, len(figure.panels), figure.columns)]
     heights = [max(panel.height for panel in row) for row in rows]
-    row, head, letters = (_ROW, _HEAD, _LETTERS) if width is None else (_JOURNAL_ROW, _JOURNAL_HEAD, _JOURNAL_LETTERS)
+    if width is None:
+        row, head, letters = (_ROW, _HEAD, _LETTERS)
+    else:
+        row, head, letters = (_JOURNAL_ROW, _JOURNAL_HEAD, _JOURNAL_LETTERS)
     size = (width or _WIDTH, head + row * sum(heights))
     if interactive:
         from matplotlib import pyplot
@@ -252,7 +255,10 @@ def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
     for axes, panel in zip(grid.flat, figure.panels, strict=False):
         entries = _draw_panel(axes, panel, letters)
         if panel.legend and entries:
-            beside = {} if panel.y_label else {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
+            if panel.y_label:
+                beside = {}
+            else:
+                beside = {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
             axes.legend(entries.values(), entries, loc="lower right", ncols=1 if panel.y_label else 4,
                         columnspacing=1.0, handletextpad=0.4, **beside)  # fmt: skip
         else:
@@ -361,7 +367,11 @@ def _draw_panel(axes: Axes, panel: Panel, letters: int) -> dict[str, Artist]:
     for bound in panel.bounds:
         shown["bound"] = _draw_bound(axes, bound)
     for label in panel.labels:
-        look: dict[str, Any] = {"color": label.colour} if label.colour else {}
+        look: dict[str, Any]
+        if label.colour:
+            look = {"color": label.colour}
+        else:
+            look = {}
         axes.text(label.x, label.y, label.text, ha="center", va="center", fontweight="bold" if label.bold else None,
                   **look)  # fmt: skip
     if panel.y_log:
@@ -396,7 +406,10 @@ def _draw_series(axes: Axes, series: Series) -> Artist:
         return bars
     if series.style == "points":
         looks |= {"marker": _MARKERS[series.marker], "markersize": series.width, "linestyle": "none"}
-        looks["markeredgewidth"] = 0.9 if series.marker == "x" else 0.0
+        if series.marker == "x":
+            looks["markeredgewidth"] = 0.9
+        else:
+            looks["markeredgewidth"] = 0.0
     else:
         looks |= {"linewidth": series.width, "linestyle": _DASHES if series.dashed else "-"}
         looks |= {"drawstyle": "steps-post"} if series.style == "steps" else {}

@@ -185,7 +185,10 @@ def _draw_panel(canvas: Canvas, panel: Panel, place: dict[str, int], points: int
             y = [bound.value, bound.value]
             canvas.add_trace(Scatter(x=x, y=y, mode="lines", line=line, name="bound", hoverinfo="skip"), **place)
     for label in panel.labels:
-        shown = f"<b>{html.escape(label.text)}</b>" if label.bold else html.escape(label.text)
+        if label.bold:
+            shown = f"<b>{html.escape(label.text)}</b>"
+        else:
+            shown = html.escape(label.text)
         font = {"color": label.colour} if label.colour else {}
         canvas.add_annotation(x=label.x, y=label.y, text=shown, font=font, showarrow=False, **place)
     if panel.x_label:
@@ -213,18 +216,20 @@ def _draw_series(canvas: Canvas, series: Series, place: dict[str, int], points: 
     shared: dict[str, Any] = {"name": html.escape(series.label), "legendgroup": series.group or None}
     shared["opacity"] = series.opacity
     if series.style == "bars":
-        width = float(np.diff(series.x).min()) if series.x.size > 1 else 0.8
+        if series.x.size > 1:
+            width = float(np.diff(series.x).min())
+        else:
+            width = 0.8
         shared |= {"marker": {"color": series.colour, "line": {"width": 0}}, "width": width, "base": series.base}
         hover = "%{x:.4g}: %{customdata} %{fullData.name}<extra></extra>"
         canvas.add_trace(
             Bar(x=series.x.astype(np.float32), y=series.y, customdata=series.y, hovertemplate=hover, **shared), **place
         )
         return
-    drawn = (
-        thinned_curve(series.y, points)
-        if series.style != "points" or series.flights is None
-        else np.arange(series.y.size)
-    )
+    if series.style != "points" or series.flights is None:
+        drawn = thinned_curve(series.y, points)
+    else:
+        drawn = np.arange(series.y.size)
     x = series.x[drawn].astype(np.float32)
     y = series.y[drawn].astype(np.float32)
     if series.style == "points":

@@ -68,7 +68,10 @@ def vehicle_figure(vehicle: Vehicle) -> Figure:
     top = np.array([0.0, float(places[:, 1].max()) + 1.5 * radius])
     areas.append(_arrow_head(top - np.array([0.0, 0.2 * radius]), top, 0.15 * radius, COLOUR.axis_x))
     labels.append(_label(top + np.array([0.5 * radius, -0.1 * radius]), "front", bold=True))
-    unknown = "" if vehicle.rotor_radius else "; propellers of unknown size, as large as fit"
+    if vehicle.rotor_radius:
+        unknown = ""
+    else:
+        unknown = "; propellers of unknown size, as large as fit"
     panel = Panel(
         title=f"hubs: {'x, y' if level else 'x, y, z'} [m], arm [m]; {2.0 * reach:.3g} m across{unknown}",
         areas=tuple(areas),

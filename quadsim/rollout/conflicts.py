@@ -120,7 +120,9 @@ def smallest_widening(infeasible_period: InfeasiblePeriod, sides: Collection[Sid
     query = infeasible_period.query
     scales = {side: _scales(problem)[side.place][side.row] for side in sides}
     relaxed = _relaxed(problem, query, _sides(problem), sides, together=scales)
-    return None if relaxed is None else relaxed.total
+    if relaxed is None:
+        return None
+    return relaxed.total
 
 
 def has_answer(problem: Problem, query: Query) -> bool:

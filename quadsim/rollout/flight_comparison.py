@@ -52,7 +52,10 @@ class FlightComparison(Tabular):
         flights = []
         for name, flight in zip(self.names, self.flights, strict=True):
             flights.append(f"\n {name}: {flight.outcome}{worst_margin(flight.findings)}")
-        more = f"\n and {len(flights) - _FIRST} more" if len(flights) > _FIRST else ""
+        if len(flights) > _FIRST:
+            more = f"\n and {len(flights) - _FIRST} more"
+        else:
+            more = ""
         return f"<FlightComparison of {len(flights)} flights{''.join(flights[:_FIRST])}{more}>"
 
     @property
@@ -67,7 +70,9 @@ class FlightComparison(Tabular):
         from quadsim.report.flight_figures import signals
 
         flown = [flight for flight in self.flights if flight.time.size]
-        return signals(self.flights, ("x", "y", "z")) if flown else None
+        if flown:
+            return signals(self.flights, ("x", "y", "z"))
+        return None
 
     def records(self) -> list[dict[str, Any]]:
         """Return a row per flight: verdict, `Flight.metrics`, and of each constraint its margin and verdict.
@@ -157,14 +162,20 @@ def compare_flights(
     from quadsim.report.comparison import comparison_rows, run_names
     from quadsim.report.comparison_page import write_comparison
 
-    whose = None if constraints is None else place_of(constraints, targets)
+    if constraints is None:
+        whose = None
+    else:
+        whose = place_of(constraints, targets)
     check_names(names, len(targets))
     require_film(products.get("video"), fps)
     opened = [_opened(target) for target in targets]
     with contextlib.ExitStack() as stack:
         if out is not None:
             stack.enter_context(reserving(out, overwrite=overwrite))
-        beside = None if out is None else out.parent / f"{out.name}-runs"
+        if out is None:
+            beside = None
+        else:
+            beside = out.parent / f"{out.name}-runs"
         flights = tuple(_flight_of(target, beside, progress, products) for target in opened)
         if names:
             flights = tuple(flight.labelled(name) for flight, name in zip(flights, names, strict=True))
@@ -230,7 +241,9 @@ def _controller_of(flight: Flight) -> Mapping[str, Any] | None:
     if flight.own_code:
         return None
     controller = plain(flight.scenario.controller)
-    return {"type": controller} if isinstance(controller, str) else controller
+    if isinstance(controller, str):
+        return {"type": controller}
+    return controller
 
 
 def controller_differences(controllers: Sequence[Mapping[str, Any] | None], names: Sequence[str]) -> tuple[str, ...]:
@@ -254,7 +267,10 @@ def _controller_difference(a: str, first: Mapping[str, Any], b: str, second: Map
         values = (first[field], second[field])
         is_nested = any(isinstance(value, Mapping | list) for value in values)
         shown.append(field if is_nested else f"{field} ({values[0]}, {values[1]})")
-    parts = [f"differ in {', '.join(shown)}"] if shown else []
+    if shown:
+        parts = [f"differ in {', '.join(shown)}"]
+    else:
+        parts = []
     for name, one, other in ((a, first, second), (b, second, first)):
         alone = [field for field, value in one.items() if field not in other and value != []]
         if alone:
@@ -296,9 +312,14 @@ def _flight_of(
     target: Flight | Scenario, beside: Path | None, progress: Progress, products: Mapping[str, bool | None]
 ) -> Flight:
     """Return a target as a flight; fly it if necessary, and save it beside the page, if there is one."""
-    flight = target if isinstance(target, Flight) else Rollout(target).fly(progress)
+    if isinstance(target, Flight):
+        flight = target
+    else:
+        flight = Rollout(target).fly(progress)
     if beside is None or flight.directory is not None:
-        return flight if isinstance(target, Flight) else flight.as_stored()
+        if isinstance(target, Flight):
+            return flight
+        return flight.as_stored()
     with reserving(beside / flight.name, free=True) as place:
         written = write_run(flight, place, {**products, "video": False}, overwrite=False, progress=progress, flown=None)
     return written.as_stored()

@@ -165,7 +165,10 @@ class FlightEvents:
         duration = round(k * scenario.control_period, 9)
         events = [event for event in scenario.events if event.at < duration]
         for event in scenario.events:
-            substitute = None if event.at < duration else neutral(scenario, event)
+            if event.at < duration:
+                substitute = None
+            else:
+                substitute = neutral(scenario, event)
             if substitute is not None and substitute not in events:
                 events.insert(0, substitute)
         return scenario.altered(duration=duration, events=events)
@@ -228,7 +231,10 @@ class FlightEvents:
         return min(periods, key=lambda period: period.converges is not None, default=None)
 
     def _switch(self, spec: AnyController, ready: Successor | None) -> None:
-        successor = ready if ready is not None and ready.spec == spec else self._built(spec)
+        if ready is not None and ready.spec == spec:
+            successor = ready
+        else:
+            successor = self._built(spec)
         self.infeasible_period = self.first_infeasible_period()
         self._loop.switch(successor.controller)
         self._spec = spec
@@ -253,14 +259,21 @@ class FlightEvents:
 
 def infeasible_period_of(controller: Controller) -> InfeasiblePeriod | None:
     """Return the first period whose QP had no answer; None if there is none."""
-    period = controller.infeasible_period if isinstance(controller, Diagnosable) else None
-    return period if isinstance(period, InfeasiblePeriod) else None
+    if isinstance(controller, Diagnosable):
+        period = controller.infeasible_period
+    else:
+        period = None
+    if isinstance(period, InfeasiblePeriod):
+        return period
+    return None
 
 
 def _lasting(event: Event) -> float:
     """Return the time for which an event counts [s]."""
     duration: float | None = getattr(event, "duration", 0.0)
-    return math.inf if duration is None else duration
+    if duration is None:
+        return math.inf
+    return duration
 
 
 def _not_started_for(event: Event) -> InputError:
@@ -276,8 +289,14 @@ def prepared(assembly: Assembly) -> Scenario:
     """
     scenario = assembly.scenario
     air = assembly.effects.air
-    sensed = {} if scenario.sensors is None else scenario.sensors.present()
-    names = [*sensed] if scenario.estimator is not None else [*get_args(SensorText)]
+    if scenario.sensors is None:
+        sensed = {}
+    else:
+        sensed = scenario.sensors.present()
+    if scenario.estimator is not None:
+        names = [*sensed]
+    else:
+        names = [*get_args(SensorText)]
     possible: list[Event] = [
         _push(scenario),
         *([_mass(scenario)] if scenario.plant.integrator == "mujoco" else []),
@@ -296,7 +315,9 @@ def neutral(scenario: Scenario, event: Event) -> Event | None:
         return _mass(scenario)
     if isinstance(event, Gust | WindChange):
         return _wind(scenario)
-    return _fault(scenario, event.sensor) if isinstance(event, SensorFaultEvent) else None
+    if isinstance(event, SensorFaultEvent):
+        return _fault(scenario, event.sensor)
+    return None
 
 
 def _push(scenario: Scenario) -> Push:
@@ -336,5 +357,8 @@ def story(scenario: Scenario, duration: float) -> list[dict[str, Any]]:
 
 def _text(event: Event) -> str:
     duration = getattr(event, "duration", None)
-    lasting = "" if duration is None else f" for {duration:g} s"
+    if duration is None:
+        lasting = ""
+    else:
+        lasting = f" for {duration:g} s"
     return printable(f"{event.text()}{lasting}")[:_LONGEST]

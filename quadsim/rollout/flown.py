@@ -156,7 +156,10 @@ class Flight(Result):
 
     def __repr__(self) -> str:
         flown = f"{self.log.control.t.size * self.scenario.control_period:.2f} s"
-        end = self.assembly.course_cut if self.recorded is None else self.recorded.get("course", {}).get("cut_before")
+        if self.recorded is None:
+            end = self.assembly.course_cut
+        else:
+            end = self.recorded.get("course", {}).get("cut_before")
         if end is not None:
             flown += f" of a course that ends at {end:g} s"
         line = f"<Flight {self.scenario.name}: {self.outcome}, {flown} by {self.controller}"
@@ -220,7 +223,9 @@ class Flight(Result):
         if self.infeasible_period is None:
             kept_law = self.scenario.controller_at(self.end) == self.scenario.controller
             is_its_own = kept_law and not self.own_code
-            return lacking_report(self.assembly, self.end) if self.outcome == "lost" and is_its_own else None
+            if self.outcome == "lost" and is_its_own:
+                return lacking_report(self.assembly, self.end)
+            return None
         if self.infeasible_period.status == NOT_CONVERGED and self.satisfied:
             return None
         spec = self.scenario.controller_at(self.infeasible_period.time)
@@ -235,7 +240,9 @@ class Flight(Result):
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks of `quadsim check` that are not errors."""
-        return () if self.checked is None else self.checked.notes
+        if self.checked is None:
+            return ()
+        return self.checked.notes
 
     @property
     def end(self) -> float:
@@ -313,7 +320,9 @@ class Flight(Result):
     @cached_property
     def numbers(self) -> Mapping[str, Any]:
         """`summary` before a change that its diagnosis advises is flown."""
-        return summarise(self) if self.recorded is None else self.recorded
+        if self.recorded is None:
+            return summarise(self)
+        return self.recorded
 
     @cached_property
     def metrics(self) -> dict[str, float]:
@@ -462,9 +471,16 @@ class Flight(Result):
     def exit_status(self) -> int:
         """See `Result.exit_status`; 1 of a check that does not show that every constraint of the scenario holds."""
         if self.checked is not None:
-            again = self.findings if self.checked.again is None else self.checked.again
-            return EXIT_DONE if self.satisfied and self.verdict_of(again) == "satisfied" else EXIT_FAILED
-        return EXIT_DONE if self.outcome in ("satisfied", "incomplete", "unaudited") else EXIT_FAILED
+            if self.checked.again is None:
+                again = self.findings
+            else:
+                again = self.checked.again
+            if self.satisfied and self.verdict_of(again) == "satisfied":
+                return EXIT_DONE
+            return EXIT_FAILED
+        if self.outcome in ("satisfied", "incomplete", "unaudited"):
+            return EXIT_DONE
+        return EXIT_FAILED
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
@@ -473,7 +489,10 @@ class Flight(Result):
         yield from summary_tables(self)
         if self.checked is not None and self.checked.again is not None:
             alike = (self.verdict_of(self.checked.again) == "satisfied") == self.satisfied
-            phrase = "as recorded" if alike else "a different verdict than recorded"
+            if alike:
+                phrase = "as recorded"
+            else:
+                phrase = "a different verdict than recorded"
             yield f"audited again from the tables, {self.scenario.log_rate:g} rows per second: {phrase}"
 
     def verdicts(self) -> tuple[str, Cases]:
@@ -513,7 +532,9 @@ class Flight(Result):
         """See `Result.small_plot`: position over time."""
         from quadsim.report.flight_figures import signals
 
-        return signals([self], ("x", "y", "z")) if self.time.size else None
+        if self.time.size:
+            return signals([self], ("x", "y", "z"))
+        return None
 
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""
@@ -609,12 +630,18 @@ def summarise(flight: Flight) -> dict[str, Any]:
     ground = scenario.effects.ground
     flown = log.control.t.size > 0
     samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
-    estimation = {} if log.control.measured_perfectly else {**metrics.estimation(log.control), "samples": samples}
+    if log.control.measured_perfectly:
+        estimation = {}
+    else:
+        estimation = {**metrics.estimation(log.control), "samples": samples}
     steps = flight.assembly.course_steps
     course_cut = flight.assembly.course_cut
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=steps)
     own_law = flight.own_code or is_plugin(scenario.controller.type)
-    owner = "your model" if own_law else f"the model of {flight.controller}"
+    if own_law:
+        owner = "your model"
+    else:
+        owner = f"the model of {flight.controller}"
     model_error = model_report(log.control, log.foreseen, owner)
     notes = implausible(flight.actual)
     notes += model_notes(flight.assembly) if flight.controller == scenario.controller.type else []

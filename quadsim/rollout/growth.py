@@ -79,7 +79,9 @@ class Growth:
         """Whether the loop is stable; `neutral` where the difference stays what it was."""
         if self.ended or self.rate > NEUTRAL:
             return "unstable"
-        return "stable" if self.rate < -NEUTRAL else "neutral"
+        if self.rate < -NEUTRAL:
+            return "stable"
+        return "neutral"
 
     @property
     def notable(self) -> bool:

@@ -57,8 +57,14 @@ def diagnose(
     spec = scenario.controller
     case = (_Case if isinstance(spec, Bounded) else _OwnCase)(infeasible_period, scenario, spec, vehicle)
     conflict = find_conflict(infeasible_period)
-    entries = [] if conflict is None else _merged([*case.entries(conflict)])
-    suggestions = [] if conflict is None or conflict.feasible else [*case.suggestions(conflict)]
+    if conflict is None:
+        entries = []
+    else:
+        entries = _merged([*case.entries(conflict)])
+    if conflict is None or conflict.feasible:
+        suggestions = []
+    else:
+        suggestions = [*case.suggestions(conflict)]
     report = {
         "time": round(infeasible_period.time, 9),
         "status": infeasible_period.status,
@@ -66,7 +72,10 @@ def diagnose(
         "conflict": entries,
         "suggestions": suggestions,
     }
-    advice = case.widenings(conflict) if isinstance(case, _OwnCase) else _advice(report)
+    if isinstance(case, _OwnCase):
+        advice = case.widenings(conflict)
+    else:
+        advice = _advice(report)
     return {**report, "sentence": _sentence(report), "advice": advice}
 
 
@@ -112,11 +121,20 @@ def _unconverged(
     infeasible_period: InfeasiblePeriod, converges: Callable[[int], bool], before: int, statuses: Sequence[str]
 ) -> dict[str, Any]:
     """Return the diagnosis of a period whose QPs were solved but whose SQP did not converge."""
-    count = f" in {sum(status == NOT_CONVERGED for status in statuses)} of {len(statuses)} periods" if statuses else ""
+    if statuses:
+        count = f" in {sum(status == NOT_CONVERGED for status in statuses)} of {len(statuses)} periods"
+    else:
+        count = ""
     enough = next((count for count in ITERATIONS if count > before and converges(count)), None)
-    suggestions = [] if enough is None else [{"settings": {"controller.iterations": enough}, "after": None}]
+    if enough is None:
+        suggestions = []
+    else:
+        suggestions = [{"settings": {"controller.iterations": enough}, "after": None}]
     never = f"it does not within {ITERATIONS[-1]} iterations either"
-    advice = never if enough is None else f"to try: {change_text(suggestions[0])}"
+    if enough is None:
+        advice = never
+    else:
+        advice = f"to try: {change_text(suggestions[0])}"
     return {
         "time": round(infeasible_period.time, 9),
         "status": infeasible_period.status,
@@ -200,7 +218,11 @@ class _Case:
 
     def _soft(self, tables: Sequence[str]) -> Settings | None:
         other_law = "controller.soft" in tables and not isinstance(self._spec, Robust)
-        law: Settings = {"controller.type": "robust"} if other_law else {}
+        law: Settings
+        if other_law:
+            law = {"controller.type": "robust"}
+        else:
+            law = {}
         return next(filter(self._helps, ({**law, **dict.fromkeys(tables, soft)} for soft in SOFT)), None)
 
     def _widened(self, amounts: Mapping[str, tuple[set[Side], float]]) -> Settings | None:
@@ -288,11 +310,15 @@ class _OwnCase(_Case):
             if least is not None:
                 amount = f"{least * origin.factor:.3g} {origin.unit.replace('-', '')}".rstrip()
                 widenings.append(f"{origin.name} {_which(side)} wider by {amount}")
-        return f"has an answer with {'; or '.join(widenings)}" if widenings else "no bound alone gives it an answer"
+        if widenings:
+            return f"has an answer with {'; or '.join(widenings)}"
+        return "no bound alone gives it an answer"
 
 
 def _which(side: Side) -> str:
-    return "upper" if side.upper else "lower"
+    if side.upper:
+        return "upper"
+    return "lower"
 
 
 def _named(origin: Origin, side: Side) -> dict[str, Any]:
@@ -324,7 +350,10 @@ def _merged(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _outwards(bound: float, amount: float, *, upper: bool) -> float:
     """Move a bound outwards by an amount, rounded up to three digits."""
-    digits = 2 - math.floor(math.log10(amount)) if amount > 0.0 else 0
+    if amount > 0.0:
+        digits = 2 - math.floor(math.log10(amount))
+    else:
+        digits = 0
     moved = math.ceil(round(amount * 10.0**digits, 6)) / 10.0**digits
     return round(bound + moved if upper else bound - moved, max(digits, 0) + 3)
 
@@ -355,7 +384,9 @@ def _advice(report: Mapping[str, Any]) -> str:
     if report["feasible"] is not False:
         return ""
     changes = "; ".join(map(change_text, report["suggestions"]))
-    return f"to try: {changes}" if changes else "no bound alone, nor all of them by as much, gives it an answer"
+    if changes:
+        return f"to try: {changes}"
+    return "no bound alone, nor all of them by as much, gives it an answer"
 
 
 def change_text(change: Mapping[str, Any]) -> str:
@@ -380,4 +411,6 @@ def _toml(value: object) -> str:
     """Format a text, a list of numbers, or a table of numbers as in a scenario file."""
     if not isinstance(value, dict):
         return json.dumps(value)
-    return f"{{ {', '.join(f'{name} = {number:g}' for name, number in value.items())} }}" if value else "{}"
+    if value:
+        return f"{{ {', '.join(f'{name} = {number:g}' for name, number in value.items())} }}"
+    return "{}"

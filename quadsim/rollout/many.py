@@ -180,7 +180,12 @@ class _Worker:
         if self.pipe in ready or self.process.sentinel in ready:
             self.process.join(0.5)
             code = self.process.exitcode
-            how = "without a row" if code is None else f"by signal {-code}" if code < 0 else f"with exit status {code}"
+            if code is None:
+                how = "without a row"
+            elif code < 0:
+                how = f"by signal {-code}"
+            else:
+                how = f"with exit status {code}"
             return {"verdict": DIED, "reason": f"its process ended {how}"}
         if clock.monotonic() >= self.deadline:
             return {"verdict": TIMEOUT, "reason": f"it took longer than {self._timeout:g} s"}

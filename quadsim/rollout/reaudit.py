@@ -235,7 +235,10 @@ def _constraint_differences(
     for key in _DEMANDS:
         if entry.get(key) != again.get(key):
             yield f"{key} is recorded as {entry.get(key)!r:.80}, and is {again.get(key)!r:.80} in the scenario"
-    rounding = ROUNDING_TILT if limit.signal == "tilt" else ARITHMETIC_TOLERANCE
+    if limit.signal == "tilt":
+        rounding = ROUNDING_TILT
+    else:
+        rounding = ARITHMETIC_TOLERANCE
     sampled = limit.source.plant is None
     whole = sampled or scenario.plant_stride == 1 or not log.control.t.size  # the tables are complete
     alike = ("peak_sampled", "worst_margin_sampled", *(("peak_plant", "worst_margin") if whole else ()))
@@ -250,7 +253,10 @@ def _constraint_differences(
         yield f"worst_margin is recorded as {margin}, and the tables go down to {there:.6g}"
     peak = "peak_sampled" if sampled else "peak_plant"
     if margin is not None:
-        at_peak = None if entry[peak] is None else float(limit.margin(np.array([entry[peak]]))[0])
+        if entry[peak] is None:
+            at_peak = None
+        else:
+            at_peak = float(limit.margin(np.array([entry[peak]]))[0])
         if at_peak is None or not -rounding <= at_peak - margin <= limit.tie:  # of tied peaks the first is recorded
             yield from _recorded("worst_margin", margin, at_peak, f"by its {peak}", rounding)
     beyond = margin is not None and limit.violated(margin)
@@ -280,7 +286,10 @@ def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[
     signal = finding.limit.source
     limit = finding.limit
     seen = finding.time_violated
-    row = 1.0 / scenario.log_rate if scenario.plant_stride > 1 else 0.0
+    if scenario.plant_stride > 1:
+        row = 1.0 / scenario.log_rate
+    else:
+        row = 0.0
     if signal.plant is None or not log.control.t.size or scenario.plant_stride == 1:
         return seen - ARITHMETIC_TOLERANCE, seen + row + ARITHMETIC_TOLERANCE
     t = log.plant.t[:-1]  # the last row ends the flight, and lasts no time
@@ -290,5 +299,8 @@ def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[
 
 def _contradiction(directory: Path, differing: Sequence[str]) -> FileError:
     shown = "; ".join(differing[:MOST_REPORTED])
-    more = f"; and {len(differing) - MOST_REPORTED} more" if len(differing) > MOST_REPORTED else ""
+    if len(differing) > MOST_REPORTED:
+        more = f"; and {len(differing) - MOST_REPORTED} more"
+    else:
+        more = ""
     return FileError(directory, f"is not as it was written: {printable(shown)}{more}")

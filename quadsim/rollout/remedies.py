@@ -65,11 +65,17 @@ def tried(explanation: Mapping[str, Any], flight: Flight, fly: FlyUntil, measure
     until = min(report["time"] + AFTER, scenario.duration)
     unflown = _not_flown(flight, report["time"], until)
     flew_its_law = flight.controller == scenario.controller.type and unflown != _CHANGED_LAW
-    modelling = _modelling(assembly) if flew_its_law and not notes else []
+    if flew_its_law and not notes:
+        modelling = _modelling(assembly)
+    else:
+        modelling = []
     if modelling and not unflown:
         report["loop"] = _loop_report(assembly, measure)
     others = [change for change in report["suggestions"] if change not in modelling]
-    candidates = _reaching_hover(scenario, assembly) if notes else [*modelling, *others]
+    if notes:
+        candidates = _reaching_hover(scenario, assembly)
+    else:
+        candidates = [*modelling, *others]
     if not candidates:
         return report
     if unflown:
@@ -100,7 +106,9 @@ def _not_flown(flight: Flight, time: float, until: float) -> str:
         return "the scenario does not repeat code that was passed in"
     if flight.scenario.controller_at(time) != flight.scenario.controller:
         return _CHANGED_LAW
-    return f"it would take more than {LONGEST_TRIAL:g} s of flight" if until > LONGEST_TRIAL else ""
+    if until > LONGEST_TRIAL:
+        return f"it would take more than {LONGEST_TRIAL:g} s of flight"
+    return ""
 
 
 @dataclass(frozen=True, kw_only=True)

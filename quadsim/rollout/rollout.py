@@ -173,7 +173,10 @@ class Rollout:
     def __repr__(self) -> str:
         scenario = self.scenario
         flown = f"{self.k * scenario.control_period:.2f} of {scenario.duration:g} s flown by {self._law[0]}"
-        ended = "" if self.loop.reason is None else f", {self.loop.reason}"
+        if self.loop.reason is None:
+            ended = ""
+        else:
+            ended = f", {self.loop.reason}"
         return f"<Rollout {scenario.name}: {flown}{ended}>"
 
     def __enter__(self) -> Rollout:
@@ -289,7 +292,9 @@ class Rollout:
                 loss=scenario.lost.limits,
             )
             self._simulate_s += clock.perf_counter() - started
-            return None if log is None else self._flight_of(log, scenario)
+            if log is None:
+                return None
+            return self._flight_of(log, scenario)
 
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
         """Apply an event from the next period on that is not yet observed, like an event of the file.
@@ -398,7 +403,9 @@ def fly_for_table(scenario: Scenario) -> Flight:
     if law is None:
         return rollout.fly()
     flight = rollout.fly_in_core(law)
-    return Rollout(scenario).fly() if flight is None else flight
+    if flight is None:
+        return Rollout(scenario).fly()
+    return flight
 
 
 def started_plain(assembly: Assembly) -> Rollout:

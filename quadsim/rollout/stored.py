@@ -82,7 +82,9 @@ def stored_scenario(directory: Path) -> Scenario:
             data["controller"] = {**fields, "type": "elsewhere:Controller"}
     scenario = parse_scenario(data, source=str(path))
     course = scenario.reference
-    return scenario.altered(reference=course.located(directory)) if isinstance(course, Csv) else scenario
+    if isinstance(course, Csv):
+        return scenario.altered(reference=course.located(directory))
+    return scenario
 
 
 def _drop_gone(data: dict[str, Any]) -> None:

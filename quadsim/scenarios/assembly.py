@@ -187,7 +187,10 @@ class Assembly:
 
         It has what the scenario states, defaults included; what is derived stands in comments.
         """
-        scenario = self.scenario if scenario is None else scenario
+        if scenario is None:
+            scenario = self.scenario
+        else:
+            scenario = scenario
         return scenario.written(self._stating(scenario).altered(events=scenario.events))
 
     def audited(self) -> Assembly:
@@ -254,7 +257,9 @@ class Assembly:
     @property
     def _stated(self) -> dict[str, Any]:
         """The vehicle parameters that `[actual]` states."""
-        return {} if self.scenario.actual is None else self.scenario.actual.overrides()
+        if self.scenario.actual is None:
+            return {}
+        return self.scenario.actual.overrides()
 
     @cached_property
     def effects(self) -> Effects:
@@ -306,7 +311,9 @@ class Assembly:
         initial = self.scenario.initial
         if initial.rotor_speeds is not None:
             return np.array(initial.rotor_speeds)
-        return np.zeros(N_ROTORS) if initial.cold else self.vehicle.hover_speeds
+        if initial.cold:
+            return np.zeros(N_ROTORS)
+        return self.vehicle.hover_speeds
 
     # --- course ------------------------------------------------------------------------------------------------------
 
@@ -336,7 +343,9 @@ class Assembly:
         end = self.course.end
         if isinstance(reference, Csv) and reference.content is not None:
             return None
-        return round(end, 9) if self.scenario.duration < end - 1e-9 and math.isfinite(end) else None
+        if self.scenario.duration < end - 1e-9 and math.isfinite(end):
+            return round(end, 9)
+        return None
 
     @property
     def initial_pose(self) -> Array:
@@ -478,7 +487,10 @@ class Assembly:
     @property
     def autopilot_flown(self) -> dict[str, Any]:
         """What flew the targets: the class of an autopilot passed in, or `built-in`, and the lags that the law knew."""
-        name = "built-in" if self.user_autopilot is None else type(self.user_autopilot).__name__
+        if self.user_autopilot is None:
+            name = "built-in"
+        else:
+            name = type(self.user_autopilot).__name__
         lag = self.scenario.controller.inner_lag or vars(self).get("inner_lag")
         flown: dict[str, Any] = {"name": name}
         if lag is not None:
@@ -533,7 +545,9 @@ class Assembly:
     def with_law_bounds(self, controller: Controller) -> Assembly:
         """Return the assembly with the bounds of a user's controller as constraints of its scenario."""
         scenario = with_law_bounds(self.scenario, controller)
-        return self if scenario is self.scenario else self.of(scenario)
+        if scenario is self.scenario:
+            return self
+        return self.of(scenario)
 
     @property
     def audit_notes(self) -> list[str]:
@@ -637,7 +651,10 @@ class Assembly:
         Raises:
             ParameterError: rotors with inertia would change their speed at once.
         """
-        events = self.scenario.events if events is None else events
+        if events is None:
+            events = self.scenario.events
+        else:
+            events = events
         rotors = self.effects.rotors or RotorDynamics()
         for event in events:
             if isinstance(event, LagChange):
@@ -670,7 +687,9 @@ class Assembly:
     @property
     def sensors(self) -> dict[SensorName, Sensor]:
         """The scenario's sensors."""
-        return {} if self.scenario.sensors is None else self.scenario.sensors.present()
+        if self.scenario.sensors is None:
+            return {}
+        return self.scenario.sensors.present()
 
     @property
     def faults(self) -> tuple[SensorFault, ...]:
@@ -718,4 +737,6 @@ def preferring_core(scenario: Scenario) -> Scenario:
 
 def _solver_of(controller: AnyController) -> str | None:
     """Return the solver that a controller's table states; None for none."""
-    return controller.solver if isinstance(controller, Bounded) else None
+    if isinstance(controller, Bounded):
+        return controller.solver
+    return None

@@ -111,7 +111,9 @@ def scenario_source(name: str) -> Source:
 def source_label(source: Source) -> str:
     """Return what messages call it: a file's name, or the table of variants and its row."""
     file, changes = source
-    return f"{VARIANTS.name}, {changes['name']}" if changes else file.name
+    if changes:
+        return f"{VARIANTS.name}, {changes['name']}"
+    return file.name
 
 
 campaign_names = partial(_names, CAMPAIGNS)

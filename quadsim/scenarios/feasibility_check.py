@@ -78,7 +78,10 @@ def hover_notes(assembly: Assembly) -> tuple[str, ...]:
     lower, upper = assembly.bounds.get("speed", (0.0, math.inf))
     if lower <= hover.min() and hover.max() <= upper:
         return ()
-    bound, side = (upper, "") if hover.max() > upper else (lower, "at least ")
+    if hover.max() > upper:
+        bound, side = (upper, "")
+    else:
+        bound, side = (lower, "at least ")
     return (f"hover needs {span(hover)} rad/s, the bound is {side}{bound:.4g}: no controller can hold altitude",)
 
 
@@ -101,7 +104,10 @@ def floor_notes(assembly: Assembly) -> tuple[str, ...]:
         what = f"The course is below the floor, by up to {-z.min():.3g} m"
     if is_meant:
         return ()
-    since = f", from {t[below][0]:.3g} s on" if not below[0] else ""
+    if not below[0]:
+        since = f", from {t[below][0]:.3g} s on"
+    else:
+        since = ""
     advice = "where z points down, as in PX4 and ArduPilot, the signs of y, z and yaw have to be turned"
     return (f"{what}{since}: z points up here; {advice}.",)
 
@@ -145,7 +151,9 @@ def fitting(assembly: Assembly) -> str:
         ways.append(f"with a response time of {filtered_by / share:.3g} s")
     if len(ways) < 2 and (share := _largest(smaller)) is not None:
         ways.append(f"at {100.0 * share:.0f} % of its size")
-    return f"It would fit {', or '.join(ways)}." if ways else ""
+    if ways:
+        return f"It would fit {', or '.join(ways)}."
+    return ""
 
 
 def _setpoints(scenario: Scenario) -> list[SetpointEvent]:
@@ -171,7 +179,10 @@ def _largest(fits: Callable[[float], bool]) -> float | None:
         return None
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if fits(0.01 * middle) else (low, middle)
+        if fits(0.01 * middle):
+            low, high = (middle, high)
+        else:
+            low, high = (low, middle)
     return 0.01 * low
 
 

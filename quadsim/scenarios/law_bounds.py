@@ -96,7 +96,9 @@ def _alike(matrix: Array, constraint: Constraint) -> tuple[float, float] | None:
     upper = constraint.upper
     if matrix.shape != (N_ROTORS, N_ROTORS) or (matrix != np.eye(N_ROTORS)).any():
         return None
-    return (float(lower[0]), float(upper[0])) if (lower == lower[0]).all() and (upper == upper[0]).all() else None
+    if (lower == lower[0]).all() and (upper == upper[0]).all():
+        return (float(lower[0]), float(upper[0]))
+    return None
 
 
 def _row(constraint: Constraint, i: int, C: Array, D: Array) -> Iterator[Limit]:

@@ -33,7 +33,10 @@ def signal_limits(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit
 
 def with_law_bounds(scenario: Scenario, controller: Controller) -> Scenario:
     """Return the scenario with the bounds of a user's controller as constraints; see `law_limits`."""
-    adapted = controller.law if isinstance(controller, Pilot) else controller
+    if isinstance(controller, Pilot):
+        adapted = controller.law
+    else:
+        adapted = controller
     if not isinstance(adapted, PluginController):
         return scenario
     named = _named(scenario)
@@ -42,7 +45,9 @@ def with_law_bounds(scenario: Scenario, controller: Controller) -> Scenario:
         for limit in law_limits(adapted.law, scenario.audited_names)
         if limit.signal == SUM or limit.signal not in named
     ]
-    return scenario.altered(constraints=[*scenario.constraints, *limits]) if limits else scenario
+    if limits:
+        return scenario.altered(constraints=[*scenario.constraints, *limits])
+    return scenario
 
 
 def audit_notes(scenario: Scenario, vehicle: Vehicle, bounds: Mapping[str, Range], *, audited: bool) -> list[str]:
@@ -101,7 +106,10 @@ def _unnamed(scenario: Scenario, bounds: Mapping[str, Range]) -> Iterator[Limit]
     for signal, (lower, upper) in bounds.items():
         if signal in named:
             continue
-        name = f"controller.{signal}" if signal in scenario.audited_names else signal
+        if signal in scenario.audited_names:
+            name = f"controller.{signal}"
+        else:
+            name = signal
         yield Limit(name=name, signal=signal, lower=lower, upper=upper)
 
 
@@ -116,8 +124,12 @@ def _named(scenario: Scenario) -> set[str]:
 
 def _range(lower: float, upper: float) -> str:
     if math.isinf(lower) or math.isinf(upper):
-        return f"at least {format_number(lower)}" if math.isinf(upper) else f"at most {format_number(upper)}"
-    return f"±{format_number(upper)}" if lower == -upper else f"{format_number(lower)} .. {format_number(upper)}"
+        if math.isinf(upper):
+            return f"at least {format_number(lower)}"
+        return f"at most {format_number(upper)}"
+    if lower == -upper:
+        return f"±{format_number(upper)}"
+    return f"{format_number(lower)} .. {format_number(upper)}"
 
 
 def space_limits(

@@ -45,7 +45,10 @@ def assemble(
     if not isinstance(source, str | Path) and not changes:
         changes = {}
     if seed is not None:
-        changes = {**changes, "seed": seed} if isinstance(changes, Mapping) else [*changes, f"seed={seed}"]
+        if isinstance(changes, Mapping):
+            changes = {**changes, "seed": seed}
+        else:
+            changes = [*changes, f"seed={seed}"]
     if not isinstance(source, str | Path) and changes and not isinstance(changes, Mapping):
         raise InputError("changes of a Scenario are a mapping: {'controller.horizon': 30}")
     if isinstance(source, str | Path) and Path(source).is_dir() and str(source) not in scenario_names():
@@ -116,7 +119,9 @@ class ScenarioFile(Document):
 
     def to_json(self) -> Any:
         """Return its tables."""
-        return tomllib.loads(self.content) if self.data is None else self.data
+        if self.data is None:
+            return tomllib.loads(self.content)
+        return self.data
 
 
 def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directory: Path | None = None) -> Scenario:

@@ -131,7 +131,10 @@ def _lag(assembly: Assembly) -> list[Unmodelled]:
 
 def _ideal_rotors(assembly: Assembly) -> dict[str, Any]:
     """Return the fields with which the plant's rotors follow as good as at once."""
-    stated = {} if assembly.scenario.actual is None else assembly.scenario.actual.overrides()
+    if assembly.scenario.actual is None:
+        stated = {}
+    else:
+        stated = assembly.scenario.actual.overrides()
     absent: dict[str, Any] = {f"actual.{name}": None for name in ("rotor_rise", "rotor_fall") if name in stated}
     if assembly.effects.rotors is not None:  # not 0: rotors with inertia need a lag
         absent |= {"effects.rotors.rise": 0.5 * SHORTEST_LAG, "effects.rotors.fall": 0.5 * SHORTEST_LAG}
@@ -243,7 +246,10 @@ def _forces(spec: Nonlinear | Bounded, assembly: Assembly) -> list[Unmodelled]:
         absent["effects.disturbance"] = None
     if not stated:
         return []
-    estimate = "controller.disturbance" if isinstance(spec, Nonlinear) else "controller.offset_free"
+    if isinstance(spec, Nonlinear):
+        estimate = "controller.disturbance"
+    else:
+        estimate = "controller.offset_free"
     settings = {**_law_with(assembly, "offset_free"), estimate: {}}
     text = " and ".join(stated)
     return [Unmodelled(quantity="", text=text, remedy=_as_written(settings), absent=absent, settings=settings)]
@@ -315,7 +321,10 @@ def _stated_lag(assembly: Assembly) -> float:
 
 def _lag_remedy(spec: AnyController, assembly: Assembly, lag: float) -> list[str]:
     """Return the changes by which a predictive law predicts the lag [s]."""
-    remedy = [] if isinstance(spec, Robust | Nonlinear) else ['controller.type = "robust" or "nonlinear"']
+    if isinstance(spec, Robust | Nonlinear):
+        remedy = []
+    else:
+        remedy = ['controller.type = "robust" or "nonlinear"']
     if assembly.vehicle.rotor_rise is None:
         remedy.append(f"vehicle.rotor_rise = {lag:g}")
     remedy.append('controller.rotor_lag = "vehicle"')

@@ -140,8 +140,14 @@ def located(controller: Any, beside: Path) -> Any:
 
     `beside` is the default folder if the module is there.
     """
-    table = {"type": controller} if isinstance(controller, str) else controller
-    name = table.get("type") if isinstance(table, Mapping) else None
+    if isinstance(controller, str):
+        table = {"type": controller}
+    else:
+        table = controller
+    if isinstance(table, Mapping):
+        name = table.get("type")
+    else:
+        name = None
     if not isinstance(name, str) or ":" not in name:
         return controller
     folder = table.get("folder")
@@ -149,7 +155,9 @@ def located(controller: Any, beside: Path) -> Any:
         return {**table, "folder": str((beside / folder).resolve())}
     first = beside / name.partition(":")[0].partition(".")[0]
     is_beside = "folder" not in table and (first.is_dir() or first.with_suffix(".py").is_file())
-    return {**table, "folder": str(beside.resolve())} if is_beside else controller
+    if is_beside:
+        return {**table, "folder": str(beside.resolve())}
+    return controller
 
 
 class PluginController:
@@ -225,7 +233,10 @@ class PluginController:
         acting, attitude, rates, unseen = (
             None if rows is None else rows.copy() for rows in (now.acting, now.attitude, now.body_rates, now.unseen)
         )
-        motion = None if now.motion is None else now.motion.read_only()
+        if now.motion is None:
+            motion = None
+        else:
+            motion = now.motion.read_only()
         given = replace(now, acting=acting, attitude=attitude, body_rates=rates, motion=motion, unseen=unseen)
         named = state.copy().view(State)
         answer: Any = self.law.step(given, named, reference.copy())
@@ -288,7 +299,10 @@ def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginC
             try:
                 inspect.signature(code).bind(None, None, None, **spec.settings)
             except TypeError as error:
-                what = "bound method" if inspect.ismethod(code) else "function"
+                if inspect.ismethod(code):
+                    what = "bound method"
+                else:
+                    what = "function"
                 given = f"the {what} {code.__qualname__}{inspect.signature(code)}"
                 raise InputError(f"controller must be {_STEP}; got {given}: {error}") from error
             law = SimpleNamespace(step=functools.partial(code, **spec.settings), name=code.__name__)
@@ -302,7 +316,10 @@ def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginC
 def make_force(force: Any, spec: PluginForce, vehicle: Vehicle, rng: np.random.Generator) -> Force:
     """Return the force of a function force(time, state), a callable object, or a class of such; see `make_law`."""
     if isinstance(code := _code_of(force), type):
-        force = force if code is type(force) else _call(code, spec, {"vehicle": vehicle}, rng=rng)
+        if code is type(force):
+            force = force
+        else:
+            force = _call(code, spec, {"vehicle": vehicle}, rng=rng)
     else:
         _call(inspect.signature(code).bind, spec, dict.fromkeys(("time", "state")))
         force = functools.update_wrapper(functools.partial(code, **spec.settings), code)
@@ -325,7 +342,10 @@ def import_plugin(spec: Plugin | PluginForce) -> Any:
     Raises:
         InputError: it does not exist, or its module cannot be imported.
     """
-    place = spec.type if ":" in spec.type else metadata.entry_points(group=ENTRY_POINTS)[spec.type].value
+    if ":" in spec.type:
+        place = spec.type
+    else:
+        place = metadata.entry_points(group=ENTRY_POINTS)[spec.type].value
     module, _, attribute = place.partition(":")
     folders = [*filter(None, [spec.folder]), str(Path.cwd())]
     top = module.partition(".")[0]
@@ -393,7 +413,10 @@ def _digests(files: Iterable[str]) -> dict[str, str]:
 
 def _no_module(module: str, folders: Sequence[str], table: str, error: BaseException) -> InputError:
     absent = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
-    where = f"; it is looked for among what is installed, and in {', '.join(folders)}" if absent else ""
+    if absent:
+        where = f"; it is looked for among what is installed, and in {', '.join(folders)}"
+    else:
+        where = ""
     return InputError(f"{table}.type: {module} cannot be imported: {reason_of(error)}{where}")
 
 
@@ -405,7 +428,10 @@ def refer_to(law: object, horizon: int = 1) -> Plugin:
     if file is not None and not file.startswith(_INSTALLED):
         folder = str(Path(file).resolve().parents[code.__module__.count(".") + file.endswith("__init__.py")])
     place = f"{code.__module__}:{code.__qualname__.replace('<locals>.', '').replace('<lambda>', 'law')}"
-    settings = law.keywords if isinstance(law, functools.partial) else {}
+    if isinstance(law, functools.partial):
+        settings = law.keywords
+    else:
+        settings = {}
     return Plugin(type=place, horizon=horizon, folder=folder, settings=settings)
 
 
@@ -422,14 +448,21 @@ def require_importable(law: object, what: str = "controller") -> None:
 
 def _code_of(law: Any) -> Any:
     """Return the class or function of a law, directly or in a partial; the class of an object."""
-    code = law.func if isinstance(law, functools.partial) else law
+    if isinstance(law, functools.partial):
+        code = law.func
+    else:
+        code = law
     if isinstance(law, functools.partial) and law.args:
         raise ParameterError("", "controller", law, "a partial with keyword arguments only")
-    return code if isinstance(code, type) or inspect.isroutine(code) else type(code)
+    if isinstance(code, type) or inspect.isroutine(code):
+        return code
+    return type(code)
 
 
 def _table(spec: Plugin | PluginForce) -> str:
-    return "forces" if isinstance(spec, PluginForce) else "controller"
+    if isinstance(spec, PluginForce):
+        return "forces"
+    return "controller"
 
 
 def reason_of(error: BaseException) -> str:
@@ -438,4 +471,6 @@ def reason_of(error: BaseException) -> str:
     text = described(error)
     ours = last.filename in (__file__, border.__file__, inspect.__file__, importlib.__file__)
     ours = ours or "<frozen" in last.filename
-    return text if ours or isinstance(error, SyntaxError) else f"{text} ({last.filename}, line {last.lineno})"
+    if ours or isinstance(error, SyntaxError):
+        return text
+    return f"{text} ({last.filename}, line {last.lineno})"

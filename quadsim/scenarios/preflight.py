@@ -86,7 +86,10 @@ def _check_floor(assembly: Assembly) -> None:
     ground = assembly.scenario.effects.ground
     sinking = -touching_speed(state, np.radians(initial.body_rates), shape)
     if sinking > _RESTING and ground is not None and ground.contact:
-        name = "velocity" if initial.velocity[2] < 0.0 else "body_rates"
+        if initial.velocity[2] < 0.0:
+            name = "velocity"
+        else:
+            name = "body_rates"
         rule = f"such that no part on the floor moves into it: one does, at {sinking:.3g} m/s"
         raise ParameterError("initial", name, list(getattr(initial, name)), rule)
 
@@ -100,6 +103,9 @@ def _check_space(assembly: Assembly) -> None:
     for limit in limits:
         clear = float(limit.shape.clearance(np.zeros(1), start)[0]) - limit.radius
         if limit.start <= 0.0 and limit.violated(clear):
-            side = "inside" if isinstance(limit.shape, Region) else "clear of"
+            if isinstance(limit.shape, Region):
+                side = "inside"
+            else:
+                side = "clear of"
             ball = f"the radius of {limit.radius:.3g} m of the ball that represents the vehicle"
             raise ParameterError("initial", "position", start[0].tolist(), f"{side} {limit.name}, by {ball}")

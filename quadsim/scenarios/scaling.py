@@ -54,11 +54,15 @@ class Scale:
         """
         of_length, of_time = _POWERS[unit]
         factor = self.length**of_length * self.time**of_time
-        return value if factor == 1.0 else significant(factor * value)
+        if factor == 1.0:
+            return value
+        return significant(factor * value)
 
     def height(self, value: float) -> float:
         """Return a height above the world's origin [m] at the scale."""
-        return significant(self.number(value, "m") + self.lift) if self.lift else self.number(value, "m")
+        if self.lift:
+            return significant(self.number(value, "m") + self.lift)
+        return self.number(value, "m")
 
 
 def significant(value: float) -> float:
@@ -69,7 +73,9 @@ def significant(value: float) -> float:
 def leading_unit(description: str | None) -> str:
     """Return the unit that a field's description begins with; `-` where it has none."""
     text = description or ""
-    return text[1 : text.index("]")] if text.startswith("[") else "-"
+    if text.startswith("["):
+        return text[1 : text.index("]")]
+    return "-"
 
 
 def scaled_table(table: Any, scale: Scale) -> Any:
@@ -118,12 +124,17 @@ def scaled_limit(limit: Limit, scale: Scale) -> Limit:
     def bound(value: float) -> float:
         if math.isinf(value):
             return value
-        return scale.height(value) if limit.signal == "z" else scale.number(value, limit.unit)
+        if limit.signal == "z":
+            return scale.height(value)
+        return scale.number(value, limit.unit)
 
     lower = bound(limit.lower)
     upper = bound(limit.upper)
     start = scale.number(limit.start, "s")
-    stop = limit.stop if math.isinf(limit.stop) else scale.number(limit.stop, "s")
+    if math.isinf(limit.stop):
+        stop = limit.stop
+    else:
+        stop = scale.number(limit.stop, "s")
     return replace(limit, lower=lower, upper=upper, start=start, stop=stop, tolerance=None, tolerance_sampled=None)
 
 

@@ -35,7 +35,9 @@ def named(scenario: Scenario, controller: object, forces: Sequence[object] = ())
     if forces:
         specs = [*scenario.forces, *(refer_to(force) for force in forces)]
         changes["forces"] = [{name: part for name, part in plain(spec).items() if name != "horizon"} for spec in specs]
-    return scenario.replace(changes) if changes else scenario
+    if changes:
+        return scenario.replace(changes)
+    return scenario
 
 
 def importable(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:
@@ -88,7 +90,10 @@ def set_up(
     Raises:
         InputError: the controller, a force or the reference cannot be set up.
     """
-    assembly = assembly if reference is None else following(assembly, reference)
+    if reference is None:
+        assembly = assembly
+    else:
+        assembly = following(assembly, reference)
     assembly.user_autopilot = autopilot
     scenario = assembly.scenario
     law = None

@@ -165,7 +165,10 @@ def _ground(spec: mujoco.MjSpec) -> None:
         spec.option.disableflags &= ~int(flag)
     for name in (FLOOR, "battery", *FOOT_NAMES, *DISC_NAMES):
         geom = spec.geom(name)
-        geom.contype, geom.conaffinity = (_MEETS, 0) if name == FLOOR else (0, _MEETS)
+        if name == FLOOR:
+            geom.contype, geom.conaffinity = (_MEETS, 0)
+        else:
+            geom.contype, geom.conaffinity = (0, _MEETS)
         geom.solref[: len(_STIFFNESS)] = _STIFFNESS
         geom.friction = _FRICTION
 
@@ -216,8 +219,15 @@ def obstacle_body(obstacle: Obstacle) -> str:
 
 def _strip(spec: mujoco.MjSpec, *, contact: bool) -> None:
     """Leave what moves: one free body, its rotors, what it stands on, and of each step only what acts on it."""
-    keep = {FLOOR, "battery", *FOOT_NAMES, *DISC_NAMES} if contact else set()
-    arms = [] if contact else [spec.body(name) for name in ARM_NAMES]  # with what hangs on them
+    if contact:
+        keep = {FLOOR, "battery", *FOOT_NAMES, *DISC_NAMES}
+    else:
+        keep = set()
+    # with what hangs on them
+    if contact:
+        arms = []
+    else:
+        arms = [spec.body(name) for name in ARM_NAMES]
     for element in [*arms, *spec.cameras, *spec.lights, *spec.sensors, spec.site(IMU)]:
         spec.delete(element)
     for geom in list(spec.geoms):

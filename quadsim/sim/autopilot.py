@@ -105,7 +105,10 @@ class AutopilotSettings:
         assert usual.rate is not None
         rate = usual.rate
         usual = filled(usual, delay=1.0 / rate)
-        filtering = 1.0 / (math.tau * usual.gyro_cutoff) if usual.gyro_cutoff else 0.0
+        if usual.gyro_cutoff:
+            filtering = 1.0 / (math.tau * usual.gyro_cutoff)
+        else:
+            filtering = 0.0
         lag = (vehicle.rotor_rise or 0.0) + filtering + (usual.delay or 0.0) + 0.5 / rate
         w = min(FASTEST_RATE_LOOP, (1.0 + LARGEST_D) / (2.0 * RATE_LOOP_DAMPING * lag))
         p = w * max(w * lag, 0.5 / RATE_LOOP_DAMPING)
@@ -312,7 +315,10 @@ def _fly_target(plant: Plant, autopilot: AutopilotLoop, target: Array) -> None:
         attitude, rates = plant.attitude
         return autopilot.speeds(plant.time, target, rates, plant.speeds, attitude)
 
-    struct = autopilot.engage(target, plant.speeds) if isinstance(autopilot, CompiledLoop) else None
+    if isinstance(autopilot, CompiledLoop):
+        struct = autopilot.engage(target, plant.speeds)
+    else:
+        struct = None
     loop = struct or InnerStruct(kind=LoopKind.OUTSIDE)
     loop.until = 0
     loop.stride = stride

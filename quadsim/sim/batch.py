@@ -138,7 +138,10 @@ class PlantBatch:
             flight.loop = ctypes.addressof(struct)
         rows.row = 0
         flight.period = self.steps
-        flight.sensing = None if sensing is None else ctypes.addressof(sensing)
+        if sensing is None:
+            flight.sensing = None
+        else:
+            flight.sensing = ctypes.addressof(sensing)
         flight.bounds = None
         flight.bounded = 0
         if margins is not None:
@@ -261,7 +264,10 @@ class PlantBatch:
             return
         for place in np.flatnonzero(self._fields["steps"]).tolist():
             at = self._places[place]
-            problem = check_command(commands[place]) if at is not None and at.loop is None else None
+            if at is not None and at.loop is None:
+                problem = check_command(commands[place])
+            else:
+                problem = None
             if problem is not None:
                 ended[place] = CommandError(problem, time=self.plant(place).time)
                 self._fields["steps"][place] = 0

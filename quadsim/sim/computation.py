@@ -125,7 +125,10 @@ def times_by_solver(per_iteration: Mapping[str, float]) -> dict[str, float]:
                 find_solver(name)
             except UnknownNameError as error:
                 known = ", ".join(sorted({*_COUNT_THEMSELVES, *ALIASES, *solver_entries()}))
-                rule = f"absent: {error}" if name in SUCCESSORS else f"absent, or one of {known}"
+                if name in SUCCESSORS:
+                    rule = f"absent: {error}"
+                else:
+                    rule = f"absent, or one of {known}"
                 raise ParameterError("computation.per_iteration", name, seconds, rule) from None
         own_name = ALIASES.get(name, name)
         if own_name in times:

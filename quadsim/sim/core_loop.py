@@ -67,7 +67,9 @@ def fly_in_core(
                     return None
     except FlightError:
         return None
-    return flight.log() if law.accepted else None
+    if law.accepted:
+        return flight.log()
+    return None
 
 
 class _Flight:
@@ -90,7 +92,10 @@ class _Flight:
         self._start = plant.physics
         self._rotors = plant.speeds
         self._truth = np.empty((periods, N_STATES))
-        self._state = self._truth if navigation is None else np.empty_like(self._truth)
+        if navigation is None:
+            self._state = self._truth
+        else:
+            self._state = np.empty_like(self._truth)
         self._step_s = np.zeros(periods)
         self._yaw = float(plant.state()[INDEX["yaw"]])
         self._lowest = float(self._start[3])
@@ -112,7 +117,10 @@ class _Flight:
         navigation = self._navigation
         reference = self._reference
         truth = plant.state()
-        state = truth if navigation is None else navigation.state()
+        if navigation is None:
+            state = truth
+        else:
+            state = navigation.state()
         self._truth[k] = truth
         self._state[k] = state
         self._lowest = min(self._lowest, float(reference[k, _HEIGHT]))
@@ -127,7 +135,10 @@ class _Flight:
         self._step_s[k] = clock.perf_counter() - started
         if not answered:
             return False
-        sensing = None if navigation is None else navigation.begin(self._steps)
+        if navigation is None:
+            sensing = None
+        else:
+            sensing = navigation.begin(self._steps)
         plant.hold(self._law.commands[k + 1], self._steps, sensing=sensing)
         if navigation is not None:
             navigation.record(plant.flown[k * self._steps : (k + 1) * self._steps])

@@ -314,8 +314,14 @@ class ClosedLoop:
     def _end(self, error: FlightError) -> None:
         """Note why the flight ended; not the error itself, which would hold all that was flown in a cycle."""
         self.reason = str(error)
-        self._criterion = error.criterion if isinstance(error, LostError) else None
-        self._traceback = error.traceback if isinstance(error, RaisedError) else ()
+        if isinstance(error, LostError):
+            self._criterion = error.criterion
+        else:
+            self._criterion = None
+        if isinstance(error, RaisedError):
+            self._traceback = error.traceback
+        else:
+            self._traceback = ()
 
     def _observe(self) -> Observation:
         k = self.k
@@ -324,14 +330,23 @@ class ClosedLoop:
         if self.before is not None:
             self.before(k)
         truth = plant.state()
-        state = truth.copy() if navigation is None else navigation.state()
-        attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
+        if navigation is None:
+            state = truth.copy()
+        else:
+            state = navigation.state()
+        if navigation is None:
+            attitude, body_rates = plant.attitude
+        else:
+            attitude, body_rates = navigation.attitude
         rows = self.followed(float(state[INDEX["yaw"]]))
         row = rows[0]
         preview = rows[1:]
         phase = Phase.FLYING
         if self._ground is not None:
-            since = self._start[None] if self.last is None else self.last.steps["physics"]
+            if self.last is None:
+                since = self._start[None]
+            else:
+                since = self.last.steps["physics"]
             phase = self._ground.advance(since[:, 0], physics_to_state(since), preview)
         self._lowest = min(self._lowest, float(row[_HEIGHT]))
         if self._loss is not None and phase is not Phase.CRASHED:
@@ -358,8 +373,14 @@ class ClosedLoop:
         try:
             with user_code(lambda error: InputError(described(error))):
                 plans = np.stack([sample.command.plan for sample in samples])
-                foreseen = controller.foresee(states, plans[:, 0]) if isinstance(controller, Foreseeing) else None
-                predicted = controller.predict(states, plans) if isinstance(controller, Predicting) else None
+                if isinstance(controller, Foreseeing):
+                    foreseen = controller.foresee(states, plans[:, 0])
+                else:
+                    foreseen = None
+                if isinstance(controller, Predicting):
+                    predicted = controller.predict(states, plans)
+                else:
+                    predicted = None
                 if predicted is None:
                     return _Prediction(len(samples), None, foreseen)
                 if foreseen is None:
@@ -396,7 +417,10 @@ class ClosedLoop:
             with _ending_flight(now.time):
                 command = self.controller.step(*self._asked(observed))
             step_s = clock.perf_counter() - started
-        delay = 0.0 if computation is None else computation.taken(now.time, command, self._draws)
+        if computation is None:
+            delay = 0.0
+        else:
+            delay = computation.taken(now.time, command, self._draws)
         self.answered = max(self.answered, now.time + delay)
         # From the start of the period in which it arrives, this one where none spends a whole period under way.
         wait = physics_steps(delay, plant.timestep) - self._under_way * steps
@@ -420,7 +444,10 @@ class ClosedLoop:
         before = plant.physics
         on_ground = now.phase in (Phase.LANDED, Phase.ARMED)
         plant.begin(steps)
-        sensing = None if self._navigation is None else self._navigation.begin(steps)
+        if self._navigation is None:
+            sensing = None
+        else:
+            sensing = self._navigation.begin(steps)
         for loop, row, count in self._schedule.popleft():
             if count > 0:
                 self._hold(loop, row, count, sensing)
@@ -428,7 +455,10 @@ class ClosedLoop:
             self._navigation.record(plant.flown, on_ground=on_ground)
         self._acting = acting
         piloted = takes_targets(self._inner)
-        self._speeds = plant.flown["commands"][-1].copy() if piloted else acting
+        if piloted:
+            self._speeds = plant.flown["commands"][-1].copy()
+        else:
+            self._speeds = acting
         return Period(
             observation=observed,
             command=command,
@@ -458,11 +488,17 @@ class ClosedLoop:
             if fresh:
                 self._flying = flying = _Flying(inner, inner_steps(inner.rate, plant.timestep))
             assert flying is not None
-            struct = flying.struct if flying.engage is None else flying.engage(row, plant.speeds) or flying.struct
+            if flying.engage is None:
+                struct = flying.struct
+            else:
+                struct = flying.engage(row, plant.speeds) or flying.struct
         measured = self._navigation if flying.measures else None
 
         def ask() -> Array:
-            attitude, rates = plant.attitude if measured is None else measured.sensed(plant.physics)
+            if measured is None:
+                attitude, rates = plant.attitude
+            else:
+                attitude, rates = measured.sensed(plant.physics)
             with _ending_flight(plant.time):
                 return np.array(inner.speeds(plant.time, row.copy(), rates, plant.speeds, attitude))
 

@@ -147,11 +147,17 @@ def violated(tolerances: Array, required: NDArray[np.bool_], smallest: Array, at
 def _step_at(time: float, timestep: float, *, after: bool) -> int:
     """Return the first physics step of a window that starts at a time [s], or the last of one that stops there."""
     if math.isinf(time):
-        return _NEVER if time > 0.0 else -_NEVER
+        if time > 0.0:
+            return _NEVER
+        return -_NEVER
     near = max(round(time / timestep), -_NEVER)
     steps = np.arange(near - 2, near + 3)
     times = np.round(steps * timestep, 9)
-    inside = steps[times >= time - 1e-9] if after else steps[times <= time + 1e-9]  # as `Limit.holds_at`
+    # as `Limit.holds_at`
+    if after:
+        inside = steps[times >= time - 1e-9]
+    else:
+        inside = steps[times <= time + 1e-9]
     return int(inside[0] if after else inside[-1])
 
 
@@ -164,8 +170,14 @@ def _translate(limit: Limit, bound: Any) -> bool:
         return False
     if name == SUM:
         for k, (term, factor) in enumerate((limit.terms or {}).items()):
-            bound.index[k] = _SPEEDS[term] if term in _SPEEDS else INDEX[term]
-            bound.factor[k] = factor if term in _SPEEDS else factor * _scale(INDEX[term])
+            if term in _SPEEDS:
+                bound.index[k] = _SPEEDS[term]
+            else:
+                bound.index[k] = INDEX[term]
+            if term in _SPEEDS:
+                bound.factor[k] = factor
+            else:
+                bound.factor[k] = factor * _scale(INDEX[term])
             bound.terms = k + 1
         bound.signal = constant("SIGNAL_SUM")
     elif name in INDEX:

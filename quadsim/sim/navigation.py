@@ -82,7 +82,10 @@ class Navigation:
             Sampler(name, sensor, timestep=timestep, faults=tuple(faults), rng=generators[name])
             for name, sensor in {**sensors, **perfect}.items()
         )
-        self.filter = None if estimator is None else ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
+        if estimator is None:
+            self.filter = None
+        else:
+            self.filter = ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
 
     def has(self, sensor: SensorName) -> bool:
         """Whether a sensor takes samples, and so may fail."""
@@ -167,7 +170,10 @@ class Navigation:
                     row[MEASURED[sampler.name]] = struct.held
         quaternion = row[PHYSICS["attitude"]]
         rates = row[PHYSICS["body_rates"]]
-        sign = -1.0 if quaternion @ self.attitude[0] < 0.0 else 1.0
+        if quaternion @ self.attitude[0] < 0.0:
+            sign = -1.0
+        else:
+            sign = 1.0
         self.attitude = sign * quaternion, rates
         if angles is None:
             state: Array = physics_to_state(row[None])[0]
@@ -183,7 +189,9 @@ class Navigation:
     @property
     def tallies(self) -> dict[SensorName, Tally]:
         """Counts of each sensor's samples in the estimator; empty without one."""
-        return {} if self.filter is None else self.filter.tallies
+        if self.filter is None:
+            return {}
+        return self.filter.tallies
 
     def _prepare(self, stop: int) -> None:
         """Make room for the samples taken before a physics step, with their errors; drop those no longer needed.
@@ -200,7 +208,10 @@ class Navigation:
             values, fates = self._samples[k]
             first = -(-start // struct.stride)
             end = -(-stop // struct.stride)
-            heard = struct.heard if self.filter is None else min(struct.heard, self._passed[k])
+            if self.filter is None:
+                heard = struct.heard
+            else:
+                heard = min(struct.heard, self._passed[k])
             drop = max(min(heard, first) - struct.first, 0)
             errors, fresh = sampler.draw(first, end - first)
             values = np.concatenate([values[drop:], errors])

@@ -198,7 +198,10 @@ def one_period(sample: Period, timestep: float) -> PeriodLog:
     moment = sample.observation.moment
     steps = sample.steps
     assert moment.acting is not None
-    target = None if sample.target is None else sample.target[None, :4]
+    if sample.target is None:
+        target = None
+    else:
+        target = sample.target[None, :4]
     t = moment.time + timestep * np.arange(len(steps) + 1)
     thrust = None
     if target is not None:
@@ -261,7 +264,9 @@ def _control_log(samples: Sequence[Period], initial_speeds: Array, period: float
 def _thrusts(sample: Period) -> Array:
     """(M,) collective thrust over the steps of a period [N]; NaN where no autopilot has a target."""
     thrust: Array = sample.steps["thrust"]
-    return np.full(len(thrust), math.nan) if sample.target is None else thrust
+    if sample.target is None:
+        return np.full(len(thrust), math.nan)
+    return thrust
 
 
 def _targets(samples: Sequence[Period]) -> Array | None:

@@ -103,7 +103,10 @@ class Plant:
         air = effects.air or Air()
         self._reweighed = self._load != _AS_IN_THE_FILE or any(isinstance(change, LOADING) for change in changes)
         self._moving = [obstacle for obstacle in obstacles if obstacle.moves]
-        self._speed_range = (vehicle.speed_min, vehicle.speed_max) if limit_speeds else (0.0, math.inf)
+        if limit_speeds:
+            self._speed_range = (vehicle.speed_min, vehicle.speed_max)
+        else:
+            self._speed_range = (0.0, math.inf)
         self._yaw = YawTurns(0.0)
         self._wind = wind
         self._own = tuple(forces)
@@ -142,7 +145,10 @@ class Plant:
             bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
             assert self.model.body_mocapid[bodies].tolist() == list(range(len(bodies)))  # the core writes them in order
         self._changes = self._scheduled(changes)
-        rng = rng if rng is not None else np.random.default_rng(0)
+        if rng is not None:
+            rng = rng
+        else:
+            rng = np.random.default_rng(0)
         self._reset_to: tuple[bytes, Array] = b"", np.zeros(_MOTION)
         self._seed(rng)
         self._struct = self._make_struct()
@@ -192,7 +198,10 @@ class Plant:
         # A generator each, so that neither draw changes the other's, however time is cut.
         self._generators = rng, rng.spawn(1)[0]
         disturbance = self.effects.disturbance
-        self._lasting = None if disturbance is None else disturbance.lasting(self.timestep, rng)
+        if disturbance is None:
+            self._lasting = None
+        else:
+            self._lasting = disturbance.lasting(self.timestep, rng)
         self._starts = [generator.bit_generator.state for generator in self._generators]
         self._ahead = [NormalsAhead(generator) for generator in self._generators]
 
@@ -223,8 +232,14 @@ class Plant:
             self._motion[:] = motion
         struct.now = 0
         struct.time = 0.0
-        struct.charge = 0.0 if self.effects.battery is None else self.effects.battery.charge
-        struct.speeds[:] = self.vehicle.hover_speeds if speeds is None else np.array(speeds, float)
+        if self.effects.battery is None:
+            struct.charge = 0.0
+        else:
+            struct.charge = self.effects.battery.charge
+        if speeds is None:
+            struct.speeds[:] = self.vehicle.hover_speeds
+        else:
+            struct.speeds[:] = np.array(speeds, float)
         struct.before[:] = motion[_POSE:]
         self._pushes: Array = np.empty((0, 6))
         self._tell()
@@ -283,7 +298,10 @@ class Plant:
             v.rotor_moment[:] = air.rotor_moment or (0.0, 0.0)
             v.rate_damping[:] = air.rate_damping or (0.0, 0.0, 0.0)
             if air.inflow_moment is not None:  # of which MuJoCo's ellipsoid gives a part
-                by_body = (0.0, 0.0) if air.body_drag is None else munk_moment(air.body_drag, air.density)
+                if air.body_drag is None:
+                    by_body = (0.0, 0.0)
+                else:
+                    by_body = munk_moment(air.body_drag, air.density)
                 v.inflow_moment[:] = np.subtract(air.inflow_moment, by_body)
             v.inflow = air.inflow or 0.0
             v.linear_drag[:] = air.linear_drag
@@ -318,7 +336,10 @@ class Plant:
         v.control = data.ctrl.ctypes.data
         if air is not None and air.body_drag is not None:
             v.fluid = data.qfrc_fluid.ctypes.data
-            v.wind = self.model.opt.wind.ctypes.data if self._wind is not None else None
+            if self._wind is not None:
+                v.wind = self.model.opt.wind.ctypes.data
+            else:
+                v.wind = None
         if self._moving:
             v.obstacles = data.mocap_pos.ctypes.data
             v.mocaps = len(self._moving)
@@ -426,7 +447,10 @@ class Plant:
         fly = core_library().quadsim_fly
         while self._step < end:
             why = fly(v, loop, sensing, rows, command.ctypes.data, end)
-            complaint = core_library().quadsim_complaint() if why == End.FAILED else b""
+            if why == End.FAILED:
+                complaint = core_library().quadsim_complaint()
+            else:
+                complaint = b""
             self.check(why, loop, complaint)
             if why == End.DUE:
                 assert loop is not None

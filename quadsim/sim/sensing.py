@@ -96,8 +96,14 @@ class Sensor:
 
 def in_si(name: SensorName, value: float | Sequence[float]) -> Vector3:
     """Return a number of a sensor's settings, or one per axis, as three in SI units."""
-    x, y, z = [value] * 3 if isinstance(value, float | int) else value
-    unit = math.radians(1.0) if name in (SensorName.ATTITUDE, SensorName.RATES) else 1.0
+    if isinstance(value, float | int):
+        x, y, z = [value] * 3
+    else:
+        x, y, z = value
+    if name in (SensorName.ATTITUDE, SensorName.RATES):
+        unit = math.radians(1.0)
+    else:
+        unit = 1.0
     return unit * x, unit * y, unit * z
 
 
@@ -141,7 +147,9 @@ MEASURED: Final = {name: PHYSICS["body_rates" if name is SensorName.RATES else n
 def truth(name: SensorName, physics: Array) -> Array:
     """Return a perfect sensor's samples (M, 3) of MuJoCo's states (M, 14)."""
     values = physics[:, MEASURED[name]]
-    return quaternion_to_euler(values) if name is SensorName.ATTITUDE else values.copy()
+    if name is SensorName.ATTITUDE:
+        return quaternion_to_euler(values)
+    return values.copy()
 
 
 class Sampler:

@@ -76,7 +76,9 @@ class CampaignResult(Result):
     @property
     def exit_status(self) -> int:
         """See `Result.exit_status`; 1 where the flights do not support a requirement."""
-        return EXIT_DONE if all(judgement.holds for judgement in self.judgements) else EXIT_FAILED
+        if all(judgement.holds for judgement in self.judgements):
+            return EXIT_DONE
+        return EXIT_FAILED
 
     def verdicts(self) -> tuple[str, Cases]:
         """See `quadsim.console.junit.Judged`."""
@@ -98,7 +100,9 @@ class CampaignResult(Result):
     def small_plot(self) -> Figure | None:
         """See `Result.small_plot`: worst margins and relevant parameters."""
         figure = campaign_overview(self.table, self.summary, "")
-        return figure if figure.panels else None
+        if figure.panels:
+            return figure
+        return None
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
@@ -165,7 +169,10 @@ def fly_campaign(
         # flights by the processor that flew them; those that raised, or that no process came back from, have none
         processors = times["machine"].drop_null().to_pylist()
         manifest["machines"] = dict(sorted(Counter(processors).items()))
-        manifest["status"] = "complete" if progress.wanted == spec.flights else "stopped"
+        if progress.wanted == spec.flights:
+            manifest["status"] = "complete"
+        else:
+            manifest["status"] = "stopped"
         manifest["files"] = {TIMES_FILE: digest_of(directory / TIMES_FILE)}
         records.write(manifest, files)
 
@@ -199,7 +206,9 @@ class _Progress:
     @property
     def missing(self) -> list[int]:
         """Return the missing flights."""
-        return [] if self._is_sure() else list(np.flatnonzero(self.outcomes < 0).tolist())
+        if self._is_sure():
+            return []
+        return list(np.flatnonzero(self.outcomes < 0).tolist())
 
     def fly(self, workers: int | None, cluster: str | None) -> None:
         """Fly missing flights until the campaign is complete or the interval is narrow enough.
@@ -273,7 +282,10 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
     """Return a flight of a campaign directory, by default the worst; see `quadsim.replay`."""
     plan = stored_plan(directory)
     table = read_flights(directory / FLIGHTS_FILE, plan.schema)
-    number = worst_flight(table) if number is None else number
+    if number is None:
+        number = worst_flight(table)
+    else:
+        number = number
     flights = table["flight"].to_pylist()
     if number not in flights:
         raise ParameterError("", "--flight", number, f"one of the flights 0 to {flights[-1]} of {directory}")
@@ -298,7 +310,9 @@ class Replay(Result):
     @property
     def exit_status(self) -> int:
         """See `Result.exit_status`; 1 if its numbers differ from the campaign's."""
-        return EXIT_FAILED if self.differing else EXIT_DONE
+        if self.differing:
+            return EXIT_FAILED
+        return EXIT_DONE
 
     def shown(self) -> Shown:
         """See `Result.shown`."""

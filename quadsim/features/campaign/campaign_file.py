@@ -294,7 +294,10 @@ class Draws:
 
     def __init__(self, spec: CampaignFile) -> None:
         self._spec = spec
-        self._spread = None if spec.sampling == "random" else _spread_points(spec)
+        if spec.sampling == "random":
+            self._spread = None
+        else:
+            self._spread = _spread_points(spec)
         self._repeats: dict[str, int] = {}  # for how many flights in a row each grid keeps its value
         repeat = 1
         for entry in reversed(spec.vary):

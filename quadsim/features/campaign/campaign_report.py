@@ -108,13 +108,19 @@ def definition_sentence(summary: CampaignSummary, failure: Sequence[str]) -> str
 
 def driver_sentence(summary: CampaignSummary) -> str:
     """Return the parameters on which the worst margin, or else failure, depends significantly, strongest first."""
-    outcome = "worst_margin" if any(related["worst_margin"] for related in drivers(summary).values()) else "failed"
+    if any(related["worst_margin"] for related in drivers(summary).values()):
+        outcome = "worst_margin"
+    else:
+        outcome = "failed"
     sure = {
         name: related[outcome]
         for name, related in drivers(summary).items()
         if related[outcome] and min(related[outcome]["p_holm"], related[outcome]["p_xi_holm"]) < ALPHA
     }
-    noun = "The worst margin" if outcome == "worst_margin" else "Failure"
+    if outcome == "worst_margin":
+        noun = "The worst margin"
+    else:
+        noun = "Failure"
     listed = ", ".join(f"{name} (rho {related['rho']:+.2f}, xi {related['xi']:.2f})" for name, related in sure.items())
     return f"{noun} depends on {listed or 'no varied parameter beyond chance'}."
 
@@ -215,7 +221,9 @@ def replay_command(directory: str, flight: int) -> str:
 
 
 def _drawn(value: Any) -> str:
-    return format_number(value) if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return format_number(value)
+    return str(value)
 
 
 def _shares(share: Mapping[str, Any]) -> tuple[str, str]:
@@ -330,9 +338,17 @@ def write_report(
         for name in _FILES
         if name == SUMMARY_FILE or any((d / name).is_file() for d in (directory, campaign))
     }
-    mark = Mark.NONE if not summary["flights"] else Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
+    if not summary["flights"]:
+        mark = Mark.NONE
+    elif summary["events"]["failure"]["count"]:
+        mark = Mark.BAD
+    else:
+        mark = Mark.GOOD
     verdict = Cell(text=sentence, mark=mark)
-    ended = "complete" if summary["flights"] == spec.flights else "stopped"
+    if summary["flights"] == spec.flights:
+        ended = "complete"
+    else:
+        ended = "stopped"
     status = f"Status: {ended}, {summary['flights']} of {count_of(spec.flights, 'flight')} flown."
     notes = [definition_sentence(summary, spec.failure), spec.description, status]
     page = render_page("campaign", spec.name, sections, notes=[*filter(None, notes)], verdict=verdict, files=files)
@@ -341,7 +357,9 @@ def write_report(
 
 
 def _plots(key: str, title: str, panels: Sequence[Panel], note: str) -> tuple[Plot, ...]:
-    return (to_plot(Figure(key=key, title=title, panels=tuple(panels)), note=note),) if panels else ()
+    if panels:
+        return (to_plot(Figure(key=key, title=title, panels=tuple(panels)), note=note),)
+    return ()
 
 
 def campaign_overview(table: pa.Table, summary: CampaignSummary, title: str) -> Figure:

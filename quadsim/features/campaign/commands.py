@@ -179,7 +179,10 @@ def campaign(
         plan = load_plan(str(campaign), list(changes), flights=flights, seed=seed)
     for requirement in requirements:
         parse_event(requirement.event.text, plan.columns)
-    target = Path("runs") / "campaigns" / plan.spec.name if out is None else Path(out)
+    if out is None:
+        target = Path("runs") / "campaigns" / plan.spec.name
+    else:
+        target = Path(out)
     with _growing(target, progress, resume=resume, overwrite=overwrite) as options:
         result = fly_campaign(plan, workers=workers, cluster=cluster, report=report, until_width=until_width, **options)
     result = replace(result, judgements=tuple(judge(result.table, requirement) for requirement in requirements))
@@ -321,7 +324,10 @@ def compare_directories(
     first, second = directories
     plans = (stored_plan(first), stored_plan(second))
     check_names(names, 2)
-    names = (names[0], names[1]) if names else (plans[0].spec.name, plans[1].spec.name)
+    if names:
+        names = (names[0], names[1])
+    else:
+        names = (plans[0].spec.name, plans[1].spec.name)
     failures = (plans[0].spec.failure, plans[1].spec.failure)
     a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
     limits = [tuple(limit.with_tolerances() for limit in plan.limits) for plan in plans]

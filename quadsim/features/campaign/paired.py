@@ -147,7 +147,9 @@ class PairedComparison(Tabular):
             return "not comparable"
         if failure.p >= ALPHA:
             return "not distinguishable"
-        return "better" if failure.only_b < failure.only_a else "worse"
+        if failure.only_b < failure.only_a:
+            return "better"
+        return "worse"
 
     @property
     def sentence(self) -> str:
@@ -462,7 +464,10 @@ def _metric_table(comparison: PairedComparison) -> Grid:
         mark = Mark.NONE
         if difference.lower is not None and difference.upper is not None:
             ends = f"{format_number(difference.lower)} to {format_number(difference.upper)}"
-            mark = Mark.BEST if metric.is_beyond_chance else Mark.NONE
+            if metric.is_beyond_chance:
+                mark = Mark.BEST
+            else:
+                mark = Mark.NONE
         means = map(format_number, (metric.mean_a, metric.mean_b))
         mean = Cell(text=format_number(difference.mean), mark=mark)
         lines.append(line(label(metric.name, metric.unit), *means, mean, ends, str(difference.pairs)))
@@ -492,7 +497,10 @@ def metrics_figure(comparison: PairedComparison) -> Figure | None:
             continue
         scale = 100.0 / abs(metric.mean_a)
         place = np.array([float(len(names))])
-        better = difference.mean > 0.0 if metric.name == "worst_margin" else difference.mean < 0.0
+        if metric.name == "worst_margin":
+            better = difference.mean > 0.0
+        else:
+            better = difference.mean < 0.0
         colour = COLOUR.measured
         label = "not beyond chance"
         if metric.is_beyond_chance:

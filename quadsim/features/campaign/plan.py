@@ -59,7 +59,9 @@ class Plan:
     @property
     def _table(self) -> str:
         """Name of the entries in messages."""
-        return "sweep" if self.one_seed else "vary"
+        if self.one_seed:
+            return "sweep"
+        return "vary"
 
     @cached_property
     def draws(self) -> Draws:
@@ -147,7 +149,9 @@ class Plan:
             reason = str(flown.log.reason)
             limit = f"(it may take {self.spec.limits.memory:g} MB)"
             short = raised[-1].startswith(MemoryError.__name__)
-            return self.failed(flight, f"{reason} {limit}", MEMORY) if short else self.failed(flight, reason)
+            if short:
+                return self.failed(flight, f"{reason} {limit}", MEMORY)
+            return self.failed(flight, reason)
         return self.row_of(flight, flown, clock.perf_counter() - started)
 
     def fly_all(
@@ -280,14 +284,18 @@ def column_type(entry: Varied) -> pa.DataType:
     first = entry.extremes()[0]
     if isinstance(first, bool):
         return pa.bool_()
-    return pa.float64() if isinstance(first, int | float) else pa.string()
+    if isinstance(first, int | float):
+        return pa.float64()
+    return pa.string()
 
 
 def cell(value: Value) -> Value | str:
     """Return a drawn value as in the results: whole numbers as numbers, lists and tables as texts."""
     if isinstance(value, bool | str):
         return value
-    return float(value) if isinstance(value, int | float) else str(value)
+    if isinstance(value, int | float):
+        return float(value)
+    return str(value)
 
 
 def changed(scenario: Scenario, changes: Sequence[DrawnChange], identity: Mapping[str, Any], *, table: str) -> Scenario:
@@ -308,7 +316,10 @@ def changed(scenario: Scenario, changes: Sequence[DrawnChange], identity: Mappin
     modelled = merge(defaults, {})  # a copy, as looking up a field makes the tables on its way
     for entry, value in changes:
         for field, single in separate({tuple(entry.fields): value}, source=table).items():
-            new = _scaled(scenario, modelled, entry, field, single, table) if entry.relative else single
+            if entry.relative:
+                new = _scaled(scenario, modelled, entry, field, single, table)
+            else:
+                new = single
             set_field(tables, field, new, source=f"{table}.{entry.name}.fields", defaults=defaults)
     return scenario.derive({**tables, **identity}, source=identity.get("name"))
 
@@ -367,5 +378,8 @@ def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -
 
 def _is_grid(entry: Any) -> bool:
     """Whether an entry has the values of a grid; what is wrong with it is told when it is parsed."""
-    values = entry.get("values") if isinstance(entry, Mapping) else None
+    if isinstance(entry, Mapping):
+        values = entry.get("values")
+    else:
+        values = None
     return isinstance(values, list | tuple) and len(values) > 0 and entry.get("distribution") == "grid"

@@ -118,10 +118,16 @@ def flown_row(
     for finding in findings:
         name = finding.limit.name
         for column, margin in ((MARGIN, finding.worst_margin), (SAMPLED, finding.worst_margin_sampled)):
-            row[column + name] = margin if math.isfinite(margin) else None
+            if math.isfinite(margin):
+                row[column + name] = margin
+            else:
+                row[column + name] = None
         row[TIME_VIOLATED + name] = finding.time_violated
         unknown = finding.verdict == "incomplete" and verdict != "lost"  # a lost flight had to get there
-        row[SATISFIED + name] = None if unknown else finding.satisfied
+        if unknown:
+            row[SATISFIED + name] = None
+        else:
+            row[SATISFIED + name] = finding.satisfied
     if (worst := worst_finding(findings)) is not None:
         row["worst_margin"] = worst_share(findings)
         row["worst_constraint"] = worst.limit.name
@@ -132,7 +138,9 @@ def make_table(rows: Iterable[Row], schema: pa.Schema) -> pa.Table:
     """Rows as a table, sorted by flight; what a row lacks is null, and text that is no Unicode has backslashes."""
 
     def storable(value: object) -> object:
-        return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
+        if isinstance(value, str):
+            return value.encode("utf-8", "backslashreplace").decode()
+        return value
 
     ordered = sorted(rows, key=lambda row: row["flight"])
     columns = [pa.array([storable(row.get(field.name)) for row in ordered], field.type) for field in schema]
@@ -216,7 +224,10 @@ def not_held(table: pa.Table, name: str) -> FlightFlags:
 
 def texts(table: pa.Table, name: str) -> Texts:
     """(K,) a column as text, `-` where a flight has none; truth values as `true` and `false`."""
-    words = table[name].cast(pa.string()) if pa.types.is_boolean(table[name].type) else table[name]
+    if pa.types.is_boolean(table[name].type):
+        words = table[name].cast(pa.string())
+    else:
+        words = table[name]
     return np.array(["-" if value is None else str(value) for value in words.to_pylist()], object)
 
 
@@ -233,11 +244,9 @@ def failure_of(table: pa.Table) -> list[str]:
 
 def unaudited(table: pa.Table) -> FlightFlags:
     """(K,) which flights had no constraint; none of a table without verdicts."""
-    return (
-        np.asarray(texts(table, "verdict") == UNAUDITED)
-        if "verdict" in table.column_names
-        else np.zeros(table.num_rows, bool)
-    )
+    if "verdict" in table.column_names:
+        return np.asarray(texts(table, "verdict") == UNAUDITED)
+    return np.zeros(table.num_rows, bool)
 
 
 def is_counted(table: pa.Table, event: CountedEvent) -> FlightFlags:

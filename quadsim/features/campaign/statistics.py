@@ -54,7 +54,9 @@ from quadsim.ties import TIE_SHARE, first_smallest, in_order
 
 def percent(share: float | None, digits: int = 2) -> str:
     """A share in percent, e.g. `3.7 %`: enough digits that its distance to 0 or 100 % shows, and at least tenths."""
-    return ABSENT if share is None else f"{_percent(share, digits)} %"
+    if share is None:
+        return ABSENT
+    return f"{_percent(share, digits)} %"
 
 
 def interval(lower: float, upper: float) -> str:
@@ -64,7 +66,9 @@ def interval(lower: float, upper: float) -> str:
 
 def label(name: str, unit: str) -> str:
     """A name with its unit, where it has one."""
-    return name if unit == "-" else f"{name} [{unit}]"
+    if unit == "-":
+        return name
+    return f"{name} [{unit}]"
 
 
 def count_of(count: int, thing: str) -> str:
@@ -74,13 +78,18 @@ def count_of(count: int, thing: str) -> str:
 
 def p_value(p: float) -> str:
     """A p-value, e.g. `p = 0.012`, or `p < 0.001`."""
-    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+    if p < 0.001:
+        return "p < 0.001"
+    return f"p = {p:.2g}"
 
 
 def _percent(share: float, digits: int = 2) -> str:
     value = 100.0 * share
     size = min(abs(value), abs(100.0 - value))
-    decimals = max(1, digits - 1 - math.floor(math.log10(size))) if size > 1e-9 else 0
+    if size > 1e-9:
+        decimals = max(1, digits - 1 - math.floor(math.log10(size)))
+    else:
+        decimals = 0
     return f"{value:.{decimals}f}"
 
 
@@ -149,7 +158,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def mcnemar(only_a: int, only_b: int) -> float:
     """Two-sided p-value of McNemar's exact test: a discordant pair is as likely to be of the first as of the second."""
     discordant = only_a + only_b
-    return float(scipy.stats.binomtest(only_a, discordant).pvalue) if discordant else 1.0
+    if discordant:
+        return float(scipy.stats.binomtest(only_a, discordant).pvalue)
+    return 1.0
 
 
 def paired_difference(a: Array, b: Array) -> PairedDifference:
@@ -200,9 +211,15 @@ def dependence(x: Array, y: Array, rng: np.random.Generator) -> Dependence | Non
     in_order = y[np.lexsort((rng.random(x.size), x))]
     event = np.unique(y).size == 2
     permuted = scipy.stats.PermutationMethod(n_resamples=_PERMUTATIONS, rng=rng)
-    law = permuted if y.size <= _PERMUTED_UP_TO and not event else "asymptotic"
+    if y.size <= _PERMUTED_UP_TO and not event:
+        law = permuted
+    else:
+        law = "asymptotic"
     xi = scipy.stats.chatterjeexi(np.arange(y.size), in_order, method=law)
-    p_xi = scipy.stats.ks_2samp(x[y > y.min()], x[y == y.min()]).pvalue if event else xi.pvalue
+    if event:
+        p_xi = scipy.stats.ks_2samp(x[y > y.min()], x[y == y.min()]).pvalue
+    else:
+        p_xi = xi.pvalue
     return Dependence(
         rho=float(ranked.statistic), p=float(ranked.pvalue), xi=float(xi.statistic), p_xi=float(p_xi), flights=y.size
     )
@@ -277,7 +294,10 @@ def ranking(table: pa.Table) -> Indices:
     ranked: list[int] = []
     for kind, members in sorted(groups.items()):
         rows = np.array(members)
-        window = TIE_SHARE * float(distance[rows].max()) if kind[2] else TIE_SHARE
+        if kind[2]:
+            window = TIE_SHARE * float(distance[rows].max())
+        else:
+            window = TIE_SHARE
         ranked.extend(rows[in_order(score[rows], window)].tolist())
     return np.array(ranked, int)
 
@@ -344,7 +364,10 @@ def parameters(table: pa.Table) -> dict[str, Any]:
         outcomes[name] = {"kind": "number", "unit": unit_of(table, DRAW + name)}
         for outcome, measured in (("worst_margin", margin), ("failed", failed.astype(float))):
             related = dependence(values, measured, np.random.default_rng(0))  # the same every time
-            outcomes[name][outcome] = None if related is None else asdict(related)
+            if related is None:
+                outcomes[name][outcome] = None
+            else:
+                outcomes[name][outcome] = asdict(related)
             tested += [] if related is None else [outcomes[name][outcome]]
         outcomes[name]["groups"] = _groups(values, failed)
     corrected = iter(holm([entry[key] for entry in tested for key in ("p", "p_xi")]))
@@ -386,7 +409,10 @@ def _groups(values: Array, failed: FlightFlags) -> list[dict[str, Any]]:
     if not size:
         return []
     distinct = np.unique(values)
-    cuts = distinct[1:] if distinct.size <= size else np.quantile(values, np.arange(1, size) / size)
+    if distinct.size <= size:
+        cuts = distinct[1:]
+    else:
+        cuts = np.quantile(values, np.arange(1, size) / size)
     group = np.searchsorted(cuts, values, side="right")
     return [
         {"low": float(values[of].min()), "high": float(values[of].max()), **share_of(failed[of])}
@@ -439,7 +465,10 @@ class Judgement:
     def sentence(self) -> str:
         """Return the judgement with its numbers."""
         required = self.requirement
-        share = f" ({percent(self.count / self.flights)})" if self.flights else ""
+        if self.flights:
+            share = f" ({percent(self.count / self.flights)})"
+        else:
+            share = ""
         phrase = (
             f"{required.text} {'holds' if self.holds else 'does not hold'}: {required.event.text} in {self.count} of "
             f"{count_of(self.flights, 'flight')}{share}, so with {100.0 * required.confidence:g} % confidence at "
@@ -519,7 +548,10 @@ def least_flights(requirement: Requirement) -> int:
     With n such flights the bound is (1 - confidence)^(1/n) from the far end, which requires
     n = ln(1 - confidence) / ln(1 - share); at a tie, the bound itself as it is computed decides.
     """
-    per_flight = math.log1p(-requirement.share) if requirement.at_most else math.log(requirement.share)
+    if requirement.at_most:
+        per_flight = math.log1p(-requirement.share)
+    else:
+        per_flight = math.log(requirement.share)
     n = max(1, math.ceil(math.log1p(-requirement.confidence) / per_flight))
     near = range(max(1, n - 1), n + 2)
     best = ((k, _bound(requirement, 0 if requirement.at_most else k, k)) for k in near)
@@ -528,7 +560,10 @@ def least_flights(requirement: Requirement) -> int:
 
 def _bound(requirement: Requirement, count: int, flights: int) -> float:
     """The one-sided bound on the probability."""
-    bounds = upper_bounds if requirement.at_most else lower_bounds
+    if requirement.at_most:
+        bounds = upper_bounds
+    else:
+        bounds = lower_bounds
     return float(bounds(count, flights, requirement.confidence))
 
 

@@ -99,7 +99,9 @@ class Store:
     def counted(self) -> int:
         """Number of flights in the final table; 0 without one."""
         path = self._directory / FLIGHTS_FILE
-        return read_table(path).num_rows if path.is_file() else 0
+        if path.is_file():
+            return read_table(path).num_rows
+        return 0
 
     def add(self, row: Row) -> None:
         """Add a row; it may stay in memory until `flush`, for a short time."""
@@ -210,7 +212,10 @@ def require_same(plan: Plan, directory: Path) -> None:
     if known.scenario != plan.scenario:
         differing.append("scenario")
     if differing:
-        rule = "; more flights may follow, except of a latin_hypercube" if differing == ["flights"] else ""
+        if differing == ["flights"]:
+            rule = "; more flights may follow, except of a latin_hypercube"
+        else:
+            rule = ""
         raise InputError(
             f"{directory}: --resume needs the same campaign, and its {', '.join(differing)} differs from "
             f"the one there{rule}; choose another --out"

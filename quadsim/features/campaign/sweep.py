@@ -122,7 +122,9 @@ def _text(value: object) -> str:
     """A cell of the table."""
     if isinstance(value, float):
         return f"{value:.4g}"
-    return "-" if value is None else str(value)
+    if value is None:
+        return "-"
+    return str(value)
 
 
 def fly_sweep(
@@ -163,7 +165,10 @@ def _is_cut(plan: Plan, flight: int) -> bool:
 
 def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> GridValues:
     """Return the values of a field, or of several together, after checking each."""
-    owner = fields if isinstance(fields, str) else f"({', '.join(fields)})"
+    if isinstance(fields, str):
+        owner = fields
+    else:
+        owner = f"({', '.join(fields)})"
     if isinstance(tried, str) or not hasattr(tried, "__len__") or not len(tried):
         raise ParameterError("sweep", owner, tried, "a list of values to try")
     values = [value.tolist() if hasattr(value, "tolist") else value for value in tried]

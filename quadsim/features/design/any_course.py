@@ -139,7 +139,10 @@ def fitted_course(
     Raises:
         InputError: the course cannot be read, or such a controller cannot fly it.
     """
-    base = _of_table(name, file, tuning) if is_trajectory(name) else load_scenario(name)
+    if is_trajectory(name):
+        base = _of_table(name, file, tuning)
+    else:
+        base = load_scenario(name)
     assembly = Assembly(base)
     _require_upright(name, base, assembly)
     if (base.obstacles or base.regions) and not avoids:
@@ -147,7 +150,10 @@ def fitted_course(
         raise ParameterError("", "--course", name, rule)
     own = is_trajectory(name) or (name.endswith(".toml") and _same(base, assembly, vehicle, file))
     samples = _sampled(base, assembly)
-    by_extent = 1.0 if own else vehicle.enclosing_radius / assembly.vehicle.enclosing_radius
+    if own:
+        by_extent = 1.0
+    else:
+        by_extent = vehicle.enclosing_radius / assembly.vehicle.enclosing_radius
     length = _length_factor(name, samples, size, by_extent)
     time, response = _time_factor(samples, length, vehicle, tuning)
     if base.obstacles or base.regions:
@@ -228,11 +234,20 @@ def _sampled(base: Scenario, assembly: Assembly) -> SampledCourse:
     smooth_everywhere = np.zeros(_SAMPLES - 1, bool)
     channels = zip(poses.T, course.resolution, strict=True)
     poses = np.column_stack([within_rounding(values, unit, smooth_everywhere) for values, unit in channels])
-    before = course.sample(np.array(course.jumps) - 1e-6) if course.jumps else np.empty((0, 4))
-    after = course.sample(np.array(course.jumps) + 1e-6) if course.jumps else np.empty((0, 4))
+    if course.jumps:
+        before = course.sample(np.array(course.jumps) - 1e-6)
+    else:
+        before = np.empty((0, 4))
+    if course.jumps:
+        after = course.sample(np.array(course.jumps) + 1e-6)
+    else:
+        after = np.empty((0, 4))
     moved = after - before
     has_jumps = isinstance(base.reference, Steps) and bool(np.abs(moved).max(initial=0.0) > 0.0)
-    gaps = np.diff(course.jumps) if has_jumps else np.array([math.inf])
+    if has_jumps:
+        gaps = np.diff(course.jumps)
+    else:
+        gaps = np.array([math.inf])
     velocity = np.diff(poses[:, :3], axis=0)
     fastest = float(np.linalg.norm(velocity, axis=1).max())
     bends = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
@@ -411,7 +426,9 @@ def _space(base: Scenario, scale: Scale, explained: set[object]) -> str:
             lines += ["", *stated_lines(header, scaled_table(shape, scale), explained)]
     if base.keep_in is not None:
         lines += ["", *stated_lines("[keep_in]", scaled_table(base.keep_in, scale), explained)]
-    return "\n".join([*lines, ""]) if lines else ""
+    if lines:
+        return "\n".join([*lines, ""])
+    return ""
 
 
 def _is_floor(entry: Limit) -> bool:
@@ -428,7 +445,10 @@ def _constraint(entry: Limit, scale: Scale, allowed: float, *, own: bool) -> str
     limit = scaled_limit(entry, scale)
     why = "scaled with the course"
     if entry.signal in _ERRORS and not own:
-        least = _YAW_ALLOWED if entry.signal == "yaw_error" else in_digits(allowed)
+        if entry.signal == "yaw_error":
+            least = _YAW_ALLOWED
+        else:
+            least = in_digits(allowed)
         lower = min(limit.lower, -least)
         upper = max(limit.upper, least)
         if (lower, upper) != (limit.lower, limit.upper):
@@ -442,7 +462,10 @@ def _constraint(entry: Limit, scale: Scale, allowed: float, *, own: bool) -> str
 
 def _scale_notes(scale: Scale, response: float, *, own: bool) -> list[str]:
     """Return lines on what was scaled."""
-    lengths = "as stated" if own and scale.length == 1.0 else f"times {scale.length:g}"
+    if own and scale.length == 1.0:
+        lengths = "as stated"
+    else:
+        lengths = f"times {scale.length:g}"
     notes = [f"Lengths {lengths}, times by {scale.time:g}, heights raised by {scale.lift:g} m."]
     if response:
         notes.append(f"Its corners are filtered: the response time of {response:g} s is that of steps by rule.")
@@ -459,4 +482,6 @@ def _left_out(base: Scenario) -> list[str]:
     names += [entry.name for entry in base.constraints if entry.signal not in (*_CARRIED, *_BOUNDED)]
     if base.polytopes:
         names.append("controller.polytopes")
-    return [f"Left out, as no part of the course: {', '.join(names)}."] if names else []
+    if names:
+        return [f"Left out, as no part of the course: {', '.join(names)}."]
+    return []

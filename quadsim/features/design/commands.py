@@ -191,7 +191,10 @@ def vehicle_report(
         for option, value in {"--template": template, "--scenario": scenario}.items():
             if value:
                 raise ParameterError("", "--thrust-stand", str(thrust_stand), f"given without {option}")
-        start = blank if name is None else vehicle_path(str(name))
+        if name is None:
+            start = blank
+        else:
+            start = vehicle_path(str(name))
         return _by_stand(Path(thrust_stand), start, rotors, diameter, out, overwrite=overwrite)
     for option, number in {"--rotors": rotors, "--diameter": diameter}.items():
         if number is not None:
@@ -203,8 +206,14 @@ def vehicle_report(
         raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
     path = vehicle_path(str(name))
     loaded = load_vehicle(path)
-    against = None if scenario is None else loading.load_scenario(scenario)
-    picture = None if out is None else vehicle_drawing.drawing_file(out, overwrite=overwrite)
+    if scenario is None:
+        against = None
+    else:
+        against = loading.load_scenario(scenario)
+    if out is None:
+        picture = None
+    else:
+        picture = vehicle_drawing.drawing_file(out, overwrite=overwrite)
     autopilot = (stated_autopilot(path) or AutopilotSettings()).resolved(loaded)
     report = vehicle_report.VehicleReport(
         vehicle=loaded,
@@ -240,7 +249,10 @@ def _by_stand(
         load_vehicle(start)
     if out is not None and Path(out).suffix != ".toml":
         raise ParameterError("", "--out", str(out), "a .toml file with --thrust-stand")
-    target = None if out is None else require_file(out, overwrite=overwrite)
+    if out is None:
+        target = None
+    else:
+        target = require_file(out, overwrite=overwrite)
     text, numbers = stand_vehicle_text(stand, start.read_text(encoding="utf-8-sig"), rotors=rotors, diameter=diameter)
     if target is None:
         return results.Document(text, numbers)

@@ -59,7 +59,9 @@ class PacedFlight:
             return self.outcome
         limit = self.worst.limit
         left = f"{limit.name} has {100.0 * self.worst.share:.3g} % of half its band left"
-        return left if self.outcome == "satisfied" else f"{left}; {self.outcome}"
+        if self.outcome == "satisfied":
+            return left
+        return f"{left}; {self.outcome}"
 
 
 @dataclass(frozen=True, kw_only=True)

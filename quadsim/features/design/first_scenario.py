@@ -173,7 +173,10 @@ def first_scenario(
     if isinstance(course, str):
         course = course_by_rule(course, vehicle, tuning)
     name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course.name}".lower())[:80]
-    for_duration = "" if course.duration is None else f"duration = {course.duration}  # s\n"
+    if course.duration is None:
+        for_duration = ""
+    else:
+        for_duration = f"duration = {course.duration}  # s\n"
     text = f"""{_notes(vehicle, tuning, course, law)}
 name = {_text(name)}
 description = {_text(f"{vehicle.name}: {course.about}")}
@@ -222,7 +225,10 @@ def _notes(vehicle: Vehicle, tuning: Design, course: FirstCourse, law: str) -> s
         "torque": "torque: 0.5 sqrt(alpha / tilt bound), alpha the smaller of roll's and pitch's",
         "period": f"what a period of {1e3 * tuning.period:g} ms can serve",
     }
-    stated = f" --tilt {_tilt(tuning):g}" if tuning.tilt_stated else ""
+    if tuning.tilt_stated:
+        stated = f" --tilt {_tilt(tuning):g}"
+    else:
+        stated = ""
     option = ""
     what = "The loop's bandwidth for x and y"
     then = (
@@ -251,7 +257,9 @@ def largest_eight(vehicle: Vehicle, tuning: Design) -> tuple[float, Literal["til
     tilting = vehicle.gravity * tuning.acceleration
     # Of (a sin wt, a/2 sin 2wt) the largest speed is sqrt(2) a w.
     moving = tuning.fastest * _EIGHT_PEAK * EIGHT_RATIO * tuning.bandwidth / math.sqrt(2.0)
-    return (moving, "speed") if moving < tilting else (tilting, "tilt")
+    if moving < tilting:
+        return (moving, "speed")
+    return (tilting, "tilt")
 
 
 def _eight_limit(vehicle: Vehicle, tuning: Design) -> str:
@@ -536,7 +544,10 @@ horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for t
         return text
     if observed:  # the reference of steps has no jerk and snap that are worth feeding forward
         lag = vehicle.rotor_rise or 0.0
-        lagging = f"rotor_lag = {lag}  # s, the vehicle's rotor_rise\n" if lag > 0.0 else ""
+        if lag > 0.0:
+            lagging = f"rotor_lag = {lag}  # s, the vehicle's rotor_rise\n"
+        else:
+            lagging = ""
         return text + f"\n[controller.disturbance]  # the air's torque, too, is observed and compensated\n{lagging}"
     text += "integral = true  # against drag and what else is not modelled\n"
     if course.lasts and _turns_in_air(vehicle):
@@ -591,7 +602,9 @@ def _tilt(tuning: Design) -> float:
     degrees = math.degrees(tuning.tilt) + 1e-9
     if tuning.tilt_stated:
         return round(degrees, 6)
-    return float(math.floor(degrees)) if degrees > 5.0 else in_digits(degrees)
+    if degrees > 5.0:
+        return float(math.floor(degrees))
+    return in_digits(degrees)
 
 
 def _slew(tuning: Design) -> tuple[float, float]:

@@ -99,7 +99,10 @@ def design_for(vehicle: Vehicle, tilt: float | None = None) -> Design:
         rule = f"further from its hover speed, {vehicle.hover_speed:.4g} rad/s, or nothing is left to control it with"
         side = ("speed_max", "speed_min")[first_smallest([can.climb, can.sink], TIE_SHARE * vehicle.gravity)]
         raise ParameterError("vehicle", side, getattr(vehicle, side), rule)
-    bound = _tilt_bound(can) if tilt is None else _stated_tilt(can, tilt)
+    if tilt is None:
+        bound = _tilt_bound(can)
+    else:
+        bound = _stated_tilt(can, tilt)
     bandwidth, limited_by, period = _bandwidth(can, bound)
     height = min(HEIGHT_RATIO * bandwidth, math.sqrt(min(can.climb, can.sink) / HEIGHT_STEP))
     heading = min(HEADING_RATIO * bandwidth, math.sqrt(can.turning[2] / HEADING_STEP))
@@ -142,9 +145,10 @@ def _stated_tilt(can: Authority, tilt: float) -> float:
     """A tilt bound [deg] in radians, if the vehicle can hold it."""
     steady = math.degrees(can.steady_tilt)
     if not LEAST_TILT <= tilt <= min(steady, LARGEST_TILT):
-        most = (
-            f"{steady:.3g}, up to where the rotors carry the weight" if steady < LARGEST_TILT else f"{LARGEST_TILT:g}"
-        )
+        if steady < LARGEST_TILT:
+            most = f"{steady:.3g}, up to where the rotors carry the weight"
+        else:
+            most = f"{LARGEST_TILT:g}"
         raise ParameterError("", "--tilt", tilt, f"between {LEAST_TILT:g} and {most} [deg]")
     return math.radians(tilt)
 
@@ -166,7 +170,9 @@ def _bandwidth(can: Authority, tilt: float) -> tuple[float, Literal["lag", "torq
 
 def _reached(period: float, lag: float | None) -> float:
     """Share of a step that a rotor's speed makes in a period."""
-    return 1.0 if lag is None else 1.0 - math.exp(-period / lag)
+    if lag is None:
+        return 1.0
+    return 1.0 - math.exp(-period / lag)
 
 
 def gain(vehicle: Vehicle, tuning: Design) -> Array:
@@ -225,5 +231,8 @@ def delay_margin(vehicle: Vehicle, tuning: Design) -> float:
         high = 1.5 * high
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if is_stable(vehicle, tuning, K, middle) else (low, middle)
+        if is_stable(vehicle, tuning, K, middle):
+            low, high = (middle, high)
+        else:
+            low, high = (low, middle)
     return low

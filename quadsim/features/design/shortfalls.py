@@ -47,7 +47,9 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
     assembly = Assembly(scenario)
     required = report(assembly)
     missed += [f"the course requires {problem}" for problem in required.problems]
-    return (*missed, required.advice) if required.advice else tuple(missed)
+    if required.advice:
+        return (*missed, required.advice)
+    return tuple(missed)
 
 
 def _inputs(bounds: InputBounds, vehicle: Vehicle, period: float) -> list[str]:
@@ -68,7 +70,10 @@ def _inputs(bounds: InputBounds, vehicle: Vehicle, period: float) -> list[str]:
     up = bounds.slew[1]
     needed = vehicle.speed_max - float(hover.max())
     if up * SLOWEST_ANSWER < needed * period:
-        time = f"{needed * period / up:.3g} s" if up else "for ever"
+        if up:
+            time = f"{needed * period / up:.3g} s"
+        else:
+            time = "for ever"
         missed.append(
             f"controller.input_bounds.slew: {up:g} rad/s per period take {time} from hover to the highest speed, "
             f"{needed:.4g} rad/s more; too slow to control tilt and height"

@@ -153,7 +153,10 @@ def _column(path: Path, quantity: str, place: int, scale: float, lines: list[lis
     values = []
     for number, row in zip(numbers, lines, strict=True):
         cell = row[place].strip() if place < len(row) else ""
-        bare = cell.removesuffix("%").strip() if quantity == "throttle" else cell
+        if quantity == "throttle":
+            bare = cell.removesuffix("%").strip()
+        else:
+            bare = cell
         try:
             value = float(bare)
         except ValueError:

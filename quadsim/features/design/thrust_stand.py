@@ -125,7 +125,10 @@ def stand_vehicle_text(
         if table is None:
             table = document[name] = tomlkit.table()
             table["unit"] = _PARAMETER_UNITS[name]
-        table["value"] = [_rounded(one) for one in value] if isinstance(value, tuple) else _rounded(value)
+        if isinstance(value, tuple):
+            table["value"] = [_rounded(one) for one in value]
+        else:
+            table["value"] = _rounded(value)
         table["source"] = sources[name]
     head = "".join(f"# {line}\n" for line in _fit_lines(fit, stand.name, replaced))
     data = {**numbers, "thrust_error": fit.thrust_error, "torque_error": fit.torque_error, "notes": list(fit.notes)}
@@ -196,7 +199,10 @@ def _numbers(fit: StandFit) -> dict[str, Any]:
 
 def _sources(fit: StandFit, of: str) -> dict[str, str]:
     """Return the origin of each parameter."""
-    law = "b w^2" if fit.thrust_of_throttle is None else "a1 u + a2 u^2"
+    if fit.thrust_of_throttle is None:
+        law = "b w^2"
+    else:
+        law = "a1 u + a2 u^2"
     thrust = f"{of}: {law}, to {fit.thrust_error:.1%} of the largest thrust (RMS)"
     sources = {"thrust_coefficient": thrust, "thrust_of_throttle": thrust}
     if fit.torque_error is not None:
@@ -222,7 +228,10 @@ def _fit_lines(fit: StandFit, name: str, replaced: list[str]) -> list[str]:
     ]
     if replaced:
         lines.append(f"replaces {' and '.join(replaced)} of the file")
-    by, unit = ("speed", "rad/s") if "speed" in fit.columns else ("throttle", "-")
+    if "speed" in fit.columns:
+        by, unit = ("speed", "rad/s")
+    else:
+        by, unit = ("throttle", "-")
     lines.append(f"{f'{by} ({unit})':>14} {'thrust (N)':>12} {'fitted (N)':>12} {'error':>8}")
     thrust = fit.columns["thrust"]
     largest = float(thrust.max())

@@ -200,7 +200,9 @@ def _designed(vehicle: Vehicle) -> Designed | None:
 def _trim(sheet: VehicleSheet) -> list[tuple[int, float]]:
     """Return the number of each rotor and its speed in hover; nothing where all are alike."""
     speeds = sheet.hover_speeds
-    return [] if len({*speeds}) == 1 else list(enumerate(speeds, start=1))
+    if len({*speeds}) == 1:
+        return []
+    return list(enumerate(speeds, start=1))
 
 
 def vehicle_tables(report: VehicleReport) -> list[Grid]:
@@ -281,7 +283,10 @@ def _abilities(sheet: VehicleSheet) -> list[tuple[str, ...]]:
     if made is None:
         return [sinks, ("none can be made: hover leaves nothing to control it with", "-", "")]
     why = {"lag": "the rotors' lag", "torque": "torque in reserve", "period": "the shortest control period"}
-    speed = ("none", "") if made.level_speed is None else (format_number(made.level_speed), "m/s")
+    if made.level_speed is None:
+        speed = ("none", "")
+    else:
+        speed = (format_number(made.level_speed), "m/s")
     labels = {"x, y": f"x, y, limited by {why[made.limited_by]}"}
     return [
         sinks,

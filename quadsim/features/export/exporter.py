@@ -58,7 +58,10 @@ class Reach:
     lost: int = 0
 
     def __str__(self) -> str:
-        draws = DRAWS if self.drawn == 0 else self.drawn // (1 + DISTANCES.index(self.distance))
+        if self.drawn == 0:
+            draws = DRAWS
+        else:
+            draws = self.drawn // (1 + DISTANCES.index(self.distance))
         sufficed = f"up to {self.distance:g} m and m/s per axis it sufficed for all {self.feasible} feasible states"
         if self.beyond is None:
             return f"{sufficed} of {self.drawn} drawn"
@@ -211,7 +214,10 @@ def c_controller(scenario: Scenario | Assembly, precision: Precision = "double",
     Raises:
         ExportError: this controller cannot be exported.
     """
-    assembly = scenario if isinstance(scenario, Assembly) else Assembly(scenario)
+    if isinstance(scenario, Assembly):
+        assembly = scenario
+    else:
+        assembly = Assembly(scenario)
     scenario = assembly.scenario
     table = scenario.controller
     title = _title(scenario)
@@ -241,7 +247,10 @@ def exported_law(scenario: Scenario) -> Exportable:
     controller = scenario.controller
     shapes = (*scenario.obstacles, *scenario.regions)
     if not isinstance(controller, Weighted):
-        how = "" if controller.commands == ROTORS else f' with commands = "{controller.commands}"'
+        if controller.commands == ROTORS:
+            how = ""
+        else:
+            how = f' with commands = "{controller.commands}"'
         exported = "exported are unconstrained, constrained, robust, nonlinear, and geometric of rates"
         raise ExportError(f"it is {controller.type!r}{how}; {exported}")
     return exportable(controller, Assembly(scenario).vehicle, scenario.control_period, shapes)
@@ -276,7 +285,10 @@ def programs(controller: CSource, target: Machine) -> dict[str, str]:
 
 def _title(scenario: Scenario) -> str:
     """The scenario's name and description as they can stand in a comment."""
-    title = f"{scenario.name}: {scenario.description}" if scenario.description else scenario.name
+    if scenario.description:
+        title = f"{scenario.name}: {scenario.description}"
+    else:
+        title = scenario.name
     title = title.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")
     return title.encode("ascii", "replace").decode().replace("\n", " ")
 

@@ -94,7 +94,10 @@ class Program:
     """A program that runs, and the serial line to it; see `Line`."""
 
     def __init__(self, target: Machine, image: Path) -> None:
-        command = [*target.emulation, "-serial", "stdio", "-kernel", str(image)] if target.board else [str(image)]
+        if target.board:
+            command = [*target.emulation, "-serial", "stdio", "-kernel", str(image)]
+        else:
+            command = [str(image)]
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0
         )
@@ -268,12 +271,22 @@ class MPCInTheLoop:
         Raises:
             FlightError: no answer came over the line.
         """
-        acting = self._before if now.acting is None else now.acting
+        if now.acting is None:
+            acting = self._before
+        else:
+            acting = now.acting
         if now.phase in GROUNDED:
-            self._before = np.zeros(N_ROTORS) if self._bounds is None else self._bounds.lowest(acting)
+            if self._bounds is None:
+                self._before = np.zeros(N_ROTORS)
+            else:
+                self._before = self._bounds.lowest(acting)
             self._serial.reset(self._before)
             return stopped(self._before.copy(), self.horizon, now.phase)
-        kind: Solving = QueryKind.STEP if now.phase is Phase.FLYING else QueryKind.STAND
+        kind: Solving
+        if now.phase is Phase.FLYING:
+            kind = QueryKind.STEP
+        else:
+            kind = QueryKind.STAND
         if self._whole:
             state = measured_state(now, state)
             reference = reference_rows(now, reference, self._rows)

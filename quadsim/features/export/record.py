@@ -62,7 +62,10 @@ class Recorder:
         self.name = inner.name
         self.solver = inner.solver
         self.horizon = inner.horizon
-        self.commands = inner.commands if isinstance(inner, QUATERNIONS) else ROTORS
+        if isinstance(inner, QUATERNIONS):
+            self.commands = inner.commands
+        else:
+            self.commands = ROTORS
         self.asked: list[_Asked] = []
         self._before = np.zeros(4)
         self._ended = False
@@ -79,7 +82,10 @@ class Recorder:
         flying = now.phase is Phase.FLYING and (now.unseen is None or not now.unseen.any())
         self._ended |= bool(self.asked) and not flying
         if flying and not self._ended:
-            acting = self._before if now.acting is None else now.acting
+            if now.acting is None:
+                acting = self._before
+            else:
+                acting = now.acting
             parts = (state.copy(), np.array(acting, float), np.array(reference, float))
             self.asked.append(_Asked(*parts, replace(now, signals=None)))
         command = self.inner.step(now, state, reference)
@@ -105,7 +111,10 @@ def record(scenario: Scenario) -> Recording:
         raise ExportError("its flight has no period in the air, with everything measured, to record")
     status, commands = _answers(law, scenario.control_period, asked)
     known = len(status)
-    rows = law.motion_rows if isinstance(law, QUATERNIONS) else 0
+    if isinstance(law, QUATERNIONS):
+        rows = law.motion_rows
+    else:
+        rows = 0
     windows = [reference_rows(query.now, query.reference, rows) for query in asked[:known]]
     return Recording(
         before=asked[0].acting,
@@ -119,7 +128,9 @@ def record(scenario: Scenario) -> Recording:
 
 def _measured(law: RecordedLaw, query: _Asked) -> Array:
     """Return a state as an exported controller takes it."""
-    return measured_state(query.now, query.state) if isinstance(law, QUATERNIONS) else query.state
+    if isinstance(law, QUATERNIONS):
+        return measured_state(query.now, query.state)
+    return query.state
 
 
 def _answers(law: RecordedLaw, period: float, asked: list[_Asked]) -> tuple[NDArray[np.int64], Array]:
@@ -148,7 +159,9 @@ def _answers(law: RecordedLaw, period: float, asked: list[_Asked]) -> tuple[NDAr
 def _found(law: LinearMPC | NonlinearMPC | GeometricController, command: Command) -> int:
     """Return the status of an optimum, as of `enum quadsim_status`."""
     if isinstance(law, QUATERNIONS):
-        return STATUSES.index(command.status) if command.status != SOLVED else Method.WHOLE
+        if command.status != SOLVED:
+            return STATUSES.index(command.status)
+        return Method.WHOLE
     assert law.answer is not None
     return law.answer.method
 

@@ -101,7 +101,10 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         Raises:
             InputError: an argument is not allowed.
         """
-        self.episodes = scenario if isinstance(scenario, Episodes) else Episodes(scenario, vary)
+        if isinstance(scenario, Episodes):
+            self.episodes = scenario
+        else:
+            self.episodes = Episodes(scenario, vary)
         self._base = self.episodes.base
         if render_mode not in (None, "rgb_array"):
             raise ParameterError("", "render_mode", render_mode, "rgb_array or None")
@@ -202,7 +205,11 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if self.episodes.varied:
             self.actions = Actions(self._action, scenario, assembly.vehicle)
         # events that change the controller need a real one
-        law: Any = None if scenario.controller_changes else Agent(scenario.controller.horizon)
+        law: Any
+        if scenario.controller_changes:
+            law = None
+        else:
+            law = Agent(scenario.controller.horizon)
         self._flight = Rollout(assembly, law)
         self.limits = self._flight.limits
         self._margins = Margins(self.limits, scenario.plant.timestep)

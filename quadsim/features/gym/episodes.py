@@ -62,7 +62,10 @@ class Episodes:
         loaded: Scenario = preferring_core(load_scenario(scenario))
         self._plan: Any = None
         if vary is not None:
-            vary = str(vary) if isinstance(vary, str | Path) else vary
+            if isinstance(vary, str | Path):
+                vary = str(vary)
+            else:
+                vary = vary
             self._plan = commands_of("campaign").drawn_flights(loaded, vary)
             loaded = self._plan.scenario
         self.base = loaded
@@ -91,10 +94,16 @@ class Episodes:
         if self._plan is None:
             if options:
                 raise ParameterError("", "options", dict(options), "absent where nothing varies")
-            seed = int(rng.integers(2**31)) if seed is None else int(seed)
+            if seed is None:
+                seed = int(rng.integers(2**31))
+            else:
+                seed = int(seed)
             return Episode(scenario=self.base.altered(seed=seed), flight=None, draw={})
         flights = self._plan.spec.flights
-        flight = options["flight"] if "flight" in options else int(rng.integers(flights))
+        if "flight" in options:
+            flight = options["flight"]
+        else:
+            flight = int(rng.integers(flights))
         if set(options) - {"flight"} or not (isinstance(flight, int | np.integer) and 0 <= flight < flights):
             raise ParameterError("", "options", dict(options), f"absent, or a flight from 0 to {flights - 1}")
         return self.of_flight(int(flight))
@@ -108,7 +117,9 @@ class Episodes:
         """Return the parts of an episode, with the bounds of a user's controller where a campaign varies it."""
         as_in_base = (scenario.vehicle, scenario.recorded) == (self.base.vehicle, self.base.recorded)
         assembly = Assembly(scenario, self._vehicle if as_in_base else None)  # its file is read once
-        return assembly.audited() if self.varied else assembly
+        if self.varied:
+            return assembly.audited()
+        return assembly
 
     @cached_property
     def _vehicle(self) -> Vehicle:

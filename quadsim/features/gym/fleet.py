@@ -229,7 +229,10 @@ class Together:
         self._batch = PlantBatch(count, steps=base.steps_per_period, limits=limits, threads=threads)
         first = self._setup(Episode(scenario=base, flight=None, draw={}), key=None)
         self._rows = np.repeat(first.rows[None], count if self._episodes.varied else 1, axis=0)
-        self._table = np.arange(count) if self._episodes.varied else np.zeros(count, int)
+        if self._episodes.varied:
+            self._table = np.arange(count)
+        else:
+            self._table = np.zeros(count, int)
         self._ahead = np.arange(1 + self._preview)
         self._scale = {name: np.repeat(values[None], count, axis=0) for name, values in first.actions.scale.items()}
         self._k = np.zeros(count, int)
@@ -279,7 +282,10 @@ class Together:
             self._keep_rows(place, setup.rows)
         self._k[place] = 0
         self._turns[place] = np.nan
-        self._periods[place] = setup.periods if self._most is None else min(setup.periods, self._most)
+        if self._most is None:
+            self._periods[place] = setup.periods
+        else:
+            self._periods[place] = min(setup.periods, self._most)
         self._lowest[place] = setup.state[_HEIGHT]
         self._loss[place] = setup.loss
         self._state[place] = self._batch.state[place]
@@ -313,7 +319,10 @@ class Together:
         if slot is None or slot.setup is not setup or forces:
             if slot is not None and not forces:
                 slot.setup.spares.append(slot)
-            slot = setup.spares.pop() if setup.spares else _Slot(setup, assembly.plant(), setup.actions.autopilot())
+            if setup.spares:
+                slot = setup.spares.pop()
+            else:
+                slot = _Slot(setup, assembly.plant(), setup.actions.autopilot())
             self._slots[place] = slot
         if setup.drawn:
             slot.plant.redraw(assembly.generator("disturbance"), assembly.wind())

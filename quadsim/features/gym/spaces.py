@@ -185,7 +185,10 @@ class Actions:
             raise ParameterError("", "action", self.kind, rule)
         if self.kind == "speeds":
             return np.array(speeds, float)
-        amount = self._vehicle.thrusts(speeds) if self.kind == "thrust" else speeds
+        if self.kind == "thrust":
+            amount = self._vehicle.thrusts(speeds)
+        else:
+            amount = speeds
         deviation = amount - self.scale["hover"]
         return (deviation / np.where(deviation < 0.0, self.scale["down"], self.scale["up"])).astype(np.float32)
 

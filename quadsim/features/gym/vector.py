@@ -108,7 +108,10 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         self._episodes = self._single.episodes
         self.scenario = self._episodes.base
         self.observations = self._single.observations
-        self.constraint_names = self._single.constraint_names if margins else ()
+        if margins:
+            self.constraint_names = self._single.constraint_names
+        else:
+            self.constraint_names = ()
         self.single_action_space = self._single.action_space
         self.single_observation_space = self.observations.space
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -116,7 +119,10 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         self.render_mode = None
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self.obstacle = obstacle_to_batch(self.scenario)
-        limits = len(self._single.constraint_names) if margins else 0
+        if margins:
+            limits = len(self._single.constraint_names)
+        else:
+            limits = 0
         self._frame = StepResults.empty(self.num_envs, len(self.observations.layout), limits)
         shared: dict[str, Any] = {"rewards": RewardHook(reward), "most": max_episode_steps}
         self._fleet: Fleet
@@ -286,7 +292,10 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             numbers["flight"] = episode.flight
         for name, number in numbers.items():
             self._of_episodes.setdefault(name, np.zeros(self.num_envs, np.int64))[place] = number
-        draws = self._of_episodes.setdefault("draw", {}) if episode.flight is not None else {}
+        if episode.flight is not None:
+            draws = self._of_episodes.setdefault("draw", {})
+        else:
+            draws = {}
         for name, value in episode.draw.items():
             numeric = isinstance(value, int | float) and not isinstance(value, bool)
             kind = float if numeric else object
@@ -307,7 +316,10 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         info["phase"] = frame.phases.copy()
         info["reason"] = frame.reasons.copy()
         for name, values in self._of_episodes.items():
-            info[name] = _masked(values, mask) if isinstance(values, dict) else values
+            if isinstance(values, dict):
+                info[name] = _masked(values, mask)
+            else:
+                info[name] = values
         return _masked(info, mask)
 
     def _reset_at_once(self, ended: Flags) -> tuple[Array, Array, Flags, Flags, dict[str, Any]]:
@@ -368,7 +380,10 @@ class _ActionLog:
         if ended or (last is not None and present is not None and last[1] == present[1]):
             found = last
         else:
-            found = None if present is None else (*present, self._next)
+            if present is None:
+                found = None
+            else:
+                found = (*present, self._next)
         if found is None:
             return None
         episode, first, end = found

@@ -89,7 +89,10 @@ def tilt_fit(motion: Lateral, *, mirrored: bool = False, shift: int = 0) -> tupl
     side = np.concatenate(sides)
     solution = np.linalg.lstsq(matrix, side, rcond=None)[0]
     total = float(np.square(side).sum())
-    explained = 1.0 - float(np.square(side - matrix @ solution).sum()) / total if total else 0.0
+    if total:
+        explained = 1.0 - float(np.square(side - matrix @ solution).sum()) / total
+    else:
+        explained = 0.0
     return explained, complex(solution[0], solution[1])
 
 
@@ -183,7 +186,9 @@ def _better(readings: Mapping[str, Pairs], names: Sequence[str], period: float) 
                 if total > best:
                     best = total
                     better = ("; ".join(filter(None, (reading, change))), score - usual)
-    return better[0] if better[1] > LEAST_RISE else ""
+    if better[1] > LEAST_RISE:
+        return better[0]
+    return ""
 
 
 def _changes(correlation: Array, names: Sequence[str]) -> Iterator[tuple[str, float]]:
@@ -192,7 +197,10 @@ def _changes(correlation: Array, names: Sequence[str]) -> Iterator[tuple[str, fl
         along = correlation[list(order), range(3)]
         negated = [name for name, value in zip(names, along, strict=True) if value < -0.25]
         moved = [name for i, name in enumerate(names) if order[i] != i]
-        changes = [f"{' and '.join(moved)} are swapped"] if moved else []
+        if moved:
+            changes = [f"{' and '.join(moved)} are swapped"]
+        else:
+            changes = []
         changes += [f"{' and '.join(negated)} {'is' if len(negated) == 1 else 'are'} negated"] if negated else []
         score = sum(-value if value < -0.25 else value for value in along.tolist())
         yield "; ".join(changes), score - 0.5 * len(negated) - 0.3 * len(moved)

@@ -42,7 +42,10 @@ def read_bag(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
             for connection, arrived, raw in bag.messages(connections) if connections else ():
                 message: Any = bag.deserialize(raw, connection.msgtype)
                 stamp = getattr(getattr(message, "header", None), "stamp", None)
-                t = 1e-9 * arrived if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
+                if stamp is None:
+                    t = 1e-9 * arrived
+                else:
+                    t = stamp.sec + 1e-9 * stamp.nanosec
                 rows.append([t, *map(partial(_at, path, message), names)])
             if rows:
                 times, *values = np.array(rows, float).T
@@ -55,7 +58,10 @@ def _at(path: Path, message: Any, name: str) -> float:
     value = message
     for field, index in _STEP.findall(name.partition(".")[2]):
         try:
-            value = getattr(value, field) if field else value[int(index)]
+            if field:
+                value = getattr(value, field)
+            else:
+                value = value[int(index)]
         except (AttributeError, IndexError, TypeError) as error:
             fields = [key for key in getattr(value, "__dataclass_fields__", ()) if key != "__msgtype__"]
             there = ", ".join(fields) or f"{np.size(value)} number{'s' * (np.size(value) > 1)}"

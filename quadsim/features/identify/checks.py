@@ -61,7 +61,10 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
         for check in ROW_CHECKS:
             check.run(record, logged)
     shortest = max(round(SHORTEST_SPAN / record.period), 2)
-    flying = np.ones_like(logged) if record.flying is None else record.flying
+    if record.flying is None:
+        flying = np.ones_like(logged)
+    else:
+        flying = record.flying
     if not (logged & flying).any() and logged.any():
         raise InputError(f"{record.name}: never flies: by its autopilot it is disarmed or landed all the time")
     aloft = runs(logged, shortest) and runs(logged & flying & ~_grounded(record, logged, vehicle.gravity), shortest)
@@ -69,13 +72,18 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     if longest >= LEAST * (1.0 - 1e-6):
         return aloft
     inputs = driver(record)[logged]
-    swing = float(np.ptp(inputs, axis=0).max() / max(np.abs(inputs).max(), 1e-9)) if len(inputs) else 0.0
-    height = (
-        ""
-        if record.position is None or not len(inputs)
-        else f", its altitude by {np.ptp(record.position[logged, 2]):.2f} m"
-    )
-    flies = f"flies for {longest:.1f} s at most in one piece" if longest else "never flies"
+    if len(inputs):
+        swing = float(np.ptp(inputs, axis=0).max() / max(np.abs(inputs).max(), 1e-9))
+    else:
+        swing = 0.0
+    if record.position is None or not len(inputs):
+        height = ""
+    else:
+        height = f", its altitude by {np.ptp(record.position[logged, 2]):.2f} m"
+    if longest:
+        flies = f"flies for {longest:.1f} s at most in one piece"
+    else:
+        flies = "never flies"
     raise InputError(
         f"{record.name}: {flies}; {LEAST:g} s in the air without a gap are needed ({100.0 * logged.mean():.0f} % of "
         f"its samples are complete; in them the rotors' outputs change by {100.0 * swing:.0f} %{height})"
@@ -129,7 +137,10 @@ def _check_outputs_are_logged_often(record: Record, logged: NDArray[np.bool_]) -
     inputs = driver(record)[logged]
     _, rest = _still(record, logged)
     changed = (np.abs(np.diff(inputs, axis=0)) > ROUNDING * np.abs(inputs).max()).any(axis=1)
-    rate = float(changed[~rest].mean()) / record.period if not rest.all() else 0.0
+    if not rest.all():
+        rate = float(changed[~rest].mean()) / record.period
+    else:
+        rate = 0.0
     if rate < 0.9 * SLOWEST_COMMANDS and 1.0 / record.period > 1.5 * rate:
         raise InputError(
             f"{record.name}: the rotors' outputs change {rate:.3g} times per second, and rates are logged "
@@ -139,7 +150,9 @@ def _check_outputs_are_logged_often(record: Record, logged: NDArray[np.bool_]) -
 
 
 def _advised(record: Record) -> str:
-    return f" ({record.advice})" if record.advice else ""
+    if record.advice:
+        return f" ({record.advice})"
+    return ""
 
 
 def _logged(record: Record) -> NDArray[np.bool_]:
@@ -158,7 +171,10 @@ def _grounded(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDAr
     acceleration = rate_over_window(velocity, record.period, 0.2)
     load = ((acceleration + np.array([0.0, 0.0, gravity])) * body_z(attitude)).sum(axis=1) / gravity
     heavy = logged & (effort > 0.5 * effort[logged].max()) & (load > 0.3)
-    hover = float(np.median(effort[heavy] / load[heavy])) if heavy.any() else float(np.median(effort[logged]))
+    if heavy.any():
+        hover = float(np.median(effort[heavy] / load[heavy]))
+    else:
+        hover = float(np.median(effort[logged]))
     lacking = 1.0 - effort / max(hover, 1e-30)  # share of the weight that the rotors do not carry
     calm = np.ones(len(effort), bool)
     for rows, most in ((velocity, SLOW), (rates, CALM)):

@@ -15,7 +15,9 @@ VECTORS: Final = {"inertia": "xyz", "rotor_moment": "xy", "inflow_moment": "xy",
 
 def field_of(name: str) -> str:
     """Return the field of a vehicle file that holds a parameter: `inertia` of `inertia_x`."""
-    return name[:-2] if name[:-2] in VECTORS else name
+    if name[:-2] in VECTORS:
+        return name[:-2]
+    return name
 
 
 def number_in(vehicle: Vehicle, name: str) -> float | None:
@@ -27,7 +29,9 @@ def number_in(vehicle: Vehicle, name: str) -> float | None:
         return vehicle.mean_coefficient
     value = getattr(vehicle, field_of(name), None)
     axis = name[-1] if field_of(name) != name else "x"
-    return value["xyz".index(axis)] if isinstance(value, tuple) else value
+    if isinstance(value, tuple):
+        return value["xyz".index(axis)]
+    return value
 
 
 @dataclass(frozen=True, kw_only=True)

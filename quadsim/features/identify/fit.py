@@ -208,7 +208,10 @@ class _Fit:
         each = self.left_out @ row
         scatter = math.sqrt((len(each) - 1) * each.var())
         colour = max(self.colour[axis] for axis in axes)
-        widened = math.sqrt((1.0 + colour) / (1.0 - colour)) if colour > self.most_colour else 1.0
+        if colour > self.most_colour:
+            widened = math.sqrt((1.0 + colour) / (1.0 - colour))
+        else:
+            widened = 1.0
         explained = math.sqrt(row @ self.cov @ row)
         beyond = math.hypot(scatter, self._floor(shares, axes), self._between_flights(row, widened))
         return math.hypot(_NORMAL * widened * explained, self.quantile * beyond)
@@ -241,7 +244,9 @@ class _Fit:
 
     def _kind(self, i: int) -> str:
         name = self.search.sought[i].name
-        return "lateness" if name == "delay" and not self._blind else name
+        if name == "delay" and not self._blind:
+            return "lateness"
+        return name
 
     def _every_estimate(self) -> dict[str, ParameterEstimate]:
         found = {name: self._estimate(name, at) for name, at in self._places().items()}
@@ -299,8 +304,14 @@ class _Fit:
             half = _quantile(response.blocks) * spread
             widest = _WIDEST_ANSWER.get(name, math.expm1(WIDEST) * abs(value))
             unit = kind.unit or VEHICLE_UNITS[name]
-            why = f"{_WEAK}: the interval is +-{half:.2g} {unit}, allowed {widest:.2g}" if half > widest else ""
-            why = "no lag can be seen" if name in ("rotor_rise", "rotor_fall") and value <= 0.0 else why
+            if half > widest:
+                why = f"{_WEAK}: the interval is +-{half:.2g} {unit}, allowed {widest:.2g}"
+            else:
+                why = ""
+            if name in ("rotor_rise", "rotor_fall") and value <= 0.0:
+                why = "no lag can be seen"
+            else:
+                why = why
             found[name] = self._judged(name, value, value - half, value + half, why)
         return found
 
@@ -319,7 +330,10 @@ class _Fit:
             self.set_anew.add(name)
         halves = np.array([self._half_width({i: 1.0}, kind.axes) for i in places])
         middle = float(np.average(x, weights=halves**-2.0))
-        half = float(halves.min()) if len(places) == 1 else max(float(halves.min()), float(np.abs(x - middle).max()))
+        if len(places) == 1:
+            half = float(halves.min())
+        else:
+            half = max(float(halves.min()), float(np.abs(x - middle).max()))
         value = number.value(middle)
         found = self._judged(
             name, value, number.value(middle - half), number.value(middle + half), self._weak(name, places, half, value)
@@ -336,7 +350,9 @@ class _Fit:
         if number.name in ("body_drag", *_PER_FLIGHT):
             return False
         absent = number.scale is None and number_in(self.vehicle, number.name) is None
-        return deviation < 0.5 if absent else abs(self.search.x[i]) > 2.0 * deviation
+        if absent:
+            return deviation < 0.5
+        return abs(self.search.x[i]) > 2.0 * deviation
 
     def _weak(self, name: str, places: Sequence[int], half: float, value: float) -> str:
         """Why a number that is searched for tells nothing, or nothing."""
@@ -358,7 +374,9 @@ class _Fit:
         if name == "body_drag" and self.vehicle.body_drag is None:
             return "its ratio along x, y and z is not known: give body_drag in the start file"
         rests = max(self.rests[i] for i in places)
-        return "" if rests <= MOST_PRIOR else f"rests on a rule of thumb for {rests:.0%}, allowed {MOST_PRIOR:.0%}"
+        if rests <= MOST_PRIOR:
+            return ""
+        return f"rests on a rule of thumb for {rests:.0%}, allowed {MOST_PRIOR:.0%}"
 
     def _uncarried(self) -> float:
         """Share of the weight that neither thrust nor drag carry, in the mean over all stretches."""
@@ -404,7 +422,12 @@ class _Fit:
         found = {}
         for name in self.estimates:
             known = name == "lateness" or (name == "delay" and not self._blind)
-            found[name] = numbers.get("delay", []) if name == "lateness" else [] if known else numbers.get(name, [])
+            if name == "lateness":
+                found[name] = numbers.get("delay", [])
+            elif known:
+                found[name] = []
+            else:
+                found[name] = numbers.get(name, [])
             if len(found[name]) == 1:
                 values[name] = float(f"{found[name][0]:.6g}")
         # Each within its interval, the three together may make no body.
@@ -456,7 +479,9 @@ class _Fit:
     def _answer(self, name: str, sought: float) -> float:
         """A number of the response to throttle and voltage, where the log has measured speeds too."""
         estimate = self.estimates.get(name)
-        return sought if self._blind or estimate is None or estimate.refused else estimate.value
+        if self._blind or estimate is None or estimate.refused:
+            return sought
+        return estimate.value
 
     def _numbers_of(self, refined: Search, flight: int) -> FlightNumbers:
         places = [i for i, part in enumerate(refined.parts) if part.flight == flight]
@@ -557,7 +582,10 @@ def _quantile(blocks: int) -> float:
 
 
 def _not_excited(half: float) -> str:
-    width = f"+-{np.expm1(half):.0%}" if half < _HOPELESS else f"more than +-{np.expm1(_HOPELESS):.0%}"
+    if half < _HOPELESS:
+        width = f"+-{np.expm1(half):.0%}"
+    else:
+        width = f"more than +-{np.expm1(_HOPELESS):.0%}"
     return f"{_WEAK}: the interval is {width}, allowed {np.expm1(WIDEST):.0%}"
 
 

@@ -100,12 +100,17 @@ class Stretch:
 def mean_voltage(parts: Sequence[Stretch]) -> float:
     """Return the mean voltage of the battery in some stretches, 0 where none is logged [V]."""
     voltages = [part.record.voltage for part in parts if part.record.voltage is not None]
-    return float(np.mean(np.concatenate(voltages))) if voltages else 0.0
+    if voltages:
+        return float(np.mean(np.concatenate(voltages)))
+    return 0.0
 
 
 def stretch(record: Record, flight: int) -> Stretch:
     """Prepare a record, all of which flies, from its first new row to its last."""
-    rows = np.arange(len(record.t)) if record.fresh is None else np.flatnonzero(record.fresh)
+    if record.fresh is None:
+        rows = np.arange(len(record.t))
+    else:
+        rows = np.flatnonzero(record.fresh)
     record = part_of(record, slice(rows[0], rows[-1] + 1))
     rows = rows - rows[0]
     if record.speeds is not None:
@@ -129,7 +134,10 @@ def _smoothed(record: Record) -> Array:
     smoothed = [tuple(record.attitude[0].tolist())]
     for angle, seen in zip(halves.tolist(), record.attitude[1:].tolist(), strict=True):
         ahead = multiply(smoothed[-1], exponential(tuple(angle)))
-        sign = 1.0 if sum(map(operator.mul, ahead, seen)) >= 0.0 else -1.0
+        if sum(map(operator.mul, ahead, seen)) >= 0.0:
+            sign = 1.0
+        else:
+            sign = -1.0
         smoothed.append(normalise(tuple(a + share * (sign * b - a) for a, b in zip(ahead, seen, strict=True))))
     return np.array(smoothed)
 

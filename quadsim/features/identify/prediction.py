@@ -172,7 +172,10 @@ def predict(
         at = np.rint(np.array(HORIZONS) / record.period).astype(int)
         drawn = np.s_[: 2 * _SHOWN : 2, :, _VELOCITY_AND_RATES]
         drawn_states = {}
-        known = identification.of_flight(flight) if fitted else identification
+        if fitted:
+            known = identification.of_flight(flight)
+        else:
+            known = identification
         predicted = _predictions(known, start, record, rows, measured, rng)
         for name, prediction in predicted.items():
             of_windows = _errors(prediction.states[:, at], prediction.truth[:, at])
@@ -267,7 +270,10 @@ def _forecast(
 def _misfit(p: Parameters, vehicle: Vehicle, held: Record, rotors: Turning, samples: slice) -> Array:
     """(N - 1, 6) measured less predicted increments of N samples; those over held rows are spread evenly."""
     past = stretch(part_of(replace(held, speeds=None), samples), 0)
-    new = np.arange(samples.stop - samples.start) if held.fresh is None else np.flatnonzero(held.fresh[samples])
+    if held.fresh is None:
+        new = np.arange(samples.stop - samples.start)
+    else:
+        new = np.flatnonzero(held.fresh[samples])
     first = int(new[0])
     last = int(new[-1])
     before = rotors.during(np.arange(samples.start + first, samples.start + last))
@@ -288,7 +294,10 @@ def _surprises(known: Identification, period: float, shape: tuple[int, int], rng
 
 def _measured(record: Record) -> Array:
     """(N, 13) position, velocity, attitude and body rates; positions are NaN where there are none."""
-    position = np.full_like(record.velocity, np.nan) if record.position is None else record.position
+    if record.position is None:
+        position = np.full_like(record.velocity, np.nan)
+    else:
+        position = record.position
     velocity = record.velocity
     if record.inertial:  # what it drifts by is left out
         velocity = velocity - uniform_filter1d(np.nan_to_num(velocity), round(_DRIFT / record.period), axis=0)

@@ -112,7 +112,10 @@ def logged_as(
 ) -> NamedQuantity:
     """A quantity by its columns: by their names, or one name with {} for each of some words, else for 0, 1, ..."""
     size, units, _ = LOGGED[quantity]
-    names = [columns.format(i) for i in each.split() or range(size)] if "{}" in columns else columns.split()
+    if "{}" in columns:
+        names = [columns.format(i) for i in each.split() or range(size)]
+    else:
+        names = columns.split()
     zero, scale = units[unit or next(iter(units))]
     known = {"zero": zero, "scale": scale, **numbers}
     return NamedQuantity(quantity=quantity, columns=tuple(names), down=down, **known)
@@ -134,7 +137,10 @@ def _named_in(path: Path, quantity: str, table: Any) -> NamedQuantity:
     usual: dict[str, Any] = {"columns": [], "unit": next(iter(units)), "sign": [1] * size}
     usual |= {"frame": frames[0]} if frames else {}
     if not isinstance(table, dict) or (odd := {*table} - {*usual}):
-        what = f"has no {sorted(odd)[0]!r}" if isinstance(table, dict) else f"must be a table; got {table!r:.80}"
+        if isinstance(table, dict):
+            what = f"has no {sorted(odd)[0]!r}"
+        else:
+            what = f"must be a table; got {table!r:.80}"
         raise FileError(path, f"{quantity} {what}; its fields are {', '.join(usual)}")
     of = usual | table
     sizes = {field: len(of[field]) if isinstance(of[field], list) else 0 for field in ("columns", "sign")}
@@ -213,7 +219,10 @@ def to_series(
         known["attitude"] = known["euler"]
     for quantity in {*series} & {*known}:
         if known[quantity].down:
-            turn = np.append(1.0, HALF_TURN) if quantity == "attitude" else HALF_TURN
+            if quantity == "attitude":
+                turn = np.append(1.0, HALF_TURN)
+            else:
+                turn = HALF_TURN
             series[quantity] = Column(t=series[quantity].t, values=series[quantity].values * turn)
     return series
 
@@ -249,7 +258,11 @@ def _series(columns: Mapping[str, Column], one: NamedQuantity) -> Column:
     t = columns[one.columns[0]].t
     rows = [c.values if c.t is t else np.interp(t, c.t, c.values) for c in (columns[name] for name in one.columns)]
     values = (np.stack(rows, axis=1) - one.zero) * one.scale
-    values = np.maximum(values, 0.0) if np.any(one.zero) else values  # a motor that is stopped has a shorter pulse
+    # a motor that is stopped has a shorter pulse
+    if np.any(one.zero):
+        values = np.maximum(values, 0.0)
+    else:
+        values = values
     return Column(t=t, values=values * one.sign if one.sign else values)
 
 

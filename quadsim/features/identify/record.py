@@ -115,7 +115,10 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
     """
     given = Path(path)
     bag = (given / "metadata.yaml").is_file()  # of ROS 2, a directory
-    file = given / FLIGHT_FILE if given.is_dir() and not bag else given
+    if given.is_dir() and not bag:
+        file = given / FLIGHT_FILE
+    else:
+        file = given
     if not (file.is_file() or bag):
         raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
     kind = _format_of(file)
@@ -207,7 +210,10 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
         values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
         rates = f"{1.0 / period:.0f} Hz, of which means at {1.0 / (grid[1] - grid[0]):.0f} Hz are used"
         notes = (*notes, f"{name}: {rates}")
-    aloft = None if flying is None else held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
+    if flying is None:
+        aloft = None
+    else:
+        aloft = held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
     if "fresh" in values:
         values["fresh"] = values["fresh"] > 0.0
         values["rotors_unknown"] = float(values["rotors_unknown"][0])
@@ -237,7 +243,10 @@ def _without_repeated_times(name: str, series: Mapping[str, Column]) -> tuple[di
             first = np.append(True, np.diff(samples.t) != 0.0)
             repeats = np.count_nonzero(~first)
             few = 0 < repeats <= MOST_TIMES_REPEATED * samples.t.size
-            kept[clock] = (samples.t[first], first) if few else (samples.t, np.ones(samples.t.size, bool))
+            if few:
+                kept[clock] = (samples.t[first], first)
+            else:
+                kept[clock] = (samples.t, np.ones(samples.t.size, bool))
             if few:
                 row = int(np.argmin(first))
                 where = f"the first at row {row}, t = {samples.t[row]:.6g} s"
@@ -341,7 +350,10 @@ def _sampled(series: Column, grid: Array, *, held: bool) -> Array:
     near = 0.05 * period  # a stamp's jitter must neither hold a command for a period too long nor open a gap
     before = np.clip(np.searchsorted(t, grid + near, side="right") - 1, 0, t.size - 1)
     after = np.minimum(np.searchsorted(t, grid - near, side="left"), t.size - 1)
-    sampled = values[before] if held else np.stack([np.interp(grid, t, column) for column in values.T], axis=1)
+    if held:
+        sampled = values[before]
+    else:
+        sampled = np.stack([np.interp(grid, t, column) for column in values.T], axis=1)
     outside = (grid < t[0] - 0.5 * period) | (grid > t[-1] + (LONGEST_GAP if held else 0.5) * period)
     sampled[outside | (t[after] - t[before] > LONGEST_GAP * period + near)] = np.nan
     return np.asarray(sampled)

@@ -92,7 +92,10 @@ class IdentifiedVehicle(Tabular):
         certain = [e for e in self.identification.estimates if not (e.in_file or e.refused or e.low <= 0.0 <= e.high)]
         known = {estimate.name: rounded(estimate.value, estimate) for estimate in certain}
         offset = [known.get(f"offset_{axis}", 0.0) for axis in "xy"]
-        settings = {"computation.delay": f"{known['delay']:g}"} if known.get("delay", 0.0) > 0.0 else {}
+        if known.get("delay", 0.0) > 0.0:
+            settings = {"computation.delay": f"{known['delay']:g}"}
+        else:
+            settings = {}
         return settings | ({"effects.load.centre_of_mass": f"[{offset[0]:g}, {offset[1]:g}, 0]"} if any(offset) else {})
 
     def tables(self) -> tuple[Grid, Grid, Grid]:
@@ -335,7 +338,10 @@ def _render(result: IdentifiedVehicle) -> str:
 
 def _parameter(estimate: ParameterEstimate, known: Identification) -> tuple[Cell, ...]:
     """Return a line of the table of parameters."""
-    start = ABSENT if estimate.start is None else f"{estimate.start:.4g}"
+    if estimate.start is None:
+        start = ABSENT
+    else:
+        start = f"{estimate.start:.4g}"
     value = f"{rounded(estimate.value, estimate):.7g}"
     found = Cell(text=verdict(estimate, known.vehicle), mark=Mark.TEXT)
     return line(estimate.name, estimate.unit, start, value, interval_text(estimate), found)
@@ -364,4 +370,6 @@ def _plain(values: Any) -> Any:
         return {name: _plain(value) for name, value in values.items()}
     if isinstance(values, list | tuple | np.ndarray):
         return [_plain(value) for value in values]
-    return None if isinstance(values, float) and not math.isfinite(values) else values
+    if isinstance(values, float) and not math.isfinite(values):
+        return None
+    return values

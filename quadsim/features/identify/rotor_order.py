@@ -116,8 +116,16 @@ def _named(order: Sequence[int], turn: float, vehicle: Vehicle, record: Record) 
         return f"the arms are 45 deg off: try rotor_azimuths = [{', '.join(f'{a:g}' for a in azimuths)}]"
     mirrored = np.allclose(vehicle.hubs[list(order)], vehicle.hubs * [-1.0, 1.0, 1.0])
     moved = [i + 1 for i in range(N_ROTORS) if order[i] != i]
-    column = "w" if record.speeds is not None else "u" if record.commands is not None else "throttle"
-    swapped = f"rotors {moved[0]} and {moved[1]} are swapped" if len(moved) == 2 else "the rotors are in another order"
+    if record.speeds is not None:
+        column = "w"
+    elif record.commands is not None:
+        column = "u"
+    else:
+        column = "throttle"
+    if len(moved) == 2:
+        swapped = f"rotors {moved[0]} and {moved[1]} are swapped"
+    else:
+        swapped = "the rotors are in another order"
     return f"{swapped}: try the order {','.join(f'{column}{i + 1}' for i in order)}" + (
         " (or body axes are x forward, y right, z down)" if mirrored else ""
     )

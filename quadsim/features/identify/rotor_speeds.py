@@ -33,7 +33,10 @@ def check_against_commands(record: Record, parts: Sequence[slice], vehicle: Vehi
     """
     if record.commands is None and record.throttle is None:
         return
-    voltage = 0.0 if record.voltage is None else float(np.nanmean(record.voltage))
+    if record.voltage is None:
+        voltage = 0.0
+    else:
+        voltage = float(np.nanmean(record.voltage))
     wanted = commanded(record, vehicle, Parameters.of(vehicle, voltage=voltage))
     speeds = np.concatenate([np.asarray(record.speeds)[part] for part in parts])
     targets = np.concatenate([wanted[part] for part in parts])

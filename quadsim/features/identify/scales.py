@@ -95,7 +95,10 @@ def check_scales(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> No
     if falls is None or not falls.off():  # gravity speaks for the velocity: small differences are the position's
         if move is not None and move.off(_OF_ONE):
             factor = 1.0 / move.value
-            likely = " likely in cm;" if abs(math.log(factor / 100.0)) < _NEAR else ""
+            if abs(math.log(factor / 100.0)) < _NEAR:
+                likely = " likely in cm;"
+            else:
+                likely = ""
             what = f"{name}: x, y, z are {factor:.3g} times the integral of vx, vy, vz;{likely}"
             raise InputError(f"{what} give m and m/s")
     else:
@@ -132,7 +135,9 @@ def _refuse(
 
 def _likely(factor: float, kind: str) -> str:
     near = [unit for of, unit in _UNITS[kind] if abs(math.log(max(factor, 1e-9) / of)) < _NEAR]
-    return f": likely {near[0]}" if near else ""
+    if near:
+        return f": likely {near[0]}"
+    return ""
 
 
 def _common(factors: Sequence[ScaleFactor | None]) -> ScaleFactor | None:

@@ -79,7 +79,9 @@ class Sought(NamedTuple):
 
     def place(self, value: float) -> float:
         """Where in x a value is: the inverse of `value`."""
-        return math.log(value / self.start) if self.scale is None else (value - self.start) / self.scale
+        if self.scale is None:
+            return math.log(value / self.start)
+        return (value - self.start) / self.scale
 
 
 def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterator[Sought]:
@@ -94,17 +96,29 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch], *, wind: bool) -> Iterat
         yield Sought(f"inertia_{axis}", moment, None, None)
     yield Sought("drag_to_thrust", vehicle.drag_to_thrust, None, None)
     yield Sought("rotor_inertia", vehicle.rotor_inertia or 6e-4 * vehicle.inertia[2], None, 1.0)
-    area = vehicle.body_drag[0] if vehicle.body_drag else 0.25 * arm**2
+    if vehicle.body_drag:
+        area = vehicle.body_drag[0]
+    else:
+        area = 0.25 * arm**2
     yield Sought("rotor_drag", vehicle.rotor_drag or 0.005 * weight / hover, None, 1.5)
     yield Sought("body_drag", area, area, 1.0)
     for i, axis in enumerate("xy"):
-        moment = vehicle.rotor_moment[i] if vehicle.rotor_moment else 0.0
+        if vehicle.rotor_moment:
+            moment = vehicle.rotor_moment[i]
+        else:
+            moment = 0.0
         yield Sought(f"rotor_moment_{axis}", moment, 0.01 * weight * arm / (4.0 * hover), 10.0)
     for i, axis in enumerate("xy"):
-        moment = vehicle.inflow_moment[i] if vehicle.inflow_moment else 0.0
+        if vehicle.inflow_moment:
+            moment = vehicle.inflow_moment[i]
+        else:
+            moment = 0.0
         yield Sought(f"inflow_moment_{axis}", moment, 0.01 * weight * arm, 10.0)
     for i, axis in enumerate("xyz"):
-        damping = vehicle.rate_damping[i] if vehicle.rate_damping else 0.0
+        if vehicle.rate_damping:
+            damping = vehicle.rate_damping[i]
+        else:
+            damping = 0.0
         yield Sought(f"rate_damping_{axis}", damping, vehicle.inertia[i], 10.0)
     yield Sought("inflow", vehicle.inflow or 0.0, 0.02 * weight / (4.0 * hover), 5.0)
     yield Sought("yaw_trim", 0.0, 0.01 * weight * vehicle.drag_to_thrust, 10.0)
@@ -280,7 +294,9 @@ class Search:
         lift = np.concatenate([self._lift(misfit[:, -1], i) for i, misfit in enumerate(misfits)])
         cost = self.prior(x)[0] + sum(len(e) * 0.5 * float(np.log((e**2).mean(axis=0)).sum()) for e in every)
         cost += 0.5 * float(lift @ lift)
-        return cost if np.isfinite(cost) else np.inf
+        if np.isfinite(cost):
+            return cost
+        return np.inf
 
     def misfits(self, x: Array, part: int) -> tuple[Array, Array]:
         """Misfit (N, 6) of a stretch's increments and its slopes (N, 6, P) by every number that is sought."""
@@ -347,7 +363,10 @@ class Search:
         blocks = []
         for i in range(len(self.parts)):
             innovations, slopes, lift, lift_slopes = self._slopes(i)
-            instruments = self._instruments(i, slopes) if instrumented else slopes
+            if instrumented:
+                instruments = self._instruments(i, slopes)
+            else:
+                instruments = slopes
             sigma = self.sigma[self.parts[i].flight]
             for rows, mean, slope in zip(self.rows(i), lift, lift_slopes, strict=True):
                 J = np.vstack([(slopes[rows] / sigma[:, None]).reshape(-1, len(self.x)), slope])

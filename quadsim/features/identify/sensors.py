@@ -82,10 +82,16 @@ def without_spikes(name: str, series: Mapping[str, Column]) -> tuple[dict[str, C
         for i in np.flatnonzero(off.any(axis=0)):
             row = int(np.argmax(off[:, i]))
             count = np.count_nonzero(off[:, i])
-            logged = samples.values[row] if field == "attitude" else samples.values[row, i : i + 1]
+            if field == "attitude":
+                logged = samples.values[row]
+            else:
+                logged = samples.values[row, i : i + 1]
             value = ", ".join(f"{number:.4g}" for number in logged)
             what = f"{name}: {columns[i]} is {value} {unit} at t = {samples.t[row]:.6g} s"
-            more = f" and in {count - 1} more samples" if count > 1 else ""
+            if count > 1:
+                more = f" and in {count - 1} more samples"
+            else:
+                more = ""
             if count > MOST_CUT * len(off):
                 raise InputError(
                     f"{what}{more}, far from the samples beside; at most {MOST_CUT:.0%} of a sensor's samples may jump:"
@@ -199,7 +205,10 @@ def at_rest(still: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
     """
     rest = np.zeros_like(still)
     for run in runs(still):
-        before = still[run.start - 2 : run.start] if run.start >= 2 else still[:0]
+        if run.start >= 2:
+            before = still[run.start - 2 : run.start]
+        else:
+            before = still[:0]
         after = still[run.stop : run.stop + 2]
         at_an_end = run.start == 0 or run.stop == len(still)
         lasts = run.stop - run.start > longest and not before.any() and not after.any()
@@ -242,7 +251,10 @@ def without_stopped_counters(name: str, series: Mapping[str, Column]) -> tuple[d
             f"on while the others turn at {others[row]:.4g}, in {share:.1%} of the time that they turn"
         )
         if share > MOST_STOPPED:
-            way = ", or name the commands alone" if {"commands", "throttle"} & {*series} else ""
+            if {"commands", "throttle"} & {*series}:
+                way = ", or name the commands alone"
+            else:
+                way = ""
             raise InputError(f"{what}: its counter is dead, at most {MOST_STOPPED:.0%} is allowed: mend it{way}")
         values[stopped] = np.nan
         notes.append(f"{what}: left out")

@@ -52,7 +52,10 @@ def read_columns(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     Raises:
         FileError: it is no table, has no column of time or two of one name, or a column is not of numbers.
     """
-    table = _read_csv(path) if path.suffix.lower() == ".csv" else read_parquet(path)
+    if path.suffix.lower() == ".csv":
+        table = _read_csv(path)
+    else:
+        table = read_parquet(path)
     short = [name.partition("[")[0].strip().lower() for name in table.column_names]
     if twice := sorted({name for name in short if name in _KNOWN and short.count(name) > 1}):
         raise FileError(path, f"has two columns of one name: {listed(twice)}; a name is what stands before its unit")
@@ -105,5 +108,8 @@ def _time(path: Path, columns: Mapping[str, pa.ChunkedArray], given: Sequence[Na
         allowed = ", ".join((*(one.columns[0] for one in _TIMES), *_TIMES_OF_ANY_UNIT))
         raise FileError(path, f"lacks a column of time: one of {allowed}; it has {listed(columns)}{MAPPED}")
     t = _numbers(path, name, columns[name])
-    step = float(np.median(np.abs(np.diff(t)))) if t.size > 1 else 1.0
+    if t.size > 1:
+        step = float(np.median(np.abs(np.diff(t))))
+    else:
+        step = 1.0
     return t * (1.0 if step < 0.5 else 1e-3 if step < 200.0 else 1e-6)

@@ -29,7 +29,9 @@ def verdict(estimate: ParameterEstimate, vehicle: Vehicle) -> str:
     if not estimate.in_file or number_in(vehicle, estimate.name) is None:
         return f"left out: {estimate.refused}"
     number = number_in(vehicle, estimate.name)
-    return f"kept: {estimate.refused}" if number == estimate.start else f"set to {number:.4g}: {estimate.refused}"
+    if number == estimate.start:
+        return f"kept: {estimate.refused}"
+    return f"set to {number:.4g}: {estimate.refused}"
 
 
 def rounded(value: float, estimate: ParameterEstimate) -> float:
@@ -104,18 +106,32 @@ def factor_text(interval: tuple[float, float]) -> str:
 def _value(value: Any, estimates: Sequence[ParameterEstimate]) -> Any:
     """Return a number, or the numbers of a vector, rounded where they are identified."""
     numbers = np.atleast_1d(value).tolist()
-    by_number = estimates if len(estimates) == len(numbers) else [*estimates] * len(numbers)
+    if len(estimates) == len(numbers):
+        by_number = estimates
+    else:
+        by_number = [*estimates] * len(numbers)
     numbers = [n if e.refused else rounded(n, e) for n, e in zip(numbers, by_number, strict=True)]
-    return numbers if isinstance(value, tuple) else numbers[0]
+    if isinstance(value, tuple):
+        return numbers
+    return numbers[0]
 
 
 def _source(vehicle: Vehicle, estimates: Sequence[ParameterEstimate], before: str, logs: Sequence[str]) -> str:
     """Return where each number is from."""
     parts = []
     for estimate in estimates:
-        start = "" if estimate.start is None else f"; start {estimate.start:.4g}"
-        axis = "" if len(estimates) == 1 else f"{estimate.name[-1]} "
-        within = "" if estimate.refused else f": 95 % within {interval_text(estimate)}{start}"
+        if estimate.start is None:
+            start = ""
+        else:
+            start = f"; start {estimate.start:.4g}"
+        if len(estimates) == 1:
+            axis = ""
+        else:
+            axis = f"{estimate.name[-1]} "
+        if estimate.refused:
+            within = ""
+        else:
+            within = f": 95 % within {interval_text(estimate)}{start}"
         parts.append(f"{axis}{verdict(estimate, vehicle)}{within}")
     refused = [bool(estimate.refused) for estimate in estimates]
     parts += [] if all(refused) else [f"logs {', '.join(logs)}"]

@@ -62,6 +62,9 @@ def live(
             raise ParameterError("", "--set" if changes else "--seed", "given", "absent when a run is continued")
         scenario = reaudit(Path(str(scenario)), products=False).scenario
     flown = load_scenario(scenario, changes, seed)
-    other = None if against is None else load_scenario(against).controller
+    if against is None:
+        other = None
+    else:
+        other = load_scenario(against).controller
     place = {"port": port, "host": host, "browser": browser}
     return fly_live(flown, other, script, onward=onward, out=out, overwrite=overwrite, video=video, **place)

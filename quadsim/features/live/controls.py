@@ -140,7 +140,10 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     no_wind, no_load, no_lag, *blind = session.refusals([gust, load, lag, *sensors])
 
     def pulled(event: Any) -> None:
-        to = None if event.phase == "end" else [float(number) for number in event.end_position]
+        if event.phase == "end":
+            to = None
+        else:
+            to = [float(number) for number in event.end_position]
         session.submit({"type": "pull", "to": to}, subject="pull")
         use("pull")
 
@@ -153,7 +156,10 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
         widgets.give(wear[0], round(worn if is_broken() else worn + (1.0 - worn) * _BROKEN, 4))
 
     async def named(event: Any) -> None:  # also after a reset
-        button.label = "Repair the rotor" if is_broken() else "Break a rotor"
+        if is_broken():
+            button.label = "Repair the rotor"
+        else:
+            button.label = "Break a rotor"
         button.color = None if is_broken() else BREAKS
 
     widgets.on(stage.grab.on_drag("left"), pulled)
@@ -253,7 +259,10 @@ class Steering:
         if above * direction[2] < 0.0:  # it meets the ground
             meets = origin - above / direction[2] * direction
             last = self._session.flights[0].loop.last
-            height = self._place.value[2] if last is None else last.observation.reference[2]
+            if last is None:
+                height = self._place.value[2]
+            else:
+                height = last.observation.reference[2]
             self._set_point((*meets[:2], height))
             self._use("waypoint")
 
@@ -392,5 +401,8 @@ def _shown_lag(acts: Disturbances) -> tuple[float, float]:
 def _wear(rotor: int, loss: Any, acts: Disturbances) -> dict[str, Any]:
     """Return the input by which a rotor lacks a share of its thrust; what it lacks by the scenario stays."""
     left = 1.0 - float(acts.worn[rotor - 1])
-    more = max(0.0, 1.0 - (1.0 - float(loss)) / left) if left > 0.0 else 0.0
+    if left > 0.0:
+        more = max(0.0, 1.0 - (1.0 - float(loss)) / left)
+    else:
+        more = 0.0
     return {"type": "wear", "rotor": rotor, "loss": round(more, 4)}

@@ -134,7 +134,9 @@ def _values(headers: Any, name: str) -> list[str]:
     """Return every value of a header, of the library's headers or of a mapping."""
     if hasattr(headers, "get_all"):
         return list(headers.get_all(name))
-    return [headers[name]] if name in headers else []
+    if name in headers:
+        return [headers[name]]
+    return []
 
 
 def _status(address: str, port: int, headers: Mapping[str, str]) -> int | None:

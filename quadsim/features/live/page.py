@@ -69,7 +69,9 @@ T = TypeVar("T")
 def _reachable(host: str) -> str:
     """Return the host name for links to this server; one address if it listens on all."""
     if host not in ("0.0.0.0", "::"):
-        return f"[{host}]" if ":" in host else host
+        if ":" in host:
+            return f"[{host}]"
+        return host
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route, contextlib.suppress(OSError):
         route.connect(("192.0.2.1", 9))  # of a network that is nowhere: nothing is sent
         return str(route.getsockname()[0])
@@ -384,7 +386,10 @@ def _series(names: Collection[str], bounds: Collection[bool]) -> tuple[dict[str,
     lines = []
     named = False
     for shown in bounds:
-        further = {"class": readout.FURTHER} if named or not shown else {}
+        if named or not shown:
+            further = {"class": readout.FURTHER}
+        else:
+            further = {}
         named = named or shown
         lines.append({**_BOUND, **further, "show": shown})
     return {"label": "t [s]"}, *curves, *lines
@@ -400,7 +405,10 @@ class _Line:
 
     def curve(self, time: Array, ends: Mapping[str, float]) -> Array:
         """(M,) its value at times [s], NaN where it does not hold; `ends` has those of the constraints in force [s]."""
-        until = ends.get(self.name, -math.inf) if self.name else math.inf
+        if self.name:
+            until = ends.get(self.name, -math.inf)
+        else:
+            until = math.inf
         return np.where((time >= self.start) & (time <= until), self.value, np.nan)
 
 

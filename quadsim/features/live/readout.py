@@ -71,7 +71,9 @@ def block(content: str, mark: str = "") -> str:
 
 def says(text: str, mark: str = "") -> str:
     """Return a sentence in the panel's style."""
-    return block(escape(text), mark) if text else ""
+    if text:
+        return block(escape(text), mark)
+    return ""
 
 
 def hints(used: Collection[str], names: Sequence[str]) -> str:
@@ -85,10 +87,20 @@ def hints(used: Collection[str], names: Sequence[str]) -> str:
 
 def status_line(state: str, frame: Frame | None, factor: float) -> str:
     """Return what the flight does now, its time and its speed."""
-    time = "" if frame is None else f" <b>{frame.time:.2f} s</b>"
-    speed = f", real-time factor {factor:.2f}" if frame is not None and state == "flying" else ""
+    if frame is None:
+        time = ""
+    else:
+        time = f" <b>{frame.time:.2f} s</b>"
+    if frame is not None and state == "flying":
+        speed = f", real-time factor {factor:.2f}"
+    else:
+        speed = ""
     chip = f'<span class="chip {state}">{state}</span>'
-    over = "" if state == "flying" else f'<div class="over">{chip}</div>'  # seen also where the panel is scrolled
+    # seen also where the panel is scrolled
+    if state == "flying":
+        over = ""
+    else:
+        over = f'<div class="over">{chip}</div>'
     return block(f"{chip}{time}{speed}", "line") + over
 
 
@@ -101,13 +113,19 @@ def readings(frame: Frame | None, states: Sequence[tuple[float, float]] = (), lo
     if frame is None or sample is None:
         return block("&nbsp;", "line") * 4
     command = sample.command
-    late = ' <span class="bad">late</span>' if sample.missed else ""
+    if sample.missed:
+        late = ' <span class="bad">late</span>'
+    else:
+        late = ""
     solved = f"QP {escape(command.status)} by {escape(command.answered_by)}"
     if command.status not in OPTIMAL or command.fallback:
         solved = f'<span class="bad">QP {escape(command.status)}, fallback {command.fallback}</span>'
     elif not command.stats.active:
         solved = f"no bound active, by {escape(command.answered_by)}"
-    active = f", {command.stats.active} bounds active" if command.stats.active else ""
+    if command.stats.active:
+        active = f", {command.stats.active} bounds active"
+    else:
+        active = ""
     weak = [f"rotor {i}: {100 * (share - 1):.0f} %" for i, share in enumerate(frame.health, 1) if share < 1.0]
     rows = [
         f"MPC: {solved}{active}",
@@ -153,21 +171,32 @@ class Constraints:
     def rows(self, frame: Frame, audited: Collection[str]) -> str:
         """Return the table; `audited` names the limits that still apply."""
         both = len(frame.margins) > 1
-        titles = [f"{_dot(0)}worst", f"{_dot(1)}worst"] if both else ["margin", "worst"]
+        if both:
+            titles = [f"{_dot(0)}worst", f"{_dot(1)}worst"]
+        else:
+            titles = ["margin", "worst"]
         heads = "".join(f'<th class="n" style="width:22%">{title}' for title in titles)
         head = f'<tr><th style="width:30%">constraint<th>utilisation{heads}'
         rows = [self._row(limit, limit.name in audited, frame) for limit in self._limits]
-        return block(f"<table>{head}{''.join(rows)}</table>") if rows else ""
+        if rows:
+            return block(f"<table>{head}{''.join(rows)}</table>")
+        return ""
 
     def _row(self, limit: Limit, audited: bool, frame: Frame) -> str:
         margins = [margins.get(limit.name, math.nan) for margins in frame.margins]
         marks = "".join(_mark(limit, margin, i) for i, margin in enumerate(margins) if not math.isnan(margin))
         worst = [self._worst.get((limit.name, i), math.nan) for i in range(len(margins))]
-        kind = "near" if margins[0] <= NEAR * limit.half_band else ""
+        if margins[0] <= NEAR * limit.half_band:
+            kind = "near"
+        else:
+            kind = ""
         cells = [_number(limit, margin) for margin in (worst if len(margins) > 1 else [margins[0], *worst])]
         if math.isnan(margins[0]):
             kind = "off"
-            cells[0] = f"from {limit.start:g} s" if audited and frame.time < limit.start else "ended"
+            if audited and frame.time < limit.start:
+                cells[0] = f"from {limit.start:g} s"
+            else:
+                cells[0] = "ended"
         bound = f'<i style="left:{100.0 / _SHOWN:.1f}%;width:2px;background:{COLOUR.bound}"></i>'
         numbers = "".join(f'<td class="n">{cell}</td>' for cell in cells)
         name = f"{escape(limit.name)} [{escape(limit.unit)}]"
@@ -181,7 +210,9 @@ def _number(limit: Limit, margin: float) -> str:
         return ""
     decimals = max(0, 2 - math.floor(math.log10(limit.half_band)))
     text = f"{round(margin, decimals) + 0.0:+.{decimals}f}"
-    return f'<span class="bad" title="violated">{text}</span>' if limit.violated(margin) else text
+    if limit.violated(margin):
+        return f'<span class="bad" title="violated">{text}</span>'
+    return text
 
 
 def _mark(limit: Limit, margin: float, vehicle: int) -> str:
@@ -190,5 +221,8 @@ def _mark(limit: Limit, margin: float, vehicle: int) -> str:
     colour = line_colour(vehicle)
     if vehicle:
         return f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{colour};z-index:1"></i>'
-    colour = COLOUR.violated if limit.violated(margin) else colour
+    if limit.violated(margin):
+        colour = COLOUR.violated
+    else:
+        colour = colour
     return f'<i style="left:0;width:{100.0 * share:.1f}%;background:{colour}"></i>'

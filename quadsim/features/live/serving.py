@@ -87,7 +87,10 @@ def fly_live(
         seconds = session.k * session.period
         if saved is not None:
             text = "".join(f"{line}\n" for line in (next(iter(saved.shown())), *saved.outputs()))
-        status = EXIT_DONE if session.reason is None and not refused else EXIT_FAILED
+        if session.reason is None and not refused:
+            status = EXIT_DONE
+        else:
+            status = EXIT_FAILED
         facts = {"directory": str(directory), "duration": seconds, "reason": session.reason, "refused": refused}
         return Document(text, facts, status)
 
@@ -99,7 +102,10 @@ def _require_server(host: str, port: int) -> None:
     if not 0 <= port <= 65535:
         raise ParameterError("", "--port", port, "from 1 to 65535, or 0 for any that is free")
     try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        if ":" in host:
+            family = socket.AF_INET6
+        else:
+            family = socket.AF_INET
         socket.create_server((host or "?", port), family=family).close()
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES):

@@ -141,7 +141,11 @@ class Session:
         self._against = against
         self._effects = Assembly(self.scenario).effects
         repeat = self.scenario.reference.repeat
-        self._round = None if repeat is None else round(repeat / self.period)  # periods until the course starts again
+        # periods until the course starts again
+        if repeat is None:
+            self._round = None
+        else:
+            self._round = round(repeat / self.period)
         self._queue: deque[tuple[Mapping[str, Any], str, Successor | None, str]] = deque()
         self.flights: tuple[Rollout, ...] = ()
         self.reset()
@@ -239,7 +243,10 @@ class Session:
                     sample = flight.step()
                     entry = sample, flight.margins(sample), _horizon(flight, sample)
                 except FlightError as error:
-                    self.reason = str(error) if flight is self.flights[0] else self.reason
+                    if flight is self.flights[0]:
+                        self.reason = str(error)
+                    else:
+                        self.reason = self.reason
             shown.append(entry)
         samples, margins, horizons = zip(*shown, strict=True)
         health = self._left(by_hand=True)
@@ -255,9 +262,15 @@ class Session:
         flight = self.flights[0]
         result = flight.successor(fields)
         for signal, (lower, upper) in result.spec.audited(flight.vehicle).items():
-            hover = flight.vehicle.hover_speeds if signal == "speed" else np.zeros(1)
+            if signal == "speed":
+                hover = flight.vehicle.hover_speeds
+            else:
+                hover = np.zeros(1)
             if signal not in REFERENCE_NAMES and not (lower <= hover.min() and hover.max() <= upper):
-                table = "input_bounds" if signal in COMMAND_SIGNALS else "output_bounds"
+                if signal in COMMAND_SIGNALS:
+                    table = "input_bounds"
+                else:
+                    table = "output_bounds"
                 rule = f"a range that contains {span(hover)}, as in hover"
                 raise ParameterError(f"controller.{table}", signal, [lower, upper], rule)
         return result
@@ -354,7 +367,10 @@ class Session:
         worn = {"type": "rotor_loss", "duration": self.period}
         events += [worn | {"rotor": rotor, "loss": loss} for rotor, loss in sorted(held.wear.items()) if loss > 0.0]
         if held.steer.any():
-            at = last.observation.reference[:3] if held.setpoint is None else held.setpoint
+            if held.setpoint is None:
+                at = last.observation.reference[:3]
+            else:
+                at = held.setpoint
             held.setpoint = np.round(at + self.period * held.steer, 6)
             events.append({"type": "setpoint", **dict(zip("xyz", held.setpoint.tolist(), strict=True))})
         try:
@@ -375,7 +391,10 @@ def looping(scenario: Scenario) -> Scenario:
     course = Assembly(scenario).course
     period = scenario.control_period
     moves = bool(np.ptp(course.sample(period * np.arange(scenario.periods + 1, dtype=np.float64)), axis=0).any())
-    end = max((scenario.duration, *course.jumps, *course.kinks)) if math.isinf(course.end) else course.end
+    if math.isinf(course.end):
+        end = max((scenario.duration, *course.jumps, *course.kinks))
+    else:
+        end = course.end
     if scenario.reference.repeat is not None or course.derivatives is not None or not moves or math.isinf(end):
         return scenario
     length = round(period * math.ceil(max(scenario.duration, end) / period - 1e-6), 9)

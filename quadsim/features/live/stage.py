@@ -86,7 +86,10 @@ class Stage:
             colour = rgb(line_colour(i))
             self._frames.append(scene.add_frame(f"{_ROOT}/{name}", show_axes=False))
             for material, (*paint, alpha), mesh in look.airframe(model):
-                tint = tuple(paint) if alone or material not in _TINTED else colour
+                if alone or material not in _TINTED:
+                    tint = tuple(paint)
+                else:
+                    tint = colour
                 self._add(f"{name}/{material}", mesh, tint, opacity=None if alpha == 1.0 else alpha)
             arrows = np.zeros((len(self._rotors), 2, 3))
             widths = {"shaft_radius": 0.04 * self.unit, "head_radius": 0.09 * self.unit, "head_length": 0.2 * self.unit}

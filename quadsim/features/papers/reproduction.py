@@ -108,7 +108,9 @@ class PaperNumber:
     @property
     def counted_as(self) -> str:
         """What it is counted as: its kind, or its role where it is none of the paper's numbers of what is flown."""
-        return self.kind if self.role == "number" else self.role
+        if self.role == "number":
+            return self.kind
+        return self.role
 
     @property
     def stated(self) -> float | list[float]:
@@ -119,13 +121,18 @@ class PaperNumber:
     @property
     def span(self) -> tuple[float, float]:
         """The lowest and the highest of the stated numbers [unit]."""
-        low, high = self.stated if isinstance(self.stated, list) else (self.stated, self.stated)
+        if isinstance(self.stated, list):
+            low, high = self.stated
+        else:
+            low, high = (self.stated, self.stated)
         return low, high
 
     @property
     def tolerance(self) -> float:
         """Allowed difference [unit]."""
-        return self.absolute if self.absolute is not None else (self.relative or 0.0) * max(map(abs, self.span))
+        if self.absolute is not None:
+            return self.absolute
+        return (self.relative or 0.0) * max(map(abs, self.span))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +188,9 @@ class Reproduced:
     def difference(self) -> float | None:
         """Ours minus theirs, or minus the nearest of several [unit]."""
         low, high = self.spec.span
-        return None if self.ours is None else self.ours - min(max(self.ours, low), high)
+        if self.ours is None:
+            return None
+        return self.ours - min(max(self.ours, low), high)
 
     @property
     def within(self) -> bool:
@@ -207,16 +216,24 @@ class Reproduced:
         unit = self.spec.unit
         ours = self._shown(self.ours)
         difference = self._shown(self.difference, "+")
-        role = "" if self.spec.role == "number" else f", a {self.spec.role}"
+        if self.spec.role == "number":
+            role = ""
+        else:
+            role = f", a {self.spec.role}"
         theirs = f"{NUMBER_KINDS[self.spec.kind]}{role}: {self._theirs} {unit}"
         text = f"{theirs}; ours {ours} (difference {difference}, tolerance {self._tolerance})"
-        return f"{text}: {self.reason}" if self.reason else text
+        if self.reason:
+            return f"{text}: {self.reason}"
+        return text
 
     def cells(self, kinds: Sequence[str]) -> tuple[Cell, ...]:
         """Its line of a table with a column for each of some kinds."""
         spec = self.spec
         theirs = [self._theirs if kind == spec.kind else ABSENT for kind in kinds]
-        verdict = Cell(text="yes", mark=Mark.GOOD) if self.within else Cell(text="no", mark=Mark.BAD)
+        if self.within:
+            verdict = Cell(text="yes", mark=Mark.GOOD)
+        else:
+            verdict = Cell(text="no", mark=Mark.BAD)
         return line(
             spec.name,
             spec.unit,
@@ -230,13 +247,18 @@ class Reproduced:
     @property
     def _theirs(self) -> str:
         """What ours is compared with: `0.241`, `0.1163 to 0.1164` or `at most 0.02`."""
-        relation = "" if self.spec.relation == "equal" else f"{self.spec.relation} "
+        if self.spec.relation == "equal":
+            relation = ""
+        else:
+            relation = f"{self.spec.relation} "
         return relation + " to ".join(f"{value:g}" for value in sorted(set(self.spec.span)))
 
     @property
     def _tolerance(self) -> str:
         spec = self.spec
-        return f"{spec.tolerance:.2g}" if spec.relative is None else f"{100.0 * spec.relative:g} %"
+        if spec.relative is None:
+            return f"{spec.tolerance:.2g}"
+        return f"{100.0 * spec.relative:g} %"
 
     def _shown(self, value: float | None, sign: str = "") -> str:
         """Return a value to a tenth of the tolerance, or to four digits without a tolerance."""
@@ -275,7 +297,10 @@ class Reproduction:
         """The counts, each kind apart: `published: 1 of 1; by the authors' code: 8 of 8`."""
         parts = []
         for name, (within, count) in self.counts.items():
-            of = f" of {self.paper.subject}" if name == "published" and self.paper.subject else ""
+            if name == "published" and self.paper.subject:
+                of = f" of {self.paper.subject}"
+            else:
+                of = ""
             parts.append(f"{COUNTED[name]}: {within} of {count}{of}")
         return "; ".join(parts)
 
@@ -316,7 +341,9 @@ class Reproductions(tuple[Reproduction, ...], Tabular):
     @property
     def exit_status(self) -> int:
         """See `Result.exit_status`; 1 where a number is not reproduced."""
-        return EXIT_DONE if all(paper.within for paper in self) else EXIT_FAILED
+        if all(paper.within for paper in self):
+            return EXIT_DONE
+        return EXIT_FAILED
 
     def verdicts(self) -> tuple[str, Cases]:
         """See `quadsim.console.junit.Judged`."""
@@ -374,7 +401,10 @@ def _measured(spec: PaperNumber, summary: dict[str, Any]) -> Reproduced:
             value = {entry["name"] if path == "constraints" else str(i): entry for i, entry in enumerate(value)}
         there = value if isinstance(value, Mapping) else {}
         if key not in there:
-            has = f" ({path or 'summary.json'} has: {', '.join(there)})" if there else ""
+            if there:
+                has = f" ({path or 'summary.json'} has: {', '.join(there)})"
+            else:
+                has = ""
             raise InputError(f"{spec.name}: {_RULE}; got {spec.measure!r}{has}")
         path = f"{path}.{key}".lstrip(".")
         value = there[key]

@@ -137,7 +137,10 @@ def _flown(scenario: Scenario, controllers: object) -> list[tuple[str, Scenario]
     """Return each controller's name with the scenario that has it, with the numbers of its vehicle's file."""
     from quadsim.scenarios.assembly import Assembly
 
-    several = controllers if isinstance(controllers, list | tuple) else [controllers]
+    if isinstance(controllers, list | tuple):
+        several = controllers
+    else:
+        several = [controllers]
     flown = [_with_controller(scenario, controller) for controller in several] or [
         (str(scenario.controller.type), scenario)
     ]

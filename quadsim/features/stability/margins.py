@@ -144,7 +144,10 @@ def look(loop: MeasuredLoop, values: Mapping[str, float]) -> LoopPoint:
         result = measure_growth(loop.scenario, heading=heading, size=loop.size, changes=changes)
     except InputError as error:
         return LoopPoint(values=values, state="no flight", why=str(error))
-    rate = result.rate if math.isfinite(result.rate) else None
+    if math.isfinite(result.rate):
+        rate = result.rate
+    else:
+        rate = None
     return LoopPoint(values=values, state=result.verdict, rate=rate, why=result.ended)
 
 
@@ -240,7 +243,10 @@ def measured_here(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> L
         InputError: the loop cannot be built.
     """
     result: Growth = _grow(loop)["growth"]
-    tasks = list(_searches(loop, quantities)) if result.stable else []
+    if result.stable:
+        tasks = list(_searches(loop, quantities))
+    else:
+        tasks = []
     sides = {(task.quantity, task.upward): _search(task)["side"] for task in tasks}
     return LoopMargins(name=loop.name, size=loop.size, growth=result, margins=_margins(loop, quantities, sides))
 
@@ -292,7 +298,10 @@ class Measuring:
             if result.stable
             for task in _searches(loop, quantities)
         ]
-        rows = self._rows("margins", tasks, _search) if tasks else []
+        if tasks:
+            rows = self._rows("margins", tasks, _search)
+        else:
+            rows = []
         found = list(zip(tasks, rows, strict=True))
         measured: list[LoopMargins] = []
         for loop, result in zip(self._loops, growths, strict=True):
@@ -356,7 +365,10 @@ def _map_values(margin: Margin) -> tuple[float, ...]:
             ends[i] = margin.nominal
         elif side.unstable is not None:
             reached = margin.nominal + _BEYOND * (side.stable - margin.nominal)
-            ends[i] = max(reached, ends[0]) if i == 0 else min(reached, ends[1])
+            if i == 0:
+                ends[i] = max(reached, ends[0])
+            else:
+                ends[i] = min(reached, ends[1])
     low, high = ends
     return tuple(quantity.between(low, high, i / (MAP_POINTS - 1)) for i in range(MAP_POINTS))
 
@@ -374,7 +386,10 @@ def to_plain(margins: LoopMargins) -> dict[str, Any]:
         }
     growth = asdict(margins.growth)
     for name in ("rate", "left"):
-        growth[name] = growth[name] if math.isfinite(growth[name]) else None
+        if math.isfinite(growth[name]):
+            growth[name] = growth[name]
+        else:
+            growth[name] = None
     return {
         "controller": margins.name,
         "size": margins.size,

@@ -64,7 +64,10 @@ class VariedQuantity:
         """
         if share == 0.0:
             return start
-        value = start * (end / start) ** share if self.geometric else start + (end - start) * share
+        if self.geometric:
+            value = start * (end / start) ** share
+        else:
+            value = start + (end - start) * share
         if step == 0.0:
             return value
         steps = round(value / step)
@@ -92,7 +95,9 @@ def _usual_heading(assembly: Assembly) -> float:
 
 def _delay(assembly: Assembly) -> float:
     computation = assembly.scenario.computation
-    return 0.0 if computation is None else 1e3 * computation.delay
+    if computation is None:
+        return 0.0
+    return 1e3 * computation.delay
 
 
 def _set_delay(assembly: Assembly, value: float) -> FieldValues:
@@ -123,7 +128,10 @@ def _set_lag(assembly: Assembly, value: float) -> FieldValues:
 
 def _without_actual(assembly: Assembly, *names: str) -> FieldValues:
     """Remove values of `[actual]` that would contradict those of an effect."""
-    stated = {} if assembly.scenario.actual is None else assembly.scenario.actual.overrides()
+    if assembly.scenario.actual is None:
+        stated = {}
+    else:
+        stated = assembly.scenario.actual.overrides()
     return {f"actual.{name}": None for name in names if name in stated}
 
 
@@ -152,7 +160,10 @@ def _set_period(assembly: Assembly, value: float) -> FieldValues:
 def _set_drag(assembly: Assembly, value: float) -> FieldValues:
     """Add linear drag of the body to what the scenario states."""
     air = assembly.scenario.effects.air
-    stated = Air().linear_drag if air is None else air.linear_drag
+    if air is None:
+        stated = Air().linear_drag
+    else:
+        stated = air.linear_drag
     added = value * assembly.actual.mass
     drag = [axis + added for axis in stated]
     changes: FieldValues = {"effects.air.linear_drag": drag}

@@ -116,7 +116,10 @@ class Stability(Tabular):
                 row["nominal"] = margin.nominal
                 for end, side in (("lower", margin.lower), ("upper", margin.upper)):
                     row[end] = None if side is None else side.stable
-                    row[f"{end}_state"] = None if side is None else side.state
+                    if side is None:
+                        row[f"{end}_state"] = None
+                    else:
+                        row[f"{end}_state"] = side.state
                 rows.append(row)
         return rows
 
@@ -149,13 +152,18 @@ class Stability(Tabular):
     def to_markdown(self) -> str:
         """Return table and sentences as Markdown."""
         grid = self.grid
-        parts = [grid_to_markdown(grid), f"{grid.note}\n"] if grid.lines else []
+        if grid.lines:
+            parts = [grid_to_markdown(grid), f"{grid.note}\n"]
+        else:
+            parts = []
         return "\n".join([*parts, *(f"{sentence}\n" for sentence in self.sentences)])
 
     def small_plot(self) -> Figure | None:
         """See `Result.small_plot`."""
         figure = self.figure
-        return figure if figure.panels else None
+        if figure.panels:
+            return figure
+        return None
 
     @property
     def figure(self) -> Figure:
@@ -270,7 +278,10 @@ def _closest_sentence(loop: LoopMargins) -> str:
     if closest is None:
         return "Within the ranges searched nothing makes it unstable."
     quantity = VARIED[closest.quantity]
-    of = "the nominal value" if quantity.measure == "nominal" else "the range searched"
+    if quantity.measure == "nominal":
+        of = "the nominal value"
+    else:
+        of = "the range searched"
     value = _value(closest.value, closest.quantity)
     return f"The closest limit is that of {quantity.name}, at {value}: {100.0 * closest.share:.3g} % of {of} away."
 
@@ -278,7 +289,12 @@ def _closest_sentence(loop: LoopMargins) -> str:
 def _share(loop: LoopMargins, quantity: VariedQuantity, sign: float) -> float:
     """Return a margin [%], signed, for the bars; 0 where there is none."""
     margin = loop.margins.get(quantity.name)
-    side = None if margin is None else (margin.upper if sign > 0.0 else margin.lower)
+    if margin is None:
+        side = None
+    elif sign > 0.0:
+        side = margin.upper
+    else:
+        side = margin.lower
     if margin is None or side is None:
         return 0.0
     return sign * min(100.0 * quantity.distance(margin.nominal, side.stable), 100.0)

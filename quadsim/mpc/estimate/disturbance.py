@@ -224,7 +224,10 @@ def _fill(
     gain_of_change = (1.0 - pole) ** 2 / period
     largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
     numbers.targets = thrust_lag is not None
-    numbers.scaled = numbers.targets if settings.thrust_scale is None else settings.thrust_scale
+    if settings.thrust_scale is None:
+        numbers.scaled = numbers.targets
+    else:
+        numbers.scaled = settings.thrust_scale
     if numbers.scaled:
         largest[2] = LARGEST_CHANGE * vehicle.gravity
     if numbers.targets:
@@ -233,13 +236,19 @@ def _fill(
     numbers.mass = vehicle.mass
     numbers.gravity = vehicle.gravity
     numbers.least_lift = OBSERVABLE_THRUST * vehicle.gravity
-    lag = (settings.rotor_lag or 0.0) if thrust_lag is None else thrust_lag
+    if thrust_lag is None:
+        lag = settings.rotor_lag or 0.0
+    else:
+        lag = thrust_lag
     numbers.lag = lag / period
     numbers.share = late / period
     if lag:
         numbers.left = math.exp(-(period - late) / lag)
         numbers.left_before = math.exp(-late / lag)
-    rotor_inertia = (vehicle.rotor_inertia or 0.0) if lag else 0.0
+    if lag:
+        rotor_inertia = vehicle.rotor_inertia or 0.0
+    else:
+        rotor_inertia = 0.0
     set_members(
         numbers,
         gain=gain,

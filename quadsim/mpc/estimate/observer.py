@@ -63,7 +63,9 @@ class Observing(Protocol):
 
 def disturbance_of(law: object) -> Array | None:
     """Return (6,) the disturbance that a law estimates; None if it estimates none."""
-    return law.disturbance if isinstance(law, Observing) else None
+    if isinstance(law, Observing):
+        return law.disturbance
+    return None
 
 
 def observer_gain(period: float, *, noise: float, walk: float, change: float) -> tuple[float, float]:

@@ -32,14 +32,21 @@ class CText:
         """A finite number, e.g. `-1.5F`; the compiler rounds it once."""
         if not np.isfinite(value):
             raise ValueError(f"{value} cannot be written in C")
-        text = "0.0" if abs(value) < LEAST_FLOAT else repr(float(value))
-        return text if self.precision == "double" else f"{text}F"
+        if abs(value) < LEAST_FLOAT:
+            text = "0.0"
+        else:
+            text = repr(float(value))
+        if self.precision == "double":
+            return text
+        return f"{text}F"
 
     def value(self, value: float | Array) -> str:
         """Return an initialiser of an integer, a number, or an array of these, row by row."""
         if isinstance(value, np.ndarray):
             return "{" + ", ".join(map(self.number, value.ravel().tolist())) + "}"
-        return str(value) if isinstance(value, int) else self.number(value)
+        if isinstance(value, int):
+            return str(value)
+        return self.number(value)
 
     def array(self, name: str, values: Array) -> str:
         """Return a constant array of bytes or numbers, row by row; an empty one gets a single zero."""

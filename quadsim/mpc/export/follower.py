@@ -86,9 +86,13 @@ class CFollower(CSource):
     @property
     def motion_rows(self) -> int:
         """See `CSource`."""
-        return self.law.motion_rows if self.motion else 0
+        if self.motion:
+            return self.law.motion_rows
+        return 0
 
     @property
     def reference(self) -> tuple[int, int, str]:
         """See `CSource`."""
-        return (self.motion_rows, WIDTH_OF_MOTION, self.motion_row) if self.motion_rows else super().reference
+        if self.motion_rows:
+            return (self.motion_rows, WIDTH_OF_MOTION, self.motion_row)
+        return super().reference

@@ -110,7 +110,9 @@ class CSource(abc.ABC):
     @property
     def real_bytes(self) -> int:
         """Size of a number in bytes."""
-        return 8 if self.precision == "double" else 4
+        if self.precision == "double":
+            return 8
+        return 4
 
     @property
     def memory_bytes(self) -> int:
@@ -130,7 +132,9 @@ class CSource(abc.ABC):
     @property
     def defines(self) -> str:
         """Flags of a compiler that its files take."""
-        return "-DQUADSIM_FLOAT" if self.precision == "float" else ""
+        if self.precision == "float":
+            return "-DQUADSIM_FLOAT"
+        return ""
 
     @property
     def objects(self) -> str:
@@ -194,7 +198,9 @@ class CController(CSource):
     def bounds(self) -> ActuatorBounds | None:
         """See `CSource`."""
         problem = self.law.problem
-        return ActuatorBounds.of_problem(problem) if problem.every_constraint else None
+        if problem.every_constraint:
+            return ActuatorBounds.of_problem(problem)
+        return None
 
     @cached_property
     def tables(self) -> Tables:
@@ -219,7 +225,10 @@ class CController(CSource):
         work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + room * (room - 1) // 2
         settings = self.law.settings
         period = self.law.problem.model.period
-        sent = 0 if settings is None else N_ROTORS * split_delay(settings.delay, period)[0]
+        if settings is None:
+            sent = 0
+        else:
+            sent = N_ROTORS * split_delay(settings.delay, period)[0]
         return work + packed // self.real_bytes + 1 + N * (len(problem.objective.C_r) + N_ROTORS) + sent
 
     def numbers(self, text: CText) -> list[str]:

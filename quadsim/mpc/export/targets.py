@@ -32,7 +32,10 @@ class Machine:
 
     def makefile(self, defines: str) -> str:
         """Return the first lines of the Makefile."""
-        run = " ".join(["timeout 600", *self.emulation, "-serial none -kernel"]) if self.board else ""
+        if self.board:
+            run = " ".join(["timeout 600", *self.emulation, "-serial none -kernel"])
+        else:
+            run = ""
         lines = {
             "COMPILER": self.compiler,
             "MACHINE": self.machine,

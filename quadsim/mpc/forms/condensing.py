@@ -261,7 +261,10 @@ class FreeOptimum:
     def __init__(self, form: Condensed) -> None:
         self.form = form
         self._factor, failed = lapack.dpotrf(form.cost.H)
-        self.condition = math.inf if failed else self._condition()
+        if failed:
+            self.condition = math.inf
+        else:
+            self.condition = self._condition()
 
     @classmethod
     def of(cls, problem: Problem, form: Condensed | None = None) -> FreeOptimum | None:
@@ -274,12 +277,16 @@ class FreeOptimum:
         if size * (size + rows.lower.size) > LARGEST_QP:
             return None
         optimum = cls(form or Condensed(problem))
-        return optimum if optimum.condition <= LARGEST_CONDITION else None
+        if optimum.condition <= LARGEST_CONDITION:
+            return optimum
+        return None
 
     def _condition(self) -> float:
         """Return the condition number of the Hessian in the 1-norm, estimated from its factor (LAPACK's dpocon)."""
         reciprocal, _ = lapack.dpocon(self._factor, float(np.abs(self.form.cost.H).sum(axis=0).max()))
-        return 1.0 / reciprocal if reciprocal > 0.0 else math.inf
+        if reciprocal > 0.0:
+            return 1.0 / reciprocal
+        return math.inf
 
     def solve(self, query: Query) -> Solution | None:
         """Return the condensed QP's solution without constraints; None if it violates one."""

@@ -100,7 +100,9 @@ class ActuatorBounds:
     def lowest(self, before: Array) -> Array:
         """Return the command (4,) of stopping rotors: the lowest speeds in reach of `before` (4,), or no rates."""
         lower, _ = self.reach(before)
-        return np.append(lower[0], np.zeros(N_ROTORS - 1)) if self.targets else lower
+        if self.targets:
+            return np.append(lower[0], np.zeros(N_ROTORS - 1))
+        return lower
 
     def clip(self, speeds: Array, before: Array) -> Array:
         """Return the speeds (4,) [rad/s] in reach of `before` that are closest to `speeds`."""
@@ -246,7 +248,9 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
     beyond = np.abs(speeds - bounds.clip(speeds, before))
     if beyond[beyond.argmax()] <= BOUND_TOLERANCE and all_true(np.isfinite(plan)):
         return None
-    return "out_of_bounds" if np.isfinite(speeds).all() and np.isfinite(plan).all() else "not_finite"
+    if np.isfinite(speeds).all() and np.isfinite(plan).all():
+        return "out_of_bounds"
+    return "not_finite"
 
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:

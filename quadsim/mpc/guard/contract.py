@@ -182,13 +182,17 @@ class Guard:
     def trim(self, law: Controller) -> Trim:
         """Return the equilibrium that the law estimates; level hover if it estimates none."""
         trim = _tried(lambda: self._trim_of(law))
-        return trim if isinstance(trim, Trim) else self._level
+        if isinstance(trim, Trim):
+            return trim
+        return self._level
 
     def _trim_of(self, law: Controller) -> object:
         if law is not self._law:  # asked once: a runtime protocol takes as long as ten array operations
             self._law = law
             self._trimmed = law if isinstance(law, Trimmed) else None
-        return None if self._trimmed is None else self._trimmed.trim
+        if self._trimmed is None:
+            return None
+        return self._trimmed.trim
 
     def predict(self, law: Controller, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Predicting`; by the hover model where the law cannot."""

@@ -91,7 +91,10 @@ def geometric_gains(vehicle: Vehicle, period: float, settings: Geometric) -> Geo
     require_positive("period", period)
     lag = settings.lag
     targets = settings.commands != ROTORS
-    allowed = lag_to_allow_for(vehicle, period) if lag is None else lag
+    if lag is None:
+        allowed = lag_to_allow_for(vehicle, period)
+    else:
+        allowed = lag
     k_Omega = 1.0 / (2.0 * (0.5 * period + allowed)) / (1.0 + SEPARATION**-2)
     k_v = k_Omega / SEPARATION**2
     k = np.zeros(3)
@@ -215,7 +218,9 @@ class GeometricController(FeedbackLaw):
     @property
     def motion_rows(self) -> int:
         """Samples that it takes of a course's motion; 0 for none."""
-        return MOTION_SAMPLES if self._feedforward else 0
+        if self._feedforward:
+            return MOTION_SAMPLES
+        return 0
 
     @property
     def integrals(self) -> Integrals:
@@ -512,15 +517,21 @@ class Geometric(Tuned):
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
-        return super().audited(vehicle) if self.commands == "rotors" else self.target_bounds.audited(vehicle)
+        if self.commands == "rotors":
+            return super().audited(vehicle)
+        return self.target_bounds.audited(vehicle)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """See `quadsim.mpc.laws.parts.feedback.Baseline.actuators`; of targets where it commands these."""
-        return super().actuators(vehicle) if self.commands == ROTORS else self.target_bounds.actuators(vehicle)
+        if self.commands == ROTORS:
+            return super().actuators(vehicle)
+        return self.target_bounds.actuators(vehicle)
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
         """See `quadsim.mpc.tables.controller.ControllerTable.inner_loop`."""
-        return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
+        if self.indi is None:
+            return None
+        return TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> GeometricController:
         """See `quadsim.mpc.tables.controller.ControllerTable.law`."""

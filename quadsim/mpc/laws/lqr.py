@@ -158,7 +158,10 @@ class LQR(FeedbackLaw):
             speeds = balanced - self.gain @ self._limited(xi - targets[i])
             lower, upper = self.bounds.reach(before)
             # The mixer's priorities matter for the command; the forecast is limited rotor by rotor.
-            plan[i] = self._held(speeds, lower, upper) if i == 0 else np.clip(speeds, lower, upper)
+            if i == 0:
+                plan[i] = self._held(speeds, lower, upper)
+            else:
+                plan[i] = np.clip(speeds, lower, upper)
             before = plan[i]
             xi = self.model.A @ xi + self.model.B @ (plan[i] - self.model.u_bar)
         return Command(speeds=plan[0].copy(), plan=plan)

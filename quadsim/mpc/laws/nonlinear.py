@@ -87,7 +87,10 @@ class Weights:
             axes = ((),) if name in ("input", "move") else ((), (3,))
             inside = np.isfinite(array) & (array >= 0.0) & ((array > 0.0) | (name == "move"))
             if array.shape not in axes or not inside.all():
-                rule = "positive: one number, or three" if len(axes) == 2 else "one positive number"
+                if len(axes) == 2:
+                    rule = "positive: one number, or three"
+                else:
+                    rule = "one positive number"
                 raise ParameterError("controller.weights", name, value, rule)
             if array.ndim:
                 object.__setattr__(self, name, tuple(array.tolist()))
@@ -288,7 +291,9 @@ class Nonlinear(ControllerTable):
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
         """See `quadsim.mpc.tables.controller.ControllerTable.inner_loop`."""
-        return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
+        if self.indi is None:
+            return None
+        return TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
@@ -299,8 +304,14 @@ class Nonlinear(ControllerTable):
         """Return C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
         weights = self.weights
         difference = self.attitude_error == "difference"
-        rows = np.eye(13) if difference else np.delete(np.eye(13), 3, axis=0)
-        attitude = np.full(4, weights.attitude) if difference else 4.0 * _three(weights.attitude)
+        if difference:
+            rows = np.eye(13)
+        else:
+            rows = np.delete(np.eye(13), 3, axis=0)
+        if difference:
+            attitude = np.full(4, weights.attitude)
+        else:
+            attitude = 4.0 * _three(weights.attitude)
         parts = (_three(weights.position), attitude, _three(weights.velocity), _three(weights.body_rates))
         return rows, np.concatenate(parts)
 
@@ -328,7 +339,10 @@ class Nonlinear(ControllerTable):
         if not self.output_bounds:
             return polytopes
         lower, upper = np.array([*self.output_bounds.values()], float).T
-        penalty = None if self.soft is None else self.soft.penalty(lower.size)
+        if self.soft is None:
+            penalty = None
+        else:
+            penalty = self.soft.penalty(lower.size)
         rows = selection([*self.output_bounds])
         origins = tuple(origin_of_state(INDEX[name]) for name in self.output_bounds)
         outputs = Constraint(name="outputs", lower=lower, upper=upper, C=rows, penalty=penalty, origins=origins)

@@ -123,7 +123,10 @@ class CascadedPID(FeedbackLaw):
         k = self.gains.bandwidths
         period = self._period
         force, velocity_integral = self._velocity_loop(memory, motion, target)
-        turning = np.zeros(3) if memory.rates is None else (motion.rates - memory.rates) / period
+        if memory.rates is None:
+            turning = np.zeros(3)
+        else:
+            turning = (motion.rates - memory.rates) / period
         desired = self._desired_rates(motion, force, target)
         error = desired - motion.rates
         proportional = np.array([k.rate, k.rate, k.yaw_rate])
@@ -167,7 +170,10 @@ class CascadedPID(FeedbackLaw):
         proportional = gains.bandwidths.velocity
         desired = desired_velocity(gains.bandwidths.position, self._largest_velocity, motion.position, target)
         error = desired - motion.velocity
-        measured = np.zeros(3) if memory.velocity is None else (motion.velocity - memory.velocity) / period
+        if memory.velocity is None:
+            measured = np.zeros(3)
+        else:
+            measured = (motion.velocity - memory.velocity) / period
         demanded_acceleration = (
             target.acceleration
             + proportional * error
@@ -211,7 +217,10 @@ def force_within(force: Array, *, weight: float, largest: float, tilt: float) ->
     spared = min(horizontal, HORIZONTAL_MARGIN * largest, math.sqrt(largest**2 - climbing**2))
     upward = min(upright[2], math.sqrt(largest**2 - spared**2))
     allowed = min(math.sqrt(largest**2 - upward**2), upward * math.tan(tilt))
-    share = 1.0 if horizontal <= allowed else allowed / horizontal
+    if horizontal <= allowed:
+        share = 1.0
+    else:
+        share = allowed / horizontal
     return np.array([share * upright[0], share * upright[1], upward])
 
 

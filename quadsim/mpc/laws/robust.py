@@ -215,7 +215,10 @@ class Robust(Bounded):
         model = self._model(vehicle, period)
         objective = self.objective()
         n = model.n
-        moves = None if self.move_weight is None else self.move_weight * np.eye(N_ROTORS)
+        if self.move_weight is None:
+            moves = None
+        else:
+            moves = self.move_weight * np.eye(N_ROTORS)
         objective = replace(objective, C_r=_widened(objective.C_r, n), Q_d=moves)
         if self.terminal == "lqr":
             objective = replace(objective, P=lqr_terminal_weight(model, objective))
@@ -223,7 +226,10 @@ class Robust(Bounded):
             constraints = (*self._target_constraints(vehicle), *self.constraints())
             return Problem(model=model, horizon=self.horizon, objective=objective, constraints=constraints)
         bounds = self.bounds()
-        penalty = None if self.soft is None else self.soft.penalty(len(self.output_bounds))
+        if self.soft is None:
+            penalty = None
+        else:
+            penalty = self.soft.penalty(len(self.output_bounds))
         return Problem(
             model=model,
             horizon=self.horizon,
@@ -250,7 +256,10 @@ class Robust(Bounded):
         """Return the bounds on outputs and on an autopilot's targets as constraints."""
         C_c, lower, upper = self.output_limits()
         names = [name for name in STATE_NAMES if name in self.output_bounds]
-        penalty = None if self.soft is None else self.soft.penalty(len(names))
+        if self.soft is None:
+            penalty = None
+        else:
+            penalty = self.soft.penalty(len(names))
         origins = tuple(origin_of_state(INDEX[name]) for name in names)
         outputs = Constraint(name="outputs", lower=lower, upper=upper, C=C_c, penalty=penalty, origins=origins)
         bounds = self.target_bounds.actuators(vehicle)
@@ -288,7 +297,9 @@ class Robust(Bounded):
 
     def position_margins(self, vehicle: Vehicle, period: float) -> Array | None:
         """See `quadsim.mpc.tables.bounded.Bounded.position_margins`."""
-        return None if self.tightening is None else position_margins(**self._tightened(vehicle, period))
+        if self.tightening is None:
+            return None
+        return position_margins(**self._tightened(vehicle, period))
 
     def _tightened(self, vehicle: Vehicle, period: float) -> dict[str, Any]:
         """Return the inputs of the tightening."""

@@ -101,12 +101,16 @@ class Pilot:
     @property
     def commands(self) -> str:
         """What the law commands: rotor speeds, or the targets of an autopilot by name."""
-        return self.law.commands if isinstance(self.law, Commanding) else ROTORS
+        if isinstance(self.law, Commanding):
+            return self.law.commands
+        return ROTORS
 
     @property
     def infeasible_period(self) -> object:
         """The law's first period since `reset` whose QP had no answer; None if there is none."""
-        return self.law.infeasible_period if isinstance(self.law, Diagnosable) else None
+        if isinstance(self.law, Diagnosable):
+            return self.law.infeasible_period
+        return None
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], at rest unless `begin` follows.
@@ -118,7 +122,10 @@ class Pilot:
         self._rates = np.zeros(3)
         if self.attitudes is not None:
             self.attitudes.reset()
-        before = self._hover.copy() if self.takes_targets else speeds
+        if self.takes_targets:
+            before = self._hover.copy()
+        else:
+            before = speeds
         if self.guard is not None:
             before = self.guard.reset(before)
         self.law.reset(before)
@@ -131,7 +138,10 @@ class Pilot:
 
     def adopt(self, previous: object) -> None:
         """Take over what the previous pilot's law, contract and inner loop know; a vehicle has one autopilot."""
-        before = previous if isinstance(previous, Pilot) else None
+        if isinstance(previous, Pilot):
+            before = previous
+        else:
+            before = None
         if isinstance(self.law, Adopting):
             self.law.adopt(previous if before is None else before.law)
         if before is None:
@@ -197,7 +207,9 @@ class Pilot:
                 self.inner.settle(self._rates, rotors)
         self._target = command
         self._fresh = False
-        return self.inner.engage(command, rotors) if isinstance(self.inner, CompiledLoop) else None
+        if isinstance(self.inner, CompiledLoop):
+            return self.inner.engage(command, rotors)
+        return None
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
         """See `quadsim.controller.InnerLoop`."""
@@ -215,8 +227,12 @@ class Pilot:
         """See `quadsim.controller.Predicting`."""
         if self.guard is not None:
             return self.guard.predict(self.law, states, plans)
-        return self.law.predict(states, plans) if isinstance(self.law, Predicting) else None
+        if isinstance(self.law, Predicting):
+            return self.law.predict(states, plans)
+        return None
 
     def foresee(self, states: Array, commands: Array) -> Array | None:
         """See `quadsim.controller.Foreseeing`."""
-        return self.law.foresee(states, commands) if isinstance(self.law, Foreseeing) else None
+        if isinstance(self.law, Foreseeing):
+            return self.law.foresee(states, commands)
+        return None

@@ -89,12 +89,16 @@ class Objective:
     @cached_property
     def terminal_weights(self) -> tuple[Array, Array]:
         """The same for the last state, with x_s as the origin."""
-        return self.weights if self.P is None else (self.P, self.P @ np.linalg.pinv(self.C_r))
+        if self.P is None:
+            return self.weights
+        return (self.P, self.P @ np.linalg.pinv(self.C_r))
 
     @property
     def move_weight(self) -> Array:
         """Q_d (nu, nu), zeros if there is none."""
-        return np.zeros_like(self.Q_u) if self.Q_d is None else self.Q_d
+        if self.Q_d is None:
+            return np.zeros_like(self.Q_u)
+        return self.Q_d
 
 
 def objective_of(output_weights: Mapping[str, float], speed_weights: float | Sequence[float]) -> Objective:
@@ -194,7 +198,10 @@ class Problem:
         model = self.model
         sizes = f"{model.n} states, {model.nu} inputs, {self.horizon} periods of {model.period:g} s"
         names = [constraint.name for constraint in self.every_constraint]
-        rows = f"{self.rows.lower.size} rows of constraints: {', '.join(names)}" if names else "without constraints"
+        if names:
+            rows = f"{self.rows.lower.size} rows of constraints: {', '.join(names)}"
+        else:
+            rows = "without constraints"
         return f"<Problem: {sizes}\n {rows}>"
 
     @property
@@ -209,7 +216,9 @@ class Problem:
 
     def rates(self, reference: Array) -> Array | None:
         """Return the `reference_rates` of a preview (N, 4); None if no desired output depends on them."""
-        return reference_rates(reference, self.model.period) if self.objective.needs_rates else None
+        if self.objective.needs_rates:
+            return reference_rates(reference, self.model.period)
+        return None
 
     def desired(self, reference: Array) -> Array:
         """Return the desired outputs (N, n_r) of a preview (N, 4) x, y, z [m], yaw [rad], and of its rates."""

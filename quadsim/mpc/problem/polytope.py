@@ -77,7 +77,9 @@ class Polytope:
     @property
     def row_names(self) -> list[str]:
         """One name per row."""
-        return [self.name] if len(self.rows) == 1 else [f"{self.name}_{i + 1}" for i in range(len(self.rows))]
+        if len(self.rows) == 1:
+            return [self.name]
+        return [f"{self.name}_{i + 1}" for i in range(len(self.rows))]
 
     def constraint(self) -> Constraint:
         """Return the rows over the 12 states and four rotor speeds, in SI units."""
@@ -114,4 +116,6 @@ def rows_of(polytopes: Sequence[Polytope]) -> tuple[Constraint, ...]:
 
 def _unit(term: str) -> str:
     """Return the unit in which files state a term of a polytope."""
-    return shown_unit(STATE_UNITS[INDEX[term]])[0] if term in INDEX else "rad/s"
+    if term in INDEX:
+        return shown_unit(STATE_UNITS[INDEX[term]])[0]
+    return "rad/s"

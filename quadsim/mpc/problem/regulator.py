@@ -72,7 +72,10 @@ def undetected(A: Array, C: Array) -> Indices:
     basis = observed(A, C)
     if basis.shape[1] == len(A):
         return np.zeros(0, np.int64)
-    hidden = scipy.linalg.null_space(basis.T) if basis.shape[1] else np.eye(len(A))
+    if basis.shape[1]:
+        hidden = scipy.linalg.null_space(basis.T)
+    else:
+        hidden = np.eye(len(A))
     return _states_of(hidden @ _moving(hidden.T @ A @ hidden))
 
 

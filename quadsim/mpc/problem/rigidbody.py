@@ -131,7 +131,9 @@ class RigidBody:
         """Number of actuator states: four rotors, the collective thrust, or none."""
         if self.targets:
             return 1
-        return 0 if self.rotor_lag is None else N_ROTORS
+        if self.rotor_lag is None:
+            return 0
+        return N_ROTORS
 
     @property
     def n(self) -> int:
@@ -146,7 +148,9 @@ class RigidBody:
     @property
     def lags(self) -> tuple[float, ...]:
         """(4,) time constants of what follows the inputs [s], 0 for none."""
-        return self.lag if self.targets else (self.rotor_lag or 0.0,) * N_ROTORS
+        if self.targets:
+            return self.lag
+        return (self.rotor_lag or 0.0,) * N_ROTORS
 
     @property
     def effect(self) -> Array:
@@ -162,7 +166,9 @@ class RigidBody:
     def shares(self, thrusts: Array) -> Array:
         """Return the inputs for rotor thrusts [N]; negative ones count as zero if inputs are speeds."""
         shares = np.asarray(thrusts) / self.largest_thrust
-        return shares if self.inputs is Inputs.THRUST else np.sqrt(np.maximum(shares, 0.0))
+        if self.inputs is Inputs.THRUST:
+            return shares
+        return np.sqrt(np.maximum(shares, 0.0))
 
 
 class AirMaps(NamedTuple):

@@ -35,7 +35,9 @@ class SolverEntry:
 
     def formulate(self, problem: Problem) -> Formulation:
         """Return the form of the problem that it takes."""
-        return Condensed(problem) if self.dense else Staged(problem)
+        if self.dense:
+            return Condensed(problem)
+        return Staged(problem)
 
     @property
     def installed(self) -> bool:
@@ -50,7 +52,9 @@ class SolverEntry:
     @property
     def _missing(self) -> str:
         installed = importlib.util.find_spec(self.package) is not None
-        return "" if installed else f"not installed: pip install 'quadsim[{self.extra}]'"
+        if installed:
+            return ""
+        return f"not installed: pip install 'quadsim[{self.extra}]'"
 
 
 SOLVERS: Final = {
@@ -85,7 +89,10 @@ def find_solver(name: str) -> SolverEntry:
         return SOLVERS.get(name, COMPILED)
     entries = solver_entries()
     if name not in entries:
-        hint = "" if len(entries) > len(SOLVERS) + 1 else "pip install 'quadsim[solvers]' adds those of qpsolvers"
+        if len(entries) > len(SOLVERS) + 1:
+            hint = ""
+        else:
+            hint = "pip install 'quadsim[solvers]' adds those of qpsolvers"
         raise UnknownNameError("solver", name, entries, hint, successor=SUCCESSORS.get(name))
     return entries[name]
 
@@ -196,7 +203,10 @@ class QPSolver:
         self.formulation = find_solver(name).formulate(problem)
         self._free: FreeOptimum | None = None
         if free_first:
-            condensed = self.formulation if isinstance(self.formulation, Condensed) else None
+            if isinstance(self.formulation, Condensed):
+                condensed = self.formulation
+            else:
+                condensed = None
             self._free = FreeOptimum.of(problem, condensed)
         self.reset()
 
@@ -221,7 +231,10 @@ class QPSolver:
             nowhere = np.full_like(form.qp.c, math.nan)
             return Answer(form.inputs(nowhere), form.slacks(nowhere), INVALID_DATA, self.name)
         started = clock.perf_counter()
-        answer = None if self._free is None else _free_answer(self._free, query)
+        if self._free is None:
+            answer = None
+        else:
+            answer = _free_answer(self._free, query)
         spent_s = clock.perf_counter() - started
         if answer is None:
             qp = form.assemble(query)

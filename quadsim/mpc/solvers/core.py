@@ -63,7 +63,9 @@ class CoreProblem:
         elif not isinstance(value, np.ndarray):
             return value
         self._kept.append(value)
-        return value.ctypes.data if isinstance(value, np.ndarray) else ctypes.addressof(value)
+        if isinstance(value, np.ndarray):
+            return value.ctypes.data
+        return ctypes.addressof(value)
 
     @cached_property
     def condensed(self) -> Condensed:
@@ -91,7 +93,9 @@ def _content(value: object) -> object:
         return tuple(_content(getattr(value, item.name)) for item in fields(value))
     if isinstance(value, dict):
         return tuple(value.items())
-    return tuple(map(_content, value)) if isinstance(value, tuple) else value
+    if isinstance(value, tuple):
+        return tuple(map(_content, value))
+    return value
 
 
 def core_problem(problem: Problem) -> CoreProblem:
@@ -252,5 +256,8 @@ class Core:
         self._x_s[:] = x_s
         self._u_s[:] = u_s
         self._before[:] = u_before
-        found = self._library.quadsim_optimise(*self._arguments) if math.isfinite(self._query.sum()) else len(Method)
+        if math.isfinite(self._query.sum()):
+            found = self._library.quadsim_optimise(*self._arguments)
+        else:
+            found = len(Method)
         return self._optimum.answer(found, query, started)

@@ -225,7 +225,9 @@ def with_constraints(problem: Problem) -> Problem:
 def rotor_states(problem: Problem) -> int:
     """Return how many states at the end of a problem's are rotor speeds: one per rotor where these lag, otherwise 0."""
     nu = problem.model.nu
-    return nu if problem.model.n == N_STATES + nu else 0
+    if problem.model.n == N_STATES + nu:
+        return nu
+    return 0
 
 
 def _modes(problem: Problem) -> Array:
@@ -254,7 +256,10 @@ def _in_modes(problem: Problem, modes: Array) -> Problem:
     B = to @ model.B
     for matrix in (A, B):
         matrix[np.abs(matrix) < ROW_ROUNDING * np.abs(matrix).max()] = 0.0
-    P = None if objective.P is None else symmetric(back.T @ objective.P @ back)
+    if objective.P is None:
+        P = None
+    else:
+        P = symmetric(back.T @ objective.P @ back)
     return Problem(
         model=replace(model, A=A, B=B),
         horizon=problem.horizon,
@@ -360,7 +365,10 @@ def _scale(axes: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> A
         total = np.zeros(N)
         for g, part in enumerate(axes):
             width = part.inputs + len(part.rows)
-            entries = [(1.0, part.inputs + part.rows.index(r), 0)] if row.axis == g else []
+            if row.axis == g:
+                entries = [(1.0, part.inputs + part.rows.index(r), 0)]
+            else:
+                entries = []
             entries += [(c * T[j, part.first + a], a, lag) for c, j, lag in row.terms for a in range(part.inputs)]
             for left, a, lag in entries:
                 for right, b, other in entries:

@@ -49,7 +49,11 @@ class Piqp:
     """
 
     def __init__(self, *, dense: bool = False, changing: bool = False) -> None:
-        self._solver: Any = piqp.DenseSolver() if dense else piqp.SparseSolver()
+        self._solver: Any
+        if dense:
+            self._solver = piqp.DenseSolver()
+        else:
+            self._solver = piqp.SparseSolver()
         settings = self._solver.settings
         if not dense:
             settings.kkt_solver = piqp.KKTSolver.sparse_multistage
@@ -120,7 +124,9 @@ class Piqp:
 
     def _of_rows(self, part: Any) -> Any:
         """Return what belongs to the rows that PIQP has, of a matrix or vector of all."""
-        return part if self._kept.all() else part[self._kept]
+        if self._kept.all():
+            return part
+        return part[self._kept]
 
 
 def _bounded(qp: QP) -> NDArray[np.bool_]:

@@ -34,7 +34,10 @@ class AnyOfQpsolvers:
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._matrix = np.asarray if name in qpsolvers.dense_solvers else csc_matrix
+        if name in qpsolvers.dense_solvers:
+            self._matrix = np.asarray
+        else:
+            self._matrix = csc_matrix
 
     def setup(self, qp: QP) -> None:
         """Do nothing: each QP is set up anew."""

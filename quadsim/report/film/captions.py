@@ -93,7 +93,10 @@ class Overlay:
         k = self._footage.period[i]
         time = self._footage.times[i]
         lines: list[tuple[str, float, str]] = [(self._run.name, 21, ink.WHITE)]
-        faster = "" if self._speed == 1.0 else f"   {self._speed:g} times real speed"
+        if self._speed == 1.0:
+            faster = ""
+        else:
+            faster = f"   {self._speed:g} times real speed"
         lines += [(self._subtitle, 14, ink.GREY), (f"t = {time:.2f} s{faster}", 20, ink.WHITE), self._answer(k)]
         for vectors, what, unit, colour in (
             (self._footage.wind, "wind", "m/s", ON_DARK.disturbance),
@@ -120,7 +123,10 @@ class Overlay:
         status = control.status[k]
         phase = control.phase[k]
         fallback = control.fallback[k]
-        phrases = [phase] if self._grounded and status != phase else []
+        if self._grounded and status != phase:
+            phrases = [phase]
+        else:
+            phrases = []
         phrases.append(status + (f" (fallback {fallback})" if fallback else ""))
         if not fallback and control.answered_by[k] not in (LAW, STOPPED):
             phrases.append(f"by {control.answered_by[k]}")
@@ -137,7 +143,10 @@ class Overlay:
         values = (*self._footage.position[i], self._footage.euler[i, 2])
         for j, (name, state) in enumerate(zip(REFERENCE_NAMES, REFERENCE_STATES, strict=True)):
             angle = state == INDEX["yaw"]
-            factor, digits = (math.degrees(1.0), 1) if angle else (1.0, 2)
+            if angle:
+                factor, digits = (math.degrees(1.0), 1)
+            else:
+                factor, digits = (1.0, 2)
             now = factor * values[j]
             target = factor * reference[j]
             row = y + 24 + 27 * j
@@ -146,9 +155,11 @@ class Overlay:
             columns = (118, now, ink.WHITE), (192, target, ON_DARK.reference), (262, now - target, ink.GREY)
             for right, value, colour in columns:
                 shown = f"{round(value, digits) + 0.0:+.{digits}f}"  # no "-0.00"
-                text = (
-                    ABSENT if unknown and colour is not ON_DARK.reference else shown
-                )  # no value is bounded upside down
+                # no value is bounded upside down
+                if unknown and colour is not ON_DARK.reference:
+                    text = ABSENT
+                else:
+                    text = shown
                 painter.text(x + right, row, text, colour=colour, anchor="ra")
 
     def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:
@@ -162,7 +173,10 @@ class Overlay:
             limit = self._limit(name, i)
             row = y + 32 + 50 * j
             whole = {"tilt": 180.0, "pitch": 90.0}
-            span = 2.0 * max(map(abs, _bounds(limit)), default=15.0) if tilted is None else whole[name]
+            if tilted is None:
+                span = 2.0 * max(map(abs, _bounds(limit)), default=15.0)
+            else:
+                span = whole[name]
             broken = _breaks(limit, value)
             shown = f"{round(value, 2) + 0.0:+.2f}"
             painter.text(x, row, name, size=17)
@@ -224,7 +238,10 @@ class Overlay:
         painter.text(x, y, "limit", size=13, colour=ink.GREY)
         painter.text(x + 226, y, "worst margin so far", size=13, colour=ink.GREY, anchor="ra")
         shown, rest = margin_rows(self._ranked, i)
-        pitch = 18.5 if len(self._ranked) <= _MOST_MARGINS else 16.0
+        if len(self._ranked) <= _MOST_MARGINS:
+            pitch = 18.5
+        else:
+            pitch = 16.0
         for j, track in enumerate(shown):
             worst = track.worst[i]
             row = y + 22 + pitch * j
@@ -235,7 +252,10 @@ class Overlay:
             painter.text(
                 x + 226, row, phrases, size=14, colour=ON_DARK.violated if once_broken else ink.WHITE, anchor="ra"
             )
-        colour = ON_DARK.violated if "violated" in rest else ink.GREY
+        if "violated" in rest:
+            colour = ON_DARK.violated
+        else:
+            colour = ink.GREY
         painter.text(x, y + 22 + pitch * len(shown), rest, size=14, colour=colour)
 
 
@@ -250,7 +270,9 @@ def margin_rows(ranked: Sequence[MarginTrack], i: int) -> tuple[list[MarginTrack
 
 
 def _bounds(limit: Limit | None) -> list[float]:
-    return [] if limit is None else [bound for bound in (limit.lower, limit.upper) if math.isfinite(bound)]
+    if limit is None:
+        return []
+    return [bound for bound in (limit.lower, limit.upper) if math.isfinite(bound)]
 
 
 def _breaks(limit: Limit | None, value: float, *, sampled: bool = False) -> bool:

@@ -159,7 +159,10 @@ def make_footage(run: Filmed, times: Array) -> Footage:
     steps = np.diff(plant.t, prepend=plant.t[:1])[:, None]
     turned = np.cumsum(steps * np.abs(plant.speeds), axis=0)
     course = control.reference[:, :3]
-    force = None if plant.wrench is None else plant.wrench[:, :3]
+    if plant.wrench is None:
+        force = None
+    else:
+        force = plant.wrench[:, :3]
     return Footage(
         times=times,
         period=_row_before(control.t, times),

@@ -178,7 +178,10 @@ class FilmStage:
             length = 1.0 * self._arm * min(float(speed / hover) ** 2, _LONGEST_ARROW)
             if length < 0.02 * self._arm:
                 continue
-            colour = _BROKEN_COLOUR if speed > self._speed_bound + 1e-6 else _THRUST_COLOUR
+            if speed > self._speed_bound + 1e-6:
+                colour = _BROKEN_COLOUR
+            else:
+                colour = _THRUST_COLOUR
             tip = body.xpos + length * body.xmat.reshape(3, 3)[:, 2]
             self._connect(mujoco.mjtGeom.mjGEOM_ARROW, 0.04 * self._arm, body.xpos, tip, colour)
 

@@ -90,7 +90,10 @@ def worker_count(frames: int, most: int | None = None) -> int:
         ParameterError: there is to be none.
     """
     if most is None:
-        most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        if hasattr(os, "sched_getaffinity"):
+            most = len(os.sched_getaffinity(0))
+        else:
+            most = os.cpu_count() or 1
     if most < 1:
         raise ParameterError("film", "workers", most, "at least 1")
     return max(1, min(most, frames // _FEWEST_FRAMES))
@@ -112,7 +115,9 @@ def frame_rate(length: float, fps: int | None = None) -> int:
 
 def film_speed(length: float) -> float:
     """How many times as fast as it was flown a flight of a length [s] is shown: three times if it is long."""
-    return _FAST if length > _LONG else 1.0
+    if length > _LONG:
+        return _FAST
+    return 1.0
 
 
 def frame_count(length: float, fps: int, speed: float | None = None) -> int:
@@ -161,7 +166,9 @@ class Estimate:
 
 def rough_time(seconds: float) -> str:
     """Format a time that is only estimated: to 5 s, or to the minute from 90 s on."""
-    return f"{round(seconds / 60.0)} min" if seconds >= 90.0 else f"{max(5, 5 * round(seconds / 5.0))} s"
+    if seconds >= 90.0:
+        return f"{round(seconds / 60.0)} min"
+    return f"{max(5, 5 * round(seconds / 5.0))} s"
 
 
 def render_video(
@@ -339,4 +346,6 @@ def _work(
 
 def _last_line(text: bytes) -> str:
     lines = text.decode(errors="replace").strip().splitlines()
-    return lines[-1].strip() if lines else "it ended without a word"
+    if lines:
+        return lines[-1].strip()
+    return "it ended without a word"

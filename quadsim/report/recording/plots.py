@@ -54,7 +54,10 @@ def send_plots(recording: rr.RecordingStream, run: FlightRecord) -> rrb.Tabs:
     events = rrb.TextLogView(name="Events", origin="/events")
     times, solver = _send_solver(recording, run)
     lanes = [f"verdicts/{limit.name}" for limit in reached if limit.start == 0.0]
-    verdicts = [rrb.StateTimelineView(name="Constraints on the whole flight", contents=lanes)] if lanes else []
+    if lanes:
+        verdicts = [rrb.StateTimelineView(name="Constraints on the whole flight", contents=lanes)]
+    else:
+        verdicts = []
     return rrb.Tabs(
         rrb.Grid(*signals[:FRONT_PANELS], *verdicts, *times, grid_columns=2, name="Flight"),
         *([rrb.Grid(*signals[FRONT_PANELS:], grid_columns=2, name="More signals")] if signals[FRONT_PANELS:] else []),

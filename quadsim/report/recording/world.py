@@ -122,7 +122,10 @@ def _part(solid: Solid, colour: Any) -> rr.AsComponents:
         case "capsule":
             bottom = solid.centre - b * solid.turn[:, 2]
             return rr.Capsules3D(translations=[bottom], lengths=[2.0 * b], radii=[a], **turned)
-    half = (a, a, a) if solid.kind == "sphere" else solid.size
+    if solid.kind == "sphere":
+        half = (a, a, a)
+    else:
+        half = solid.size
     return rr.Ellipsoids3D(centers=centres, half_sizes=[half], **turned)
 
 
@@ -144,7 +147,10 @@ def send_scene(recording: rr.RecordingStream, run: FlightRecord) -> None:
     # The body turns below an entity that only moves: views that start there follow the vehicle without tilting.
     thrusts = np.zeros((plant.t.size, N_ROTORS, 3))
     thrusts[..., 2] = run.actual.longest_arm * np.square(plant.speeds / run.actual.hover_speed)
-    turned = euler_to_quaternion(plant.state[:, EULER]) if plant.attitude is None else plant.attitude
+    if plant.attitude is None:
+        turned = euler_to_quaternion(plant.state[:, EULER])
+    else:
+        turned = plant.attitude
     attitude = _vector_first(turned)
     arrows = rr.Arrows3D.columns(vectors=thrusts.reshape(-1, 3)).partition([N_ROTORS] * plant.t.size)
     recording.send_columns("world/vehicle", [time_column(plant.t)], rr.Transform3D.columns(translation=position))

@@ -52,9 +52,10 @@ def along_path(course: Course, *, response_time: float, rate: float) -> Course:
         return np.column_stack([poses[:, :3], known.at(t)])
 
     jumps = np.array(course.jumps)
-    moved = (
-        course.sample(jumps + 1e-6) - course.sample(np.maximum(jumps - 1e-6, 0.0)) if jumps.size else np.empty((0, 4))
-    )
+    if jumps.size:
+        moved = course.sample(jumps + 1e-6) - course.sample(np.maximum(jumps - 1e-6, 0.0))
+    else:
+        moved = np.empty((0, 4))
     has_moved = np.abs(moved[:, :3]).max(axis=1, initial=0.0) > 1e-4
     still_jumps = tuple(jumps[has_moved].tolist())
     return replace(course, sample=sample, jumps=still_jumps, free_heading=False, stated_heading=True)

@@ -197,7 +197,10 @@ def poses_of(points: Sequence[Point], initial: Array) -> Array:
     poses = []
     yaw = float(initial[3])
     for point in points:
-        yaw = yaw if point.yaw is None else nearest_turn(math.radians(point.yaw), yaw)
+        if point.yaw is None:
+            yaw = yaw
+        else:
+            yaw = nearest_turn(math.radians(point.yaw), yaw)
         poses.append([*point.position, yaw])
     return np.array(poses)
 

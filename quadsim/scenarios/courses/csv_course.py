@@ -111,7 +111,10 @@ class Csv(Travelled):
     def build(self, initial: Array, gravity: float) -> Course:
         """As `Filtered.build`."""
         path = FilePath(self.file)
-        table = read_course_table(path) if self.content is None else parse_rows(path, self.content)
+        if self.content is None:
+            table = read_course_table(path)
+        else:
+            table = parse_rows(path, self.content)
         if self.sha256 not in (None, table.sha256):
             raise FileError(self.file, f"is not the file of the scenario: its SHA-256 is not {self.sha256}")
         if not table.has_yaw:
@@ -219,7 +222,10 @@ def parse_rows(path: FilePath, content: bytes) -> Table:
         rows.pop()
     if rows and len(rows[0]) > 1 and not any(row[-1].strip() for row in rows if row):
         rows = [row[:-1] for row in rows]  # lines that end with a comma
-    header = tuple(cell.strip().lower() for cell in rows[0]) if rows else ()
+    if rows:
+        header = tuple(cell.strip().lower() for cell in rows[0])
+    else:
+        header = ()
     if not header:
         raise FileError(path, "row 1: must be a header, such as t,x,y,z,yaw; the file is empty")
     known = table_format(header)
@@ -320,7 +326,10 @@ def _acceleration_notes(t: Array, velocities: Array, accelerations: Array) -> It
         gained = np.diff(velocity) / periods
         stated = 0.5 * (acceleration[1:] + acceleration[:-1])
         if mean(stated - gained) > DISAGREEMENT * max(mean(gained), mean(stated)) + SMALL:
-            hint = "; is gravity in it?" if name == "z" and abs(float(np.mean(stated - gained)) - 9.8) < 0.5 else ""
+            if name == "z" and abs(float(np.mean(stated - gained)) - 9.8) < 0.5:
+                hint = "; is gravity in it?"
+            else:
+                hint = ""
             yield (
                 f"column a{name} is {mean(stated):.4g} m/s^2 on average, but column v{name} changes by "
                 f"{mean(gained):.4g} m/s^2{hint}"
@@ -503,7 +512,9 @@ def _resolution(cells: Iterable[str]) -> float:
     for cell in cells:
         digits, _, exponent = cell.strip().lower().partition("e")
         decimals = max(decimals, len(digits.partition(".")[2]) - int(exponent or 0))
-    return 10.0**-decimals if decimals in ROUNDED else 0.0
+    if decimals in ROUNDED:
+        return 10.0**-decimals
+    return 0.0
 
 
 def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, ...]) -> list[float]:

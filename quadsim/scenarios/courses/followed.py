@@ -79,7 +79,10 @@ class FollowedCourse:
         while len(self._samples) < count:
             t = self._period * np.arange(len(self._samples), len(self._samples) + _BLOCK, dtype=np.float64)
             samples = self._course.sample(t)
-            before = self._samples[-1] if len(self._samples) else self._course.initial
+            if len(self._samples):
+                before = self._samples[-1]
+            else:
+                before = self._course.initial
             samples[:, _YAW] = unwrapped(samples[:, _YAW], float(before[_YAW]))
             self._samples = np.concatenate([self._samples, samples])
         if len(self._rows) >= count:
@@ -88,7 +91,10 @@ class FollowedCourse:
         samples = self._samples[known : -(-count // _BLOCK) * _BLOCK].copy()
         for channel, value in self._setpoint.items():
             samples[:, channel] = value
-        before = self._rows[-1] if known else self._course.initial
+        if known:
+            before = self._rows[-1]
+        else:
+            before = self._course.initial
         self._rows = np.concatenate([self._rows, self._filtered(samples, before)])
 
     def _filtered(self, samples: Array, before: Array) -> Array:

@@ -69,7 +69,10 @@ def ramped(t: Array, *, rate: float, total: float, ramp: float) -> Array:
     """
     duration = total / rate + ramp
     from_nearer_end = np.minimum(t, duration - t)
-    s = np.clip(from_nearer_end / ramp, 0.0, 1.0) if ramp > 0.0 else np.zeros_like(t)
+    if ramp > 0.0:
+        s = np.clip(from_nearer_end / ramp, 0.0, 1.0)
+    else:
+        s = np.zeros_like(t)
     gained = ramp * s**5 * (7.0 + s * (-14.0 + s * (10.0 - 2.5 * s)))  # the integral of S
     angle = rate * (gained + np.maximum(from_nearer_end - ramp, 0.0))
     return np.where(t <= 0.5 * duration, angle, total - angle)

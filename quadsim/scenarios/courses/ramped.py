@@ -224,7 +224,9 @@ class RampedCircle(_Ramped):
 
     def curve(self, yaw: float) -> Curve:
         """The circle."""
-        return upright_circle_curve(self.radius, yaw) if self.plane == "vertical" else circle_curve(self.radius)
+        if self.plane == "vertical":
+            return upright_circle_curve(self.radius, yaw)
+        return circle_curve(self.radius)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,8 +18,13 @@ DEFAULT: Final = "steps"  # the type of a table that states none
 
 def _kind(value: object) -> str:
     """The tag of a table or of what was made of one."""
-    kind = value.get("type", DEFAULT) if isinstance(value, dict) else getattr(value, "type", DEFAULT)
-    return kind if isinstance(kind, str) else repr(kind)
+    if isinstance(value, dict):
+        kind = value.get("type", DEFAULT)
+    else:
+        kind = getattr(value, "type", DEFAULT)
+    if isinstance(kind, str):
+        return kind
+    return repr(kind)
 
 
 ReferenceTable = Annotated[

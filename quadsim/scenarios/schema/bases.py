@@ -19,7 +19,10 @@ _TOLERANCES: Final = ("tolerance", "tolerance_sampled")
 def locate_files(data: dict[str, Any], directory: Path) -> None:
     """Make paths that are relative to a file's folder independent of it, in place."""
     for name, ending in (("vehicle", ".toml"), (RECORDED, ".toml"), ("reference", "")):
-        file = data[name].get("file") if isinstance(data.get(name), dict) else None
+        if isinstance(data.get(name), dict):
+            file = data[name].get("file")
+        else:
+            file = None
         if isinstance(file, str) and file.endswith(ending) and (directory / file).is_file():
             data[name]["file"] = str((directory / file).resolve())
     if "controller" in data:

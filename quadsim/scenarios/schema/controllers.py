@@ -18,12 +18,17 @@ from quadsim.scenarios.schema.writing import plain
 
 def _law(controller: object) -> str | None:
     """Return the tag of a table's law; an unknown law is left for the message."""
-    law_name = controller.get("type") if isinstance(controller, Mapping) else None
+    if isinstance(controller, Mapping):
+        law_name = controller.get("type")
+    else:
+        law_name = None
     if isinstance(controller, ControllerTable):
         law_name = controller.type
     if not isinstance(law_name, str):
         return None
-    return law_name if law_name in LAWS or not is_plugin(law_name) else FORM
+    if law_name in LAWS or not is_plugin(law_name):
+        return law_name
+    return FORM
 
 
 class _OrName:
@@ -59,7 +64,11 @@ def changed_controller(controller: AnyController, fields: Mapping[str, Any]) -> 
     Raises:
         ScenarioError: a field is not there, or its value is not allowed.
     """
-    data: dict[str, Any] = {} if "type" in fields else plain(controller)
+    data: dict[str, Any]
+    if "type" in fields:
+        data = {}
+    else:
+        data = plain(controller)
     for path, value in _leaves(fields):
         set_field(data, path, value, source="fields")
     return parse_table(_Holder, {"controller": data}, "controller").controller

@@ -94,7 +94,9 @@ def _loosened(schema: Any) -> Any:
     if isinstance(schema, list):
         return [_loosened(entry) for entry in schema]
     if isinstance(schema, str):
-        return schema.replace(_TABLES, _TABLES + _PARTIAL) if schema.startswith(_TABLES) else schema
+        if schema.startswith(_TABLES):
+            return schema.replace(_TABLES, _TABLES + _PARTIAL)
+        return schema
     if not isinstance(schema, dict):
         return schema
     optional = {key: value for key, value in schema.items() if key not in ("required", "discriminator")}

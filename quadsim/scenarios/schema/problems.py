@@ -56,7 +56,9 @@ class Kind:
     @property
     def fields(self) -> tuple[str, ...]:
         """Names of a table's fields; none for other kinds."""
-        return tuple(fields_of(self.type)) if is_table(self.type) else ()
+        if is_table(self.type):
+            return tuple(fields_of(self.type))
+        return ()
 
     @property
     def is_list(self) -> bool:
@@ -75,7 +77,9 @@ class Kind:
         """Allowed values, if they are enumerated."""
         if isinstance(self.type, type) and issubclass(self.type, Enum):
             return tuple(member.value for member in self.type)
-        return get_args(self.type) if get_origin(self.type) is Literal else ()
+        if get_origin(self.type) is Literal:
+            return get_args(self.type)
+        return ()
 
     @property
     def labels(self) -> set[str]:
@@ -99,7 +103,9 @@ class Kind:
         """Return what is allowed, to end the sentence "must be ..."."""
         if self.choices:
             *rest, last = ("false" if choice is False else repr(choice) for choice in self.choices)
-            return f"one of {', '.join(rest)} or {last}" if rest else last
+            if rest:
+                return f"one of {', '.join(rest)} or {last}"
+            return last
         limits = self.limits
         count = _count(*self.lengths)
         if self.is_list:
@@ -107,11 +113,21 @@ class Kind:
             return f"a list of {count}{'numbers' if held <= {float, int} else 'texts' if held == {str} else 'entries'}"
         if self.type in _NAMES:
             bounds = [f"{sign} {_number(limits[name])}" for name, sign in _LIMITS.items() if name in limits]
-            finite = "finite " if self.type is float and not bounds else ""
+            if self.type is float and not bounds:
+                finite = "finite "
+            else:
+                finite = ""
             count = f"of {count}characters" if count else ""
-            form = f"of the form {limits['pattern']}" if "pattern" in limits else ""
+            if "pattern" in limits:
+                form = f"of the form {limits['pattern']}"
+            else:
+                form = ""
             return " ".join(filter(None, [f"a {finite}{_NAMES[self.type]}", " and ".join(bounds), count, form]))
-        return "true or false" if self.type is bool else f"a table of {count}entries" if count else "a table"
+        if self.type is bool:
+            return "true or false"
+        if count:
+            return f"a table of {count}entries"
+        return "a table"
 
 
 def _limits(notes: Iterable[Any]) -> Iterator[tuple[str, Any]]:
@@ -129,12 +145,18 @@ def _count(shortest: int, longest: float) -> str:
     if shortest == longest:
         return f"{shortest} "
     if math.isinf(longest):
-        return f"{shortest} or more " if shortest else ""
-    return f"{shortest} to {longest} " if shortest else f"{longest} or fewer "
+        if shortest:
+            return f"{shortest} or more "
+        return ""
+    if shortest:
+        return f"{shortest} to {longest} "
+    return f"{longest} or fewer "
 
 
 def _number(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:.15g}"
+    if isinstance(value, int):
+        return str(value)
+    return f"{value:.15g}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,14 +188,20 @@ def find(path: Sequence[int | str], data: Any, root: type[Any]) -> FilePlace:
         fields = [fields_of(kind.type)[part] for kind in kinds if part in kind.fields]
         if isinstance(part, int):
             data = data[part]
-            name = data.get("name") if isinstance(data, Mapping) else None
+            if isinstance(data, Mapping):
+                name = data.get("name")
+            else:
+                name = None
             names.append(name if isinstance(name, str) and name else str(part))
             kinds = tuple(entry for kind in kinds for entry in kind.entries)
         elif len(kinds) > 1 and named:
             kinds = named
         elif fields or (isinstance(data, Mapping) and part in data):
             names.append(part)
-            data = data.get(part) if isinstance(data, Mapping) else None
+            if isinstance(data, Mapping):
+                data = data.get(part)
+            else:
+                data = None
             inner = [kinds_of(field.annotation, tuple(field.metadata)) for field in fields]
             kinds = tuple(kind for group in inner or [kind.entries for kind in kinds] for kind in group)
     return FilePlace(names=tuple(names), kinds=kinds, given=data)
@@ -187,7 +215,9 @@ def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...
         return kinds_of(inner, (*metadata, *notes))
     if origin in (Union, UnionType):
         return tuple(kind for member in get_args(annotation) for kind in kinds_of(member, metadata))
-    return () if annotation is NoneType else (Kind(type=annotation, metadata=metadata),)
+    if annotation is NoneType:
+        return ()
+    return (Kind(type=annotation, metadata=metadata),)
 
 
 _MOST_LINES: Final = 20  # problems listed in one message; the rest are counted
@@ -347,12 +377,18 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *,
         quoted = details["ctx"][
             "discriminator"
         ]  # in quotes where it is a field's name, and else a function of the spec's
-        name = quoted.strip("'") if quoted.startswith("'") else "type"
+        if quoted.startswith("'"):
+            name = quoted.strip("'")
+        else:
+            name = "type"
         expected = details["ctx"].get("expected_tags") or ", ".join(
             repr(each) for k in place.kinds for each in k.labels
         )
         choices = expected.strip("'").split("', '")
-        given = given.get(name) if isinstance(given, Mapping) else given
+        if isinstance(given, Mapping):
+            given = given.get(name)
+        else:
+            given = given
         field = f"{field}.{name}"
         rule = f"one of {expected}"
     return f"{field} must be {rule if kind in _KNOWN else details['msg']}; got {shown(given)}{_guess(given, choices)}"
@@ -376,7 +412,9 @@ def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
         text = "[" + ", ".join([*entries, *(["..."] if len(value) > _MOST_ENTRIES else [])]) + "]"
     else:
         text = repr(value)
-    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
+    if len(text) <= _LONGEST:
+        return text
+    return text[: _LONGEST - 3] + "..."
 
 
 def _guess(given: object, allowed: Iterable[str]) -> str:

@@ -245,7 +245,10 @@ class Scenario:
     def tables(self) -> dict[str, Any]:
         """What was stated, as nested tables in file units, without defaults and derived values; a copy."""
         stated: dict[str, Any] | None = vars(self).get("stated")
-        tables = copy.deepcopy(stated) if stated is not None else self._every_field()
+        if stated is not None:
+            tables = copy.deepcopy(stated)
+        else:
+            tables = self._every_field()
         for name in vars(self).get("restated", ()):
             value = getattr(self, name)
             if is_absent(value):
@@ -294,9 +297,15 @@ class Scenario:
             try:
                 steps_per_period(value, unit)
             except ParameterError:
-                what = "the control period" if name == "duration" else "the physics step plant.timestep"
+                if name == "duration":
+                    what = "the control period"
+                else:
+                    what = "the physics step plant.timestep"
                 rate = self.log_rate if name == "log_rate" else value
-                period = "have a period that is" if name == "log_rate" else "be"
+                if name == "log_rate":
+                    period = "have a period that is"
+                else:
+                    period = "be"
                 raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {rate}") from None
         if self.recorded is not None and self.recorded.file != self.vehicle.file:
             advice = (
@@ -350,7 +359,10 @@ class Scenario:
         return names + [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
 
     def _check_events(self) -> None:
-        carried = len(self.effects.load.payloads) if self.effects.load is not None else 0
+        if self.effects.load is not None:
+            carried = len(self.effects.load.payloads)
+        else:
+            carried = 0
         controller = self.controller
         for i, event in sorted(enumerate(self.events), key=lambda entry: entry[1].at):
             if event.at >= self.duration:
@@ -362,7 +374,10 @@ class Scenario:
                     raise ValueError(f"events.{i}.type must not be payload_drop at {event.at} s: nothing is carried")
                 carried = 0
             elif isinstance(event, SensorFaultEvent) and self.estimator is not None:
-                present = [] if self.sensors is None else [str(name) for name in self.sensors.present()]
+                if self.sensors is None:
+                    present = []
+                else:
+                    present = [str(name) for name in self.sensors.present()]
                 if event.sensor not in present:
                     rule = f"one that the estimator has, of {', '.join(present)}"
                     raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
@@ -431,7 +446,9 @@ class Scenario:
         """
         other = Scenario.parse(tables, source=self.name if source is None else source)
         # A reference that was passed in as a function has its rows in memory.
-        return other.altered(reference=self.reference) if other.reference == self.reference else other
+        if other.reference == self.reference:
+            return other.altered(reference=self.reference)
+        return other
 
     def replace(self, changes: Mapping[Any, Any]) -> Scenario:
         """Return a scenario with other values of some fields; this one is unchanged.
@@ -457,7 +474,10 @@ class Scenario:
         tables = self.tables
         defaults = plain(self)
         for path, value in separate(changes, source="replace").items():
-            number = value.tolist() if hasattr(value, "tolist") else value
+            if hasattr(value, "tolist"):
+                number = value.tolist()
+            else:
+                number = value
             set_field(tables, path, number, source="replace", defaults=defaults)
         return self.derive(tables)
 

@@ -119,7 +119,10 @@ def restate(data: dict[str, Any], path: str, value: Any) -> None:
         if not data["autopilot"]:
             del data["autopilot"]
     elif table in REPEATING and field != "file":
-        names = [field.partition(".")[0]] if field else [*_table({table: value}, table)]
+        if field:
+            names = [field.partition(".")[0]]
+        else:
+            names = [*_table({table: value}, table)]
         new = [f"{table}.{name}" for name in names if f"{table}.{name}" not in stated]
         data[RECORDED] = {**recorded, "stated": [*stated, *new]}
 
@@ -135,7 +138,10 @@ def separate(changes: Mapping[Any, Any], *, source: str) -> dict[str, Any]:
         if isinstance(fields, str):
             separated[fields] = value
             continue
-        values = value if isinstance(value, tuple) else (value,) * len(fields)
+        if isinstance(value, tuple):
+            values = value
+        else:
+            values = (value,) * len(fields)
         if len(values) != len(fields):
             rule = f"one value for all, or a tuple of {len(fields)}; a pair for all is a list"
             raise ParameterError(source, f"({', '.join(fields)})", value, rule)
@@ -146,13 +152,19 @@ def separate(changes: Mapping[Any, Any], *, source: str) -> dict[str, Any]:
 def state_bounds(data: dict[str, Any], controller: Any) -> None:
     """Write the bounds that constraints took from a controller into them, when a law without these replaces it."""
     before = data.get("controller")
-    after = {"type": controller} if isinstance(controller, str) else controller
+    if isinstance(controller, str):
+        after = {"type": controller}
+    else:
+        after = controller
     if not (isinstance(before, dict) and isinstance(after, dict)) or after.get("type") in (None, before.get("type")):
         return
     names = ("output_bounds", "input_bounds")
     bounds, others = ({k: v for name in names for k, v in _table(law, name).items()} for law in (before, after))
     for entry in data["constraints"] if isinstance(data.get("constraints"), list) else ():
-        pair = bounds.get(str(entry.get("signal"))) if isinstance(entry, dict) else None
+        if isinstance(entry, dict):
+            pair = bounds.get(str(entry.get("signal")))
+        else:
+            pair = None
         taken = pair is not None and entry["signal"] not in others and not {"lower", "upper"} & entry.keys()
         if taken and isinstance(pair, list) and len(pair) == 2:
             entry["lower"], entry["upper"] = pair
@@ -160,7 +172,9 @@ def state_bounds(data: dict[str, Any], controller: Any) -> None:
 
 def _table(data: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     table = data.get(name)
-    return table if isinstance(table, Mapping) else {}
+    if isinstance(table, Mapping):
+        return table
+    return {}
 
 
 def note_change(data: dict[str, Any], path: str, value: Any) -> None:
@@ -178,7 +192,10 @@ def _note(data: dict[str, Any], changes: Iterable[tuple[str, Any]]) -> None:
     if not isinstance(description, str):
         return
     text, _, noted = description.partition(_CHANGED)
-    earlier = noted.removesuffix(")").split("; ") if noted else []
+    if noted:
+        earlier = noted.removesuffix(")").split("; ")
+    else:
+        earlier = []
     notes = {note.partition(" = ")[0]: note for note in earlier}
     for path, value in changes:
         if path not in NOT_DESCRIBED:
@@ -214,11 +231,16 @@ def field_text(value: Any) -> str:
     if value is None:
         return "absent"
     try:
-        text = f"{value:.6g}" if isinstance(value, float) else json.dumps(value, default=str)
+        if isinstance(value, float):
+            text = f"{value:.6g}"
+        else:
+            text = json.dumps(value, default=str)
     except ValueError:  # Python does not write out very long whole numbers
         return "..."
     text = text.replace("; ", ", ")
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+    if len(text) <= _LONGEST:
+        return text
+    return f"{text[: _LONGEST - 3]}..."
 
 
 def get_field(data: dict[str, Any], path: str) -> Any:
@@ -249,7 +271,10 @@ def _holder(
     for depth, key in enumerate(through):
         if isinstance(holder, list):
             i = _index(holder, ".".join(through[:depth]), key)
-            default = default[i] if isinstance(default, list) and i < len(default) else None
+            if isinstance(default, list) and i < len(default):
+                default = default[i]
+            else:
+                default = None
             holder = holder[i]
         else:
             if key == "controller" and isinstance(holder.get(key), str):  # its name alone
@@ -284,4 +309,6 @@ def _parse_value(text: str) -> Any:
         raise
     except ValueError:  # also of a number of thousands of digits
         return text
-    return table["value"] if table.keys() == {"value"} else text
+    if table.keys() == {"value"}:
+        return table["value"]
+    return text

@@ -46,7 +46,9 @@ def plain(value: Any) -> Any:
         value = {name: getattr(value, name) for name in fields_of(type(value))}
     if isinstance(value, Mapping):
         return {name: plain(entry) for name, entry in value.items() if not is_absent(entry)}
-    return [plain(entry) for entry in value] if isinstance(value, list | tuple) else value
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    return value
 
 
 def to_toml(model: Any, stated: Mapping[str, Any] | None = None, recorded: Mapping[str, str] | None = None) -> str:
@@ -108,7 +110,10 @@ def _lines(
         kinds = tables_in(field.annotation)
         is_new = (type(model), name) not in explained
         explained.add((type(model), name))
-        comment = " ".join((field.description or "").split()) if is_new else ""
+        if is_new:
+            comment = " ".join((field.description or "").split())
+        else:
+            comment = ""
         if is_table(type(value)):
             below.append((name, value, comment or headline(type(value)) if is_new else ""))
         elif isinstance(value, Mapping) or (value and kinds and not path):
@@ -133,7 +138,10 @@ def _lines(
             yield from ["", *_wrapped(comment)]
             several = len({type(entry) for entry in value}) > 1
             for entry in value:
-                about = headline(type(entry)) if (several or not comment) and type(entry) not in explained else ""
+                if (several or not comment) and type(entry) not in explained:
+                    about = headline(type(entry))
+                else:
+                    about = ""
                 explained.add(type(entry))
                 lines = _lines(entry, f"{name}.", explained, plain(entry), recorded)
                 yield from ["", *_commented(f"[[{name}]]", about), *lines]
@@ -159,7 +167,10 @@ def _absent(path: str, kinds: Sequence[type[Any]], comment: str, explained: set[
     for name, field in sorted(fields_of(kind).items(), key=_type_first):
         is_new = (kind, name) not in explained
         explained.add((kind, name))
-        about = " ".join((field.description or "").split()) if is_new else ""
+        if is_new:
+            about = " ".join((field.description or "").split())
+        else:
+            about = ""
         default = field.get_default(call_default_factory=True)
         tables = tables_in(field.annotation)
         if tables and not isinstance(default, list | tuple):
@@ -178,7 +189,9 @@ def _unstated(text: str) -> str:
 
 
 def _labelled_as(label: str, comment: str) -> str:
-    return f"{label}; {comment}" if comment else label
+    if comment:
+        return f"{label}; {comment}"
+    return label
 
 
 def _about_entries(kinds: Sequence[type[Any]]) -> Iterator[str]:
@@ -199,8 +212,13 @@ def _type_first(field: tuple[str, FieldInfo]) -> bool:
 
 def _labelled(name: str, info: FieldInfo) -> str:
     """Return a field's name; for a type field with its value."""
-    choices = get_args(info.annotation) if get_origin(info.annotation) is Literal else ()
-    return f'{name} = "{choices[0]}"' if name == "type" and len(choices) == 1 else name
+    if get_origin(info.annotation) is Literal:
+        choices = get_args(info.annotation)
+    else:
+        choices = ()
+    if name == "type" and len(choices) == 1:
+        return f'{name} = "{choices[0]}"'
+    return name
 
 
 def _pair(name: str, value: Any) -> str:
@@ -216,14 +234,18 @@ def _text(value: Any) -> str:
     if isinstance(value, list | tuple):
         entries = [*map(_text, value)]
         line = f"[{', '.join(entries)}]"
-        return line if len(line) <= _LONG else "[\n" + "".join(f"    {entry},\n" for entry in entries) + "]"
+        if len(line) <= _LONG:
+            return line
+        return "[\n" + "".join(f"    {entry},\n" for entry in entries) + "]"
     return tomlkit.item(value).as_string()
 
 
 def _commented(text: str, comment: str) -> list[str]:
     """Return a line with its comment beside it, or above it if it is long."""
     line = f"{text}  # {comment}" if comment else text
-    return [line] if len(line) <= WIDTH and "\n" not in text else [*_wrapped(comment), text]
+    if len(line) <= WIDTH and "\n" not in text:
+        return [line]
+    return [*_wrapped(comment), text]
 
 
 def _wrapped(comment: str, **options: Any) -> list[str]:

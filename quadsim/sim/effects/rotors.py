@@ -135,5 +135,8 @@ class LagChange:
 
     def text(self) -> str:
         """Describe the event."""
-        fall = "" if self.fall in (None, self.rise) else f", {self.fall:g} s downwards"
+        if self.fall in (None, self.rise):
+            fall = ""
+        else:
+            fall = f", {self.fall:g} s downwards"
         return f"rotors lag by {self.rise:g} s{fall}"

@@ -180,9 +180,15 @@ class WindField:
         self._mean = mean
         x, y, _ = mean
         speed = math.hypot(x, y)
-        self._along = (x / speed, y / speed) if speed > 0.0 else (1.0, 0.0)
+        if speed > 0.0:
+            self._along = (x / speed, y / speed)
+        else:
+            self._along = (1.0, 0.0)
         self._timestep = timestep
-        self._turbulence = None if turbulence is None else Turbulence(turbulence, timestep=timestep, rng=rng)
+        if turbulence is None:
+            self._turbulence = None
+        else:
+            self._turbulence = Turbulence(turbulence, timestep=timestep, rng=rng)
         self.reset()
         self.reschedule(gusts, changes)
 
@@ -215,7 +221,10 @@ class WindField:
         """Compute the wind from now on to a physics step."""
         left = self._turbulent[self._step - self._start :]
         more = end - self._step - len(left)
-        fresh = np.zeros((more, 3)) if self._turbulence is None else self._turbulence.advance(more)
+        if self._turbulence is None:
+            fresh = np.zeros((more, 3))
+        else:
+            fresh = self._turbulence.advance(more)
         self._turbulent = np.concatenate([left, fresh])
         self._start = self._step
         self._wind = self._sum_up()

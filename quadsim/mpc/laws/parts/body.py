@@ -49,9 +49,15 @@ def body_numbers(model: RigidBody, p: Struct) -> Array:
     p.substeps = model.substeps
     p.step = model.step
     p.gravity = model.gravity
-    p.largest = model.mass * model.gravity if model.targets else model.largest_thrust
+    if model.targets:
+        p.largest = model.mass * model.gravity
+    else:
+        p.largest = model.largest_thrust
     ixx, iyy, izz = model.inertia.tolist()
-    gyration = (0.0, 0.0, 0.0) if model.targets else ((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz)
+    if model.targets:
+        gyration = (0.0, 0.0, 0.0)
+    else:
+        gyration = ((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz)
     lag = np.array(model.lags)
     air = {"moment": model.moment, "inflow": model.inflow, "damping": model.damping}
     p.loss = model.loss

@@ -31,7 +31,10 @@ class FeedbackLaw(ABC):
         self.bounds = settings.actuators(vehicle)
         self.horizon = settings.horizon
         self._period = period
-        self.model = hover_model(vehicle, period) if model is None else model
+        if model is None:
+            self.model = hover_model(vehicle, period)
+        else:
+            self.model = model
         self._operator = differentiator(self.horizon, period)
         self._turns = ReferenceTurns()
         self.reset(self.model.u_bar)
@@ -96,7 +99,9 @@ class Baseline(ControllerTable):
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
-        return {} if self.input_bounds is None else self.input_bounds.audited(vehicle)
+        if self.input_bounds is None:
+            return {}
+        return self.input_bounds.audited(vehicle)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""

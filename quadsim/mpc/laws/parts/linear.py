@@ -185,7 +185,10 @@ class LinearMPC:
         self.commands = commands
         self._solver = solver
         self._holds = holds
-        self._obstacles = None if space is None else ObstacleQP(self.problem, solver, space)
+        if space is None:
+            self._obstacles = None
+        else:
+            self._obstacles = ObstacleQP(self.problem, solver, space)
         self._bounds, self._check = ActuatorBounds.of_problem(self.problem), AnswerCheck(self.problem, kkt_every)
         self.reset(self.problem.model.u_bar)
 
@@ -203,7 +206,10 @@ class LinearMPC:
 
     def adopt(self, previous: object) -> None:
         """Take over what the previous law has learnt, and its plan, to hold if a QP has no answer."""
-        law = previous if isinstance(previous, LinearMPC) else None
+        if isinstance(previous, LinearMPC):
+            law = previous
+        else:
+            law = None
         if law is not None and law._plan is not None and self._holds:
             self._plan = resized(law._plan, self.horizon)
             self._held = law._held
@@ -261,7 +267,10 @@ class LinearMPC:
         if not self._holds:
             return refused(self._acting, self.horizon, reason, answer)
         if self._plan is None or self._held + 1 >= self.horizon:
-            held = f"after holding the last plan for {self._held} periods" if self._held else "with no plan to hold"
+            if self._held:
+                held = f"after holding the last plan for {self._held} periods"
+            else:
+                held = "with no plan to hold"
             raise PlanExhaustedError(f"the solver answered {reason!r} {held}", time=now.time)
         self._held += 1
         self._acting = self._bounds.clip(self._plan[self._held], self._acting)

@@ -143,7 +143,10 @@ class NonlinearMPC:
         self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
         self.commands: str = settings.commands
         self.horizon = settings.horizon
-        self._bounds = settings.actuators(vehicle) if bounds is None else bounds
+        if bounds is None:
+            self._bounds = settings.actuators(vehicle)
+        else:
+            self._bounds = bounds
         self.model = prediction_model(settings, vehicle, period)
         self.problem = nonlinear_problem(settings, vehicle, period, self.model, self._bounds, constraints)
         self._nodes = self.problem.horizon
@@ -180,7 +183,10 @@ class NonlinearMPC:
         self.bodies = make_bodies(period=body, unlagged=without_lag)
         self._lag = self.model.lags[0]  # of actuator states [s]
         observing = settings.offset_free
-        self._observer = None if observing is None else DisturbanceObserver(observing, period)
+        if observing is None:
+            self._observer = None
+        else:
+            self._observer = DisturbanceObserver(observing, period)
         self.ramp = self._make_ramp()
         self.numbers = self._make_numbers(stride)
         self._library = core_library()
@@ -196,7 +202,10 @@ class NonlinearMPC:
         model = self.model
         if settings.disturbance is None:
             return None
-        lag = self._lag if settings.disturbance.rotor_lag is None else settings.disturbance.rotor_lag
+        if settings.disturbance.rotor_lag is None:
+            lag = self._lag
+        else:
+            lag = settings.disturbance.rotor_lag
         return RampObserver(
             replace(settings.disturbance, rotor_lag=lag),
             self._vehicle,
@@ -370,7 +379,10 @@ class NonlinearMPC:
             self._acting[:] = now.acting
         elapsed = now.time - self._called_at
         self._called_at = now.time
-        periods = round(elapsed / self._period) if math.isfinite(elapsed) else 0
+        if math.isfinite(elapsed):
+            periods = round(elapsed / self._period)
+        else:
+            periods = 0
         if now.phase in GROUNDED:
             self._library.quadsim_nonlinear_stand(self.struct, periods, self._command)
             self._acting[:] = self._bounds.lowest(self._acting)
@@ -400,8 +412,14 @@ class NonlinearMPC:
     def _begin(self, periods: int, now: StepInputs, state: Array, reference: Array) -> bool:
         """Make the query of a period, so many after the last, from its inputs; False if they are implausible."""
         self._state[:] = state
-        self._attitude[:] = math.nan if now.attitude is None else now.attitude
-        self._rates[:] = math.nan if now.body_rates is None else now.body_rates
+        if now.attitude is None:
+            self._attitude[:] = math.nan
+        else:
+            self._attitude[:] = now.attitude
+        if now.body_rates is None:
+            self._rates[:] = math.nan
+        else:
+            self._rates[:] = now.body_rates
         moves = now.motion is not None
         if now.motion is None:
             self._preview[:] = reference
@@ -523,7 +541,10 @@ class NonlinearMPC:
         """Take SQP steps among half-spaces: those of a program follow its optimum, a few times at most."""
         t = time + space.period * np.arange(1.0, self._nodes + 1.0)
         limit = self.settings.time_limit
-        deadline = math.inf if limit is None else self.clock() + limit
+        if limit is None:
+            deadline = math.inf
+        else:
+            deadline = self.clock() + limit
         if not self._library.quadsim_nmpc_begin(*self._arguments):
             return SQPStatus.NOT_FINITE
         goes_on = True
@@ -550,7 +571,10 @@ class NonlinearMPC:
         """Take SQP steps from the stored plan; return the last program's optimum and the plan's status in the core."""
         work = self._work
         started = clock.perf_counter()
-        found = self.solve() if self._space is None else self._among(self._space, time)
+        if self._space is None:
+            found = self.solve()
+        else:
+            found = self._among(self._space, time)
         code: int = self._library.quadsim_nonlinear_end(self.struct, found)
         spent_s = clock.perf_counter() - started
         if found not in _OPTIMA:
@@ -629,9 +653,15 @@ class NonlinearMPC:
         """Return the last step's program, and its optimum with multipliers."""
         problem = self._rows()
         query = self._query()
-        form = self._form if problem is self.problem else Staged(problem)
+        if problem is self.problem:
+            form = self._form
+        else:
+            form = Staged(problem)
         qp = form.assemble(query)
-        groups = self._groups if problem is self.problem else slack_groups(problem)
+        if problem is self.problem:
+            groups = self._groups
+        else:
+            groups = slack_groups(problem)
         of_rows = multipliers(self.program, self._work, len(problem.rows.names), len(self.problem.rows.names))
         return qp, form.solution(query, qp, self.inputs, self._slacks(groups), of_rows)
 

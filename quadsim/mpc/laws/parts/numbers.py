@@ -79,7 +79,10 @@ def robust_numbers(settings: Robust, vehicle: Vehicle, period: float) -> dict[st
     effectiveness = np.asarray(vehicle.accelerations(vehicle.allocation), float)
     ixx, iyy, izz = vehicle.inertia
     observing = settings.offset_free
-    observer = None if observing is None else DisturbanceObserver(observing, period)
+    if observing is None:
+        observer = None
+    else:
+        observer = DisturbanceObserver(observing, period)
     air = air_maps(vehicle, 1.0)
     instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
 
@@ -88,7 +91,10 @@ def robust_numbers(settings: Robust, vehicle: Vehicle, period: float) -> dict[st
         return np.asarray(np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time)), float)
 
     answers = {name: np.zeros(ANSWER) for name in ("before", "delay", "period")}
-    gain = np.zeros(6) if observer is None else observer.gain.copy()
+    if observer is None:
+        gain = np.zeros(6)
+    else:
+        gain = observer.gain.copy()
     if settings.commands != ROTORS:
         spans = {"before": period - late, "delay": late, "period": period}
         answers = {name: inner_answer(settings, span) for name, span in spans.items()}
