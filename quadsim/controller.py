@@ -484,5 +484,7 @@ def counts(answered_by: Mapping[str, int]) -> str:
     """
     texts = {GAIN: "at the unconstrained optimum, no QP", LAW: COMMANDED}
     ranked = sorted(answered_by.items(), key=lambda entry: -entry[1])
-    parts = [f"{count}{'' if i else ' periods'} {texts.get(by, f'by {by}')}" for i, (by, count) in enumerate(ranked)]
+    parts = []
+    for i, (by, count) in enumerate(ranked):
+        parts.append(f"{count}{'' if i else ' periods'} {texts.get(by, f'by {by}')}")
     return "; ".join(parts)

@@ -56,7 +56,10 @@ def require_floor(settings: object, *names: str, unit: str) -> None:
 
 def filled(settings: Declaration, **values: object) -> Declaration:
     """Return settings with the fields that are None set to `values`."""
-    absent: dict[str, Any] = {name: value for name, value in values.items() if getattr(settings, name) is None}
+    absent: dict[str, Any] = {}
+    for name, value in values.items():
+        if getattr(settings, name) is None:
+            absent[name] = value
     return replace(settings, **absent)  # type: ignore[type-var]
 
 

@@ -290,7 +290,10 @@ def _require_replaceable(target: Path, *, overwrite: bool, first: Sequence[str] 
         raise OutputError(target, f"it has no {SUMMARY_FILE} that lists its files; choose another --out")
     files = {*(listed or ()), SUMMARY_FILE, LOCK_FILE}
     folders = {str(parent) for name in files for parent in Path(name).parents}
-    others = [n for n, mode in there.items() if n not in (files if S_ISREG(mode) else folders if S_ISDIR(mode) else ())]
+    others = []
+    for n, mode in there.items():
+        if n not in (files if S_ISREG(mode) else folders if S_ISDIR(mode) else ()):
+            others.append(n)
     if others:
         raise OutputError(target, f"its {SUMMARY_FILE} does not list {_few(others)}; move that away first")
 

@@ -460,7 +460,10 @@ def shape_from_json(entry: Mapping[str, Any]) -> Constraining:
     if entry.get("type") not in SHAPES:
         raise UnknownNameError("shape", str(entry.get("type")), SHAPES)
     kind = SHAPES[entry["type"]]
-    values = {name: _frozen(value) for name, value in entry.items() if name != "type"}
+    values = {}
+    for name, value in entry.items():
+        if name != "type":
+            values[name] = _frozen(value)
     if "path" in values and issubclass(kind, Obstacle):
         values["path"] = tuple(Place(time=place["time"], position=tuple(place["position"])) for place in entry["path"])
     shape: Constraining = kind(**values)

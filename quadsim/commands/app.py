@@ -515,7 +515,10 @@ def compare(
     if not targets:
         raise InputError("compare needs runs, scenarios, or two campaigns")
     page = None if out is None else absolute(out)
-    owners = [owner_of(Path(target)) for target in targets if isinstance(target, str | Path)]
+    owners = []
+    for target in targets:
+        if isinstance(target, str | Path):
+            owners.append(owner_of(Path(target)))
     owner = next(filter(None, owners), None)
     products = {"video": video, "recording": recording, "figures": figures}
     if (page is None or owner) and (asked := [name for name, wanted in products.items() if wanted]):

@@ -140,7 +140,9 @@ def _complain(error: Exception) -> None:
     from quadsim.console import console
 
     lines = printable(f"quadsim: {error}", keep="\n").split("\n")
-    shown = [line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]} ..." for line in lines[:_MOST_LINES]]
+    shown = []
+    for line in lines[:_MOST_LINES]:
+        shown.append(line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]} ...")
     if len(lines) > _MOST_LINES:
         more = [f"... and {len(lines) - _MOST_LINES} more"]
     else:

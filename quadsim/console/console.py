@@ -201,7 +201,9 @@ def styled_cell(cell: Cell) -> Text:
 def grids(grids: Iterable[Grid], *, left: Collection[str] = ()) -> Iterator[RenderableType]:
     """Return tables of a report with their notes; `left` names columns of words."""
     for grid in grids:
-        lines = [[styled_cell(value) for value in line] for line in grid.lines]
+        lines = []
+        for line in grid.lines:
+            lines.append([styled_cell(value) for value in line])
         yield table(grid.title, grid.head, lines, caption=grid.note.replace("`", "") or None, left=left)
         yield ""
 

@@ -134,18 +134,19 @@ def audit_table(findings: Sequence[Finding]) -> Table:
     margins = [rounded_margin(finding.margin, finding.limit.tolerances[0]) for finding in findings]
     tolerances = [tolerance_text(finding.limit) for finding in findings]
     head = ("constraint", "bounds", "sampled", "plant", "margin", "tolerance", "beyond", "verdict")
-    lines = [
-        (
-            f"{finding.limit.name} [{finding.limit.unit}]",
-            _range(finding.limit.lower, finding.limit.upper),
-            *(short_number(peak, finding.limit.unit) for peak in (finding.peak_sampled, finding.peak_plant)),
-            short_number(margin),
-            tolerance.replace(" at the samples", " s"),
-            short_number(finding.time_violated),
-            _verdict(finding),
+    lines = []
+    for finding, margin, tolerance in zip(findings, margins, tolerances, strict=True):
+        lines.append(
+            (
+                f"{finding.limit.name} [{finding.limit.unit}]",
+                _range(finding.limit.lower, finding.limit.upper),
+                *(short_number(peak, finding.limit.unit) for peak in (finding.peak_sampled, finding.peak_plant)),
+                short_number(margin),
+                tolerance.replace(" at the samples", " s"),
+                short_number(finding.time_violated),
+                _verdict(finding),
+            )
         )
-        for finding, margin, tolerance in zip(findings, margins, tolerances, strict=True)
-    ]
     occurring = {
         "margin: the smallest, negative = beyond the bound": any(margin < 0.0 for margin in margins),
         "tolerance: at the physics rate and at the samples (s)": any("samples" in text for text in tolerances),

@@ -142,7 +142,10 @@ def compile_library(root: Path = ROOT) -> Path:
         CompilationError: there is no compiler, it fails, a header cannot be mirrored, or the folder cannot be written.
     """
     library = root / LIBRARY
-    units = [str(file) for file in sources(root) if file.suffix == ".c"]
+    units = []
+    for file in sources(root):
+        if file.suffix == ".c":
+            units.append(str(file))
     command = [*compiler(), *FLAGS, *include(root), f'-DQUADSIM_SOURCES="{stamp(root)}"', *units]
     try:
         with (

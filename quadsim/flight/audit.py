@@ -446,9 +446,10 @@ def worst_share(findings: Iterable[Finding]) -> float | None:
 def _counted(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings that count for `worst_finding`, in order."""
     reached = [finding for finding in findings if math.isfinite(finding.margin)]
-    counted = [
-        finding for finding in reached if finding.verdict == "violated" or finding.limit.signal not in COMMAND_SIGNALS
-    ]
+    counted = []
+    for finding in reached:
+        if finding.verdict == "violated" or finding.limit.signal not in COMMAND_SIGNALS:
+            counted.append(finding)
     return [finding for finding in counted if finding.limit.required] or counted
 
 
@@ -491,11 +492,10 @@ def limit_differences(first: Sequence[Limit], second: Sequence[Limit], *, demand
     a, b = ({limit.name: limit for limit in limits} for limits in (first, second))
     lines = [f"{name} only in the {where}" for where, name in _alone(a, b)]
     for name in (name for name in a if name in b):
-        pairs = [
-            (what, getattr(a[name], what), getattr(b[name], what))
-            for what in (*_COMPARED, *(["required"] if demands else []))
-            if hasattr(a[name], what) or hasattr(b[name], what)
-        ]
+        pairs = []
+        for what in (*_COMPARED, *(["required"] if demands else [])):
+            if hasattr(a[name], what) or hasattr(b[name], what):
+                pairs.append((what, getattr(a[name], what), getattr(b[name], what)))
         lines += [f"{name}: {what} {_plain(one)} and {_plain(other)}" for what, one, other in pairs if one != other]
     return lines
 

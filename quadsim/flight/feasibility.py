@@ -168,7 +168,11 @@ def assess(
         jumps: times [s] at which the course jumps.
     """
     bounds = bounds or {}
-    tilts = [abs(side) for name in ("roll", "pitch") if name in bounds for side in bounds[name]]
+    tilts = []
+    for name in ("roll", "pitch"):
+        if name in bounds:
+            for side in bounds[name]:
+                tilts.append(abs(side))
     peaks = {
         "tilt": math.degrees(float(tilt(needed.state).max())),
         "velocity": float(np.linalg.norm(needed.state[:, VELOCITY], axis=1).max()),

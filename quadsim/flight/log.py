@@ -255,7 +255,9 @@ class PlantLog:
 
     def every(self, stride: int) -> PlantLog:
         """Return every `stride`-th row, starting with the first."""
-        thinned: dict[str, Any] = {name: None if rows is None else rows[::stride] for name, rows in vars(self).items()}
+        thinned: dict[str, Any] = {}
+        for name, rows in vars(self).items():
+            thinned[name] = None if rows is None else rows[::stride]
         return PlantLog(**thinned)
 
 

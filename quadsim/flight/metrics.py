@@ -148,11 +148,10 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
     accepted = np.array([status in ACCEPTED for status in log.status])
     answerers = np.array(log.answered_by)
     iterations = {by: log.iterations[answerers == by] for by in sorted(set(log.answered_by))}
-    by_answerer = {
-        by: {"mean": float(counts.mean()), "max": int(counts.max())}
-        for by, counts in iterations.items()
-        if counts.any() or by not in NO_SOLVER
-    }
+    by_answerer = {}
+    for by, counts in iterations.items():
+        if counts.any() or by not in NO_SOLVER:
+            by_answerer[by] = {"mean": float(counts.mean()), "max": int(counts.max())}
     solvers = set(iterations) - NO_SOLVER
     optimises = bool(set(iterations) - NO_OPTIMUM) or bool(log.active.any())
     return {

@@ -219,11 +219,13 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
         values = _fields(flight, ControlLog, optional="truth")
         if values["truth"] is None:
             values["truth"] = values["state"]
-        logged = {
-            field.name: (field.metadata[b"unit"].decode(), np.asarray(flight.column(field.name), np.float64))
-            for field in flight.schema
-            if field.name not in COLUMNS
-        }
+        logged = {}
+        for field in flight.schema:
+            if field.name not in COLUMNS:
+                logged[field.name] = (
+                    field.metadata[b"unit"].decode(),
+                    np.asarray(flight.column(field.name), np.float64),
+                )
         control = ControlLog(**values, logged=logged, speeds_before=before)
         plant_log = PlantLog(**_fields(plant, PlantLog))
         timing_log = TimingLog(**_fields(timing, TimingLog))

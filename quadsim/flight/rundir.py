@@ -122,7 +122,10 @@ def _leads_into(link: Path, home: Path) -> bool:
 def limit_to_json(finding: Finding) -> dict[str, Any]:
     """Return an entry of `constraints` in `summary.json`; null for an absent bound or a window that was not reached."""
     limit = finding.limit
-    stated = {name: value for name, value in vars(limit).items() if name not in ("name", "signal", "terms", "shape")}
+    stated = {}
+    for name, value in vars(limit).items():
+        if name not in ("name", "signal", "terms", "shape"):
+            stated[name] = value
     audited = {name: value for name, value in vars(finding).items() if name != "limit"}
     return {
         "name": limit.name,

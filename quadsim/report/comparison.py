@@ -50,7 +50,9 @@ def run_names(runs: Sequence[FlightRecord]) -> tuple[str, ...]:
     parts: list[tuple[str, ...]] = [(run.label or run.name,) for run in runs]
     laws = [law_name(printable(str(nested(run.numbers, "controller", "name") or ABSENT))) for run in runs]
     for further in (laws, [printable(_folder_name(run)) for run in runs]):
-        peers = {part: {more for more, other in zip(further, parts, strict=True) if other == part} for part in parts}
+        peers = {}
+        for part in parts:
+            peers[part] = {more for more, other in zip(further, parts, strict=True) if other == part}
         parts = [(*part, more) if len(peers[part]) > 1 else part for part, more in zip(parts, further, strict=True)]
     names = [part[0] + (f" ({', '.join(part[1:])})" if part[1:] else "") for part in parts]
     seen = Counter(names)
@@ -317,7 +319,10 @@ def crash(flight: FlightRecord) -> str | None:
     if Phase.CRASHED not in flight.numbers["controller"].get("statuses", ()):
         return None
     violated = [finding.limit for finding in flight.findings if finding.verdict == "violated"]
-    touched = [limit.name for limit in violated if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Obstacle)]
+    touched = []
+    for limit in violated:
+        if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Obstacle):
+            touched.append(limit.name)
     if touched:
         return f"crashed, touched {', '.join(touched)}"
     return "crashed"
@@ -365,11 +370,10 @@ def required(flight: FlightRecord) -> Cell:
     if not findings:
         return Cell(text="none audited", mark=Mark.WARN)
     demanded = [finding for finding in findings if finding.limit.required]
-    failing = {
-        text: [finding.limit.name for finding in demanded if finding.verdict == verdict]
-        for verdict, text in VERDICT_TEXT.items()
-        if verdict != "satisfied"
-    }
+    failing = {}
+    for verdict, text in VERDICT_TEXT.items():
+        if verdict != "satisfied":
+            failing[text] = [finding.limit.name for finding in demanded if finding.verdict == verdict]
     if parts := [f"{text}: {', '.join(names)}" for text, names in failing.items() if names]:
         return Cell(text="; ".join(parts), mark=Mark.BAD if failing["violated"] else Mark.WARN)
     if demanded:
@@ -426,13 +430,14 @@ def _tracking_rows(runs: Sequence[FlightRecord]) -> Iterator[QuantityRow]:
             unit, values = tracking_values(runs, measure, channel)
             yield _best_smallest("Tracking", f"{label}, {channel}", unit, runs, values)
     # One row per step of the courses; `-` where an output does not settle or a run has no such step.
-    settled = [
-        {
-            (entry["channel"], entry["time"]): entry["settled"]
-            for entry in nested(run.numbers, "tracking", "settling") or ()
-        }
-        for run in runs
-    ]
+    settled = []
+    for run in runs:
+        settled.append(
+            {
+                (entry["channel"], entry["time"]): entry["settled"]
+                for entry in nested(run.numbers, "tracking", "settling") or ()
+            }
+        )
     for channel, time in dict.fromkeys(step for steps in settled for step in steps):
         times = [steps.get((channel, time)) for steps in settled]
         yield _best_smallest("Tracking", f"settling, {channel} at {time:g} s", "s", runs, times)
@@ -451,11 +456,10 @@ def _best_smallest(
 ) -> QuantityRow:
     """Return a row with its smallest magnitude marked, among completed flights and if they differ."""
     texts = [format_number(value) for value in values]
-    eligible = {
-        i: abs(value)
-        for i, (run, value) in enumerate(zip(runs, values, strict=True))
-        if value is not None and run.log.status == "completed"
-    }
+    eligible = {}
+    for i, (run, value) in enumerate(zip(runs, values, strict=True)):
+        if value is not None and run.log.status == "completed":
+            eligible[i] = abs(value)
     differ = len({texts[i] for i in eligible}) > 1
     best = {i for i in eligible if differ and texts[i] == texts[min(eligible, key=eligible.__getitem__)]}
     cells = tuple(Cell(text=text, mark=Mark.BEST if i in best else Mark.NONE) for i, text in enumerate(texts))
@@ -463,7 +467,9 @@ def _best_smallest(
 
 
 def _constraint_rows(runs: Sequence[FlightRecord]) -> Iterator[QuantityRow]:
-    audits = [{finding.limit.name: finding for finding in run.findings} for run in runs]
+    audits = []
+    for run in runs:
+        audits.append({finding.limit.name: finding for finding in run.findings})
     for name in dict.fromkeys(name for audit in audits for name in audit):
         entries = [audit.get(name) for audit in audits]
         own_unit = next(entry.limit.unit for entry in entries if entry is not None)
@@ -539,7 +545,10 @@ def mismatch(flight: FlightRecord) -> tuple[str, ...]:
     """Return the vehicle parameters that the controller has wrong, as one text; none if there are none."""
     actual = flight.numbers.get("actual", {})
     modelled = flight.numbers["vehicle"]
-    wrong = [f"{name} {modelled[name]} for {value}" for name, value in actual.items() if value != modelled[name]]
+    wrong = []
+    for name, value in actual.items():
+        if value != modelled[name]:
+            wrong.append(f"{name} {modelled[name]} for {value}")
     if wrong:
         return (", ".join(wrong),)
     return ()

@@ -83,10 +83,11 @@ def write_comparison(
         ]
         courses = len(distinct_courses(runs))
         warning = f"The runs follow {courses} different courses, so their errors are not like for like."
-        figures = [
-            scene_to_plot(figure) if isinstance(figure, Scene) else to_plot(figure, labelled=len(runs) == 1)
-            for figure in page_figures(runs)
-        ]
+        figures = []
+        for figure in page_figures(runs):
+            figures.append(
+                scene_to_plot(figure) if isinstance(figure, Scene) else to_plot(figure, labelled=len(runs) == 1)
+            )
         plots = Section(title="Plots", plots=tuple(figures))
         if len(names) < 3:
             title = " and ".join(names)

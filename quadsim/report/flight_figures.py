@@ -420,10 +420,9 @@ def _one_unit(name: str, units: Sequence[str]) -> str:
 def _several(title: str, unit: str, t: Array, values: Array, names: Sequence[str]) -> Panel:
     """Plot curves (M, n) in one panel with its own legend."""
     first = 4 - len(names)  # x, y and z have the same colours with and without w
-    curves = [
-        Series(x=t, y=column, colour=line_colour(first + i), label=name, width=1.0)
-        for i, (name, column) in enumerate(zip(names, values.T, strict=True))
-    ]
+    curves = []
+    for i, (name, column) in enumerate(zip(names, values.T, strict=True)):
+        curves.append(Series(x=t, y=column, colour=line_colour(first + i), label=name, width=1.0))
     return Panel(title=title, unit=unit, series=tuple(curves), legend=True)
 
 

@@ -63,7 +63,10 @@ def render_page(
     has the URL of each file beside the page, by its label.
     """
     groups = [(group, list(of_group)) for group, of_group in itertools.groupby(rows, lambda row: row.group)]
-    shown = [part for part in map(_without_empty, sections) if part.text or part.plots or part.tables or part.folded]
+    shown = []
+    for part in map(_without_empty, sections):
+        if part.text or part.plots or part.tables or part.folded:
+            shown.append(part)
     return _environment().get_template("page.html.j2").render(
         kind=kind, title=title, sections=shown, verdict=verdict, notes=notes, runs=runs, groups=groups,
         files=files or {}, palette=css(), plotly=plotly_script() if any(section.plots for section in shown) else "",

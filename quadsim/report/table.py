@@ -89,7 +89,9 @@ def grid_to_markdown(grid: Grid) -> str:
 
 def _markdown(head: Sequence[str], names: int, lines: Sequence[Sequence[Cell]]) -> str:
     """A table whose first columns, so many, are names, aligned to the left."""
-    texts = [[f"**{cell.text}**" if cell.mark is Mark.BEST else cell.text for cell in cells] for cells in lines]
+    texts = []
+    for cells in lines:
+        texts.append([f"**{cell.text}**" if cell.mark is Mark.BEST else cell.text for cell in cells])
     table = [head, ["---"] * names + ["---:"] * (len(head) - names), *texts]
     return "".join("| " + " | ".join(printable(text).replace("|", r"\|") for text in row) + " |\n" for row in table)
 

@@ -179,10 +179,9 @@ def _sides(problem: Problem) -> dict[Side, Constraint]:
     sides = {}
     for place, (part, scales) in enumerate(zip(problem.every_constraint, _scales(problem), strict=True)):
         for row in range(scales.size if part.penalty is None else 0):
-            matrices: dict[str, Any] = {
-                name: None if matrix is None else matrix[..., [row], :] / scales[row]
-                for name, matrix in (("C", part.C), ("D", part.D), ("E", part.E))
-            }
+            matrices: dict[str, Any] = {}
+            for name, matrix in (("C", part.C), ("D", part.D), ("E", part.E)):
+                matrices[name] = None if matrix is None else matrix[..., [row], :] / scales[row]
             for upper in (False, True):
                 bound = (part.upper if upper else part.lower)[..., [row]] / scales[row]
                 if np.isfinite(bound).any():

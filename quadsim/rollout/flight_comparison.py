@@ -103,14 +103,15 @@ class FlightComparison(Tabular):
 
         yield from self.notes
         yield console.styled_cell(self.conclusion)
-        lines = [
-            (
-                (row.group if row.headline else row.label) + (f" [{row.unit}]" if row.unit else ""),
-                *map(console.styled_cell, row.cells),
-            )
-            for row in self.rows
-            if row.label.startswith(_BRIEF)
-        ]
+        lines = []
+        for row in self.rows:
+            if row.label.startswith(_BRIEF):
+                lines.append(
+                    (
+                        (row.group if row.headline else row.label) + (f" [{row.unit}]" if row.unit else ""),
+                        *map(console.styled_cell, row.cells),
+                    )
+                )
         yield console.table("comparison", ["", *self.names], lines)
 
     def outputs(self) -> Shown:

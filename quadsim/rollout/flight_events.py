@@ -223,11 +223,10 @@ class FlightEvents:
 
     def first_infeasible_period(self) -> InfeasiblePeriod | None:
         """Return, over all controllers so far, the first QP without an answer, or else the first SQP not converged."""
-        periods = [
-            period
-            for period in (self.infeasible_period, infeasible_period_of(self._loop.controller))
-            if period is not None
-        ]
+        periods = []
+        for period in (self.infeasible_period, infeasible_period_of(self._loop.controller)):
+            if period is not None:
+                periods.append(period)
         return min(periods, key=lambda period: period.converges is not None, default=None)
 
     def _switch(self, spec: AnyController, ready: Successor | None) -> None:

@@ -39,7 +39,10 @@ def processor_name() -> str:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.processor() or platform.machine()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    names = []
+    for line in lines:
+        if line.startswith("model name"):
+            names.append(line.partition(":")[2].strip())
     if names:
         return names[0]
     return platform.machine()

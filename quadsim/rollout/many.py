@@ -303,7 +303,10 @@ def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float
 
 def _beside(fly: bytes, flight: Any, timeout: float, memory: float, code: Mapping[str, str]) -> Row:
     """In a Dask worker, fly in a child process, so that no flight can harm the worker."""
-    other = [f"{name} {value}, not {code.get(name)}" for name, value in _code().items() if code.get(name) != value]
+    other = []
+    for name, value in _code().items():
+        if code.get(name) != value:
+            other.append(f"{name} {value}, not {code.get(name)}")
     if other:
         raise ClusterError(f"it has {', '.join(other)}")
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # it may have children

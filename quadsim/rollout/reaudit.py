@@ -90,7 +90,10 @@ def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> 
 
 def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     """Return files in a run's directory that its summary does not list, sorted."""
-    files = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
+    files = set()
+    for path in directory.rglob("*"):
+        if not path.is_dir():
+            files.add(path.relative_to(directory).as_posix())
     return sorted(files - {rundir.SUMMARY_FILE, *summary["files"]})
 
 

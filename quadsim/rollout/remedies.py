@@ -140,7 +140,10 @@ def _trial(scenario: Scenario, assembly: Assembly, settings: Settings, until: fl
         return _Trial(why="crashed" if flight.log.control.crashed else "in fallback to its end")
     if flight.departure is not None and flight.departure.leaving:
         return _Trial(why=f"{flight.departure.distance:.3g} m off its course at its end, and leaving it")
-    violated = [each.limit.name for each in flight.findings if each.limit.required and each.verdict == "violated"]
+    violated = []
+    for each in flight.findings:
+        if each.limit.required and each.verdict == "violated":
+            violated.append(each.limit.name)
     lasting = [name for name in violated if _lasts(flight.margins[name])]
     return _Trial(why=f"violated: {', '.join(violated)}" if lasting else "", violated=tuple(violated))
 

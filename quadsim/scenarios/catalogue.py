@@ -156,7 +156,10 @@ class Catalogue(Tabular):
         bases = {name: entry.variant.base for name, entry in self.scenarios.items() if entry.variant is not None}
         for name, entry in self.scenarios.items():
             if name not in bases:
-                below = {f"  {variant}": self.scenarios[variant].line for variant in bases if bases[variant] == name}
+                below = {}
+                for variant in bases:
+                    if bases[variant] == name:
+                        below[f"  {variant}"] = self.scenarios[variant].line
                 groups[f"scenarios: {entry.group}"] |= {name: entry.line, **below}
         others = ("campaigns", "vehicles", "controllers", "papers", "solvers")
         groups = {title: lines for title, lines in groups.items() if lines}
@@ -176,7 +179,9 @@ class Catalogue(Tabular):
         """Return plain values; those of scenarios by field."""
         shipped = self.scenarios.items()
         columns = {"scenarios": "description", "groups": "group", "expected": "expect"}
-        by_field = {title: {name: getattr(entry, field) for name, entry in shipped} for title, field in columns.items()}
+        by_field = {}
+        for title, field in columns.items():
+            by_field[title] = {name: getattr(entry, field) for name, entry in shipped}
         rows = {name: entry.variant for name, entry in shipped if entry.variant is not None}
         variants = {"variants": {name: {"base": row.base, "set": row.set} for name, row in rows.items()}}
         return {

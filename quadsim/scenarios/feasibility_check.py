@@ -166,7 +166,10 @@ def _left(assembly: Assembly) -> float:
     scenario = assembly.scenario
     course = assembly.course
     t = scenario.control_period * np.arange(scenario.periods + 1, dtype=np.float64)
-    moving = [n for n, values in zip(REFERENCE_NAMES, course.sample(t).T, strict=True) if np.ptp(values) > 0.0]
+    moving = []
+    for n, values in zip(REFERENCE_NAMES, course.sample(t).T, strict=True):
+        if np.ptp(values) > 0.0:
+            moving.append(n)
     taken = {name: event.at for event in reversed(_setpoints(scenario)) for name in event.values}
     return max((min(taken.get(name, math.inf), scenario.duration) for name in moving), default=scenario.duration)
 

@@ -65,9 +65,10 @@ def _limits(stated: Any, source: str) -> Iterator[Limit]:
         elif isinstance(entry, Constraint):
             yield from _rows(entry)
         else:
-            finite = {
-                name: value for name, value in entry.items() if not (isinstance(value, float) and math.isinf(value))
-            }
+            finite = {}
+            for name, value in entry.items():
+                if not (isinstance(value, float) and math.isinf(value)):
+                    finite[name] = value
             yield parse_table(Limit, finite, f"the controller's {source}")
 
 

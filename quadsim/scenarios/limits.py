@@ -40,11 +40,10 @@ def with_law_bounds(scenario: Scenario, controller: Controller) -> Scenario:
     if not isinstance(adapted, PluginController):
         return scenario
     named = _named(scenario)
-    limits = [
-        limit
-        for limit in law_limits(adapted.law, scenario.audited_names)
-        if limit.signal == SUM or limit.signal not in named
-    ]
+    limits = []
+    for limit in law_limits(adapted.law, scenario.audited_names):
+        if limit.signal == SUM or limit.signal not in named:
+            limits.append(limit)
     if limits:
         return scenario.altered(constraints=[*scenario.constraints, *limits])
     return scenario
@@ -60,7 +59,10 @@ def audit_notes(scenario: Scenario, vehicle: Vehicle, bounds: Mapping[str, Range
         audited: whether anything is audited at all.
     """
     unnamed = [limit.name for limit in _unnamed(scenario, bounds)]
-    absent = [entry.name for entry in scenario.constraints if not (entry.has_bounds or entry.signal in bounds)]
+    absent = []
+    for entry in scenario.constraints:
+        if not (entry.has_bounds or entry.signal in bounds):
+            absent.append(entry.name)
     notes = []
     if unnamed:
         notes.append(f"{', '.join(unnamed)}: audited as the controller bounds {'it' if len(unnamed) == 1 else 'them'}")

@@ -101,7 +101,10 @@ def _of_types(problems: Sequence[str], name: str, read: Mapping[str, Any], data:
             changed = f"--set changed its type from {before!r} to {data[table]['type']!r}, and all other fields stayed"
             base = Path(name).name
             yield f'{table}: {changed}; a file with base = "{base}" and a whole [{table}] replaces them'
-    missing = {problem.partition(".")[0] for problem in problems if problem.endswith(" is missing")}
+    missing = set()
+    for problem in problems:
+        if problem.endswith(" is missing"):
+            missing.add(problem.partition(".")[0])
     file, _ = scenario_source(name)
     for table, before in replaced_tables(file).items():
         if table in missing - {*types_before}:

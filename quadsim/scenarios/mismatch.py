@@ -135,7 +135,10 @@ def _ideal_rotors(assembly: Assembly) -> dict[str, Any]:
         stated = {}
     else:
         stated = assembly.scenario.actual.overrides()
-    absent: dict[str, Any] = {f"actual.{name}": None for name in ("rotor_rise", "rotor_fall") if name in stated}
+    absent: dict[str, Any] = {}
+    for name in ("rotor_rise", "rotor_fall"):
+        if name in stated:
+            absent[f"actual.{name}"] = None
     if assembly.effects.rotors is not None:  # not 0: rotors with inertia need a lag
         absent |= {"effects.rotors.rise": 0.5 * SHORTEST_LAG, "effects.rotors.fall": 0.5 * SHORTEST_LAG}
     return absent

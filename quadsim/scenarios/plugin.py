@@ -268,10 +268,9 @@ def _checked(stats: Any) -> Statistics:
     if not isinstance(stats, Statistics):
         raise TypeError(f"its stats must be quadsim.Statistics; got {stats!r:.80}")
     values: tuple[Any, ...] = stats
-    numbers: list[Any] = [
-        operator.index(value) if isinstance(usual, int) else float(numbers_of(value))
-        for usual, value in zip(NO_STATISTICS, values, strict=True)
-    ]
+    numbers: list[Any] = []
+    for usual, value in zip(NO_STATISTICS, values, strict=True):
+        numbers.append(operator.index(value) if isinstance(usual, int) else float(numbers_of(value)))
     return Statistics(*numbers)
 
 
@@ -360,7 +359,10 @@ def import_plugin(spec: Plugin | PluginForce) -> Any:
     _log.info("imported %s from %s", module, getattr(imported, "__file__", None) or file)
     for part in attribute.split("."):
         if not hasattr(imported, part):
-            names = [name for name, value in vars(imported).items() if callable(value) and not name.startswith("_")]
+            names = []
+            for name, value in vars(imported).items():
+                if callable(value) and not name.startswith("_"):
+                    names.append(name)
             raise UnknownNameError(f"{_table(spec)}.type in {getattr(imported, '__name__', module)}", part, names)
         imported = getattr(imported, part)
     return imported
@@ -402,7 +404,10 @@ def _import(module: str, folders: Sequence[str], table: str) -> Any:
         new = [name for name in sys.modules if name not in before or name.partition(".")[0] == top]
         files = {getattr(sys.modules[name], "__file__", None) or "" for name in new}
         installed = (*_INSTALLED, *OUR_FOLDERS)
-        users = [file for file in files - {*_imported} if file.endswith(".py") and not file.startswith(installed)]
+        users = []
+        for file in files - {*_imported}:
+            if file.endswith(".py") and not file.startswith(installed):
+                users.append(file)
         _imported.update(_digests(users))
 
 

@@ -306,11 +306,10 @@ def plant_log(steps: PhysicsSteps, rotors: Array, start: Array, yaw: float, time
     """
     physics = np.concatenate([start[None], steps["physics"]])
     # What acts during a step is shown from its start on, so the last row repeats that of the last step.
-    acting = {
-        name: np.append(steps[name], steps[name][-1:], axis=0)
-        for name in ("wrench", "wind", "battery")
-        if name in (steps.dtype.names or ())
-    }
+    acting = {}
+    for name in ("wrench", "wind", "battery"):
+        if name in (steps.dtype.names or ()):
+            acting[name] = np.append(steps[name], steps[name][-1:], axis=0)
     return PlantLog(
         t=instants(len(physics), timestep),
         state=physics_to_state(physics, yaw),

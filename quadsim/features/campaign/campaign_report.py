@@ -74,7 +74,9 @@ def campaign_lines(
 def _brief(grid: Grid) -> Grid:
     """The first lines of a table, with a short last column."""
     ends = [(line, " ".join(line[-1].text.split())) for line in grid.lines[:_MOST_LINES]]
-    lines = [(*line[:-1], replace(line[-1], text=end if len(end) <= 60 else f"{end[:57]}...")) for line, end in ends]
+    lines = []
+    for line, end in ends:
+        lines.append((*line[:-1], replace(line[-1], text=end if len(end) <= 60 else f"{end[:57]}...")))
     return replace(grid, note="", lines=tuple(lines))
 
 
@@ -98,7 +100,9 @@ def definition_sentence(summary: CampaignSummary, failure: Sequence[str]) -> str
     units |= {MARGIN + name: constraint["unit"] for name, constraint in summary["constraints"].items()}
     events = [parse_event(text) for text in failure]
     violation = summary["events"]["violation"]
-    listed = [text.rstrip(" -") for text in (f"{event.text} {units.get(event.column_name, '')}" for event in events)]
+    listed = []
+    for text in (f"{event.text} {units.get(event.column_name, '')}" for event in events):
+        listed.append(text.rstrip(" -"))
     sentence = f"Counted as failure: {', '.join(listed)}."
     if violation["count"] and "violation" not in (event.text for event in events):
         flights = count_of(violation["flights"], "flight")
@@ -112,11 +116,10 @@ def driver_sentence(summary: CampaignSummary) -> str:
         outcome = "worst_margin"
     else:
         outcome = "failed"
-    sure = {
-        name: related[outcome]
-        for name, related in drivers(summary).items()
-        if related[outcome] and min(related[outcome]["p_holm"], related[outcome]["p_xi_holm"]) < ALPHA
-    }
+    sure = {}
+    for name, related in drivers(summary).items():
+        if related[outcome] and min(related[outcome]["p_holm"], related[outcome]["p_xi_holm"]) < ALPHA:
+            sure[name] = related[outcome]
     if outcome == "worst_margin":
         noun = "The worst margin"
     else:
@@ -251,7 +254,9 @@ def group_table(summary: CampaignSummary) -> Grid:
     failure = summary["events"]["failure"]
     listed = {}
     for name, parameter in summary["parameters"].items() if 0 < failure["count"] < failure["flights"] else ():
-        levels = [f"{level}: {percent(share['share'])}" for level, share in parameter.get("levels", {}).items()]
+        levels = []
+        for level, share in parameter.get("levels", {}).items():
+            levels.append(f"{level}: {percent(share['share'])}")
         if cells := levels + [_group(group) for group in parameter.get("groups", ())]:
             listed[label(name, parameter["unit"])] = cells
     size = max(map(len, listed.values()), default=0)
@@ -333,11 +338,10 @@ def write_report(
         ),
         Section(title="Worst flights", tables=worst),
     ]
-    files = {
-        name: name
-        for name in _FILES
-        if name == SUMMARY_FILE or any((d / name).is_file() for d in (directory, campaign))
-    }
+    files = {}
+    for name in _FILES:
+        if name == SUMMARY_FILE or any((d / name).is_file() for d in (directory, campaign)):
+            files[name] = name
     if not summary["flights"]:
         mark = Mark.NONE
     elif summary["events"]["failure"]["count"]:

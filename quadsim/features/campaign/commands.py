@@ -330,7 +330,9 @@ def compare_directories(
         names = (plans[0].spec.name, plans[1].spec.name)
     failures = (plans[0].spec.failure, plans[1].spec.failure)
     a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
-    limits = [tuple(limit.with_tolerances() for limit in plan.limits) for plan in plans]
+    limits = []
+    for plan in plans:
+        limits.append(tuple(limit.with_tolerances() for limit in plan.limits))
     if constraints is not None:
         whose = place_of(constraints, directories)
         a, b = (

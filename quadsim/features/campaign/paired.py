@@ -180,7 +180,10 @@ class PairedComparison(Tabular):
                 parts["closer" if closer else "farther"].append(f"{axis} ({errors})")
             else:
                 parts["not distinguishable"].append(axis)
-        told = [f"{verdict} in {', '.join(axes)}" for verdict, axes in parts.items() if axes]
+        told = []
+        for verdict, axes in parts.items():
+            if axes:
+                told.append(f"{verdict} in {', '.join(axes)}")
         if not told:
             return ""
         return f"RMS error, where both flights were completed: {self.names[1]} is {'; '.join(told)}."
@@ -393,7 +396,9 @@ def _compare_events(a: pa.Table, b: pa.Table, *, audited_alike: bool) -> tuple[E
         both = reached(a, name) & reached(b, name)
         if both.any():
             happened[f"{name} not held"] = [not_held(table, name)[both] for table in (a, b)]
-    alone = {event: (int((in_a & ~in_b).sum()), int((in_b & ~in_a).sum())) for event, (in_a, in_b) in happened.items()}
+    alone = {}
+    for event, (in_a, in_b) in happened.items():
+        alone[event] = (int((in_a & ~in_b).sum()), int((in_b & ~in_a).sum()))
     p = {event: mcnemar(*counts) for event, counts in alone.items()}
     tested = [event for event, counts in alone.items() if any(counts)]
     corrected = dict(zip(tested, holm([p[event] for event in tested]), strict=True))

@@ -143,7 +143,9 @@ def make_table(rows: Iterable[Row], schema: pa.Schema) -> pa.Table:
         return value
 
     ordered = sorted(rows, key=lambda row: row["flight"])
-    columns = [pa.array([storable(row.get(field.name)) for row in ordered], field.type) for field in schema]
+    columns = []
+    for field in schema:
+        columns.append(pa.array([storable(row.get(field.name)) for row in ordered], field.type))
     return pa.Table.from_arrays(columns, schema=schema)
 
 

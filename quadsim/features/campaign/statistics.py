@@ -381,11 +381,10 @@ def drivers(summary: CampaignSummary) -> dict[str, Mapping[str, Any]]:
 
     They are ordered by how `worst_margin` depends on them, or else `failed`.
     """
-    related = {
-        name: effect
-        for name, effect in summary["parameters"].items()
-        if effect.get("worst_margin") or effect.get("failed")
-    }
+    related = {}
+    for name, effect in summary["parameters"].items():
+        if effect.get("worst_margin") or effect.get("failed"):
+            related[name] = effect
 
     def weakness(parameter: tuple[str, Mapping[str, Any]]) -> tuple[float, float]:
         related = parameter[1]["worst_margin"] or parameter[1]["failed"]

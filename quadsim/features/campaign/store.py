@@ -201,11 +201,10 @@ def require_same(plan: Plan, directory: Path) -> None:
         InputError: it is another one.
     """
     known = stored_plan(directory)
-    differing = [
-        field.name
-        for field in fields(CampaignFile)
-        if getattr(_stored(plan), field.name) != getattr(_stored(known), field.name)
-    ]
+    differing = []
+    for field in fields(CampaignFile):
+        if getattr(_stored(plan), field.name) != getattr(_stored(known), field.name):
+            differing.append(field.name)
     grows = plan.spec.sampling != "latin_hypercube" and plan.spec.flights >= known.spec.flights
     if differing == ["flights"] and grows:
         differing = []

@@ -79,7 +79,9 @@ class Sweep(Result):
         from quadsim.console import console
 
         verdicts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(self["verdict"].tolist()).items())
-        lines = [[_text(row[name]) for name in (*self.fields, *_SHOWN)] for row in self.table.to_pylist()]
+        lines = []
+        for row in self.table.to_pylist():
+            lines.append([_text(row[name]) for name in (*self.fields, *_SHOWN)])
         head = (*map(self._brief, self.fields), *_SHOWN)
         title = f"sweep of {self.name}: {len(self)} flights, {verdicts}"
         yield console.table(title, head, lines, left=("verdict", "worst_constraint"))

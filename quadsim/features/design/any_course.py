@@ -374,7 +374,10 @@ def _written(
         has_effect = ground.effect and assembly.vehicle.rotor_radius is not None
         tables = "\n" + "\n".join(stated_lines("[effects.ground]", replace(ground, effect=has_effect), set())) + tables
     holds = [entry for entry in base.constraints if entry.signal in _ERRORS and entry.has_bounds]
-    entries = [_constraint(entry, scale, allowed, own=own) for entry in base.constraints if _carries(entry)]
+    entries = []
+    for entry in base.constraints:
+        if _carries(entry):
+            entries.append(_constraint(entry, scale, allowed, own=own))
     duration = None
     if not base.ends_with_course:
         duration = later(scale.time * base.duration + response)

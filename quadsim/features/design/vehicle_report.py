@@ -209,10 +209,11 @@ def vehicle_tables(report: VehicleReport) -> list[Grid]:
     """All of it as tables: figures, torques, what a controller can do, linear model, parameters, shortfalls."""
     vehicle = report.vehicle
     sheet = report.figures
-    spans = [
-        (torque.axis, *(f"{format_number(low)} .. {format_number(high)}" for low, high in _ranges(torque)))
-        for torque in sheet.torques
-    ]
+    spans = []
+    for torque in sheet.torques:
+        spans.append(
+            (torque.axis, *(f"{format_number(low)} .. {format_number(high)}" for low, high in _ranges(torque)))
+        )
     tables = [
         _grid(f"{vehicle.name} at hover", ("", "value", "unit"), _figures(vehicle, sheet), note=vehicle.description),
         _grid(
@@ -322,10 +323,11 @@ def _listed(numbers: Sequence[float]) -> str:
 def _poles(sheet: VehicleSheet) -> list[tuple[str, ...]]:
     chains = ", ".join(map(str, sheet.integrator_chains))
     body = f"rigid body: {len(sheet.continuous_poles)} poles, chains of {chains} integrators"
-    lags = [
-        (f"rotors that {name.removeprefix('rotor_')}: {N_ROTORS} poles, not in this model", format_number(pole))
-        for name, pole in sheet.lag_poles.items()
-    ]
+    lags = []
+    for name, pole in sheet.lag_poles.items():
+        lags.append(
+            (f"rotors that {name.removeprefix('rotor_')}: {N_ROTORS} poles, not in this model", format_number(pole))
+        )
     discrete = map(format_number, sheet.discrete_lag_poles.values())
     return [(body, "0", "1"), *((*lag, pole) for lag, pole in zip(lags, discrete, strict=True))]
 

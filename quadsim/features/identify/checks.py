@@ -106,7 +106,10 @@ def _check_columns_move(record: Record, logged: NDArray[np.bool_]) -> None:
     name = record.name
     for field, columns in (("rates", "wx wy wz"), ("velocity", "vx vy vz"), ("attitude", "qw qx qy qz")):
         rows = getattr(record, field)[logged]
-        frozen = [c for c, moved in zip(columns.split(), np.ptp(rows, axis=0) > ROUNDING, strict=True) if not moved]
+        frozen = []
+        for c, moved in zip(columns.split(), np.ptp(rows, axis=0) > ROUNDING, strict=True):
+            if not moved:
+                frozen.append(c)
         if len(frozen) == rows.shape[1]:
             raise InputError(f"{name}: {', '.join(frozen)} stand still while the motors run: log what was measured")
         offsets = np.abs(rows[0, [columns.split().index(c) for c in frozen]])

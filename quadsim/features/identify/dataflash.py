@@ -71,7 +71,9 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
                     rows.setdefault(name, []).append(tuple(row[key] for key in fields[name]))
             parameters = {**log.params}
     for name, of in fields.items():
-        table = {f"{name}.{field}": values for field, values in zip(of, np.array(rows[name], float).T, strict=True)}
+        table = {}
+        for field, values in zip(of, np.array(rows[name], float).T, strict=True):
+            table[f"{name}.{field}"] = values
         clock = next(clock for clock in _CLOCKS if f"{name}.{clock}" in table)
         columns |= on_one_clock(table[f"{name}.{clock}"] * _CLOCKS[clock], table)
     turns = [columns[name].t.size if name in columns else 0 for name in ("XKQ.Q1", "ATT.Roll")]

@@ -36,7 +36,9 @@ def with_disturbance(
     misfits = [search.misfit(steady, i)[0] for i in stretches]
     periods = [part.step for part in search.parts]
     blocks = [search.rows(i) for i in stretches]
-    fits = [identify_noise([of[:, axis] for of in misfits], periods, blocks) for axis in range(len(INCREMENTS))]
+    fits = []
+    for axis in range(len(INCREMENTS)):
+        fits.append(identify_noise([of[:, axis] for of in misfits], periods, blocks))
     inertial = any(part.record.inertial for part in search.parts)
     return replace(
         identification,

@@ -122,11 +122,10 @@ def identify_records(
         InputError: nothing flies, or the records differ in what they say of rotors and battery.
         ParameterError: what was identified makes no vehicle, such as one that cannot hover.
     """
-    flown = [
-        stretch(part_of(record, span), flight)
-        for flight, (record, own) in enumerate(zip(records, spans, strict=True))
-        for span in own
-    ]
+    flown = []
+    for flight, (record, own) in enumerate(zip(records, spans, strict=True)):
+        for span in own:
+            flown.append(stretch(part_of(record, span), flight))
     if {part.flight for part in flown} != {*range(len(records))}:
         raise InputError("no part of the logs flies")
     if len({(record.speeds is None, record.commands is None, record.voltage is None) for record in records}) > 1:
@@ -317,7 +316,10 @@ class _Fit:
 
     def _turns_by_a_known_amount(self) -> bool:
         shares = {"drag_to_thrust": 1.0, "thrust_coefficient": 1.0, "inertia_z": -1.0}
-        sought = {i: shares[number.name] for i, number in enumerate(self.search.sought) if number.name in shares}
+        sought = {}
+        for i, number in enumerate(self.search.sought):
+            if number.name in shares:
+                sought[i] = shares[number.name]
         return self._half_width(sought, ("yaw",)) <= WIDEST
 
     def _estimate(self, name: str, places: Sequence[int]) -> ParameterEstimate:
@@ -431,7 +433,9 @@ class _Fit:
             if len(found[name]) == 1:
                 values[name] = float(f"{found[name][0]:.6g}")
         # Each within its interval, the three together may make no body.
-        inertia = [values.get(f"inertia_{axis}", number_in(self.vehicle, f"inertia_{axis}") or 0.0) for axis in "xyz"]
+        inertia = []
+        for axis in "xyz":
+            inertia.append(values.get(f"inertia_{axis}", number_in(self.vehicle, f"inertia_{axis}") or 0.0))
         if not _is_body(inertia):
             values["inertia_z"] = float(f"{PLATE[0] * (inertia[0] + inertia[1]):.6g}")
         moved = {}
@@ -511,7 +515,10 @@ def _impossible(search: Search) -> dict[str, float]:
     """Numbers that were found and make no vehicle, with what takes their place: they are to be held at it."""
     p = search.parameters(search.x, 0)
     sought = {number.name for number in search.sought}
-    held = {f"rate_damping_{axis}": 0.0 for axis, value in zip("xyz", p.rate_damping, strict=True) if value < 0.0}
+    held = {}
+    for axis, value in zip("xyz", p.rate_damping, strict=True):
+        if value < 0.0:
+            held[f"rate_damping_{axis}"] = 0.0
     if p.inflow < 0.0:
         held["inflow"] = 0.0
     held = {name: value for name, value in held.items() if name in sought}

@@ -66,7 +66,11 @@ def interval_figure(estimates: Sequence[ParameterEstimate]) -> Figure:
         marker="diamond",
         width=6.0,
     )
-    sure = [_percent(end, e) for e in drawn if not e.refused for end in (e.low, e.high, e.start or e.value)]
+    sure = []
+    for e in drawn:
+        if not e.refused:
+            for end in (e.low, e.high, e.start or e.value):
+                sure.append(_percent(end, e))
     reach = 1.2 * min(max(np.abs([1.0, *sure])), 100.0)
     panel = Panel(
         title="relative to the estimate",

@@ -118,7 +118,9 @@ class PredictionErrors:
         texts = []
         for rival in RIVALS:
             by_quantity = self.ratios(rival).values()
-            by_horizon = [[of[i] for of in by_quantity if i < len(of)] for i in range(len(JUDGED))]
+            by_horizon = []
+            for i in range(len(JUDGED)):
+                by_horizon.append([of[i] for of in by_quantity if i < len(of)])
             means = [math.exp(np.log(np.maximum(of, 1e-12)).mean()) for of in by_horizon]
             texts.append(f"{', '.join(f'{mean:.2f}' for mean in means)} of the errors of {rival}")
         return f"predicts flight that was not fitted better: {horizons}, {', '.join(texts[:-1])} and {texts[-1]}"
@@ -263,7 +265,9 @@ def _forecast(
     samples = slice(int(rows[0, 0]), int(rows[-1, -1]) + 1)
     misfit = _misfit(p, vehicle, held, rotors, samples)
     starts = rows[:, 0] - samples.start
-    forecasts = [noise.forecast(misfit[:, i], held.period, starts, rows.shape[1] - 1) for i, noise in enumerate(noises)]
+    forecasts = []
+    for i, noise in enumerate(noises):
+        forecasts.append(noise.forecast(misfit[:, i], held.period, starts, rows.shape[1] - 1))
     return np.stack(forecasts, axis=-1)
 
 

@@ -256,7 +256,9 @@ def listed(columns: Iterable[str]) -> str:
 def _series(columns: Mapping[str, Column], one: NamedQuantity) -> Column:
     """The columns on the clock of the first of them."""
     t = columns[one.columns[0]].t
-    rows = [c.values if c.t is t else np.interp(t, c.t, c.values) for c in (columns[name] for name in one.columns)]
+    rows = []
+    for c in (columns[name] for name in one.columns):
+        rows.append(c.values if c.t is t else np.interp(t, c.t, c.values))
     values = (np.stack(rows, axis=1) - one.zero) * one.scale
     # a motor that is stopped has a shorter pulse
     if np.any(one.zero):

@@ -89,7 +89,10 @@ class Record:
 
 def part_of(record: Record, span: slice) -> Record:
     """A span of a record as one of its own."""
-    cut: dict[str, Any] = {name: rows[span] for name, rows in vars(record).items() if isinstance(rows, np.ndarray)}
+    cut: dict[str, Any] = {}
+    for name, rows in vars(record).items():
+        if isinstance(rows, np.ndarray):
+            cut[name] = rows[span]
     return replace(record, **cut)
 
 

@@ -89,7 +89,10 @@ class IdentifiedVehicle(Tabular):
     @property
     def settings(self) -> dict[str, str]:
         """What is certainly not zero and has no field in a vehicle file: values by field of a scenario."""
-        certain = [e for e in self.identification.estimates if not (e.in_file or e.refused or e.low <= 0.0 <= e.high)]
+        certain = []
+        for e in self.identification.estimates:
+            if not (e.in_file or e.refused or e.low <= 0.0 <= e.high):
+                certain.append(e)
         known = {estimate.name: rounded(estimate.value, estimate) for estimate in certain}
         offset = [known.get(f"offset_{axis}", 0.0) for axis in "xy"]
         if known.get("delay", 0.0) > 0.0:
@@ -122,11 +125,15 @@ class IdentifiedVehicle(Tabular):
         for j, (quantity, si) in enumerate(QUANTITIES.items()):
             unit, scale = shown_unit(si)
             for horizon in JUDGED:
-                errors = [scale * float(of[HORIZONS.index(horizon), j]) for of in self.prediction.errors.values()]
+                errors = []
+                for of in self.prediction.errors.values():
+                    errors.append(scale * float(of[HORIZONS.index(horizon), j]))
                 if all(map(math.isfinite, errors)):
                     *predicted, floor = errors
                     best = min(predicted)
-                    cells = [Cell(text=format_number(e), mark=Mark.BEST if e == best else Mark.NONE) for e in predicted]
+                    cells = []
+                    for e in predicted:
+                        cells.append(Cell(text=format_number(e), mark=Mark.BEST if e == best else Mark.NONE))
                     cells.append(Cell(text=format_number(floor)))  # no prediction
                     lines.append(line(f"{quantity} [{unit}]", f"{horizon:g} s", *cells))
         errors_grid = Grid(
@@ -196,9 +203,9 @@ class IdentifiedVehicle(Tabular):
 
     def to_json(self) -> dict[str, Any]:
         """All of it as plain values; a number that is not finite is None."""
-        errors = {
-            model: {name: of[:, j] for j, name in enumerate(QUANTITIES)} for model, of in self.prediction.errors.items()
-        }
+        errors = {}
+        for model, of in self.prediction.errors.items():
+            errors[model] = {name: of[:, j] for j, name in enumerate(QUANTITIES)}
         data = {
             "logs": self.logs,
             "test": self.test,

@@ -124,7 +124,10 @@ def _refuse(
         names = ", ".join(columns.split())
         value = common.value
     else:
-        wrong = {of: f for of, f in zip(columns.split(), factors, strict=True) if f is not None and f.off(_OF_ONE)}
+        wrong = {}
+        for of, f in zip(columns.split(), factors, strict=True):
+            if f is not None and f.off(_OF_ONE):
+                wrong[of] = f
         if not wrong:
             return
         names = ", ".join(wrong)

@@ -174,7 +174,9 @@ class Search:
         deviations = [number.deviation for number in self.sought]
         self._weights = np.array([0.0 if sd is None else sd**-2.0 for sd in deviations] + [1 / 9.0] * len(noise))
         self._weights = np.append(self._weights, np.full(len(self.x) - self._starts, 1 / 16.0))
-        winds = [[i for i, n in enumerate(self.sought) if n.part == k] for k in range(len(parts))]
+        winds = []
+        for k in range(len(parts)):
+            winds.append([i for i, n in enumerate(self.sought) if n.part == k])
         self._winds = [
             np.array(wind, int).reshape(-1, 3) for wind in winds
         ]  # (K, 3) where each stretch's wind is in `x`

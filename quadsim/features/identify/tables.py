@@ -63,7 +63,9 @@ def read_columns(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     found |= {name.strip(): column for name, column in zip(table.column_names, table.columns, strict=True)}
     used = _KNOWN | {column for one in given for column in one.columns}
     t = _time(path, found, given)
-    columns = {name: Column(t, _numbers(path, name, column) if name in used else t) for name, column in found.items()}
+    columns = {}
+    for name, column in found.items():
+        columns[name] = Column(t, _numbers(path, name, column) if name in used else t)
     if b"speeds_before" in (table.schema.metadata or {}):  # quadsim's own
         angles, rates = (
             np.stack([_numbers(path, name, found[name]) for name in names.split()], axis=1)

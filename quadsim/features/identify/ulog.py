@@ -84,7 +84,9 @@ def stated_rotors(path: Path) -> str:
         stated = _parsed(path, _STATES).initial_parameters
     if stated_number(path, stated, "CA_ROTOR_COUNT", 0, whole=True) != N_ROTORS:
         return ""
-    hubs = [[stated_number(path, stated, f"CA_ROTOR{i}_P{axis}", 0.0) for axis in "XYZ"] for i in _ROTORS]
+    hubs = []
+    for i in _ROTORS:
+        hubs.append([stated_number(path, stated, f"CA_ROTOR{i}_P{axis}", 0.0) for axis in "XYZ"])
     moments = np.array([stated_number(path, stated, f"CA_ROTOR{i}_KM", 0.05) for i in _ROTORS])
     values = {
         "rotor_positions": ((np.round(np.array(hubs) * HALF_TURN, 4) + 0.0).tolist(), "m"),
@@ -124,7 +126,9 @@ def _by_pulses(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
 
     def pulses(end: str, usual: float) -> Array:
         names = [(f"PWM_MAIN_{end}{i + 1}", f"PWM_MAIN_{end}", f"PWM_{end}") for i in outputs]
-        stated = [[stated_number(path, parameters, way, -1.0) for way in ways] for ways in names]
+        stated = []
+        for ways in names:
+            stated.append([stated_number(path, parameters, way, -1.0) for way in ways])
         return np.array([next((pulse for pulse in of if pulse >= 0.0), usual) for of in stated])
 
     low = pulses("MIN", 1000.0)

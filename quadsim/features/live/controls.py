@@ -165,14 +165,15 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     widgets.on(stage.grab.on_drag("left"), pulled)
     loss = f"rotor 1 loses {100 * _BROKEN:.0f} % of its thrust"
     button = widgets.button("Break a rotor", broken, hint=loss, color=BREAKS)
-    wear = [
-        widgets.shows(
-            gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, _rotor_loss(rotor, acts)),
-            partial(_rotor_loss, rotor),
-            partial(_wear, rotor),
+    wear = []
+    for rotor in range(1, N_ROTORS + 1):
+        wear.append(
+            widgets.shows(
+                gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, _rotor_loss(rotor, acts)),
+                partial(_rotor_loss, rotor),
+                partial(_wear, rotor),
+            )
         )
-        for rotor in range(1, N_ROTORS + 1)
-    ]
     wear[0].on_update(named)
     most = max(_WIND, *map(abs, acts.wind))
     box = {"min": (-most, -most), "max": (most, most), "step": 0.5, "disabled": bool(no_wind)}

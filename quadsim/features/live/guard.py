@@ -57,7 +57,10 @@ class Guard:
         if origin is not None and not self._is_ours(origin.partition("://")[2], port):
             return "a page of another site may not connect"
         # Other programs on this host set cookies too, whose form is theirs: only ours is looked at.
-        cookies = [pair.strip().partition("=") for line in _values(headers, "Cookie") for pair in line.split(";")]
+        cookies = []
+        for line in _values(headers, "Cookie"):
+            for pair in line.split(";"):
+                cookies.append(pair.strip().partition("="))
         tokens = [value for name, _, value in cookies if name == f"quadsim-{port}"]
         tokens += parse_qs(path.partition("?")[2]).get("token", [])
         if not any(secrets.compare_digest(token.encode(errors="replace"), self.token.encode()) for token in tokens):

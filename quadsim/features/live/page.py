@@ -170,8 +170,14 @@ class Page:
                 self._announce()
                 self._widgets.follow()
                 loops = [flight.loop for flight in self._session.flights[1:]]
-                lost = [f"{law_name(loop.controller.name)} lost: {loop.reason}" for loop in loops if loop.reason]
-                states = [(value[5], math.hypot(*value[:3])) for value in values if value is not None]
+                lost = []
+                for loop in loops:
+                    if loop.reason:
+                        lost.append(f"{law_name(loop.controller.name)} lost: {loop.reason}")
+                states = []
+                for value in values:
+                    if value is not None:
+                        states.append((value[5], math.hypot(*value[:3])))
                 self._numbers.content = readout.readings(frame, states, lost)
                 audited = {limit.name for limit in self._session.limits}
                 self._margins.content = self._constraints.rows(frame, audited)
@@ -417,11 +423,10 @@ def _lines_of(session: Session, title: str) -> list[_Line]:
     if title.startswith("Step"):
         return [_Line("", 1e3 * session.period, 0.0)]
     limits = [limit for limit in session.limits if limit.signal in _PLOTS[title].values()]
-    ends = {
-        (value, limit.start, limit.stop): _Line(limit.name, value, limit.start)
-        for limit in limits
-        for value in (limit.lower, limit.upper)
-    }
+    ends = {}
+    for limit in limits:
+        for value in (limit.lower, limit.upper):
+            ends[(value, limit.start, limit.stop)] = _Line(limit.name, value, limit.start)
     return [bound for bound in ends.values() if math.isfinite(bound.value)]
 
 

@@ -193,7 +193,10 @@ class Session:
         wind = air.wind
         factor = load.mass_factor
         lag = (rotors.rise or 0.0, rotors.fall or 0.0)
-        changes = [event for event in flight.scenario.events if isinstance(event, WindChange | MassChange | LagChange)]
+        changes = []
+        for event in flight.scenario.events:
+            if isinstance(event, WindChange | MassChange | LagChange):
+                changes.append(event)
         for change in sorted(changes, key=lambda change: change.at):
             match change if change.at <= flight.loop.time + 1e-9 else None:
                 case WindChange(velocity=velocity):
@@ -410,7 +413,9 @@ def read_script(path: str | Path) -> Script:
         InputError: it is malformed, or an input is wrong whatever the scenario.
     """
     script = parse_table(Script, read_toml(Path(path)), str(path), file="script")
-    inputs = [{k: v for k, v in entry.items() if k != "at" or entry.get("type") not in HELD} for entry in script.inputs]
+    inputs = []
+    for entry in script.inputs:
+        inputs.append({k: v for k, v in entry.items() if k != "at" or entry.get("type") not in HELD})
     parse_table(_Declared, {"inputs": inputs}, str(path), file="script")
     return script
 

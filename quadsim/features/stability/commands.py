@@ -99,11 +99,10 @@ def stability(
             raise ParameterError("", "--heading", heading, "within +-180 deg")
         stated = hovering(stated, heading=heading)
     sizes = [SIZE] if size is None else [SIZE, size]
-    loops = [
-        MeasuredLoop(name=name, scenario=flown, size=each)
-        for name, flown in _flown(stated, controller)
-        for each in sizes
-    ]
+    loops = []
+    for name, flown in _flown(stated, controller):
+        for each in sizes:
+            loops.append(MeasuredLoop(name=name, scenario=flown, size=each))
     with (
         nullcontext() if out is None else reserving(out, overwrite=overwrite),
         reporting(progress, "the stability check") as report,

@@ -319,10 +319,11 @@ class Measuring:
         columns, rows = (_map_values(measured.margins[name]) for name in pair)
         tasks = [_Look(loop=loop, values={pair[0]: x, pair[1]: y}) for y in rows for x in columns]
         looked = self._rows("map", tasks, _look)
-        points = [
-            row["point"] if "point" in row else LoopPoint(values=task.values, state="no flight", why=row["reason"])
-            for task, row in zip(tasks, looked, strict=True)
-        ]
+        points = []
+        for task, row in zip(tasks, looked, strict=True):
+            points.append(
+                row["point"] if "point" in row else LoopPoint(values=task.values, state="no flight", why=row["reason"])
+            )
         return StabilityMap(
             name=loop.name, size=loop.size, quantities=pair, values=(columns, rows), points=tuple(points)
         )

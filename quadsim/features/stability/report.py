@@ -212,7 +212,11 @@ class Stability(Tabular):
             margin = loop.margins.get(quantity.name)
             if margin is None:
                 continue
-            points = [point for side in margin.sides for point in side.points if point.rate is not None]
+            points = []
+            for side in margin.sides:
+                for point in side.points:
+                    if point.rate is not None:
+                        points.append(point)
             rates = {point.values[quantity.name]: point.rate for point in points} | {margin.nominal: loop.growth.rate}
             values = np.array(sorted(rates))
             heights = np.clip([rates[value] for value in values.tolist()], -_FASTEST, _FASTEST)
@@ -311,13 +315,14 @@ def _map_grid(found: StabilityMap) -> Grid:
     across, up = (VARIED[name] for name in found.quantities)
     lines = []
     for value, points in _map_rows(found):
-        cells = [
-            Cell(
-                text=ABSENT if point.rate is None else f"{point.rate:.2f}",
-                mark=Mark.GOOD if point.state == "stable" else Mark.BAD,
+        cells = []
+        for point in points:
+            cells.append(
+                Cell(
+                    text=ABSENT if point.rate is None else f"{point.rate:.2f}",
+                    mark=Mark.GOOD if point.state == "stable" else Mark.BAD,
+                )
             )
-            for point in points
-        ]
         lines.append(line(f"{value:.3g}", *cells))
     return Grid(
         key=f"map-{across.name}-{up.name}",

@@ -95,7 +95,9 @@ class CText:
             if isinstance(value, list):
                 parts = [self.members(part, f"_{i}") for i, part in enumerate(value)]
                 blocks += [block for inner, _ in parts for block in inner]
-                entries = ["{" + ", ".join(f".{k} = {v}" for k, v in part.items()) + "}" for _, part in parts]
+                entries = []
+                for _, part in parts:
+                    entries.append("{" + ", ".join(f".{k} = {v}" for k, v in part.items()) + "}")
                 lines = ",\n".join(entries or ["{0}"]).splitlines()
                 blocks.append(self._array(ENTRIES[name].__name__, name, len(value), lines))
             elif isinstance(value, np.ndarray):

@@ -126,7 +126,9 @@ class CSource(abc.ABC):
     @cached_property
     def files(self) -> dict[str, str]:
         """Its C files, by name."""
-        body = {name: (resources.files("quadsim.core") / name).read_text(encoding="utf-8") for name in BODY_FILES}
+        body = {}
+        for name in BODY_FILES:
+            body[name] = (resources.files("quadsim.core") / name).read_text(encoding="utf-8")
         return {name: part(name, "quadsim.mpc") for name in self.law_files} | body | {DATA: self.filled(part(DATA))}
 
     @property

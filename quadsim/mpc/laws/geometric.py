@@ -251,9 +251,9 @@ class GeometricController(FeedbackLaw):
 
     def _measure(self, state: Array, attitude: Array | None, rates: Array | None) -> None:
         """Take the motion of a state, with the attitude and the body rates that are measured, if they are."""
-        arrays = [
-            None if array is None else np.ascontiguousarray(array, np.float64) for array in (state, attitude, rates)
-        ]
+        arrays = []
+        for array in (state, attitude, rates):
+            arrays.append(None if array is None else np.ascontiguousarray(array, np.float64))
         addresses = (None if array is None else array.ctypes.data for array in arrays)
         self._library.quadsim_geometric_measure(*addresses, self._motion)
 

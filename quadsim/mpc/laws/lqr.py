@@ -107,7 +107,10 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
     except ValueError as error:
         rule = f"such that every unweighted state comes to rest: weigh x, y, z and yaw; {error}"
         Q = objective.C_r.T @ objective.Q_y @ objective.C_r
-        weights = {name: float(weight) for name, weight in zip(STATE_NAMES, Q.diagonal(), strict=True) if weight}
+        weights = {}
+        for name, weight in zip(STATE_NAMES, Q.diagonal(), strict=True):
+            if weight:
+                weights[name] = float(weight)
         raise ParameterError("controller", "output_weights", weights, rule) from error
     return read_only(K)
 

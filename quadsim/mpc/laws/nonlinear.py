@@ -225,7 +225,10 @@ class Nonlinear(ControllerTable):
             "input_bounds": VEHICLES_SPEEDS,
         }
         require_space(self, of_rotors)
-        speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
+        speeds = []
+        for polytope in self.polytopes:
+            if any("speed_" in name for name in polytope.of):
+                speeds.append(polytope.name)
         if speeds and self.commands != ROTORS:
             raise ValueError(f'polytopes must be without rotor speeds where commands = "{self.commands}"; got {speeds}')
         if self.inputs == "thrust" and self.input_bounds.slew is not None:

@@ -154,7 +154,10 @@ class Robust(Bounded):
             if value is not None:
                 reason = "the autopilot turns the rotors; inner_lag, target_weights and target_bounds describe it"
                 raise ValueError(f'{name} must be absent where commands = "{self.commands}": {reason}')
-        speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
+        speeds = []
+        for polytope in self.polytopes:
+            if any("speed_" in name for name in polytope.of):
+                speeds.append(polytope.name)
         if speeds:
             rule = f'without rotor speeds where commands = "{self.commands}"'
             raise ValueError(f"polytopes must be {rule}; got {speeds}")

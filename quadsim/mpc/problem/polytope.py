@@ -103,7 +103,10 @@ class Polytope:
         )
 
     def _origin(self, row: int) -> Origin:
-        units = {_unit(name) for name, factor in zip(self.of, self.rows[row], strict=True) if factor}
+        units = set()
+        for name, factor in zip(self.of, self.rows[row], strict=True):
+            if factor:
+                units.add(_unit(name))
         field = f"controller.polytopes.{self.name}"
         unit = units.pop() if len(units) == 1 else "-"
         return Origin(self.row_names[row], unit, field=field, row=row, soft=f"{field}.soft")

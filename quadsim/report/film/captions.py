@@ -104,7 +104,10 @@ class Overlay:
         ):
             if vectors is not None:
                 lines.append((f"{what} {np.linalg.norm(vectors[i]):.2g} {unit}", 14, colour))
-        happened = [event for event in self._run.events if 0.0 <= time - event["time"] <= _SHOWN * self._speed]
+        happened = []
+        for event in self._run.events:
+            if 0.0 <= time - event["time"] <= _SHOWN * self._speed:
+                happened.append(event)
         lines += [(event["text"][:_WIDEST], 15, ON_DARK.warning) for event in happened[-_MOST_EVENTS:]]
         reason = self._run.log.reason
         if reason is not None and time >= control.t[-1]:

@@ -244,10 +244,9 @@ def _film(run: Filmed, shot: Shot, path: Path, workers: int | None, progress: Fr
     names = [f"piece{piece}.mp4" for piece in range(pieces)]
     content = path.parent / "flight.pickle"
     content.write_bytes(pickle.dumps(run))
-    commands = [
-        (*_WORKER, "film", str(content), json.dumps(asdict(part)), str(path.parent / name))
-        for part, name in zip(shots, names, strict=True)
-    ]
+    commands = []
+    for part, name in zip(shots, names, strict=True):
+        commands.append((*_WORKER, "film", str(content), json.dumps(asdict(part)), str(path.parent / name)))
     _work(commands, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
     listing = path.parent / "pieces.txt"
     listing.write_text("".join(f"file '{name}'\n" for name in names), encoding="utf-8")

@@ -281,7 +281,9 @@ def _table_of_rows(
     velocities = columns(VELOCITY_QUANTITIES)
     accelerations = columns(ACCELERATION_QUANTITIES)
     rounded = [places[quantity] for quantity in POSITION_QUANTITIES] + ([places["yaw"]] if yaw is not None else [])
-    resolution = [_resolution(row[column] for row in rows[1:]) for column in rounded]
+    resolution = []
+    for column in rounded:
+        resolution.append(_resolution(row[column] for row in rows[1:]))
     resolution += [0.0] * (len(EXACT) - len(resolution))
     notes = [*_speed_notes(path, t, positions), *_yaw_notes(path, t, poses[:, 3])]
     if velocities is not None:
@@ -454,7 +456,10 @@ def _velocity_notes(
         if off <= DISAGREEMENT * max(moved, said) or off <= SMALL + rounding:
             continue
         ratio = said / moved if moved > 0.0 else math.inf
-        likely = [f"; is it in {known}?" for known, factor in SPEED_UNITS.items() if abs(ratio / factor - 1.0) < ALIKE]
+        likely = []
+        for known, factor in SPEED_UNITS.items():
+            if abs(ratio / factor - 1.0) < ALIKE:
+                likely.append(f"; is it in {known}?")
         likely += ["; is its sign wrong?"] if mean(stated + covered) < DISAGREEMENT * said else []
         hint = likely[0] if likely else ""
         if said > OVERSTATED * (moved + rounding) + 1.0:

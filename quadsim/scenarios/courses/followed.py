@@ -100,8 +100,7 @@ class FollowedCourse:
     def _filtered(self, samples: Array, before: Array) -> Array:
         """Filter samples (M, 4) that follow a row (4,)."""
         channels = zip(samples.T, before.tolist(), strict=True)
-        further = [
-            smooth(values, initial=last, response_time=self._response_time, period=self._period)
-            for values, last in channels
-        ]
+        further = []
+        for values, last in channels:
+            further.append(smooth(values, initial=last, response_time=self._response_time, period=self._period))
         return np.stack(further, axis=1)

@@ -48,7 +48,10 @@ class Steps(Headed):
         """As `Filtered.build`."""
         channels = self.channels(initial)
         elsewhere = np.array([value for _, value in channels])
-        instants = {time for windows, value in channels for time, _, _ in switches(windows, value, initial=value)}
+        instants = set()
+        for windows, value in channels:
+            for time, _, _ in switches(windows, value, initial=value):
+                instants.add(time)
 
         def sample(t: Array) -> Array:
             return np.stack([steps(t, windows, value) for windows, value in channels], axis=1)
@@ -60,7 +63,9 @@ class Steps(Headed):
         x, y, z, before = initial.tolist()
         if isinstance(self.yaw, str):
             return [(self.x, x), (self.y, y), (self.z, z), ((), before)]
-        yaw = [replace(window, value=math.radians(1.0) * nearest_turn(window.value, turn=360.0)) for window in self.yaw]
+        yaw = []
+        for window in self.yaw:
+            yaw.append(replace(window, value=math.radians(1.0) * nearest_turn(window.value, turn=360.0)))
         return [(self.x, x), (self.y, y), (self.z, z), (yaw, 0.0)]
 
     def course_steps(self, initial: Array, *, duration: float, preview: float) -> list[CourseStep]:
@@ -101,7 +106,9 @@ def switches(windows: Sequence[Window], elsewhere: float, *, initial: float) -> 
     Of windows that overlap, the last holds; the first step is counted from `initial`, where the output is at time 0.
     """
     instants = sorted({max(0.0, instant) for window in windows for instant in (window.start, window.stop)} | {0.0})
-    values_in_force = [[window.value for window in windows if window.start <= t < window.stop] for t in instants]
+    values_in_force = []
+    for t in instants:
+        values_in_force.append([window.value for window in windows if window.start <= t < window.stop])
     values = [initial, *(values[-1] if values else elsewhere for values in values_in_force)]
     steps = zip(instants, itertools.pairwise(values), strict=True)
     return [(time, before, after) for time, (before, after) in steps if before != after]

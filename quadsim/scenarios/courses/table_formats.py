@@ -45,7 +45,10 @@ class TableFormat:
         """Return the place of each quantity in a header; None if the header is not of this format."""
         if len(set(header)) < len(header) or not set(header) <= self.known():
             return None
-        places = {quantity: header.index(column) for quantity, column in self.columns.items() if column in header}
+        places = {}
+        for quantity, column in self.columns.items():
+            if column in header:
+                places[quantity] = header.index(column)
         if not all(quantity in places for quantity in self.needed):
             return None
         for group in self.groups:

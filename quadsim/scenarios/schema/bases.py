@@ -115,8 +115,14 @@ def replaced_tables(path: Path) -> dict[str, str]:
 
 def retyped(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, str]:
     """Return the former type of each table whose type changes, by the table's name."""
-    kinds = {name: table["type"] for name, table in before.items() if isinstance(table, dict) and "type" in table}
-    now = {name: table.get("type", kinds.get(name)) for name, table in after.items() if isinstance(table, dict)}
+    kinds = {}
+    for name, table in before.items():
+        if isinstance(table, dict) and "type" in table:
+            kinds[name] = table["type"]
+    now = {}
+    for name, table in after.items():
+        if isinstance(table, dict):
+            now[name] = table.get("type", kinds.get(name))
     return {name: kind for name, kind in kinds.items() if name in now and now[name] != kind}
 
 

@@ -112,7 +112,10 @@ class Kind:
             held = {entry.type for entry in self.entries}
             return f"a list of {count}{'numbers' if held <= {float, int} else 'texts' if held == {str} else 'entries'}"
         if self.type in _NAMES:
-            bounds = [f"{sign} {_number(limits[name])}" for name, sign in _LIMITS.items() if name in limits]
+            bounds = []
+            for name, sign in _LIMITS.items():
+                if name in limits:
+                    bounds.append(f"{sign} {_number(limits[name])}")
             if self.type is float and not bounds:
                 finite = "finite "
             else:
@@ -185,7 +188,10 @@ def find(path: Sequence[int | str], data: Any, root: type[Any]) -> FilePlace:
     kinds: tuple[Kind, ...] = (Kind(type=root),)
     for part in path:
         named = tuple(kind for kind in kinds if part in kind.labels)
-        fields = [fields_of(kind.type)[part] for kind in kinds if part in kind.fields]
+        fields = []
+        for kind in kinds:
+            if part in kind.fields:
+                fields.append(fields_of(kind.type)[part])
         if isinstance(part, int):
             data = data[part]
             if isinstance(data, Mapping):
@@ -314,7 +320,9 @@ def _of_dicts_and_lists(schema: Any) -> Any:
         return [_of_dicts_and_lists(entry) for entry in schema]
     if not isinstance(schema, dict):
         return schema
-    relaxed = {name: entry if name in _NO_SCHEMA else _of_dicts_and_lists(entry) for name, entry in schema.items()}
+    relaxed = {}
+    for name, entry in schema.items():
+        relaxed[name] = entry if name in _NO_SCHEMA else _of_dicts_and_lists(entry)
     if relaxed.get("type") in _WRITTEN_OTHERWISE:
         relaxed["strict"] = False
     return relaxed
@@ -405,7 +413,9 @@ def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
     elif isinstance(value, Mapping | list) and depth == 0:
         text = "..."
     elif isinstance(value, Mapping):
-        entries = [f"{shown(key)}: {shown(entry, depth - 1)}" for key, entry in islice(value.items(), _MOST_ENTRIES)]
+        entries = []
+        for key, entry in islice(value.items(), _MOST_ENTRIES):
+            entries.append(f"{shown(key)}: {shown(entry, depth - 1)}")
         text = "{" + ", ".join([*entries, *(["..."] if len(value) > _MOST_ENTRIES else [])]) + "}"
     elif isinstance(value, list):
         entries = [shown(entry, depth - 1) for entry in value[:_MOST_ENTRIES]]

@@ -279,7 +279,11 @@ class Scenario:
         record = self.recorded
         if record is None:
             tables = {name: plain(getattr(self, name) or {}) for name in REPEATING}
-            stated = [f"{table}.{name}" for table in tables for name in tables[table] if name != "file"]
+            stated = []
+            for table in tables:
+                for name in tables[table]:
+                    if name != "file":
+                        stated.append(f"{table}.{name}")
             record = RecordedVehicle(file=self.vehicle.file, stated=tuple(stated))
         return self.altered(vehicle=vehicle, autopilot=autopilot, recorded=record)
 

@@ -217,7 +217,9 @@ def leaves(data: Mapping[str, Any], above: str = "", *, entries: bool = False) -
     for key, value in data.items():
         below: Any = value
         if isinstance(value, list | tuple) and value and all(isinstance(e, Mapping) and "name" in e for e in value):
-            below = {str(entry["name"]): {k: v for k, v in entry.items() if k != "name"} for entry in value}
+            below = {}
+            for entry in value:
+                below[str(entry["name"])] = {k: v for k, v in entry.items() if k != "name"}
         elif entries and isinstance(value, list | tuple):
             below = {str(i): entry for i, entry in enumerate(value)}
         if isinstance(below, Mapping):
@@ -289,7 +291,9 @@ def _holder(
 
 def _index(entries: list[Any], where: str, key: str) -> int:
     """Return the position of a list's entry from its name, or from its index."""
-    names = [str(entry.get("name", i)) if isinstance(entry, dict) else str(i) for i, entry in enumerate(entries)]
+    names = []
+    for i, entry in enumerate(entries):
+        names.append(str(entry.get("name", i)) if isinstance(entry, dict) else str(i))
     if key not in names:
         raise UnknownNameError(f"entry of {where}", key, names)
     return names.index(key)
