@@ -131,7 +131,7 @@ def _at_home(word: str) -> str:
     """Expand `~` in a word as a shell does, also in `--out=~/x`."""
     match = _HOME.fullmatch(word)
     if match is None:
-        return word  # noqa: PTH111
+        return word
     return (match[1] or "") + os.path.expanduser(match[2])  # noqa: PTH111
 
 
