@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all rooms peers firmware betaflight chain check format docs build numbers reproduce pins clean
+.PHONY: help setup demo test test-all without-features rooms peers firmware betaflight chain check format docs build numbers reproduce pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -49,17 +49,19 @@ demo: setup  ## fly the paper's two flights, compare them on a page, then film t
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite \
 		$(if $(filter --no-video,$(OPTIONS)),,$$([ ! -e $(VENV)/.renders ] || echo --video))
 
-test test-all rooms peers firmware betaflight chain numbers reproduce: export OMP_NUM_THREADS := 1
-test test-all rooms peers firmware betaflight chain numbers reproduce: export OPENBLAS_NUM_THREADS := 1
-test test-all rooms peers firmware betaflight chain numbers reproduce: export MKL_NUM_THREADS := 1
-test: setup $(VENV)/.browser  ## all tests but the slow groups, of which it runs a witness each (OPTIONS="-k audit" for some)
-	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope -m "not slow or witness" --hypothesis-profile=quick $(OPTIONS)
+test test-all without-features peers firmware betaflight chain numbers reproduce: export OMP_NUM_THREADS := 1
+test test-all without-features peers firmware betaflight chain numbers reproduce: export OPENBLAS_NUM_THREADS := 1
+test test-all without-features peers firmware betaflight chain numbers reproduce: export MKL_NUM_THREADS := 1
+test: setup $(VENV)/.browser  ## all tests but the slow groups, of which it runs a representative each (OPTIONS="-k audit" for some)
+	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope -m "not slow or representative" --hypothesis-profile=quick $(OPTIONS)
 
 test-all: setup $(VENV)/.browser  ## run every test but those of make peers and make firmware
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
-rooms: setup  ## take each feature away, in a copy, and see the rest pass (OPTIONS=live for one)
-	@$(PY) tests/rooms.py $(OPTIONS)
+rooms: without-features
+
+without-features: setup  ## take each feature away, in a copy, and see the rest pass (OPTIONS=live for one)
+	@$(PY) tests/without_features.py $(OPTIONS)
 
 peers: setup $(VENV)/.peers  ## install the peers and every solver, and hold quadsim against them
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope tests/peers $(OPTIONS)

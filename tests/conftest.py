@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from rooms import USING
 from support import NO_PRODUCTS, draw_nothing, fly_here
+from without_features import USING
 
 from quadsim.console.progress import Progress, silent
 from quadsim.features.entries import FEATURES
@@ -52,7 +52,7 @@ LONG = (
         "mpc/solvers/test_core.py",
         "mpc/laws/test_rates.py",
     ),
-    *("test_spine.py", "test_rooms.py", "sim/test_autopilot.py", "sim/estimation/test_estimator.py"),
+    *("test_main_path.py", "test_without_features.py", "sim/test_autopilot.py", "sim/estimation/test_estimator.py"),
     *(
         "rollout/test_piloted.py",
         "rollout/test_take_off.py",

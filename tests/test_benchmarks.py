@@ -44,7 +44,7 @@ def test_solvers_agree_on_the_optimum(tmp_path: Path) -> None:
         assert 0.0 < record["p50_ms"] <= record["p99_ms"] <= record["max_ms"]
 
 
-@pytest.mark.witness("benchmarks")
+@pytest.mark.representative("benchmarks")
 def test_two_solvers_of_one_scenario_have_a_record_each(tmp_path: Path) -> None:
     names = ["piqp-multistage", "piqp-dense"]
     records = quick("solvers", tmp_path, "--scenario", "paper-constrained", "--solvers", *names)

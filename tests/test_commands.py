@@ -49,7 +49,7 @@ QUADSIM = [*dict.fromkeys(line.partition("#")[0].strip() for line in LINES if li
 ELSEWHERE = ("quadsim view", "--cluster", "--fly", "casadi")
 """`view` opens a window and stays; a cluster, and what takes an emulator or CasADi, have tests of their own."""
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-SLOW, WITNESS = pytest.mark.slow("commands"), pytest.mark.witness("commands")
+SLOW, WITNESS = pytest.mark.slow("commands"), pytest.mark.representative("commands")
 RUNNABLE = [
     pytest.param(line, marks=[SLOW, WITNESS] if line in README else SLOW)
     for line in QUADSIM

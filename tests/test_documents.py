@@ -35,7 +35,7 @@ PYTHON = {page: blocks for page in PAGES if (blocks := BLOCKS.findall(page.read_
 SOURCES = [path for folder in ("quadsim", "benchmarks", "examples") for path in (ROOT / folder).rglob("*.py")]
 RUN_ON = re.compile(r"^ *(?:Args|Attributes|Examples|Raises|Returns|Yields):[ ]*\S", re.MULTILINE)
 """A section of a docstring that starts on the line of its title, which no tool then takes for a section."""
-SLOW, WITNESS = pytest.mark.slow("pages"), pytest.mark.witness("pages")
+SLOW, WITNESS = pytest.mark.slow("pages"), pytest.mark.representative("pages")
 ENTRY_POINTS = {"quadsim.controllers"}
 """Groups of entry points, which are written like modules."""
 

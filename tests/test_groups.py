@@ -1,4 +1,4 @@
-"""What `make test` leaves out: the groups of slow tests, each with a witness that it runs all the same."""
+"""What `make test` leaves out: the groups of slow tests, each with a representative that it runs all the same."""
 
 from __future__ import annotations
 
@@ -13,14 +13,18 @@ def marked() -> Iterator[tuple[str, str, Path]]:
     """The mark and group of every `pytest.mark.MARK("group")` of these, and its file."""
     for path in sorted(TESTS.rglob("test_*.py")):
         text = path.read_text(encoding="utf-8")
-        for node in ast.walk(ast.parse(text)) if "mark.slow" in text or "mark.witness" in text else ():
+        for node in ast.walk(ast.parse(text)) if "mark.slow" in text or "mark.representative" in text else ():
             match node:
-                case ast.Call(func=ast.Attribute(attr="slow" | "witness" as mark), args=[ast.Constant(value=group)]):
+                case ast.Call(
+                    func=ast.Attribute(attr="slow" | "representative" as mark), args=[ast.Constant(value=group)]
+                ):
                     yield mark, group, path
 
 
 def test_every_slow_group_has_a_witness_among_the_quick_tests() -> None:
     marks = {*marked()}
-    slow, witnesses = ({(group, path) for mark, group, path in marks if mark == kind} for kind in ("slow", "witness"))
-    assert {group for group, _ in witnesses} == {group for group, _ in slow}
-    assert witnesses <= slow, "a witness is a test of its group"
+    slow, representatives = (
+        {(group, path) for mark, group, path in marks if mark == kind} for kind in ("slow", "representative")
+    )
+    assert {group for group, _ in representatives} == {group for group, _ in slow}
+    assert representatives <= slow, "a representative is a test of its group"

@@ -133,7 +133,7 @@ def test_version_is_the_same_everywhere(dist: Path) -> None:
     assert (changes[1], citation[1]) == (__version__, __version__)
 
 
-@pytest.mark.witness("packages")
+@pytest.mark.representative("packages")
 def test_every_requirement_is_pinned() -> None:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = [line for line in lines if not line.startswith("#")]

@@ -1,7 +1,7 @@
 """The features: folders beside the core, which names none of them but here.
 
 A feature has its commands in its `commands.py`, imported when one is called, its tests in a folder of its name, and its
-pages.  `make rooms` takes each away, with its entry here, and sees the rest pass.
+pages.  `make without-features` takes each away, with its entry here, and sees the rest pass.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ def flight() -> Flight:
 
 CONSTANTS = {"STATE_NAMES"}
 """Public names that are no functions or classes, and so have no docstring to run."""
-SLOW, WITNESS = pytest.mark.slow("docstrings"), pytest.mark.witness("docstrings")
+SLOW, WITNESS = pytest.mark.slow("docstrings"), pytest.mark.representative("docstrings")
 NAMES = [*sorted({*quadsim.__all__} - CONSTANTS), *(f"gym.{name}" for name in quadsim.gym.__all__)]
 RENDERS = {"film"}
 """Whose examples need a machine that renders."""

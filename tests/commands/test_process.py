@@ -32,7 +32,7 @@ def environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(ROOT)}
 
 
-@pytest.mark.witness("process")
+@pytest.mark.representative("process")
 def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0() -> None:
     """`quadsim list | true`."""
     command = [sys.executable, "-m", "quadsim.commands.entry", "list"]
@@ -180,13 +180,15 @@ sys.exit(main())
     ("place", "caught"),
     [
         ("quadsim.sim.loop.flight_log", ""),
-        pytest.param("quadsim.rollout.rollout.audit", "", marks=pytest.mark.witness("process")),
+        pytest.param("quadsim.rollout.rollout.audit", "", marks=pytest.mark.representative("process")),
         ("quadsim.rollout.rollout.audit", "caught"),
         ("quadsim.rollout.flown.summarise", ""),
         ("quadsim.rollout.flown.write_log", ""),
         ("quadsim.report.recording.write_recording", ""),
         ("quadsim.report.flight_figures.write_figures", ""),
-        pytest.param("quadsim.report.flight_figures.write_figures", "caught", marks=pytest.mark.witness("process")),
+        pytest.param(
+            "quadsim.report.flight_figures.write_figures", "caught", marks=pytest.mark.representative("process")
+        ),
         ("quadsim.rollout.flown.amend", ""),
         ("quadsim.console.console.show", ""),
         ("logging.shutdown", ""),

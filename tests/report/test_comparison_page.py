@@ -55,7 +55,7 @@ def without_scripts(page: str) -> str:
     return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
 
 
-@pytest.mark.witness("comparisons")
+@pytest.mark.representative("comparisons")
 def test_the_page_stands_beside_its_files(page_of_two: Path) -> None:
     page = page_of_two
     assert (page.parent.name, page.name) == ("out", "index.html")
@@ -68,7 +68,7 @@ def test_the_page_stands_beside_its_files(page_of_two: Path) -> None:
         assert url == "data:," or (page.parent / url).is_file(), url
 
 
-@pytest.mark.witness("comparisons")
+@pytest.mark.representative("comparisons")
 def test_the_text_gives_outcomes_reasons_and_numbers_and_nothing_is_fetched(page_of_two: Path) -> None:
     text = without_scripts(page_of_two.read_text())
     assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//""", text)

@@ -63,7 +63,7 @@ def with_effects(run: Flight) -> Flight:
     return dataclasses.replace(run, log=dataclasses.replace(run.log, plant=plant, control=control))
 
 
-@pytest.mark.witness("figures")
+@pytest.mark.representative("figures")
 def test_the_papers_scenario_gives_the_papers_figure_numbers(short_run: Flight, tmp_path: Path) -> None:
     paths = write_figures(short_run, tmp_path)
     assert [path.name for path in paths] == ["figure4_states.png", "figure5_inputs.png", "solve_times.png"]

@@ -54,7 +54,7 @@ def position_error(flight: Flight) -> float:
 
 
 @pytest.mark.slow("air")
-@pytest.mark.witness("air")
+@pytest.mark.representative("air")
 def test_geometric_control_that_knows_it_follows_a_figure_eight_ten_times_as_closely() -> None:
     without, knowing = (quadsim.fly(figure_eight(**known), progress=False) for known in ({}, {"moment": True}))
     assert (without.outcome, knowing.outcome) == ("satisfied", "satisfied")

@@ -44,7 +44,7 @@ def test_as_many_periods_are_a_solvers_as_it_had_calls(
 
 @pytest.mark.slow("core")
 @pytest.mark.parametrize(
-    "name", ["worn-rotor-hard-bounds", pytest.param("stalled-solver", marks=pytest.mark.witness("core"))]
+    "name", ["worn-rotor-hard-bounds", pytest.param("stalled-solver", marks=pytest.mark.representative("core"))]
 )
 def test_a_period_in_fallback_or_too_late_is_answered_by_the_fallback(name: str) -> None:
     control = Rollout(load_scenario(name)).fly().log.control

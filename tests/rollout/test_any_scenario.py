@@ -217,7 +217,7 @@ def accepted(table: dict[str, Any]) -> Scenario | None:
     return scenario
 
 
-@pytest.mark.witness("any scenario")
+@pytest.mark.representative("any scenario")
 @settings(max_examples=3, derandomize=True, database=None)
 @given(table=tables())
 def test_a_few_valid_scenarios_fly_and_their_resolved_files_fly_them_again(table: dict[str, Any]) -> None:

@@ -77,7 +77,7 @@ def test_whole_turns_of_reference_or_initial_yaw_change_no_command_and_no_verdic
         assert verdicts(shifted) == verdicts(flown)
 
 
-@pytest.mark.witness("headings")
+@pytest.mark.representative("headings")
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_a_law_called_by_itself_takes_headings_that_jump_by_whole_turns(name: str) -> None:
     """Each period's preview is on another turn, and jumps from its third sample on."""

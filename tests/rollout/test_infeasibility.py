@@ -187,7 +187,7 @@ def setting(field: str, value: object) -> str:
     return f"{field}={json.dumps(value)}"
 
 
-@pytest.mark.witness("diagnosis")
+@pytest.mark.representative("diagnosis")
 @pytest.mark.parametrize("name", CASES)
 def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, file: str) -> None:
     case = CASES[name]

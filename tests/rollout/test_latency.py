@@ -35,7 +35,7 @@ def flown(scenario: Scenario, **changes: Any) -> Flight:
     return quadsim.fly(scenario.replace(changes) if changes else scenario, progress=False)
 
 
-@pytest.mark.witness("latency")
+@pytest.mark.representative("latency")
 def test_a_law_that_knows_the_delay_survives_it(late: Scenario) -> None:
     """One that does not overturns; one told of a single period is worse than one told the truth."""
     known, told = flown(late, **KNOWN), flown(late, **{"controller.delay": 0.025})

@@ -42,7 +42,7 @@ def values(rows: Sequence[dict[str, Any]]) -> list[float | None]:
 EXPECTED = [number * number / 7.0 for number in range(30)]
 
 
-@pytest.mark.witness("workers")
+@pytest.mark.representative("workers")
 @pytest.mark.parametrize("options", [{"workers": 1}, {"workers": 3}, {"workers": 2, "isolate": True}])
 def test_rows_are_the_same_whatever_the_workers(options: dict[str, Any]) -> None:
     rows = rows_of(CALM, **options)

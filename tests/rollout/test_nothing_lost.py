@@ -76,7 +76,7 @@ def test_a_module_that_exits_does_not_pass_a_check(tmp_path: Path) -> None:
     assert (done.returncode, (tmp_path / "v.xml").exists()) == (2, False)
 
 
-@pytest.mark.witness("process")
+@pytest.mark.representative("process")
 def test_an_inner_loop_that_raises_ends_the_flight_there() -> None:
     class Inner:
         rate = 500.0

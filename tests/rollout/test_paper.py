@@ -38,7 +38,7 @@ def assert_constrained_flight_holds(flight: Flight, *, plant_tolerance: float) -
     assert np.abs(error).max() < 0.01
 
 
-@pytest.mark.witness("paper")
+@pytest.mark.representative("paper")
 def test_constrained_flight_keeps_every_bound_and_arrives(constrained_flight: Flight) -> None:
     assert_constrained_flight_holds(constrained_flight, plant_tolerance=PLANT)
     assert constrained_flight.satisfied
@@ -57,7 +57,7 @@ def test_it_holds_over_the_parameters_the_paper_leaves_out(
     assert_constrained_flight_holds(flight, plant_tolerance=0.1)
 
 
-@pytest.mark.witness("paper")
+@pytest.mark.representative("paper")
 def test_unconstrained_flight_tracks_and_leaves_every_bound(unconstrained_flight: Flight) -> None:
     control, result = unconstrained_flight.log.control, findings(unconstrained_flight)
     error = control.state[:, [0, 2, 4, 10]] - control.reference

@@ -153,7 +153,7 @@ def test_a_saved_flight_keeps_its_targets(flight: quadsim.Flight, tmp_path: Path
 @pytest.mark.parametrize(
     "table",
     [
-        pytest.param("geometric of attitudes", marks=pytest.mark.witness("autopilot")),
+        pytest.param("geometric of attitudes", marks=pytest.mark.representative("autopilot")),
         "geometric of rates",
         "nonlinear of rates",
     ],

@@ -166,7 +166,7 @@ def test_tables_that_contradict_each_other_are_reported(
         ("slow-solver", {"computation.delay": 0.12}),
         ("slow-solver", {"computation": {"delay": 0.06, "jitter": 0.03, "plan": False}}),
         ("robust", {"computation": {"delay": 0.06, "jitter": 0.03}, "controller.delay": 0.06}),
-        pytest.param("stalled-solver", {"computation": {"delay": 0.06}}, marks=pytest.mark.witness("reaudit")),
+        pytest.param("stalled-solver", {"computation": {"delay": 0.06}}, marks=pytest.mark.representative("reaudit")),
     ],
 )
 def test_commands_are_followed_to_when_they_act(name: str, changes: dict[str, Any], tmp_path: Path) -> None:

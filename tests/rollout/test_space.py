@@ -152,7 +152,7 @@ def test_the_robust_controller_keeps_clear_in_any_heading() -> None:
 @pytest.mark.parametrize(
     "more",
     [
-        pytest.param({}, marks=pytest.mark.witness("obstacles")),
+        pytest.param({}, marks=pytest.mark.representative("obstacles")),
         {"node": 0.1, "iterations": 2},
         {"rotor_lag": 0.02, "offset_free": {}},
     ],
@@ -184,7 +184,7 @@ def offset_at(speed: float) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("law", "speed"),
     [
-        pytest.param("constrained", 0.5, marks=pytest.mark.witness("obstacles")),
+        pytest.param("constrained", 0.5, marks=pytest.mark.representative("obstacles")),
         ("constrained", 0.8),
         ("robust", 0.5),
         ("nonlinear", 0.8),

@@ -83,7 +83,7 @@ def written_and_read(scenario: Scenario) -> Scenario:
     return Scenario.parse(tomllib.loads(scenario.to_toml()))
 
 
-@pytest.mark.witness("by hand")
+@pytest.mark.representative("by hand")
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_periods_by_hand_are_the_batch_flight(name: str) -> None:
     scenario = cut(name)

@@ -70,7 +70,7 @@ def from_the_ground(law: str, height: float, heavier: float, **others: Any) -> q
 @pytest.mark.parametrize(
     ("law", "height", "heavier"),
     [
-        *(pytest.param(law, 0.3, 0.3, marks=pytest.mark.witness("take-off")) for law in EACH_KIND),
+        *(pytest.param(law, 0.3, 0.3, marks=pytest.mark.representative("take-off")) for law in EACH_KIND),
         *((law, 0.3, 0.3) for law in LAWS if law not in EACH_KIND),
         *((law, height, 0.3) for law in LAWS for height in (0.5, 1.5, 5.0)),
         *((law, 0.3, heavier) for law in LAWS for heavier in (0.0, 0.04, 0.11)),

@@ -59,9 +59,9 @@ def flown_here() -> list[str]:
 
 def flights() -> list[ParameterSet]:
     """`make test` flies the two that other modules need as well."""
-    slow, witness = pytest.mark.slow("library"), pytest.mark.witness("library")
+    slow, representative = pytest.mark.slow("library"), pytest.mark.representative("library")
     quick = ("paper-constrained", "paper-unconstrained")
-    return [pytest.param(name, marks=[slow, witness] if name in quick else slow) for name in flown_here()]
+    return [pytest.param(name, marks=[slow, representative] if name in quick else slow) for name in flown_here()]
 
 
 @pytest.fixture(scope="module", params=flights())

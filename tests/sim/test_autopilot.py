@@ -109,7 +109,7 @@ def test_default_gains_follow_the_rule(vehicle: Vehicle) -> None:
     assert settings.resolved(vehicle) == settings
 
 
-@pytest.mark.witness("autopilot")
+@pytest.mark.representative("autopilot")
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_step_of_a_body_rate_is_reached_with_little_overshoot(vehicle: Vehicle, axis: int) -> None:
     target = hover(vehicle)

@@ -75,8 +75,8 @@ def _brief(grid: Grid) -> Grid:
     """The first lines of a table, with a short last column."""
     ends = [(line, " ".join(line[-1].text.split())) for line in grid.lines[:_MOST_LINES]]
     lines = []
-    for line, end in ends:
-        lines.append((*line[:-1], replace(line[-1], text=end if len(end) <= 60 else f"{end[:57]}...")))
+    for row, end in ends:
+        lines.append((*row[:-1], replace(row[-1], text=end if len(end) <= 60 else f"{end[:57]}...")))
     return replace(grid, note="", lines=tuple(lines))
 
 

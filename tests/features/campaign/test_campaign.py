@@ -108,7 +108,7 @@ def content(result: Result) -> tuple[bytes, bytes]:
     return (result.directory / "flights.parquet").read_bytes(), (result.directory / SUMMARY_FILE).read_bytes()
 
 
-@pytest.mark.witness("campaigns")
+@pytest.mark.representative("campaigns")
 def test_results_are_the_same_bytes_with_any_worker(plan: Plan, whole: Result, by_two: Result, tmp_path: Path) -> None:
     engines = {"backwards": Alone(backwards=True), "one": 1}
     results = [whole, by_two, *(fly_campaign(plan, tmp_path / name, engine) for name, engine in engines.items())]

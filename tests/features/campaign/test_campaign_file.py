@@ -206,7 +206,7 @@ CUT = NORMAL | {"low": 2.8, "high": 4.0}
     ("entry", "expected"),
     [
         (UNIFORM, stats.uniform(2.0, 3.0)),
-        pytest.param(LOG_UNIFORM, stats.loguniform(0.1, 10.0), marks=pytest.mark.witness("statistics")),
+        pytest.param(LOG_UNIFORM, stats.loguniform(0.1, 10.0), marks=pytest.mark.representative("statistics")),
         (NORMAL, stats.norm(3.0, 0.5)),
         (CUT, stats.truncnorm(-0.4, 2.0, loc=3.0, scale=0.5)),
     ],

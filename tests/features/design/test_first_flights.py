@@ -147,7 +147,7 @@ def test_the_figure_eight_comes_near_to_what_it_is_made_for() -> None:
     assert 25.0 < flight.tilt < 32.0
 
 
-@pytest.mark.witness("first flights")
+@pytest.mark.representative("first flights")
 @pytest.mark.parametrize("law", DESIGNED_LAWS)
 @pytest.mark.parametrize("course", COURSES)
 def test_the_file_states_what_is_flown(course: str, law: str) -> None:

@@ -19,7 +19,7 @@ QUICK = (("iris", "step"), ("uneven", "figure-eight"))
 @pytest.mark.parametrize(
     ("name", "course"),
     [
-        *[pytest.param(*pair, marks=pytest.mark.witness("vehicles")) for pair in QUICK],
+        *[pytest.param(*pair, marks=pytest.mark.representative("vehicles")) for pair in QUICK],
         *[p for p in FIRST if p not in QUICK],
     ],
 )

@@ -27,7 +27,7 @@ ALL = vehicles()
 EVERY = pytest.mark.parametrize("vehicle", ALL, ids=lambda vehicle: vehicle.name)
 
 
-@pytest.mark.witness("first flights")
+@pytest.mark.representative("first flights")
 @EVERY
 def test_the_loop_stands_a_third_of_its_time_constant_of_more_delay(vehicle: Vehicle) -> None:
     """The bound by lag then leaves 0.8 (T + tau / 2), whatever the vehicle."""

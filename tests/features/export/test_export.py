@@ -90,7 +90,7 @@ def test_the_same_export_twice_is_the_same_bytes(tmp_path: Path) -> None:
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
 
 
-@pytest.mark.witness("export")
+@pytest.mark.representative("export")
 def test_both_precisions_have_the_same_numbers() -> None:
     double, single = (c_controller(load_scenario("hover"), precision).files[DATA] for precision in ("double", "float"))
     numbers = [text[text.index("static const") :].split() for text in (double, single)]
@@ -172,7 +172,7 @@ def test_a_problem_with_too_many_numbers_is_refused() -> None:
         _ = c_controller(load_scenario("paper-constrained", ["controller.horizon=900"])).files
 
 
-@pytest.mark.witness("export")
+@pytest.mark.representative("export")
 @pytest.mark.parametrize(
     ("value", "text"), [(1.5, "1.5"), (-0.1, "-0.1"), (1e-39, "0.0"), (-5e-324, "0.0"), (1.2e-38, "1.2e-38")]
 )
@@ -204,7 +204,7 @@ def optimum(axis: AxisTables, start: Array, reference: Array) -> Array:
     return w
 
 
-@pytest.mark.witness("export")
+@pytest.mark.representative("export")
 @pytest.mark.parametrize("settings", [[], ["controller.terminal=lqr"], ["controller.horizon=10"]])
 def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None:
     scenario = load_scenario("paper-constrained", settings)
@@ -220,7 +220,7 @@ def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None
         np.testing.assert_allclose(w[0], desired[axis.first : axis.first + axis.inputs], rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.witness("export")
+@pytest.mark.representative("export")
 @pytest.mark.parametrize("name", ["paper-constrained", "robust", "polytopes"])
 def test_responses_are_those_of_the_condensed_problem(name: str) -> None:
     scenario = load_scenario(name, ["controller.horizon=8"])
@@ -247,7 +247,7 @@ def _keys(rows: object) -> list[list[bytes]]:
     return [[np.ascontiguousarray(row).tobytes() for row in getattr(rows, name)] for name in ("C", "D", "E")]
 
 
-@pytest.mark.witness("export")
+@pytest.mark.representative("export")
 def test_inputs_fall_into_axes_without_loss() -> None:
     """Also where some inputs move nothing that costs."""
     scenario = load_scenario("paper-constrained")

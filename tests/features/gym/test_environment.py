@@ -93,7 +93,7 @@ def test_actions_are_within_the_controllers_bounds_or_the_vehicles() -> None:
 @pytest.mark.parametrize(
     ("name", "action"),
     [
-        pytest.param("motion-capture", "deviations", marks=pytest.mark.witness("gym")),
+        pytest.param("motion-capture", "deviations", marks=pytest.mark.representative("gym")),
         ("late-commands", "speeds"),
         ("torrente-loop4-drag", "speeds"),
     ],
@@ -148,7 +148,7 @@ def test_cost_counts_required_constraints_beyond_their_tolerance() -> None:
     assert infos[-1]["cost"] == 2.0
 
 
-@pytest.mark.witness("gym")
+@pytest.mark.representative("gym")
 def test_a_lost_vehicle_terminates_and_time_truncates() -> None:
     env = quadsim.gym.make_env(short("hover", 3.0))
     env.reset()
@@ -291,7 +291,7 @@ def test_the_inner_loop_flies_thrust_and_body_rates() -> None:
         env.controller_action()
 
 
-@pytest.mark.witness("gym")
+@pytest.mark.representative("gym")
 def test_a_closed_environment_says_so_and_keeps_its_flight() -> None:
     env = quadsim.gym.QuadrotorEnv(short("hover"), render_mode="rgb_array")
     env.reset(seed=0)

@@ -92,7 +92,7 @@ def test_a_filter_whose_model_has_rotor_lag_finds_its_plans() -> None:
     assert 0 < env.interventions < env.steps
 
 
-@pytest.mark.witness("gym")
+@pytest.mark.representative("gym")
 def test_what_is_safe_passes_to_the_bit() -> None:
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(safety_filter.filtered_air("gust"), action="speeds"))
     env.reset(seed=0)

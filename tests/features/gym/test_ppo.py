@@ -139,7 +139,7 @@ def test_an_update_makes_better_actions_likelier_but_not_by_more_than_the_clip()
 # --- learning ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.witness("gym")
+@pytest.mark.representative("gym")
 def test_a_few_updates_raise_the_reward_and_repeat_to_the_bit() -> None:
     """In episodes of 1.5 s, in which staying up and in place is all there is to learn."""
     settings = ppo.Settings(environments=32, length=30, minibatch=120, units=(16, 16), epochs=10, learning_rate=2e-3)

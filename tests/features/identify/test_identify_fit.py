@@ -143,7 +143,7 @@ def test_rotors_lag_as_the_plant_s_do() -> None:
     assert rotors.square[100:] == pytest.approx(np.square(middles).mean(axis=1)[100:-1], rel=3e-3)
 
 
-@pytest.mark.witness("identification")
+@pytest.mark.representative("identification")
 @pytest.mark.parametrize("delay", [0.004, 0.01, 0.013, -0.01])
 def test_a_delay_shifts_what_rotors_do(delay: float) -> None:
     commands = 450.0 + 50.0 * np.random.default_rng(0).standard_normal((60, 4))
@@ -155,7 +155,7 @@ def test_a_delay_shifts_what_rotors_do(delay: float) -> None:
     )
 
 
-@pytest.mark.witness("identification")
+@pytest.mark.representative("identification")
 def test_a_polynomial_of_reflection_coefficients_is_stable_and_complete() -> None:
     assert _polynomial(np.array([0.5, -0.3])) == pytest.approx([1.0, 0.5 * 0.7, -0.3])
     for reflections in np.random.default_rng(0).uniform(-1.0, 1.0, (50, 4)):

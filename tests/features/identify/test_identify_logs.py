@@ -98,7 +98,7 @@ def late(record: Record, count: int, *fields: str) -> Record:
 # Reading
 
 
-@pytest.mark.witness("identification")
+@pytest.mark.representative("identification")
 def test_run_directory(run_directory: Path, eight: Record) -> None:
     """What was measured, the command of each period, and the battery's voltage from the plant's table."""
     assert eight.name == read_record(run_directory / "flight.parquet").name == run_directory.name
@@ -559,7 +559,7 @@ def test_rotors_of_a_ulog_that_are_no_number_are_refused(tmp_path: Path, eight: 
         stated_rotors(path)
 
 
-@pytest.mark.witness("identification")
+@pytest.mark.representative("identification")
 def test_ulog_with_a_topic_without_time(tmp_path: Path, eight: Record, capfd: pytest.CaptureFixture[str]) -> None:
     """It is left out, with a note; where it is needed, the refusal says so. Nothing is printed."""
     path = ulog(tmp_path / "px4.ulg", px4_topics(eight))

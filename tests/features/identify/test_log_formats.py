@@ -454,7 +454,7 @@ def test_blackbox_that_cannot_be_used(tmp_path: Path, eight: Record) -> None:
         read_record(blackbox(tmp_path / "default.bbl", table, **HEADERS))
 
 
-@pytest.mark.witness("identification")
+@pytest.mark.representative("identification")
 @pytest.mark.parametrize(
     ("header", "value", "message"),
     [

@@ -50,7 +50,7 @@ pytestmark = pytest.mark.slow("live")
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 
 
-@pytest.mark.witness("live")
+@pytest.mark.representative("live")
 @pytest.mark.parametrize(
     ("headers", "query", "let_in"),
     [
@@ -108,7 +108,7 @@ def test_cookies_of_other_programs_on_this_host_lock_nobody_out(others: str) -> 
     assert refusal(ours, hosts=("127.0.0.1:8080", "evil.example")) == "a header is there twice"
 
 
-@pytest.mark.witness("live")
+@pytest.mark.representative("live")
 def test_a_server_that_is_made_past_the_guard_is_not_served(monkeypatch: pytest.MonkeyPatch) -> None:
     """As by a version of viser that does not look `serve` up where it is replaced."""
     library: Any = websockets.asyncio.server
@@ -467,7 +467,7 @@ def tab(browser: Any, served: Served) -> Iterator[Any]:
     tab.close()
 
 
-@pytest.mark.witness("live")
+@pytest.mark.representative("live")
 def test_the_address_alone_opens_the_page(served: Served) -> None:
     bare = served.page.address.partition("?")[0]
     with pytest.raises(urllib.error.HTTPError, match="403") as refused:

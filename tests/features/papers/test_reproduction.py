@@ -89,7 +89,7 @@ def test_the_first_seconds_at_8_m_s_are_those_of_the_specification() -> None:
     np.testing.assert_allclose(positions, expected, atol=1e-6)
 
 
-@pytest.mark.witness("papers")
+@pytest.mark.representative("papers")
 def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
     assert {"quadrotor-uav", "torrente2021"} <= {*paper_names()}
     papers = [load_paper(name) for name in paper_names()]
@@ -102,7 +102,7 @@ def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
     assert {name for name in scenario_names() if load_scenario(name).group == "papers"} <= flown
 
 
-@pytest.mark.witness("papers")
+@pytest.mark.representative("papers")
 @pytest.mark.parametrize(
     ("relation", "ours", "within"),
     [
@@ -135,7 +135,7 @@ def test_a_flight_that_ends_early_reproduces_nothing(tmp_path: Path) -> None:
     assert "| time flown | s | 0.5 | - | - | 1 | no |" in grid_to_markdown(result.grid)
 
 
-@pytest.mark.witness("papers")
+@pytest.mark.representative("papers")
 def test_the_command_prints_and_fails_beyond_tolerance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good = written(tmp_path, ("0.5", "absolute = 0.0"))
     report = tmp_path / "verdicts.xml"
@@ -158,7 +158,7 @@ def test_the_command_prints_and_fails_beyond_tolerance(tmp_path: Path, capsys: p
     assert "0.5 s" in root.findtext("testcase/system-out", "")
 
 
-@pytest.mark.witness("papers")
+@pytest.mark.representative("papers")
 def test_only_what_a_paper_prints_of_what_is_flown_is_called_published() -> None:
     """Three kinds by their sources, counted apart; bars and claims are no reproduced numbers."""
     numbers = load_paper("torrente2021").numbers
@@ -179,7 +179,7 @@ def test_only_what_a_paper_prints_of_what_is_flown_is_called_published() -> None
         assert (number.kind, number.role) == ("published", "claim")
 
 
-@pytest.mark.witness("papers")
+@pytest.mark.representative("papers")
 def test_each_kind_has_its_column_and_its_count() -> None:
     paper = load_paper("torrente2021")
     numbers = tuple(Reproduced(spec=number, ours=number.span[0]) for number in paper.numbers)
@@ -203,7 +203,7 @@ def test_each_kind_has_its_column_and_its_count() -> None:
     assert confirmed.grid.head[2:4] == ("claimed", "ours")
 
 
-@pytest.mark.witness("papers")
+@pytest.mark.representative("papers")
 def test_the_table_of_the_page_states_each_kind() -> None:
     rows = list(csv.DictReader((ROOT / "docs/data/papers.csv").read_text(encoding="utf-8").splitlines()))
     for name in paper_names():

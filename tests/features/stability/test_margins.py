@@ -208,7 +208,7 @@ def test_a_larger_push_does_not_reach_as_far() -> None:
 
 
 @pytest.mark.slow("stability")
-@pytest.mark.witness("stability")
+@pytest.mark.representative("stability")
 def test_two_controllers_stand_side_by_side(hummingbird: Scenario, tmp_path: Path) -> None:
     found = quadsim.stability(
         hummingbird, controller=["constrained", "lqr"], over=["delay"], out=tmp_path / "both", progress=False

@@ -158,7 +158,7 @@ def test_two_seconds_of_failures_are_hovered_through(vehicle: Vehicle, undisturb
     ("kind", "duration", "channels"),
     [
         *[(FaultKind.NAN, 1.0, (name,)) for name in SensorName],
-        pytest.param(FaultKind.NAN, 1.0, tuple(SensorName), marks=pytest.mark.witness("fallback")),
+        pytest.param(FaultKind.NAN, 1.0, tuple(SensorName), marks=pytest.mark.representative("fallback")),
         *[(FaultKind.FREEZE, 0.5, (name,)) for name in SensorName],
         (FaultKind.FREEZE, 0.5, tuple(SensorName)),
     ],

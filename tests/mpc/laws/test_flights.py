@@ -44,7 +44,7 @@ def test_a_flight_repeats_itself_with_the_same_controller(
     np.testing.assert_array_equal(flights[0].control.speeds, flights[1].control.speeds)
 
 
-@pytest.mark.witness("baselines")
+@pytest.mark.representative("baselines")
 def test_half_a_turn_is_turned_while_flying_sideways(law: str, vehicle: Vehicle, build: Build, fly_from: Fly) -> None:
     state = make_state(euler=(0.0, 0.0, math.pi))
     log = fly_from(build(law, vehicle), vehicle, state, periods=160, course=np.array([1.0, 1.0, 0.0, 0.0])).control

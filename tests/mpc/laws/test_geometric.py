@@ -126,7 +126,7 @@ def test_integrals_stop_at_their_limits(vehicle: Vehicle, build: Callable[..., A
 @pytest.mark.parametrize(
     ("name", "euler"),
     [
-        pytest.param("lopes2011", (120.0, 0.0, 0.0), marks=pytest.mark.witness("baselines")),
+        pytest.param("lopes2011", (120.0, 0.0, 0.0), marks=pytest.mark.representative("baselines")),
         ("hummingbird", (-120.0, 20.0, 90.0)),
         ("lopes2011", (170.0, 0.0, 0.0)),
         ("crazyflie2", (170.0, 0.0, 0.0)),

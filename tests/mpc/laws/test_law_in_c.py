@@ -44,7 +44,8 @@ PAPERS = (
 
 @pytest.mark.slow("core")
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.witness("core") if name == PAPERS[0] else ()) for name in PAPERS]
+    "name",
+    [pytest.param(name, marks=pytest.mark.representative("core") if name == PAPERS[0] else ()) for name in PAPERS],
 )
 def test_the_exported_c_answers_as_flights_in_python(name: str) -> None:
     scenario = quadsim.load(name)

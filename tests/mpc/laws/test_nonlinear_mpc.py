@@ -218,7 +218,7 @@ def test_upside_down_it_turns_over_and_comes_back(q: tuple[float, ...]) -> None:
     assert np.abs(states[:, P]).max() < 2.0
 
 
-@pytest.mark.witness("nonlinear")
+@pytest.mark.representative("nonlinear")
 def test_a_flip_is_flown_through() -> None:
     """A whole turn about body x in 0.6 s, one second in; the quaternion comes back with the other sign."""
     t = PERIOD * np.arange(225)
@@ -309,7 +309,7 @@ def furthest(states: Array) -> tuple[float, float]:
     return float(np.degrees(np.arccos(thrust_axis(states[:, Q])[:, 2]).max())), float(np.abs(states[:, W]).max())
 
 
-@pytest.mark.witness("nonlinear")
+@pytest.mark.representative("nonlinear")
 def test_tilt_and_body_rates_are_bounded() -> None:
     x = at_rest()
     x[P] = 3.0, -3.0, 0.0

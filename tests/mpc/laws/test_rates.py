@@ -211,7 +211,7 @@ def test_a_stiff_soft_tilt_does_not_turn_it_over(
     np.testing.assert_allclose(states[-1, P], 1.0, atol=0.02)
 
 
-@pytest.mark.witness("nonlinear")
+@pytest.mark.representative("nonlinear")
 def test_targets_and_body_rates_hold_their_bounds() -> None:
     bounds = TargetBounds(thrust=(3.5, 8.0), body_rate=(120.0, 90.0, 60.0))
     made = table(target_bounds=bounds, body_rate=100.0, soft=Soft(linear=1e4, quadratic=10.0))
@@ -262,7 +262,7 @@ def test_offset_free_it_finds_the_thrust_that_holds_the_height() -> None:
 
 
 @pytest.mark.slow("nonlinear")
-@pytest.mark.parametrize("scaled", [pytest.param(True, marks=pytest.mark.witness("nonlinear")), False])
+@pytest.mark.parametrize("scaled", [pytest.param(True, marks=pytest.mark.representative("nonlinear")), False])
 def test_the_observer_of_forces_finds_the_thrust_that_holds_the_height(scaled: bool) -> None:
     made = table(disturbance=RampSettings(thrust_scale=scaled), horizon=20, node=0.05)
     controller = build(made, VEHICLE, 0.05)

@@ -186,7 +186,7 @@ def test_stated_mismatch_is_not_attributed_to_a_disturbance(vehicle: Vehicle, de
 
 
 @pytest.mark.slow("robust")
-@pytest.mark.parametrize("factor", [0.7, pytest.param(1.3, marks=pytest.mark.witness("robust"))])
+@pytest.mark.parametrize("factor", [0.7, pytest.param(1.3, marks=pytest.mark.representative("robust"))])
 def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> None:
     """On a course that tilts the vehicle back and forth; at rest thrust explains it all."""
     heavy = nonlinear_model(replace(vehicle, mass=factor * vehicle.mass), PERIOD)

@@ -341,7 +341,7 @@ def test_steps_end_with_the_time_and_keep_the_plan(settings: dict[str, Any]) -> 
 
 
 @pytest.mark.slow("nonlinear")
-@pytest.mark.parametrize("count", [pytest.param(80, marks=pytest.mark.witness("nonlinear")), 800])
+@pytest.mark.parametrize("count", [pytest.param(80, marks=pytest.mark.representative("nonlinear")), 800])
 def test_ten_thousand_thrown_states_have_typed_answers(count: int) -> None:
     """From near to absurd: no hang, no number that is none, no status without a name."""
     rng = np.random.default_rng(1)

@@ -122,7 +122,7 @@ def at_hover(law: GeometricController, vehicle: Vehicle, lag: tuple[float, ...])
     return np.asarray(np.linalg.eigvals(A))
 
 
-@pytest.mark.witness("targets")
+@pytest.mark.representative("targets")
 @LAGS
 def test_the_inner_loop_makes_the_lag_a_pole_beside_those_of_the_gains(
     vehicle: Vehicle, lag: tuple[float, ...]
@@ -144,8 +144,8 @@ def test_the_inner_loop_makes_the_lag_a_pole_beside_those_of_the_gains(
 @pytest.mark.parametrize(
     ("lag", "commands"),
     [
-        pytest.param(FAST, "attitude", marks=pytest.mark.witness("targets")),
-        pytest.param(SLOW, "rates", marks=pytest.mark.witness("targets")),
+        pytest.param(FAST, "attitude", marks=pytest.mark.representative("targets")),
+        pytest.param(SLOW, "rates", marks=pytest.mark.representative("targets")),
         (FAST, "rates"),
         (SLOW, "attitude"),
     ],
@@ -211,7 +211,7 @@ def test_the_translation_s_integral_removes_the_offset_and_the_autopilot_has_the
     assert not law.integrals.rotation.any()
 
 
-@pytest.mark.witness("targets")
+@pytest.mark.representative("targets")
 @COMMANDS
 def test_targets_stay_within_their_bounds_and_integrals_hold_there(vehicle: Vehicle, commands: str) -> None:
     weight = vehicle.mass * vehicle.gravity

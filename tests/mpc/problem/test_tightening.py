@@ -337,7 +337,7 @@ def test_without_margins_the_tilt_passes_its_bound(vehicle: Vehicle) -> None:
 @pytest.mark.parametrize(
     ("sets", "rotor_lag"),
     [
-        pytest.param((), 0.0, id="nominal", marks=pytest.mark.witness("tightening")),
+        pytest.param((), 0.0, id="nominal", marks=pytest.mark.representative("tightening")),
         pytest.param((WIND, PUSH, *LAGGING), LAG, id="wind, push and lag"),
         pytest.param((CHANGING,), 0.0, id="changing"),
     ],
@@ -404,7 +404,7 @@ TURNS, ALL = alternating(3.0, 0.0), alternating(6.0, STATED.acceleration)
 @pytest.mark.parametrize(
     ("course", "rotor_lag", "delay"),
     [
-        pytest.param(TURNS, 0.0, 0.0, marks=pytest.mark.witness("tightening")),
+        pytest.param(TURNS, 0.0, 0.0, marks=pytest.mark.representative("tightening")),
         (TURNS, LAG, 0.05),
         (ALL, 0.0, 0.05),
         (ALL, LAG, 0.05),

@@ -92,7 +92,7 @@ SCENARIOS = {  # periods by who answered them; what these would be, were they th
 }
 
 
-SLOW, WITNESS = pytest.mark.slow("core"), pytest.mark.witness("core")
+SLOW, WITNESS = pytest.mark.slow("core"), pytest.mark.representative("core")
 
 
 @pytest.mark.parametrize(

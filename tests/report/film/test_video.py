@@ -45,7 +45,7 @@ def backend() -> str:
         pytest.skip(str(error))
 
 
-@pytest.mark.witness("films")
+@pytest.mark.representative("films")
 def test_the_film_has_the_frames_requested(
     backend: str, short_run: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

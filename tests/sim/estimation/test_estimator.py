@@ -62,7 +62,7 @@ def test_without_disturbance_and_with_little_noise_the_estimate_becomes_the_trut
 
 
 @pytest.mark.slow("estimator")
-@pytest.mark.witness("estimator")
+@pytest.mark.representative("estimator")
 def test_the_estimate_is_better_than_the_samples(gentle: Any, run_filter: SIMULATE) -> None:
     errors = [run_filter(gentle, SENSORS, SETTINGS, seed=seed)[1][20:] for seed in range(4)]
     assert rms(errors, slice(0, 3)) < 0.5 * in_si(SensorName.POSITION, SENSORS[SensorName.POSITION].noise)[0]

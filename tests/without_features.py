@@ -1,13 +1,13 @@
-"""Take features away and see the rest pass: `make rooms`.
+"""Take features away and see the rest pass: `make without-features`.
 
 In a copy of the checkout each feature loses its folders, its tests, its pages and its lines in the two lists of
 features, `quadsim/features/entries.py` and `quadsim/__init__.py`.  There `quadsim list` and `quadsim run hover` have to
 work. Without all features, the remaining quick tests are run too; without a single one, all of them are collected,
-which imports them, and those of the architecture are run.  What a test uses of features when it runs, `test_rooms.py`
+which imports them, and those of the architecture are run.  What a test uses of features when it runs, `test_without_features.py`
 holds to `USING`.
 
-    python tests/rooms.py                # each feature by itself, then all at once
-    python tests/rooms.py live campaign  # these two at once, with all quick tests
+    python tests/without_features.py                # each feature by itself, then all at once
+    python tests/without_features.py live campaign  # these two at once, with all quick tests
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ USING: Final = {
     "test_groups.py": EVERY,
     "test_packaging.py": EVERY,
     "test_refusals.py": ("campaign",),
-    "test_rooms.py": EVERY,
+    "test_without_features.py": EVERY,
     "test_snapshots.py": EVERY,
 }
 """Modules of tests that use a feature beside its own, and are left out without it; `EVERY` of what lists all."""
@@ -97,7 +97,17 @@ COMMANDS: Final = (
 )
 """What has to work without any feature."""
 QUICK: Final = (
-    *("pytest", "-q", "-n", "2", "--dist", "loadscope", "-m", "not slow or witness", "--hypothesis-profile=quick"),
+    *(
+        "pytest",
+        "-q",
+        "-n",
+        "2",
+        "--dist",
+        "loadscope",
+        "-m",
+        "not slow or representative",
+        "--hypothesis-profile=quick",
+    ),
 )
 """As `make test`."""
 COLLECTED: Final = ("pytest", "-q", "-n", "0", "-k", "test_architecture")

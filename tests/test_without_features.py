@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-import rooms as taking
+import without_features as taking
 from test_architecture import Import, imports_of, modules
 
 import quadsim
@@ -80,7 +80,7 @@ def used_by(test: Path) -> frozenset[str]:
     features = {
         feature for start, feature in NAMED.items() if any(f"{name}.".startswith(f"{start}.") for name in names)
     }
-    helpers = {path for name in names - {test.stem, "rooms"} if (path := TESTS / f"{name}.py").is_file()}
+    helpers = {path for name in names - {test.stem, "without_features"} if (path := TESTS / f"{name}.py").is_file()}
     return frozenset(features.union({COMMANDS[word] for word in words & {*COMMANDS}}, *map(used_by, helpers)))
 
 
@@ -111,7 +111,7 @@ def test_the_list_of_commands_says_what_the_features_say() -> None:
 
 
 def test_without_any_feature_the_rest_lists_and_flies(tmp_path: Path) -> None:
-    """In a copy; `make rooms` takes each away by itself, and runs the tests too."""
+    """In a copy; `make without-features` takes each away by itself, and runs the tests too."""
     taking.copy_without(FEATURES, tmp_path)
     features = (tmp_path / "quadsim" / "features" / "entries.py").read_text().split("FEATURES")[1].split('"')
     for feature in FEATURES:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-pytestmark = pytest.mark.slow("spine")
+pytestmark = pytest.mark.slow("main path")
 
 WATCHED = """
 import json, os, sys
@@ -51,7 +51,7 @@ def test_a_vehicle_is_loaded_once_and_a_course_is_built_once(calls: Counter[str]
     assert [count for name, count in calls.items() if course.fullmatch(name)] == [1]
 
 
-@pytest.mark.witness("spine")
+@pytest.mark.representative("main path")
 @pytest.mark.parametrize(
     ("code", "most"), [("import quadsim", 0.1), ("import quadsim.commands.cli as c; c.main(['-h'])", 0.3)]
 )
