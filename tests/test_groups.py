@@ -21,7 +21,7 @@ def marked() -> Iterator[tuple[str, str, Path]]:
                     yield mark, group, path
 
 
-def test_every_slow_group_has_a_witness_among_the_quick_tests() -> None:
+def test_every_slow_group_has_a_representative_among_the_quick_tests() -> None:
     marks = {*marked()}
     slow, representatives = (
         {(group, path) for mark, group, path in marks if mark == kind} for kind in ("slow", "representative")

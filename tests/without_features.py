@@ -3,8 +3,8 @@
 In a copy of the checkout each feature loses its folders, its tests, its pages and its lines in the two lists of
 features, `quadsim/features/entries.py` and `quadsim/__init__.py`.  There `quadsim list` and `quadsim run hover` have to
 work. Without all features, the remaining quick tests are run too; without a single one, all of them are collected,
-which imports them, and those of the architecture are run.  What a test uses of features when it runs, `test_without_features.py`
-holds to `USING`.
+which imports them, and those of the architecture are run.  What a test uses of features when it runs,
+`test_without_features.py` holds to `USING`.
 
     python tests/without_features.py                # each feature by itself, then all at once
     python tests/without_features.py live campaign  # these two at once, with all quick tests

@@ -33,9 +33,18 @@ double *start(void)
     return exchange.state;
 }
 
-int horizon(void) { return QUADSIM_HORIZON; }
-int changes(void) { return mpc.work.changes; }
-void reset(void) { quadsim_mpc_reset(&mpc, exchange.acting); }
+int horizon(void)
+{
+    return QUADSIM_HORIZON;
+}
+int changes(void)
+{
+    return mpc.work.changes;
+}
+void reset(void)
+{
+    quadsim_mpc_reset(&mpc, exchange.acting);
+}
 int step(void)
 {
     return (int)quadsim_mpc_step(&mpc, QUADSIM_PHASE_FLYING, exchange.state, exchange.reference, exchange.acting,

@@ -221,13 +221,14 @@ static int lost(const quadsim_track *t)
 /* Whether the same rotor speeds act in two steps, in the same contact with the ground. */
 static int alike(const double *commands, const uint8_t *grounded, int64_t one, int64_t other)
 {
-    return grounded[one] == grounded[other]
-           && !memcmp(commands + ROTORS * one, commands + ROTORS * other, ROTORS * sizeof *commands);
+    return grounded[one] == grounded[other] &&
+           !memcmp(commands + ROTORS * one, commands + ROTORS * other, ROTORS * sizeof *commands);
 }
 
-/* The moment of the air at the mean's velocity, for the rotors' speeds and their sum, and the thrust lost to inflow; the
- * covariance knows nothing of them. */
-static void add_air(const quadsim_filter *f, const quadsim_track *t, const double *speeds, double turning, double *wrench)
+/* The moment of the air at the mean's velocity, for the rotors' speeds and their sum, and the thrust lost to inflow;
+ * the covariance knows nothing of them. */
+static void add_air(const quadsim_filter *f, const quadsim_track *t, const double *speeds, double turning,
+                    double *wrench)
 {
     const double *rate = t->mean + MEAN_RATES;
     double R[3][3], along[3], *torque = wrench + 1;
@@ -249,8 +250,8 @@ static void add_air(const quadsim_filter *f, const quadsim_track *t, const doubl
     }
 }
 
-static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *commands, const uint8_t *grounded, int64_t base,
-                       int64_t step)
+static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *commands, const uint8_t *grounded,
+                       int64_t base, int64_t step)
 {
     while (t->step < step) {
         const int64_t first = t->step - base;
@@ -340,7 +341,8 @@ static int update(const quadsim_filter *f, quadsim_track *t, const quadsim_sampl
             rows[i][j] = t->P[block + i][j] + (biased ? t->P[BIAS + i][j] : 0.0);
         }
         for (int j = 0; j < 3; j++) {
-            S[i][j] = rows[i][block + j] + (biased ? rows[i][BIAS + j] : 0.0) + (i == j ? f->variance[s->kind][i] : 0.0);
+            S[i][j] =
+                rows[i][block + j] + (biased ? rows[i][BIAS + j] : 0.0) + (i == j ? f->variance[s->kind][i] : 0.0);
         }
     }
     invert(S, W);
@@ -402,8 +404,8 @@ static void use(const quadsim_filter *f, quadsim_track *t, const quadsim_sample 
     }
 }
 
-void quadsim_filter_run(const quadsim_filter *f, quadsim_track *t, const quadsim_sample *samples, int64_t count, const double *commands,
-                const uint8_t *grounded, int64_t base, int64_t until)
+void quadsim_filter_run(const quadsim_filter *f, quadsim_track *t, const quadsim_sample *samples, int64_t count,
+                        const double *commands, const uint8_t *grounded, int64_t base, int64_t until)
 {
     for (int64_t k = 0; k < count; k++) {
         const quadsim_sample *s = samples + k;

@@ -1,12 +1,12 @@
-/* The inner loops that fly a command between control instants: the built-in autopilot, and incremental nonlinear dynamic
- * inversion; and the allocation of a wrench to rotor speeds. */
+/* The inner loops that fly a command between control instants: the built-in autopilot, and incremental nonlinear
+ * dynamic inversion; and the allocation of a wrench to rotor speeds. */
 #include "quadsim_plant.h"
 
 #include <string.h>
 
 #include "quadsim_rotation.h"
 
-static const double DAMPING = 0.70710678118654752440; /* of INDI's filter: Butterworth */
+static const double DAMPING = 0.70710678118654752440;        /* of INDI's filter: Butterworth */
 static const double WEIGHT[4] = {30.0, 1000.0, 1000.0, 1.0}; /* of thrust, roll, pitch and yaw in `nearest` */
 
 static double clip(double number, double low, double high) /* what is no number stays so */
@@ -280,8 +280,8 @@ static void invert_dynamics(quadsim_inner *a, double time, const double *rates, 
                 torque += a->effect[1 + i][j] * square_of(a, j, rotors[j]);
             }
             const double missed = torque - gained[i] / step - gyroscopic[i];
-            a->slope[i] = (a->slope[i] + step * (w * w) * (missed - a->filtered[i]))
-                          / (1.0 + 2.0 * DAMPING * w * step + (w * step) * (w * step));
+            a->slope[i] = (a->slope[i] + step * (w * w) * (missed - a->filtered[i])) /
+                          (1.0 + 2.0 * DAMPING * w * step + (w * step) * (w * step));
             a->filtered[i] += step * a->slope[i];
         }
     }

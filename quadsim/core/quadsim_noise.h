@@ -1,4 +1,5 @@
-/* Coloured noise: white noise behind a first-order filter, as turbulence is made of (`quadsim.sim.effects.turbulence`). */
+/* Coloured noise: white noise behind a first-order filter, as turbulence is made of (`quadsim.sim.effects.turbulence`).
+ */
 #ifndef QUADSIM_NOISE_H
 #define QUADSIM_NOISE_H
 

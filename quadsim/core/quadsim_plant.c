@@ -19,7 +19,8 @@ static const double LOWEST_RATIO = 0.5; /* lowest height of a rotor, in radii, a
 /* What a step's rotors give whatever the motion: sums of their speeds, and of speed by place; drag about z, angular
  * momentum, spin-up torque. */
 typedef struct {
-    double thrust[ROTORS], speed[ROTORS], drag, drag_x, drag_y, drag_xy, turning, turning_x, turning_y, momentum, spin_up;
+    double thrust[ROTORS], speed[ROTORS], drag, drag_x, drag_y, drag_xy, turning, turning_x, turning_y, momentum,
+        spin_up;
 } rotor_state;
 
 static double clip(double number, double low, double high) /* what is no number stays so */
@@ -160,7 +161,8 @@ static void add_pushes(const quadsim_vehicle *v, double R[3][3], double *wrench)
     }
 }
 
-static void add_ground_effect(const quadsim_vehicle *v, double R[3][3], double height, const double *thrust, double *wrench)
+static void add_ground_effect(const quadsim_vehicle *v, double R[3][3], double height, const double *thrust,
+                              double *wrench)
 {
     double lift = 0.0;
     for (int i = 0; i < ROTORS; i++) {
@@ -176,7 +178,8 @@ static void add_ground_effect(const quadsim_vehicle *v, double R[3][3], double h
     }
 }
 
-/* What the height of the hubs adds to drag and moment of the rotors, with `along` the velocity of the air along x and y. */
+/* What the height of the hubs adds to drag and moment of the rotors, with `along` the velocity of the air along x and
+ * y. */
 static void add_height(const quadsim_vehicle *v, double R[3][3], const double *along, const double *rate,
                        const double *speed, double *wrench)
 {
@@ -195,9 +198,10 @@ static void add_height(const quadsim_vehicle *v, double R[3][3], const double *a
     }
 }
 
-/* Thrust that rotors lose to the air along their axes, with its torques; `climbing`: the velocity of the air along z. */
-static void add_inflow(const quadsim_vehicle *v, double R[3][3], double climbing, const double *rate, const double *speed,
-                       double *wrench)
+/* Thrust that rotors lose to the air along their axes, with its torques; `climbing`: the velocity of the air along z.
+ */
+static void add_inflow(const quadsim_vehicle *v, double R[3][3], double climbing, const double *rate,
+                       const double *speed, double *wrench)
 {
     double lost = 0.0;
     for (int i = 0; i < ROTORS; i++) {
@@ -333,8 +337,8 @@ static void derive(const quadsim_vehicle *v, const double *x, const rotor_state 
     }
 }
 
-static void step_runge_kutta(quadsim_vehicle *v, const rotor_state *rotors, const double *wind, const double *disturbance,
-                             double *wrench)
+static void step_runge_kutta(quadsim_vehicle *v, const rotor_state *rotors, const double *wind,
+                             const double *disturbance, double *wrench)
 {
     static const double PART[4] = {0.0, 0.5, 0.5, 1.0}, ZERO[WRENCH] = {0.0};
     const double h = v->timestep, *held = disturbance ? disturbance : ZERO;

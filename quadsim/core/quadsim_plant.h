@@ -1,10 +1,10 @@
 /* What happens at the physics rate: rotors, battery, forces, inner loop and sensors around MuJoCo's step or an own
  * Runge-Kutta step, and the error-state filter over the samples of a control period.
  *
- * All memory is the caller's, and every draw of a random number comes in from outside.  SI units; world and body frames,
- * quaternions wxyz, body to world, and a motion of 13 numbers (position, quaternion, velocity, body rates) as MuJoCo has
- * them.  A step depends on the state at its start alone, so that results have the same bits however time is cut into
- * calls.  Equations and sources: `quadsim.sim.effects`, `quadsim.sim.autopilot`, `quadsim.sim.estimator`. */
+ * All memory is the caller's, and every draw of a random number comes in from outside.  SI units; world and body
+ * frames, quaternions wxyz, body to world, and a motion of 13 numbers (position, quaternion, velocity, body rates) as
+ * MuJoCo has them.  A step depends on the state at its start alone, so that results have the same bits however time is
+ * cut into calls.  Equations and sources: `quadsim.sim.effects`, `quadsim.sim.autopilot`, `quadsim.sim.estimator`. */
 #ifndef QUADSIM_PLANT_H
 #define QUADSIM_PLANT_H
 
@@ -47,15 +47,15 @@ typedef struct quadsim_vehicle {
 
     /* constants */
     double mass, gravity, inertia[3], products[3], inverse[3][3], torque_of_thrust[3][ROTORS]; /* of the own method */
-    double linear, coefficient[ROTORS]; /* of a rotor's thrust: linear w + coefficient w^2 */
+    double linear, coefficient[ROTORS];          /* of a rotor's thrust: linear w + coefficient w^2 */
     double hover, demand[ROTORS], linear_demand; /* of power, at hover speed, over the mean rotor's in hover */
     double slowest, fastest, place[ROTORS][3], spin[ROTORS];
     double rotor_drag, rotor_inertia, rotor_moment[2], inflow_moment[2], rate_damping[3], linear_drag[3];
     double quadratic_drag[3], inflow;
-    double floor, disc, radius;      /* of the ground effect; radius 0: none */
+    double floor, disc, radius;              /* of the ground effect; radius 0: none */
     double loss, deviation, largest[ROTORS]; /* of thrust noise; largest 0: none */
     double cells, capacity, resistance, hover_current, idle_current, reference_voltage, exponent; /* cells 0: none */
-    const double *curve;             /* [points][2] charge and voltage of a cell */
+    const double *curve; /* [points][2] charge and voltage of a cell */
     int64_t points;
     int64_t follows_motion; /* 0: no force but the rotors' */
 
@@ -124,15 +124,15 @@ int64_t quadsim_fly(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *se
 void quadsim_trap(const char *message);
 const char *quadsim_complaint(void);
 
-/* MuJoCo's states [count][14], `width` numbers a row, as the paper's [count][12]: Euler angles, body to world, and their
- * rates; the yaw unwrapped along the rows, as by `quadsim.state.YawTurns`, from the turn nearest to `yaw`. */
+/* MuJoCo's states [count][14], `width` numbers a row, as the paper's [count][12]: Euler angles, body to world, and
+ * their rates; the yaw unwrapped along the rows, as by `quadsim.state.YawTurns`, from the turn nearest to `yaw`. */
 void quadsim_states(const double *physics, int64_t count, int64_t width, double yaw, double *states);
 
 /* One of them, from MuJoCo's [14], on the turn of the yaw nearest the last one, or upright the last upright one. */
 void quadsim_observe(const double *physics, double *last, double *upright, double *state);
 
-/* Its parts: the turn of the yaw of Euler angles [3], which stays where one is not finite; rates of Euler angles [3] from
- * body rates [3]. */
+/* Its parts: the turn of the yaw of Euler angles [3], which stays where one is not finite; rates of Euler angles [3]
+ * from body rates [3]. */
 void quadsim_turn(const double *euler, double *last, double *upright);
 void quadsim_euler_rates(const double *euler, const double *rate, double *rates);
 
@@ -152,9 +152,9 @@ void quadsim_allocate(const quadsim_inner *loop, const double *wrench, double *s
 typedef struct quadsim_filter {
     double timestep, mass, gravity, inertia[3], products[3], inverse[3][3], allocation[4][ROTORS];
     double rotor_moment[2], inflow_moment[2], rate_damping[3], inflow;
-    double density[5]; /* of white noise on the five blocks of the error */
+    double density[5];                                            /* of white noise on the five blocks of the error */
     double variance[SENSORS][3], initial[ERRORS], gate, patience; /* patience in steps */
-    int64_t stride;    /* longest prediction, in steps */
+    int64_t stride;                                               /* longest prediction, in steps */
 } quadsim_filter;
 
 /* The filter at a step. */

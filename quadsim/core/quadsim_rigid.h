@@ -1,5 +1,6 @@
-/* The rigid body that plant, filter and laws share.  `real`, a type, and R(), which makes a constant of it, are those of
- * the file that includes this.  Quaternions q are wxyz, body to world; body rates w; rotations turn[3][3], body to world. */
+/* The rigid body that plant, filter and laws share.  `real`, a type, and R(), which makes a constant of it, are those
+ * of the file that includes this.  Quaternions q are wxyz, body to world; body rates w; rotations turn[3][3], body to
+ * world. */
 #ifndef QUADSIM_RIGID_H
 #define QUADSIM_RIGID_H
 
@@ -12,8 +13,8 @@ static inline void quaternion_rate(const real *q, const real *w, real *rate)
     rate[3] = R(0.5) * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0]);
 }
 
-/* Add what body rates do to each other, -w x J w, where J is diagonal: coupling is (Jyy - Jzz), (Jzz - Jxx), (Jxx - Jyy),
- * or these over Jxx, Jyy, Jzz. */
+/* Add what body rates do to each other, -w x J w, where J is diagonal: coupling is (Jyy - Jzz), (Jzz - Jxx), (Jxx -
+ * Jyy), or these over Jxx, Jyy, Jzz. */
 static inline void add_gyroscopic(const real *coupling, const real *w, real *turned)
 {
     turned[0] += coupling[0] * w[1] * w[2];

@@ -1,5 +1,5 @@
-/* Many vehicles under hostile commands, flown by several threads, each beside a copy that flies alone: the same bits, and
- * what ends one flight ends no other.  Arguments: threads, physics steps in all. */
+/* Many vehicles under hostile commands, flown by several threads, each beside a copy that flies alone: the same bits,
+ * and what ends one flight ends no other.  Arguments: threads, physics steps in all. */
 #include <math.h>
 #include <pthread.h>
 #include <stdint.h>

@@ -1,5 +1,5 @@
-/* What the start-up code promises: initialised data, a clock that counts instructions, a serial line, and an exit status
- * of 3 for any fault.  Each byte that comes is a test. */
+/* What the start-up code promises: initialised data, a clock that counts instructions, a serial line, and an exit
+ * status of 3 for any fault.  Each byte that comes is a test. */
 #include "target.h"
 
 static volatile double initialised = 2.0;

@@ -1,5 +1,6 @@
-/* Steps of a controller from arbitrary bytes, for libFuzzer: for any input, command and plan are finite and within every
- * bound, the status and the fallback level belong together, and the active set changes no more often than it may. */
+/* Steps of a controller from arbitrary bytes, for libFuzzer: for any input, command and plan are finite and within
+ * every bound, the status and the fallback level belong together, and the active set changes no more often than it may.
+ */
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -90,7 +91,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         for (j = 0; j < 4; j++) {
             acting[j] = command[j];
             if ((manners & 64) == 0) {
-                acting[j] = take(&data, &size, (manners >> 4) & 3, fallback->hover[j], fallback->targets ? R(5.0) : R(80.0));
+                acting[j] =
+                    take(&data, &size, (manners >> 4) & 3, fallback->hover[j], fallback->targets ? R(5.0) : R(80.0));
             }
         }
         if ((manners & 128) != 0) {
@@ -102,7 +104,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         steps++;
         require(status >= QUADSIM_FREE && status <= QUADSIM_COMMANDED && status != QUADSIM_MISSED, "a status");
         require((status == QUADSIM_LANDED) == (phase == QUADSIM_PHASE_LANDED), "rotors that stop on the ground alone");
-        require((quadsim_is_flown(status) || status == QUADSIM_LANDED) == (law->guard.level == 0), "a level without optimum");
+        require((quadsim_is_flown(status) || status == QUADSIM_LANDED) == (law->guard.level == 0),
+                "a level without optimum");
         require(law->guard.level >= 0 && law->guard.level <= 3, "a level");
         require(is_finite(law->guard.state, 12), "a state");
         require(is_finite(command, 4), "a finite command");

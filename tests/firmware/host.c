@@ -31,8 +31,8 @@ void host_reset(host *at, const double *before)
     quadsim_law_reset(&at->law, start);
 }
 
-/* Inputs: state, acting [4], phase, reference.  Answered: status, fallback, changes, command [4], the law's plan [N][4],
- * the guard's plan [N][4]. */
+/* Inputs: state, acting [4], phase, reference.  Answered: status, fallback, changes, command [4], the law's plan
+ * [N][4], the guard's plan [N][4]. */
 void host_step(host *at, const double *inputs, double *answers)
 {
     quadsim_real state[QUADSIM_STATE], acting[4], reference[QUADSIM_ROWS * QUADSIM_ROW], command[4];

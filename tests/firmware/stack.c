@@ -24,8 +24,8 @@ int main(void)
     for (k = 0; k < quadsim_vectors_count; k++) {
         quadsim_real command[4];
         const struct quadsim_vector *recorded = &quadsim_vectors[k];
-        (void)quadsim_law_step(&law, QUADSIM_PHASE_FLYING, recorded->state, quadsim_vectors_path[k],
-                               recorded->acting, command);
+        (void)quadsim_law_step(&law, QUADSIM_PHASE_FLYING, recorded->state, quadsim_vectors_path[k], recorded->acting,
+                               command);
     }
     while (bottom[untouched] == PAINT) {
         untouched++;

@@ -10,8 +10,8 @@ static const real *left_after(const quadsim_nmpc_problem *body)
 }
 
 /* Shares some steps after, under a command. */
-static void move_actuators(const quadsim_delay_numbers *n, const quadsim_nmpc_problem *body, int steps, const real *command,
-                           real *rotors)
+static void move_actuators(const quadsim_delay_numbers *n, const quadsim_nmpc_problem *body, int steps,
+                           const real *command, real *rotors)
 {
     const real *left = left_after(body);
     real shares[NU];
@@ -27,8 +27,8 @@ static void move_actuators(const quadsim_delay_numbers *n, const quadsim_nmpc_pr
 }
 
 /* A state's next one after a step of a body under a command. */
-static void move_state(const quadsim_delay_numbers *n, const quadsim_nmpc_problem *body, const quadsim_nmpc_world *world,
-                       const real *command, real *state)
+static void move_state(const quadsim_delay_numbers *n, const quadsim_nmpc_problem *body,
+                       const quadsim_nmpc_world *world, const real *command, real *state)
 {
     real shares[NU], next[MOST];
     commands_to_shares(body, n->coefficient, n->scale, command, shares);
@@ -47,7 +47,8 @@ void quadsim_delay_reset(quadsim_delay *delay, const quadsim_delay_numbers *n, c
     memcpy(delay->rotors_before, delay->rotors, sizeof(delay->rotors));
 }
 
-void quadsim_delay_send(quadsim_delay *delay, const quadsim_delay_numbers *n, int periods, const quadsim_real command[4])
+void quadsim_delay_send(quadsim_delay *delay, const quadsim_delay_numbers *n, int periods,
+                        const quadsim_real command[4])
 {
     memcpy(delay->before, delay->sent[0], sizeof(delay->before));
     memmove(delay->sent[0], delay->sent[1], (size_t)n->under_way * sizeof(delay->sent[0]));
@@ -102,7 +103,8 @@ void quadsim_delay_sample(const quadsim_delay_numbers *n, quadsim_real period, c
         sample[i] = now[i] + s * (next[i] - now[i]);
     }
     for (i = 0; i < 3; i++) {
-        const real leaving = (s - R(2.0) * square + square * s) * now[V + i], arriving = (square * s - square) * next[V + i];
+        const real leaving = (s - R(2.0) * square + square * s) * now[V + i],
+                   arriving = (square * s - square) * next[V + i];
         sample[P + i] = now[P + i] + end * (next[P + i] - now[P + i]) + period * (leaving + arriving);
     }
     for (i = 0; i < 4; i++) {

@@ -157,7 +157,8 @@ static void head_for(real yaw, const target_now *target, jet heading)
 
 /* ---- the attitude of a force and a heading ----------------------------------------------------------------------- */
 
-void quadsim_geometric_limit(const quadsim_real force[3], quadsim_real least, quadsim_real slope, quadsim_real limited[3])
+void quadsim_geometric_limit(const quadsim_real force[3], quadsim_real least, quadsim_real slope,
+                             quadsim_real limited[3])
 {
     const real upward = force[2] > least ? force[2] : least, allowed = upward * slope;
     const real horizontal = square_root(force[0] * force[0] + force[1] * force[1]);
@@ -485,8 +486,8 @@ void quadsim_geometric_integrate(quadsim_geometric *law, const motion_now *motio
 
 /* The disturbance in the middle of the period for which this command acts, and the thrust scale; none until the vehicle
  * flies. */
-static void estimate_disturbance(quadsim_geometric *law, int flying, int follows, const motion_now *motion, const real *acting,
-                    disturbance_now *d)
+static void estimate_disturbance(quadsim_geometric *law, int flying, int follows, const motion_now *motion,
+                                 const real *acting, disturbance_now *d)
 {
     const numbers_of_law *n = law->numbers;
     memset(d, 0, sizeof(*d));
@@ -499,8 +500,8 @@ static void estimate_disturbance(quadsim_geometric *law, int flying, int follows
         return;
     }
     quadsim_ramp_update(&law->ramp, n->ramp, follows, motion->velocity, motion->attitude, motion->rates, acting);
-    quadsim_ramp_foreseen(&law->ramp, n->ramp, R(0.5) * n->period + (n->delay == NULL ? R(0.0) : n->delay->delay), d->force,
-                          d->change, d->torque);
+    quadsim_ramp_foreseen(&law->ramp, n->ramp, R(0.5) * n->period + (n->delay == NULL ? R(0.0) : n->delay->delay),
+                          d->force, d->change, d->torque);
     law->thrust_scale = quadsim_ramp_scale(&law->ramp, n->ramp);
 }
 
@@ -622,7 +623,8 @@ void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, qu
     }
 }
 
-/* ---- with the fallback contract ------------------------------------------------------------------------------------ */
+/* ---- with the fallback contract ------------------------------------------------------------------------------------
+ */
 
 /* The law's answer to the guard's state, as law->plan. */
 static void plan_commands(quadsim_geometric *law, int flying, const real *measured, const real *reference)
@@ -633,7 +635,8 @@ static void plan_commands(quadsim_geometric *law, int flying, const real *measur
     const int turned = quadsim_guard_turned(guard);
     const int turning = unseen[ROLL + 1] == 0 && unseen[PITCH + 1] == 0 && unseen[YAW + 1] == 0;
     const real *attitude = n->exact && turned && is_finite(measured + 12, 4) ? measured + 12 : NULL;
-    const real *rates = n->exact && quadsim_guard_has_rates(guard) && is_finite(measured + 16, 3) ? measured + 16 : NULL;
+    const real *rates =
+        n->exact && quadsim_guard_has_rates(guard) && is_finite(measured + 16, 3) ? measured + 16 : NULL;
     motion_now motion;
     target_now target;
     const int moved = unseen[VX] == 0 && unseen[VY] == 0 && unseen[VZ] == 0;
@@ -654,9 +657,8 @@ static void plan_commands(quadsim_geometric *law, int flying, const real *measur
 }
 
 enum quadsim_status quadsim_geometric_step(quadsim_geometric *law, enum quadsim_phase phase,
-                                           const quadsim_real state[QUADSIM_MEASURED],
-                                           const quadsim_real *reference, const quadsim_real acting[4],
-                                           quadsim_real command[4])
+                                           const quadsim_real state[QUADSIM_MEASURED], const quadsim_real *reference,
+                                           const quadsim_real acting[4], quadsim_real command[4])
 {
     const numbers_of_law *n = law->numbers;
     const int count = n->motion ? QUADSIM_GEOMETRIC_SAMPLES * QUADSIM_MOTION : n->horizon * 4;

@@ -1,26 +1,27 @@
 /* The fallback contract around a law: what is flown when it has no usable answer, and the state that it is given.
  *
- * Each period flies the first of these that there is: the law's optimum; the last one's plan, shifted, with a correction
- * towards the states that it foresaw; level hover; descent.
+ * Each period flies the first of these that there is: the law's optimum; the last one's plan, shifted, with a
+ * correction towards the states that it foresaw; level hover; descent.
  *
- * Completion.  A channel is missing if it is not finite, implausibly large, or frozen, and is replaced by its conditional
- * mean.  The hover model, about the equilibrium (x_s, u_s) and in axes turned by the yaw, predicts the state under the
- * command in force; a Kalman filter corrects it, channel by channel, with those that are measured (Simon, "Optimal State
- * Estimation", 2006, Secs. 5.1 and 6.1):
+ * Completion.  A channel is missing if it is not finite, implausibly large, or frozen, and is replaced by its
+ * conditional mean.  The hover model, about the equilibrium (x_s, u_s) and in axes turned by the yaw, predicts the
+ * state under the command in force; a Kalman filter corrects it, channel by channel, with those that are measured
+ * (Simon, "Optimal State Estimation", 2006, Secs. 5.1 and 6.1):
  *
  *     x = x_s + A (x - x_s) + B (u - u_s)    P = A P A' + Q
  *     x = x + P_i (y_i - x_i) / (P_ii + r_i)    P = P - P_i P_i' / (P_ii + r_i)    for each measured channel i
  *
- * Measured channels pass unchanged.  A group of three is frozen if it repeats the last period's numbers bit by bit though
- * the prediction has moved away from them: a sensor slower than the controller repeats its numbers between samples.
+ * Measured channels pass unchanged.  A group of three is frozen if it repeats the last period's numbers bit by bit
+ * though the prediction has moved away from them: a sensor slower than the controller repeats its numbers between
+ * samples.
  *
  * Level hover is the LQR of the hover model in axes turned by the yaw, from errors e to accelerations along z and about
  * x, y, z, which S maps from changes of commands:
  *
  *     u = u_s - S^-1 K e    roll and pitch demanded by horizontal errors: -(k_p e_p + k_v e_v) / k_tilt
  *
- * The demanded tilt, that at rest included, is bounded: the law is exactly the LQR within the bound, and demands no more
- * tilt beyond.  Numbers: quadsim/mpc/guard/numbers.py of quadsim. */
+ * The demanded tilt, that at rest included, is bounded: the law is exactly the LQR within the bound, and demands no
+ * more tilt beyond.  Numbers: quadsim/mpc/guard/numbers.py of quadsim. */
 #include "quadsim_guard.h"
 
 #include <string.h>
@@ -86,8 +87,8 @@ static void predict_about(const quadsim_fallback *f, const real heading[2], cons
 }
 
 /* A state a period later under a command, by the model about where the vehicle rests. */
-static void predict_state(const quadsim_fallback *f, const quadsim_trim *trim, const real heading[2], const real *command,
-                    real *state)
+static void predict_state(const quadsim_fallback *f, const quadsim_trim *trim, const real heading[2],
+                          const real *command, real *state)
 {
     real effect[NU], level[2], lift = R(0.0);
     int j;
@@ -403,7 +404,8 @@ static int hover(quadsim_guard *g, const quadsim_trim *trim, real *command)
     return sinking ? 3 : 2;
 }
 
-/* The closed loop of level hover, or of the descent, by the model turned by the yaw now, from the period's command on. */
+/* The closed loop of level hover, or of the descent, by the model turned by the yaw now, from the period's command on.
+ */
 static void plan_hover(const quadsim_guard *g, real *plan)
 {
     const quadsim_fallback *f = g->numbers;
@@ -479,7 +481,8 @@ enum quadsim_status quadsim_guard_begin(quadsim_guard *guard, enum quadsim_phase
 {
     const quadsim_fallback *f = guard->numbers;
     int i, oldest = 0, moving = 1;
-    memcpy(guard->in_force, is_within(acting, f->largest_command, NU) ? acting : guard->before, sizeof(guard->in_force));
+    memcpy(guard->in_force, is_within(acting, f->largest_command, NU) ? acting : guard->before,
+           sizeof(guard->in_force));
     complete_state(guard, trim, state, phase == QUADSIM_PHASE_FLYING);
     count_up(&guard->waiting);
     for (i = 0; i < 12; i++) {
@@ -505,7 +508,8 @@ enum quadsim_status quadsim_guard_begin(quadsim_guard *guard, enum quadsim_phase
     return QUADSIM_FREE;
 }
 
-enum quadsim_status quadsim_guard_check(const quadsim_guard *guard, enum quadsim_status status, const quadsim_real *plan)
+enum quadsim_status quadsim_guard_check(const quadsim_guard *guard, enum quadsim_status status,
+                                        const quadsim_real *plan)
 {
     real flown[NU];
     int i;

@@ -149,12 +149,11 @@ static inline void sin_cos(real angle, real *sine, real *cosine)
 /* atan of a number that is not negative [rad]. */
 static inline real arc_tangent(real tangent)
 {
-    static const real SERIES[11] = {R(3.33333333333329318027e-01),  R(-1.99999999998764832476e-01),
-                                    R(1.42857142725034663711e-01),  R(-1.11111104054623557880e-01),
-                                    R(9.09088713343650656196e-02),  R(-7.69187620504482999495e-02),
-                                    R(6.66107313738753120669e-02),  R(-5.83357013379057348645e-02),
-                                    R(4.97687799461593236017e-02),  R(-3.65315727442169155270e-02),
-                                    R(1.62858201153657823623e-02)};
+    static const real SERIES[11] = {
+        R(3.33333333333329318027e-01),  R(-1.99999999998764832476e-01), R(1.42857142725034663711e-01),
+        R(-1.11111104054623557880e-01), R(9.09088713343650656196e-02),  R(-7.69187620504482999495e-02),
+        R(6.66107313738753120669e-02),  R(-5.83357013379057348645e-02), R(4.97687799461593236017e-02),
+        R(-3.65315727442169155270e-02), R(1.62858201153657823623e-02)};
     real base = R(0.0), x = tangent, square, sum = SERIES[10];
     int i;
     if (tangent > R(2.4375)) {
@@ -214,7 +213,8 @@ static inline real square_root(real number)
     return factor * root;
 }
 
-/* ---- vectors (3,) and matrices [3][3], row by row; results lie apart from what they are of ------------------------ */
+/* ---- vectors (3,) and matrices [3][3], row by row; results lie apart from what they are of ------------------------
+ */
 
 static inline void cross_product(const real *left, const real *right, real *result)
 {
@@ -276,8 +276,8 @@ static inline void air_moment(const real *across, const real *inflow, const real
 /* What the air does with so much speed of the rotors in all, at a velocity and rates along the body's axes, as angular
  * acceleration: by maps [3][2] of the velocity across the rotors, per speed and per velocity along z, and [3][3] of the
  * rates. */
-static inline void turn_by_air(const real *moment, const real *inflow, const real *damping, real speed, const real *along,
-                               const real *rates, real turned[3])
+static inline void turn_by_air(const real *moment, const real *inflow, const real *damping, real speed,
+                               const real *along, const real *rates, real turned[3])
 {
     int i;
     for (i = 0; i < 3; i++) {
@@ -341,7 +341,8 @@ static inline void lean_of(const real lift[3], real sine, real cosine, real *rol
     *pitch = angle_of(forward, lift[2]);
 }
 
-/* ---- a constant disturbance: force along three axes, torque about three --------------------------------------------- */
+/* ---- a constant disturbance: force along three axes, torque about three ---------------------------------------------
+ */
 
 /* Steady-state Kalman filters of six scalar disturbances, d += L (v - v expected), each within its limit. */
 static inline void update_disturbance(const real gain[6], const real largest[6], const real surprise[6],
@@ -362,7 +363,8 @@ static inline void put_disturbance(const real largest[6], const real given[6], r
     }
 }
 
-/* ---- references: rows x y z yaw ----------------------------------------------------------------------------------- */
+/* ---- references: rows x y z yaw -----------------------------------------------------------------------------------
+ */
 
 /* Turns to be taken off the reference's heading in the next period, so that it starts near a yaw: as it went on
  * before, and from the yaw anew only where that is more than 190 deg away. */

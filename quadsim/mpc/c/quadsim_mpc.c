@@ -1,8 +1,8 @@
 /* The query of a linear law, and its optimum.
  *
  * The robust law predicts the vehicle from t_k to the instant t_k + d from which its command acts, through the commands
- * u(k-1-n) .. u(k-1) that act before.  With Z-Y-X Euler angles eta, body rates omega = E(eta) d(eta)/dt and rotor speeds
- * that follow commands as tau_r dw/dt = u - w,
+ * u(k-1-n) .. u(k-1) that act before.  With Z-Y-X Euler angles eta, body rates omega = E(eta) d(eta)/dt and rotor
+ * speeds that follow commands as tau_r dw/dt = u - w,
  *
  *     d2(p)/dt2 = U / m R(eta) e_z - g e_z + a,
  *     d(omega)/dt = I^-1 (tau - omega x I omega) + (U / m) twist,
@@ -16,8 +16,8 @@
  *
  *     x(k+1) = x_s + A (x(k) - x_s) + B (u(k) - u_s),
  *
- * and u_s is the target of the inputs: a loop that settles with no bound active has no steady error, whatever the errors
- * of A and B.  With the air's moment, u_s balances what it does at x(k) beyond A.
+ * and u_s is the target of the inputs: a loop that settles with no bound active has no steady error, whatever the
+ * errors of A and B.  With the air's moment, u_s balances what it does at x(k) beyond A.
  *
  * Where an inner loop turns the vehicle, U is commanded, and omega is known at every instant from its targets
  * (quadsim/mpc/problem/rigidbody.py): omega = a omega(0) + (1 - a - b) omega_c.  There is no twist then. */
@@ -308,8 +308,8 @@ static void update_trim(quadsim_mpc *mpc)
     }
 }
 
-/* What the air does at a state and the rotors' speeds there beyond what the hover matrices have of it: U/m, I^-1 tau.  They
- * have it at hover speeds, of level velocities in their axes and of rates of Euler angles. */
+/* What the air does at a state and the rotors' speeds there beyond what the hover matrices have of it: U/m, I^-1 tau.
+ * They have it at hover speeds, of level velocities in their axes and of rates of Euler angles. */
 static void air_beyond_hover(const quadsim_mpc *mpc, const real *state, real beyond[NU])
 {
     static const real ONES[NU] = {R(1.0), R(1.0), R(1.0), R(1.0)};
@@ -332,8 +332,8 @@ static void air_beyond_hover(const quadsim_mpc *mpc, const real *state, real bey
     }
 }
 
-/* u_s: speeds at rest that also balance what is so now and the hover matrices omit: the torque caused by thrust as it is,
- * and what the air does at a state `ahead`, unless it is NULL. */
+/* u_s: speeds at rest that also balance what is so now and the hover matrices omit: the torque caused by thrust as it
+ * is, and what the air does at a state `ahead`, unless it is NULL. */
 static void update_resting(quadsim_mpc *mpc, const real *ahead)
 {
     const quadsim_robust *r = mpc->controller->robust;
@@ -515,8 +515,8 @@ static void note_sent(quadsim_mpc *mpc, const real *acting)
 }
 
 /* Let the rotors follow their commands up to the instant from which this period's acts.  From a state (12,), NULL where
- * none is usable, predict the one there, `ahead`, and let the observer compare it with the one expected; returns whether
- * there is one. */
+ * none is usable, predict the one there, `ahead`, and let the observer compare it with the one expected; returns
+ * whether there is one. */
 static int predict_ahead(quadsim_mpc *mpc, const real *state, int learns, real ahead[12])
 {
     const quadsim_robust *r = mpc->controller->robust;

@@ -1,7 +1,7 @@
 /* Sequential quadratic programming: the reference, the start, steps and what is kept of them. */
 #include "quadsim_nmpc_qp.h"
 
-static const real SHORTEST = R(0.1);  /* share of a step that Aitken's relaxation takes */
+static const real SHORTEST = R(0.1); /* share of a step that Aitken's relaxation takes */
 enum { ROW_INTS = sizeof(quadsim_nmpc_row) / sizeof(int) };
 enum { PATIENCE = 8 }; /* steps without a new shortest one after which the largest share of a step is halved */
 
@@ -222,8 +222,8 @@ static real cost_of(const quadsim_nmpc_work *work)
     return sum;
 }
 
-/* Inputs by which a geometric law follows the reference, and the states to which they lead: the thrust axis turns to the
- * acceleration that a damped oscillator about the reference asks for. */
+/* Inputs by which a geometric law follows the reference, and the states to which they lead: the thrust axis turns to
+ * the acceleration that a damped oscillator about the reference asks for. */
 static void steer(quadsim_nmpc_work *work, const quadsim_nmpc_world *world)
 {
     const quadsim_nmpc_problem *p = work->p;

@@ -3,12 +3,12 @@
  * Each step linearises the rigid body along the stored plan, solves the quadratic program exactly, and keeps the new
  * plan.  All sizes and numbers of a vehicle are data: a quadsim_nmpc_problem, read only, which may be shared; what is
  * remembered is in a quadsim_nmpc_work and memory of the caller's, of quadsim_nmpc_reals(problem) reals and
- * quadsim_nmpc_ints(problem) ints.  Nothing is allocated, nothing is shared, there is no recursion, and of the C library
- * only memcpy, memmove and memset.
+ * quadsim_nmpc_ints(problem) ints.  Nothing is allocated, nothing is shared, there is no recursion, and of the C
+ * library only memcpy, memmove and memset.
  *
  * States s: position [3], quaternion [4], velocity [3], body rates [3], actuators [0, 1 or 4], and, where moves have a
- * weight, the input before [4]; the quaternion is q_r* q inside the program, with the node's reference q_r, and q itself
- * in plans.  Inputs u [4] are shares. */
+ * weight, the input before [4]; the quaternion is q_r* q inside the program, with the node's reference q_r, and q
+ * itself in plans.  Inputs u [4] are shares. */
 #ifndef QUADSIM_NMPC_H
 #define QUADSIM_NMPC_H
 
@@ -27,7 +27,7 @@ enum {
     QUADSIM_NMPC_MOST = QUADSIM_NMPC_BODY + 8, /* states */
     QUADSIM_NMPC_SIDES = 12,                   /* of the polygon that bounds the tilt */
     QUADSIM_NMPC_LEFT = 8,                     /* columns of `left` */
-    QUADSIM_NMPC_ENTRIES = 15                  /* bounded quantities of a node: inputs, tilt, rates, position, velocity */
+    QUADSIM_NMPC_ENTRIES = 15 /* bounded quantities of a node: inputs, tilt, rates, position, velocity */
 };
 
 /* Numbers of a vehicle and its controller.
@@ -41,45 +41,46 @@ typedef struct quadsim_nmpc_term {
 } quadsim_nmpc_term;
 
 typedef struct quadsim_nmpc_problem {
-    int horizon;                /* N nodes */
-    int actuators;              /* states of actuators: none, 1 with targets, 4 with rotor lag */
-    int targets;                /* whether inputs are thrust and body rates, not those of rotors */
-    int speeds;                 /* whether inputs are rotor speeds, not thrusts */
-    int moments;                /* whether the air turns the body; not with targets */
-    int substeps;               /* Runge-Kutta steps from node to node */
-    int difference;             /* whether the attitude error is q - q_r, not 2 vec(q_r* q) */
-    int shifts;                 /* whether the plan moves on by a node from call to call */
-    int moves;                  /* whether steps of inputs have a weight */
-    int tilts, turns, places;   /* which entries there are */
-    int rows;                   /* that the caller states, per node */
-    int bound_nodes;            /* nodes whose bounds are stated; those of the last hold in all that follow */
-    int faces;                  /* at most so many half-spaces of positions, per node */
-    int slacks;                 /* of a node: of tilt, body rates and half-spaces, then those of rows */
-    int room;                   /* active rows that there is room for */
-    int changes;                /* of the active set in a search, after which it is given up */
-    int iterations, corrections; /* most SQP steps of a call; further ones, if the plan misses the dynamics by too much */
-    quadsim_real tolerance;     /* change of a state or input at which further steps end */
-    quadsim_real converged;     /* largest defect of a plan that has converged */
+    int horizon;              /* N nodes */
+    int actuators;            /* states of actuators: none, 1 with targets, 4 with rotor lag */
+    int targets;              /* whether inputs are thrust and body rates, not those of rotors */
+    int speeds;               /* whether inputs are rotor speeds, not thrusts */
+    int moments;              /* whether the air turns the body; not with targets */
+    int substeps;             /* Runge-Kutta steps from node to node */
+    int difference;           /* whether the attitude error is q - q_r, not 2 vec(q_r* q) */
+    int shifts;               /* whether the plan moves on by a node from call to call */
+    int moves;                /* whether steps of inputs have a weight */
+    int tilts, turns, places; /* which entries there are */
+    int rows;                 /* that the caller states, per node */
+    int bound_nodes;          /* nodes whose bounds are stated; those of the last hold in all that follow */
+    int faces;                /* at most so many half-spaces of positions, per node */
+    int slacks;               /* of a node: of tilt, body rates and half-spaces, then those of rows */
+    int room;                 /* active rows that there is room for */
+    int changes;              /* of the active set in a search, after which it is given up */
+    int iterations,
+        corrections;        /* most SQP steps of a call; further ones, if the plan misses the dynamics by too much */
+    quadsim_real tolerance; /* change of a state or input at which further steps end */
+    quadsim_real converged; /* largest defect of a plan that has converged */
     quadsim_real step, gravity; /* time between nodes [s], [m/s^2] */
     quadsim_real largest;       /* thrust that is a share of 1 [N]: of a rotor, or with targets the weight */
-    quadsim_real effect[16];    /* maps shares to T [m/s^2] and I^-1 tau; with targets its diagonal to T and body rates */
-    quadsim_real gyration[3];   /* (Iyy - Izz) / Ixx, ... */
+    quadsim_real effect[16];  /* maps shares to T [m/s^2] and I^-1 tau; with targets its diagonal to T and body rates */
+    quadsim_real gyration[3]; /* (Iyy - Izz) / Ixx, ... */
     quadsim_real moment[6], inflow[6], damping[9]; /* I^-1 torque: [3][2] of velocity along body x and y, per sum of the
-                                         * rotors' speeds as shares, and per velocity along z, and [3][3] of body rates,
-                                         * which it opposes */
-    quadsim_real loss;          /* T per sum of the rotors' speeds as shares and velocity along z, which it opposes */
-    quadsim_real lead[4];       /* targets: time constants over the step, for the reference, */
-    quadsim_real hold[4];       /* and what a step's mean takes of them: 1, above it where an attitude is commanded */
-    const quadsim_real *left;   /* [2 substeps + 1][QUADSIM_NMPC_LEFT] after each half substep: what is left of a distance
-                                 * from the input [4]; of an attitude's targets, what the turn so far takes of them [4] */
+                                                    * rotors' speeds as shares, and per velocity along z, and [3][3] of
+                                                    * body rates, which it opposes */
+    quadsim_real loss;        /* T per sum of the rotors' speeds as shares and velocity along z, which it opposes */
+    quadsim_real lead[4];     /* targets: time constants over the step, for the reference, */
+    quadsim_real hold[4];     /* and what a step's mean takes of them: 1, above it where an attitude is commanded */
+    const quadsim_real *left; /* [2 substeps + 1][QUADSIM_NMPC_LEFT] after each half substep: what is left of a distance
+                               * from the input [4]; of an attitude's targets, what the turn so far takes of them [4] */
     quadsim_real weight[QUADSIM_NMPC_MOST], effort[QUADSIM_INPUTS], move; /* diagonals of Q and R; of steps of inputs */
     const quadsim_real *terminal;                                         /* [n][n], symmetric */
     quadsim_real lower[QUADSIM_INPUTS], upper[QUADSIM_INPUTS];
-    quadsim_real tilt, turn[3];           /* of the thrust axis along a side of the polygon, [rad/s] */
-    const quadsim_nmpc_term *terms;       /* of all rows */
-    const int *first;                     /* [rows + 1] the first term of each row */
-    const quadsim_real *bounds;           /* [bound_nodes][rows] upper ones; 1e30: none */
-    const int *slack;                     /* [rows] which slack a row has; -1: it is hard */
+    quadsim_real tilt, turn[3];             /* of the thrust axis along a side of the polygon, [rad/s] */
+    const quadsim_nmpc_term *terms;         /* of all rows */
+    const int *first;                       /* [rows + 1] the first term of each row */
+    const quadsim_real *bounds;             /* [bound_nodes][rows] upper ones; 1e30: none */
+    const int *slack;                       /* [rows] which slack a row has; -1: it is hard */
     const quadsim_real *linear, *quadratic; /* [slacks] leaving a bound by e costs l e + q e^2 / 2, not both
                                              * 0; l >= 1e30: hard */
 } quadsim_nmpc_problem;
@@ -132,28 +133,29 @@ typedef struct quadsim_nmpc_work {
     int patience;      /* see relax in quadsim_nmpc.c */
     int allowed;       /* changes of the active set in the present search */
     int ends;          /* the caller's, between _begin and _keep: whether no SQP step is to follow, as time is up */
-    quadsim_real defect, moved, violation; /* of the plan; the largest violation of a row by the optimum, less its slack */
+    quadsim_real defect, moved,
+        violation; /* of the plan; the largest violation of a row by the optimum, less its slack */
     quadsim_real share, largest, least;
     quadsim_real measured[QUADSIM_NMPC_MOST]; /* state, with the input before */
     quadsim_real start[QUADSIM_NMPC_MOST];    /* the same, its quaternion in the first frame */
     quadsim_real before[QUADSIM_INPUTS];
-    quadsim_real *x, *u;                   /* the plan [N+1][n], [N][4] */
-    quadsim_real *frame;                   /* [N+1][4] reference quaternions */
-    quadsim_real *goal, *aim;              /* [N+1][n] of states, [N][4] of inputs */
-    quadsim_real *face, *beyond;           /* [N][faces][3] normals of half-spaces normal . p <= beyond, [N][faces] */
-    quadsim_real *map, *offset, *end;      /* [N][13][W] slopes; [N][n] c; [N][n] next states */
-    quadsim_real *axis, *known;            /* [N][2][4], [N][2] of the thrust axis at the end of a step */
+    quadsim_real *x, *u;              /* the plan [N+1][n], [N][4] */
+    quadsim_real *frame;              /* [N+1][4] reference quaternions */
+    quadsim_real *goal, *aim;         /* [N+1][n] of states, [N][4] of inputs */
+    quadsim_real *face, *beyond;      /* [N][faces][3] normals of half-spaces normal . p <= beyond, [N][faces] */
+    quadsim_real *map, *offset, *end; /* [N][13][W] slopes; [N][n] c; [N][n] next states */
+    quadsim_real *axis, *known;       /* [N][2][4], [N][2] of the thrust axis at the end of a step */
     quadsim_real *gain, *inverse, *feed, *more; /* [N][4][n], [N][16], [N][4], [N][4] */
-    quadsim_real *s, *v;                   /* the optimum [N+1][n], [N][4]; quaternions in their frames */
-    quadsim_real *value;                   /* [N+1][w] of entries at the present multipliers, those before first */
-    quadsim_real *own, *response;          /* [N+1][w]; [room][N+1][w], or what the recursion and the interior point
-                                            * method keep there */
+    quadsim_real *s, *v;                        /* the optimum [N+1][n], [N][4]; quaternions in their frames */
+    quadsim_real *value;                        /* [N+1][w] of entries at the present multipliers, those before first */
+    quadsim_real *own, *response;              /* [N+1][w]; [room][N+1][w], or what the recursion and the interior point
+                                                * method keep there */
     quadsim_real *factor, *multiplier, *r, *d; /* L D L' of the active rows, row by row; [room] each */
-    quadsim_real *price, *rate, *origin;   /* [N][slacks] sums of multipliers, and of their slopes; see the search */
+    quadsim_real *price, *rate, *origin;      /* [N][slacks] sums of multipliers, and of their slopes; see the search */
     quadsim_real *x_before, *u_before, *last; /* the plan before a step, and [N][4] the step before; or candidates */
-    quadsim_nmpc_row *row;                 /* [room] active rows */
-    int *free;                             /* [N][slacks] whether a slack may be positive */
-    int *held;                             /* [N][4] inputs at bounds: 1 above, -1 below */
+    quadsim_nmpc_row *row;                    /* [room] active rows */
+    int *free;                                /* [N][slacks] whether a slack may be positive */
+    int *held;                                /* [N][4] inputs at bounds: 1 above, -1 below */
 } quadsim_nmpc_work;
 
 long quadsim_nmpc_reals(const quadsim_nmpc_problem *problem);
@@ -189,15 +191,16 @@ int quadsim_nmpc_keep(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, 
 
 /* Slopes [13][W] of the next state in all states but the position, in the frames [2][4] of a step's start and end, then
  * in the inputs, padded to an even number W of columns; and the next state [n]. */
-void quadsim_nmpc_slopes(const quadsim_nmpc_problem *problem, const quadsim_nmpc_world *world, const quadsim_real *state,
-                         const quadsim_real *inputs, const quadsim_real *frames, quadsim_real *slopes, quadsim_real *next);
+void quadsim_nmpc_slopes(const quadsim_nmpc_problem *problem, const quadsim_nmpc_world *world,
+                         const quadsim_real *state, const quadsim_real *inputs, const quadsim_real *frames,
+                         quadsim_real *slopes, quadsim_real *next);
 
 /* Next states [count][n] of states and inputs [count][4]; a step, its substeps and lags are the problem's. */
 void quadsim_nmpc_advance(const quadsim_nmpc_problem *problem, const quadsim_nmpc_world *world, int count,
                           const quadsim_real *states, const quadsim_real *inputs, quadsim_real *ends);
 
-/* The angular acceleration [3] by the air's torque in a state [13] with thrusts of the rotors [4] in newton; returns how
- * much of T is lost to inflow. */
+/* The angular acceleration [3] by the air's torque in a state [13] with thrusts of the rotors [4] in newton; returns
+ * how much of T is lost to inflow. */
 quadsim_real quadsim_nmpc_turned(const quadsim_nmpc_problem *problem, const quadsim_real *state,
                                  const quadsim_real *thrusts, quadsim_real *turned);
 

@@ -1,19 +1,19 @@
-/* The dual active-set method of Goldfarb and Idnani (1983): violated rows are added one by one, and rows whose multipliers
- * fall to zero are dropped.
+/* The dual active-set method of Goldfarb and Idnani (1983): violated rows are added one by one, and rows whose
+ * multipliers fall to zero are dropped.
  *
- * With the active rows' products A z = b, their multipliers y and H of the whole program (see quadsim_nmpc_riccati.c), a
- * row a whose multiplier grows by t moves
+ * With the active rows' products A z = b, their multipliers y and H of the whole program (see quadsim_nmpc_riccati.c),
+ * a row a whose multiplier grows by t moves
  *
  *     z <- z - t (H^-1 a - H^-1 A' r),   y <- y - t r,   A H^-1 A' r = A H^-1 a,
  *
- * its own violation falls by t (a H^-1 a - a H^-1 A' r), and t ends at the first of these: the violation is zero, and the
- * row is active; a multiplier is zero, and its row is dropped; the price of a slack reaches its linear one, and the slack
- * is free.  A free slack adds 1 / q to the products of the rows that share it.  A H^-1 A' is kept as a factor L D L',
- * row by row, of which each change of the set costs O(count^2).
+ * its own violation falls by t (a H^-1 a - a H^-1 A' r), and t ends at the first of these: the violation is zero, and
+ * the row is active; a multiplier is zero, and its row is dropped; the price of a slack reaches its linear one, and the
+ * slack is free.  A free slack adds 1 / q to the products of the rows that share it.  A H^-1 A' is kept as a factor L D
+ * L', row by row, of which each change of the set costs O(count^2).
  *
- * Where the violation does not fall and no multiplier does, the rows exclude each other, in exact arithmetic.  By rounding
- * that may only seem so: bounds of inputs alone, for instance, never do.  It is said only with a proof: with the hard rows
- * of states that take part, and their multipliers y >= 0,
+ * Where the violation does not fall and no multiplier does, the rows exclude each other, in exact arithmetic.  By
+ * rounding that may only seem so: bounds of inputs alone, for instance, never do.  It is said only with a proof: with
+ * the hard rows of states that take part, and their multipliers y >= 0,
  *
  *     sum y (a z - b) > 0  for all inputs within their bounds:  at the present ones, with the gradient in the inputs,
  *
@@ -70,7 +70,8 @@ static int factorise_row(quadsim_nmpc_work *work, int j)
     return mine[j] > DEPENDENT * whole;
 }
 
-/* Add weight z z' to the product of the factor, from row j on (Gill, Golub, Murray and Saunders 1974); z is overwritten. */
+/* Add weight z z' to the product of the factor, from row j on (Gill, Golub, Murray and Saunders 1974); z is
+ * overwritten. */
 static void update_factor(quadsim_nmpc_work *work, int j, real weight, real *z)
 {
     int r;

@@ -2,8 +2,8 @@
  * many of them.
  *
  * A row  a z + t = b, t > 0,  has a multiplier y > 0, and a soft one  a z + t - e = b, with a slack of its own, e > 0,
- * whose own multiplier is  l + q e - y > 0.  A step towards  t y = m - p  and  e (l + q e - y) = m - r  follows from the
- * optimum with the row's weight w and slope c,
+ * whose own multiplier is  l + q e - y > 0.  A step towards  t y = m - p  and  e (l + q e - y) = m - r  follows from
+ * the optimum with the row's weight w and slope c,
  *
  *     w = y / t,   c = (m - p) / t + y - w b;             and with f = q + (l + q e - y) / e  of its slack
  *     w <- w / (1 + w / f),   c <- (c - w ((m - r) / e - l + (l + q e - y)) / f) / (1 + w / f),
@@ -16,9 +16,9 @@
  * that they cost a tenth of the recursion. */
 #include "quadsim_nmpc_qp.h"
 
-static const real SHORTER = R(0.995); /* share of a step that ends at a bound */
+static const real SHORTER = R(0.995);        /* share of a step that ends at a bound */
 static const real LEAST_MULTIPLIER = R(3.0); /* of inputs at the start */
-static const real INSIDE = R(0.3);   /* share of an input's range from its bounds, at the start */
+static const real INSIDE = R(0.3);           /* share of an input's range from its bounds, at the start */
 
 /* Numbers of each row; those of inputs are first, upper ones [N][4], then lower ones [N][4], those of states
  * [N][quadsim_nmpc_state_rows] follow.  A row of states that is not bounded has t = 0. */

@@ -12,9 +12,9 @@ static const real SLOW = R(0.01); /* share of thrust below which a parabola stan
 
 /* What acts at an instant. */
 struct drive {
-    real thrust, angular[3];  /* T, I^-1 tau + alpha */
-    real speed;               /* sum of the rotors' speeds, as shares */
-    real rates[3];            /* of targets */
+    real thrust, angular[3]; /* T, I^-1 tau + alpha */
+    real speed;              /* sum of the rotors' speeds, as shares */
+    real rates[3];           /* of targets */
     const real *left;
 };
 
@@ -274,8 +274,8 @@ INLINED void pushing_slopes(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
     }
 }
 
-/* Derivatives of what a step leads to: columns that turn the attitude, of quaternion, velocity and body rates, and of the
- * position; and columns that only push, of velocity and of the position. */
+/* Derivatives of what a step leads to: columns that turn the attitude, of quaternion, velocity and body rates, and of
+ * the position; and columns that only push, of velocity and of the position. */
 struct columns {
     real turning[10][TURNING], moved[3][TURNING];
     real pushing[3][PUSHING], pushed[3][PUSHING];
@@ -307,12 +307,12 @@ static void actuators_after(const quadsim_nmpc_problem *p, const real *x, const 
     }
 }
 
-/* Runge-Kutta's classical method over a step with held inputs: it moves y, the quaternion, velocity and body rates [10],
- * and adds to `place` how far the position went; and, where `derive`, moves the columns: m that turn, padded, with targets
- * or not, so many actuators, and with the air's torque or not. */
+/* Runge-Kutta's classical method over a step with held inputs: it moves y, the quaternion, velocity and body rates
+ * [10], and adds to `place` how far the position went; and, where `derive`, moves the columns: m that turn, padded,
+ * with targets or not, so many actuators, and with the air's torque or not. */
 INLINED void integrate(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
-                       const int derive, const int m, const int targets, const int actuators, const int moments, real *y,
-                       real *place, struct columns *columns)
+                       const int derive, const int m, const int targets, const int actuators, const int moments,
+                       real *y, real *place, struct columns *columns)
 {
     const real h = p->step / (real)p->substeps, part[4] = {R(0.0), R(0.5) * h, R(0.5) * h, h};
     const int air = meets_air(p, world);
@@ -398,11 +398,12 @@ INLINED void integrate(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *
 }
 
 /* One node: m turning columns, padded, with targets or not, so many actuators, and with the air's torque or not. */
-INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
-                            const real *frame, const real *next, const int m, const int targets, const int actuators,
-                            const int moments, int n, real *map, real *end)
+INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x,
+                            const real *u, const real *frame, const real *next, const int m, const int targets,
+                            const int actuators, const int moments, int n, real *map, real *end)
 {
-    static const real UNITS[4][4] = {{R(1.0)}, {R(0.0), R(1.0)}, {R(0.0), R(0.0), R(1.0)}, {R(0.0), R(0.0), R(0.0), R(1.0)}};
+    static const real UNITS[4][4] = {
+        {R(1.0)}, {R(0.0), R(1.0)}, {R(0.0), R(0.0), R(1.0)}, {R(0.0), R(0.0), R(0.0), R(1.0)}};
     const int width = columns_of(n), turning = targets ? 10 : 11 + actuators, befores = n - BODY - actuators;
     struct columns d;
     real y[10], travelled[3] = {R(0.0)};

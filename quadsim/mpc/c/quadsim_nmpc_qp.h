@@ -1,6 +1,7 @@
 /* What the files of an iteration's quadratic program share.
  *
- *     min  1/2 sum |s_i - goal_i|^2_Q + |u_i - aim_i|^2_R    s.t.  s_{i+1} = A_i s_i + B_i u_i + c_i  and rows a z <= b.
+ *     min  1/2 sum |s_i - goal_i|^2_Q + |u_i - aim_i|^2_R    s.t.  s_{i+1} = A_i s_i + B_i u_i + c_i  and rows a z <=
+ * b.
  *
  *   quadsim_nmpc_rows.c        what rows are: their products, bounds, gradients and slacks
  *   quadsim_nmpc_riccati.c     the recursion: the optimum without rows, and what a row's multiplier does to it
@@ -84,16 +85,16 @@ int quadsim_nmpc_worst_row(const quadsim_nmpc_work *work, quadsim_nmpc_row *wors
 /* Weights of one step of an interior point method.  Rows of inputs are part of their effort; for each row of states
  * it has w z^2 / 2 + c z. */
 typedef struct quadsim_nmpc_weights {
-    quadsim_real *effort, *push; /* [N][4] of the inputs: w u^2 / 2 + c u */
+    quadsim_real *effort, *push;  /* [N][4] of the inputs: w u^2 / 2 + c u */
     quadsim_real *weight, *slope; /* [N][quadsim_nmpc_state_rows] w, 0 where there is no row, and c; NULL: no rows */
-    quadsim_real *known;         /* [N][n] products that a second step with the same w takes from the first one */
-    quadsim_real *inputs;        /* [N][4] the inputs that follow */
-    quadsim_real *entries;       /* [N+1][w] the entries that follow, where there are rows */
+    quadsim_real *known;          /* [N][n] products that a second step with the same w takes from the first one */
+    quadsim_real *inputs;         /* [N][4] the inputs that follow */
+    quadsim_real *entries;        /* [N+1][w] the entries that follow, where there are rows */
 } quadsim_nmpc_weights;
 
-/* Gains, and the optimum with the held inputs at their bounds and no other rows.  The recursion starts from node `last`,
- * the last node whose held inputs have changed since the recursion before: nothing else may have used the responses'
- * memory since.  N - 1: from the end. */
+/* Gains, and the optimum with the held inputs at their bounds and no other rows.  The recursion starts from node
+ * `last`, the last node whose held inputs have changed since the recursion before: nothing else may have used the
+ * responses' memory since.  N - 1: from the end. */
 void quadsim_nmpc_optimum(quadsim_nmpc_work *work, int last);
 
 /* Add the active rows' multipliers to that optimum. */
@@ -113,8 +114,8 @@ void quadsim_nmpc_weighted_optimum(quadsim_nmpc_work *work, const quadsim_nmpc_w
 
 /* ---- quadsim_nmpc_active_set.c ----------------------------------------------------------------------------------- */
 
-/* The optimum from the active set that is there, beside what quadsim_nmpc_optimum has found.  Where it says that there is
- * none, that is proven for all inputs within their bounds, held or not. */
+/* The optimum from the active set that is there, beside what quadsim_nmpc_optimum has found.  Where it says that there
+ * is none, that is proven for all inputs within their bounds, held or not. */
 enum quadsim_nmpc_status quadsim_nmpc_search(quadsim_nmpc_work *work);
 
 /* ---- quadsim_nmpc_interior.c ------------------------------------------------------------------------------------- */

@@ -6,10 +6,11 @@
  *     H = R + B' P B,      K = H^-1 B' P A,      feed = -H^-1 (B' (P c + g) + d),
  *     P <- Q + A' P A - A' P B K,                g <- A' (P c + g) - K' (B' (P c + g) + d) - Q goal,
  *
- * then forwards  u = feed - K s,  s <- A s + B u + c.  Where moves have a weight m, the last states are the input before:
- * m is added to H, and -m to B' P A in their columns.  An input that is held at a bound has unit rows and columns in H,
- * none in H^-1, and its bound for a feed.  A row's multiplier adds its gradient a to d and g: with the same K and H^-1,
- * one pass backwards and forwards gives the response of all entries, H^-1 a with the whole program's H.
+ * then forwards  u = feed - K s,  s <- A s + B u + c.  Where moves have a weight m, the last states are the input
+ * before: m is added to H, and -m to B' P A in their columns.  An input that is held at a bound has unit rows and
+ * columns in H, none in H^-1, and its bound for a feed.  A row's multiplier adds its gradient a to d and g: with the
+ * same K and H^-1, one pass backwards and forwards gives the response of all entries, H^-1 a with the whole program's
+ * H.
  *
  * Maps have no columns for the position, whose derivative is the unit matrix: the first three columns of P A are P's.
  * Functions are made for each number of states: loops of constant length are a third faster. */
@@ -46,7 +47,7 @@ INLINED void lower_rows(const quadsim_nmpc_work *work, const real *map, real bot
         real row[WIDE + 1] = {R(0.0)};
         for (k = 0; k < W; k++) {
             const real by = map[k * width + j];
-            for (r = 0; r < past; r++) { /* rows of `both` are set, whichever columns are */
+            for (r = 0; r < past; r++) {   /* rows of `both` are set, whichever columns are */
                 row[r] += by * both[k][r]; /* NOLINT(clang-analyzer-core.UndefinedBinaryOperatorResult) */
             }
         }
@@ -169,8 +170,8 @@ INLINED void riccati_node(quadsim_nmpc_work *work, int i, const int actuators, c
     }
     for (a = 0; a < NU; a++) {
         for (j = 0; j < n; j++) {
-            gain[a * n + j] = inverse[a * NU] * K[0][j] + inverse[a * NU + 1] * K[1][j] + inverse[a * NU + 2] * K[2][j] +
-                              inverse[a * NU + 3] * K[3][j];
+            gain[a * n + j] = inverse[a * NU] * K[0][j] + inverse[a * NU + 1] * K[1][j] +
+                              inverse[a * NU + 2] * K[2][j] + inverse[a * NU + 3] * K[3][j];
         }
     }
     for (r = 0; r < n; r++) { /* A' P A - K' gain, the lower part, then the upper */
@@ -211,8 +212,8 @@ INLINED void carry_back(const quadsim_nmpc_work *work, int i, const int actuator
 }
 
 /* The feed of a node from the gradient g of the next state and push of the inputs; then that of this state. */
-INLINED void backward_node(const quadsim_nmpc_work *work, int i, const int actuators, const int moves,
-                           const real *push, real *g, real *feed)
+INLINED void backward_node(const quadsim_nmpc_work *work, int i, const int actuators, const int moves, const real *push,
+                           real *g, real *feed)
 {
     const int n = BODY + actuators + (moves ? NU : 0);
     const real *gain = work->gain + i * NU * n, *inverse = work->inverse + i * NU * NU;
@@ -271,7 +272,8 @@ INLINED void forward_node(const quadsim_nmpc_work *work, int i, const int actuat
     }
 }
 
-/* ---- passes ------------------------------------------------------------------------------------------------------- */
+/* ---- passes -------------------------------------------------------------------------------------------------------
+ */
 
 /* The quadratic and linear cost of the last state. */
 INLINED void cost_at_end(const quadsim_nmpc_work *work, const int n, real *cost, real *g)
@@ -287,9 +289,9 @@ INLINED void cost_at_end(const quadsim_nmpc_work *work, const int n, real *cost,
     }
 }
 
-/* Gains, and the optimum with the held inputs at their bounds and no other bounds.  Costs of all nodes' ends but the last
- * are kept in the responses' memory, [N - 1][n][n + 1], so that the next recursion may start from node `last`: that is
- * the last node whose held inputs have changed since. */
+/* Gains, and the optimum with the held inputs at their bounds and no other bounds.  Costs of all nodes' ends but the
+ * last are kept in the responses' memory, [N - 1][n][n + 1], so that the next recursion may start from node `last`:
+ * that is the last node whose held inputs have changed since. */
 INLINED void optimum_sized(quadsim_nmpc_work *work, int last, const int actuators, const int moves)
 {
     const quadsim_nmpc_problem *p = work->p;
@@ -497,8 +499,7 @@ INLINED void weighted_optimum_sized(quadsim_nmpc_work *work, const quadsim_nmpc_
     }
     memcpy(s, work->start, sizeof(real) * (size_t)n);
     for (i = 0; i < N; i++) {
-        forward_node(work, i, actuators, moves, work->more + i * NU, work->offset + i * n, s,
-                     inputs + i * NU, next);
+        forward_node(work, i, actuators, moves, work->more + i * NU, work->offset + i * n, s, inputs + i * NU, next);
         if (weights->weight != NULL) {
             quadsim_nmpc_entries_at(work, i, 1, inputs + i * NU, next, weights->entries);
         }
@@ -515,25 +516,25 @@ INLINED void weighted_optimum_sized(quadsim_nmpc_work *work, const quadsim_nmpc_
 #elif defined QUADSIM_SIZES
 #define SIZED(function, ...) function(__VA_ARGS__, QUADSIM_SIZES);
 #else
-#define SIZED(function, ...)                                              \
-    switch (2 * work->p->actuators + (work->p->moves ? 1 : 0)) {          \
-    case 0:                                                               \
-        function(__VA_ARGS__, 0, 0);                                      \
-        break;                                                            \
-    case 1:                                                               \
-        function(__VA_ARGS__, 0, 1);                                      \
-        break;                                                            \
-    case 2:                                                               \
-        function(__VA_ARGS__, 1, 0);                                      \
-        break;                                                            \
-    case 3:                                                               \
-        function(__VA_ARGS__, 1, 1);                                      \
-        break;                                                            \
-    case 8:                                                               \
-        function(__VA_ARGS__, 4, 0);                                      \
-        break;                                                            \
-    default:                                                              \
-        function(__VA_ARGS__, 4, 1);                                      \
+#define SIZED(function, ...)                                                                                           \
+    switch (2 * work->p->actuators + (work->p->moves ? 1 : 0)) {                                                       \
+    case 0:                                                                                                            \
+        function(__VA_ARGS__, 0, 0);                                                                                   \
+        break;                                                                                                         \
+    case 1:                                                                                                            \
+        function(__VA_ARGS__, 0, 1);                                                                                   \
+        break;                                                                                                         \
+    case 2:                                                                                                            \
+        function(__VA_ARGS__, 1, 0);                                                                                   \
+        break;                                                                                                         \
+    case 3:                                                                                                            \
+        function(__VA_ARGS__, 1, 1);                                                                                   \
+        break;                                                                                                         \
+    case 8:                                                                                                            \
+        function(__VA_ARGS__, 4, 0);                                                                                   \
+        break;                                                                                                         \
+    default:                                                                                                           \
+        function(__VA_ARGS__, 4, 1);                                                                                   \
     }
 #endif
 

@@ -13,10 +13,10 @@ enum { SIDES = QUADSIM_NMPC_SIDES, AXES = 3 };
 enum { OF_TILT, OF_RATES, OF_FACES }; /* slacks of a node; those of stated rows follow */
 
 static const real SIDE[SIDES][2] = {
-    {R(1.0), R(0.0)},  {R(0.86602540378443864676), R(0.5)},  {R(0.5), R(0.86602540378443864676)},
-    {R(0.0), R(1.0)},  {R(-0.5), R(0.86602540378443864676)}, {R(-0.86602540378443864676), R(0.5)},
+    {R(1.0), R(0.0)},  {R(0.86602540378443864676), R(0.5)},   {R(0.5), R(0.86602540378443864676)},
+    {R(0.0), R(1.0)},  {R(-0.5), R(0.86602540378443864676)},  {R(-0.86602540378443864676), R(0.5)},
     {R(-1.0), R(0.0)}, {R(-0.86602540378443864676), R(-0.5)}, {R(-0.5), R(-0.86602540378443864676)},
-    {R(0.0), R(-1.0)}, {R(0.5), R(-0.86602540378443864676)}, {R(0.86602540378443864676), R(-0.5)}};
+    {R(0.0), R(-1.0)}, {R(0.5), R(-0.86602540378443864676)},  {R(0.86602540378443864676), R(-0.5)}};
 
 /* ---- which there are --------------------------------------------------------------------------------------------- */
 
@@ -171,7 +171,8 @@ quadsim_real quadsim_nmpc_bound(const quadsim_nmpc_work *work, const quadsim_nmp
 
 /* ---- gradients --------------------------------------------------------------------------------------------------- */
 
-static void add_entry_gradient(const quadsim_nmpc_work *work, int node, int entry, real factor, real *inputs, real *state)
+static void add_entry_gradient(const quadsim_nmpc_work *work, int node, int entry, real factor, real *inputs,
+                               real *state)
 {
     const quadsim_nmpc_problem *p = work->p;
     int j;

@@ -23,9 +23,9 @@ enum { MOST_ROUNDS = 4, MOST_INNER = 30, MOST_INNER_ROWS = 60, MOST_AGAIN = 20 }
 enum { LONG_SEARCH = 5 }; /* changes per node that a search has before the interior point method of all rows */
 
 /* Hold inputs that leave their bounds, release those whose multipliers have the wrong sign, until there are none: the
- * primal-dual active-set method (Hintermueller, Ito and Kunisch 2002), a Riccati recursion each, from the last node that
- * changes.  Where it is `hasty`, it ends as soon as the changes do not get fewer, or are many at first.  Whether it
- * settled. */
+ * primal-dual active-set method (Hintermueller, Ito and Kunisch 2002), a Riccati recursion each, from the last node
+ * that changes.  Where it is `hasty`, it ends as soon as the changes do not get fewer, or are many at first.  Whether
+ * it settled. */
 static int settle(quadsim_nmpc_work *work, int rounds, int hasty)
 {
     const quadsim_nmpc_problem *p = work->p;

@@ -91,8 +91,8 @@ static void put_node(quadsim_nonlinear *law, int node, const real *place, const 
     }
 }
 
-/* Row k of a preview as it is the delay later, its yaw without turns: `turns` are those of the row read before, and become
- * those of this one.  Past the end the last row is held. */
+/* Row k of a preview as it is the delay later, its yaw without turns: `turns` are those of the row read before, and
+ * become those of this one.  Past the end the last row is held. */
 static void read_row(const quadsim_nonlinear_numbers *numbers, const real *reference, int k, real *turns, real row[4])
 {
     const int last = rows_of(numbers) - 1, at = k + under_way_of(numbers), now = at < last ? at : last;
@@ -146,7 +146,8 @@ static void take_preview(quadsim_nonlinear *law, const real *reference, real yaw
     }
 }
 
-/* ---- what disturbs ------------------------------------------------------------------------------------------------ */
+/* ---- what disturbs ------------------------------------------------------------------------------------------------
+ */
 
 static int is_any(const real *numbers, int count)
 {
@@ -208,8 +209,8 @@ static void update_estimate(quadsim_nonlinear *law)
     apply_estimate(law);
 }
 
-/* Turn a quaternion by the least rotation that takes a unit vector to the direction of another, (1 + a . b, a x b) up to
- * its length; not at all where they are opposite. */
+/* Turn a quaternion by the least rotation that takes a unit vector to the direction of another, (1 + a . b, a x b) up
+ * to its length; not at all where they are opposite. */
 static void turn_least(const real *unit, const real *to, real size, real *q)
 {
     real turn[4], turned[4], length;
@@ -291,7 +292,8 @@ static void follow_force(quadsim_nonlinear *law, int follows, const real *acting
     find_trim(law);
 }
 
-/* ---- periods ------------------------------------------------------------------------------------------------------ */
+/* ---- periods ------------------------------------------------------------------------------------------------------
+ */
 
 /* Let actuators follow the commands in force, since the call before; `acting` is the last one that was sent. */
 static void update_actuators(quadsim_nonlinear *law, int periods, const real *acting)
@@ -431,8 +433,8 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int
     law->learns = 0;
     put_shares(numbers, acting, law->before);
     update_actuators(law, periods, acting);
-    if (!is_within(state, numbers->plausible, 12) || !is_within(reference, numbers->plausible, count_of(numbers, motion)) ||
-        !is_finite(law->before, NU)) {
+    if (!is_within(state, numbers->plausible, 12) ||
+        !is_within(reference, numbers->plausible, count_of(numbers, motion)) || !is_finite(law->before, NU)) {
         return 0;
     }
     put_body(state, attitude, rates, law->measured);
@@ -466,8 +468,9 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int
 
 enum quadsim_status quadsim_nonlinear_end(quadsim_nonlinear *law, enum quadsim_nmpc_status answer)
 {
-    static const enum quadsim_status STATUS[] = {QUADSIM_FREE, QUADSIM_WHOLE, QUADSIM_WHOLE, QUADSIM_PRIMAL_INFEASIBLE,
-                                                 QUADSIM_MAX_ITERATIONS, QUADSIM_NO_ROOM, QUADSIM_INVALID_DATA};
+    static const enum quadsim_status STATUS[] = {
+        QUADSIM_FREE,           QUADSIM_WHOLE,   QUADSIM_WHOLE,       QUADSIM_PRIMAL_INFEASIBLE,
+        QUADSIM_MAX_ITERATIONS, QUADSIM_NO_ROOM, QUADSIM_INVALID_DATA};
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     const quadsim_nmpc_problem *p = numbers->problem;
     const quadsim_nmpc_work *work = &law->work;
@@ -496,7 +499,8 @@ enum quadsim_status quadsim_nonlinear_end(quadsim_nonlinear *law, enum quadsim_n
     return work->defect > numbers->problem->converged ? QUADSIM_NOT_CONVERGED : status;
 }
 
-/* ---- with the fallback contract ------------------------------------------------------------------------------------ */
+/* ---- with the fallback contract ------------------------------------------------------------------------------------
+ */
 
 /* The state (12,) of a body, its yaw on the turn nearest to that of the state before. */
 static void put_state(const real *body, real *state)
@@ -545,9 +549,8 @@ static void predict_fallback(quadsim_nonlinear *law)
 }
 
 enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_phase phase,
-                                           const quadsim_real state[QUADSIM_MEASURED],
-                                           const quadsim_real *reference, const quadsim_real acting[4],
-                                           quadsim_real command[4])
+                                           const quadsim_real state[QUADSIM_MEASURED], const quadsim_real *reference,
+                                           const quadsim_real acting[4], quadsim_real command[4])
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     const int count = count_of(numbers, numbers->motion);
@@ -562,8 +565,8 @@ enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_
         status = QUADSIM_INVALID_DATA;
         if (quadsim_nonlinear_begin(law, guard->asked, phase == QUADSIM_PHASE_FLYING, numbers->motion, guard->state,
                                     attitude, rates, reference, guard->in_force)) {
-            status = quadsim_nonlinear_end(law, quadsim_nmpc_step(&law->work, &law->world, law->measured, law->before,
-                                                                  law->states, law->thrusts));
+            status = quadsim_nonlinear_end(
+                law, quadsim_nmpc_step(&law->work, &law->world, law->measured, law->before, law->states, law->thrusts));
         }
         status = quadsim_guard_check(guard, status, law->plan);
     }

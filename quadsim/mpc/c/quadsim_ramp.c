@@ -14,8 +14,8 @@ void quadsim_ramp_reset(quadsim_ramp *ramp, const ramp_numbers *n, const quadsim
     memcpy(ramp->command, ramp->acting, sizeof(ramp->command));
 }
 
-/* Add what a command gives over a share of the period: its part of the means of squared speeds, or of the thrust [N], and
- * of the change of the rotors' momentum; the actuators follow it. */
+/* Add what a command gives over a share of the period: its part of the means of squared speeds, or of the thrust [N],
+ * and of the change of the rotors' momentum; the actuators follow it. */
 static void add_command(quadsim_ramp *ramp, const ramp_numbers *n, const real *command, real share, real left,
                         real means[NU], real *spun)
 {
@@ -36,7 +36,8 @@ static void add_command(quadsim_ramp *ramp, const ramp_numbers *n, const real *c
     }
 }
 
-/* The mean thrust [N], before its scale, and torque [N m] of a period with this command, or with the one before and it. */
+/* The mean thrust [N], before its scale, and torque [N m] of a period with this command, or with the one before and it.
+ */
 static void mean_wrench(quadsim_ramp *ramp, const ramp_numbers *n, const real *command, real *thrust, real torque[3])
 {
     const real scale = quadsim_ramp_scale(ramp, n);
@@ -99,7 +100,8 @@ static void resisting_torque(const quadsim_ramp *ramp, const ramp_numbers *n, co
     }
 }
 
-/* Take a mean of the period that the model misses into the filters; whether the thrust scale, if there is one, moved. */
+/* Take a mean of the period that the model misses into the filters; whether the thrust scale, if there is one, moved.
+ */
 static int update_filters(quadsim_ramp *ramp, const ramp_numbers *n, const real lift[3], real missed[6])
 {
     const int holds = n->scaled && lift[2] < n->least_lift;
@@ -158,7 +160,8 @@ void quadsim_ramp_update(quadsim_ramp *ramp, const ramp_numbers *n, int follows,
     }
     /* Means over the period from its two ends; for the thrust axis also from its derivative (Euler-Maclaurin). */
     for (i = 0; i < 3; i++) {
-        const real axis = R(0.5) * (last.axis[i] + ramp->axis[i]) + period / R(12.0) * (last.turning[i] - ramp->turning[i]);
+        const real axis =
+            R(0.5) * (last.axis[i] + ramp->axis[i]) + period / R(12.0) * (last.turning[i] - ramp->turning[i]);
         lift[i] = thrust / n->mass * axis;
         missed[i] = (velocity[i] - last.velocity[i]) / period - lift[i] - R(0.5) * (last.pull[i] + ramp->pull[i]);
         torque[i] -= R(0.5) * (last.resisting[i] + ramp->resisting[i]);
