@@ -591,7 +591,7 @@ def vehicle_sources(path: Path) -> dict[str, str]:
     return {key: entry["source"] for key, entry in _read_entries(path)[1].items()}
 
 
-EXAMPLE: Final = "example"
+EXAMPLE_SOURCE: Final = "example"
 """The source of each number of `quadsim vehicle --template`."""
 EXAMPLE_DESCRIPTION: Final = "An example: "
 """How its description begins."""
@@ -605,11 +605,13 @@ def example_notes(path: Path, replaced: Collection[str] = ()) -> tuple[str, ...]
         replaced: parameters that the file's values are not used of.
     """
     texts, entries = _read_entries(path)
-    left = [name for name, entry in entries.items() if entry["source"] == EXAMPLE and name not in replaced]
+    left = [name for name, entry in entries.items() if entry["source"] == EXAMPLE_SOURCE and name not in replaced]
     notes = []
     if left:
         count = f"{len(left)} of {len(entries)} values"
-        notes.append(f'{path.name}: {count} are of an example (source = "{EXAMPLE}"), not yours: {", ".join(left)}')
+        notes.append(
+            f'{path.name}: {count} are of an example (source = "{EXAMPLE_SOURCE}"), not yours: {", ".join(left)}'
+        )
     if texts.get("description", "").startswith(EXAMPLE_DESCRIPTION):
         notes.append(f"{path.name}: the description is of an example, not yours: {texts['description']!r}")
     return tuple(notes)

@@ -380,7 +380,7 @@ def test_c_of_the_testbed_includes_its_own_headers_alone() -> None:
 
 def test_what_is_imported_is_what_is_declared(imports: list[Import]) -> None:
     imported = {item.library for item in imports} - set(sys.stdlib_module_names) - set(PACKAGES)
-    assert imported | ABSENT == declared() - {"pandas"}  # pyarrow does
+    assert imported | ABSENT == declared()
 
 
 def test_help_loads_little_and_list_no_simulator() -> None:

@@ -51,6 +51,8 @@ EVERY: Final = tuple(PARTS)
 USING: Final = {
     "mpc/laws/test_delay.py": ("export",),
     "mpc/laws/test_law_in_c.py": ("export",),
+    "mpc/laws/test_linear_targets.py": ("export",),
+    "mpc/pilot/test_attitudes.py": ("export",),
     "mpc/laws/test_one_list_of_laws.py": ("design",),
     "test_palette.py": ("live",),
     "test_plausibility.py": ("design",),
@@ -63,6 +65,7 @@ USING: Final = {
     "features/identify/test_identify_logs.py": ("design",),
     "features/identify/test_log_formats.py": ("design",),
     "features/identify/test_noise.py": ("design",),
+    "features/identify/test_sensors.py": ("design",),
     "commands/test_answer_first.py": ("campaign", "design", "identify"),
     "commands/test_api.py": EVERY,
     "scenarios/test_bounded_input.py": ("campaign", "identify"),
@@ -97,17 +100,8 @@ COMMANDS: Final = (
 )
 """What has to work without any feature."""
 QUICK: Final = (
-    *(
-        "pytest",
-        "-q",
-        "-n",
-        "2",
-        "--dist",
-        "loadscope",
-        "-m",
-        "not slow or representative",
-        "--hypothesis-profile=quick",
-    ),
+    *("pytest", "-q", "-n", "2", "--dist", "loadscope"),
+    *("-m", "not slow or representative", "--hypothesis-profile=quick"),
 )
 """As `make test`."""
 COLLECTED: Final = ("pytest", "-q", "-n", "0", "-k", "test_architecture")

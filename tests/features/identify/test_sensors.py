@@ -60,6 +60,7 @@ def put(record: Record, field: str, row: int | slice, column: int, value: float)
 # Samples that jump
 
 
+@pytest.mark.slow("identification")
 @pytest.mark.representative("identification")
 @pytest.mark.parametrize(
     ("field", "column", "value", "sensor"),

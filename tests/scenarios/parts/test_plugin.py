@@ -199,7 +199,7 @@ class Answers:
 def test_a_command_with_a_wrong_part_is_refused(part: str, given: Any, rule: str) -> None:
     law = PluginController(Answers(**{part: given}), 3)
     with pytest.raises(
-        CommandError, match=rf"Answers answered .*, neither a Command nor four rotor speeds [rad/s]: {rule}"
+        CommandError, match=rf"Answers answered .*, neither a Command nor four rotor speeds \[rad/s\]: {rule}"
     ):
         law.step(StepInputs(acting=np.ones(4)), np.zeros(12), np.zeros((3, 4)))
 
