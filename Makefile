@@ -26,7 +26,7 @@ RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; re
 FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang wasm-ld node cppcheck clang-tidy
 HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done && \
 	echo 'int LLVMFuzzerTestOneInput(void) { return 0; }' | clang -fsanitize=fuzzer -x c -o /dev/null -) >/dev/null 2>&1
-C_FILES := find quadsim docs examples tests -name '*.[ch]'
+C_FILES := find quadsim docs examples tests -name '*.[ch]' -not -path 'quadsim/mpc/export/c/*'
 HAS_GCC := command -v gcc >/dev/null
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 

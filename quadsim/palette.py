@@ -35,8 +35,9 @@ class Palette(NamedTuple):
 COLOUR: Final = Palette()
 CYCLE: Final = (COLOUR.flown, COLOUR.second, "#8c6d31", "#5d4a8a", "#6e8b00", "#4d4f57")
 """Of several flights, rotors or components, which only a legend can name; none of them means anything else."""
+# share in a colour that suits a dark, or as a text a light background
 _WHITE = 0.2
-_BLACK = 0.3  # share in a colour that suits a dark, or as a text a light background
+_BLACK = 0.3
 
 
 def line_colour(i: int) -> str:

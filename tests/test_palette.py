@@ -27,7 +27,6 @@ MATERIALS = {
     ("quadsim/features/live/look.py", "#31435a"): "sky",
     ("quadsim/report/templates/page.css", "#0b5cad"): "link",
     ("quadsim/report/templates/page.css", "#7cb8ff"): "link",
-    ("quadsim/report/to_plotly.py", "(210, 34, 46)"): "no colour: lengths in pixels",
     ("docs/tools/gallery.py", "(160, 90, 8)"): "no colour: lengths in pixels",
     ("quadsim/features/live/look.py", "(128, 128, 3)"): "no colour: shape of an array",
     ("docs/fly/fly.js", "#596b85"): "rotor disc, as in models/quadrotor.xml",

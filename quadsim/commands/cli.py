@@ -23,8 +23,9 @@ from quadsim.commands.app import app
 from quadsim.console.results import EXIT_FAILED, EXIT_WRONG_INPUT, Document, Result
 from quadsim.errors import QuadsimError, printable
 
+# of a message: one with many problems has a line for each
 _MOST_LINES = 21
-_LONGEST_LINE = 1000  # of a message: one with many problems has a line for each
+_LONGEST_LINE = 1000
 _HOME: Final = re.compile(r"(--[\w-]+=)?(~.*)", re.DOTALL)
 
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False  # otherwise Ctrl-C ends it silently

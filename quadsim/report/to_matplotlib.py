@@ -72,13 +72,15 @@ JOURNAL: Final[dict[RcKeyType, Any]] = {
 """What a figure of a stated width has besides: texts of 8 pt, and fonts that journals accept, Type 42."""
 JOURNAL_DPI: Final = 300
 SUFFIXES: Final = (".pdf", ".svg", ".png")
+# of a figure, of a row of panels and of what stands above and below them [in]
 _WIDTH = 9.6
 _ROW = 1.95
-_HEAD = 0.7  # of a figure, of a row of panels and of what stands above and below them [in]
+_HEAD = 0.7
 _LETTERS: Final = 26  # characters beside a vertical axis
+# the same of a figure of a stated width
 _JOURNAL_ROW = 1.2
 _JOURNAL_HEAD = 0.5
-_JOURNAL_LETTERS = 17  # the same of a figure of a stated width
+_JOURNAL_LETTERS = 17
 _LARGEST_SVG = 40_000
 _NOTEBOOK_DPI = 55
 _READ_LATE: Final[tuple[RcKeyType, ...]] = ("pdf.fonttype", "ps.fonttype")

@@ -17,11 +17,13 @@ from quadsim.state import Array
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure as Canvas
 
+# of a row of panels, and above and below them all [px]
 _ROW = 210
 _TOP = 34
-_BOTTOM = 46  # of a row of panels, and above and below them all [px]
+_BOTTOM = 46
+# between rows of panels, and where each has a label [px]
 _GAP = 56
-_LABELLED_GAP = 76  # between rows of panels, and where each has a label [px]
+_LABELLED_GAP = 76
 _SCENE: Final = 560  # [px]
 _LEAST_SHARE: Final = 0.4  # of the longest axis of a scene: how long the others are at least
 _MOST_POINTS: Final = 3000

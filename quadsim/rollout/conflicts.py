@@ -104,8 +104,9 @@ def find_conflict(infeasible_period: InfeasiblePeriod) -> Conflict | None:
                 first=int(steps[0]) + later,
                 last=int(steps[-1]) + later,
             )
+            # widened for the next pass by the violation
             one = sides[side]
-            wider = share + FEASIBLE  # widened for the next pass by the violation
+            wider = share + FEASIBLE
             sides[side] = replace(one, lower=one.lower - wider, upper=one.upper + wider)
         held |= _needed(problem, query, present, elastic, relaxed, giving)
     return Conflict(total=total, violated=violated, blocking=tuple(sorted(held - violated.keys())))

@@ -213,8 +213,9 @@ def _required(course: Course, assembly: Assembly, *, duration: float, pace: floa
     samples = round(duration / period) + 1
     given = [(event.at / pace, event.values) for event in _setpoints(scenario)]
     changes = [(first_period(at, period), values) for at, values in given]
+    # the vehicle is at rest before the flight
     before = np.tile(course.initial, (STENCIL, 1))
-    count = samples + STENCIL  # the vehicle is at rest before the flight
+    count = samples + STENCIL
     unfiltered, poses_along = assembly.followed(course).flown(count, changes)
     poses = np.vstack([before, poses_along])
     raw = np.vstack([before, unfiltered])

@@ -41,9 +41,10 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 Gains = Annotated[tuple[NonNegative, ...], Len(3, 3)]
 
+# [Hz]
 RATE = 1000.0
 GYRO_CUTOFF = 100.0
-D_CUTOFF = 60.0  # [Hz]
+D_CUTOFF = 60.0
 LARGEST_RATE: Final = (500.0, 500.0, 200.0)  # [deg/s]
 RATE_LOOP_DAMPING: Final = 0.7
 """Damping of the rate loop that the default gains aim at."""
@@ -204,12 +205,14 @@ class Autopilot(CompiledLoop):
 STEPS: Final = (0.1, 1.0, 1.0, 0.5)
 """Steps by which lags are identified: of the weight, and of body rates [rad/s]."""
 FIT_WINDOW: Final = 0.3  # time of a step response that is fitted [s]
+# [s]
 SHORTEST_FITTED_LAG = 1e-4
-LONGEST_FITTED_LAG = 0.6  # [s]
+LONGEST_FITTED_LAG = 0.6
 ATTITUDE_STEP: Final = 0.1
 """Step by which lags of an attitude are identified [rad]."""
+# [s]
 SHORTEST_ATTITUDE_LAG = 0.01
-LONGEST_ATTITUDE_LAG = 5.0  # [s]
+LONGEST_ATTITUDE_LAG = 5.0
 
 
 def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float = 1e-3) -> tuple[float, ...]:

@@ -176,8 +176,9 @@ class ClosedLoop:
         self._schedule: deque[list[Hold]] = deque([held] * self._under_way)
         self._speeds = self._initial_speeds  # the rotor speeds commanded last
         self._flying: _Flying | None = None  # the inner loop called last
+        # the last plan that came in time, and how many periods ago
         self._plan = self._acting[None]
-        self._age = 0  # the last plan that came in time, and how many periods ago
+        self._age = 0
         self._observed: Observation | None = None
         self._samples: list[Period] | None = [] if recorded else None
         self.last: Period | None = None

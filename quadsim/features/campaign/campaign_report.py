@@ -414,8 +414,9 @@ def scatters(table: pa.Table) -> list[Panel]:
     if not np.isfinite(margins).any():
         return []
     low, high = _ends(margins[np.isfinite(margins)])
+    # 0, the end of what is allowed, is among them
     low = min(0.0, low)
-    high = max(0.0, high)  # 0, the end of what is allowed, is among them
+    high = max(0.0, high)
     y, beyond_y = _clip(np.where(np.isfinite(margins), margins, -np.inf), low, high, "down", "up")
     padding = 0.6 * _GAP * ((high - low) or 1.0)
     panels = []

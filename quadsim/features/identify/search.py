@@ -47,9 +47,10 @@ LEVEL_PLATE: Final = (1.0, 1.0, 2.0)  # drag areas along x, y, z to each other, 
 _LAG_RATIO: Final = 0.5  # standard deviation of log(rise / fall)
 _WIND: Final = (2.0, 2.0, 0.7)  # standard deviation of the mean wind of a stretch, world axes [m/s]
 _WIND_STEP: Final = 0.2  # of its change in one second, over that of the mean
+# of the search: how many, shortened how often, until the likelihood gains less
 _STEPS = 60
 _TRIES = 8
-_SMALL = 5e-3  # of the search: how many, shortened how often, until the likelihood gains less
+_SMALL = 5e-3
 _LOG_STEP: Final = 1e-4  # of a logarithm, for slopes
 _NEWTON_STEPS = 30
 _LONGEST_STEP = 0.5

@@ -42,8 +42,9 @@ class Pace:
 
     def drive(self, session: Session, view: Any, until: Callable[[Frame], bool] = lambda frame: False) -> None:
         """Fly until `stop` or the last frame, shown by a `Page`; a flight that ended waits for a reset."""
+        # two seconds
         due = self._now()
-        recent = deque[float](maxlen=round(2.0 / session.period) + 1)  # two seconds
+        recent = deque[float](maxlen=round(2.0 / session.period) + 1)
         while not self._stop.is_set():
             while self._orders:
                 self._orders.popleft()(session)

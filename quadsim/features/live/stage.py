@@ -182,8 +182,9 @@ class Stage:
         """Clear the scene for a new flight."""
         course = self._ahead.points = _course(self._session)
         self.ground = min(0.0, float(course[..., 2].min())) + self._drop
+        # those that have been seen
         self._events = 0
-        self.mark.visible = False  # those that have been seen
+        self.mark.visible = False
         self._shown.clear()
         for trail, path in zip(self._trails, self._paths, strict=True):
             trail.clear()

@@ -68,8 +68,9 @@ class Pilot:
         self.rate = 0.0 if inner is None else inner.rate
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._slowest = np.full(4, vehicle.speed_min)
+        # the target in force; whether the autopilot is to be reset
         self._target = self._hover
-        self._fresh = True  # the target in force; whether the autopilot is to be reset
+        self._fresh = True
         # Body rates at which it starts then, with the rotors as they turn [rad/s]; None from the ground: as at hover.
         self._rates: Array | None = np.zeros(3)
 

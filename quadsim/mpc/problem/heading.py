@@ -32,8 +32,9 @@ def turn_horizontally(states: Array, angles: Array | float) -> Array:
     else:
         cosine = np.cos(angles)[..., None]
         sine = np.sin(angles)[..., None]
+    # x and vx, then y and vy
     along = states[..., 0:2]
-    across = states[..., 2:4]  # x and vx, then y and vy
+    across = states[..., 2:4]
     turned[..., 0:2] = cosine * along - sine * across
     turned[..., 2:4] = sine * along + cosine * across
     return turned

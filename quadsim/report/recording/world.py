@@ -84,8 +84,9 @@ def time_column(t: Array) -> rr.TimeColumn:
 
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
+# length of a dash of the reference, in arm lengths, and of dashes and gaps together
 _DASH = 0.8
-_MOST_DASHES = 500  # length of a dash of the reference, in arm lengths, and of dashes and gaps together
+_MOST_DASHES = 500
 _WIND_LENGTH: Final = 1.5  # how long a flight's strongest wind is drawn, in arm lengths
 
 

@@ -50,8 +50,8 @@ def test_without_effects_nothing_acts() -> None:
 def test_every_field_arrives() -> None:
     result = effects(
         "effects.rotors={rise=0.01, fall=0.02, acceleration=900.0, inertia=1e-4, efficiency=[1.0, 0.9, 0.8, 0.7]}",
-        "effects.air={density=1.1, rotor_drag=2e-4, inflow=2e-4, rotor_moment=[1e-5, 2e-5], inflow_moment=[3e-3, 4e-3], "
-        "rate_damping=[1e-3, 2e-3, 3e-3], body_drag=[0.01, 0.02, 0.03]}",
+        "effects.air={density=1.1, rotor_drag=2e-4, inflow=2e-4, rotor_moment=[1e-5, 2e-5], "
+        "inflow_moment=[3e-3, 4e-3], rate_damping=[1e-3, 2e-3, 3e-3], body_drag=[0.01, 0.02, 0.03]}",
         "effects.ground={effect=true, rotor_radius=0.1}",
         "effects.load={mass_factor=1.1, inertia_factor=[1.2, 1.1, 1.05], centre_of_mass=[0.01, 0.02, 0.03], "
         "payloads=[{mass=0.3, position=[0.0, 0.0, -0.1]}]}",

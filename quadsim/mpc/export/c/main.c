@@ -1,6 +1,6 @@
-/* Answers the recorded periods.  Prints of each, in hexadecimal digits, its number, its status, the changes of the
- * active set, the bits of the four commands, and the ticks that it took.  Exit status 1 where a status is not the
- * recorded one, or a command is farther from the exact optimum than it may be. */
+/* Answers the recorded periods.  Prints of each, in hexadecimal digits, its number, its status, the changes of the active
+ * set, the bits of the four commands, and the ticks that it took.  Exit status 1 where a status is not the recorded one,
+ * or a command is farther from the exact optimum than it may be. */
 #include "quadsim_data.h"
 #include "target.h"
 #include "vectors.h"
@@ -35,8 +35,9 @@ int main(void)
         const uint32_t started = target_ticks();
         char line[128], *end = line;
         quadsim_real command[4];
-        const int status = (int)quadsim_law_step(&law, QUADSIM_PHASE_FLYING, recorded->state, quadsim_vectors_path[k],
-                                                 recorded->acting, command);
+        const int status =
+            (int)quadsim_law_step(&law, QUADSIM_PHASE_FLYING, recorded->state, quadsim_vectors_path[k],
+                                  recorded->acting, command);
         const int changes = quadsim_law_changes(&law);
         const uint32_t ticks = target_ticks() - started;
         /* Else there is no optimum to compare with. */

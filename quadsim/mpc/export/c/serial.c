@@ -19,7 +19,7 @@
 enum kind { START, ROW, STEP, STAND };
 
 struct question {
-    uint32_t mark, number;             /* MARK; one more with each question */
+    uint32_t mark, number;  /* MARK; one more with each question */
     quadsim_real state[QUADSIM_STATE]; /* x(k), as in the controller's header */
     quadsim_real row[QUADSIM_ROW];     /* the last row of the reference; those before have come before */
     quadsim_real acting[4];            /* u(k - 1) */
@@ -27,8 +27,8 @@ struct question {
 };
 
 struct answer {
-    uint32_t mark, number;     /* the question's */
-    quadsim_real command[4];   /* u(k) */
+    uint32_t mark, number; /* the question's */
+    quadsim_real command[4]; /* u(k) */
     uint16_t status, fallback; /* as of quadsim_law_step, and its level */
     uint32_t crc;
 };
@@ -111,9 +111,8 @@ static int solve(const struct question *question)
         return 0;
     }
     flying = 1;
-    answer.status =
-        (uint16_t)quadsim_law_step(&law, question->kind == STAND ? QUADSIM_PHASE_ARMED : QUADSIM_PHASE_FLYING,
-                                   question->state, window, question->acting, answer.command);
+    answer.status = (uint16_t)quadsim_law_step(&law, question->kind == STAND ? QUADSIM_PHASE_ARMED : QUADSIM_PHASE_FLYING,
+                                               question->state, window, question->acting, answer.command);
     answer.fallback = (uint16_t)law.guard.level;
     return 1;
 }

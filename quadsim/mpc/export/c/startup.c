@@ -68,8 +68,7 @@ struct vectors {
 
 extern const struct vectors vectors;
 __attribute__((section(".vectors"))) const struct vectors vectors = {
-    stack_top,
-    {reset, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault}};
+    stack_top, {reset, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault, fault}};
 
 uint32_t target_ticks(void)
 {

@@ -13,9 +13,8 @@ extern const uint32_t target_ticks_per_ms;
 /* Text for a person or a test.  POSIX: standard output.  Cortex-M: the debugger's console, by semihosting. */
 void target_print(const char *text);
 
-/* The serial line.  POSIX: standard input and output.  Cortex-M: the first UART of the board, polled, which does for
- * the emulated one: no byte is read during a step, so that a UART that holds few needs an interrupt that fills a
- * buffer. */
+/* The serial line.  POSIX: standard input and output.  Cortex-M: the first UART of the board, polled, which does for the
+ * emulated one: no byte is read during a step, so that a UART that holds few needs an interrupt that fills a buffer. */
 int target_read(void); /* the next byte; -1 where none has come, after a millisecond at most */
 void target_write(const void *bytes, size_t count);
 
