@@ -129,7 +129,7 @@ def span(values: Iterable[float], form: str = ".3g") -> str:
 def _bound(bound: Record, unit: str) -> str:
     if bound["satisfied"]:
         return f"holds ({bound['margin']:.3f} {unit})"
-    seconds = f"{bound['time_violated']:.2f} s" if bound["time_violated"] else "by commands alone"
+    seconds = f"{bound['time_violated']:.2f} s" if bound["time_violated"] else "only the command violates it"
     return f"violated ({bound['margin']:.2f} {unit}), {seconds}"
 
 

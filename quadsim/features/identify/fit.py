@@ -43,9 +43,11 @@ _NORMAL: Final = 1.96  # standard deviations on either side, of a normal distrib
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
 _YAW: Final = "yaw steps of 40 deg, one per second, for 10 s"
 _GUSTS: Final = 0.015  # of drag, by wind that changes faster than its knots
-_BLOWN: Final = 0.01  # of what torques show, by such wind where `rotor_moment` turns it into torque
-_MAPPED: Final = 2.0  # how much more the prediction leaves out where speeds follow from a throttle's curve
-_SPUN: Final = 0.004  # of inertia: noise of the gyro shrinks what commands explain, by 0.5 % where it is loud
+_WIND_TORQUE_FLOOR: Final = 0.01  # of what torques show, by such wind where `rotor_moment` turns it into torque
+# How much more the prediction leaves out where speeds follow from a throttle's curve.
+_THROTTLE_FLOOR_FACTOR: Final = 2.0
+# Of inertia: noise of the gyro shrinks what commands explain, by 0.5 % where it is loud.
+_GYRO_NOISE_FLOOR: Final = 0.004
 _LAG_UNKNOWN = 0.4
 _ANSWER_UNKNOWN = 0.15
 _TORQUE_UNKNOWN = 0.08
@@ -70,13 +72,13 @@ class _Kind(NamedTuple):
 
 _KINDS: Final = {
     "thrust_coefficient": _Kind(("vz",), "20 s in the air, climbing and sinking"),
-    "inertia_x": _Kind(("roll",), "steps to the side or a figure eight, 20 s", "kg m^2", floor=_SPUN),
-    "inertia_y": _Kind(("pitch",), "steps forward or a figure eight, 20 s", "kg m^2", floor=_SPUN),
-    "inertia_z": _Kind(("roll", "pitch", "yaw"), _TURNS, "kg m^2", floor=_SPUN),
-    "drag_to_thrust": _Kind(("yaw",), _YAW, floor=_SPUN),
-    "rotor_rise": _Kind(("roll", "pitch", "yaw"), _YAW, floor=2.0 * _SPUN),
-    "rotor_fall": _Kind(("roll", "pitch", "yaw"), _YAW, floor=2.0 * _SPUN),
-    "rotor_inertia": _Kind(("yaw",), _YAW, floor=_SPUN),
+    "inertia_x": _Kind(("roll",), "steps to the side or a figure eight, 20 s", "kg m^2", floor=_GYRO_NOISE_FLOOR),
+    "inertia_y": _Kind(("pitch",), "steps forward or a figure eight, 20 s", "kg m^2", floor=_GYRO_NOISE_FLOOR),
+    "inertia_z": _Kind(("roll", "pitch", "yaw"), _TURNS, "kg m^2", floor=_GYRO_NOISE_FLOOR),
+    "drag_to_thrust": _Kind(("yaw",), _YAW, floor=_GYRO_NOISE_FLOOR),
+    "rotor_rise": _Kind(("roll", "pitch", "yaw"), _YAW, floor=2.0 * _GYRO_NOISE_FLOOR),
+    "rotor_fall": _Kind(("roll", "pitch", "yaw"), _YAW, floor=2.0 * _GYRO_NOISE_FLOOR),
+    "rotor_inertia": _Kind(("yaw",), _YAW, floor=_GYRO_NOISE_FLOOR),
     "rotor_drag": _Kind(("vx", "vy"), _FAST, floor=_GUSTS),
     "inflow": _Kind(("vz",), _RISING, floor=0.02, widest=1.0),
     "rotor_moment_x": _Kind(("roll",), _FAST, floor=0.02, widest=0.5),
@@ -223,13 +225,13 @@ class _Fit:
 
     def _floor(self, shares: Mapping[int, float], axes: Sequence[str]) -> float:
         """Deviation of a sum of shares of x by what the prediction leaves out."""
-        floor = max(_KINDS[self._kind(i)].floor for i in shares) * (_MAPPED if self._throttle else 1.0)
+        floor = max(_KINDS[self._kind(i)].floor for i in shares) * (_THROTTLE_FLOOR_FACTOR if self._throttle else 1.0)
         turns = {*axes} <= {"roll", "pitch", "yaw"} and all(self.search.sought[i].scale is None for i in shares)
         if not turns:
             return floor
         lags = any(self._kind(i) in ("rotor_rise", "rotor_fall") for i in shares)
         unknown = self._rotors_unknown * (_LAG_UNKNOWN if lags else _TORQUE_UNKNOWN)
-        return math.hypot(floor, unknown, _BLOWN if self._blown else 0.0)
+        return math.hypot(floor, unknown, _WIND_TORQUE_FLOOR if self._blown else 0.0)
 
     def _gusts_turn(self) -> bool:
         """Whether there is wind and, by two standard deviations, a moment that it makes a torque of."""
