@@ -236,8 +236,6 @@ def failure_line(error: BaseException) -> str:
     # its path is that of what was to be made
     if isinstance(error, OutputError):
         text = error.problem
-    else:
-        text = text
     return f"failed: {printable(' '.join(text.split()))}"[:_LONGEST]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import re
+import subprocess
 import tomllib
 from collections.abc import Callable
 from html import escape
@@ -140,6 +141,20 @@ def test_every_table_that_is_filled_is_known_and_stays_where_its_file_is_not(
     (tmp_path / "solvers.origin.json").write_text(json.dumps(made))
     stated = "*`make numbers OPTIONS=solvers`, commit 0123abcd, 2026-01-02, PIQP 1.2.3.*"
     assert stated in remake.filled(page)[0]
+
+
+def test_numbers_are_made_by_their_command_with_their_origin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran = []
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        ran.append(command)
+        return subprocess.CompletedProcess(command, 0, stdout="0123abcd\n")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    monkeypatch.setattr(remake, "MADE", tmp_path)
+    remake.make("solvers")
+    assert ran[0] == remake.COMMANDS["solvers"][0]
+    assert json.loads((tmp_path / "solvers.origin.json").read_text(encoding="utf-8"))["commit"] == "0123abcd"
 
 
 @pytest.mark.slow("pages")

@@ -88,7 +88,7 @@ def make(name: str) -> None:
     """Run the commands of a name, and note what its numbers come from."""
     MADE.mkdir(parents=True, exist_ok=True)
     for command in COMMANDS[name]:
-        with reporting(name in PRINTED or name == "pictures") as report:  # the others say how far they are
+        with reporting(name in PRINTED or name == "pictures", name) as report:  # the others say how far they are
             report(name, 0, 1)
             stdout = subprocess.PIPE if name in PRINTED else None
             done = subprocess.run(command, cwd=ROOT, check=True, text=True, stdout=stdout)

@@ -106,8 +106,6 @@ def demand(
     intervals = course.shape[0] - 1
     if jumps is None:
         jumps = np.zeros(intervals, bool)
-    else:
-        jumps = jumps
     kinks = jumps if kinks is None else jumps | kinks
     velocity = np.diff(course, axis=0) / period
     usable = ~(jumps[1:] | jumps[:-1])

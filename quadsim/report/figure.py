@@ -276,10 +276,11 @@ class Panel:
         if settled is None or every is None:
             return None
         low, high = settled
-        span = max(high - low, LEAST_SPANS.get(self.unit, 0.0))
+        span = max(high - low, LEAST_SPANS.get(self.unit, 0.0)) or max(abs(high), 1.0)
         if every[1] - every[0] <= _SPIKE * span:
             return None
-        return low - 0.05 * span, high + 0.05 * span
+        middle = 0.5 * (low + high)
+        return middle - 0.55 * span, middle + 0.55 * span
 
     @property
     def fixed_range(self) -> tuple[float, float] | None:

@@ -212,6 +212,8 @@ class Rollout:
         Raises:
             FlightError: the vehicle is lost; the flight has ended.
         """
+        if self.loop.before is None:
+            raise InputError("the flight is closed")
         return self.loop.observation
 
     def step(self, command: Command | Array | None = None) -> Period:

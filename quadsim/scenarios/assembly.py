@@ -189,8 +189,6 @@ class Assembly:
         """
         if scenario is None:
             scenario = self.scenario
-        else:
-            scenario = scenario
         return scenario.written(self._stating(scenario).altered(events=scenario.events))
 
     def audited(self) -> Assembly:
@@ -653,8 +651,6 @@ class Assembly:
         """
         if events is None:
             events = self.scenario.events
-        else:
-            events = events
         rotors = self.effects.rotors or RotorDynamics()
         for event in events:
             if isinstance(event, LagChange):

@@ -315,9 +315,7 @@ def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginC
 def make_force(force: Any, spec: PluginForce, vehicle: Vehicle, rng: np.random.Generator) -> Force:
     """Return the force of a function force(time, state), a callable object, or a class of such; see `make_law`."""
     if isinstance(code := _code_of(force), type):
-        if code is type(force):
-            force = force
-        else:
+        if code is not type(force):
             force = _call(code, spec, {"vehicle": vehicle}, rng=rng)
     else:
         _call(inspect.signature(code).bind, spec, dict.fromkeys(("time", "state")))

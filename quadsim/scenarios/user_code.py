@@ -90,9 +90,7 @@ def set_up(
     Raises:
         InputError: the controller, a force or the reference cannot be set up.
     """
-    if reference is None:
-        assembly = assembly
-    else:
+    if reference is not None:
         assembly = following(assembly, reference)
     assembly.user_autopilot = autopilot
     scenario = assembly.scenario

@@ -129,8 +129,12 @@ class Margins:
             return
         t, values = source.finest(log)
         margins = np.where(limit.holds_at(t), limit.margin(values), np.inf)
-        if source.plant is not None:
+        if source.gaps:  # of each step, at its start: there is none yet at the end
+            margins = margins[np.isfinite(values)]
+        elif source.plant is not None:
             margins = margins[first:]
+        if not margins.size:
+            return
         smallest[i] = margins.min()
         at_end[i] = margins[-1]
 

@@ -145,9 +145,7 @@ class Plant:
             bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
             assert self.model.body_mocapid[bodies].tolist() == list(range(len(bodies)))  # the core writes them in order
         self._changes = self._scheduled(changes)
-        if rng is not None:
-            rng = rng
-        else:
+        if rng is None:
             rng = np.random.default_rng(0)
         self._reset_to: tuple[bytes, Array] = b"", np.zeros(_MOTION)
         self._seed(rng)

@@ -11,6 +11,7 @@ from drawn_events import HAPPENING, kind
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import quadsim
 from quadsim.errors import CommandError, FlightError, InputError
 from quadsim.rollout.flight_events import prepared
 from quadsim.rollout.flown import Flight
@@ -221,3 +222,11 @@ def test_without_a_record_there_is_no_log() -> None:
         assert set(started.margins()) == {limit.name for limit in started.limits}
         with pytest.raises(InputError, match="recorded"):
             started.flight()
+
+
+def test_a_closed_flight_has_no_observation() -> None:
+    flight = quadsim.start("hover")
+    flight.step()
+    flight.close()
+    with pytest.raises(InputError, match="the flight is closed"):
+        _ = flight.observation

@@ -284,8 +284,6 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
     table = read_flights(directory / FLIGHTS_FILE, plan.schema)
     if number is None:
         number = worst_flight(table)
-    else:
-        number = number
     flights = table["flight"].to_pylist()
     if number not in flights:
         raise ParameterError("", "--flight", number, f"one of the flights 0 to {flights[-1]} of {directory}")

@@ -72,7 +72,7 @@ _FASTEST = 1e3
 _HALVINGS: Final = 40
 _YAW_ALLOWED: Final = 90.0 * ALLOWED_SHARE
 """Least allowed error of the heading [deg]: that of a quarter turn."""
-AVOIDING: Final = ("robust", "rates")
+AVOIDING: Final = ("robust", "nonlinear", "rates")
 """Designed controllers that keep clear of obstacles."""
 _ERRORS: Final = tuple(f"{name}_error" for name in REFERENCE_NAMES)
 _CARRIED: Final = ("x", "y", "z", "vx", "vy", "vz", *_ERRORS)
@@ -236,11 +236,9 @@ def _sampled(base: Scenario, assembly: Assembly) -> SampledCourse:
     poses = np.column_stack([within_rounding(values, unit, smooth_everywhere) for values, unit in channels])
     if course.jumps:
         before = course.sample(np.array(course.jumps) - 1e-6)
-    else:
-        before = np.empty((0, 4))
-    if course.jumps:
         after = course.sample(np.array(course.jumps) + 1e-6)
     else:
+        before = np.empty((0, 4))
         after = np.empty((0, 4))
     moved = after - before
     has_jumps = isinstance(base.reference, Steps) and bool(np.abs(moved).max(initial=0.0) > 0.0)

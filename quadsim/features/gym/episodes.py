@@ -64,8 +64,6 @@ class Episodes:
         if vary is not None:
             if isinstance(vary, str | Path):
                 vary = str(vary)
-            else:
-                vary = vary
             self._plan = commands_of("campaign").drawn_flights(loaded, vary)
             loaded = self._plan.scenario
         self.base = loaded

@@ -33,7 +33,7 @@ Flags = NDArray[np.bool_]
 _YAW: Final = INDEX["yaw"]
 _HEIGHT: Final = INDEX["z"]
 _NEAR_LOSS: Final = 1.0 - 1e-6  # share of a limit of [lost] beyond which a vehicle is looked at by itself
-MOST_SETUPS: Final = 4096  # drawn flights whose parts are kept
+MOST_SETUPS: Final = 1024  # drawn flights whose parts are kept
 
 
 def obstacle_to_batch(scenario: Scenario) -> str | None:

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from quadsim.controller import UNCONSTRAINED
+from quadsim.controller import ROTORS, UNCONSTRAINED
 from quadsim.errors import ParameterError
 from quadsim.features.gym.environment import QuadrotorEnv
 from quadsim.features.gym.spaces import Action
@@ -73,6 +73,8 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
             scenario = scenario.replace({"controller": dict(controller)})
         if not isinstance(scenario.controller, Robust):
             raise ParameterError("controller", "type", scenario.controller.type, "robust, for a safety filter")
+        if scenario.controller.commands != ROTORS:
+            raise ParameterError("controller", "commands", scenario.controller.commands, "rotors, for a safety filter")
         self._base = base
         self._spec = scenario.controller
         self._vehicle: Vehicle | None = None

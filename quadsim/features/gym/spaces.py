@@ -68,7 +68,7 @@ class Actions:
         if kind not in ACTIONS:
             raise UnknownNameError("action", str(kind), ACTIONS)
         spec = scenario.controller
-        if isinstance(spec, Bounded):
+        if isinstance(spec, Bounded) and spec.input_bounds is not None:
             bounds = spec.input_bounds.actuators(vehicle)
             owner = "controller.input_bounds"
         else:

@@ -22,6 +22,7 @@ from quadsim.features.gym.rewards import Reward, RewardHook, nearness
 from quadsim.features.gym.spaces import USUAL, Action, check_action
 from quadsim.rollout.flown import Flight
 from quadsim.scenarios.schema.scenario import Scenario
+from quadsim.sim.margins import Margins
 from quadsim.state import Array
 
 
@@ -119,6 +120,9 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         self.render_mode = None
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self.obstacle = obstacle_to_batch(self.scenario)
+        compiled = Margins(self._single.limits, self.scenario.plant.timestep).compiled
+        if self.obstacle is None and margins and not compiled:
+            self.obstacle = "a constraint whose margins Python computes"
         if margins:
             limits = len(self._single.constraint_names)
         else:

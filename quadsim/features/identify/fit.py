@@ -311,8 +311,6 @@ class _Fit:
                 why = ""
             if name in ("rotor_rise", "rotor_fall") and value <= 0.0:
                 why = "no lag can be seen"
-            else:
-                why = why
             found[name] = self._judged(name, value, value - half, value + half, why)
         return found
 

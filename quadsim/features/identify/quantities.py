@@ -263,8 +263,6 @@ def _series(columns: Mapping[str, Column], one: NamedQuantity) -> Column:
     # a motor that is stopped has a shorter pulse
     if np.any(one.zero):
         values = np.maximum(values, 0.0)
-    else:
-        values = values
     return Column(t=t, values=values * one.sign if one.sign else values)
 
 

@@ -22,6 +22,7 @@ SPIKE_TIME: Final = 0.03  # [s]: what lasts longer may be flown
 FARTHEST: Final = 1.5  # how far a sample may be from the median about it, in ranges of all medians
 LOUDEST: Final = 8.0  # the same in median distances, where a column hardly changes
 COMMANDS_APART: Final = 3.0  # how far a command may be from 0, in the largest median: a real one may last one sample
+LEAST_DROP: Final = 0.05  # share of a battery's voltage below which a change is no jump: it is logged to 0.1 V
 MOST_CUT: Final = 0.01  # share of a sensor's samples that may be cut
 TURN_AWAY = 1.0
 TURNED_BACK = 0.5
@@ -76,7 +77,8 @@ def without_spikes(name: str, series: Mapping[str, Column]) -> tuple[dict[str, C
         if field == "attitude":
             off = _attitude_spikes(samples.values)[:, None]
         else:
-            off = _spikes(samples, command=field == "commands")
+            least = LEAST_DROP if field == "voltage" else 0.0
+            off = _spikes(samples, command=field == "commands", least=least)
         if not off.any():
             continue
         for i in np.flatnonzero(off.any(axis=0)):
@@ -104,15 +106,19 @@ def without_spikes(name: str, series: Mapping[str, Column]) -> tuple[dict[str, C
     return result, tuple(notes)
 
 
-def _spikes(samples: Column, *, command: bool) -> NDArray[np.bool_]:
-    """Samples (M, n) that are far from the median about them."""
+def _spikes(samples: Column, *, command: bool, least: float) -> NDArray[np.bool_]:
+    """Samples (M, n) that are far from the median about them: by more than a share `least` of the largest median."""
     t, values = samples
     off = np.zeros(values.shape, bool)
     there = np.isfinite(values).all(axis=1)
     if np.count_nonzero(there) < 4 * LONGEST_SPIKE:
         return off
     rows = values[there]
-    longest = round(SPIKE_TIME / float(np.median(np.diff(t))))
+    steps = np.diff(t)
+    steps = steps[steps > 0.0]  # a battery's clock may be coarse
+    if not steps.size:
+        return off
+    longest = round(SPIKE_TIME / float(np.median(steps)))
     size = 2 * min(max(longest, 1), LONGEST_SPIKE) + 1
     middle = median_filter(rows, size=(size, 1), mode="nearest")
     distance = np.abs(rows - middle)
@@ -120,6 +126,7 @@ def _spikes(samples: Column, *, command: bool) -> NDArray[np.bool_]:
         off[there] = np.abs(rows) > COMMANDS_APART * np.abs(middle).max()
     else:
         farthest = FARTHEST * np.ptp(middle, axis=0) + LOUDEST * np.median(distance, axis=0)
+        farthest = np.maximum(farthest, least * np.abs(middle).max(axis=0))
         off[there] = distance > farthest + ROUNDING
     return off
 

@@ -223,6 +223,4 @@ def _mark(limit: Limit, margin: float, vehicle: int) -> str:
         return f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{colour};z-index:1"></i>'
     if limit.violated(margin):
         colour = COLOUR.violated
-    else:
-        colour = colour
     return f'<i style="left:0;width:{100.0 * share:.1f}%;background:{colour}"></i>'

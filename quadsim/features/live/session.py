@@ -248,8 +248,6 @@ class Session:
                 except FlightError as error:
                     if flight is self.flights[0]:
                         self.reason = str(error)
-                    else:
-                        self.reason = self.reason
             shown.append(entry)
         samples, margins, horizons = zip(*shown, strict=True)
         health = self._left(by_hand=True)
@@ -267,6 +265,8 @@ class Session:
         for signal, (lower, upper) in result.spec.audited(flight.vehicle).items():
             if signal == "speed":
                 hover = flight.vehicle.hover_speeds
+            elif signal == "thrust":
+                hover = np.array([flight.vehicle.mass * flight.vehicle.gravity])
             else:
                 hover = np.zeros(1)
             if signal not in REFERENCE_NAMES and not (lower <= hover.min() and hover.max() <= upper):

@@ -387,9 +387,7 @@ def to_plain(margins: LoopMargins) -> dict[str, Any]:
         }
     growth = asdict(margins.growth)
     for name in ("rate", "left"):
-        if math.isfinite(growth[name]):
-            growth[name] = growth[name]
-        else:
+        if not math.isfinite(growth[name]):
             growth[name] = None
     return {
         "controller": margins.name,

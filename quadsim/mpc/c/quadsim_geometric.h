@@ -2,13 +2,15 @@
  *
  * Once every period, call quadsim_geometric_step with what is measured now; hold the command until the next call.
  *
- * state [19]        position, velocity, Euler angles and their rates in the order of quadsim_guard.h [12]; the attitude
- * as a quaternion w x y z, body to world [4], and body rates [3] [rad/s], each derived from the angles and their rates
- * where it is not finite, or where `exact` is not set reference         previews [N][4]: x y z yaw [m, rad], where to
- * be one period from now, two, ... N periods from now; whole turns of yaw make no difference.  Or where `motion` is set
- * samples of a course [7][17], now, one period on, ...: position, quaternion, and ten numbers that this law does not
- * need; past the end of the course its last one acting [4]        the command before, in force up to now command [4]
- * targets of an autopilot, to hold for the period: thrust [N] and body rates [rad/s]
+ * state [19]        position, velocity, Euler angles and their rates in the order of quadsim_guard.h [12]; the
+ *                   attitude as a quaternion w x y z, body to world [4], and body rates [3] [rad/s], each derived
+ *                   from the angles and their rates where it is not finite, or where `exact` is not set
+ * reference         previews [N][4]: x y z yaw [m, rad], where to be one period from now, two, ... N periods from now;
+ *                   whole turns of yaw make no difference.  Or where `motion` is set samples of a course [7][17], now,
+ *                   one period on, ...: position, quaternion, and ten numbers that this law does not need; past the
+ *                   end of the course its last one
+ * acting [4]        the command before, in force up to now
+ * command [4]       targets of an autopilot, to hold for the period: thrust [N] and body rates [rad/s]
  *
  * A law's numbers are read only, and may be shared.  All that a law remembers is in a quadsim_geometric and its memory
  * of quadsim_geometric_reals(numbers) reals, all of the caller's.  Nothing is allocated, nothing is shared. */

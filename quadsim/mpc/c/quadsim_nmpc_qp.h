@@ -1,7 +1,7 @@
 /* What the files of an iteration's quadratic program share.
  *
- *     min  1/2 sum |s_i - goal_i|^2_Q + |u_i - aim_i|^2_R    s.t.  s_{i+1} = A_i s_i + B_i u_i + c_i  and rows a z <=
- * b.
+ *     min  1/2 sum |s_i - goal_i|^2_Q + |u_i - aim_i|^2_R
+ *     s.t. s_{i+1} = A_i s_i + B_i u_i + c_i  and rows a z <= b.
  *
  *   quadsim_nmpc_rows.c        what rows are: their products, bounds, gradients and slacks
  *   quadsim_nmpc_riccati.c     the recursion: the optimum without rows, and what a row's multiplier does to it

@@ -2,13 +2,15 @@
  *
  * Once every period, call quadsim_nonlinear_step with what is measured now; hold the command until the next call.
  *
- * state [19]        position, velocity, Euler angles and their rates in the order of quadsim_guard.h [12]; the attitude
- * as a quaternion w x y z, body to world [4], and body rates [3] [rad/s], each derived from the angles and their rates
- * where it is not finite reference         previews [rows][4]: x y z yaw [m, rad], where to be one period from now,
- * two, ... N periods from now; whole turns of yaw make no difference.  Motions [rows + 1][17], now and then the same:
- * position, quaternion, velocity, body rates, and thrusts of the rotors [N]; with a delay of n periods and a part of
- * one, n + 1 rows more acting [4]        the command before, in force up to now command [4]       rotor speeds [rad/s],
- * or targets of an inner loop: thrust [N] and body rates [rad/s]
+ * state [19]        position, velocity, Euler angles and their rates in the order of quadsim_guard.h [12]; the
+ *                   attitude as a quaternion w x y z, body to world [4], and body rates [3] [rad/s], each derived
+ *                   from the angles and their rates where it is not finite
+ * reference         previews [rows][4]: x y z yaw [m, rad], where to be one period from now, two, ... N periods from
+ *                   now; whole turns of yaw make no difference.  Motions [rows + 1][17], now and then the same:
+ *                   position, quaternion, velocity, body rates, and thrusts of the rotors [N]; with a delay of n
+ *                   periods and a part of one, n + 1 rows more
+ * acting [4]        the command before, in force up to now
+ * command [4]       rotor speeds [rad/s], or targets of an inner loop: thrust [N] and body rates [rad/s]
  *
  * A controller's numbers are a quadsim_nonlinear_numbers, which is read only and may be shared.  All that a controller
  * remembers is in a quadsim_nonlinear and its memory of quadsim_nonlinear_reals(numbers) reals and

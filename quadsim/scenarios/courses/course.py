@@ -197,9 +197,7 @@ def poses_of(points: Sequence[Point], initial: Array) -> Array:
     poses = []
     yaw = float(initial[3])
     for point in points:
-        if point.yaw is None:
-            yaw = yaw
-        else:
+        if point.yaw is not None:
             yaw = nearest_turn(math.radians(point.yaw), yaw)
         poses.append([*point.position, yaw])
     return np.array(poses)

@@ -130,6 +130,7 @@ class Csv(Travelled):
             start=time * self.start,
             response_time=time * self.response_time,
             repeat=None if self.repeat is None else time * self.repeat,
+            yaw_rate=self.yaw_rate / time if self.looks_ahead else self.yaw_rate,
             length_factor=length * self.length_factor,
             time_factor=time * self.time_factor,
             lift=length * self.lift + lift,

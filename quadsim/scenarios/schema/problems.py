@@ -30,7 +30,7 @@ _TAGS: Final = ("type", "distribution")  # fields that distinguish tables
 _NAMES: Final = {float: "number", int: "whole number", str: "text"}
 _LIMITS: Final = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 _REASONS: Final = {
-    "controller.commands": " with this controller: only nonlinear and geometric can command thrust and rates; "
+    "controller.commands": " with this controller: only robust, nonlinear and geometric can command thrust and rates; "
     "models and gains of the others are for rotor speeds",
 }
 """Reasons why a controller lacks a field that a reader may expect."""
@@ -395,8 +395,6 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *,
         choices = expected.strip("'").split("', '")
         if isinstance(given, Mapping):
             given = given.get(name)
-        else:
-            given = given
         field = f"{field}.{name}"
         rule = f"one of {expected}"
     return f"{field} must be {rule if kind in _KNOWN else details['msg']}; got {shown(given)}{_guess(given, choices)}"

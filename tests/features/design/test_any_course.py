@@ -131,7 +131,7 @@ def test_a_table_keeps_its_lengths_and_starts_at_its_first_row(tmp_path: Path) -
     [
         ("power-loop", {}, "--course must be one that stays upright"),
         ("inverted-start", {}, "--course must be one that stays upright"),
-        ("slalom", {"law": "pid"}, "--course must be flown by --controller robust or rates"),
+        ("slalom", {"law": "pid"}, "--course must be flown by --controller robust or nonlinear or rates"),
         ("hover", {"size": 2.0}, "--size must be absent with --course hover"),
         ("lost-rotor", {"size": 2.0}, "--size must be absent with --course lost-rotor, which does not move"),
         ("step", {"size": 0.0}, "--size must be between"),

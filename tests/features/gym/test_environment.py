@@ -378,3 +378,28 @@ def test_record_video_names_what_it_lacks(tmp_path: Path, monkeypatch: pytest.Mo
     env = quadsim.gym.make_env("hover", render_mode="rgb_array")
     with pytest.raises(DependencyNotInstalled, match=r"(?i)moviepy is not installed"):
         RecordVideo(env, str(tmp_path / "films"))
+
+
+def test_a_bound_on_the_climb_acceleration_has_margins_and_is_flown_apart() -> None:
+    bound = {"name": "climb", "signal": "climb_acceleration", "lower": -0.5, "upper": 0.5}
+    scenario = short("hover", 0.3, constraints=[bound])
+    with quadsim.gym.make_env(scenario) as env:
+        env.reset(seed=0)
+        action = env.action_space.high
+        _, _, _, _, info = env.step(action)
+        assert np.isfinite(info["margins"]["climb"])
+        assert info["margins"]["climb"] < 0.0
+    envs = quadsim.gym.make_vec(scenario, 2)
+    assert envs.obstacle == "a constraint whose margins Python computes"
+    envs.close()
+
+
+def test_a_scenario_of_an_autopilot_s_targets_is_an_environment() -> None:
+    """With the vehicle's bounds, as the controller has none on rotor speeds."""
+    controller = {"type": "robust", "commands": "rates", "horizon": 10, "output_weights": {"x": 1.0}}
+    controller |= {"target_weights": {"thrust": 0.1, "body_rate": 0.1}, "inner_lag": [0.0, 0.05, 0.05, 0.1]}
+    scenario = short("hover", 0.2, controller=controller, autopilot={}, constraints=[])
+    with quadsim.gym.make_env(scenario, action="rates") as env:
+        env.reset(seed=0)
+        observation, *_ = env.step(env.action_space.sample())
+        assert np.isfinite(observation).all()

@@ -237,3 +237,12 @@ def test_the_teacher_labels_its_own_flight_and_the_students() -> None:
     assert len(other.seen) == len(other.speeds) > 1
     assert np.array_equal(other.speeds[0], own.speeds[0])
     assert not np.array_equal(other.speeds[1], own.speeds[1])
+
+
+def test_a_filter_of_an_autopilot_s_targets_is_refused() -> None:
+    weights = {"thrust": 0.1, "body_rate": 0.1}
+    controller = {"type": "robust", "commands": "rates", "horizon": 10, "output_weights": {"x": 1.0}}
+    controller |= {"target_weights": weights, "inner_lag": [0.0, 0.05, 0.05, 0.1]}
+    env = quadsim.gym.make_env("hover", action="speeds")
+    with env, pytest.raises(ParameterError, match=r"controller\.commands must be rotors, for a safety filter"):
+        quadsim.gym.MPCSafetyFilter(env, controller=controller)

@@ -17,6 +17,7 @@ from quadsim.features.identify.checks import LOG_CHECKS, ROW_CHECKS, check_log, 
 from quadsim.features.identify.fit import deviation_between, identify_records
 from quadsim.features.identify.record import Record, read_record, to_record
 from quadsim.features.identify.rotors import lagging
+from quadsim.features.identify.sensors import without_spikes
 from quadsim.features.identify.series import Column
 from quadsim.state import Array
 from quadsim.vehicle import load_vehicle
@@ -261,3 +262,20 @@ def test_a_log_is_named_in_each_note(eight: Record, tmp_path: Path) -> None:
     record = replace(read(eight), name="mine.csv", notes=())
     for note in notes(record):
         assert note.startswith("mine.csv: ")
+
+
+def test_a_battery_that_is_logged_to_a_tenth_of_a_volt_does_not_jump() -> None:
+    t = 0.01 * np.arange(2000)
+    volts = np.full((2000, 1), 12.0)
+    volts[::30] = 11.9
+    kept, notes = without_spikes("log.csv", {"voltage": Column(t=t, values=volts)})
+    assert not notes
+    assert np.isfinite(kept["voltage"].values).all()
+
+
+def test_a_battery_s_clock_may_be_in_whole_seconds() -> None:
+    t = np.floor(0.01 * np.arange(2000))
+    volts = np.full((2000, 1), 12.0)
+    volts[700] = 1e6
+    _, notes = without_spikes("log.csv", {"voltage": Column(t=t, values=volts)})
+    assert len(notes) == 1

@@ -172,3 +172,29 @@ def test_it_is_not_exported() -> None:
     scenario = quadsim.load("hover").replace({**FLIGHT, "controller": TABLE | {"commands": "rates"}})
     with pytest.raises(ExportError, match='commands = "rates"; exported is "rotors"'):
         c_controller(Assembly(scenario))
+
+
+def test_rotor_speeds_take_over_from_targets_without_taking_them_for_speeds() -> None:
+    """The estimate of the disturbance does not jump where the law changes in flight."""
+    rotors = {
+        "type": "robust",
+        "commands": "rotors",
+        "rotor_lag": 0.05,
+        "offset_free": {},
+        "horizon": 40,
+        "heading": True,
+        "soft": {},
+        "output_weights": TABLE["output_weights"],
+        "input_weights": {"speed": 1e-3},
+        "input_bounds": {"speed": [0.0, 700.0], "slew": [-700.0, 700.0]},
+    }
+    event = {"type": "controller", "at": 1.0, "fields": rotors}
+    hover = {"reference": {"type": "steps"}, "effects.air": {}, "events": [event], "duration": 1.5}
+    scenario = quadsim.load("hover").replace({**FLIGHT, "controller": TABLE | {"commands": "rates"}, **hover})
+    with quadsim.start(scenario) as flight:
+        estimates = []
+        while not flight.done:
+            flight.step()
+            estimates.append(flight.loop.controller.law.disturbance)
+    change = np.abs(estimates[51] - estimates[49])
+    assert change.max() < 0.2

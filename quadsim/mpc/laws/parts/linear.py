@@ -36,6 +36,7 @@ class Remembered(NamedTuple):
     called_at: float  # [s] time of the last call
     measured: float  # [s] and of the last measured state
     estimate: Array | None  # (6,) of the observer, as `quadsim.mpc.estimate.observer` says; None without one
+    targets: bool  # whether commands are an inner loop's targets, not rotor speeds
 
 
 class Preparation(Protocol):

@@ -117,15 +117,17 @@ class RobustPreparation:
             called_at=self._called_at,
             measured=self._measured,
             estimate=self._estimate.copy() if self._robust.observes else None,
+            targets=bool(self._robust.targets),
         )
 
     def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
         """Take over the rotor speeds, the commands under way and the disturbance of the previous law."""
         if memory is not None:
-            self._rotors[:] = memory.rotors
-            self._turning[:] = memory.turning
-            for row, sent in zip(self._sent[::-1], memory.sent[::-1], strict=False):
-                row[:] = sent
+            if memory.targets == bool(self._robust.targets):
+                self._rotors[:] = memory.rotors
+                self._turning[:] = memory.turning
+                for row, sent in zip(self._sent[::-1], memory.sent[::-1], strict=False):
+                    row[:] = sent
             self._called_at = memory.called_at
             self._measured = memory.measured
             if memory.ahead is not None and memory.delay == self.delay:
