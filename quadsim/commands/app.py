@@ -772,7 +772,7 @@ def doctor() -> Listing:
         >>> checks["solvers"]["piqp-multistage"].startswith("works")
         True
         >>> sorted(checks)
-        ['machine', 'packages', 'rendering', 'solvers', 'viewer']
+        ['machine', 'many vehicles', 'packages', 'rendering', 'solvers', 'viewer']
     """
     from quadsim.commands.doctor import capabilities
     from quadsim.console.results import Listing

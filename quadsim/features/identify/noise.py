@@ -29,6 +29,7 @@ LONGEST_NOISE: Final = 10.0  # time constant [s]: what lasts longer is a trim
 SHORTEST_NOISE: Final = 0.5  # time constant over the period: what is shorter is white
 _TIMES: Final = (0.03, 0.3)  # time constants that the search starts from [s]
 _STEP: Final = 1e-3  # of the slopes of innovations, in logarithms
+_FARTHEST: Final = 50.0  # largest logarithm of a deviation that the search tries, either way
 _LEAST_SPREAD: Final = 1e-9  # of misfits [rad/s, m/s]
 _REGULAR: Final = 1e-6 * np.eye(3)  # information without which a number that nothing shows has none
 _ENOUGH: Final = 10_000  # samples that the search begins with
@@ -109,18 +110,18 @@ def identify_noise(misfits: Sequence[Array], periods: Sequence[float], blocks: S
         blocks: of each stretch, the samples of the parts that are left out in turn.
     """
     spread = max(float(np.concatenate(misfits).std()), _LEAST_SPREAD)
-    shortest = math.log(SHORTEST_NOISE * periods[0])
-    longest = math.log(LONGEST_NOISE)
+    least = np.array([-_FARTHEST, math.log(SHORTEST_NOISE * periods[0]), -_FARTHEST])
+    most = np.array([_FARTHEST, math.log(LONGEST_NOISE), _FARTHEST])
 
     def noise_of(x: Array) -> AxisNoise:
-        log_time = min(max(x[1], shortest), longest)
-        return AxisNoise(deviation=math.exp(x[0]), time=math.exp(log_time), sensor=math.exp(x[2]))
+        deviation, time, sensor = np.exp(np.clip(x, least, most)).tolist()
+        return AxisNoise(deviation=deviation, time=time, sensor=sensor)
 
     share = min(1.0, _ENOUGH / sum(map(len, misfits)))
     parts = [misfit[: math.ceil(share * len(misfit))] for misfit in misfits]
 
     def cost(x: Array) -> float:
-        beyond = max(shortest - x[1], x[1] - longest, 0.0)
+        beyond = float(np.abs(x - np.clip(x, least, most)).sum())
         return beyond + _cost(noise_of(x), parts, periods)
 
     searches = []

@@ -366,7 +366,7 @@ def test_a_log_without_noise_gives_what_is_right() -> None:
     )
     found = identify(record, wind=False)
     moments = {f"{name}_{axis}": v for name, of in MOMENTS.items() for axis, v in zip("xyz", of, strict=False)}
-    assert not wrong(found, **moments)
+    assert not wrong(found, **moments, inflow=INFLOW)
     known = by_name(found)
     for name in ("thrust_coefficient", "inertia_x", "inertia_y", "rotor_moment_x", "rotor_moment_y"):
         assert not known[name].refused
