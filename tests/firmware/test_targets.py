@@ -54,7 +54,7 @@ LAWS = {
     "paper-constrained": Limits(
         (("cortex-m7", "double"), ("cortex-m7", "float"), ("cortex-m4f", "float")),
         (0.1, 3.0, 7.0, 9.0),
-        {"double": 200, "float": 127},
+        {"double": 200, "float": 134},
         {"double": 103, "float": 53},
         (1400, 4000),
         1200,

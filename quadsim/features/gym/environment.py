@@ -151,7 +151,8 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             raise ResetNeeded("call env.reset() first; a pickled or copied environment is without its episode")
         return self._flight
 
-    def _require_open(self) -> None:
+    def require_open(self) -> None:
+        """Raise `gymnasium.error.ClosedEnvironmentError` after `close`."""
         if self._closed:
             raise ClosedEnvironmentError("the environment is closed; make a new one")
 
@@ -172,7 +173,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             InputError: the seed or an option is not allowed.
             ClosedEnvironmentError: `close` has been called.
         """
-        self._require_open()
+        self.require_open()
         if seed is not None:
             self.episodes.check_seed(seed)
         elif self._flight is None:
@@ -186,7 +187,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         Raises:
             ClosedEnvironmentError: `close` has been called.
         """
-        self._require_open()
+        self.require_open()
         self.start(episode)
         for action in actions:
             if self._over:
@@ -230,7 +231,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             ResetNeeded: there is no episode, or it has ended.
             ClosedEnvironmentError: `close` has been called.
         """
-        self._require_open()
+        self.require_open()
         flight = self.started
         if self._over:
             raise ResetNeeded(f"the episode has ended ({flight.loop.reason or 'the scenario is over'}); call reset()")
@@ -270,7 +271,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             FlightError: the controller has no answer; a flight of its own would end here.
             ClosedEnvironmentError: `close` has been called.
         """
-        self._require_open()
+        self.require_open()
         flight = self.started
         if self._answered is None or self._answered[0] != flight.k:
             seen = self._seen
@@ -311,7 +312,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             RenderingUnavailableError: nothing can render here.
             ClosedEnvironmentError: `close` has been called.
         """
-        self._require_open()
+        self.require_open()
         if self.render_mode is None:
             return None
         if self._camera is None:

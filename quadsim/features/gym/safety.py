@@ -110,6 +110,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         """
         if self._vehicle is None:
             raise ResetNeeded("call env.reset() first; a pickled or copied environment is without its episode")
+        self._base.require_open()
         seen = self._base.started.observation
         horizon = self._law.horizon
         requested = self._base.actions.held_speeds(action, _body_rates(seen))
