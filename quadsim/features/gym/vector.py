@@ -159,7 +159,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             InputError: a seed or an option is not allowed.
             ClosedEnvironmentError: `close` has been called.
         """
-        self.require_open()
+        self._require_open()
         seeds = self._seeds(seed)
         options = dict(options or {})
         mask = self._mask(options.pop("reset_mask", None))
@@ -184,7 +184,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             ResetNeeded: `reset` has not been called, or, with `Disabled`, an episode has ended.
             ClosedEnvironmentError: `close` has been called.
         """
-        self.require_open()
+        self._require_open()
         if not self._started.all():
             raise ResetNeeded("call envs.reset() first")
         if self._autoreset is AutoresetMode.DISABLED and self._ended.any():
@@ -220,7 +220,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
             ResetNeeded: there is no such episode.
             ClosedEnvironmentError: `close` has been called.
         """
-        self.require_open()
+        self._require_open()
         if not (isinstance(place, int | np.integer) and 0 <= place < self.num_envs):
             raise ParameterError("", "place", place, f"from 0 to {self.num_envs - 1}")
         recorded = self._log.recorded(int(place), ended=ended)
@@ -233,7 +233,7 @@ class QuadrotorVectorEnv(VectorEnv):  # type: ignore[misc]
         self._fleet.close()
         self._single.close()
 
-    def require_open(self) -> None:
+    def _require_open(self) -> None:
         if self.closed:
             raise ClosedEnvironmentError("the environments are closed; make new ones")
 
