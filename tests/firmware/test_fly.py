@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from exported_c import Host, replay
-from fly.build import CONTROLLERS, build, missing
+from fly.build import CONTROLLERS, build
 
 from quadsim.features.export.record import record
 from quadsim.rollout.rollout import Rollout
@@ -53,9 +53,8 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     if chromium is None:
         pytest.skip("no Chromium here: install the package 'chromium' to open the page in a browser")
     folder = tmp_path_factory.mktemp("fly")
-    if reason := missing():
+    if reason := build(folder):
         pytest.skip(f"the page cannot be built: {reason}")
-    assert build(folder) is None
     requests: list[str] = []
     errors: list[str] = []
     with api.sync_playwright() as playwright:
