@@ -504,9 +504,6 @@ class Geometric(Tuned):
     def __post_init__(self) -> None:
         require_space(self, {"input_bounds": None, "indi": None})
         require_one_scale(self.indi, self.disturbance)
-        if self.delay and self.commands == "attitude":
-            rule = 'zero where commands = "attitude", whose rates the autopilot decides'
-            raise ParameterError("", "delay", self.delay, rule)
         if any(self.drag) and not self.feedforward:
             raise ParameterError("", "drag", [*self.drag], "zero where feedforward is not true")
         if self.moment and (not self.feedforward or self.commands != ROTORS):

@@ -150,8 +150,6 @@ def require_targets(table: Any) -> None:
                 raise ValueError(f'{name} must be absent where commands = "{table.commands}": {reason}')
     elif any(0.0 < lag < SHORTEST_LAG for lag in table.inner_lag or ()):
         raise ParameterError("", "inner_lag", table.inner_lag, f"0, or at least {SHORTEST_LAG:g} s, each")
-    if not hasattr(table, "attitude_lag"):
-        return
     if table.commands == ATTITUDE and table.delay:
         rule = f'zero where commands = "{ATTITUDE}", whose rates the autopilot decides'
         raise ParameterError("", "delay", table.delay, rule)
