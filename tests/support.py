@@ -391,12 +391,15 @@ def fly_once(
 def decode(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     """All frames of an MP4, and its metadata by ffmpeg."""
     gc.freeze()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)  # imageio leaves ffmpeg's pipes in cycles
-        reader = imageio_ffmpeg.read_frames(path)
-        meta: dict[str, Any] = next(reader)
-        reader.close()
-        del reader
-        frames = iio.imread(path, plugin="FFMPEG")
-        gc.collect()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ResourceWarning)  # imageio leaves ffmpeg's pipes in cycles
+            reader = imageio_ffmpeg.read_frames(path)
+            meta: dict[str, Any] = next(reader)
+            reader.close()
+            del reader
+            frames = iio.imread(path, plugin="FFMPEG")
+            gc.collect()
+    finally:
+        gc.unfreeze()
     return frames, meta
