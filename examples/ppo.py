@@ -417,6 +417,7 @@ def main() -> None:
     if arguments.json is not None:
         parts: dict[str, Any] = {"curve": [asdict(point) for point in learner.curve], "seconds": seconds}
         parts["comparison"] = [asdict(each) for each in scores]
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
         arguments.json.write_text(json.dumps(parts), encoding="utf-8")
 
 
