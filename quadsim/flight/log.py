@@ -30,7 +30,7 @@ from quadsim.state import (
 from quadsim.vehicle import N_ROTORS
 
 Counts = np.ndarray[Any, np.dtype[np.int64]]
-Positions = np.ndarray[Any, np.dtype[np.float32]]
+PredictedPositions = np.ndarray[Any, np.dtype[np.float32]]
 NUMBER = "number"
 TEXT = "text"
 COUNT = "count"
@@ -283,7 +283,7 @@ class FlightLog:
     control: ControlLog  # one row per control period
     timing: TimingLog  # clock times, one row per control period
     plant: PlantLog  # the plant, at the physics rate after a flight, at the log rate when read from a file
-    predicted: Positions | None = None
+    predicted: PredictedPositions | None = None
     """(K, N, 3) float32 positions [m] predicted in each period for t_{k+1} .. t_{k+N}, N the shortest horizon of its
     controllers; None if one of them has no model."""
     foreseen: Array | None = None

@@ -25,7 +25,7 @@ from quadsim.flight.log import (
     ControlLog,
     FlightLog,
     PlantLog,
-    Positions,
+    PredictedPositions,
     TimingLog,
     columns_of,
 )
@@ -116,7 +116,7 @@ def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, 
     return tables
 
 
-def _predicted_columns(t: Array, predicted: Positions) -> Iterator[_Column]:
+def _predicted_columns(t: Array, predicted: PredictedPositions) -> Iterator[_Column]:
     """The columns of the positions (K, N, 3) [m] that were predicted at times (K,) [s]; each row has N per axis."""
     yield "t", "s", False, pa.array(t)
     horizon = predicted.shape[1]
@@ -295,7 +295,7 @@ def _require_consistent(log: FlightLog) -> None:
             raise ValueError("t does not increase")
 
 
-def _read_predicted(path: Path) -> Positions | None:
+def _read_predicted(path: Path) -> PredictedPositions | None:
     """Return the predicted positions (K, N, 3) [m]; None if the flight has none."""
     if not path.exists():
         return None
