@@ -2,9 +2,8 @@
 
     margin = min(value - lower, upper - value)    [negative beyond a bound; violated where it is below -tolerance]
 
-A QP bounds the samples of a linear model, but the vehicle must respect its limits between samples too: the audit reads
-the plant of a `quadsim.flight.log` at the physics rate.  Margins, tolerances, violations, the worst finding and the
-verdict on a flight are defined here and nowhere else; `docs/conventions.md` explains them.
+A QP bounds the samples of a linear model; the audit reads the plant between them, too, of a `quadsim.flight.log`.  What
+a margin, a tolerance, a violation, the worst finding and the verdict on a flight are is defined here and nowhere else.
 """
 
 from __future__ import annotations

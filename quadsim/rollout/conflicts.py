@@ -1,10 +1,9 @@
 """Explains why a problem has no answer: which constraints conflict, by how much, and what would help.
 
-With a slack e >= 0 for each bound at each step, and s half of the gap between a row's bounds, the elastic problem is
-
-    minimise  sum e / s    subject to    the dynamics,  lower - e <= C x + D u + E du <= upper + e,
-
-a linear program that always has an answer.  `quadsim.rollout.infeasibility` puts the conflict into a scenario's terms.
+The elastic problem has a slack e >= 0 for each bound at each step; s is half of the gap between a row's bounds:
+    minimise  sum e / s    subject to    the dynamics,  lower - e <= C x + D u + E du <= upper + e.
+It is a linear program that always has an answer.  `quadsim.rollout.infeasibility` puts the conflict into the terms of a
+scenario file.
 """
 
 from __future__ import annotations

@@ -192,13 +192,14 @@ def compare_flights(
             if flown is not None:
                 flown(comparison)
             unfilmed = _unfilmed(comparison.flights, beside, products.get("video"))
-            if unfilmed:
-                note = f"the page without them: {short_path(page)}"
-                filmed = add_films(unfilmed, note=note, progress=progress, fps=fps)
-                write_comparison(comparison.flights, out, notes=comparison.notes, overwrite=True)
-                if products.get("video"):
-                    for flight in filmed:
-                        require_product(flight, VIDEO_FILE)
+            if not unfilmed:
+                return comparison
+            note = f"the page without them: {short_path(page)}"
+            filmed = add_films(unfilmed, note=note, progress=progress, fps=fps)
+            write_comparison(comparison.flights, out, notes=comparison.notes, overwrite=True)
+            if products.get("video"):
+                for flight in filmed:
+                    require_product(flight, VIDEO_FILE)
             return comparison
 
 
