@@ -157,8 +157,8 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
 
     `iterations` covers the periods that the QP solver answered, None if there are none, or several solvers;
     `iterations_by` lists every answerer that iterates.  Each residual has its largest value among accepted answers, and
-    the number of these periods in which it was computed.  What a law does not report, the time of its optimum and the
-    active constraints there, is None.
+    the number of these periods in which it was computed.  What a controller does not report, the time of its optimum
+    and the active constraints there, is None.
     """
     answerers = set(log.answered_by)
     iterations_by = _iterations_by(log)
@@ -255,10 +255,11 @@ def never_took_off(log: ControlLog) -> float | None:
     if log.crashed or log.t.size - start < 2:
         return None
     heights = log.truth[start:, INDEX["z"]]
-    told = np.flatnonzero(log.reference[start:, REFERENCE_NAMES.index("z")] > heights.min() + TAKEOFF_RISE)
-    lasted = told.size * float(log.t[1] - log.t[0])
+    references = log.reference[start:, REFERENCE_NAMES.index("z")]
+    above = np.flatnonzero(references > heights.min() + TAKEOFF_RISE)
+    lasted = above.size * float(log.t[1] - log.t[0])
     if lasted >= TAKEOFF_PATIENCE - 1e-9:
-        return float(log.t[start + told[0]])
+        return float(log.t[start + above[0]])
     return None
 
 

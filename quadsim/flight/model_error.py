@@ -1,4 +1,4 @@
-"""Where a law's model contradicts the flight: what it predicted for a period later, against what was flown.
+"""Where a controller's model contradicts the flight: what it predicted for a period later, against what was flown.
 
 Compared are the changes over each control period of the states that a command drives, velocities and Euler rates, by
 their correlation and their standard deviations (`_error_of`).  `quadsim.rollout.flown` has the sentence in a summary.

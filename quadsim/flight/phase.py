@@ -117,20 +117,21 @@ CRITERIA: Final = {
 class TakeoffLead:
     """The height to add to a controller's reference so that a vehicle takes off which is heavier than its model.
 
-    On the ground, most laws cannot learn a mismatch: the ground carries what thrust does not, so observers and
-    integrals hold until lift-off, and a law without them never learns.  Every law demands more thrust for a higher
-    reference, so the lead is an integral on thrust for all of them, within the law's own bounds.
+    On the ground, most controllers cannot learn a mismatch: the ground carries what thrust does not, so observers and
+    integrals hold until lift-off, and a controller without them never learns.  Every controller demands more thrust for
+    a higher reference, so the lead is an integral on thrust for all of them, within the controller's own bounds.
 
     - It stays zero until an armed, level vehicle with its course in the air has stood for `STANDSTILL` without more
-      thrust.  A law that takes off by itself never sees it.
+      thrust.  A controller that takes off by itself never sees it.
     - It then grows at `LEAD_RATE` up to `LARGEST_LEAD`, while the vehicle does not rise and thrust follows: rotors that
       saturate stop it.
     - From lift-off at height z_0 on it fades with the climb, and never grows again:
 
           lead = lead_0 (1 - (z - z_0) / min(FADING, z_ref - z_0)).
 
-      It is thus released as the law's own estimate or integral takes over, and gone at the course.  A law with neither
-      keeps its steady altitude error, but hovers just above the ground where it would have stayed on it.
+      It is thus released as the controller's own estimate or integral takes over, and gone at the course.  With
+      neither, the controller keeps its steady altitude error, but hovers just above the ground where it would have
+      stayed on it.
     """
 
     def __init__(self, period: float) -> None:

@@ -698,16 +698,16 @@ def _outcome_entries(flight: Flight) -> dict[str, Any]:
 
 
 def _model_entries(flight: Flight) -> dict[str, Any]:
-    """Return the entries on the law's model: what it lacks of the flight, and what it gets wrong; none for nothing."""
-    law = flight.scenario.controller.type
+    """Return the entries on the controller's model, if any: what it lacks of the flight, and what it gets wrong."""
+    stated = flight.scenario.controller.type
     entries: dict[str, Any] = {}
     notes = implausible(flight.actual)
-    if flight.controller == law:
+    if flight.controller == stated:
         notes += model_notes(flight.assembly)
     if notes:
         entries["model_notes"] = notes
     owner = f"the model of {flight.controller}"
-    if flight.own_code or is_plugin(law):
+    if flight.own_code or is_plugin(stated):
         owner = "your model"
     model_error = model_report(flight.log.control, flight.log.foreseen, owner)
     if model_error is not None:

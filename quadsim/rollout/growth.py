@@ -66,9 +66,9 @@ MeasureGrowth: TypeAlias = Callable[[Scenario, float], "Growth"]
 class Growth:
     """How the difference of two flights grows.
 
-    `rate` is the largest real part of the loop's exponents, of any law, linear or not, with the plant as it is,
-    sampled, delayed and lagging.  Negative means stable.  For a linear law it is ln(rho) / tau_s, with rho the spectral
-    radius of the sampled loop.
+    `rate` is the largest real part of the loop's exponents, of any controller, linear or not, with the plant as it
+    is, sampled, delayed and lagging.  Negative means stable.  For a linear one it is ln(rho) / tau_s, with rho the
+    spectral radius of the sampled loop.
     """
 
     rate: float  # [1/s]; infinite where a flight ended before its difference could be compared
@@ -99,7 +99,7 @@ class Growth:
 def hovering(
     scenario: Scenario, *, heading: float, size: float = 0.0, changes: Mapping[str, Any] | None = None
 ) -> Scenario:
-    """Return a scenario that holds a hover in free air, with vehicle, law, effects and sensors of this one.
+    """Return a scenario that holds a hover in free air, with vehicle, controller, effects and sensors of this one.
 
     Args:
         scenario: gives all but course, start, events, obstacles, ground and constraints.

@@ -83,7 +83,7 @@ def diagnose(
 def lacking_report(assembly: Assembly, time: float) -> dict[str, Any] | None:
     """Return `diagnosis` of a flight that was lost at a time [s], though every problem that it solved had an answer.
 
-    It names what the scenario states and the law's model lacks; None where that is nothing.
+    It names what the scenario states and the controller's model lacks; None where that is nothing.
     """
     lacking = [*unmodelled(assembly), *unpredicted(assembly)]
     if not lacking:
@@ -260,11 +260,11 @@ class _FailedPeriod:
 
     def _soft(self, tables: Sequence[str]) -> Settings | None:
         """Return tables of softness with the largest penalty that helps; None if none does."""
-        law: Settings = {}
+        other_type: Settings = {}
         if "controller.soft" in tables and not isinstance(self._spec, Robust):
-            law = {"controller.type": "robust"}
+            other_type = {"controller.type": "robust"}
         for penalty in SOFT:
-            settings = {**law, **dict.fromkeys(tables, penalty)}
+            settings = {**other_type, **dict.fromkeys(tables, penalty)}
             if self._helps(settings):
                 return settings
         return None

@@ -202,20 +202,20 @@ def _in_force(
 def _bridges_delays(scenario: Scenario, t: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Return (K,) whether steps of a plan bridge the wait for the command in the periods that start at t (K,) [s]."""
     assembly = Assembly(scenario)
-    laws = [(0.0, scenario.controller), *scenario.controller_changes]
+    controllers = [(0.0, scenario.controller), *scenario.controller_changes]
     plans = []
-    for _, spec in laws:
+    for _, spec in controllers:
         computation = assembly.computation(spec)
         plans.append(computation is not None and bool(computation.plan))
-    changes = [time for time, _ in laws]
+    changes = [time for time, _ in controllers]
     in_command = np.searchsorted(changes, t + ARITHMETIC_TOLERANCE, side="right") - 1
     return np.array(plans)[in_command]
 
 
 def _holds_commands(scenario: Scenario) -> bool:
     """Return whether the rotors turn at the commanded speeds throughout each period."""
-    changed_laws = [spec for _, spec in scenario.controller_changes]
-    commands_held = all(spec.holds_speeds for spec in (scenario.controller, *changed_laws))
+    changed = [spec for _, spec in scenario.controller_changes]
+    commands_held = all(spec.holds_speeds for spec in (scenario.controller, *changed))
     lagging = any(isinstance(event, LagChange) for event in scenario.events)
     return commands_held and not lagging and Assembly(scenario).effects.rotors is None
 

@@ -34,7 +34,7 @@ MOST_FLOWN: Final = 6  # flights of one diagnosis
 MOST_PAIRS: Final = 4  # pairs of hovers without what the model lacks, and with changes, each
 RETURNING: Final = 0.9  # violation at the end of a flight, over its largest, up to which it is passing
 HOVER_RESERVE: Final = 0.1  # distance of the advised bound on rotor speeds from hover, over hover
-_CHANGED_LAW: Final = "an event had changed the controller"
+_CHANGED_CONTROLLER: Final = "an event had changed the controller"
 _SPEED: Final = "controller.input_bounds.speed"
 
 
@@ -68,7 +68,7 @@ def tried(explanation: Mapping[str, Any], flight: Flight, fly: FlyUntil, measure
         candidates = _reaching_hover(scenario, assembly)
     else:
         modelling = []
-        if flight.controller == scenario.controller.type and unflown != _CHANGED_LAW:
+        if flight.controller == scenario.controller.type and unflown != _CHANGED_CONTROLLER:
             modelling = [_change(settings) for settings in modelling_changes(assembly)]
         if modelling and not unflown:
             report["loop"] = _loop_report(assembly, measure)
@@ -129,7 +129,7 @@ def _not_flown(flight: Flight, time: float, until: float) -> str:
     if flight.own_code:
         return "the scenario does not repeat code that was passed in"
     if flight.scenario.controller_at(time) != flight.scenario.controller:
-        return _CHANGED_LAW
+        return _CHANGED_CONTROLLER
     if until > LONGEST_TRIAL:
         return f"it would take more than {LONGEST_TRIAL:g} s of flight"
     return ""
@@ -248,7 +248,7 @@ def _grows(scenario: Scenario | None, heading: float, measure: MeasureGrowth) ->
 
 
 def _loop_sentence(report: Mapping[str, Any]) -> str:
-    """Say that a push grows, and which single thing, taken away or known to the law, lets it shrink."""
+    """Say that a push grows, and which single thing, taken away or known to the controller, lets it shrink."""
     cures = []
     for entry in report["without"]:
         if _is_stable(entry):

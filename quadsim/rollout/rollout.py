@@ -77,19 +77,20 @@ def needs_quaternions(scenario: Scenario) -> bool:
     return any(spec.any_attitude for spec in (scenario.controller, *changed))
 
 
-def _checked_controller(assembly: Assembly, law: Controller | None) -> Controller:
-    """Return the controller that flies, the scenario's or `law`.
+def _checked_controller(assembly: Assembly, user_controller: Controller | None) -> Controller:
+    """Return the controller that flies, the scenario's or `user_controller`.
 
     Raises:
         InputError: it cannot be built, or does not fit the scenario.
     """
     scenario = assembly.scenario
-    if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
-        raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
-    if law is None:
-        controller: Controller = assembly.controller()
-    else:
-        controller = law
+    if user_controller is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
+        raise ParameterError(
+            "", "controller", user_controller, "absent where an event changes the scenario's controller"
+        )
+    controller = user_controller
+    if controller is None:
+        controller = assembly.controller()
     check_measured(scenario.computation, controller)
     return controller
 
@@ -150,7 +151,7 @@ class Rollout:
     def __init__(
         self,
         scenario: Scenario | Assembly,
-        law: Controller | None = None,
+        user_controller: Controller | None = None,
         forces: Sequence[Force] | None = None,
         *,
         live: bool = False,
@@ -160,7 +161,7 @@ class Rollout:
 
         Args:
             scenario: the scenario to fly, or its assembly.
-            law: replaces the scenario's controller.
+            user_controller: replaces the scenario's controller.
             forces: replace the scenario's forces.
             live: see `quadsim.commands.app.start`.
             recorded: see `quadsim.commands.app.start`.
@@ -175,7 +176,7 @@ class Rollout:
         if live:
             assembly = assembly.of(prepared(assembly))
         threadpool_limits(limits=1)  # the matrices are small, and results must not depend on the number of cores
-        controller = _checked_controller(assembly, law)
+        controller = _checked_controller(assembly, user_controller)
         assembly = assembly.with_law_bounds(controller)
         self._started = assembly.scenario
         _check_parts(assembly, controller)
@@ -184,7 +185,7 @@ class Rollout:
         self.limits = assembly.limits
         self._law_name = controller.name
         self._solver_name = controller.solver
-        self._own_code = law is not None or forces is not None or assembly.user_autopilot is not None
+        self._own_code = user_controller is not None or forces is not None or assembly.user_autopilot is not None
         self._plant = assembly.plant(forces)
         self._navigation = assembly.navigation()
         started = clock.perf_counter()
@@ -194,7 +195,7 @@ class Rollout:
         )
         self._simulate_s = clock.perf_counter() - started
         build = None
-        if law is None:
+        if user_controller is None:
             build = assembly.controller
         self._events = FlightEvents(
             assembly,
