@@ -290,7 +290,7 @@ def _exceeded(
         unit: of all numbers.
         values: over the course, of any shape.
         allowed: lower and upper limit.
-        whose: the owner of the limit, `rotor `; empty for the controller.
+        whose: `rotor ` where the limit is the rotors', empty where it is the controller's.
         stated: the bounds that were tightened to `allowed`; None if they were not.
     """
     if not values.size:
@@ -298,7 +298,7 @@ def _exceeded(
     lower, upper = allowed
     highest = float(values.max())
     lowest = float(values.min())
-    beyond = []
+    beyond = []  # each with the side of the limits that it exceeds
     if highest > upper + DIFFERENCE_ROUNDING * (1.0 + abs(upper)):
         beyond.append((highest, 1))
     if lowest < lower - DIFFERENCE_ROUNDING * (1.0 + abs(lower)):
@@ -309,15 +309,15 @@ def _exceeded(
         text = f"{whose}limit {limit:.4g} {unit}"
         if stated is not None:
             text = f"limit {stated[side]:.4g} {unit}, tightened to {limit:.4g} {unit}"
-        phrases.append(f"{_apart(value, limit)} {unit} of {quantity} ({text})")
+        phrases.append(f"{_distinct_from(limit, value)} {unit} of {quantity} ({text})")
     return phrases
 
 
-def _apart(value: float, limit: float) -> str:
-    """Return a value with three digits, or with as many more as it has before its point, or as tell it from a limit."""
+def _distinct_from(limit: float, value: float) -> str:
+    """Return a value in three digits, or in more where it has them before its point or they tell it from the limit."""
     digits = 3
-    if abs(value) >= 1.0:
-        digits = max(digits, math.floor(math.log10(abs(value))) + 1)
+    if math.isfinite(value):
+        digits = max(digits, len(str(round(abs(value)))))
     text = f"{value:.{digits}g}"
     while float(text) == limit or (float(text) > limit) != (value > limit):
         digits += 1

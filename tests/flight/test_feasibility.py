@@ -155,7 +155,7 @@ def test_every_limit_and_bound_that_is_left_is_named(vehicle: Vehicle) -> None:
 
 @pytest.mark.parametrize(
     ("rate", "bound", "shown"),
-    [(114.6, 100.0, "115"), (114.2, 114.1, "114.2"), (40.04, 40.0, "40.04"), (1719.4, 1600.0, "1719")],
+    [(114.6, 100.0, "115"), (114.2, 114.1, "114.2"), (40.04, 40.0, "40.04"), (999.96, 900.0, "1000")],
 )
 def test_a_value_has_the_digits_that_tell_it_from_its_limit(
     vehicle: Vehicle, rate: float, bound: float, shown: str
