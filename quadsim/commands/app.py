@@ -117,7 +117,7 @@ def feasibility(scenario: ScenarioName) -> Feasibility:
         scenario: the scenario, or its name or file.
 
     Returns:
-        The peaks of the course, such as `tilt` [deg]; `problems`, the limits and bounds that it exceeds; a `sentence`.
+        The peaks of the course, such as `tilt` [deg]; `problems`, what it needs beyond limits and bounds; a `sentence`.
 
     Raises:
         InputError: the course cannot be built.
@@ -128,7 +128,7 @@ def feasibility(scenario: ScenarioName) -> Feasibility:
         ()
         >>> fast = quadsim.load("figure-eight").replace({"reference.period": 6.0, "reference.ramp": 3.0})
         >>> quadsim.feasibility(fast).problems[0]
-        'roll up to 40.43 deg (bound 5)'
+        '40.4 deg of roll (limit 5 deg)'
     """
     from quadsim.rollout.stability import instability_notes
     from quadsim.scenarios import feasibility_check, loading

@@ -1,11 +1,9 @@
 """The audit: signed margins of every limit, at the control samples and at the physics rate, and the verdicts.
 
-A QP bounds the samples of a linear model, but the vehicle must respect its limits between samples too.  The audit
-therefore reads the plant at the physics rate.  A margin is the signed distance to the nearer bound: positive inside,
-negative beyond it.  A limit is violated where the margin is below minus its tolerance.
+    margin = min(value - lower, upper - value)    [negative beyond a bound; violated where it is below -tolerance]
 
-Margins, tolerances, violations, the worst finding and the verdict on a flight are defined here and nowhere else;
-`docs/conventions.md` explains them.
+A QP bounds the samples of a linear model; the audit reads the plant between them, too, of a `quadsim.flight.log`.  What
+a margin, a tolerance, a violation, the worst finding and the verdict on a flight are is defined here and nowhere else.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 from annotated_types import doc
@@ -134,21 +132,40 @@ def _climb_acceleration(t: Array, states: Array) -> Array:
     return np.append(np.diff(states[:, INDEX["vz"]]) / np.diff(t), math.nan)
 
 
-def _present(values: Array | None, t: Array) -> Array:
-    """The values (K,), or NaN where there are none."""
-    if values is None:
-        return np.full(t.shape, math.nan)
-    return values
+def _target_thrust(log: Sampled) -> Array:
+    """(K,) collective thrust that the autopilot is to fly [N]; NaN without an autopilot."""
+    if log.target is None:
+        return np.full(log.t.shape, math.nan)
+    return log.target[:, 0]
+
+
+def _acting_thrust(log: PlantLog) -> Array:
+    """(M,) collective thrust of the rotors [N]; NaN without an autopilot."""
+    if log.thrust is None:
+        return np.full(log.t.shape, math.nan)
+    return log.thrust
+
+
+def _signals_of_states() -> dict[str, Signal]:
+    """Each state, its error against the reference, and the error of its estimate, by name."""
+    signals = {}
+    for name, i in INDEX.items():
+        signals[name] = _state(i)
+    for j, name in enumerate(REFERENCE_NAMES):
+        signals[f"{name}_error"] = _error(j)
+    for i in (*POSITION, *EULER):
+        signals[f"{STATE_NAMES[i]}_estimate_error"] = _estimate_error(i)
+    return signals
 
 
 SIGNALS: Final[dict[str, Signal]] = {
-    **{name: _state(i) for name, i in INDEX.items()},
-    **{f"{name}_error": _error(j) for j, name in enumerate(REFERENCE_NAMES)},
-    **{f"{STATE_NAMES[i]}_estimate_error": _estimate_error(i) for i in (*POSITION, *EULER)},
+    **_signals_of_states(),
     "tilt": Signal(
         unit="deg", sampled=lambda log: np.degrees(tilt(log.truth)), plant=lambda log: np.degrees(tilt(log.state))
     ),
-    **{f"body_rate_{name}": _body_rate(axis) for axis, name in enumerate("xyz")},
+    "body_rate_x": _body_rate(0),
+    "body_rate_y": _body_rate(1),
+    "body_rate_z": _body_rate(2),
     "climb_acceleration": Signal(
         unit="m/s^2",
         sampled=lambda log: _climb_acceleration(log.t, log.truth),
@@ -158,8 +175,8 @@ SIGNALS: Final[dict[str, Signal]] = {
     # Commanded at the samples, acting in between: the two differ when rotors saturate, or the mixer changes the thrust.
     "thrust": Signal(
         unit="N",
-        sampled=lambda log: _present(log.target[:, 0] if log.target is not None else None, log.t),
-        plant=lambda log: _present(log.thrust, log.t),
+        sampled=_target_thrust,
+        plant=_acting_thrust,
         gaps=True,  # it has no target on the ground
     ),
     "speed": Signal(
@@ -178,10 +195,17 @@ def _rotor(i: int) -> Signal:
     )
 
 
-TERM_SIGNALS: Final[dict[str, Signal]] = {
-    **{name: SIGNALS[name] for name in STATE_NAMES},
-    **{f"speed_{i + 1}": _rotor(i) for i in range(N_ROTORS)},
-}
+def _term_signals() -> dict[str, Signal]:
+    """Each state, and each rotor's speed, by name."""
+    signals = {}
+    for name in STATE_NAMES:
+        signals[name] = SIGNALS[name]
+    for i in range(N_ROTORS):
+        signals[f"speed_{i + 1}"] = _rotor(i)
+    return signals
+
+
+TERM_SIGNALS: Final[dict[str, Signal]] = _term_signals()
 """The terms allowed in a sum."""
 SUM: Final = "sum"  # the signal of a limit on a sum of terms
 CLEARANCE: Final = "clearance"  # the signal of a limit in space: clearance of the vehicle's bounding ball [m]
@@ -189,14 +213,31 @@ CLEARANCE: Final = "clearance"  # the signal of a limit in space: clearance of t
 
 def sum_signal(terms: Mapping[str, float]) -> Signal:
     """Return the signal of a sum of terms: names in `TERM_SIGNALS` with their factors."""
-    signals = [(factor, TERM_SIGNALS[name]) for name, factor in terms.items()]
-    units = {signal.unit for _, signal in signals}
-    return Signal(
-        unit=units.pop() if len(units) == 1 else "-",
-        sampled=lambda log: np.sum([factor * signal.sampled(log) for factor, signal in signals], axis=0),
-        plant=lambda log: np.sum([factor * signal.plant(log) for factor, signal in signals if signal.plant], axis=0),
-        tolerance=COMMAND_TOLERANCE if all(signal.tolerance is COMMAND_TOLERANCE for _, signal in signals) else MOTION,
-    )
+    summands = [(factor, TERM_SIGNALS[name]) for name, factor in terms.items()]
+    units = {signal.unit for _, signal in summands}
+    if len(units) == 1:
+        unit = units.pop()
+    else:
+        unit = "-"
+    if all(signal.tolerance is COMMAND_TOLERANCE for _, signal in summands):
+        tolerance = COMMAND_TOLERANCE
+    else:
+        tolerance = MOTION
+
+    def sampled(log: Sampled) -> Array:
+        return np.sum([factor * signal.sampled(log) for factor, signal in summands], axis=0)
+
+    def plant(log: PlantLog) -> Array:
+        parts = []
+        for factor, signal in summands:
+            assert signal.plant is not None
+            parts.append(factor * signal.plant(log))
+        return np.sum(parts, axis=0)
+
+    return Signal(unit=unit, sampled=sampled, plant=plant, tolerance=tolerance)
+
+
+_SIGNALS_WITH_UNITS: Final = ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,9 +251,7 @@ class Limit:
     name: Annotated[str, doc("name in reports")] = field(metadata={"pattern": "^[A-Za-z0-9_.-]+$"})
     signal: Annotated[
         str,
-        doc(
-            "bounded quantity: " + ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items()) + ", or sum"
-        ),
+        doc(f"bounded quantity: {_SIGNALS_WITH_UNITS}, or sum"),
     ] = field(metadata={"json_schema_extra": {"enum": [*SIGNALS, SUM]}})
     terms: Annotated[
         dict[str, Number] | None,
@@ -281,7 +320,10 @@ class Limit:
         """Half the gap between the bounds; the magnitude of a single bound, or 1 if that is 0."""
         if math.isfinite(self.lower) and math.isfinite(self.upper):
             return 0.5 * (self.upper - self.lower)
-        return abs(self.lower if math.isfinite(self.lower) else self.upper) or 1.0
+        bound = self.upper
+        if math.isfinite(self.lower):
+            bound = self.lower
+        return abs(bound) or 1.0
 
     @property
     def tie(self) -> float:
@@ -297,13 +339,15 @@ class Limit:
         """
         plant, sampled = self.source.tolerance.of(self.half_band)
         if self.tolerance is None:
-            stated = self.tolerance_sampled
-            if stated is None:
-                return (plant, sampled)
-            return (max(plant, stated), stated)
+            if self.tolerance_sampled is None:
+                return plant, sampled
+            return max(plant, self.tolerance_sampled), self.tolerance_sampled
         if self.tolerance_sampled is not None:
             return self.tolerance, self.tolerance_sampled
-        return self.tolerance, self.tolerance * (sampled / plant if plant else 1.0)
+        proportion = 1.0
+        if plant:
+            proportion = sampled / plant
+        return self.tolerance, self.tolerance * proportion
 
     def with_tolerances(self) -> Limit:
         """Return the limit with both tolerances stated."""
@@ -433,7 +477,8 @@ def worst_finding(findings: Iterable[Finding]) -> Finding | None:
     counted = _counted(findings)
     if not counted:
         return None
-    nearest = [counted[i] for i in tied([finding.share for finding in counted])]
+    shares = [finding.share for finding in counted]
+    nearest = [counted[i] for i in tied(shares)]
     violated = [finding for finding in nearest if finding.verdict == "violated"]
     return (violated or nearest)[0]
 
@@ -445,12 +490,13 @@ def worst_share(findings: Iterable[Finding]) -> float | None:
 
 def _counted(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings that count for `worst_finding`, in order."""
-    reached = [finding for finding in findings if math.isfinite(finding.margin)]
     counted = []
-    for finding in reached:
-        if finding.verdict == "violated" or finding.limit.signal not in COMMAND_SIGNALS:
+    for finding in findings:
+        reached = math.isfinite(finding.margin)
+        if reached and (finding.verdict == "violated" or finding.limit.signal not in COMMAND_SIGNALS):
             counted.append(finding)
-    return [finding for finding in counted if finding.limit.required] or counted
+    required = [finding for finding in counted if finding.limit.required]
+    return required or counted
 
 
 def flight_verdict(findings: Sequence[Finding], *, aborted: bool, lost: bool, failed: bool) -> FlightVerdict:
@@ -467,11 +513,11 @@ def flight_verdict(findings: Sequence[Finding], *, aborted: bool, lost: bool, fa
         violated; `incomplete`, where it ended before a required limit was reached; `unaudited`, where it has no limit;
         otherwise `satisfied`.
     """
-    verdicts = {finding.verdict for finding in findings if finding.limit.required}
-    if aborted or lost:
-        if aborted:
-            return "aborted"
+    if aborted:
+        return "aborted"
+    if lost:
         return "lost"
+    verdicts = {finding.verdict for finding in findings if finding.limit.required}
     if failed or "violated" in verdicts:
         return "violated"
     if "incomplete" in verdicts:
@@ -489,19 +535,28 @@ def limit_differences(first: Sequence[Limit], second: Sequence[Limit], *, demand
 
     `demands`: also in which are required, on which the verdict on a flight depends.
     """
-    a, b = ({limit.name: limit for limit in limits} for limits in (first, second))
-    lines = [f"{name} only in the {where}" for where, name in _alone(a, b)]
-    for name in (name for name in a if name in b):
-        pairs = []
-        for what in (*_COMPARED, *(["required"] if demands else [])):
-            if hasattr(a[name], what) or hasattr(b[name], what):
-                pairs.append((what, getattr(a[name], what), getattr(b[name], what)))
-        lines += [f"{name}: {what} {_plain(one)} and {_plain(other)}" for what, one, other in pairs if one != other]
+    compared = [*_COMPARED]
+    if demands:
+        compared.append("required")
+    a = {limit.name: limit for limit in first}
+    b = {limit.name: limit for limit in second}
+    lines = [f"{name} only in the first" for name in a if name not in b]
+    lines += [f"{name} only in the second" for name in b if name not in a]
+    for name, limit in a.items():
+        if name in b:
+            lines += _field_differences(limit, b[name], compared)
     return lines
 
 
-def _alone(a: Mapping[str, Limit], b: Mapping[str, Limit]) -> list[tuple[str, str]]:
-    return [("first", name) for name in a if name not in b] + [("second", name) for name in b if name not in a]
+def _field_differences(limit: Limit, other: Limit, compared: Sequence[str]) -> list[str]:
+    """Return in which of the compared fields two limits of one name differ."""
+    lines = []
+    for what in compared:
+        value = getattr(limit, what, None)
+        other_value = getattr(other, what, None)
+        if value != other_value:
+            lines.append(f"{limit.name}: {what} {_plain(value)} and {_plain(other_value)}")
+    return lines
 
 
 def _plain(value: object) -> str:
@@ -525,7 +580,11 @@ def margins_at(limit: Limit, t: Array, values: Array) -> Array:
 
 def smallest_margins(log: FlightLog | PeriodLog, limits: Sequence[Limit]) -> dict[str, float]:
     """Smallest signed margin of each limit, by name, at the highest available rate; NaN outside its window."""
-    return {limit.name: _worst(limit, *limit.source.finest(log))[1] for limit in limits}
+    margins = {}
+    for limit in limits:
+        t, values = limit.source.finest(log)
+        margins[limit.name] = _nearest(limit, t, values).margin
+    return margins
 
 
 def audit(log: FlightLog, limits: Sequence[Limit]) -> tuple[Finding, ...]:
@@ -536,24 +595,35 @@ def audit(log: FlightLog, limits: Sequence[Limit]) -> tuple[Finding, ...]:
 def _find(log: FlightLog, limit: Limit) -> Finding:
     t = log.control.t
     values = limit.source.sampled(log.control)
-    sampled = peak, margin, time = _worst(limit, t, values)
+    sampled = _nearest(limit, t, values)
     if t.size:  # a flight can end before its first period
         t, values = limit.source.finest(log)
-        peak, margin, time = _worst(limit, t, values)
+    finest = _nearest(limit, t, values)
     beyond = limit.holds_at(t) & limit.violated(limit.margin(values))
     durations = np.diff(t, append=log.plant.t[-1:])  # a value lasts until the next, or until the flight's end
+    peak_plant = finest.value
+    if limit.source.plant is None:
+        peak_plant = math.nan
     return Finding(
         limit=limit,
-        peak_sampled=sampled[0],
-        peak_plant=math.nan if limit.source.plant is None else peak,
-        worst_margin_sampled=sampled[1],
-        worst_margin=margin,
-        worst_time=time,
+        peak_sampled=sampled.value,
+        peak_plant=peak_plant,
+        worst_margin_sampled=sampled.margin,
+        worst_margin=finest.margin,
+        worst_time=finest.time,
         time_violated=round(float(durations[beyond].sum()), 9) + 0.0,
     )
 
 
-def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
+class _Nearest(NamedTuple):
+    """Where a signal comes nearest to a bound of its limit, or is furthest beyond it."""
+
+    value: float
+    margin: float
+    time: float  # [s]
+
+
+def _nearest(limit: Limit, t: Array, values: Array) -> _Nearest:
     """Return value, margin and time of the smallest margin; NaN if the window is empty.
 
     Of tied instants (`Limit.tie`) the first gives the time, and the bound and rotor whose extreme is the value.
@@ -562,7 +632,7 @@ def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
     if limit.source.gaps:
         inside &= np.isfinite(values)
     if not inside.any():
-        return math.nan, math.nan, math.nan
+        return _Nearest(math.nan, math.nan, math.nan)
     columns = values[inside].reshape(np.count_nonzero(inside), -1)
     margins = limit.margin(columns)
     smallest = margins.min()
@@ -570,6 +640,8 @@ def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
     distances = np.stack([limit.upper - columns[row], columns[row] - limit.lower])
     first = first_smallest([*distances.ravel(), smallest], limit.tie)  # one of the distances: some are tied with it
     side, column = np.unravel_index(first, distances.shape)
-    nearest = columns[:, column]
-    value = nearest.max() if side == 0 else nearest.min()
-    return float(value), float(smallest), float(t[inside][row])
+    if side == 0:
+        value = columns[:, column].max()
+    else:
+        value = columns[:, column].min()
+    return _Nearest(float(value), float(smallest), float(t[inside][row]))

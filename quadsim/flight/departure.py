@@ -1,17 +1,8 @@
 """Departure: a flight that ends off its course and still leaves it.
 
 A vehicle may be far from its reference and fly well: after a step, or behind a fast course, it lags.  What counts is
-therefore the distance from the course flown so far, the polyline through the vehicle's start and the references of the
-last `PATH` seconds:
-
-    d(t) = min over the polyline of |p(t) - q|,   D_1, D_2 = the largest d in the two halves of the last `SPAN` seconds,
-
-and with halves of T seconds
-
-    distance = D_2,   growth = ln(D_2 / D_1) / T.
-
-A vehicle that lags stays near this course, one that a disturbance displaced comes back to it; an unstable loop does
-neither.  Only the flight itself counts: the span begins after the last period on the ground.
+therefore the distance from the course flown so far, and how it grows at the end of a flight (`departure_numbers`).
+`quadsim.rollout.flown` takes its verdict from it.
 """
 
 from __future__ import annotations
@@ -19,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import takewhile
 from typing import Any, Final
 
 import numpy as np
@@ -28,12 +18,12 @@ from quadsim.controller import Phase
 from quadsim.flight.log import ControlLog
 from quadsim.state import POSITION, Array
 
-SPAN: Final = 5.0  # end of a flight that is looked at [s]
-LEAST_IN_AIR: Final = 1.0  # time in the air from which on there are numbers [s]
-PATH: Final = 60.0  # course flown so far [s]: no vehicle lags by more
-SAMPLING: Final = 0.1  # time between the instants that are looked at, or a control period [s]
-LEAVING_FROM: Final = 1.0  # distance from which on a growing one is named [m]
-LEAVING_GROWTH: Final = 0.02  # growth from which on a distance grows [1/s]: a constant one has rounding's
+END_SPAN: Final = 5.0  # time at the end of a flight over which the growth is taken [s]
+LEAST_IN_AIR: Final = 1.0  # shortest time in the air for which there are numbers [s]
+COURSE_SPAN: Final = 60.0  # time for which the course flown so far counts [s]: no vehicle lags by more
+SAMPLING: Final = 0.1  # time between the instants at which the distance is taken, or a control period [s]
+LEAVING_FROM: Final = 1.0  # distance above which a growing one is reported [m]
+LEAVING_GROWTH: Final = 0.02  # growth above which a distance grows [1/s]: that of a constant one is rounding's
 DEPARTURE: Final = "departure"
 """The criterion's name in `[lost]`; unlike `quadsim.flight.phase.CRITERIA` it does not end a flight, but judges one."""
 _RESOLUTION: Final = 1e-3  # distances below it count as this one [m]
@@ -79,14 +69,25 @@ class Departure:
 def departure_numbers(log: ControlLog) -> dict[str, float] | None:
     """Return `distance` [m] and `growth` [1/s] at the end of a flight; None where it ends on the ground, or too early.
 
-    Too early is before `LEAST_IN_AIR` in the air, or before two control periods.
+    The course flown so far is the polyline through the vehicle's start and the references of the last `COURSE_SPAN`
+    seconds.  Of the distances from it,
+
+        d(t) = min over the polyline of |p(t) - q|,   D_1, D_2 = the largest d in the halves of the last `END_SPAN`,
+
+    and with halves of T seconds
+
+        distance = D_2,   growth = ln(D_2 / D_1) / T.
+
+    A vehicle that lags stays near this course, one that a disturbance displaced comes back to it; an unstable loop does
+    neither.  Only the flight itself counts: the span begins after the last period on the ground.  Too early is before
+    `LEAST_IN_AIR` in the air, or before two control periods.
     """
     rows = log.t.size
-    in_air = sum(1 for _ in takewhile(lambda phase: phase == Phase.FLYING, reversed(log.phase)))
+    in_air = _periods_in_air(log)
     if in_air < 2:
         return None
     period = float(log.t[1] - log.t[0])
-    count = min(in_air, max(round(SPAN / period), 2))
+    count = min(in_air, max(round(END_SPAN / period), 2))
     positions = log.truth[:, POSITION]
     if count * period < LEAST_IN_AIR - 1e-9 or not np.isfinite(positions[rows - count :]).all():
         return None
@@ -107,10 +108,20 @@ def departure_of(numbers: Mapping[str, Any] | None, limit: float | None) -> Depa
     return Departure(**numbers, limit=limit)
 
 
+def _periods_in_air(log: ControlLog) -> int:
+    """Return how many periods at the end of a flight it was in the air."""
+    count = 0
+    for phase in reversed(log.phase):
+        if phase != Phase.FLYING:
+            break
+        count += 1
+    return count
+
+
 def _course(log: ControlLog, period: float) -> Array:
-    """Return the corners (M, 3) of the course flown in the last `PATH` seconds, from the start of the vehicle on."""
+    """Return the corners (M, 3) of the course of the last `COURSE_SPAN` seconds, from the vehicle's start on."""
     references = log.reference[:, :3]
-    recent = round(PATH / period)
+    recent = round(COURSE_SPAN / period)
     if references.shape[0] > recent:
         return references[-recent - 1 :]
     return np.vstack([log.truth[:1, POSITION], references])

@@ -1,13 +1,8 @@
 """The demands of a course on a vehicle, computed before the flight by differential flatness.
 
 A quadrotor's attitude, rates, torques and rotor speeds follow from its position, its yaw, and their derivatives
-(Mellinger & Kumar 2011, Sec.  III). Derivatives are central differences at the control period, of the samples that the
-controller receives: it knows nothing in between, and a corner demands a turn within one period.  Three effects are left
-out, because differences would be meaningless:
-
-- around a jump of the course, acceleration (hover is assumed);
-- around a kink, where the velocity or its derivative may jump, torque;
-- wind and drag.
+(Mellinger & Kumar 2011, Sec.  III). `demand` computes them, `assess` compares them with limits and bounds, and
+`quadsim.scenarios.feasibility_check` calls both for a scenario.
 """
 
 from __future__ import annotations
@@ -41,10 +36,10 @@ from quadsim.vehicle import Vehicle
 STENCIL: Final = 2  # samples on either side that a torque depends on
 DIFFERENCE_ROUNDING: Final = 1e-6
 """Tolerances of a bound, relative and absolute, for rounding in the differences."""
-
-
 BODY_RATES: Final = ("body_rate_x", "body_rate_y", "body_rate_z")
 """Bounds on body rates, by their signals."""
+_NUMERALS: Final = ("two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+"""Words for counts from two on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +70,7 @@ class Feasibility:
     thrust_min: float  # least thrust of a rotor [N]; negative: not flyable, whatever the rotors' limits
     jumps: tuple[float, ...]  # times of jumps of the course [s]; the peaks exclude them
     problems: tuple[str, ...]
-    """One line per exceeded limit or bound; empty for a course that can be flown exactly."""
+    """What it needs beyond each exceeded limit, after `it needs`; empty for a course that can be flown exactly."""
     sentence: str  # summary for the user
     advice: str  # the speed, response time or size that would be within limits and bounds, in a sentence
     notes: tuple[str, ...]  # what no controller can do, and doubts about the course's numbers
@@ -94,7 +89,12 @@ def demand(
 
     With f = a + g e_z, and a frame turned by the yaw psi, the thrust is m |f| along body z = f / |f|, so that
     roll = asin(-f_y / |f|), pitch = atan2(f_x, f_z).  Body rates are those of the attitudes half a period before and
-    after, and tau = J d(w)/dt + w x J w; rotor speeds come from thrust and torque by the inverse allocation.
+    after; rotor speeds come from thrust and torque by the inverse allocation.
+
+    Derivatives are central differences at the control period, of the samples that the controller receives: it knows
+    nothing in between, and a corner demands a turn within one period.  Three effects are left out, because differences
+    would be meaningless: acceleration around a jump of the course (hover is assumed); torque around a kink, where the
+    velocity or its derivative may jump; wind and drag.
 
     Args:
         course: (K + 4, 4) x, y, z [m], yaw [rad], world, with two extra samples on either side.
@@ -106,43 +106,36 @@ def demand(
     intervals = course.shape[0] - 1
     if jumps is None:
         jumps = np.zeros(intervals, bool)
-    kinks = jumps if kinks is None else jumps | kinks
+    if kinks is None:
+        kinks = jumps
+    else:
+        kinks = jumps | kinks
+
     velocity = np.diff(course, axis=0) / period
     usable = ~(jumps[1:] | jumps[:-1])
     acceleration = np.where(usable[:, None], np.diff(velocity[:, :3], axis=0) / period, 0.0)
-    pushed = acceleration + np.array([0.0, 0.0, vehicle.gravity])
-    force = np.linalg.norm(pushed, axis=1)
-    euler = _attitudes(pushed, course[1:-1, 3])
-
+    specific_force = acceleration + np.array([0.0, 0.0, vehicle.gravity])
+    euler = _attitudes(specific_force, course[1:-1, 3])
     euler_rates = np.diff(euler, axis=0) / period
     body_rates = euler_to_body_rates(0.5 * (euler[1:] + euler[:-1]), euler_rates)
     smooth = ~(kinks[3:] | kinks[2:-1] | kinks[1:-2] | kinks[:-3])
-    rates = 0.5 * (body_rates[1:] + body_rates[:-1])
-    torque = vehicle.momentum(np.diff(body_rates, axis=0)) / period + np.cross(rates, vehicle.momentum(rates))
-    torque = np.where(smooth[:, None], torque, 0.0)
+    torque = np.where(smooth[:, None], _torques(body_rates, period, vehicle), 0.0)
 
     inner = slice(1, -1)
-    wrench = np.column_stack([vehicle.mass * force[inner], torque])
-    squared = np.linalg.solve(vehicle.allocation, wrench.T).T
-    thrusts = vehicle.coefficients * squared
+    thrust = vehicle.mass * np.linalg.norm(specific_force, axis=1)[inner]
+    wrench = np.column_stack([thrust, torque])
+    squared_speeds = np.linalg.solve(vehicle.allocation, wrench.T).T
+    thrusts = vehicle.coefficients * squared_speeds
     speeds = vehicle.speeds(np.maximum(thrusts, 0.0))
-    between = smooth[1:] & smooth[:-1]
-
-    state = np.zeros((smooth.size, N_STATES))
-    mean_velocity = 0.5 * (velocity[1:] + velocity[:-1])
-    state[:, POSITION] = course[STENCIL:-STENCIL, :3]
-    state[:, VELOCITY] = np.where(usable[:, None], mean_velocity[:, :3], 0.0)[inner]
-    state[:, EULER] = euler[inner]
-    turning = usable[2:] & usable[1:-1] & usable[:-2]
-    state[:, EULER_RATE] = np.where(turning[:, None], 0.5 * (euler_rates[1:] + euler_rates[:-1]), 0.0)
+    both_smooth = smooth[1:] & smooth[:-1]
     return Demand(
-        state=state,
+        state=_states(course, velocity, euler, euler_rates, usable),
         acceleration=acceleration[inner],
-        thrust=wrench[:, 0],
+        thrust=thrust,
         torque=torque,
         thrusts=thrusts,
         speeds=speeds,
-        slews=np.where(between[:, None], np.diff(speeds, axis=0), np.nan),
+        slews=np.where(both_smooth[:, None], np.diff(speeds, axis=0), np.nan),
     )
 
 
@@ -187,15 +180,44 @@ def assess(
     return Feasibility(**peaks, jumps=tuple(jumps), problems=problems, sentence=sentence, advice="", notes=())
 
 
-def _attitudes(pushed: Array, yaw: Array) -> Array:
+def _attitudes(specific_force: Array, yaw: Array) -> Array:
     """(M, 3) roll, pitch, yaw [rad] with body z along the specific force (M, 3) [m/s^2]."""
     cos = np.cos(yaw)
     sin = np.sin(yaw)
-    forward = cos * pushed[:, 0] + sin * pushed[:, 1]
-    left = cos * pushed[:, 1] - sin * pushed[:, 0]
-    pitch = np.unwrap(np.arctan2(forward, pushed[:, 2]))  # upside down, pitch continues beyond 180 deg
-    roll = np.arctan2(-left, np.hypot(forward, pushed[:, 2]))
+    forward = cos * specific_force[:, 0] + sin * specific_force[:, 1]
+    left = cos * specific_force[:, 1] - sin * specific_force[:, 0]
+    up = specific_force[:, 2]
+    pitch = np.unwrap(np.arctan2(forward, up))  # upside down, pitch continues beyond 180 deg
+    roll = np.arctan2(-left, np.hypot(forward, up))
     return np.stack([roll, pitch, yaw], axis=1)
+
+
+def _torques(body_rates: Array, period: float, vehicle: Vehicle) -> Array:
+    """Return (M - 1, 3) tau = J d(w)/dt + w x J w [N m], of body rates w (M, 3) [rad/s] a period apart."""
+    rates = 0.5 * (body_rates[1:] + body_rates[:-1])
+    return vehicle.momentum(np.diff(body_rates, axis=0)) / period + np.cross(rates, vehicle.momentum(rates))
+
+
+def _states(course: Array, velocity: Array, euler: Array, euler_rates: Array, usable: Mask) -> Array:
+    """Return the states (K, 12) at the samples of a course (K + 4, 4).
+
+    Args:
+        course: x, y, z [m], yaw [rad].
+        velocity: (K + 3, 4) its differences from sample to sample, per second.
+        euler: (K + 2, 3) attitudes [rad], without the first and the last sample.
+        euler_rates: (K + 1, 3) their differences from sample to sample [rad/s].
+        usable: (K + 2,) whether there is no jump beside the sample; there, velocities and rates are 0.
+    """
+    inner = slice(1, -1)
+    mean_velocity = 0.5 * (velocity[1:] + velocity[:-1])
+    mean_rates = 0.5 * (euler_rates[1:] + euler_rates[:-1])
+    turning = usable[2:] & usable[1:-1] & usable[:-2]
+    state = np.zeros((course.shape[0] - 2 * STENCIL, N_STATES))
+    state[:, POSITION] = course[STENCIL:-STENCIL, :3]
+    state[:, VELOCITY] = np.where(usable[:, None], mean_velocity[:, :3], 0.0)[inner]
+    state[:, EULER] = euler[inner]
+    state[:, EULER_RATE] = np.where(turning[:, None], mean_rates, 0.0)
+    return state
 
 
 def _problems(
@@ -204,48 +226,103 @@ def _problems(
     bounds: Mapping[str, tuple[float, float]],
     tightened: Mapping[str, tuple[float, float]],
 ) -> tuple[str, ...]:
-    """Return one line per side of a limit or bound that the demands exceed."""
-    least = vehicle.speed_min
-    most = vehicle.speed_max
-    problems = _beyond("rotor speed", "rad/s", needed.speeds, (least, most), "limit")
-    thrust = float(needed.thrusts.min())
-    if thrust < -DIFFERENCE_ROUNDING * vehicle.mass * vehicle.gravity:
-        problems.append(f"not flyable: a rotor would need a negative thrust, down to {thrust:.4g} N")
-    for name, (lower, upper) in bounds.items():
-        if name == "speed":  # an equally narrow vehicle limit is already listed
-            tighter = (lower if lower > least else -math.inf, upper if upper < most else math.inf)
-            problems += _beyond("rotor speed", "rad/s", needed.speeds, tighter, "bound")
-        elif name == "slew":
-            slews = needed.slews[np.isfinite(needed.slews)]
-            problems += _beyond("change of rotor speed", "rad/s per period", slews, (lower, upper), "bound")
-        elif name == "thrust":
-            problems += _beyond("thrust", "N", needed.thrust, (lower, upper), "bound")
-        elif name in BODY_RATES:
-            rates = euler_to_body_rates(needed.state[:, ANGLES], needed.state[:, ANGLE_RATES])
-            about_axis = np.degrees(rates[:, BODY_RATES.index(name)])
-            problems += _beyond(name, "deg/s", about_axis, (lower, upper), "bound")
-        else:
-            unit, scale = shown_unit(STATE_UNITS[INDEX[name]])
-            values = scale * needed.state[:, INDEX[name]]
-            beyond = _beyond(name, unit, values, (lower, upper), "bound")
-            if not beyond and name in tightened:
-                beyond = _beyond(name, unit, values, tightened[name], f"bound {upper:.4g}, tightened to")
-            problems += beyond
+    """Return what is needed beyond each side of a limit or bound."""
+    problems = _rotor_problems(needed, vehicle)
+    for name, allowed in bounds.items():
+        quantity, unit, values = _bounded(name, needed)
+        if name == "speed":
+            allowed = _narrower_than_rotors(allowed, vehicle)
+        beyond = _exceeded(quantity, unit, values, allowed)
+        if not beyond and name in tightened:
+            beyond = _exceeded(quantity, unit, values, tightened[name], stated=allowed)
+        problems += beyond
     return tuple(problems)
 
 
-def _beyond(name: str, unit: str, values: Array, allowed: tuple[float, float], kind: str) -> list[str]:
+def _rotor_problems(needed: Demand, vehicle: Vehicle) -> list[str]:
+    """Return what is needed of the rotors beyond their limits."""
+    limits = (vehicle.speed_min, vehicle.speed_max)
+    problems = _exceeded("rotor speed", "rad/s", needed.speeds, limits, whose="rotor ")
+    lowest = float(needed.thrusts.min())
+    if lowest < -DIFFERENCE_ROUNDING * vehicle.mass * vehicle.gravity:
+        problems.append(f"{lowest:.3g} N of thrust from a rotor, which is not flyable")
+    return problems
+
+
+def _bounded(name: str, needed: Demand) -> tuple[str, str, Array]:
+    """Return the bounded quantity in words, its unit, and its values over the course."""
+    if name == "speed":
+        return "rotor speed", "rad/s", needed.speeds
+    if name == "slew":
+        return "rotor speed change per period", "rad/s", needed.slews[np.isfinite(needed.slews)]
+    if name == "thrust":
+        return "thrust", "N", needed.thrust
+    if name in BODY_RATES:
+        rates = euler_to_body_rates(needed.state[:, ANGLES], needed.state[:, ANGLE_RATES])
+        return name, "deg/s", np.degrees(rates[:, BODY_RATES.index(name)])
+    unit, scale = shown_unit(STATE_UNITS[INDEX[name]])
+    return name, unit, scale * needed.state[:, INDEX[name]]
+
+
+def _narrower_than_rotors(bound: tuple[float, float], vehicle: Vehicle) -> tuple[float, float]:
+    """Return a bound on rotor speeds without the sides that the rotors' own limits, named already, make as narrow."""
+    lower, upper = bound
+    if lower <= vehicle.speed_min:
+        lower = -math.inf
+    if upper >= vehicle.speed_max:
+        upper = math.inf
+    return lower, upper
+
+
+def _exceeded(
+    quantity: str,
+    unit: str,
+    values: Array,
+    allowed: tuple[float, float],
+    *,
+    whose: str = "",
+    stated: tuple[float, float] | None = None,
+) -> list[str]:
+    """Return a phrase for each side on which values are beyond what is allowed, e.g. `19.1 deg of roll (limit 5 deg)`.
+
+    Args:
+        quantity: in words.
+        unit: of all numbers.
+        values: over the course, of any shape.
+        allowed: lower and upper limit.
+        whose: `rotor ` where the limit is the rotors', empty where it is the controller's.
+        stated: the bounds that were tightened to `allowed`; None if they were not.
+    """
     if not values.size:
         return []
     lower, upper = allowed
-    low = float(values.min())
-    high = float(values.max())
-    problems = []
-    if high > upper + DIFFERENCE_ROUNDING * (1.0 + abs(upper)):
-        problems.append(f"{name} up to {high:.4g} {unit} ({kind} {upper:.4g})")
-    if low < lower - DIFFERENCE_ROUNDING * (1.0 + abs(lower)):
-        problems.append(f"{name} down to {low:.4g} {unit} ({kind} {lower:.4g})")
-    return problems
+    highest = float(values.max())
+    lowest = float(values.min())
+    beyond = []  # each with the side of the limits that it exceeds
+    if highest > upper + DIFFERENCE_ROUNDING * (1.0 + abs(upper)):
+        beyond.append((highest, 1))
+    if lowest < lower - DIFFERENCE_ROUNDING * (1.0 + abs(lower)):
+        beyond.append((lowest, 0))
+    phrases = []
+    for value, side in beyond:
+        limit = allowed[side]
+        text = f"{whose}limit {limit:.4g} {unit}"
+        if stated is not None:
+            text = f"limit {stated[side]:.4g} {unit}, tightened to {limit:.4g} {unit}"
+        phrases.append(f"{_distinct_from(limit, value)} {unit} of {quantity} ({text})")
+    return phrases
+
+
+def _distinct_from(limit: float, value: float) -> str:
+    """Return a value in three digits, or in more where it has them before its point or they tell it from the limit."""
+    digits = 3
+    if math.isfinite(value):
+        digits = max(digits, len(str(round(abs(value)))))
+    text = f"{value:.{digits}g}"
+    while float(text) == limit or (float(text) > limit) != (value > limit):
+        digits += 1
+        text = f"{value:.{digits}g}"
+    return text
 
 
 def _sentence(
@@ -255,28 +332,44 @@ def _sentence(
     jumps: Sequence[float],
     problems: Sequence[str],
 ) -> str:
+    """Return what the course needs beyond limits, or its peaks where it is within them.
+
+    Args:
+        peaks: by the names of `Feasibility`.
+        vehicle: its rotor limits are named.
+        allowed: the narrowest bound on roll or pitch [deg]; None without one.
+        jumps: times of its jumps [s].
+        problems: what it needs beyond limits.
+    """
     if problems:
-        if len(problems) > 1:
-            more = f" and {len(problems) - 1} more"
-        else:
-            more = ""
-        return f"The course cannot be followed exactly: {problems[0]}{more}."
-    if allowed is None:
-        bound = ""
-    else:
+        return f"The course needs {problems[0]}{_further(len(problems) - 1)}."
+    subject = "The course requires"
+    if jumps:
+        times = ", ".join(f"{time:g}" for time in jumps[:4])
+        if len(jumps) > 4:
+            times += ", ..."
+        subject = f"The course steps (at {times} s); the rest requires"
+    bound = ""
+    if allowed is not None:
         bound = f" (bound {allowed:.4g} deg)"
-    times = ", ".join(f"{time:g}" for time in jumps[:4]) + (", ..." if len(jumps) > 4 else "")
+    turned = ""
     if peaks["yaw"] > 0.5:
         turned = f", a yaw of {round(peaks['yaw'], 1):g} deg"
-    else:
-        turned = ""
-    if jumps:
-        subject = f"The course steps (at {times} s); the rest requires"
-    else:
-        subject = "The course requires"
     return (
         f"{subject} up to {round(peaks['tilt'], 2):g} deg of tilt{bound}, "
         f"{round(peaks['velocity'], 2):g} m/s{turned}, "
         f"and rotor speeds of {peaks['rotor_min']:.4g} to {peaks['rotor_max']:.4g} rad/s "
         f"(limits {vehicle.speed_min:.4g} and {vehicle.speed_max:.4g})."
     )
+
+
+def _further(count: int) -> str:
+    """Say how many limits are exceeded besides the one that is named."""
+    if count == 0:
+        return ""
+    if count == 1:
+        return "; another limit is exceeded, too"
+    number = str(count)
+    if count - 2 < len(_NUMERALS):
+        number = _NUMERALS[count - 2]
+    return f"; {number} other limits are exceeded, too"

@@ -30,6 +30,7 @@ from quadsim.state import (
 from quadsim.vehicle import N_ROTORS
 
 Counts = np.ndarray[Any, np.dtype[np.int64]]
+PredictedPositions = np.ndarray[Any, np.dtype[np.float32]]
 NUMBER = "number"
 TEXT = "text"
 COUNT = "count"
@@ -58,16 +59,17 @@ class Columns(NamedTuple):
 
 def columns_of(table: type[Any]) -> dict[str, Columns]:
     """Return the columns of a table's fields, in their order, by field; those that default to None are optional."""
-    stated = [one for one in fields(table) if "units" in one.metadata]
-    return {
-        one.name: Columns(
-            {one.name: units} if isinstance(units := one.metadata["units"], str) else units,
-            one.metadata["kind"],
-            one.metadata["gaps"],
-            one.default is None,
+    by_field = {}
+    for one in fields(table):
+        if "units" not in one.metadata:
+            continue
+        units = one.metadata["units"]
+        if isinstance(units, str):
+            units = {one.name: units}
+        by_field[one.name] = Columns(
+            units=units, kind=one.metadata["kind"], gaps=one.metadata["gaps"], optional=one.default is None
         )
-        for one in stated
-    }
+    return by_field
 
 
 def _numbered(name: str, unit: str) -> dict[str, str]:
@@ -96,12 +98,15 @@ class LoggedSignals(dict[str, tuple[str, float]]):
 
 
 def stacked(periods: Sequence[LoggedSignals]) -> dict[str, tuple[str, Array]]:
-    """Unit and values (K,) of each signal that K periods logged, NaN in periods without."""
-    units = {name: unit for signals in reversed(periods) for name, (unit, _) in signals.items()}
-    return {
-        name: (units[name], np.array([signals.get(name, ("", math.nan))[1] for signals in periods]))
-        for name in dict.fromkeys(name for signals in periods for name in signals)
-    }
+    """Unit, of its first period, and values (K,) of each signal that K periods logged, NaN in periods without."""
+    stack: dict[str, tuple[str, Array]] = {}
+    for k, signals in enumerate(periods):
+        for name, (unit, value) in signals.items():
+            if name not in stack:
+                stack[name] = (unit, np.full(len(periods), math.nan))
+            _, values = stack[name]
+            values[k] = value
+    return stack
 
 
 class Sampled:
@@ -217,9 +222,10 @@ class ControlLog(Sampled):
         return str(Phase.CRASHED) in self.phase
 
 
-COLUMNS: Final = frozenset(name for one in columns_of(ControlLog).values() for name in one.units)
+_OF_FIELDS: Final = columns_of(ControlLog)
+COLUMNS: Final = frozenset(name for columns in _OF_FIELDS.values() for name in columns.units)
 """The columns of flight.parquet, but for those that a controller logs."""
-RESIDUALS: Final = tuple(name for name, one in columns_of(ControlLog).items() if one.gaps and not one.optional)
+RESIDUALS: Final = tuple(name for name, columns in _OF_FIELDS.items() if columns.gaps and not columns.optional)
 """Fields that every flight has, with gaps."""
 
 
@@ -257,7 +263,9 @@ class PlantLog:
         """Return every `stride`-th row, starting with the first."""
         thinned: dict[str, Any] = {}
         for name, rows in vars(self).items():
-            thinned[name] = None if rows is None else rows[::stride]
+            thinned[name] = rows
+            if rows is not None:
+                thinned[name] = rows[::stride]
         return PlantLog(**thinned)
 
 
@@ -275,7 +283,7 @@ class FlightLog:
     control: ControlLog  # one row per control period
     timing: TimingLog  # clock times, one row per control period
     plant: PlantLog  # the plant, at the physics rate after a flight, at the log rate when read from a file
-    predicted: np.ndarray[Any, np.dtype[np.float32]] | None = None
+    predicted: PredictedPositions | None = None
     """(K, N, 3) float32 positions [m] predicted in each period for t_{k+1} .. t_{k+N}, N the shortest horizon of its
     controllers; None if one of them has no model."""
     foreseen: Array | None = None
@@ -287,7 +295,9 @@ class FlightLog:
     lost: str | None = None  # loss criterion that ended it, e.g. `tilt`; None if none did
 
     def __repr__(self) -> str:
-        ended = "" if self.reason is None else f", {self.reason}"
+        ended = ""
+        if self.reason is not None:
+            ended = f", {self.reason}"
         return f"<FlightLog: {self.control.t.size} control periods, {self.plant.t.size} rows of the plant{ended}>"
 
     @property

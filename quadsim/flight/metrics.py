@@ -1,4 +1,7 @@
-"""Pure functions from a flight to the numbers of its summary."""
+"""The numbers of a flight's summary, from its `quadsim.flight.log`: tracking, commands, solver, faults, ground.
+
+Pure functions; `flight_numbers` calls those that `quadsim.rollout.flown` writes and `quadsim.rollout.reaudit` checks.
+"""
 
 from __future__ import annotations
 
@@ -66,15 +69,15 @@ def tracking(log: ControlLog) -> dict[str, Any]:
         "final_error": error[-1],
         "overshoot": np.maximum(beyond, 0.0),
     }
-    return {
-        "unit": dict(zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)),
-        **{name: dict(zip(REFERENCE_NAMES, values.tolist(), strict=True)) for name, values in by_channel.items()},
-        "position_error": {  # papers often print the mean of the distance as RMSE
-            "mean": float(distance.mean()),
-            "rms": math.sqrt(float(np.mean(np.square(distance)))),
-            "max": float(distance.max()),
-        },
+    numbers: dict[str, Any] = {"unit": dict(zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True))}
+    for name, values in by_channel.items():
+        numbers[name] = dict(zip(REFERENCE_NAMES, values.tolist(), strict=True))
+    numbers["position_error"] = {  # papers often print the mean of the distance as RMSE
+        "mean": float(distance.mean()),
+        "rms": math.sqrt(float(np.mean(np.square(distance)))),
+        "max": float(distance.max()),
     }
+    return numbers
 
 
 def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict[str, Any]]:
@@ -88,25 +91,37 @@ def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict
     Returns:
         One entry per step, in order: the step's fields, and `settled` [s].
     """
-    period = t[1] - t[0] if t.size > 1 else 0.0
     entries = []
     for step in steps:
-        in_window = (t >= step.time - 1e-9) & (t <= step.until + 1e-9)
-        error = outputs[in_window, REFERENCE_NAMES.index(step.channel)] - step.after
-        size = step.after - step.before
-        if step.channel == "yaw":
-            error = wrapped(error)
-            size = wrapped(size)
-        outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(size))
-        first = outside[-1] + 1 if outside.size else 0
-        reached_end = t.size > 1 and t[-1] + period > step.until - 1e-9
-        if reached_end and first < error.size:
-            settled = round(float(t[in_window][first] - step.time), 9)
-        else:
-            settled = None
-        step_taken = {name: getattr(step, name) for name in ("channel", "time", "before", "after")}
-        entries.append({**step_taken, "settled": settled})
+        entries.append(
+            {
+                "channel": step.channel,
+                "time": step.time,
+                "before": step.before,
+                "after": step.after,
+                "settled": _settling_time(t, outputs[:, REFERENCE_NAMES.index(step.channel)], step),
+            }
+        )
     return entries
+
+
+def _settling_time(t: Array, output: Array, step: CourseStep) -> float | None:
+    """Return the settling time of one step [s], from the output of its channel (K,) at times (K,) [s]."""
+    if t.size < 2 or t[-1] + (t[1] - t[0]) <= step.until - 1e-9:
+        return None
+    in_window = (t >= step.time - 1e-9) & (t <= step.until + 1e-9)
+    error = output[in_window] - step.after
+    size = step.after - step.before
+    if step.channel == "yaw":
+        error = wrapped(error)
+        size = wrapped(size)
+    outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(size))
+    first = 0  # sample from which on the output stays within the band
+    if outside.size:
+        first = int(outside[-1]) + 1
+    if first == error.size:
+        return None
+    return round(float(t[in_window][first] - step.time), 9)
 
 
 def peak_tilt(state: Array) -> float:
@@ -142,29 +157,31 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
 
     `iterations` covers the periods that the QP solver answered, None if there are none, or several solvers;
     `iterations_by` lists every answerer that iterates.  Each residual has its largest value among accepted answers, and
-    the number of these periods in which it was computed.  What a law does not report, the time of its optimum and the
-    active constraints there, is None.
+    the number of these periods in which it was computed.  What a controller does not report, the time of its optimum
+    and the active constraints there, is None.
     """
-    accepted = np.array([status in ACCEPTED for status in log.status])
-    answerers = np.array(log.answered_by)
-    iterations = {by: log.iterations[answerers == by] for by in sorted(set(log.answered_by))}
-    by_answerer = {}
-    for by, counts in iterations.items():
-        if counts.any() or by not in NO_SOLVER:
-            by_answerer[by] = {"mean": float(counts.mean()), "max": int(counts.max())}
-    solvers = set(iterations) - NO_SOLVER
-    optimises = bool(set(iterations) - NO_OPTIMUM) or bool(log.active.any())
+    answerers = set(log.answered_by)
+    iterations_by = _iterations_by(log)
+    solvers = answerers - NO_SOLVER
+    iterations = None
+    if len(solvers) == 1:
+        iterations = iterations_by.get(solvers.pop())
+    active_max = None
+    active_periods = None
+    if answerers - NO_OPTIMUM or log.active.any():
+        active_max = int(log.active.max())
+        active_periods = int(np.count_nonzero(log.active))
     return {
         "statuses": dict(sorted(Counter(log.status).items())),
         "fallbacks": {str(level): count for level, count in sorted(Counter(log.fallback.tolist()).items())},
         "unrecovered": unrecovered(log),
         "never_took_off": never_took_off(log),
         "answered_by": dict(sorted(Counter(log.answered_by).items())),
-        "iterations": by_answerer.get(solvers.pop()) if len(solvers) == 1 else None,
-        "iterations_by": by_answerer,
-        "active_max": int(log.active.max()) if optimises else None,
-        "active_periods": int(np.count_nonzero(log.active)) if optimises else None,
-        "residuals": {name: _largest(getattr(log, name)[accepted]) for name in RESIDUALS},
+        "iterations": iterations,
+        "iterations_by": iterations_by,
+        "active_max": active_max,
+        "active_periods": active_periods,
+        "residuals": _residuals(log),
         "solve_ms": percentiles(timing.solve_ms),
         "step_ms": percentiles(timing.step_ms),
         "deadline_ms": deadline_ms,
@@ -172,18 +189,41 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
     }
 
 
+def _iterations_by(log: ControlLog) -> dict[str, dict[str, Any]]:
+    """Return the mean and the largest number of iterations of each answerer that iterates, by name."""
+    answered_by = np.array(log.answered_by)
+    numbers = {}
+    for answerer in sorted(set(log.answered_by)):
+        counts = log.iterations[answered_by == answerer]
+        if counts.any() or answerer not in NO_SOLVER:
+            numbers[answerer] = {"mean": float(counts.mean()), "max": int(counts.max())}
+    return numbers
+
+
+def _residuals(log: ControlLog) -> dict[str, dict[str, Any]]:
+    """Return the largest value of each residual among accepted answers, None without one, and their number."""
+    accepted = np.array([status in ACCEPTED for status in log.status])
+    numbers = {}
+    for name in RESIDUALS:
+        values = getattr(log, name)[accepted]
+        computed = values[np.isfinite(values)]
+        largest = None
+        if computed.size:
+            largest = float(computed.max())
+        numbers[name] = {"max": largest, "periods": computed.size}
+    return numbers
+
+
 def unrecovered(log: ControlLog) -> int:
     """Return the periods in fallback at the end of a flight that never recovered; 0 if they are too short to count.
 
     They count from `UNRECOVERED` on, or if the whole flight was in fallback.
     """
-    good = np.flatnonzero(log.fallback == 0)
-    periods = log.t.size - (int(good[-1]) + 1 if good.size else 0)
-    if log.t.size > 1:
-        period = float(log.t[1] - log.t[0])
-    else:
-        period = math.inf
-    if periods and (not good.size or periods * period >= UNRECOVERED - 1e-9):
+    without_fallback = np.flatnonzero(log.fallback == 0)
+    if not without_fallback.size:
+        return log.t.size
+    periods = log.t.size - 1 - int(without_fallback[-1])
+    if periods and periods * float(log.t[1] - log.t[0]) >= UNRECOVERED - 1e-9:
         return periods
     return 0
 
@@ -208,15 +248,18 @@ def never_took_off(log: ControlLog) -> float | None:
     It is told by a reference `TAKEOFF_RISE` above the place where it stands, and counts once such a reference has
     lasted `TAKEOFF_PATIENCE`.  A crash is another failure.
     """
-    flown = [k for k, phase in enumerate(log.phase) if phase == Phase.FLYING]
-    start = flown[-1] + 1 if flown else 0
+    start = 0  # first of the periods on the ground at the end
+    for k, phase in enumerate(log.phase):
+        if phase == Phase.FLYING:
+            start = k + 1
     if log.crashed or log.t.size - start < 2:
         return None
     heights = log.truth[start:, INDEX["z"]]
-    told = np.flatnonzero(log.reference[start:, REFERENCE_NAMES.index("z")] > heights.min() + TAKEOFF_RISE)
-    lasted = told.size * float(log.t[1] - log.t[0])
+    references = log.reference[start:, REFERENCE_NAMES.index("z")]
+    above = np.flatnonzero(references > heights.min() + TAKEOFF_RISE)
+    lasted = above.size * float(log.t[1] - log.t[0])
     if lasted >= TAKEOFF_PATIENCE - 1e-9:
-        return float(log.t[start + told[0]])
+        return float(log.t[start + above[0]])
     return None
 
 
@@ -234,10 +277,12 @@ def estimation(log: ControlLog) -> dict[str, Any]:
     finite = np.isfinite(error)
     known = np.where(finite, error, 0.0)
     counted = np.maximum(finite.sum(axis=0), 1)
+    rmse = np.sqrt((known**2).sum(axis=0) / counted)
+    max_error = np.abs(known).max(axis=0)
     return {
         "unit": dict(zip(STATE_NAMES, STATE_UNITS, strict=True)),
-        "rmse": dict(zip(STATE_NAMES, np.sqrt((known**2).sum(axis=0) / counted).tolist(), strict=True)),
-        "max_error": dict(zip(STATE_NAMES, np.abs(known).max(axis=0).tolist(), strict=True)),
+        "rmse": dict(zip(STATE_NAMES, rmse.tolist(), strict=True)),
+        "max_error": dict(zip(STATE_NAMES, max_error.tolist(), strict=True)),
         "not_finite": int(np.count_nonzero(~finite.all(axis=1))),
     }
 
@@ -250,34 +295,33 @@ def ground(log: FlightLog, outline: Outline) -> dict[str, Any]:
         none; `phase`, the last one; `crashed`.
     """
     feet = clearance(log.plant.state, outline.feet, outline.foot_radius, outline.floor)
-    clearances = np.minimum(feet, clearance(log.plant.state, outline.hull, 0.0, outline.floor))
+    hull = clearance(log.plant.state, outline.hull, 0.0, outline.floor)
+    started = Phase.FLYING
+    if feet[0] <= AIRBORNE:
+        started = Phase.LANDED
+    last_phase = None
+    if log.control.phase:
+        last_phase = log.control.phase[-1]
     return {
-        "started": str(Phase.LANDED) if feet[0] <= AIRBORNE else str(Phase.FLYING),
+        "started": str(started),
         "takeoff_time": takeoff_time(log.plant.t, feet),
-        "touchdown": touchdown(log.plant.t, log.plant.state, clearances),
-        "phase": log.control.phase[-1] if log.control.phase else None,
+        "touchdown": touchdown(log.plant.t, log.plant.state, np.minimum(feet, hull)),
+        "phase": last_phase,
         "crashed": log.control.crashed,
     }
-
-
-def _largest(residuals: Array) -> dict[str, Any]:
-    """Return the largest available residual, None if there is none, and the number of available ones."""
-    computed = residuals[np.isfinite(residuals)]
-    return {"max": float(computed.max()) if computed.size else None, "periods": computed.size}
 
 
 def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseStep] = ()) -> dict[str, Any]:
     """Return `tracking`, `control` and `controller` of a summary; each is empty if no period was flown."""
     if not log.control.t.size:
         return {"tracking": {}, "control": {}, "controller": {}}
-    settled = settling(log.control.t, log.control.truth[:, REFERENCE_STATES], course)
+    errors = tracking(log.control)
     departure = departure_numbers(log.control)
+    if departure is not None:
+        errors["departure"] = departure
+    errors["settling"] = settling(log.control.t, log.control.truth[:, REFERENCE_STATES], course)
     return {
-        "tracking": {
-            **tracking(log.control),
-            **({} if departure is None else {"departure": departure}),
-            "settling": settled,
-        },
+        "tracking": errors,
         "control": control(log.control),
         "controller": controller(log.control, log.timing, deadline_ms),
     }

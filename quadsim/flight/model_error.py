@@ -1,14 +1,7 @@
-"""Where a law's model contradicts the flight: what it predicted for a period later, against what was flown.
+"""Where a controller's model contradicts the flight: what it predicted for a period later, against what was flown.
 
-Compared are the changes over each control period of the states that a command drives: velocities and Euler rates.  A
-change is predicted from the measured state by the command that was sent.  With sigma the standard deviations of the
-predicted and the flown changes, rho their correlation and s = sigma_p / sigma_f, the mean square of the error is
-
-    E = 1 - 2 rho s + s^2    [of that of the flown changes; 1: a prediction of no change]
-
-A model is wrong about a state where E is at least `WORSE` though the two belong together, |rho| at least `TOGETHER`.
-Wind, wear and pushes that a model does not know add to the flown changes, and noise to the predicted ones: they lower
-|rho|, or shift the means, which do not count.  A reversed sign has rho = -1 and E = 4.
+Compared are the changes over each control period of the states that a command drives, velocities and Euler rates, by
+their correlation and their standard deviations (`_error_of`).  `quadsim.rollout.flown` has the sentence in a summary.
 """
 
 from __future__ import annotations
@@ -22,12 +15,12 @@ from quadsim.controller import MISSED, Phase
 from quadsim.flight.log import ControlLog
 from quadsim.state import INDEX, STATE_UNITS, Array, shown_unit, tilt
 
-WORSE: Final = 2.0  # mean square of the error from which on a model is wrong, of that of predicting no change
-TOGETHER: Final = 0.9  # magnitude of the correlation from which on predicted and flown changes belong together
+WRONG_ERROR: Final = 2.0  # least mean square of the error of a wrong model, over that of predicting no change
+LEAST_CORRELATION: Final = 0.9  # least magnitude of the correlation of changes that belong together
 FEWEST_PERIODS: Final = 5  # compared periods in which a change must be predicted
 SMALLEST_ACCELERATION: Final = 0.2  # predicted accelerations below it do not count [m/s^2, rad/s^2]
 STEEPEST_COMPARED: Final = 45.0  # tilt up to which periods are compared [deg]: beyond it, Euler rates are no axes
-LATEST: Final = 0.5  # share of a period by which a command may be late: later ones act in the next period
+LONGEST_DELAY: Final = 0.5  # share of a period by which a command may be late: a later one acts in the next period
 _MOTIONS: Final = {
     "vx": ("moves", "along x"),
     "vy": ("moves", "along y"),
@@ -64,9 +57,10 @@ class ModelError:
     def sentence(self) -> str:
         """What is wrong, after `your model` or the like."""
         verb, axis = _MOTIONS[self.state]
-        what = f"{verb} the wrong way {axis}"
         if self.correlation > 0.0:
             what = f"{verb} {self.ratio:.2g} times as much as the vehicle {axis}"
+        else:
+            what = f"{verb} the wrong way {axis}"
         unit, scale = shown_unit(self.unit)
         return (
             f"{what}: in the period from {self.time:.4g} s it predicted {scale * self.predicted:+.2g}, "
@@ -111,23 +105,35 @@ def model_report(log: ControlLog, foreseen: Array | None, owner: str) -> dict[st
     errors = model_errors(log, foreseen)
     if not errors:
         return None
-    return {"sentence": f"{owner} {errors[0].sentence}", "states": [vars(error) for error in errors]}
+    states = [vars(error) for error in errors]
+    return {"sentence": f"{owner} {errors[0].sentence}", "states": states}
 
 
 def _compared(log: ControlLog, foreseen: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Return (K - 1,) in which periods the command acts at once, in the air, near level, with a prediction."""
     period = float(log.t[1] - log.t[0])
     in_air = np.array([phase == Phase.FLYING for phase in log.phase])
-    in_time = (log.delay < LATEST * period) & np.array([status != MISSED for status in log.status])
+    arrived = np.array([status != MISSED for status in log.status])
+    in_time = (log.delay < LONGEST_DELAY * period) & arrived
     level = np.degrees(tilt(log.truth)) <= STEEPEST_COMPARED
-    known = np.isfinite(foreseen).all(axis=1) & np.isfinite(log.state).all(axis=1)
-    here = in_air & in_time & level & known
-    there = in_air & level & np.isfinite(log.truth).all(axis=1)
-    return np.asarray(here[:-1] & there[1:])
+    predicted = np.isfinite(foreseen).all(axis=1) & np.isfinite(log.state).all(axis=1)
+    starts = in_air & in_time & level & predicted
+    ends = in_air & level & np.isfinite(log.truth).all(axis=1)
+    return np.asarray(starts[:-1] & ends[1:])
 
 
 def _error_of(state: str, times: Array, predicted: Array, flown: Array, *, smallest: float) -> ModelError | None:
-    """Return how the model gets a state wrong, from changes (M,) at times (M,) [s]; None if it does not."""
+    """Return how the model gets a state wrong, from changes (M,) at times (M,) [s]; None if it does not.
+
+    With sigma_p and sigma_f the standard deviations of the predicted and the flown changes, rho their correlation and
+    s = sigma_p / sigma_f, the mean square of the error is
+
+        E = 1 - 2 rho s + s^2    [of that of the flown changes; 1: a prediction of no change].
+
+    The model is wrong where E is at least `WRONG_ERROR` though the two belong together, |rho| at least
+    `LEAST_CORRELATION`.  Wind, wear and pushes that a model does not know add to the flown changes, and noise to the
+    predicted ones: they lower |rho|, or shift the means, which do not count.  A reversed sign has rho = -1 and E = 4.
+    """
     sigma_predicted = float(predicted.std())
     sigma_flown = float(flown.std())
     large = np.abs(predicted) >= smallest
@@ -137,12 +143,12 @@ def _error_of(state: str, times: Array, predicted: Array, flown: Array, *, small
     correlation = covariance / (sigma_predicted * sigma_flown)
     ratio = sigma_predicted / sigma_flown
     mean_square = 1.0 - 2.0 * correlation * ratio + ratio**2
-    if abs(correlation) < TOGETHER or mean_square < WORSE:
+    if abs(correlation) < LEAST_CORRELATION or mean_square < WRONG_ERROR:
         return None
-    worse = large & (np.abs(predicted - flown) > np.abs(flown))
-    if not worse.any():
+    wrong = large & (np.abs(predicted - flown) > np.abs(flown))
+    if not wrong.any():
         return None
-    first = int(np.argmax(worse))
+    first = int(np.argmax(wrong))
     return ModelError(
         state=state,
         unit=STATE_UNITS[INDEX[state]],

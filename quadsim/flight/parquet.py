@@ -25,10 +25,12 @@ from quadsim.flight.log import (
     ControlLog,
     FlightLog,
     PlantLog,
+    PredictedPositions,
     TimingLog,
     columns_of,
 )
 from quadsim.input_limits import LARGEST_TABLE, LARGEST_TEXTS, MOST_COLUMNS, MOST_ROWS
+from quadsim.state import Array
 
 FORMAT: Final = 2
 """Version of the files of runs and campaigns; to be raised when a file of another one would be misread."""
@@ -41,14 +43,20 @@ _Column = tuple[str, str, bool, pa.Array]
 
 
 def _columns(log: ControlLog | TimingLog | PlantLog, *, without: str = "") -> Iterator[_Column]:
-    """The columns of the fields that are there."""
+    """The columns of a log's fields, but for absent fields and the one named `without`."""
     for name, stated in columns_of(type(log)).items():
         rows = getattr(log, name)
-        if rows is not None and name != without:
-            values = [rows] if len(stated.units) == 1 else rows.T
-            kind = pa.string() if stated.kind == TEXT else None
-            for (column, unit), one in zip(stated.units.items(), values, strict=True):
-                yield column, unit, stated.gaps, pa.array(one, kind, from_pandas=stated.gaps)
+        if rows is None or name == without:
+            continue
+        if len(stated.units) == 1:
+            values = [rows]
+        else:
+            values = rows.T
+        kind = None
+        if stated.kind == TEXT:
+            kind = pa.string()
+        for (column, unit), entries in zip(stated.units.items(), values, strict=True):
+            yield column, unit, stated.gaps, pa.array(entries, kind, from_pandas=stated.gaps)
 
 
 def _logged(log: ControlLog) -> Iterator[_Column]:
@@ -93,22 +101,28 @@ def format_of(table: pa.Table) -> str | None:
 def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, str]) -> dict[str, pa.Table]:
     """A flight's tables `flight`, `timing`, `plant`, and `horizon` if positions were predicted; see `write_log`."""
     control = log.control
-    perfect = "truth" if control.measured_perfectly else ""
-    before = ",".join(repr(float(speed)) for speed in control.speeds_before)
+    left_out = ""
+    if control.measured_perfectly:
+        left_out = "truth"
+    speeds_before = ",".join(repr(float(speed)) for speed in control.speeds_before)
+    flight_columns = [*_columns(control, without=left_out), *_logged(control)]
     tables = {
-        "flight": _table(
-            [*_columns(control, without=perfect), *_logged(control)], {**metadata, "speeds_before": before}
-        ),
+        "flight": _table(flight_columns, {**metadata, "speeds_before": speeds_before}),
         "timing": _table(_columns(log.timing), metadata),
         "plant": _table(_columns(log.plant.every(plant_stride)), metadata),
     }
-    if (predicted := log.predicted) is not None:
-        columns: list[_Column] = [("t", "s", False, pa.array(control.t))]
-        for i, axis in enumerate("xyz"):
-            positions = pa.FixedSizeListArray.from_arrays(predicted[:, :, i].ravel(), predicted.shape[1])
-            columns.append((f"predicted_{axis}", "m", False, positions))
-        tables["horizon"] = _table(columns, metadata)
+    if log.predicted is not None:
+        tables["horizon"] = _table(_predicted_columns(control.t, log.predicted), metadata)
     return tables
+
+
+def _predicted_columns(t: Array, predicted: PredictedPositions) -> Iterator[_Column]:
+    """The columns of the positions (K, N, 3) [m] that were predicted at times (K,) [s]; each row has N per axis."""
+    yield "t", "s", False, pa.array(t)
+    horizon = predicted.shape[1]
+    for i, axis in enumerate("xyz"):
+        positions = pa.FixedSizeListArray.from_arrays(predicted[:, :, i].ravel(), horizon)
+        yield f"predicted_{axis}", "m", False, positions
 
 
 def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
@@ -145,32 +159,53 @@ def read_parquet(path: Path) -> pa.Table:
 def _read_bounded(path: Path, file: pq.ParquetFile) -> pa.Table:
     """Read a table that fits in memory: a few bytes of a file may stand for any number of equal values.
 
-    Numbers are counted before they are read. Texts that occur once in the file may occur in each row, so batches are
-    so small that even then each fits.
+    Numbers are counted before they are read. Texts that occur once in the file may occur in each row: where these might
+    not fit, they are read in batches.
     """
-    known = file.metadata
-    rows = known.num_rows
-    columns = known.num_columns
+    rows = file.metadata.num_rows
+    columns = file.metadata.num_columns
     if rows > MOST_ROWS or columns > MOST_COLUMNS:
         raise FileError(path, f"must have at most {MOST_ROWS} rows and {MOST_COLUMNS} columns; got {rows}, {columns}")
-    groups = [known.row_group(i) for i in range(known.num_row_groups)]
-    chunks = [group.column(i) for group in groups for i in range(columns)]
-    numbers = 8 * sum(chunk.num_values for chunk in chunks)
-    texts = sum(chunk.total_uncompressed_size for chunk in chunks if chunk.physical_type.endswith("BYTE_ARRAY"))
-    most = numbers + LARGEST_TEXTS
-    batches = []
-    if numbers <= LARGEST_TABLE and rows * texts <= LARGEST_TEXTS:
-        return file.read(use_threads=False)
+    numbers, texts = _sizes(file.metadata)
     if numbers <= LARGEST_TABLE:
-        for batch in file.iter_batches(max(1, LARGEST_TEXTS // 16 // max(1, texts)), use_threads=False):
-            batches.append(batch)
-            most -= batch.nbytes
-            if most < 0:
-                break
-        else:
-            return pa.Table.from_batches(batches, file.schema_arrow)
+        if rows * texts <= LARGEST_TEXTS:
+            return file.read(use_threads=False)
+        table = _read_in_batches(file, texts, numbers + LARGEST_TEXTS)
+        if table is not None:
+            return table
     largest = f"{LARGEST_TABLE} bytes of numbers and {LARGEST_TEXTS} of texts"
     raise FileError(path, f"must be of at most {largest} in memory; it has more")
+
+
+def _sizes(metadata: pq.FileMetaData) -> tuple[int, int]:
+    """Return the bytes of all numbers of a file in memory, and of its texts as the file has them."""
+    numbers = 0
+    texts = 0
+    for i in range(metadata.num_row_groups):
+        group = metadata.row_group(i)
+        for j in range(metadata.num_columns):
+            chunk = group.column(j)
+            numbers += 8 * chunk.num_values
+            if chunk.physical_type.endswith("BYTE_ARRAY"):
+                texts += chunk.total_uncompressed_size
+    return numbers, texts
+
+
+def _read_in_batches(file: pq.ParquetFile, texts: int, most: int) -> pa.Table | None:
+    """Read a table in batches so small that each fits, even with every text in each row; None if the table does not.
+
+    Args:
+        file: has at least one text.
+        texts: bytes of its texts as the file has them.
+        most: bytes that the table may have in memory.
+    """
+    batches = []
+    for batch in file.iter_batches(max(1, LARGEST_TEXTS // 16 // max(1, texts)), use_threads=False):
+        batches.append(batch)
+        most -= batch.nbytes
+        if most < 0:
+            return None
+    return pa.Table.from_batches(batches, file.schema_arrow)
 
 
 def _fields(table: pa.Table, log: type[Any], *, optional: str = "") -> dict[str, Any]:
@@ -178,12 +213,10 @@ def _fields(table: pa.Table, log: type[Any], *, optional: str = "") -> dict[str,
     values: dict[str, Any] = {}
     for name, stated in columns_of(log).items():
         may_lack = stated.optional or name == optional
-        there = not may_lack or set(stated.units) <= set(table.column_names)
-        columns: list[Any]
-        if there:
-            columns = [_values(table, column, stated) for column in stated.units]
-        else:
-            columns = [None]
+        if may_lack and not set(stated.units) <= set(table.column_names):
+            values[name] = None
+            continue
+        columns = [_values(table, column, stated) for column in stated.units]
         if len(columns) == 1:
             values[name] = columns[0]
         else:
@@ -200,7 +233,9 @@ def _values(table: pa.Table, name: str, stated: Columns) -> Any:
         return texts
     if column.null_count and not stated.gaps:
         raise ValueError(f"{name} has gaps")
-    return np.asarray(column.to_numpy(), dtype=np.int64 if stated.kind == COUNT else np.float64)
+    if stated.kind == COUNT:
+        return np.asarray(column.to_numpy(), dtype=np.int64)
+    return np.asarray(column.to_numpy(), dtype=np.float64)
 
 
 def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
@@ -209,44 +244,63 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
     Raises:
         FileError: a file is missing or damaged.
     """
-    flight, timing, plant = (read_parquet(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE))
-    for name, table in ((FLIGHT_FILE, flight), (TIMING_FILE, timing), (PLANT_FILE, plant)):
-        require_format(
-            format_of(table), directory / name, f"quadsim run {shlex.quote(str(directory / 'scenario.toml'))}"
-        )
+    tables = {name: read_parquet(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE)}
+    again = f"quadsim run {shlex.quote(str(directory / 'scenario.toml'))}"
+    for name, table in tables.items():
+        require_format(format_of(table), directory / name, again)
     try:
-        before = np.array([float(text) for text in (flight.schema.metadata or {})[b"speeds_before"].split(b",")])
-        values = _fields(flight, ControlLog, optional="truth")
-        if values["truth"] is None:
-            values["truth"] = values["state"]
-        logged = {}
-        for field in flight.schema:
-            if field.name not in COLUMNS:
-                logged[field.name] = (
-                    field.metadata[b"unit"].decode(),
-                    np.asarray(flight.column(field.name), np.float64),
-                )
-        control = ControlLog(**values, logged=logged, speeds_before=before)
-        plant_log = PlantLog(**_fields(plant, PlantLog))
-        timing_log = TimingLog(**_fields(timing, TimingLog))
-        predicted = _read_predicted(directory / HORIZON_FILE)
-        rows = {control.t.size, timing_log.t.size, *(() if predicted is None else (len(predicted),))}
-        if len(rows) > 1 or not plant_log.t.size:
-            raise ValueError("its tables are empty or differ in length")
-        for t in (control.t, plant_log.t):
-            if not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
-                raise ValueError("t does not increase")
+        log = FlightLog(
+            control=_read_control(tables[FLIGHT_FILE]),
+            timing=TimingLog(**_fields(tables[TIMING_FILE], TimingLog)),
+            plant=PlantLog(**_fields(tables[PLANT_FILE], PlantLog)),
+            predicted=_read_predicted(directory / HORIZON_FILE),
+            reason=reason,
+        )
+        _require_consistent(log)
     except FileError:
         raise
     except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
         raise FileError(directory, f"lacks or misstates a column of the flight log ({error})") from error
-    return FlightLog(control=control, timing=timing_log, plant=plant_log, predicted=predicted, reason=reason)
+    return log
 
 
-def _read_predicted(path: Path) -> np.ndarray[Any, np.dtype[np.float32]] | None:
+def _read_control(table: pa.Table) -> ControlLog:
+    """Return the control periods of `flight.parquet`."""
+    before = (table.schema.metadata or {})[b"speeds_before"]
+    speeds_before = np.array([float(text) for text in before.split(b",")])
+    values = _fields(table, ControlLog, optional="truth")
+    if values["truth"] is None:
+        values["truth"] = values["state"]
+    logged = {}
+    for field in table.schema:
+        if field.name not in COLUMNS:
+            unit = field.metadata[b"unit"].decode()
+            logged[field.name] = (unit, np.asarray(table.column(field.name), np.float64))
+    return ControlLog(**values, logged=logged, speeds_before=speeds_before)
+
+
+def _require_consistent(log: FlightLog) -> None:
+    """Refuse tables that are empty or differ in length, and times that do not increase.
+
+    Raises:
+        ValueError: saying which of these it is.
+    """
+    periods = {log.control.t.size, log.timing.t.size}
+    if log.predicted is not None:
+        periods.add(len(log.predicted))
+    if len(periods) > 1 or not log.plant.t.size:
+        raise ValueError("its tables are empty or differ in length")
+    for t in (log.control.t, log.plant.t):
+        if not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
+            raise ValueError("t does not increase")
+
+
+def _read_predicted(path: Path) -> PredictedPositions | None:
+    """Return the predicted positions (K, N, 3) [m]; None if the flight has none."""
     if not path.exists():
         return None
     table = read_parquet(path)
     columns = [table.column(f"predicted_{axis}").combine_chunks() for axis in "xyz"]
     shape = (table.num_rows, columns[0].type.list_size)  # also valid for a flight without periods
-    return np.stack([column.flatten().to_numpy().reshape(shape) for column in columns], axis=-1)
+    by_axis = [column.flatten().to_numpy().reshape(shape) for column in columns]
+    return np.stack(by_axis, axis=-1)

@@ -1,4 +1,8 @@
-"""Ground contact and loss: the parts that may touch the ground, the phase of the flight, take-off, loss criteria."""
+"""Ground contact and loss: the parts that may touch the ground, the phase of the flight, take-off, loss criteria.
+
+`quadsim.sim.loop` asks `PhaseMonitor` for the phase of each control period, and `check_loss` ends a flight;
+`quadsim.flight.metrics` summarises take-off and touchdown.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ from quadsim.controller import GROUNDED, Phase
 from quadsim.errors import LostError
 from quadsim.rotation import body_to_world
 from quadsim.space import Obstacle, Solids
-from quadsim.state import EULER, INDEX, POSITION, REFERENCE_NAMES, Array, tilt
+from quadsim.state import EULER, INDEX, POSITION, REFERENCE_NAMES, VELOCITY, Array, tilt
 
 AIRBORNE: Final = 0.05  # clearance of the feet [m] above which a vehicle flies; no landing gear springs back that far
 TOUCH: Final = 2e-3  # clearance [m] below which a part touches: contacts are soft, and points represent rounded parts
@@ -70,13 +74,13 @@ def touchdown(t: Array, states: Array, clearances: Array) -> dict[str, float] | 
     airborne = np.flatnonzero(clearances > AIRBORNE)
     if not airborne.size:
         return None
-    met = np.flatnonzero(clearances[airborne[0] :] <= TOUCH)
-    if not met.size:
+    touching = np.flatnonzero(clearances[airborne[0] :] <= TOUCH)
+    if not touching.size:
         return None
-    last = airborne[0] + met[0] - 1
-    vx, vy, vz = (float(states[last, INDEX[name]]) for name in ("vx", "vy", "vz"))
-    lean = float(np.degrees(tilt(states[last : last + 1])[0]))
-    return {"time": float(t[last]), "speed": -vz, "horizontal_speed": math.hypot(vx, vy), "tilt": lean}
+    last = airborne[0] + touching[0] - 1
+    vx, vy, vz = states[last, VELOCITY].tolist()
+    tilts = np.degrees(tilt(states[last : last + 1]))
+    return {"time": float(t[last]), "speed": -vz, "horizontal_speed": math.hypot(vx, vy), "tilt": float(tilts[0])}
 
 
 def takeoff_time(t: Array, clearances: Array) -> float | None:
@@ -113,20 +117,21 @@ CRITERIA: Final = {
 class TakeoffLead:
     """The height to add to a controller's reference so that a vehicle takes off which is heavier than its model.
 
-    On the ground, most laws cannot learn a mismatch: the ground carries what thrust does not, so observers and
-    integrals hold until lift-off, and a law without them never learns.  Every law demands more thrust for a higher
-    reference, so the lead is an integral on thrust for all of them, within the law's own bounds.
+    On the ground, most controllers cannot learn a mismatch: the ground carries what thrust does not, so observers and
+    integrals hold until lift-off, and a controller without them never learns.  Every controller demands more thrust for
+    a higher reference, so the lead is an integral on thrust for all of them, within the controller's own bounds.
 
     - It stays zero until an armed, level vehicle with its course in the air has stood for `STANDSTILL` without more
-      thrust.  A law that takes off by itself never sees it.
+      thrust.  A controller that takes off by itself never sees it.
     - It then grows at `LEAD_RATE` up to `LARGEST_LEAD`, while the vehicle does not rise and thrust follows: rotors that
       saturate stop it.
     - From lift-off at height z_0 on it fades with the climb, and never grows again:
 
           lead = lead_0 (1 - (z - z_0) / min(FADING, z_ref - z_0)).
 
-      It is thus released as the law's own estimate or integral takes over, and gone at the course.  A law with neither
-      keeps its steady altitude error, but hovers just above the ground where it would have stayed on it.
+      It is thus released as the controller's own estimate or integral takes over, and gone at the course.  With
+      neither, the controller keeps its steady altitude error, but hovers just above the ground where it would have
+      stayed on it.
     """
 
     def __init__(self, period: float) -> None:
@@ -136,21 +141,25 @@ class TakeoffLead:
 
     def reset(self) -> None:
         """No lead; the next take-off is the first."""
-        self.lead = self._at_liftoff = 0.0
-        self._height = self._most = self._idle = 0.0
-        self._pushing = False
+        self.lead = 0.0
+        self._at_liftoff = 0.0  # the lead there
+        self._height = 0.0  # on the ground [m]
+        self._largest_thrust = 0.0
+        self._idle = 0.0  # time without more thrust or a rise [s]
+        self._pushing = False  # whether the lead may grow
 
     def push(self, height: float, climb: float, thrust: float) -> float:
         """Return the lead of a period on the ground [m], from height [m], vertical speed [m/s] and thrust, any unit."""
-        if thrust > MORE_THRUST * self._most or climb > RISING:
-            self._most = max(thrust, self._most)
+        if thrust > MORE_THRUST * self._largest_thrust or climb > RISING:
+            self._largest_thrust = max(thrust, self._largest_thrust)
             self._idle = 0.0
         else:
             self._idle += self._period
         standing = self._idle > STANDSTILL - 1e-9
         if not self._pushing:
-            self._pushing = standing
-            self._idle = 0.0 if standing else self._idle
+            if standing:
+                self._pushing = True
+                self._idle = 0.0
         elif not standing and climb <= RISING:
             self.lead = min(self.lead + LEAD_RATE * self._period, LARGEST_LEAD)
         self._height = height
@@ -169,7 +178,7 @@ class TakeoffLead:
             self.lead = min(self.lead, max(faded, self._slowest_decay * self.lead))
             if self.lead < NO_LEAD:
                 self.lead = 0.0
-        self._most = 0.0
+        self._largest_thrust = 0.0
         self._idle = 0.0
         self._pushing = False
         return self.lead
@@ -224,25 +233,15 @@ class PhaseMonitor:
         if self._outline is None:
             return self._phase or Phase.FLYING
         gap = float(clearance(states[-1:], self._outline.feet, self._outline.foot_radius, self._outline.floor)[0])
-        self._touched = self._touched + 1 if gap <= TOUCH else 0
+        if gap <= TOUCH:
+            self._touched += 1
+        else:
+            self._touched = 0
         flight_required = bool(preview[:, REFERENCE_NAMES.index("z")].max() > self._takeoff_height)
-        if self._phase is None:
-            if gap > AIRBORNE:
-                self._phase = Phase.FLYING
-            else:
-                self._phase = Phase.LANDED
         if self._crashed(self._outline, states):
             self._phase = Phase.CRASHED
-        elif self._phase is Phase.FLYING:
-            if self._touched >= self._periods_of_rest and not flight_required:
-                self._phase = Phase.LANDED
-        elif self._phase is Phase.ARMED and gap > AIRBORNE:
-            self._phase = Phase.FLYING
-        elif self._phase is not Phase.CRASHED:
-            if flight_required:
-                self._phase = Phase.ARMED
-            else:
-                self._phase = Phase.LANDED
+        else:
+            self._phase = self._next_phase(gap, flight_required)
         if self._phase in GROUNDED:
             self._takeoff.reset()
         return self._phase
@@ -265,6 +264,30 @@ class PhaseMonitor:
             return self._takeoff.push(height, climb, thrust)
         self._takeoff.reset()
         return 0.0
+
+    def _next_phase(self, gap: float, flight_required: bool) -> Phase:
+        """Return the phase after the present one, where nothing crashes.
+
+        Args:
+            gap: clearance of the feet [m].
+            flight_required: whether the preview leaves the ground.
+        """
+        phase = self._phase
+        if phase is None:  # the first state
+            phase = Phase.LANDED
+            if gap > AIRBORNE:
+                phase = Phase.FLYING
+        if phase is Phase.CRASHED:
+            return phase
+        if phase is Phase.FLYING:
+            if self._touched >= self._periods_of_rest and not flight_required:
+                return Phase.LANDED
+            return phase
+        if phase is Phase.ARMED and gap > AIRBORNE:
+            return Phase.FLYING
+        if flight_required:
+            return Phase.ARMED
+        return Phase.LANDED
 
     def _crashed(self, outline: Outline, states: Array) -> bool:
         if self._touched and np.degrees(tilt(states[-1:])[0]) > CAPSIZED:
@@ -290,7 +313,9 @@ def check_loss(limits: Mapping[str, float], time: float, state: Array, reference
     x, vx, y, vy, z, vz, roll, _, pitch, *_ = state.tolist()  # floats are faster than arrays of so few numbers
     tilt = math.degrees(math.acos(math.cos(roll) * math.cos(pitch)))
     distance = math.dist((x, y, z), reference[:3].tolist())
-    values = (tilt, distance, lowest - z, math.hypot(vx, vy, vz))
+    depth = lowest - z
+    speed = math.hypot(vx, vy, vz)
+    values = (tilt, distance, depth, speed)
     for (name, (quantity, unit)), value in zip(CRITERIA.items(), values, strict=True):
         limit = limits.get(name, math.inf)
         if value > limit:

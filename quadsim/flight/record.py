@@ -1,4 +1,7 @@
-"""What figures, films, recordings, tables and pages take of a flight: what `quadsim.rollout.flown.Flight` provides."""
+"""What figures, films, recordings, tables and pages take of a flight.
+
+`quadsim.rollout.flown.Flight` provides it; what only reads flights depends on this protocol, and on no rollout.
+"""
 
 from __future__ import annotations
 

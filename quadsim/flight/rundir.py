@@ -1,4 +1,7 @@
-"""A run's directory: its files, and `summary.json`, with the SHA-256 of each; limits and findings to JSON and back."""
+"""A run's directory: its files, and `summary.json`, with the SHA-256 of each; limits and findings to JSON and back.
+
+`quadsim.rollout.flown` writes it, `quadsim.rollout.stored` and `quadsim.rollout.reaudit` read it.
+"""
 
 from __future__ import annotations
 
@@ -22,25 +25,53 @@ from quadsim.space import shape_from_json, shape_to_json
 
 NUMBER: Final = (int, float)
 MAYBE_NUMBER: Final = (int, float, NoneType)
-_FORM: Final = {
-    **dict.fromkeys(("scenario", "status", "verdict"), str),
+_SUMMARY_TYPES: Final = {
+    "scenario": str,
+    "status": str,
+    "verdict": str,
     "format": int,
     "reason": (str, NoneType),
     "satisfied": bool,
     "duration": NUMBER,
     "constraints": list,
-    **dict.fromkeys(("tracking", "control", "controller", "vehicle", "wall_s", "files"), dict),
+    "tracking": dict,
+    "control": dict,
+    "controller": dict,
+    "vehicle": dict,
+    "wall_s": dict,
+    "files": dict,
 }
-_CONSTRAINT: Final = {
-    **dict.fromkeys(("name", "signal", "unit"), str),
-    **dict.fromkeys(("tolerance", "tolerance_sampled", "start", "time_violated"), NUMBER),
-    **dict.fromkeys(("required", "satisfied"), bool),
-    **dict.fromkeys(
-        ("lower", "upper", "stop", "peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time"),
-        MAYBE_NUMBER,
-    ),
+_CONSTRAINT_TYPES: Final = {
+    "name": str,
+    "signal": str,
+    "unit": str,
+    "tolerance": NUMBER,
+    "tolerance_sampled": NUMBER,
+    "start": NUMBER,
+    "time_violated": NUMBER,
+    "required": bool,
+    "satisfied": bool,
+    "lower": MAYBE_NUMBER,
+    "upper": MAYBE_NUMBER,
+    "stop": MAYBE_NUMBER,
+    "peak_sampled": MAYBE_NUMBER,
+    "peak_plant": MAYBE_NUMBER,
+    "worst_margin_sampled": MAYBE_NUMBER,
+    "worst_margin": MAYBE_NUMBER,
+    "worst_time": MAYBE_NUMBER,
 }
 """Entries on which verdicts and pages depend; the rest is trusted."""
+_FINDING_NUMBERS: Final = (
+    "peak_sampled",
+    "peak_plant",
+    "worst_margin_sampled",
+    "worst_margin",
+    "worst_time",
+    "time_violated",
+)
+"""Fields of a `Finding` that are numbers."""
+_NO_BOUND: Final = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
+"""What null stands for in these fields of a limit."""
 
 
 def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
@@ -57,8 +88,9 @@ def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
         if isinstance(error, FileError):
             raise
         raise FileError(path, f"is not {what} ({printable(str(error))[:200]})") from error
-    if wrong := _misfits(table, form):
-        raise FileError(path, f"is not {what}: it lacks or misstates {', '.join(wrong)}")
+    misfits = _misfits(table, form)
+    if misfits:
+        raise FileError(path, f"is not {what}: it lacks or misstates {', '.join(misfits)}")
     return dict(table)
 
 
@@ -68,14 +100,15 @@ def _refuse(constant: str) -> None:
 
 def _misfits(table: object, form: Mapping[str, Any]) -> list[str]:
     """Return the entries of a table that are missing or of another type; true and false are not numbers."""
-    entries = table if isinstance(table, dict) else {}
-    return [
-        name
-        for name, kind in form.items()
-        if name not in entries
-        or not isinstance(entries[name], kind)
-        or (isinstance(entries[name], bool) and kind is not bool)
-    ]
+    if not isinstance(table, dict):
+        return [*form]
+    misfits = []
+    for name, kind in form.items():
+        value = table.get(name)
+        flag_for_number = isinstance(value, bool) and kind is not bool
+        if name not in table or not isinstance(value, kind) or flag_for_number:
+            misfits.append(name)
+    return misfits
 
 
 def read_summary(directory: Path) -> dict[str, Any]:
@@ -91,10 +124,11 @@ def read_summary(directory: Path) -> dict[str, Any]:
     stated = read_json(path, {}, "a run's summary")
     if {"scenario", "constraints"} <= stated.keys():
         require_format(stated.get("format"), path, f"quadsim run {shlex.quote(str(directory / SCENARIO_FILE))}")
-    summary = read_json(path, _FORM, "a run's summary")
+    summary = read_json(path, _SUMMARY_TYPES, "a run's summary")
     for i, entry in enumerate(summary["constraints"]):
-        if wrong := _misfits(entry, _CONSTRAINT):
-            raise FileError(path, f"is not a run's summary: constraints.{i} lacks or misstates {', '.join(wrong)}")
+        misfits = _misfits(entry, _CONSTRAINT_TYPES)
+        if misfits:
+            raise FileError(path, f"is not a run's summary: constraints.{i} lacks or misstates {', '.join(misfits)}")
     return summary
 
 
@@ -106,7 +140,8 @@ def require_inside(directory: Path) -> None:
     """
     home = directory.resolve()
     for folder, folders, files in os.walk(directory):  # follows no link to a folder
-        for path in (Path(folder, name) for name in sorted((*folders, *files))):
+        for name in sorted((*folders, *files)):
+            path = Path(folder, name)
             if path.is_symlink() and not _leads_into(path, home):
                 raise FileError(path, f"is a link that leads out of {directory}; nothing is read through it")
 
@@ -122,38 +157,43 @@ def _leads_into(link: Path, home: Path) -> bool:
 def limit_to_json(finding: Finding) -> dict[str, Any]:
     """Return an entry of `constraints` in `summary.json`; null for an absent bound or a window that was not reached."""
     limit = finding.limit
-    stated = {}
-    for name, value in vars(limit).items():
-        if name not in ("name", "signal", "terms", "shape"):
-            stated[name] = value
-    audited = {name: value for name, value in vars(finding).items() if name != "limit"}
-    return {
-        "name": limit.name,
-        "signal": limit.signal,
-        **({"terms": dict(limit.terms)} if limit.terms else {}),
-        **({"shape": shape_to_json(limit.shape)} if isinstance(limit, SpaceLimit) else {}),
-        "unit": limit.unit,
-        **{name: value if math.isfinite(value) else None for name, value in (stated | audited).items()},
-        "satisfied": finding.satisfied,
-        "verdict": finding.verdict,
-    }
+    entry: dict[str, Any] = {"name": limit.name, "signal": limit.signal}
+    if limit.terms:
+        entry["terms"] = dict(limit.terms)
+    if isinstance(limit, SpaceLimit):
+        entry["shape"] = shape_to_json(limit.shape)
+    entry["unit"] = limit.unit
+    for name, value in (vars(limit) | vars(finding)).items():
+        if name in ("name", "signal", "terms", "shape", "limit"):
+            continue
+        entry[name] = None
+        if math.isfinite(value):
+            entry[name] = value
+    entry["satisfied"] = finding.satisfied
+    entry["verdict"] = finding.verdict
+    return entry
 
 
 def limit_from_json(entry: Mapping[str, Any]) -> Limit:
     """Return the limit that `limit_to_json` wrote."""
-    absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
     values = {field.name: entry[field.name] for field in fields(Limit) if field.name != "terms"}
-    values |= {name: bound for name, bound in absent.items() if values[name] is None}
+    for name, no_bound in _NO_BOUND.items():
+        if values[name] is None:
+            values[name] = no_bound
     if entry.get("shape"):
         return SpaceLimit(shape=shape_from_json(entry["shape"]), radius=float(entry["radius"]), **values)
-    return Limit(terms={name: float(factor) for name, factor in entry.get("terms", {}).items()} or None, **values)
+    terms = {name: float(factor) for name, factor in entry.get("terms", {}).items()}
+    return Limit(terms=terms or None, **values)
 
 
 def finding_from_json(entry: Mapping[str, Any]) -> Finding:
     """Return the finding that `limit_to_json` wrote."""
-    names = ("peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time", "time_violated")
-    values = {name: math.nan if entry[name] is None else float(entry[name]) for name in names}
-    return Finding(limit=limit_from_json(entry), **values)
+    numbers = {}
+    for name in _FINDING_NUMBERS:
+        numbers[name] = math.nan
+        if entry[name] is not None:
+            numbers[name] = float(entry[name])
+    return Finding(limit=limit_from_json(entry), **numbers)
 
 
 def findings_of(summary: Mapping[str, Any]) -> tuple[Finding, ...]:

@@ -536,7 +536,7 @@ def _violation(finding: Finding) -> Cell:
 
 def _lowest_speed(flight: FlightRecord) -> Cell:
     """Return the lowest rotor speed that the course requires; none if it requires a negative thrust."""
-    if any(problem.startswith("not flyable") for problem in nested(flight.numbers, "course", "problems") or ()):
+    if any("not flyable" in problem for problem in nested(flight.numbers, "course", "problems") or ()):
         return Cell(text="not flyable", mark=Mark.BAD)
     return _number("course", "rotor_min")(flight)
 

@@ -1,8 +1,10 @@
-"""Compare flights: find the targets, fly those not yet flown, and lay them out on a page."""
+"""Compare flights: find the targets, fly those not yet flown, and lay them out on a page.
+
+`quadsim compare` calls `compare_flights`; the table's rows and the page are those of `quadsim.report`.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,8 +32,16 @@ if TYPE_CHECKING:
     from quadsim.report.figure import Figure
 
 _log: Final = logging.getLogger("quadsim")
-_FIRST: Final = 4  # flights of which its repr has two lines
-_BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "answered by", "statuses", "whole step, m")
+_MOST_IN_REPR: Final = 4  # flights of which its repr has two lines
+_SHOWN_ROWS: Final = (
+    "outcome",
+    "required constraints",
+    "RMS error",
+    "verdict",
+    "answered by",
+    "statuses",
+    "whole step, m",
+)
 """Starts of the row labels to show; the page and its `comparison.md` have all rows."""
 
 Compared = Flight | Scenario | str | Path
@@ -49,14 +59,13 @@ class FlightComparison(Tabular):
     page: Path | None  # `index.html`, if it was written
 
     def __repr__(self) -> str:
-        flights = []
+        lines = [f"<FlightComparison of {len(self.flights)} flights"]
         for name, flight in zip(self.names, self.flights, strict=True):
-            flights.append(f"\n {name}: {flight.outcome}{worst_margin(flight.findings)}")
-        if len(flights) > _FIRST:
-            more = f"\n and {len(flights) - _FIRST} more"
-        else:
-            more = ""
-        return f"<FlightComparison of {len(flights)} flights{''.join(flights[:_FIRST])}{more}>"
+            lines.append(f" {name}: {flight.outcome}{worst_margin(flight.findings)}")
+        left_out = len(self.flights) - _MOST_IN_REPR
+        if left_out > 0:
+            lines[1 + _MOST_IN_REPR :] = [f" and {left_out} more"]
+        return "\n".join(lines) + ">"
 
     @property
     def conclusion(self) -> Cell:
@@ -69,8 +78,7 @@ class FlightComparison(Tabular):
         """See `Result.small_plot`: position over time."""
         from quadsim.report.flight_figures import signals
 
-        flown = [flight for flight in self.flights if flight.time.size]
-        if flown:
+        if any(flight.time.size for flight in self.flights):
             return signals(self.flights, ("x", "y", "z"))
         return None
 
@@ -81,8 +89,13 @@ class FlightComparison(Tabular):
         """
         rows = []
         for name, flight in zip(self.names, self.flights, strict=True):
-            row: dict[str, Any] = {"flight": name, "verdict": flight.outcome, "reason": flight.reason}
-            row |= {"duration": flight.numbers["duration"], **flight.metrics}
+            row: dict[str, Any] = {
+                "flight": name,
+                "verdict": flight.outcome,
+                "reason": flight.reason,
+                "duration": flight.numbers["duration"],
+                **flight.metrics,
+            }
             for finding in flight.findings:
                 constraint = finding.limit.name
                 row[f"margin.{constraint}"] = finding.margin
@@ -105,13 +118,14 @@ class FlightComparison(Tabular):
         yield console.styled_cell(self.conclusion)
         lines = []
         for row in self.rows:
-            if row.label.startswith(_BRIEF):
-                lines.append(
-                    (
-                        (row.group if row.headline else row.label) + (f" [{row.unit}]" if row.unit else ""),
-                        *map(console.styled_cell, row.cells),
-                    )
-                )
+            if not row.label.startswith(_SHOWN_ROWS):
+                continue
+            label = row.label
+            if row.headline:
+                label = row.group
+            if row.unit:
+                label += f" [{row.unit}]"
+            lines.append((label, *map(console.styled_cell, row.cells)))
         yield console.table("comparison", ["", *self.names], lines)
 
     def outputs(self) -> Shown:
@@ -124,15 +138,12 @@ class FlightComparison(Tabular):
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return one row per quantity, with a text for each flight."""
-        return [
-            {
-                "group": row.group,
-                "label": row.label,
-                "unit": row.unit,
-                "values": dict(zip(self.names, (cell.text for cell in row.cells), strict=True)),
-            }
-            for row in self.rows
-        ]
+        entries = []
+        for row in self.rows:
+            texts = [cell.text for cell in row.cells]
+            values = dict(zip(self.names, texts, strict=True))
+            entries.append({"group": row.group, "label": row.label, "unit": row.unit, "values": values})
+        return entries
 
 
 def compare_flights(
@@ -160,52 +171,64 @@ def compare_flights(
         RenderingUnavailableError: a video is requested but cannot be rendered; nothing was flown.
     """
     from quadsim.console.console import short_path
-    from quadsim.report.comparison import comparison_rows, run_names
     from quadsim.report.comparison_page import write_comparison
 
-    if constraints is None:
-        whose = None
-    else:
-        whose = place_of(constraints, targets)
+    judge = None  # place of the flight against whose constraints all are audited
+    if constraints is not None:
+        judge = place_of(constraints, targets)
     check_names(names, len(targets))
     require_film(products.get("video"), fps)
     opened = [_opened(target) for target in targets]
-    with contextlib.ExitStack() as stack:
-        if out is not None:
-            stack.enter_context(reserving(out, overwrite=overwrite))
-        if out is None:
-            beside = None
-        else:
-            beside = out.parent / f"{out.name}-runs"
+    if out is None:
+        flights = tuple(_flight_of(target, None, progress, products) for target in opened)
+        return _compared(flights, names, judge, progress)
+    beside = out.parent / f"{out.name}-runs"
+    with reserving(out, overwrite=overwrite):
         flights = tuple(_flight_of(target, beside, progress, products) for target in opened)
-        if names:
-            flights = tuple(flight.labelled(name) for flight, name in zip(flights, names, strict=True))
-        names = run_names(flights)
-        if whose is None:
-            notes = _differences(flights, names)
-        else:
-            limits = flights[whose].limits
-            flights = tuple(audited_against(flight, limits) for flight in flights)
-            notes = (f"All are audited against the constraints of {names[whose]}, at the rate of their tables.",)
-        notes = (*controller_differences([_controller_of(flight) for flight in flights], names), *notes)
-        progress("comparison", 0, 1)
-        rows = comparison_rows(flights)
-        comparison = FlightComparison(flights=flights, rows=rows, names=names, notes=notes, page=None)
-        if out is None or beside is None:
-            return comparison
+        comparison = _compared(flights, names, judge, progress)
         with after(comparison, out):
-            page = write_comparison(flights, out, notes=notes, overwrite=overwrite)
+            page = write_comparison(comparison.flights, out, notes=comparison.notes, overwrite=overwrite)
             comparison = replace(comparison, page=page)
             if flown is not None:
                 flown(comparison)
-            if unfilmed := _unfilmed(flights, beside, products.get("video")):
-                note = f"the page without them: {short_path(page)}"
-                filmed = add_films(unfilmed, note=note, progress=progress, fps=fps)
-                write_comparison(flights, out, notes=notes, overwrite=True)
-                if products.get("video"):
-                    for flight in filmed:
-                        require_product(flight, VIDEO_FILE)
+            unfilmed = _unfilmed(comparison.flights, beside, products.get("video"))
+            if not unfilmed:
+                return comparison
+            note = f"the page without them: {short_path(page)}"
+            filmed = add_films(unfilmed, note=note, progress=progress, fps=fps)
+            write_comparison(comparison.flights, out, notes=comparison.notes, overwrite=True)
+            if products.get("video"):
+                for flight in filmed:
+                    require_product(flight, VIDEO_FILE)
             return comparison
+
+
+def _compared(
+    flights: tuple[Flight, ...], names: Sequence[str], judge: int | None, progress: Progress
+) -> FlightComparison:
+    """Return flights side by side, without a page.
+
+    Args:
+        flights: in the order of the columns.
+        names: of the columns; empty for those of the flights.
+        judge: place of the flight against whose constraints all are audited; None: each against its own.
+        progress: called once, as the rows are made.
+    """
+    from quadsim.report.comparison import comparison_rows, run_names
+
+    if names:
+        flights = tuple(flight.labelled(name) for flight, name in zip(flights, names, strict=True))
+    names = run_names(flights)
+    if judge is None:
+        audit_notes = _audit_differences(flights, names)
+    else:
+        limits = flights[judge].limits
+        flights = tuple(audited_against(flight, limits) for flight in flights)
+        audit_notes = (f"All are audited against the constraints of {names[judge]}, at the rate of their tables.",)
+    controllers = [_controller_of(flight) for flight in flights]
+    notes = (*controller_differences(controllers, names), *audit_notes)
+    progress("comparison", 0, 1)
+    return FlightComparison(flights=flights, rows=comparison_rows(flights), names=names, notes=notes, page=None)
 
 
 def _unfilmed(flights: Sequence[Flight], beside: Path, video: bool | None) -> list[Flight]:
@@ -222,17 +245,18 @@ def _unfilmed(flights: Sequence[Flight], beside: Path, video: bool | None) -> li
 
 def place_of(target: Compared, targets: Sequence[Compared]) -> int:
     """Return the place of the target whose constraints are to be used."""
-    for i, each in enumerate(targets):
-        if each is target or (isinstance(target, str | Path) and str(each) == str(target)):
+    for i, candidate in enumerate(targets):
+        if candidate is target or (isinstance(target, str | Path) and str(candidate) == str(target)):
             return i
     rule = f"one of what is compared: {', '.join(map(str, targets))}"
     raise ParameterError("", "--constraints", str(target), rule)
 
 
-def _differences(flights: Sequence[Flight], names: Sequence[str]) -> tuple[str, ...]:
+def _audit_differences(flights: Sequence[Flight], names: Sequence[str]) -> tuple[str, ...]:
     """Return a sentence if flights are audited against different constraints or tolerances."""
     for flight, name in zip(flights[1:], names[1:], strict=True):
-        if differences := limit_differences(flights[0].limits, flight.limits, demands=False):
+        differences = limit_differences(flights[0].limits, flight.limits, demands=False)
+        if differences:
             return (different_audits(names[0], name, differences),)
     return ()
 
@@ -262,21 +286,25 @@ def controller_differences(controllers: Sequence[Mapping[str, Any] | None], name
 
 def _controller_difference(a: str, first: Mapping[str, Any], b: str, second: Mapping[str, Any]) -> list[str]:
     """Return the fields in which two controllers differ, scalars with their values, and those that one alone has."""
-    common = [field for field in first if field in second and first[field] != second[field]]
-    shown = []
-    for field in common:
-        values = (first[field], second[field])
-        is_nested = any(isinstance(value, Mapping | list) for value in values)
-        shown.append(field if is_nested else f"{field} ({values[0]}, {values[1]})")
-    if shown:
-        parts = [f"differ in {', '.join(shown)}"]
-    else:
-        parts = []
+    differing = []
+    for field in first:
+        if field in second and first[field] != second[field]:
+            differing.append(_with_values(field, first[field], second[field]))
+    parts = []
+    if differing:
+        parts.append(f"differ in {', '.join(differing)}")
     for name, one, other in ((a, first, second), (b, second, first)):
         alone = [field for field, value in one.items() if field not in other and value != []]
         if alone:
             parts.append(f"only that of {name} has {', '.join(alone)}")
     return parts
+
+
+def _with_values(field: str, value: object, other: object) -> str:
+    """Return a field's name with its two values, where both are scalars."""
+    if isinstance(value, Mapping | list) or isinstance(other, Mapping | list):
+        return field
+    return f"{field} ({value}, {other})"
 
 
 def audited_against(flight: Flight, limits: Sequence[Limit]) -> Flight:

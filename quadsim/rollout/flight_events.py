@@ -1,4 +1,4 @@
-"""The events of a flight, scheduled in its scenario or applied during it.
+"""The events of a flight, scheduled in its scenario or applied during it; `quadsim.rollout.rollout` applies them.
 
 Where an event may occur, the model is compiled, sensors are sampled and forces are evaluated in another way than
 without events, with other last bits.  A neutral event, which changes nothing, selects that way: it is in the scenario
@@ -12,8 +12,7 @@ from bisect import insort
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
-from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Final, get_args
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
 
 from quadsim.controller import Controller, Diagnosable
 from quadsim.errors import InputError, ParameterError, printable
@@ -47,8 +46,8 @@ if TYPE_CHECKING:
 _DEPENDENT: Final = (ControllerEvent, PayloadDrop, PayloadPickup, SensorFaultEvent)
 """The events that depend on other parts of the scenario."""
 TRACKING_ERRORS: Final = frozenset(f"{name}_error" for name in REFERENCE_NAMES)  # signals relative to the course
-_MOST: Final = 3  # longest run of events of one kind that is reported singly; longer runs become one entry
-_LONGEST: Final = 200
+_MOST_SINGLY: Final = 3  # longest run of events of one kind that is reported singly; longer runs become one entry
+_LONGEST_TEXT: Final = 200  # characters of an event in a summary
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +63,15 @@ class _Listed:
     """A table of events, for messages to name them."""
 
     events: list[Event]
+
+
+class _Due(NamedTuple):
+    """An event outside the plant that is scheduled."""
+
+    period: int  # the first one from its time on
+    time: float  # [s]
+    event: SetpointEvent | ControllerEvent
+    successor: Successor | None  # the controller that takes over, if it has been built
 
 
 class FlightEvents:
@@ -95,7 +103,7 @@ class FlightEvents:
         self._build = build
         self._recent: list[Event] = [*scenario.events]  # those still pending in the plant, and others
         self.infeasible_period: InfeasiblePeriod | None = None
-        self._due: list[tuple[int, float, SetpointEvent | ControllerEvent, Successor | None]] = []
+        self._due: list[_Due] = []
         for event in scenario.events:
             self._schedule(event)
         loop.before = self._begin
@@ -131,7 +139,10 @@ class FlightEvents:
             self._plant.wind.reschedule(*assembly.winds)
         else:
             past = self._loop.time - scenario.control_period
-            recent = [e for e in (*self._recent, event) if e.at + _lasting(e) >= past]
+            recent = []
+            for other in (*self._recent, event):
+                if other.at + _duration(other) >= past:
+                    recent.append(other)
             changes = assembly.changes(recent)
             if not self._plant.allows(changes):
                 raise _not_started_for(event)
@@ -166,9 +177,8 @@ class FlightEvents:
         events = [event for event in scenario.events if event.at < duration]
         for event in scenario.events:
             if event.at < duration:
-                substitute = None
-            else:
-                substitute = neutral(scenario, event)
+                continue
+            substitute = neutral(scenario, event)
             if substitute is not None and substitute not in events:
                 events.insert(0, substitute)
         return scenario.altered(duration=duration, events=events)
@@ -189,14 +199,13 @@ class FlightEvents:
     def _with(self, event: Event) -> Scenario:
         """Return the scenario with one more event, extended to its time."""
         before = self.scenario
-        events = [*self.scenario.events, event]
+        events = [*before.events, event]
         if len(events) > MOST_EVENTS:
             raise ParameterError("scenario", "events", len(events), f"of {MOST_EVENTS} or fewer entries")
         changes: dict[str, Any] = {"events": events}
         if event.at >= before.duration:
-            changes["duration"] = round(
-                (math.floor(event.at / before.control_period + 1e-6) + 1) * before.control_period, 9
-            )
+            periods = math.floor(event.at / before.control_period + 1e-6) + 1
+            changes["duration"] = round(periods * before.control_period, 9)
         scenario = before.altered(**changes)
         if isinstance(event, _DEPENDENT):
             try:
@@ -209,17 +218,17 @@ class FlightEvents:
         """Schedule an event outside the plant for the first period from its time on."""
         if isinstance(event, SetpointEvent | ControllerEvent):
             first = first_period(event.at, self.scenario.control_period)
-            insort(self._due, (first, event.at, event, ready), key=itemgetter(0, 1))
+            insort(self._due, _Due(first, event.at, event, ready), key=lambda due: (due.period, due.time))
 
     def _begin(self, k: int) -> None:
         """Apply the events due at the start of a period."""
-        while self._due and self._due[0][0] <= k:
-            _, _, event, ready = self._due.pop(0)
-            if isinstance(event, SetpointEvent):
-                self._reference.set(k, event.values)
+        while self._due and self._due[0].period <= k:
+            due = self._due.pop(0)
+            if isinstance(due.event, SetpointEvent):
+                self._reference.set(k, due.event.values)
                 self._loop.motion = None
             else:
-                self._switch(changed_controller(self._spec, event.fields), ready)
+                self._switch(changed_controller(self._spec, due.event.fields), due.successor)
 
     def first_infeasible_period(self) -> InfeasiblePeriod | None:
         """Return, over all controllers so far, the first QP without an answer, or else the first SQP not converged."""
@@ -230,12 +239,10 @@ class FlightEvents:
         return min(periods, key=lambda period: period.converges is not None, default=None)
 
     def _switch(self, spec: AnyController, ready: Successor | None) -> None:
-        if ready is not None and ready.spec == spec:
-            successor = ready
-        else:
-            successor = self._built(spec)
+        if ready is None or ready.spec != spec:
+            ready = self._built(spec)
         self.infeasible_period = self.first_infeasible_period()
-        self._loop.switch(successor.controller)
+        self._loop.switch(ready.controller)
         self._spec = spec
         self._loop.computation = self.assembly.computation(spec)
 
@@ -258,17 +265,16 @@ class FlightEvents:
 
 def infeasible_period_of(controller: Controller) -> InfeasiblePeriod | None:
     """Return the first period whose QP had no answer; None if there is none."""
-    if isinstance(controller, Diagnosable):
-        period = controller.infeasible_period
-    else:
-        period = None
+    if not isinstance(controller, Diagnosable):
+        return None
+    period = controller.infeasible_period
     if isinstance(period, InfeasiblePeriod):
         return period
     return None
 
 
-def _lasting(event: Event) -> float:
-    """Return the time for which an event counts [s]."""
+def _duration(event: Event) -> float:
+    """Return the time for which an event acts [s]."""
     duration: float | None = getattr(event, "duration", 0.0)
     if duration is None:
         return math.inf
@@ -288,20 +294,14 @@ def prepared(assembly: Assembly) -> Scenario:
     """
     scenario = assembly.scenario
     air = assembly.effects.air
-    if scenario.sensors is None:
-        sensed = {}
-    else:
-        sensed = scenario.sensors.present()
-    if scenario.estimator is not None:
-        names = [*sensed]
-    else:
-        names = [*get_args(SensorText)]
-    possible: list[Event] = [
-        _push(scenario),
-        *([_mass(scenario)] if scenario.plant.integrator == "mujoco" else []),
-        *([_wind(scenario)] if air is not None and air.drags else []),
-        *(_fault(scenario, name) for name in get_args(SensorText) if name in names),
-    ]
+    possible: list[Event] = [_push(scenario)]
+    if scenario.plant.integrator == "mujoco":
+        possible.append(_mass(scenario))
+    if air is not None and air.drags:
+        possible.append(_wind(scenario))
+    for name in get_args(SensorText):
+        if scenario.estimator is None or (scenario.sensors is not None and name in scenario.sensors.present()):
+            possible.append(_fault(scenario, name))
     added = [event for event in possible if event not in scenario.events]
     return scenario.altered(events=[*added, *scenario.events])  # events of the file at time 0 come after
 
@@ -341,23 +341,27 @@ def story(scenario: Scenario, duration: float) -> list[dict[str, Any]]:
 
     Neutral events, as at the start of a live flight, are omitted.
     """
-    events = sorted((event for event in scenario.events if event.at < duration), key=lambda event: event.at)
-    happened = [event for event in events if event != neutral(scenario, event)]
+    happened = []
+    for event in sorted(scenario.events, key=lambda event: event.at):
+        if event.at < duration and event != neutral(scenario, event):
+            happened.append(event)
     entries = []
     for _, group in groupby(happened, key=lambda event: event.type):
         alike = list(group)
-        if len(alike) <= _MOST:
+        first = alike[0]
+        last = alike[-1]
+        if len(alike) <= _MOST_SINGLY:
             entries += [{"time": event.at, "text": _text(event)} for event in alike]
         else:
-            text = f"{len(alike)} times until {alike[-1].at:g} s: {_text(alike[0])} first, {_text(alike[-1])} last"
-            entries.append({"time": alike[0].at, "text": text})
+            text = f"{len(alike)} times until {last.at:g} s: {_text(first)} first, {_text(last)} last"
+            entries.append({"time": first.at, "text": text})
     return entries
 
 
 def _text(event: Event) -> str:
+    """Return what happened, and for how long."""
+    text = event.text()
     duration = getattr(event, "duration", None)
-    if duration is None:
-        lasting = ""
-    else:
-        lasting = f" for {duration:g} s"
-    return printable(f"{event.text()}{lasting}")[:_LONGEST]
+    if duration is not None:
+        text += f" for {duration:g} s"
+    return printable(text)[:_LONGEST_TEXT]

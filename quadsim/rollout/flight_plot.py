@@ -14,8 +14,8 @@ from quadsim.report.flight_figures import signals as draw_signals
 from quadsim.report.to_matplotlib import Style, draw, figure_file, show_window, shows_itself, write_figure
 
 PAGE_WIDTH: Final = 7.16  # of a figure across both columns of a journal's page [in]; 3.5 is one column
-_WIDTHS: Final = (2.0, 20.0)  # smallest and largest [in]
-_USUAL: Final = ("x", "y", "z", "roll", "pitch", "yaw")
+_WIDTHS: Final = (2.0, 20.0)  # of a figure, smallest and largest [in]
+_USUAL_SIGNALS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 class Overlay(list[Any], Result):
@@ -51,8 +51,11 @@ class Overlay(list[Any], Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the path of the file and the axes' labels."""
-        path = None if self.path is None else str(self.path)
-        return {"file": path, "panels": [axes.get_ylabel().replace("\n", " ") for axes in self]}
+        file = None
+        if self.path is not None:
+            file = str(self.path)
+        panels = [axes.get_ylabel().replace("\n", " ") for axes in self]
+        return {"file": file, "panels": panels}
 
 
 def plot_runs(
@@ -75,7 +78,7 @@ def plot_runs(
         runs = [run.labelled(label) for run, label in zip(runs, labels, strict=True)]
     if out is not None:
         out = figure_file(out, overwrite=overwrite)
-    figure = draw_signals(runs, signals or _USUAL)
+    figure = draw_signals(runs, signals or _USUAL_SIGNALS)
     if out is None:
         return Overlay(draw(figure, interactive=True, width=width, style=style).axes)
     plot = Overlay(write_figure(figure, out, width=width, overwrite=overwrite, style=style))

@@ -1,4 +1,8 @@
-"""A flown scenario in memory: named arrays, numbers, pictures, and its run directory."""
+"""A flown scenario in memory: named arrays, numbers, pictures, and its run directory.
+
+`quadsim.rollout.rollout` makes it, `quadsim.rollout.stored` reads one back.  From the one record `Flight` follow the
+summary, tables, figures and films, which `quadsim.flight`, `quadsim.report` and `quadsim.console` make.
+"""
 
 from __future__ import annotations
 
@@ -163,7 +167,9 @@ class Flight(Result):
         if end is not None:
             flown += f" of a course that ends at {end:g} s"
         line = f"<Flight {self.scenario.name}: {self.outcome}, {flown} by {self.controller}"
-        return f"{line}{f', {self.reason}' if self.reason else ''}{worst_margin(self.findings)}>"
+        if self.reason:
+            line += f", {self.reason}"
+        return f"{line}{worst_margin(self.findings)}>"
 
     @property
     def outcome(self) -> FlightVerdict:
@@ -221,9 +227,8 @@ class Flight(Result):
         from quadsim.rollout.infeasibility import diagnose, lacking_report
 
         if self.infeasible_period is None:
-            kept_law = self.scenario.controller_at(self.end) == self.scenario.controller
-            is_its_own = kept_law and not self.own_code
-            if self.outcome == "lost" and is_its_own:
+            flew_its_law = self.scenario.controller_at(self.end) == self.scenario.controller and not self.own_code
+            if self.outcome == "lost" and flew_its_law:
                 return lacking_report(self.assembly, self.end)
             return None
         if self.infeasible_period.status == NOT_CONVERGED and self.satisfied:
@@ -327,10 +332,12 @@ class Flight(Result):
     @cached_property
     def metrics(self) -> dict[str, float]:
         """The flight's numbers by name, e.g. `rmse.x`, `speed_max`, `step_ms.p99`; units as in `summary`."""
-        numbers = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self.numbers[name]))
-        return {
-            name: value for name, value in numbers if isinstance(value, int | float) and not isinstance(value, bool)
-        }
+        values = {}
+        for group in ("tracking", "control", "controller"):
+            for name, value in leaves(self.numbers[group]):
+                if isinstance(value, int | float) and not isinstance(value, bool):
+                    values[name] = value
+        return values
 
     def to_toml(self) -> str:
         """Return the file of its scenario, as `save` writes it."""
@@ -470,15 +477,13 @@ class Flight(Result):
     @property
     def exit_status(self) -> int:
         """See `Result.exit_status`; 1 of a check that does not show that every constraint of the scenario holds."""
-        if self.checked is not None:
-            if self.checked.again is None:
-                again = self.findings
-            else:
-                again = self.checked.again
-            if self.satisfied and self.verdict_of(again) == "satisfied":
-                return EXIT_DONE
-            return EXIT_FAILED
-        if self.outcome in ("satisfied", "incomplete", "unaudited"):
+        if self.checked is None:
+            done = self.outcome in ("satisfied", "incomplete", "unaudited")
+        elif self.checked.again is None:
+            done = self.satisfied
+        else:
+            done = self.satisfied and self.verdict_of(self.checked.again) == "satisfied"
+        if done:
             return EXIT_DONE
         return EXIT_FAILED
 
@@ -488,11 +493,10 @@ class Flight(Result):
 
         yield from summary_tables(self)
         if self.checked is not None and self.checked.again is not None:
-            alike = (self.verdict_of(self.checked.again) == "satisfied") == self.satisfied
-            if alike:
+            satisfied_again = self.verdict_of(self.checked.again) == "satisfied"
+            phrase = "a different verdict than recorded"
+            if satisfied_again == self.satisfied:
                 phrase = "as recorded"
-            else:
-                phrase = "a different verdict than recorded"
             yield f"audited again from the tables, {self.scenario.log_rate:g} rows per second: {phrase}"
 
     def verdicts(self) -> tuple[str, Cases]:
@@ -540,15 +544,19 @@ class Flight(Result):
         """Numbers and a small plot, for notebooks."""
         from quadsim.report.comparison import tolerance_text
 
-        rows = "".join(
-            f"<tr><td>{escape(entry.limit.name)}</td><td>{entry.margin:.4g} {escape(entry.limit.unit)}</td>"
-            f"<td>{escape(tolerance_text(entry.limit))}</td><td>{VERDICT_TEXT[entry.verdict]}</td></tr>"
-            for entry in self.findings
-        )
-        errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz" if self.time.size)
+        rows = ""
+        for finding in self.findings:
+            name = escape(finding.limit.name)
+            margin = f"{finding.margin:.4g} {escape(finding.limit.unit)}"
+            tolerance = escape(tolerance_text(finding.limit))
+            verdict = VERDICT_TEXT[finding.verdict]
+            rows += f"<tr><td>{name}</td><td>{margin}</td><td>{tolerance}</td><td>{verdict}</td></tr>"
+        errors = "none"
+        if self.time.size:
+            errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz")
         return (
             f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self.numbers['duration']:g} s flown, "
-            f"RMS error [m]: {errors or 'none'}</p>"
+            f"RMS error [m]: {errors}</p>"
             "<table><tr><th>constraint</th><th>margin</th><th>tolerance</th><th>verdict</th></tr>"
             f"{rows}</table>{plot_html(self.small_plot())}"
         )
@@ -627,32 +635,58 @@ def summarise(flight: Flight) -> dict[str, Any]:
     """Return `summary.json` of a flight, without the hashes of its files and the total wall time."""
     scenario = flight.scenario
     log = flight.log
-    ground = scenario.effects.ground
-    flown = log.control.t.size > 0
-    samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
-    if log.control.measured_perfectly:
-        estimation = {}
-    else:
-        estimation = {**metrics.estimation(log.control), "samples": samples}
     steps = flight.assembly.course_steps
-    course_cut = flight.assembly.course_cut
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=steps)
-    own_law = flight.own_code or is_plugin(scenario.controller.type)
-    if own_law:
-        owner = "your model"
-    else:
-        owner = f"the model of {flight.controller}"
-    model_error = model_report(log.control, log.foreseen, owner)
-    notes = implausible(flight.actual)
-    notes += model_notes(flight.assembly) if flight.controller == scenario.controller.type else []
-    return {
+    summary = _outcome_entries(flight)
+    summary["course"] = asdict(report(flight.assembly))
+    if flight.assembly.course_cut is not None:
+        summary["course"]["cut_before"] = flight.assembly.course_cut
+    events = story(scenario, log.control.t.size * scenario.control_period)
+    if events:
+        summary["events"] = events
+    summary["tracking"] = numbers["tracking"]
+    summary["constraints"] = [limit_to_json(finding) for finding in flight.findings]
+    summary["audit_notes"] = flight.assembly.audit_notes
+    summary |= _model_entries(flight)
+    summary["control"] = numbers["control"]
+    summary["diagnosis"] = flight._explanation
+    summary["controller"] = {
+        "name": flight.controller,
+        "solver": flight.solver,
+        "horizon": scenario.controller.horizon,
+        **numbers["controller"],
+    }
+    if log.control.target is not None:
+        summary["controller"]["autopilot"] = flight.assembly.autopilot_flown
+    summary |= _entries_of_parts(flight)
+    summary["vehicle"] = asdict(flight.vehicle)
+    if flight.actual != flight.vehicle:
+        summary["actual"] = asdict(flight.actual)
+    summary["wall_s"] = {"simulate": flight.simulate_s, "total": flight.simulate_s}
+    summary["versions"] = versions()
+    summary["machine"] = machine()
+    summary["products"] = {}
+    summary["files"] = {}
+    return summary
+
+
+def _outcome_entries(flight: Flight) -> dict[str, Any]:
+    """Return the first entries of a summary: what was flown, and what came of it."""
+    scenario = flight.scenario
+    log = flight.log
+    entries: dict[str, Any] = {
         "format": FORMAT,
         "scenario": scenario.name,
         "description": scenario.description,
         "status": log.status,
         "reason": log.reason,
-        **({"traceback": [*log.traceback]} if log.traceback else {}),
-        "lost": DEPARTURE if flight.log.reason is None and flight.reason is not None else log.lost,
+    }
+    if log.traceback:
+        entries["traceback"] = [*log.traceback]
+    entries["lost"] = log.lost
+    if log.reason is None and flight.reason is not None:
+        entries["lost"] = DEPARTURE
+    return entries | {
         "satisfied": flight.satisfied,
         "verdict": flight.outcome,
         "group": scenario.group,
@@ -660,33 +694,41 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "as_expected": flight.outcome == scenario.expect,
         "duration": round(log.control.t.size * scenario.control_period, 9),
         "seed": scenario.seed,
-        "course": asdict(report(flight.assembly)) | ({} if course_cut is None else {"cut_before": course_cut}),
-        **({"events": events} if (events := story(scenario, log.control.t.size * scenario.control_period)) else {}),
-        "tracking": numbers["tracking"],
-        "constraints": [limit_to_json(finding) for finding in flight.findings],
-        "audit_notes": flight.assembly.audit_notes,
-        **({"model_notes": notes} if notes else {}),
-        **({} if model_error is None else {"model_error": model_error}),
-        "control": numbers["control"],
-        "diagnosis": flight._explanation,
-        "controller": {
-            "name": flight.controller,
-            "solver": flight.solver,
-            "horizon": scenario.controller.horizon,
-            **numbers["controller"],
-            **({} if log.control.target is None else {"autopilot": flight.assembly.autopilot_flown}),
-        },
-        **({"computation": metrics.computation(log.control)} if flown and flight.assembly.computation() else {}),
-        **({"estimation": estimation} if estimation else {}),
-        **({"ground": metrics.ground(log, outline(flight.actual))} if flown and ground and ground.contact else {}),
-        "vehicle": asdict(flight.vehicle),
-        **({"actual": asdict(flight.actual)} if flight.actual != flight.vehicle else {}),
-        "wall_s": {"simulate": flight.simulate_s, "total": flight.simulate_s},
-        "versions": versions(),
-        "machine": machine(),
-        "products": {},
-        "files": {},
     }
+
+
+def _model_entries(flight: Flight) -> dict[str, Any]:
+    """Return the entries on the controller's model, if any: what it lacks of the flight, and what it gets wrong."""
+    stated = flight.scenario.controller.type
+    entries: dict[str, Any] = {}
+    notes = implausible(flight.actual)
+    if flight.controller == stated:
+        notes += model_notes(flight.assembly)
+    if notes:
+        entries["model_notes"] = notes
+    owner = f"the model of {flight.controller}"
+    if flight.own_code or is_plugin(stated):
+        owner = "your model"
+    model_error = model_report(flight.log.control, flight.log.foreseen, owner)
+    if model_error is not None:
+        entries["model_error"] = model_error
+    return entries
+
+
+def _entries_of_parts(flight: Flight) -> dict[str, Any]:
+    """Return the entries of the parts that a scenario may have: computation, estimation, ground."""
+    log = flight.log
+    flown = log.control.t.size > 0
+    entries: dict[str, Any] = {}
+    if flown and flight.assembly.computation():
+        entries["computation"] = metrics.computation(log.control)
+    if not log.control.measured_perfectly:
+        samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
+        entries["estimation"] = {**metrics.estimation(log.control), "samples": samples}
+    ground = flight.scenario.effects.ground
+    if flown and ground and ground.contact:
+        entries["ground"] = metrics.ground(log, outline(flight.actual))
+    return entries
 
 
 def add_products(
@@ -702,28 +744,36 @@ def add_products(
     shown = flight.as_stored()
     products = _Products(flight)
     if requested["recording"] is not False:
-        with products.making(rundir.RECORDING_FILE) as folder:
-            from quadsim.report.recording import write_recording
-
-            progress("recording", 0, 1)
-            write_recording(shown, folder / rundir.RECORDING_FILE)
-        progress("recording", 1, 1)
+        _add_recording(products, shown, progress)
     has_periods = bool(flight.time.size)
     if requested["figures"] is not False and has_periods and not products.interrupted:
-        with products.making(rundir.FIGURES_DIR) as folder:
-            from quadsim.report.flight_figures import write_figures
-
-            progress("figures", 0, 1)
-            write_figures(shown, folder / rundir.FIGURES_DIR)
-            progress("figures", 1, 1)
+        _add_figures(products, shown, progress)
     flight = products.recorded()
     if requested["video"] is not False and has_periods and not (flight.log.interrupted or products.interrupted):
         note = f"all else is in {short_path(products.directory)}"
         (flight,) = add_films([flight], note=note, progress=progress, fps=fps)
-    wall_s = flight.numbers["wall_s"]
-    wall_s = {**wall_s, "total": wall_s["total"] + clock.perf_counter() - started}
+    before = flight.numbers["wall_s"]
+    wall_s = {**before, "total": before["total"] + clock.perf_counter() - started}
     amend(products.directory, {"wall_s": wall_s})
     return flight._recording(wall_s=wall_s)
+
+
+def _add_recording(products: _Products, flight: Flight, progress: Progress) -> None:
+    with products.making(rundir.RECORDING_FILE) as folder:
+        from quadsim.report.recording import write_recording
+
+        progress("recording", 0, 1)
+        write_recording(flight, folder / rundir.RECORDING_FILE)
+    progress("recording", 1, 1)
+
+
+def _add_figures(products: _Products, flight: Flight, progress: Progress) -> None:
+    with products.making(rundir.FIGURES_DIR) as folder:
+        from quadsim.report.flight_figures import write_figures
+
+        progress("figures", 0, 1)
+        write_figures(flight, folder / rundir.FIGURES_DIR)
+        progress("figures", 1, 1)
 
 
 def _require_products(flight: Flight, requested: Mapping[str, bool | None]) -> None:
@@ -758,7 +808,10 @@ def add_films(
     """
     from quadsim.report.film.video import Estimate, frame_count, frame_rate, render_video
 
-    estimate = Estimate([frame_count(flight.end, frame_rate(flight.end, fps)) for flight in flights], note)
+    frames = []
+    for flight in flights:
+        frames.append(frame_count(flight.end, frame_rate(flight.end, fps)))
+    estimate = Estimate(frames, note)
 
     def follow(done: int, total: int) -> None:
         estimate(done, total)

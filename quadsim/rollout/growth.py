@@ -2,12 +2,7 @@
 
 Both hold a hover; the second starts with a small velocity and yaw rate.  Noise, gusts, biases and steady errors are the
 same in both and cancel in the difference d(t), which after its transients follows the slowest mode of the loop,
-
-    |d(t)| ~ exp(rate t),
-
-so `rate` is the largest real part of the loop's exponents: of any law, linear or not, with the plant as it is, sampled,
-delayed and lagging.  Negative means stable.  For a linear law it is ln(rho) / tau_s, rho the spectral radius of the
-sampled loop.
+|d(t)| ~ exp(rate t).  `quadsim.rollout.stability` measures with it, `quadsim.rollout.remedies` compares changes.
 """
 
 from __future__ import annotations
@@ -35,7 +30,7 @@ NEUTRAL: Final = 0.003
 """Rate [1/s] within which a difference neither grows nor decays: it takes longer than is flown to tell."""
 LONGEST_PAIR: Final = 24.0  # flown where the rate is small [s]
 USUAL_PAIR: Final = 12.0  # flown otherwise, at most [s]
-_SMALL: Final = 0.05  # magnitude of a rate below which `LONGEST_PAIR` is flown [1/s]
+_SMALL_RATE: Final = 0.05  # magnitude of a rate below which `LONGEST_PAIR` is flown [1/s]
 _BLOCK: Final = 1.0  # time of which the largest difference is taken [s]
 _LEAST_BLOCKS: Final = 4
 _DECAYED: Final = 1e-5  # difference over that of the first block at which the flights end
@@ -43,10 +38,12 @@ _GROWN: Final = 30.0  # the same, of one that grows
 _SATURATED: Final = math.e  # the same, beyond what the transients of a stable loop leave after some seconds
 SHORT_PAIR: Final = 8.0  # flown where a flight must not wait for long [s]
 NOTABLE: Final = 0.05  # least rate that tells an unstable loop where no more than `SHORT_PAIR` is flown [1/s]
-_HEIGHT: Final = 5.0  # of the hover [m]
-_VELOCITY: Final = (1.0, 0.6, 0.3)  # direction of the velocity, x component 1
-_YAW_RATE: Final = 50.0  # yaw rate [deg/s] per velocity along x [m/s]
-_EMPTY: Final[Mapping[str, list[Any]]] = {"constraints": [], "events": [], "obstacles": [], "corridors": []}
+_HOVER_HEIGHT: Final = 5.0  # [m]
+_VELOCITY_SHARES: Final = (1.0, 0.6, 0.3)  # direction of the velocity at the start, x component 1
+_YAW_RATE_SHARE: Final = 50.0  # yaw rate at the start [deg/s] per velocity along x [m/s]
+_LEFT_OUT: Final[Mapping[str, list[Any]]] = {"constraints": [], "events": [], "obstacles": [], "corridors": []}
+
+_TINY: Final = float(np.finfo(float).tiny)
 
 LoopVerdict: TypeAlias = Literal["stable", "neutral", "unstable"]
 
@@ -67,7 +64,12 @@ MeasureGrowth: TypeAlias = Callable[[Scenario, float], "Growth"]
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """How the difference of two flights grows."""
+    """How the difference of two flights grows.
+
+    `rate` is the largest real part of the loop's exponents, of any controller, linear or not, with the plant as it
+    is, sampled, delayed and lagging.  Negative means stable.  For a linear one it is ln(rho) / tau_s, with rho the
+    spectral radius of the sampled loop.
+    """
 
     rate: float  # [1/s]; infinite where a flight ended before its difference could be compared
     left: float  # difference at the end, over that at the start
@@ -97,7 +99,7 @@ class Growth:
 def hovering(
     scenario: Scenario, *, heading: float, size: float = 0.0, changes: Mapping[str, Any] | None = None
 ) -> Scenario:
-    """Return a scenario that holds a hover in free air, with vehicle, law, effects and sensors of this one.
+    """Return a scenario that holds a hover in free air, with vehicle, controller, effects and sensors of this one.
 
     Args:
         scenario: gives all but course, start, events, obstacles, ground and constraints.
@@ -108,23 +110,24 @@ def hovering(
     Raises:
         InputError: a changed field is not allowed.
     """
-    period = (changes or {}).get("control_period", scenario.control_period)
+    changed = changes or {}
+    period = changed.get("control_period", scenario.control_period)
     fields: dict[str, Any] = {
-        **_EMPTY,
+        **_LEFT_OUT,
         "duration": math.ceil(LONGEST_PAIR / period - 1e-6) * period,
         "reference": {"type": "yaw_turns", "turns": [{"start": 0.0, "yaw": heading, "rate": 30.0}]},
         "initial": {
-            "position": [0.0, 0.0, _HEIGHT],
+            "position": [0.0, 0.0, _HOVER_HEIGHT],
             "euler": [0.0, 0.0, heading],
-            "velocity": [size * share for share in _VELOCITY],
-            "body_rates": [0.0, 0.0, _YAW_RATE * size],
+            "velocity": [size * share for share in _VELOCITY_SHARES],
+            "body_rates": [0.0, 0.0, _YAW_RATE_SHARE * size],
         },
     }
     if scenario.keep_in is not None:
         fields["keep_in"] = None
     if scenario.effects.ground is not None:
         fields["effects.ground"] = None
-    return scenario.replace({**fields, **(changes or {})})
+    return scenario.replace({**fields, **changed})
 
 
 def grown(
@@ -159,17 +162,17 @@ def grown(
     per_block = max(round(_BLOCK / period), 1)
     distances: list[float] = []
     ended = ""
-    with contextlib.ExitStack() as stack:
-        first = stack.enter_context(start(Assembly(still)))
-        second = stack.enter_context(start(Assembly(pushed)))
+    with start(Assembly(still)) as first, start(Assembly(pushed)) as second:
         while len(distances) < periods:
             try:
-                states = [rollout.step().observation.truth for rollout in (first, second)]
+                state = first.step().observation.truth
+                pushed_state = second.step().observation.truth
             except FlightError as error:
                 ended = str(error)
                 break
-            distances.append(_distance(states[0], states[1]))
-            if len(distances) % per_block == 0 and _told(_blocks(distances, per_block), period * len(distances)):
+            distances.append(_distance(state, pushed_state))
+            at_block_end = len(distances) % per_block == 0
+            if at_block_end and _is_clear(_blocks(distances, per_block), period * len(distances)):
                 break
     time = round(period * len(distances), 9)
     rate, left = _rate(distances, per_block, period)
@@ -190,20 +193,21 @@ def _blocks(distances: list[float], per_block: int) -> Array:
     return np.array(distances[: whole * per_block]).reshape(whole, per_block).max(axis=1)
 
 
-def _told(blocks: Array, time: float) -> bool:
-    """Return whether the flights have told what they can, after a time [s]."""
+def _is_clear(blocks: Array, time: float) -> bool:
+    """Return whether the rate is clear after a time [s], so that no more has to be flown."""
     if blocks.size < _LEAST_BLOCKS:
         return False
     share = float(blocks[-1] / blocks[0])
     if share < _DECAYED or share > _GROWN:
         return True
-    return time >= USUAL_PAIR and abs(_slope(blocks)) > _SMALL
+    return time >= USUAL_PAIR and abs(_slope(blocks)) > _SMALL_RATE
 
 
 def _slope(blocks: Array) -> float:
     """Return the rate of the later half of the blocks [1/block], by least squares."""
     later = blocks[blocks.size // 2 :]
-    return float(np.polyfit(np.arange(later.size), np.log(np.maximum(later, np.finfo(float).tiny)), 1)[0])
+    logarithms = np.log(np.maximum(later, _TINY))
+    return float(np.polyfit(np.arange(later.size), logarithms, 1)[0])
 
 
 def _rate(distances: list[float], per_block: int, period: float) -> tuple[float, float]:
@@ -213,7 +217,8 @@ def _rate(distances: list[float], per_block: int, period: float) -> tuple[float,
     blocks = _blocks(distances, per_block)
     if blocks.size < _LEAST_BLOCKS:  # a flight was lost within seconds
         left = distances[-1] / distances[0]
-        return math.log(max(left, np.finfo(float).tiny)) / (period * (len(distances) - 1)), left
+        time = period * (len(distances) - 1)
+        return math.log(max(left, _TINY)) / time, left
     left = float(blocks[-1] / blocks[0])
     rate = _slope(blocks) / (per_block * period)
     if left > _SATURATED:  # it may have grown to a limit cycle, in which it no longer does

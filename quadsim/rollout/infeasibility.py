@@ -1,14 +1,14 @@
 """Explain why a flight's QP had no answer, in the terms and units of the scenario file, and suggest remedies.
 
 Each suggestion is a change of the file that was tried: the problem is rebuilt from the changed file and solved for the
-same period.  `quadsim.rollout.remedies` flies them.
+same period.  The conflict is that of `quadsim.rollout.conflicts`; `quadsim.rollout.remedies` flies the changes.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -17,7 +17,7 @@ from quadsim.errors import InputError
 from quadsim.mpc.laws.constrained import Constrained
 from quadsim.mpc.laws.parts.builders import build
 from quadsim.mpc.laws.robust import Robust
-from quadsim.mpc.problem.constraints import Origin
+from quadsim.mpc.problem.constraints import Constraint, Origin
 from quadsim.mpc.problem.ocp import InfeasiblePeriod
 from quadsim.mpc.space import SOFT_SPACE
 from quadsim.mpc.tables.bounded import Bounded
@@ -55,41 +55,42 @@ def diagnose(
         before = scenario.controller.iterations
         return _unconverged(infeasible_period, infeasible_period.converges, before, statuses)
     spec = scenario.controller
-    case = (_Case if isinstance(spec, Bounded) else _OwnCase)(infeasible_period, scenario, spec, vehicle)
-    conflict = find_conflict(infeasible_period)
-    if conflict is None:
-        entries = []
+    if isinstance(spec, Bounded):
+        period = _FailedPeriod(infeasible_period, scenario, spec, vehicle)
     else:
-        entries = _merged([*case.entries(conflict)])
-    if conflict is None or conflict.feasible:
-        suggestions = []
-    else:
-        suggestions = [*case.suggestions(conflict)]
-    report = {
+        period = _UserControllerPeriod(infeasible_period, scenario, spec, vehicle)
+    report: dict[str, Any] = {
         "time": round(infeasible_period.time, 9),
         "status": infeasible_period.status,
-        "feasible": None if conflict is None else conflict.feasible,
-        "conflict": entries,
-        "suggestions": suggestions,
+        "feasible": None,
+        "conflict": [],
+        "suggestions": [],
     }
-    if isinstance(case, _OwnCase):
-        advice = case.widenings(conflict)
+    conflict = find_conflict(infeasible_period)
+    if conflict is not None:
+        report["feasible"] = conflict.feasible
+        report["conflict"] = _merged(period.entries(conflict))
+        if not conflict.feasible:
+            report["suggestions"] = [*period.suggestions(conflict)]
+    report["sentence"] = _sentence(report)
+    if isinstance(period, _UserControllerPeriod):
+        report["advice"] = period.widenings(conflict)
     else:
-        advice = _advice(report)
-    return {**report, "sentence": _sentence(report), "advice": advice}
+        report["advice"] = _advice(report)
+    return report
 
 
 def lacking_report(assembly: Assembly, time: float) -> dict[str, Any] | None:
     """Return `diagnosis` of a flight that was lost at a time [s], though every problem that it solved had an answer.
 
-    It names what the scenario states and the law's model lacks; None where that is nothing.
+    It names what the scenario states and the controller's model lacks; None where that is nothing.
     """
     lacking = [*unmodelled(assembly), *unpredicted(assembly)]
     if not lacking:
         return None
     suggestions = [{"settings": settings, "after": None} for settings in modelling_changes(assembly)]
     stated = ", ".join(entry.text for entry in lacking)
-    changes = map(change_text, suggestions)
+    changes = "; ".join(map(change_text, suggestions))
     return {
         "time": round(time, 9),
         "status": "lost",
@@ -97,7 +98,7 @@ def lacking_report(assembly: Assembly, time: float) -> dict[str, Any] | None:
         "conflict": [],
         "suggestions": suggestions,
         "sentence": f"lost, and the model of {assembly.scenario.controller.type} lacks: {stated}",
-        "advice": f"to try: {'; '.join(changes)}",
+        "advice": f"to try: {changes}",
     }
 
 
@@ -108,9 +109,9 @@ def changed_scenario(scenario: Scenario, settings: Settings) -> Scenario | None:
     for field, value in settings.items():
         set_field(table, field, value, source="diagnosis", defaults=defaults)
     if "controller.type" in settings:
-        law = table["controller"]
+        fields = table["controller"]
         known = fields_of(TABLES[settings["controller.type"]])
-        table["controller"] = {name: value for name, value in law.items() if name in known}
+        table["controller"] = {name: value for name, value in fields.items() if name in known}
     try:
         return scenario.derive(table)
     except InputError:
@@ -121,33 +122,30 @@ def _unconverged(
     infeasible_period: InfeasiblePeriod, converges: Callable[[int], bool], before: int, statuses: Sequence[str]
 ) -> dict[str, Any]:
     """Return the diagnosis of a period whose QPs were solved but whose SQP did not converge."""
+    often = ""
     if statuses:
-        count = f" in {sum(status == NOT_CONVERGED for status in statuses)} of {len(statuses)} periods"
-    else:
-        count = ""
-    enough = next((count for count in ITERATIONS if count > before and converges(count)), None)
-    if enough is None:
-        suggestions = []
-    else:
-        suggestions = [{"settings": {"controller.iterations": enough}, "after": None}]
-    never = f"it does not within {ITERATIONS[-1]} iterations either"
-    if enough is None:
-        advice = never
-    else:
-        advice = f"to try: {change_text(suggestions[0])}"
+        often = f" in {statuses.count(NOT_CONVERGED)} of {len(statuses)} periods"
+    suggestions = []
+    advice = f"it does not within {ITERATIONS[-1]} iterations either"
+    for count in ITERATIONS:
+        if count > before and converges(count):
+            change = {"settings": {"controller.iterations": count}, "after": None}
+            suggestions.append(change)
+            advice = f"to try: {change_text(change)}"
+            break
     return {
         "time": round(infeasible_period.time, 9),
         "status": infeasible_period.status,
         "feasible": True,
         "conflict": [],
         "suggestions": suggestions,
-        "sentence": f"the SQP did not converge{count}, first at t = {infeasible_period.time:.2f} s: "
+        "sentence": f"the SQP did not converge{often}, first at t = {infeasible_period.time:.2f} s: "
         "every QP was solved, but the plans do not follow the nonlinear dynamics",
         "advice": advice,
     }
 
 
-class _Case:
+class _FailedPeriod:
     """One period's problem and its scenario file."""
 
     def __init__(self, infeasible_period: InfeasiblePeriod, scenario: Scenario, spec: Any, vehicle: Vehicle) -> None:
@@ -161,14 +159,21 @@ class _Case:
         """Return where a side comes from."""
         return self._infeasible_period.problem.every_constraint[side.place].origin(side.row)
 
-    def _together(self, side: Side) -> set[Side]:
+    def _alike(self, side: Side) -> set[Side]:
         """Return the sides of its constraint that have one name, and where a file states them, one number in it."""
+        origin = self.origin(side)._replace(rotor=0)
         rows = self._infeasible_period.problem.every_constraint[side.place].lower.shape[-1]
-        sides = [side._replace(row=row) for row in range(rows)]
-        return {other for other in sides if self.origin(other)._replace(rotor=0) == self.origin(side)._replace(rotor=0)}
+        alike = set()
+        for row in range(rows):
+            other = side._replace(row=row)
+            if self.origin(other)._replace(rotor=0) == origin:
+                alike.add(other)
+        return alike
 
     def _field(self, side: Side) -> str:
-        return self.origin(side).place(upper=side.upper)[0]
+        """Return the field of the file that states a side; empty if none does."""
+        field, _ = self.origin(side).place(upper=side.upper)
+        return field
 
     def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """Yield the violated bounds, the largest share first, and the blocking ones, with times and amounts.
@@ -180,50 +185,89 @@ class _Case:
         declared = sorted(conflict.violated.items())
         for i in in_order([-violation.share for _, violation in declared]):
             side, violation = declared[i]
-            first, last = (round(delay + steps * period, 9) for steps in (violation.first, violation.last))
             origin = self.origin(side)
-            yield {**_named(origin, side), "by": violation.amount * origin.factor, "start": first, "stop": last}
+            yield {
+                **_named(origin, side),
+                "by": violation.amount * origin.factor,
+                "start": round(delay + violation.first * period, 9),
+                "stop": round(delay + violation.last * period, 9),
+            }
         for side in conflict.blocking:
             yield {**_named(self.origin(side), side), "by": 0.0, "start": None, "stop": None}
 
     def suggestions(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """Yield changes of the file that make the period feasible: single bounds, smallest first; softness."""
-        giving = {self._field(side) for side in conflict.violated}
-        fields: dict[str, set[Side]] = {}
-        for side in (*conflict.violated, *conflict.blocking):
-            field = self._field(side)
-            if field and (side in conflict.violated or field not in giving):
-                fields.setdefault(field, set()).update(self._together(side))
-        least = {field: smallest_widening(self._infeasible_period, sides) for field, sides in fields.items()}
-        changes = [{field: (fields[field], amount)} for field, amount in least.items() if amount is not None]
-        alone = [settings for change in changes if (settings := self._widened(change))]
-        if not alone:
-            most: dict[str, float] = {}
-            for side, violation in conflict.violated.items():
-                field = self._field(side)
-                most[field] = max(violation.amount, most.get(field, 0.0))
-            together = self._widened({field: (sides, most[field]) for field, sides in fields.items() if field in most})
-            alone = [together] if together else []
-        for settings in (*alone, *self._softened(conflict)):
+        fields = self._sides_by_field(conflict)
+        changes = self._single_widenings(fields)
+        if not changes:
+            changes = self._common_widenings(fields, conflict)
+        for settings in (*changes, *self._softened(conflict)):
             yield {"settings": settings, "after": None}
         yield from self._fallback()
 
+    def _sides_by_field(self, conflict: Conflict) -> dict[str, set[Side]]:
+        """Return the sides that each field states of which a side is violated, or blocking and none is violated."""
+        violated_fields = {self._field(side) for side in conflict.violated}
+        fields: dict[str, set[Side]] = {}
+        for side in (*conflict.violated, *conflict.blocking):
+            field = self._field(side)
+            if field and (side in conflict.violated or field not in violated_fields):
+                fields.setdefault(field, set()).update(self._alike(side))
+        return fields
+
+    def _single_widenings(self, fields: Mapping[str, set[Side]]) -> list[Settings]:
+        """Return the changes of a single field that widen its bounds by enough."""
+        changes = []
+        for field, sides in fields.items():
+            amount = smallest_widening(self._infeasible_period, sides)
+            if amount is None:
+                continue
+            settings = self._widened({field: (sides, amount)})
+            if settings is not None:
+                changes.append(settings)
+        return changes
+
+    def _common_widenings(self, fields: Mapping[str, set[Side]], conflict: Conflict) -> list[Settings]:
+        """Return the change that widens all violated fields by their violations, if it is enough."""
+        amounts: dict[str, float] = {}
+        for side, violation in conflict.violated.items():
+            field = self._field(side)
+            amounts[field] = max(violation.amount, amounts.get(field, 0.0))
+        settings = self._widened(
+            {field: (sides, amounts[field]) for field, sides in fields.items() if field in amounts}
+        )
+        if settings:
+            return [settings]
+        return []
+
     def _softened(self, conflict: Conflict) -> list[Settings]:
         """Return changes that soften one violated constraint, or all of them, at the largest penalty that works."""
-        tables = [*dict.fromkeys(table for side in conflict.violated if (table := self.origin(side).soft))]
-        softened = [settings for table in tables if (settings := self._soft([table]))]
-        if not softened and len(tables) > 1 and (settings := self._soft(tables)):
-            softened = [settings]
-        return softened
+        tables: list[str] = []
+        for side in conflict.violated:
+            table = self.origin(side).soft
+            if table and table not in tables:
+                tables.append(table)
+        changes = []
+        for table in tables:
+            settings = self._soft([table])
+            if settings is not None:
+                changes.append(settings)
+        if not changes and len(tables) > 1:
+            settings = self._soft(tables)
+            if settings is not None:
+                changes.append(settings)
+        return changes
 
     def _soft(self, tables: Sequence[str]) -> Settings | None:
-        other_law = "controller.soft" in tables and not isinstance(self._spec, Robust)
-        law: Settings
-        if other_law:
-            law = {"controller.type": "robust"}
-        else:
-            law = {}
-        return next(filter(self._helps, ({**law, **dict.fromkeys(tables, soft)} for soft in SOFT)), None)
+        """Return tables of softness with the largest penalty that helps; None if none does."""
+        other_type: Settings = {}
+        if "controller.soft" in tables and not isinstance(self._spec, Robust):
+            other_type = {"controller.type": "robust"}
+        for penalty in SOFT:
+            settings = {**other_type, **dict.fromkeys(tables, penalty)}
+            if self._helps(settings):
+                return settings
+        return None
 
     def _widened(self, amounts: Mapping[str, tuple[set[Side], float]]) -> Settings | None:
         """Return fields with bounds moved outwards by at least these amounts, if that helps."""
@@ -231,15 +275,19 @@ class _Case:
         for more in WIDER:
             settings: Settings = {}
             for field, (sides, amount) in amounts.items():
-                numbers = [*(before := get_field(table, field))]
-                for side in sides:  # several rotors share an entry
-                    origin = self.origin(side)
-                    _, entry = origin.place(upper=side.upper)
-                    numbers[entry] = _outwards(before[entry], more * amount * origin.factor, upper=side.upper)
-                settings[field] = numbers
+                settings[field] = self._moved(get_field(table, field), sides, more * amount)
             if self._helps(settings):
                 return settings
         return None
+
+    def _moved(self, stated: Sequence[float], sides: Collection[Side], amount: float) -> list[float]:
+        """Return a field's numbers with these sides moved outwards by an amount; several rotors share an entry."""
+        numbers = [*stated]
+        for side in sides:
+            origin = self.origin(side)
+            _, entry = origin.place(upper=side.upper)
+            numbers[entry] = _outwards(stated[entry], amount * origin.factor, upper=side.upper)
+        return numbers
 
     def _helps(self, settings: Settings) -> bool:
         """Return whether the period has an answer with these fields."""
@@ -254,10 +302,22 @@ class _Case:
             problem = spec.problem(self._vehicle, self._period)
         except InputError:
             return False
-        space = tuple(part for part in self._infeasible_period.problem.constraints if part.origin(0).soft == SOFT_SPACE)
-        if spec.avoidance is not None and (soft := spec.avoidance.soft) is not None:
-            space = tuple(replace(part, penalty=soft.penalty(part.lower.shape[1])) for part in space)
-        return has_answer(replace(problem, constraints=(*problem.constraints, *space)), self._infeasible_period.query)
+        constraints = (*problem.constraints, *self._space_constraints(spec))
+        return has_answer(replace(problem, constraints=constraints), self._infeasible_period.query)
+
+    def _space_constraints(self, spec: Constrained | Robust) -> list[Constraint]:
+        """Return the half-spaces of the period's problem, as soft as a controller's table has them."""
+        soft = None
+        if spec.avoidance is not None:
+            soft = spec.avoidance.soft
+        constraints = []
+        for constraint in self._infeasible_period.problem.constraints:
+            if constraint.origin(0).soft != SOFT_SPACE:
+                continue
+            if soft is not None:
+                constraint = replace(constraint, penalty=soft.penalty(constraint.lower.shape[1]))
+            constraints.append(constraint)
+        return constraints
 
     def _changed(self, settings: Settings) -> Constrained | Robust | None:
         """Return the controller with other fields; None if the file would be rejected."""
@@ -286,7 +346,7 @@ class _Case:
             yield {"settings": settings, "after": round(periods * self._period, 9)}
 
 
-class _OwnCase(_Case):
+class _UserControllerPeriod(_FailedPeriod):
     """The same for a user's own controller, which no file describes."""
 
     def origin(self, side: Side) -> Origin:
@@ -301,15 +361,19 @@ class _OwnCase(_Case):
         """Return by how much each single side, for all rotors together, would have to be wider."""
         if conflict is None or conflict.feasible:
             return ""
-        alike = dict.fromkeys(frozenset(self._together(side)) for side in (*conflict.violated, *conflict.blocking))
+        groups: list[set[Side]] = []
+        for side in (*conflict.violated, *conflict.blocking):
+            alike = self._alike(side)
+            if alike not in groups:
+                groups.append(alike)
         widenings = []
-        for sides in alike:
-            side = next(iter(sides))
-            least = smallest_widening(self._infeasible_period, sides)
-            origin = self.origin(side)
-            if least is not None:
-                amount = f"{least * origin.factor:.3g} {origin.unit.replace('-', '')}".rstrip()
-                widenings.append(f"{origin.name} {_which(side)} wider by {amount}")
+        for sides in groups:
+            amount = smallest_widening(self._infeasible_period, sides)
+            if amount is not None:
+                side = next(iter(sides))
+                origin = self.origin(side)
+                shown = _with_unit(amount * origin.factor, origin.unit)
+                widenings.append(f"{origin.name} {_which(side)} wider by {shown}")
         if widenings:
             return f"has an answer with {'; or '.join(widenings)}"
         return "no bound alone gives it an answer"
@@ -321,17 +385,23 @@ def _which(side: Side) -> str:
     return "lower"
 
 
+def _with_unit(value: float, unit: str) -> str:
+    """Return a value in three digits, with its unit where it has one."""
+    if unit == "-":
+        return f"{value:.3g}"
+    return f"{value:.3g} {unit}"
+
+
 def _named(origin: Origin, side: Side) -> dict[str, Any]:
-    return {
-        "name": origin.name,
-        "rotors": [origin.rotor] if origin.rotor else [],
-        "side": _which(side),
-        "unit": origin.unit,
-        "field": origin.place(upper=side.upper)[0],
-    }
+    """Return the first entries of a bound in a report: what it is called, and where it is stated."""
+    rotors = []
+    if origin.rotor:
+        rotors.append(origin.rotor)
+    field, _ = origin.place(upper=side.upper)
+    return {"name": origin.name, "rotors": rotors, "side": _which(side), "unit": origin.unit, "field": field}
 
 
-def _merged(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _merged(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     """Merge the same side of several rotors into one entry, with the largest amount and the whole time span."""
     merged: dict[tuple[Any, ...], dict[str, Any]] = {}
     for entry in entries:
@@ -350,12 +420,15 @@ def _merged(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _outwards(bound: float, amount: float, *, upper: bool) -> float:
     """Move a bound outwards by an amount, rounded up to three digits."""
+    digits = 0
     if amount > 0.0:
         digits = 2 - math.floor(math.log10(amount))
+    step = math.ceil(round(amount * 10.0**digits, 6)) / 10.0**digits
+    if upper:
+        moved = bound + step
     else:
-        digits = 0
-    moved = math.ceil(round(amount * 10.0**digits, 6)) / 10.0**digits
-    return round(bound + moved if upper else bound - moved, max(digits, 0) + 3)
+        moved = bound - step
+    return round(moved, max(digits, 0) + 3)
 
 
 def _sentence(report: Mapping[str, Any]) -> str:
@@ -371,12 +444,19 @@ def _sentence(report: Mapping[str, Any]) -> str:
 def _phrase(entry: Mapping[str, Any]) -> str:
     """Describe one bound, e.g. `roll upper at +0.15 s .. +0.40 s by 0.8 deg`, or `slew of rotor 3 lower`."""
     rotors = entry["rotors"]
-    which = f" of rotor{'s' if len(rotors) > 1 else ''} {', '.join(map(str, rotors))}" if rotors else ""
-    name = f"{entry['name']}{which} {entry['side']}"
+    name = entry["name"]
+    if len(rotors) == 1:
+        name += f" of rotor {rotors[0]}"
+    elif rotors:
+        name += f" of rotors {', '.join(map(str, rotors))}"
+    name += f" {entry['side']}"
     if not entry["by"]:
         return name
-    times = dict.fromkeys(f"+{entry[key]:.2f} s" for key in ("start", "stop"))
-    return f"{name} at {' .. '.join(times)} by {entry['by']:.3g} {entry['unit'].replace('-', '')}".rstrip()
+    times = f"+{entry['start']:.2f} s"
+    stop = f"+{entry['stop']:.2f} s"
+    if stop != times:
+        times += f" .. {stop}"
+    return f"{name} at {times} by {_with_unit(entry['by'], entry['unit'])}"
 
 
 def _advice(report: Mapping[str, Any]) -> str:
@@ -392,14 +472,17 @@ def _advice(report: Mapping[str, Any]) -> str:
 def change_text(change: Mapping[str, Any]) -> str:
     """Return a change as after `--set`, with what has to be known about it."""
     settings = change["settings"]
-    after = change["after"]
-    fields = fields_text(settings)
-    fields += " (without the field solver)" if settings.get("controller.type") == "robust" else ""
-    if (count := settings.get("controller.iterations")) is not None:
-        fields += f", which takes up to {count} times as long"
-    fields += f" (level hover; an answer again after {after:.2f} s, by the model)" if after else ""
+    text = fields_text(settings)
+    if settings.get("controller.type") == "robust":
+        text += " (without the field solver)"
+    if settings.get("controller.iterations") is not None:
+        text += f", which takes up to {settings['controller.iterations']} times as long"
+    if change["after"]:
+        text += f" (level hover; an answer again after {change['after']:.2f} s, by the model)"
     violated = ", ".join(change.get("violated", ()))
-    return fields + (f" (violates {violated} on its way)" if violated and "why" not in change else "")
+    if violated and "why" not in change:
+        text += f" (violates {violated} on its way)"
+    return text
 
 
 def fields_text(settings: Mapping[str, Any]) -> str:
@@ -411,6 +494,7 @@ def _toml(value: object) -> str:
     """Format a text, a list of numbers, or a table of numbers as in a scenario file."""
     if not isinstance(value, dict):
         return json.dumps(value)
-    if value:
-        return f"{{ {', '.join(f'{name} = {number:g}' for name, number in value.items())} }}"
-    return "{}"
+    if not value:
+        return "{}"
+    entries = ", ".join(f"{name} = {number:g}" for name, number in value.items())
+    return f"{{ {entries} }}"

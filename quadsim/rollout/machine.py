@@ -1,4 +1,4 @@
-"""What numbers depend on outside a scenario: the code, the versions of packages, and the machine."""
+"""What numbers depend on outside a scenario: the code, the versions of packages, and the machine; for summaries."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PACKAGE: Final = Path(__file__).resolve().parents[1]
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of packages that affect numbers."""
+    """Return the versions of quadsim, Python and the packages that affect numbers."""
     return {"quadsim": importlib.metadata.version("quadsim"), "python": platform.python_version(), **_packages()}
 
 
@@ -65,7 +65,10 @@ def digest_below(roots: Iterable[Path]) -> str:
     """Return the SHA-256 of the code, models and scenarios in files and folders."""
     digest = hashlib.sha256()
     for root in roots:
-        for path in [root] if root.is_file() else sorted(root.rglob("*")):
+        paths = [root]
+        if not root.is_file():
+            paths = sorted(root.rglob("*"))
+        for path in paths:
             if path.suffix in (".py", ".c", ".h", ".toml", ".xml") and path.is_file():
                 digest.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
                 digest.update(path.read_bytes())

@@ -45,6 +45,8 @@ _PRELOAD: Final = (
     "quadsim.mpc.laws.unconstrained",
 )
 """Preloaded by the server that workers are forked from; the first one finds the others by their place."""
+_DRAWING: Final = "scipy.stats"
+"""Preloaded where it is loaded here: it is slow to import, and some campaigns draw with it."""
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
 _START_S: Final = 60.0  # longest start of a worker, or of the first one of a cluster; not counted as flight time
@@ -99,8 +101,11 @@ def count_workers(workers: int | None, cluster: str | None) -> int:
 
 
 def _require(workers: int | None, cluster: str | None) -> None:
-    if workers is not None and (workers < 1 or cluster is not None):
-        raise ParameterError("", "--workers", workers, "1 or more" if cluster is None else "absent with --cluster")
+    """Raise if the number of workers, or the address of the cluster, is invalid."""
+    if workers is not None and cluster is not None:
+        raise ParameterError("", "--workers", workers, "absent with --cluster")
+    if workers is not None and workers < 1:
+        raise ParameterError("", "--workers", workers, "1 or more")
     if cluster is not None and not _ADDRESS.fullmatch(cluster):
         rule = "the address of a Dask scheduler, e.g. tcp://10.0.0.1:8786"
         raise ParameterError("", "--cluster", cluster, rule)
@@ -110,25 +115,27 @@ def _require(workers: int | None, cluster: str | None) -> None:
 
 
 def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory: float, isolate: bool) -> FlownRows:
-    todo = enumerate(flights)
+    """Yield the rows of flights by a number of workers, each with its index; arguments as `fly_many`."""
+    remaining = enumerate(flights)
     workers = list[_Worker]()
     try:
-        flight = next(todo, None)
+        flight = next(remaining, None)
         while flight is not None or workers:
             while flight is not None and len(workers) < count:
-                workers.append(_Worker(fly, timeout, memory))
-                workers[-1].hand(*flight)
-                flight = next(todo, None)
-            left = min(worker.deadline for worker in workers) - clock.monotonic()
+                worker = _Worker(fly, timeout, memory)
+                workers.append(worker)
+                worker.hand(*flight)
+                flight = next(remaining, None)
+            ready = _wait(workers)
             rows = []
-            ready = connection.wait([end for running in workers for end in running.ends], max(left, 0.0))
             for worker in workers[:]:
-                if (row := worker.row(ready)) is None:
+                row = worker.row(ready)
+                if row is None:
                     continue
                 rows.append((worker.place, row))
                 if flight is not None and worker.usable and not isolate:
                     worker.hand(*flight)
-                    flight = next(todo, None)
+                    flight = next(remaining, None)
                 else:
                     workers.remove(worker)
                     worker.end()
@@ -136,6 +143,15 @@ def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory
     finally:
         for worker in workers:
             worker.end()
+
+
+def _wait(workers: Sequence[_Worker]) -> Sequence[object]:
+    """Wait until one of the workers has news, or its time is up; return the ends that are ready."""
+    ends: list[Any] = []
+    for worker in workers:
+        ends += worker.ends
+    first_deadline = min(worker.deadline for worker in workers)
+    return connection.wait(ends, max(first_deadline - clock.monotonic(), 0.0))
 
 
 class _Worker:
@@ -148,10 +164,10 @@ class _Worker:
         self.deadline = 0.0
         self._start_s = _START_S
         context = multiprocessing.get_context("forkserver")
-        draws = [
-            name for name in ("scipy.stats",) if name in sys.modules
-        ]  # slow to import; some campaigns draw with it
-        context.set_forkserver_preload([*_PRELOAD, *draws])
+        preload = [*_PRELOAD]
+        if _DRAWING in sys.modules:
+            preload.append(_DRAWING)
+        context.set_forkserver_preload(preload)
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, fly, memory), daemon=True)
         with closing(theirs), _starting():
@@ -159,6 +175,7 @@ class _Worker:
         self.ends = (self.pipe, self.process.sentinel)  # either becomes ready when there is news
 
     def hand(self, place: int, flight: Any) -> None:
+        """Give it a flight to fly, with its index."""
         self.place = place
         self.deadline = clock.monotonic() + self._timeout + self._start_s
         with suppress(OSError):  # it is dead already, which its sentinel shows
@@ -216,7 +233,10 @@ def _starting() -> Iterator[None]:
         finally:
             sys.modules["__main__"] = script
             for name, value in before.items():
-                os.environ.pop(name) if value is None else os.environ.update({name: value})
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
@@ -260,8 +280,9 @@ def _row(fly: Fly, flight: Any, memory: float) -> bytes:
 def _limit_memory(megabytes: float) -> None:
     """Limit this process's memory; if the machine runs out of memory, the system kills it first."""
     status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
-    bytes_held = next(1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith("VmData:"))
-    most = int(bytes_held + megabytes * 1e6)
+    held = re.search(r"^VmData:\s*(\d+) kB", status, flags=re.MULTILINE)
+    assert held is not None
+    most = int(1024 * int(held[1]) + megabytes * 1e6)
     resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
@@ -270,7 +291,7 @@ def _limit_memory(megabytes: float) -> None:
 
 
 def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float, memory: float) -> FlownRows:
-    todo = enumerate(flights)
+    remaining = enumerate(flights)
     places = dict[str, int]()
     with _client(address) as client:
         distributed = _distributed()
@@ -278,7 +299,7 @@ def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float
 
         def submit() -> None:
             """Submit two flights per thread, so that no thread waits for its next one."""
-            for place, flight in todo:
+            for place, flight in remaining:
                 future = client.submit(_beside, fly, flight, timeout, memory, _code(), pure=False)
                 places[future.key] = place
                 work.add(future)
@@ -303,12 +324,12 @@ def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float
 
 def _beside(fly: bytes, flight: Any, timeout: float, memory: float, code: Mapping[str, str]) -> Row:
     """In a Dask worker, fly in a child process, so that no flight can harm the worker."""
-    other = []
+    differing = []
     for name, value in _code().items():
         if code.get(name) != value:
-            other.append(f"{name} {value}, not {code.get(name)}")
-    if other:
-        raise ClusterError(f"it has {', '.join(other)}")
+            differing.append(f"{name} {value}, not {code.get(name)}")
+    if differing:
+        raise ClusterError(f"it has {', '.join(differing)}")
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # it may have children
     with closing(_here([flight], fly, 1, timeout, memory, isolate=True)) as rows:
         return next(rows)[1]
@@ -339,10 +360,15 @@ def _client(address: str) -> Iterator[Any]:
 
 
 def _threads(client: Any) -> int:
-    return sum(worker["nthreads"] for worker in client.scheduler_info(n_workers=-1)["workers"].values())
+    """Return the number of threads of all workers of a cluster."""
+    workers = client.scheduler_info(n_workers=-1)["workers"]
+    return sum(worker["nthreads"] for worker in workers.values())
 
 
 @functools.cache
 def _code() -> dict[str, str]:
     """Return the versions of packages that determine a flight's numbers, and the digest of our code."""
-    return {name: versions()[name] for name in ("mujoco", "numpy", "scipy", "piqp")} | {"quadsim": code_digest()[:19]}
+    installed = versions()
+    code = {name: installed[name] for name in ("mujoco", "numpy", "scipy", "piqp")}
+    code["quadsim"] = code_digest()[:19]
+    return code

@@ -1,13 +1,13 @@
 """Fly the changes that the explanation of a failure suggests: what does not prevent it is not advised.
 
-Each changed scenario is flown from its start to `AFTER` seconds past the period without an answer.  These flights are
-ordinary ones, except that nobody asks them for a diagnosis.
+Each changed scenario of `quadsim.rollout.infeasibility` is flown from its start to `AFTER` seconds past the period
+without an answer.  These flights are ordinary ones, except that nobody asks them for a diagnosis.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
@@ -34,7 +34,7 @@ MOST_FLOWN: Final = 6  # flights of one diagnosis
 MOST_PAIRS: Final = 4  # pairs of hovers without what the model lacks, and with changes, each
 RETURNING: Final = 0.9  # violation at the end of a flight, over its largest, up to which it is passing
 HOVER_RESERVE: Final = 0.1  # distance of the advised bound on rotor speeds from hover, over hover
-_CHANGED_LAW: Final = "an event had changed the controller"
+_CHANGED_CONTROLLER: Final = "an event had changed the controller"
 _SPEED: Final = "controller.input_bounds.speed"
 
 
@@ -64,40 +64,64 @@ def tried(explanation: Mapping[str, Any], flight: Flight, fly: FlyUntil, measure
     report["sentence"] = "; ".join([*notes, report["sentence"]])
     until = min(report["time"] + AFTER, scenario.duration)
     unflown = _not_flown(flight, report["time"], until)
-    flew_its_law = flight.controller == scenario.controller.type and unflown != _CHANGED_LAW
-    if flew_its_law and not notes:
-        modelling = _modelling(assembly)
-    else:
-        modelling = []
-    if modelling and not unflown:
-        report["loop"] = _loop_report(assembly, measure)
-    others = [change for change in report["suggestions"] if change not in modelling]
     if notes:
         candidates = _reaching_hover(scenario, assembly)
     else:
+        modelling = []
+        if flight.controller == scenario.controller.type and unflown != _CHANGED_CONTROLLER:
+            modelling = [_change(settings) for settings in modelling_changes(assembly)]
+        if modelling and not unflown:
+            report["loop"] = _loop_report(assembly, measure)
+        others = [change for change in report["suggestions"] if change not in modelling]
         candidates = [*modelling, *others]
     if not candidates:
         return report
     if unflown:
         report["advice"] = f"to try, not flown, as {unflown}: {'; '.join(map(change_text, candidates))}"
-        return {**report, "suggestions": candidates}
-    trials: list[_Trial] = []
+        report["suggestions"] = candidates
+        return report
+    trials = []
     for change in candidates[:MOST_FLOWN]:
-        growing = _still_grows(change["settings"], report.get("loop", {}))
-        trials.append(_Trial(why=growing) if growing else _trial(scenario, assembly, change["settings"], until, fly))
-    flown = [{**change, "violated": [*trial.violated]} for change, trial in zip(candidates, trials, strict=False)]
-    flying = [change for change, trial in zip(flown, trials, strict=True) if not trial.why]
-    kept = [change for change in flying if not change["violated"]] or flying
-    reasons = [trial.why or f"violated: {', '.join(trial.violated)}" for trial in trials]
-    left = [{**change, "why": why} for change, why in zip(flown, reasons, strict=True) if change not in kept]
-    report |= {"suggestions": kept, "rejected": left}
-    until_text = f"flown until {until:.4g} s"
+        settings = change["settings"]
+        growing = _still_grows(settings, report.get("loop", {}))
+        if growing:
+            trials.append((change, _Trial(why=growing)))
+        else:
+            trials.append((change, _trial(scenario, assembly, settings, until, fly)))
+    kept, rejected = _kept_and_rejected(trials)
+    return {**report, "suggestions": kept, "rejected": rejected, "advice": _advice(kept, rejected, until)}
+
+
+def _change(settings: Settings) -> dict[str, Any]:
+    """Return a suggestion of fields."""
+    return {"settings": settings, "after": None}
+
+
+def _kept_and_rejected(
+    trials: Sequence[tuple[dict[str, Any], _Trial]],
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return the changes to advise, and the rejected ones with the reason `why`, each with what it violated."""
+    flying = []
+    for change, trial in trials:
+        if not trial.why:
+            flying.append({**change, "violated": [*trial.violated]})
+    satisfied = [change for change in flying if not change["violated"]]
+    kept = satisfied or flying
+    rejected = []
+    for change, trial in trials:
+        flown = {**change, "violated": [*trial.violated]}
+        if flown not in kept:
+            why = trial.why or f"violated: {', '.join(trial.violated)}"
+            rejected.append({**flown, "why": why})
+    return kept, rejected
+
+
+def _advice(kept: Sequence[Mapping[str, Any]], rejected: Sequence[Mapping[str, Any]], until: float) -> str:
+    """Return the advice of flights until a time [s]."""
     if kept:
-        report["advice"] = f"to try, each {until_text}: {'; '.join(map(change_text, kept))}"
-    else:
-        failed = "; ".join(f"{change_text(change)} ({change['why']})" for change in report["rejected"])
-        report["advice"] = f"{until_text}, no change prevents it: {failed}"
-    return report
+        return f"to try, each flown until {until:.4g} s: {'; '.join(map(change_text, kept))}"
+    failed = "; ".join(f"{change_text(change)} ({change['why']})" for change in rejected)
+    return f"flown until {until:.4g} s, no change prevents it: {failed}"
 
 
 def _not_flown(flight: Flight, time: float, until: float) -> str:
@@ -105,7 +129,7 @@ def _not_flown(flight: Flight, time: float, until: float) -> str:
     if flight.own_code:
         return "the scenario does not repeat code that was passed in"
     if flight.scenario.controller_at(time) != flight.scenario.controller:
-        return _CHANGED_LAW
+        return _CHANGED_CONTROLLER
     if until > LONGEST_TRIAL:
         return f"it would take more than {LONGEST_TRIAL:g} s of flight"
     return ""
@@ -131,32 +155,30 @@ def _trial(scenario: Scenario, assembly: Assembly, settings: Settings, until: fl
     if flight.log.interrupted:
         raise KeyboardInterrupt
     unanswered = flight.infeasible_period
-    period = scenario.control_period
     if flight.log.reason is not None:
-        return _Trial(why=f"{flight.outcome} at t = {flight.time.size * period:.4g} s")
+        return _Trial(why=f"{flight.outcome} at t = {flight.time.size * scenario.control_period:.4g} s")
     if unanswered is not None and unanswered.converges is None and "controller.fallback" not in settings:
         return _Trial(why=f"no answer at t = {unanswered.time:.4g} s")
-    if flight.log.control.crashed or unrecovered(flight.log.control):
-        return _Trial(why="crashed" if flight.log.control.crashed else "in fallback to its end")
+    if flight.log.control.crashed:
+        return _Trial(why="crashed")
+    if unrecovered(flight.log.control):
+        return _Trial(why="in fallback to its end")
     if flight.departure is not None and flight.departure.leaving:
         return _Trial(why=f"{flight.departure.distance:.3g} m off its course at its end, and leaving it")
     violated = []
-    for each in flight.findings:
-        if each.limit.required and each.verdict == "violated":
-            violated.append(each.limit.name)
-    lasting = [name for name in violated if _lasts(flight.margins[name])]
-    return _Trial(why=f"violated: {', '.join(violated)}" if lasting else "", violated=tuple(violated))
+    for finding in flight.findings:
+        if finding.limit.required and finding.verdict == "violated":
+            violated.append(finding.limit.name)
+    why = ""
+    if any(_lasts(flight.margins[name]) for name in violated):
+        why = f"violated: {', '.join(violated)}"
+    return _Trial(why=why, violated=tuple(violated))
 
 
 def _lasts(margins: Array) -> bool:
     """Return whether a constraint's margins (K,), of which some are negative, end near the worst one."""
     margins = margins[np.isfinite(margins)]
     return bool(margins[-1] < RETURNING * margins.min())
-
-
-def _modelling(assembly: Assembly) -> list[dict[str, Any]]:
-    """Return the changes by which the law has what the scenario states and its model lacks."""
-    return [{"settings": settings, "after": None} for settings in modelling_changes(assembly)]
 
 
 def _still_grows(settings: Settings, loop: Mapping[str, Any]) -> str:
@@ -176,28 +198,28 @@ def _loop_report(assembly: Assembly, measure: MeasureGrowth) -> dict[str, Any]:
     scenario = assembly.scenario
     heading = worst_heading(assembly)
     report = {"heading": heading, **_grows(scenario, heading, measure), "without": [], "with": []}
-    if _cures(report):
+    if _is_stable(report):
         return report
     lacking = unmodelled(assembly)
     effects = unpredicted(assembly)
     for entry in (*lacking, *effects)[:MOST_PAIRS]:
-        level = 0.0 if entry.quantity == "heading" else heading
-        grows = _grows(_replaced(scenario, entry.absent), level, measure)
+        held_heading = heading
+        if entry.quantity == "heading":
+            held_heading = 0.0
+        grows = _grows(_replaced(scenario, entry.absent), held_heading, measure)
         report["without"].append({"lacks": entry.text, **grows})
-    alone = [dict(entry.settings) for entry in lacking]
-    together: Settings = {}
-    for settings in alone:
-        together |= settings
-    fields = [*alone, *(dict(entry.settings) for entry in effects)]
-    for settings in fields[:MOST_PAIRS]:
-        report["with"].append(_with(settings, scenario, heading, measure))
-    if len(alone) > 1 and not any(map(_cures, report["with"])):
-        report["with"].append(_with(together, scenario, heading, measure))
+    for entry in (*lacking, *effects)[:MOST_PAIRS]:
+        report["with"].append(_grows_with(dict(entry.settings), scenario, heading, measure))
+    if len(lacking) > 1 and not any(map(_is_stable, report["with"])):
+        together: Settings = {}
+        for entry in lacking:
+            together |= entry.settings
+        report["with"].append(_grows_with(together, scenario, heading, measure))
     return {**report, "sentence": _loop_sentence(report)}
 
 
-def _with(settings: Settings, scenario: Scenario, heading: float, measure: MeasureGrowth) -> dict[str, Any]:
-    """Return a change and how a push grows with it."""
+def _grows_with(settings: Settings, scenario: Scenario, heading: float, measure: MeasureGrowth) -> dict[str, Any]:
+    """Return fields, and how a push grows with them."""
     return {"settings": settings, **_grows(changed_scenario(scenario, settings), heading, measure)}
 
 
@@ -226,16 +248,19 @@ def _grows(scenario: Scenario | None, heading: float, measure: MeasureGrowth) ->
 
 
 def _loop_sentence(report: Mapping[str, Any]) -> str:
-    """Say that a push grows, and which single thing, taken away or known to the law, lets it shrink."""
-    cures = [f"without {entry['lacks']} it {_rate_text(entry)}" for entry in report["without"] if _cures(entry)]
+    """Say that a push grows, and which single thing, taken away or known to the controller, lets it shrink."""
+    cures = []
+    for entry in report["without"]:
+        if _is_stable(entry):
+            cures.append(f"without {entry['lacks']} it {_rate_text(entry)}")
     for entry in report["with"]:
-        if _cures(entry):
+        if _is_stable(entry):
             cures.append(f"with {fields_text(entry['settings'])} it {_rate_text(entry)}")
-    found = "; ".join(cures) or "nothing of what the model lacks, taken away or set, changes that"
-    return f"in hover a push {_rate_text(report)}; {found}"
+    shown = "; ".join(cures) or "nothing of what the model lacks, taken away or set, changes that"
+    return f"in hover a push {_rate_text(report)}; {shown}"
 
 
-def _cures(entry: Mapping[str, Any]) -> bool:
+def _is_stable(entry: Mapping[str, Any]) -> bool:
     """Return whether the loop was measured and is stable."""
     return not entry.get("unstable", True)
 
@@ -245,7 +270,9 @@ def _rate_text(entry: Mapping[str, Any]) -> str:
     rate = entry.get("rate")
     if rate is None:
         return f"ends {entry['ended']}"
-    return f"{'grows' if entry['unstable'] else 'shrinks'} at {abs(rate):.3g} 1/s"
+    if entry["unstable"]:
+        return f"grows at {abs(rate):.3g} 1/s"
+    return f"shrinks at {abs(rate):.3g} 1/s"
 
 
 def _reaching_hover(scenario: Scenario, assembly: Assembly) -> list[dict[str, Any]]:
@@ -256,7 +283,8 @@ def _reaching_hover(scenario: Scenario, assembly: Assembly) -> list[dict[str, An
     if not isinstance(spec, Constrained | Robust) or spec.input_bounds is None:
         return []
     lower, upper = spec.input_bounds.speed
-    ends = (-1.0, float(hover.min())), (1.0, float(hover.max()))
-    low, high = (float(f"{(1.0 + side * HOVER_RESERVE) * speed:.4g}") for side, speed in ends)
-    speeds = [max(min(lower, low), vehicle.speed_min), min(max(upper, high), max(upper, vehicle.speed_max))]
-    return [{"settings": {_SPEED: speeds}, "after": None}]
+    low = float(f"{(1.0 - HOVER_RESERVE) * float(hover.min()):.4g}")
+    high = float(f"{(1.0 + HOVER_RESERVE) * float(hover.max()):.4g}")
+    lowest = max(min(lower, low), vehicle.speed_min)
+    highest = min(max(upper, high), max(upper, vehicle.speed_max))
+    return [_change({_SPEED: [lowest, highest]})]

@@ -1,4 +1,8 @@
-"""From a scenario to its flight: the one loop for batches, live sessions, learning environments and scripts."""
+"""From a scenario to its flight: the one loop for batches, live sessions, learning environments and scripts.
+
+`quadsim.scenarios.assembly` builds the parts, `quadsim.sim.loop` steps them, and `quadsim.rollout.flown.Flight` is what
+came of it.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +33,12 @@ from quadsim.scenarios.schema.scenario import LONGEST_FLIGHT, Scenario
 from quadsim.sim.computation import check_measured
 from quadsim.sim.core_loop import fly_in_core
 from quadsim.sim.effects import Force
+from quadsim.sim.estimator import Tally
 from quadsim.sim.loop import ClosedLoop, Reference, complete
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import Observation, Period, one_period
 from quadsim.sim.plant import Plant
+from quadsim.sim.sensing import SensorName
 from quadsim.state import Array
 
 
@@ -67,8 +73,39 @@ def closed_loop(
 
 def needs_quaternions(scenario: Scenario) -> bool:
     """Return whether one of its controllers flies at any attitude."""
-    specs = (scenario.controller, *(spec for _, spec in scenario.controller_changes))
-    return any(spec.any_attitude for spec in specs)
+    changed = [spec for _, spec in scenario.controller_changes]
+    return any(spec.any_attitude for spec in (scenario.controller, *changed))
+
+
+def _checked_controller(assembly: Assembly, user_controller: Controller | None) -> Controller:
+    """Return the controller that flies, the scenario's or `user_controller`.
+
+    Raises:
+        InputError: it cannot be built, or does not fit the scenario.
+    """
+    scenario = assembly.scenario
+    if user_controller is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
+        raise ParameterError(
+            "", "controller", user_controller, "absent where an event changes the scenario's controller"
+        )
+    controller = user_controller
+    if controller is None:
+        controller = assembly.controller()
+    check_measured(scenario.computation, controller)
+    return controller
+
+
+def _check_parts(assembly: Assembly, controller: Controller) -> None:
+    """Refuse an autopilot that its controller does not command, and changes to controllers that cannot be built.
+
+    Raises:
+        InputError: naming the part.
+    """
+    if assembly.user_autopilot is not None and not takes_targets(controller):
+        rule = 'given with a controller that commands thrust and body rates, e.g. commands = "rates"'
+        raise ParameterError("", "autopilot", type(assembly.user_autopilot).__name__, rule)
+    for _, spec in assembly.scenario.controller_changes:
+        assembly.controller(spec)  # one by one, as each may take megabytes
 
 
 @contextlib.contextmanager
@@ -114,7 +151,7 @@ class Rollout:
     def __init__(
         self,
         scenario: Scenario | Assembly,
-        law: Controller | None = None,
+        user_controller: Controller | None = None,
         forces: Sequence[Force] | None = None,
         *,
         live: bool = False,
@@ -124,7 +161,7 @@ class Rollout:
 
         Args:
             scenario: the scenario to fly, or its assembly.
-            law: replaces the scenario's controller.
+            user_controller: replaces the scenario's controller.
             forces: replace the scenario's forces.
             live: see `quadsim.commands.app.start`.
             recorded: see `quadsim.commands.app.start`.
@@ -132,52 +169,50 @@ class Rollout:
         Raises:
             InputError: something cannot be built.
         """
-        assembly = scenario if isinstance(scenario, Assembly) else Assembly(scenario)
-        assembly = assembly.of(prepared(assembly)) if live else assembly
-        scenario = assembly.scenario
+        if isinstance(scenario, Assembly):
+            assembly = scenario
+        else:
+            assembly = Assembly(scenario)
+        if live:
+            assembly = assembly.of(prepared(assembly))
         threadpool_limits(limits=1)  # the matrices are small, and results must not depend on the number of cores
-        if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
-            raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
-        controller = assembly.controller() if law is None else law
-        check_measured(scenario.computation, controller)
+        controller = _checked_controller(assembly, user_controller)
         assembly = assembly.with_law_bounds(controller)
+        self._started = assembly.scenario
+        _check_parts(assembly, controller)
         self.vehicle = assembly.vehicle
         self.actual = assembly.actual
         self.limits = assembly.limits
-        self._started = scenario = assembly.scenario
-        if assembly.user_autopilot is not None and not takes_targets(controller):
-            rule = 'given with a controller that commands thrust and body rates, e.g. commands = "rates"'
-            raise ParameterError("", "autopilot", type(assembly.user_autopilot).__name__, rule)
-        for _, spec in scenario.controller_changes:
-            assembly.controller(spec)  # checked before the flight, one by one, as each may take megabytes
-        self._law = controller.name, controller.solver
-        self._own_code = law is not None or forces is not None or assembly.user_autopilot is not None
+        self._law_name = controller.name
+        self._solver_name = controller.solver
+        self._own_code = user_controller is not None or forces is not None or assembly.user_autopilot is not None
         self._plant = assembly.plant(forces)
         self._navigation = assembly.navigation()
         started = clock.perf_counter()
-        self._reference = reference = assembly.followed()
+        self._reference = assembly.followed()
         self.loop = closed_loop(
-            assembly, self._plant, controller, reference, navigation=self._navigation, recorded=recorded
+            assembly, self._plant, controller, self._reference, navigation=self._navigation, recorded=recorded
         )
         self._simulate_s = clock.perf_counter() - started
+        build = None
+        if user_controller is None:
+            build = assembly.controller
         self._events = FlightEvents(
             assembly,
             plant=self._plant,
             navigation=self._navigation,
-            reference=reference,
+            reference=self._reference,
             loop=self.loop,
-            build=assembly.controller if law is None else None,
+            build=build,
         )
-        self._longest = controller.horizon
+        self._longest_horizon = controller.horizon
 
     def __repr__(self) -> str:
         scenario = self.scenario
-        flown = f"{self.k * scenario.control_period:.2f} of {scenario.duration:g} s flown by {self._law[0]}"
-        if self.loop.reason is None:
-            ended = ""
-        else:
-            ended = f", {self.loop.reason}"
-        return f"<Rollout {scenario.name}: {flown}{ended}>"
+        flown = f"{self.k * scenario.control_period:.2f} of {scenario.duration:g} s flown by {self._law_name}"
+        if self.loop.reason is not None:
+            flown += f", {self.loop.reason}"
+        return f"<Rollout {scenario.name}: {flown}>"
 
     def __enter__(self) -> Rollout:
         return self
@@ -230,9 +265,10 @@ class Rollout:
         if self.loop.before is None:
             raise InputError("the flight is closed")
         period = self._started.control_period
-        self._longest = max(self._longest, self.loop.controller.horizon)
-        most = MOST_STEPS // max(self._started.steps_per_period, self._longest)
-        if self.k >= min(most, math.floor(LONGEST_FLIGHT / period + 1e-6)):
+        self._longest_horizon = max(self._longest_horizon, self.loop.controller.horizon)
+        most_by_steps = MOST_STEPS // max(self._started.steps_per_period, self._longest_horizon)
+        most_by_time = math.floor(LONGEST_FLIGHT / period + 1e-6)
+        if self.k >= min(most_by_steps, most_by_time):
             raise InputError(f"a flight has at most {self.k} control periods of {period} s")
         if isinstance(command, Command):
             command = replace(command, speeds=np.array(command.speeds), plan=np.array(command.plan))
@@ -257,8 +293,8 @@ class Rollout:
         """
         with self:
             started = clock.perf_counter()
-            periods = self.scenario.periods
-            periods = min(periods, math.ceil(min(until, LONGEST_FLIGHT) / self.scenario.control_period - 1e-6))
+            periods_until = math.ceil(min(until, LONGEST_FLIGHT) / self.scenario.control_period - 1e-6)
+            periods = min(self.scenario.periods, periods_until)
             progress("flight", self.k, periods)
             complete(self.loop, periods=periods, progress=lambda done: progress("flight", done, periods))
             self._simulate_s += clock.perf_counter() - started
@@ -270,8 +306,9 @@ class Rollout:
         scenario = self._events.scenario
         controller = self.loop.controller
         changing = any(isinstance(event, SetpointEvent | ControllerEvent) for event in scenario.events)
-        attended = changing or scenario.forces or self._own_code or self.loop.attends or needs_quaternions(scenario)
-        if attended or not isinstance(controller, Pilot):
+        if changing or scenario.forces or self._own_code or self.loop.attends or needs_quaternions(scenario):
+            return None
+        if not isinstance(controller, Pilot):
             return None
         return controller.in_core()
 
@@ -337,7 +374,8 @@ class Rollout:
         Args:
             sample: the period; by default the last one.
         """
-        sample = self.loop.last if sample is None else sample
+        if sample is None:
+            sample = self.loop.last
         if sample is None:
             raise InputError("no period has been flown yet")
         return smallest_margins(one_period(sample, self._plant.timestep), self.limits)
@@ -351,8 +389,13 @@ class Rollout:
             sample: the period; by default the last one.
         """
         margins = self.margins(sample)
-        beyond = {limit.name: float(limit.excess(margins[limit.name])) for limit in self.limits}
-        return {name: -math.inf if math.isnan(value) else value for name, value in beyond.items()}
+        violations = {}
+        for limit in self.limits:
+            excess = float(limit.excess(margins[limit.name]))
+            if math.isnan(excess):
+                excess = -math.inf
+            violations[limit.name] = excess
+        return violations
 
     def flight(self) -> Flight:
         """Return the flight so far, audited; its scenario has the same length and reproduces it bit for bit."""
@@ -363,15 +406,18 @@ class Rollout:
     def _flight_of(self, log: FlightLog, scenario: Scenario) -> Flight:
         """Return a log as a flight of a scenario, audited."""
         assembly = self._events.assembly.of(scenario)
+        tallies: Mapping[SensorName, Tally] = {}
+        if self._navigation is not None:
+            tallies = self._navigation.tallies
         return Flight(
             scenario=assembly.recording,
             assembly=assembly,
             log=log,
             findings=audit(log, self.limits),
-            controller=self._law[0],
-            solver=self._law[1],
+            controller=self._law_name,
+            solver=self._solver_name,
             simulate_s=self._simulate_s,
-            tallies={} if self._navigation is None else self._navigation.tallies,
+            tallies=tallies,
             infeasible_period=self._events.first_infeasible_period(),
             own_code=self._own_code,
             try_remedies=_try_remedies,

@@ -50,9 +50,10 @@ def instability_notes(assembly: Assembly) -> tuple[str, ...]:
 
 def _instability_note(scenario: Scenario, lacking: tuple[Unmodelled, ...], result: Growth) -> str:
     """Say what grows, with what, and which fields let the model have it."""
-    grows = f"a push grows {math.exp(result.rate):.3g}-fold a second"
     if result.ended or not result.rate > 0.0:
         grows = f"a hover ends {result.ended}"
+    else:
+        grows = f"a push grows {math.exp(result.rate):.3g}-fold a second"
     stated = ", ".join(entry.text for entry in lacking)
     remedies = "; ".join(entry.remedy for entry in lacking if entry.remedy)
     note = f"unstable: {grows} with what the model of {scenario.controller.type} lacks: {stated}; to try: {remedies}"

@@ -1,7 +1,11 @@
-"""A run directory -> the `Flight` that was written there: the one place where a flight is read."""
+"""A run directory -> the `Flight` that was written there: the one place where a flight is read.
+
+`quadsim.rollout.flown` wrote it; `quadsim.read`, comparisons, figures and `quadsim.rollout.reaudit` take it from here.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +13,7 @@ from typing import Any
 from quadsim.console.summary_tables import summary_tables
 from quadsim.errors import FileError, printable
 from quadsim.flight import rundir
+from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_log
 from quadsim.report.comparison import comparison_rows
 from quadsim.rollout.flown import Flight
@@ -38,9 +43,7 @@ def read_flight(directory: Path) -> Flight:
         findings = rundir.findings_of(summary)
     except _DAMAGE as error:
         raise FileError(directory / rundir.SUMMARY_FILE, f"is damaged ({error})") from error
-    raised = tuple(summary.get("traceback", ()))
-    interrupted = summary["verdict"] == "aborted" and not raised
-    log = replace(read_log(directory, reason=summary["reason"]), interrupted=interrupted, traceback=raised)
+    log = _stored_log(directory, summary)
     scenario = stored_scenario(directory)
     try:
         flight = Flight(
@@ -56,12 +59,21 @@ def read_flight(directory: Path) -> Flight:
             recorded=summary,
             thinned=True,
         )
-        for _ in (*comparison_rows([flight]), *summary_tables(flight)):
-            pass
+        # a damaged entry raises where it is shown
+        list(comparison_rows([flight]))
+        list(summary_tables(flight))
     except _DAMAGE as error:
         what = f"{type(error).__name__}: {printable(str(error))}"
         raise FileError(directory / rundir.SUMMARY_FILE, f"is damaged ({what[:200]})") from error
     return flight
+
+
+def _stored_log(directory: Path, summary: Mapping[str, Any]) -> FlightLog:
+    """Return a run's log, with what its summary says of how the flight ended."""
+    traceback = tuple(summary.get("traceback", ()))
+    interrupted = summary["verdict"] == "aborted" and not traceback
+    log = read_log(directory, reason=summary["reason"])
+    return replace(log, interrupted=interrupted, traceback=traceback)
 
 
 def stored_scenario(directory: Path) -> Scenario:
@@ -76,7 +88,7 @@ def stored_scenario(directory: Path) -> Scenario:
     if not path.is_file():
         raise FileError(path, "is missing or no file")
     data = read_whole(path)
-    _drop_gone(data)
+    _drop_obsolete(data)
     match data.get("controller"):
         case {"type": str(name), **fields} if name not in LAWS and not is_plugin(name):
             data["controller"] = {**fields, "type": "elsewhere:Controller"}
@@ -87,11 +99,14 @@ def stored_scenario(directory: Path) -> Scenario:
     return scenario
 
 
-def _drop_gone(data: dict[str, Any]) -> None:
+def _drop_obsolete(data: dict[str, Any]) -> None:
     """Leave out, in place, what runs of earlier versions state and no flight depends on any more."""
-    events = data.get("events")
     tables = [data.get("controller")]
-    tables += [event.get("fields") for event in events if isinstance(event, dict)] if isinstance(events, list) else []
+    events = data.get("events")
+    if isinstance(events, list):
+        for event in events:
+            if isinstance(event, dict):
+                tables.append(event.get("fields"))
     for table in tables:
         if isinstance(table, dict):
             table.pop("compiled", None)

@@ -131,21 +131,19 @@ def test_every_limit_and_bound_that_is_left_is_named(vehicle: Vehicle) -> None:
     _, needed = demanded(vehicle, lambda t: (np.sin(2.0 * t), 0.0 * t, np.sin(2.0 * t) * 0.5, 3.0 * t), seconds=6.0)
     bounds = {"roll": (-11.46, 11.46), "vx": (-1.0, 5.0), "yaw_rate": (-57.3, 57.3), "speed": (180.0, 260.0)}
     result = assess(needed, replace(vehicle, speed_max=200.0), bounds={**bounds, "slew": (-0.1, 0.1)}, jumps=(1.0,))
-    names = [problem.rsplit(" (", 1) for problem in result.problems]
-    assert [(text.split(" up")[0].split(" down")[0], kind) for text, kind in names] == [
-        ("rotor speed", "limit 200)"),
-        ("roll", "bound 11.46)"),
-        ("roll", "bound -11.46)"),
-        ("vx", "bound -1)"),
-        ("yaw_rate", "bound 57.3)"),
-        ("rotor speed", "bound 180)"),
-        ("change of rotor speed", "bound 0.1)"),
-        ("change of rotor speed", "bound -0.1)"),
+    assert [problem.split(" of ", 1)[1] for problem in result.problems] == [
+        "rotor speed (rotor limit 200 rad/s)",
+        "roll (limit 11.46 deg)",
+        "roll (limit -11.46 deg)",
+        "vx (limit -1 m/s)",
+        "yaw_rate (limit 57.3 deg/s)",
+        "rotor speed (limit 180 rad/s)",
+        "rotor speed change per period (limit 0.1 rad/s)",
+        "rotor speed change per period (limit -0.1 rad/s)",
     ]
-    assert f"rotor speed up to {needed.speeds.max():.4g} rad/s (limit 200)" in result.problems
-    assert f"vx down to {needed.state[:, INDEX['vx']].min():.4g} m/s (bound -1)" in result.problems
-    assert "rad/s per period" in result.problems[-1]
-    assert result.problems[0] in result.sentence
+    assert result.problems[0].startswith(f"{needed.speeds.max():.3g} rad/s of ")
+    assert result.problems[3].startswith(f"{needed.state[:, INDEX['vx']].min():.3g} m/s of ")
+    assert result.sentence == f"The course needs {result.problems[0]}; seven other limits are exceeded, too."
     assert result.yaw_rate == pytest.approx(math.degrees(3.0))
     turned = np.degrees(np.angle(np.exp(1j * needed.state[:, INDEX["yaw"]])))
     assert result.yaw == pytest.approx(np.abs(turned).max())  # nearly three turns are half a turn from zero at most
@@ -153,6 +151,18 @@ def test_every_limit_and_bound_that_is_left_is_named(vehicle: Vehicle) -> None:
     assert within.problems == ()
     assert "at 1 s" in within.sentence
     assert f"{result.yaw:.1f} deg" in within.sentence
+
+
+@pytest.mark.parametrize(
+    ("rate", "bound", "shown"),
+    [(114.6, 100.0, "115"), (114.2, 114.1, "114.2"), (40.04, 40.0, "40.04"), (999.96, 900.0, "1000")],
+)
+def test_a_value_has_the_digits_that_tell_it_from_its_limit(
+    vehicle: Vehicle, rate: float, bound: float, shown: str
+) -> None:
+    _, needed = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.0 * t, math.radians(rate) * t))
+    (problem,) = assess(needed, vehicle, bounds={"yaw_rate": (-bound, bound)}).problems
+    assert problem == f"{shown} deg/s of yaw_rate (limit {bound:g} deg/s)"
 
 
 def test_falling_faster_than_free_is_thrust_downwards(vehicle: Vehicle) -> None:
@@ -168,8 +178,9 @@ def test_a_torque_beyond_the_thrust_is_not_flyable(vehicle: Vehicle) -> None:
     least = 0.25 * (vehicle.mass * vehicle.gravity - most / vehicle.drag_to_thrust)
     assert result.thrust_min == pytest.approx(least)
     fast, pulled = result.problems
-    assert f"{result.rotor_max:.4g} rad/s" in fast
-    assert f"{least:.4g} N" in pulled
+    assert f"{result.rotor_max:.3g} rad/s" in fast
+    assert result.sentence == f"The course needs {fast}; another limit is exceeded, too."
+    assert f"{least:.3g} N" in pulled
     assert result.rotor_min == 0.0
     bounded = assess(needed, vehicle, bounds={"speed": (0.0, 250.0)})
     assert bounded.problems == result.problems  # a bound as wide as the limit is not named again

@@ -46,7 +46,7 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
         return tuple(missed)
     assembly = Assembly(scenario)
     required = report(assembly)
-    missed += [f"the course requires {problem}" for problem in required.problems]
+    missed += [f"the course needs {problem}" for problem in required.problems]
     if required.advice:
         return (*missed, required.advice)
     return tuple(missed)

@@ -78,6 +78,24 @@ def _named(pattern: str, quantities: Sequence[str], axes: Sequence[str] = ("x", 
     return {quantity: pattern.format(axis) for quantity, axis in zip(quantities, axes, strict=True)}
 
 
+def _with_yaw(
+    name: str, *, position: str, velocity: str, acceleration: str, unused: tuple[str, ...] = ()
+) -> TableFormat:
+    """Return a format with yaw as a column, by the patterns of its columns per axis."""
+    return TableFormat(
+        name=name,
+        columns={
+            "t": "t",
+            **_named(position, POSITION_QUANTITIES),
+            "yaw": "yaw",
+            **_named(velocity, VELOCITY_QUANTITIES),
+            **_named(acceleration, ACCELERATION_QUANTITIES),
+        },
+        groups=(("yaw",), VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
+        unused=unused,
+    )
+
+
 def _coefficients(axis: str) -> tuple[str, ...]:
     """Return the columns of an axis' polynomial, from the constant up."""
     return tuple(f"{axis}^{i}" for i in range(POLYNOMIAL_DEGREE + 1))
@@ -91,17 +109,7 @@ POLYNOMIALS: Final = TableFormat(
     groups=(_coefficients("yaw"),),
 )
 TABLE_FORMATS: Final = (
-    TableFormat(
-        name="quadsim",
-        columns={
-            "t": "t",
-            **_named("{}", POSITION_QUANTITIES),
-            "yaw": "yaw",
-            **_named("v{}", VELOCITY_QUANTITIES),
-            **_named("a{}", ACCELERATION_QUANTITIES),
-        },
-        groups=(("yaw",), VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
-    ),
+    _with_yaw("quadsim", position="{}", velocity="v{}", acceleration="a{}"),
     TableFormat(
         name="pmm_uav_planner, Agilicious",
         columns={
@@ -115,16 +123,11 @@ TABLE_FORMATS: Final = (
         unused=tuple(f"{name}_{axis}" for name in ("w", "a_lin", "a_rot", "j", "s") for axis in "xyz")
         + tuple(f"u_{i}" for i in range(1, 5)),
     ),
-    TableFormat(
-        name="uav_trajectories, sampled",
-        columns={
-            "t": "t",
-            **_named("pos{}", POSITION_QUANTITIES),
-            "yaw": "yaw",
-            **_named("vel{}", VELOCITY_QUANTITIES),
-            **_named("acc{}", ACCELERATION_QUANTITIES),
-        },
-        groups=(("yaw",), VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
+    _with_yaw(
+        "uav_trajectories, sampled",
+        position="pos{}",
+        velocity="vel{}",
+        acceleration="acc{}",
         unused=tuple(f"{name}{axis}" for name in ("jerk", "snap") for axis in "xyz"),
     ),
     POLYNOMIALS,
