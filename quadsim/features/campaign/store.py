@@ -184,11 +184,11 @@ def start_session(plan: Plan, files: Growing, session: Mapping[str, Any], *, fly
         SCENARIO_FILE: plan.scenario.to_toml(),
     }  # files that need no others
     files.write({name: text.encode() for name, text in texts.items()})
-    write(manifest, files)
+    write_manifest(manifest, files)
     return manifest
 
 
-def write(manifest: Mapping[str, Any], files: Growing) -> None:
+def write_manifest(manifest: Mapping[str, Any], files: Growing) -> None:
     """Write or replace the manifest in one step."""
     files.write({MANIFEST_FILE: to_json(manifest).encode()})
 
