@@ -110,8 +110,11 @@ def verdict_sentence(summary: CampaignSummary) -> str:
 
 def definition_sentence(summary: CampaignSummary, failure: Sequence[str]) -> str:
     """Return what counts as failure, and how many flights violated a constraint where that alone does not count."""
-    units = {name: metric["unit"] for name, metric in summary["metrics"].items()}
-    units |= {MARGIN + name: constraint["unit"] for name, constraint in summary["constraints"].items()}
+    units: dict[str, str] = {}
+    for name, metric in summary["metrics"].items():
+        units[name] = metric["unit"]
+    for name, constraint in summary["constraints"].items():
+        units[MARGIN + name] = constraint["unit"]
     events = [parse_event(text) for text in failure]
     listed = []
     for event in events:
@@ -286,10 +289,12 @@ def group_table(summary: CampaignSummary) -> Grid:
     for name, groups in cells.items():
         missing = [ABSENT] * (size - len(groups))
         lines.append(line(name, *groups, *missing))
-    numbers_of_groups = [f"group {k + 1}" for k in range(size)]
+    head = ["varied parameter"]
+    for k in range(size):
+        head.append(f"group {k + 1}")
     note = "Share of failed flights among those with such values; groups are of about equal size, or by value where "
     note += f"there are few. Over all flights it is {percent(failure['share'])}."
-    return _grid("groups", ("varied parameter", *numbers_of_groups), lines, note)
+    return _grid("groups", head, lines, note)
 
 
 def _group_cells(parameter: Mapping[str, Any]) -> list[str]:
@@ -449,14 +454,15 @@ def campaign_overview(table: pa.Table, summary: CampaignSummary, title: str) -> 
             return strongest.index(name)
         return len(strongest)
 
-    panels = histograms(table)[:1]
+    chosen = histograms(table)[:1]
     by_name = {}
     for panel in scatters(table):
         name, _, _unit = panel.x_label.partition(" [")
         by_name[name] = panel
     for name in sorted(by_name, key=rank)[:_MOST_SCATTERS]:
-        panels.append(by_name[name])
-    return Figure(key="campaign", title=title, panels=tuple(replace(panel, height=1.4) for panel in panels))
+        chosen.append(by_name[name])
+    panels = tuple(replace(panel, height=1.4) for panel in chosen)
+    return Figure(key="campaign", title=title, panels=panels)
 
 
 def histograms(table: pa.Table) -> list[Panel]:

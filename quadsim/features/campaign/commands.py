@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from quadsim.features.campaign.paired import PairedComparison
     from quadsim.features.campaign.plan import Plan
     from quadsim.features.campaign.sweep import Sweep
+    from quadsim.flight.audit import Limit
     from quadsim.scenarios.schema.scenario import Scenario
 
     CampaignName: TypeAlias = ScenarioName
@@ -353,8 +354,8 @@ def compare_directories(
         names = (first_plan.spec.name, second_plan.spec.name)
     first_table = read_flights(first / FLIGHTS_FILE, first_plan.schema)
     second_table = read_flights(second / FLIGHTS_FILE, second_plan.schema)
-    first_limits = tuple(limit.with_tolerances() for limit in first_plan.limits)
-    second_limits = tuple(limit.with_tolerances() for limit in second_plan.limits)
+    first_limits = _audited_limits(first_plan)
+    second_limits = _audited_limits(second_plan)
     audits: list[str] = []
     if constraints is None:
         audits = limit_differences(first_limits, second_limits)
@@ -374,3 +375,8 @@ def compare_directories(
         return comparison
     with after(comparison, out):
         return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))
+
+
+def _audited_limits(plan: Plan) -> tuple[Limit, ...]:
+    """Return the limits of a campaign's audit with both tolerances stated."""
+    return tuple(limit.with_tolerances() for limit in plan.limits)

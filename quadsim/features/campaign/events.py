@@ -10,7 +10,7 @@ import contextlib
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -139,6 +139,11 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> 
     if not math.isfinite(number):
         raise ParameterError(f"event {text!r}", "number", threshold, "a finite number")
     return CountedEvent(f"{column} {operation} {number:.15g}", column, operation, number)
+
+
+def standard_forms(texts: Iterable[str]) -> list[str]:
+    """Events in their standard form, see `CountedEvent.text`."""
+    return [parse_event(text).text for text in texts]
 
 
 def is_comparable(kind: pa.DataType) -> bool:

@@ -17,7 +17,14 @@ import pyarrow as pa
 
 from quadsim.console.results import Shown, Tabular
 from quadsim.errors import InputError
-from quadsim.features.campaign.events import EVENT_NAMES, INCOMPLETE, UNAUDITED, FlightFlags, parse_event
+from quadsim.features.campaign.events import (
+    EVENT_NAMES,
+    INCOMPLETE,
+    UNAUDITED,
+    FlightFlags,
+    parse_event,
+    standard_forms,
+)
 from quadsim.features.campaign.rows import (
     DRAW,
     MARGIN,
@@ -275,11 +282,15 @@ class PairedComparison(Tabular):
 
     def to_markdown(self) -> str:
         """Return verdict, tables and differences as Markdown."""
-        head = f"# {self.names[1]} against {self.names[0]}\n"
-        answer = [f"{sentence}\n" for sentence in self._answer()]
-        tables = [section(table) for table in self.tables]
-        differences = [section(table) for table in self.difference_tables]
-        return "\n".join([head, *answer, *tables, f"{self.pairing}\n", *differences])
+        parts = [f"# {self.names[1]} against {self.names[0]}\n"]
+        for sentence in self._answer():
+            parts.append(f"{sentence}\n")
+        for table in self.tables:
+            parts.append(section(table))
+        parts.append(f"{self.pairing}\n")
+        for table in self.difference_tables:
+            parts.append(section(table))
+        return "\n".join(parts)
 
     def write_report(self, directory: Path, *, overwrite: bool = False) -> Path:
         """Write `index.html`, `comparison.json` and `comparison.md`, together or not at all; the page.
@@ -381,8 +392,8 @@ def compare_pairs(
 
 def _require_same_failures(names: Sequence[str], failures: tuple[Sequence[str], Sequence[str]]) -> None:
     """Refuse campaigns that count different events as failure."""
-    first = sorted({parse_event(text).text for text in failures[0]})
-    second = sorted({parse_event(text).text for text in failures[1]})
+    first = sorted(set(standard_forms(failures[0])))
+    second = sorted(set(standard_forms(failures[1])))
     if first != second:
         raise InputError(
             f"{names[0]!r} counts {', '.join(first)} as failure, and {names[1]!r} {', '.join(second)}: only "
@@ -428,14 +439,14 @@ def _compare_events(a: pa.Table, b: pa.Table, *, audited_alike: bool) -> tuple[E
     only_a = {}
     only_b = {}
     p = {}
-    tested = []
+    tested = {}
     for event, (in_a, in_b) in happened.items():
         only_a[event] = int((in_a & ~in_b).sum())
         only_b[event] = int((in_b & ~in_a).sum())
         p[event] = mcnemar(only_a[event], only_b[event])
         if only_a[event] or only_b[event]:
-            tested.append(event)
-    p_holm = dict(zip(tested, holm([p[event] for event in tested]), strict=True))
+            tested[event] = p[event]
+    p_holm = dict(zip(tested, holm([*tested.values()]), strict=True))
     comparisons = []
     for event, (in_a, in_b) in happened.items():
         comparisons.append(
@@ -593,24 +604,38 @@ def metrics_figure(comparison: PairedComparison) -> Figure | None:
     level = 100.0 * CONFIDENCE
     title = f"{b} less {a}, in % of {a}'s mean, with {level:g} % interval"
     panel = Panel(
-        title=title, y_label="difference [%]", x_label="metric", x_names=tuple(names), series=tuple(curves),
-        bounds=(Bound(value=0.0),), height=1.3,
-    )  # fmt: skip
+        title=title,
+        y_label="difference [%]",
+        x_label="metric",
+        x_names=tuple(names),
+        series=tuple(curves),
+        bounds=(Bound(value=0.0),),
+        height=1.3,
+    )
     return Figure(key="metrics", title="Tracking and commands", panels=(panel,), columns=1)
 
 
 def events_figure(comparison: PairedComparison) -> Figure | None:
     """Plot the shares of the pairs in which events happened to each campaign's flight; None where none did."""
-    happened = [event for event in comparison.events if any(event.counts)][:_EVENTS_DRAWN]
+    happened = []
+    for event in comparison.events:
+        if any(event.counts):
+            happened.append(event)
     if not happened:
         return None
+    happened = happened[:_EVENTS_DRAWN]
     curves = []
     for i, name in enumerate(comparison.names):
-        values = np.array([100.0 * event.counts[i] / event.pairs for event in happened])
-        place = np.arange(len(happened), dtype=np.float64) + 0.2 * (i - 0.5)
-        curves.append(Series(x=place, y=values, colour=line_colour(i), label=name, style="points", width=6.0))
+        shares = np.array([100.0 * event.counts[i] / event.pairs for event in happened])
+        places = np.arange(len(happened), dtype=np.float64) + 0.2 * (i - 0.5)
+        curves.append(Series(x=places, y=shares, colour=line_colour(i), label=name, style="points", width=6.0))
     panel = Panel(
-        title="share of the pairs", y_label="share [%]", x_label="event", series=tuple(curves),
-        x_names=tuple(event.event for event in happened), whole=True, height=1.3,
-    )  # fmt: skip
+        title="share of the pairs",
+        y_label="share [%]",
+        x_label="event",
+        series=tuple(curves),
+        x_names=tuple(event.event for event in happened),
+        whole=True,
+        height=1.3,
+    )
     return Figure(key="events", title="Failures and other events", panels=(panel,), columns=1)

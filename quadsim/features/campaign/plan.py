@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from quadsim.errors import FileError, InputError, ParameterError, QuadsimError
 from quadsim.features.campaign.campaign_file import CampaignFile, Draws, Value, Varied
-from quadsim.features.campaign.events import CountedEvent, parse_event
+from quadsim.features.campaign.events import CountedEvent, parse_event, standard_forms
 from quadsim.features.campaign.rows import DRAW, TIMES, flown_row, make_schema
 from quadsim.flight.audit import Limit
 from quadsim.rollout.flown import Flight
@@ -78,8 +78,7 @@ class Plan:
     def schema(self) -> pa.Schema:
         """The columns of its results."""
         drawn = {entry.name: (column_type(entry), entry.unit) for entry in self.spec.vary}
-        failure = [parse_event(text).text for text in self.spec.failure]
-        return make_schema(drawn, self.limits, failure)
+        return make_schema(drawn, self.limits, standard_forms(self.spec.failure))
 
     @cached_property
     def limits(self) -> tuple[Limit, ...]:

@@ -47,7 +47,7 @@ def judged_by(
             all_reached &= ~unknown
     verdict = texts(table, "verdict")
     by_audit = np.isin(verdict.astype(str), (HARMLESS, "violated", INCOMPLETE))
-    failed_by = np.array([value is not None for value in table["failed_by"].to_pylist()], bool)
+    failed_by = ~null(table, "failed_by")
     audit_verdict = np.where(failed_by | ~all_held, "violated", np.where(all_reached, HARMLESS, INCOMPLETE))
     verdicts = np.where(by_audit, audit_verdict, verdict)
     violated = np.where(by_audit, verdicts == "violated", flags(table, "violated", absent=True))

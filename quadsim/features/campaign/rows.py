@@ -252,7 +252,13 @@ def texts(table: pa.Table, name: str) -> Texts:
         words = table[name].cast(pa.string())
     else:
         words = table[name]
-    return np.array(["-" if value is None else str(value) for value in words.to_pylist()], object)
+    values = []
+    for value in words.to_pylist():
+        if value is None:
+            values.append("-")
+        else:
+            values.append(str(value))
+    return np.array(values, object)
 
 
 def verdicts(table: pa.Table) -> dict[str, FlightFlags]:
@@ -291,12 +297,21 @@ def is_counted(table: pa.Table, event: CountedEvent) -> FlightFlags:
 
 def draw_names(table: pa.Table) -> list[str]:
     """The varied parameters, in order."""
-    return [name.removeprefix(DRAW) for name in table.column_names if name.startswith(DRAW)]
+    return _names_after(DRAW, table)
 
 
 def constraint_names(table: pa.Table) -> list[str]:
     """The constraints of the scenario, in order."""
-    return [name.removeprefix(SATISFIED) for name in table.column_names if name.startswith(SATISFIED)]
+    return _names_after(SATISFIED, table)
+
+
+def _names_after(prefix: str, table: pa.Table) -> list[str]:
+    """The rest of the columns' names that begin so, in order."""
+    names = []
+    for name in table.column_names:
+        if name.startswith(prefix):
+            names.append(name.removeprefix(prefix))
+    return names
 
 
 def metric_names(table: pa.Table) -> list[str]:

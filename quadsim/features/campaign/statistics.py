@@ -159,7 +159,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     ascending = np.asarray(p_values, float)[order]
     corrected = np.minimum(1.0, np.maximum.accumulate(factors * ascending))
     places = np.argsort(order, kind="stable")
-    return [float(p) for p in corrected[places]]
+    in_place: list[float] = corrected[places].tolist()
+    return in_place
 
 
 def mcnemar(only_a: int, only_b: int) -> float:

@@ -165,9 +165,12 @@ def fly_sweep(
     cut = sum(_is_cut(plan, flight) for flight in range(count))
     swept = _swept_columns(entries)
     results = _result_columns(make_table(rows, plan.schema), entries)
-    schema = pa.schema([*(pa.field(name, column.type) for name, column in swept.items()), *results.schema])
-    columns = [*swept.values(), *results.columns]
-    return Sweep(scenario.name, tuple(swept), pa.Table.from_arrays(columns, schema=schema), cut)
+    fields = []
+    for name, column in swept.items():
+        fields.append(pa.field(name, column.type))
+    schema = pa.schema([*fields, *results.schema])
+    whole = pa.Table.from_arrays([*swept.values(), *results.columns], schema=schema)
+    return Sweep(scenario.name, tuple(swept), whole, cut)
 
 
 def _result_columns(table: pa.Table, entries: Sequence[GridValues]) -> pa.Table:
@@ -214,11 +217,17 @@ def _swept_columns(entries: Sequence[GridValues]) -> dict[str, pa.Array]:
     """Return the columns of the swept values, by the dotted path of each number or text."""
     rows: list[dict[str, Any]] = []
     paths: dict[str, None] = {}  # in the order in which they appear
-    for combination in itertools.product(*(entry.values for entry in entries)):
-        together = {tuple(entry.fields): value for entry, value in zip(entries, combination, strict=True)}
+    values = [entry.values for entry in entries]
+    for combination in itertools.product(*values):
+        together = {}
+        for entry, value in zip(entries, combination, strict=True):
+            together[tuple(entry.fields)] = value
         row = {}
-        for path, value in leaves(separate(together, source="sweep"), entries=True):
-            row[path] = cell(value)
+        for path, leaf in leaves(separate(together, source="sweep"), entries=True):
+            row[path] = cell(leaf)
             paths[path] = None
         rows.append(row)
-    return {path: pa.array([row.get(path) for row in rows]) for path in paths}
+    columns = {}
+    for path in paths:
+        columns[path] = pa.array([row.get(path) for row in rows])
+    return columns
