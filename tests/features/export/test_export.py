@@ -14,7 +14,7 @@ import scipy.linalg
 import quadsim
 from quadsim.commands.cli import main
 from quadsim.errors import ExportError, OutputError, ParameterError
-from quadsim.features.export.exporter import FACTS, c_controller, export, exported_law, room_sentence
+from quadsim.features.export.exporter import FACTS, c_controller, export, exported_law, memory_sentence
 from quadsim.features.export.record import record
 from quadsim.mpc.export.ctext import CText
 from quadsim.mpc.export.geometric import CGeometric
@@ -104,7 +104,7 @@ def test_capacity_is_as_requested_and_its_reach_is_stated(tmp_path: Path) -> Non
         directory = quadsim.export(quadsim.load("paper-constrained", SHORT), tmp_path / str(rows), rows=rows)
         facts.append(json.loads((directory / FACTS).read_text()))
         assert f".room = {rows + 1}," in (directory / DATA).read_text()
-        assert room_sentence(facts[-1]) in (directory / "README.md").read_text().lower()
+        assert memory_sentence(facts[-1]) in (directory / "README.md").read_text().lower()
     few, many = facts
     assert few["memory_bytes"] < many["memory_bytes"]
     assert 0.0 < few["reach"]["distance"] < many["reach"]["distance"]
