@@ -22,7 +22,7 @@ from quadsim.features.export.record import Recording, record
 from quadsim.mpc.export.ctext import CText, Precision
 from quadsim.mpc.export.geometric import CGeometric
 from quadsim.mpc.export.nonlinear import CNonlinear
-from quadsim.mpc.export.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
+from quadsim.mpc.export.source import BODY_FILES, CHANGES, DATA_FILE, CController, CSource, c_source
 from quadsim.mpc.export.targets import TARGETS, Machine
 from quadsim.mpc.laws.geometric import Geometric
 from quadsim.mpc.laws.nonlinear import Nonlinear
@@ -239,7 +239,7 @@ def c_controller(scenario: Scenario | Assembly, precision: Precision = "double",
     table = scenario.controller
     title = _title(scenario)
     if not isinstance(table, Nonlinear | Geometric):
-        return CController(law=exported_law(scenario), precision=precision, title=title, asked=rows)
+        return CController(law=exported_law(scenario), precision=precision, title=title, requested_rows=rows)
     if isinstance(table, Nonlinear) and table.avoidance is not None and (scenario.obstacles or assembly.regions):
         raise ExportError(AVOIDS)
     if table.commands != ROTORS and table.inner_lag is None:
@@ -250,7 +250,7 @@ def c_controller(scenario: Scenario | Assembly, precision: Precision = "double",
         "motion": assembly.motion is not None,
         "precision": precision,
         "title": title,
-        "asked": rows,
+        "requested_rows": rows,
     }
     if isinstance(table, Geometric):
         if rows is not None:
@@ -304,9 +304,9 @@ def programs(controller: CSource, target: Machine) -> dict[str, str]:
     """Return the files that run the controller on a target, by name."""
     files = {}
     for name in ("main.c", "serial.c", "target.h", *target.sources, "LICENSE"):
-        files[name] = part(name)
+        files[name] = c_source(name)
     settings = target.makefile(controller.defines)
-    files["Makefile"] = f"{settings}CONTROLLER = {controller.objects}\n{part('Makefile')}"
+    files["Makefile"] = f"{settings}CONTROLLER = {controller.objects}\n{c_source('Makefile')}"
     return files
 
 
@@ -338,7 +338,7 @@ def vector_files(recording: Recording, controller: CSource) -> dict[str, str]:
         "const struct quadsim_vector quadsim_vectors[QUADSIM_VECTORS] = {",
         ",\n".join(periods) + "\n};\n",
     ]
-    header = controller.filled(part("vectors.h"))
+    header = controller.filled(c_source("vectors.h"))
     header = header.replace("@COUNT@", str(len(periods))).replace("@PATH@", str(len(path)))
     return {"vectors.h": header, "vectors.c": "\n".join(source)}
 
@@ -372,7 +372,7 @@ state, and of the C library `memcpy`, `memmove` and `memset`.
 | `{law}.h` | the interface: state order, units, frames |
 | `{law}.c`, {sources} | the law, the same for every controller of its kind |
 | `quadsim_guard.{{h,c}}` | what is flown without an answer of the law, and the completion of lacking measurements |
-| `{DATA}` | this controller's numbers, and the memory that it needs |
+| `{DATA_FILE}` | this controller's numbers, and the memory that it needs |
 | `{FACTS}` | {facts} |
 | `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
 | `main.c`, `Makefile` | `make check` runs these periods and compares |
