@@ -270,14 +270,36 @@ class PairedComparison(Tabular):
         rows: list[dict[str, Any]] = []
         for event in self.events:
             first, second = event.counts
-            row: dict[str, Any] = {"kind": "event", "name": event.event, "unit": "-", "pairs": event.pairs}
-            row |= {"first": first / event.pairs, "second": second / event.pairs, "difference": event.difference}
-            rows.append({**row, "lower": None, "upper": None, "p_holm": event.p_holm})
+            rows.append(
+                {
+                    "kind": "event",
+                    "name": event.event,
+                    "unit": "-",
+                    "pairs": event.pairs,
+                    "first": first / event.pairs,
+                    "second": second / event.pairs,
+                    "difference": event.difference,
+                    "lower": None,
+                    "upper": None,
+                    "p_holm": event.p_holm,
+                }
+            )
         for metric in self.metrics:
             difference = metric.difference
-            row = {"kind": "metric", "name": metric.name, "unit": metric.unit, "pairs": difference.pairs}
-            row |= {"first": metric.mean_a, "second": metric.mean_b, "difference": difference.mean}
-            rows.append({**row, "lower": difference.lower, "upper": difference.upper, "p_holm": None})
+            rows.append(
+                {
+                    "kind": "metric",
+                    "name": metric.name,
+                    "unit": metric.unit,
+                    "pairs": difference.pairs,
+                    "first": metric.mean_a,
+                    "second": metric.mean_b,
+                    "difference": difference.mean,
+                    "lower": difference.lower,
+                    "upper": difference.upper,
+                    "p_holm": None,
+                }
+            )
         return rows
 
     def to_markdown(self) -> str:
@@ -570,6 +592,24 @@ def _is_absent_or_path(value: Any) -> bool:
     return value is None or (isinstance(value, str) and Path(value).is_absolute())
 
 
+_DIRECTION_COLOURS: Final = {
+    "better": COLOUR.satisfied,
+    "worse": COLOUR.violated,
+    "not beyond chance": COLOUR.measured,
+}
+
+
+def _direction(metric: MetricComparison, mean_difference: float) -> str:
+    """Return whether the second campaign is better or worse in a metric, beyond chance."""
+    if not metric.is_beyond_chance:
+        return "not beyond chance"
+    if metric.name == "worst_margin":  # the larger, the better; of all others the smaller
+        mean_difference = -mean_difference
+    if mean_difference < 0.0:
+        return "better"
+    return "worse"
+
+
 def metrics_figure(comparison: PairedComparison) -> Figure | None:
     """Plot the metrics' differences, with intervals, as shares of the first campaign's means; None without any."""
     names: list[str] = []
@@ -580,19 +620,8 @@ def metrics_figure(comparison: PairedComparison) -> Figure | None:
             continue
         scale = 100.0 / abs(metric.mean_a)
         place = np.array([float(len(names))])
-        if metric.name == "worst_margin":
-            better = difference.mean > 0.0
-        else:
-            better = difference.mean < 0.0
-        if not metric.is_beyond_chance:
-            colour = COLOUR.measured
-            label = "not beyond chance"
-        elif better:
-            colour = COLOUR.satisfied
-            label = "better"
-        else:
-            colour = COLOUR.violated
-            label = "worse"
+        label = _direction(metric, difference.mean)
+        colour = _DIRECTION_COLOURS[label]
         ends = scale * np.array([difference.lower, difference.upper])
         mean = scale * np.array([difference.mean])
         curves.append(Series(x=np.repeat(place, 2), y=ends, colour=colour, width=2.0))

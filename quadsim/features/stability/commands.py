@@ -40,12 +40,12 @@ def stability(
     """Measure the margins of a closed loop: how fast it settles, and what makes it unstable.
 
     Two flights of one seed hold a hover, one of them pushed a little; the growth of their difference tells whether the
-    loop is stable, whatever its law.  Each quantity is then changed in both directions, by bisection to 2 %.
+    loop is stable, whatever its controller.  Each quantity is then changed in both directions, by bisection to 2 %.
 
     Args:
         scenario: library name, or path to a TOML file; its vehicle, controller, effects and sensors are used.
         over: quantities: heading, delay, lag, mass, thrust, inertia, period, drag, tilt (default: all).
-        controller: controllers side by side, in place of the scenario's: names of laws, module:Class, or scenarios
+        controller: controllers side by side, in place of the scenario's: their names, module:Class, or scenarios
             whose controller is meant; in Python also classes.
         map: two quantities; the loop is also measured over both together.
         heading: of the nominal hover [deg] (default: the one that the course has most).
@@ -68,8 +68,8 @@ def stability(
 
     Examples:
         >>> import quadsim
-        >>> found = quadsim.stability("hover", over=["delay"], workers=1, progress=False)
-        >>> loop = found.loops[0]
+        >>> report = quadsim.stability("hover", over=["delay"], workers=1, progress=False)
+        >>> loop = report.loops[0]
         >>> loop.growth.verdict, loop.growth.rate < -1.5  # [1/s]
         ('stable', True)
         >>> delay = loop.margins["delay"].upper

@@ -279,7 +279,7 @@ _ALL: Final = (
     ),
     VariedQuantity(
         name="period",
-        title="control period, for which the law is built anew",
+        title="control period, for which the controller is built anew",
         unit="ms",
         nominal=lambda assembly: 1e3 * assembly.scenario.control_period,
         ends=_factors,
