@@ -1,4 +1,8 @@
-"""Types of the commands' arguments: as Python reads them, and as the command line parses them."""
+"""Types of the commands' arguments: as Python reads them, and as the command line parses them.
+
+Type checkers see the first half, with what a call from Python may pass; cyclopts the second, with how a word is parsed,
+completed or refused.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +55,7 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
 
     def _whole(_: type, tokens: Sequence[Any]) -> int:
         text = tokens[0].value
-        if not text.lstrip("+-").isdecimal():  # by itself cyclopts rounds 3.7
+        if not text.lstrip("+-").isdecimal():  # left to itself, cyclopts rounds 3.7
             raise ValueError(f"must be a whole number; got {text!r:.100}")
         return int(text)
 

@@ -146,5 +146,9 @@ def commands_of(feature: str) -> Any:
 
 def owner_of(directory: Path) -> Any:
     """Import the commands of the feature that made a directory; None for a run, or for what no feature made."""
-    owning = (commands_of(name) for name, feature in FEATURES.items() if feature.owns_directories)
-    return next((commands for commands in owning if commands.owns(directory)), None)
+    for name, feature in FEATURES.items():
+        if feature.owns_directories:
+            commands = commands_of(name)
+            if commands.owns(directory):
+                return commands
+    return None

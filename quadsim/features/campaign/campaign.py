@@ -1,6 +1,8 @@
-"""Campaign execution: fly missing flights, save rows as they arrive, summarise the whole.
+"""Campaign execution: fly the missing flights, save their rows as they arrive, and summarise the whole.
 
-Beside it, one of its flights flown again.
+A flight's row depends on the campaign file and its number alone (`plan`), so a resumed campaign has the same table as
+one that was never interrupted.  Rows go to disk through `store`; the summary is `statistics.estimate` of the table.
+`recorded_flight` and `compare_replay` are for one flight that is flown again.
 """
 
 from __future__ import annotations
@@ -22,19 +24,31 @@ import pyarrow.compute as pc
 from quadsim.console.junit import Cases
 from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.features.campaign import store as records
-from quadsim.features.campaign.campaign_report import campaign_overview, write_report
+from quadsim.features.campaign.campaign_file import CampaignFile
+from quadsim.features.campaign.campaign_report import (
+    campaign_lines,
+    campaign_overview,
+    verdict_sentence,
+    write_report,
+)
 from quadsim.features.campaign.plan import Plan
-from quadsim.features.campaign.rows import make_table
+from quadsim.features.campaign.rows import CampaignSummary, make_table
 from quadsim.features.campaign.statistics import Judgement, estimate, proportion, worst_flight
 from quadsim.features.campaign.store import (
+    CAMPAIGN_FILE,
     FLIGHTS_FILE,
+    MANIFEST_FILE,
     TIMES_FILE,
+    UNREPRODUCIBLE,
     Store,
+    is_campaign,
     other_than_flew,
     read_flights,
     read_manifest,
+    require_same,
+    start_session,
     stored_plan,
+    write_manifest,
 )
 from quadsim.flight.rundir import SCENARIO_FILE
 from quadsim.outputs import Growing, digest_of, growing, optional
@@ -45,7 +59,7 @@ from quadsim.rollout.many import MEMORY, TIMEOUT, count_workers
 from quadsim.scenarios.schema.scenario import Scenario
 
 REPORT_FILES: Final = ("index.html", "campaign.png")
-_JUDGED: Final = 5  # requirements that a repr has
+_REQUIREMENTS_IN_REPR: Final = 5  # how many of them a repr lists
 CHECK_EVERY: Final = 10
 """Flights between checks of the interval, if it decides when to stop; for grids, whole repetitions."""
 
@@ -86,16 +100,17 @@ class CampaignResult(Result):
         return self.summary["campaign"], cases
 
     def __repr__(self) -> str:
-        from quadsim.features.campaign.campaign_report import verdict_sentence
-
         lines = [f"<CampaignResult {self.summary['campaign']}: {verdict_sentence(self.summary)}"]
-        for flight in self.summary["worst"][:1]:
-            lines.append(f"worst flight: {flight['flight']}, {flight['verdict']}")
-            if flight["worst_constraint"] is not None:
-                share = f"{flight['worst_margin']:.3g} times half its band"
-                lines.append(f"its worst margin: {flight['worst_constraint']}, {share}")
-        lines += [judgement.sentence for judgement in self.judgements[:_JUDGED]]
-        return "\n ".join([*lines, f"in {self.directory}>"])
+        if self.summary["worst"]:
+            worst = self.summary["worst"][0]
+            lines.append(f"worst flight: {worst['flight']}, {worst['verdict']}")
+            if worst["worst_constraint"] is not None:
+                share = f"{worst['worst_margin']:.3g} times half its band"
+                lines.append(f"its worst margin: {worst['worst_constraint']}, {share}")
+        for judgement in self.judgements[:_REQUIREMENTS_IN_REPR]:
+            lines.append(judgement.sentence)
+        lines.append(f"in {self.directory}>")
+        return "\n ".join(lines)
 
     def small_plot(self) -> Figure | None:
         """See `Result.small_plot`: worst margins and relevant parameters."""
@@ -106,8 +121,6 @@ class CampaignResult(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from quadsim.features.campaign.campaign_report import campaign_lines
-
         return campaign_lines(self.summary, self.judgements, self.directory)
 
     def to_json(self) -> dict[str, Any]:
@@ -140,73 +153,59 @@ def fly_campaign(
         raise ParameterError("", "--until-width", until_width, "between 0 and 1")
     engine = "local" if cluster is None else "dask"
     session = {"engine": engine, "workers": count_workers(workers, cluster), "flights": 0, "wall_s": None}
-    if records.is_campaign(directory) and not (resume or overwrite):
+    if is_campaign(directory) and not (resume or overwrite):
         raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
     code_digest()  # kept: a process that dies before its manifest is there could not be resumed
-    first = (records.CAMPAIGN_FILE, SCENARIO_FILE)
-    with growing(directory, records.MANIFEST_FILE, overwrite=overwrite, first=first) as files:
-        if records.is_campaign(directory):
-            records.require_same(plan, directory)
-        progress = _Progress(plan, files, until_width=until_width, watch=watch)
-        manifest = records.start_session(plan, files, session, flying=bool(progress.missing))
-        if progress.missing:
-            _put_report(files, REPORT_FILES, None)  # an earlier report lacks the flights to come
+    with growing(directory, MANIFEST_FILE, overwrite=overwrite, first=(CAMPAIGN_FILE, SCENARIO_FILE)) as files:
+        if is_campaign(directory):
+            require_same(plan, directory)
+        flying = _Session(plan, files, until_width=until_width, watch=watch)
+        manifest = start_session(plan, files, session, flying=bool(flying.missing))
+        if flying.missing:
+            files.remove(REPORT_FILES)  # an earlier report lacks the flights to come
         try:
-            progress.fly(workers, cluster)
+            flying.fly(workers, cluster)
         except BaseException:
             manifest["status"] = "interrupted"
             raise
         finally:
-            session |= {"flights": progress.flown, "wall_s": clock.perf_counter() - progress.started}
-            manifest["flown"] = int(np.count_nonzero(progress.outcomes[: progress.wanted] >= 0))
-            records.write(manifest, files)
+            session["flights"] = flying.flown
+            session["wall_s"] = clock.perf_counter() - flying.started
+            manifest["flown"] = int(np.count_nonzero(flying.outcomes[: flying.needed] >= 0))
+            write_manifest(manifest, files)
 
-        table, times = progress.store.close(progress.wanted)
-        spec = plan.spec
-        directory = files.path
-        about = {"campaign": spec.name, "scenario": plan.scenario.name, "failure": [*spec.failure]}
-        summary = about | estimate(table, plan.limits)
-        # flights by the processor that flew them; those that raised, or that no process came back from, have none
-        processors = times["machine"].drop_null().to_pylist()
-        manifest["machines"] = dict(sorted(Counter(processors).items()))
-        if progress.wanted == spec.flights:
-            manifest["status"] = "complete"
-        else:
-            manifest["status"] = "stopped"
-        manifest["files"] = {TIMES_FILE: digest_of(directory / TIMES_FILE)}
-        records.write(manifest, files)
-
-        def write(place: Path) -> None:
-            write_report(place, table, summary, spec, campaign=directory)
-
-        files.finish(summary, unhashed=records.UNREPRODUCIBLE)
+        table, summary = _close(plan, flying, manifest, files)
+        files.finish(summary, unhashed=UNREPRODUCIBLE)
         with optional("the report"):
-            _put_report(files, REPORT_FILES, write if report else None)
-        files.finish(summary, unhashed=records.UNREPRODUCIBLE)  # now with the report among its files
-    return CampaignResult(directory=directory, manifest=manifest, table=table, summary=summary)
+            if report:
+                _replace_report(files, table, summary, plan.spec)
+            else:
+                files.remove(REPORT_FILES)
+        files.finish(summary, unhashed=UNREPRODUCIBLE)  # now with the report among its files
+        return CampaignResult(directory=files.path, manifest=manifest, table=table, summary=summary)
 
 
-class _Progress:
-    """A session of flying: rows on disk, missing flights, and rows not yet written."""
+class _Session:
+    """A session of flying: the rows on disk, the missing flights, and when there are enough of them."""
 
     def __init__(self, plan: Plan, files: Growing, *, until_width: float | None, watch: Watch) -> None:
         self._plan = plan
         self._width = until_width
         self._watch = watch
         self.store = Store(files, plan.schema)
-        self.wanted = plan.spec.flights
+        self.needed = plan.spec.flights  # fewer once the interval is narrow enough
         self.flown = 0
         self._checked = 0
         self.started = clock.perf_counter()
-        self.outcomes = np.full(plan.spec.flights, -1, np.int8)  # not flown, passed, failed
-        there = self.store.table()
-        there = there.filter(pc.less(there["flight"], plan.spec.flights))
-        self.outcomes[there["flight"].to_numpy()] = there["failed"].to_numpy(zero_copy_only=False)
+        self.outcomes = np.full(plan.spec.flights, -1, np.int8)  # -1 not flown, 0 passed, 1 failed
+        stored = self.store.table()
+        stored = stored.filter(pc.less(stored["flight"], plan.spec.flights))
+        self.outcomes[stored["flight"].to_numpy()] = stored["failed"].to_numpy(zero_copy_only=False)
 
     @property
     def missing(self) -> list[int]:
         """Return the missing flights."""
-        if self._is_sure():
+        if self._is_narrow_enough():
             return []
         return list(np.flatnonzero(self.outcomes < 0).tolist())
 
@@ -218,8 +217,8 @@ class _Progress:
         """
         missing = self.missing
         counted = self.store.counted()
-        if self._is_sure() and self.wanted < counted:
-            narrow = f"the interval is as narrow after {self.wanted} of the {counted} flights that are there"
+        if self._is_narrow_enough() and self.needed < counted:
+            narrow = f"the interval is as narrow after {self.needed} of the {counted} flights that are there"
             raise InputError(f"--until-width would leave out flights: {narrow}; go on without it")
         try:
             with closing(self._plan.fly_all(missing, workers=workers, cluster=cluster)) as rows:
@@ -227,44 +226,71 @@ class _Progress:
                     self.store.add(row)
                     self.flown += 1
                     self.outcomes[row["flight"]] = row["failed"]
-                    there, failed = (int(np.count_nonzero(self.outcomes >= least)) for least in (0, 1))
-                    rate = self.flown / (clock.perf_counter() - self.started)
-                    self._watch(CampaignProgress(flown=there, flights=self.wanted, failed=failed, rate=rate))
-                    if self._is_sure():
+                    self._watch(self._progress())
+                    if self._is_narrow_enough():
                         return
         finally:
             self.store.flush()
 
-    def _is_sure(self) -> bool:
+    def _progress(self) -> CampaignProgress:
+        completed = int(np.count_nonzero(self.outcomes >= 0))
+        failed = int(np.count_nonzero(self.outcomes >= 1))
+        rate = self.flown / (clock.perf_counter() - self.started)
+        return CampaignProgress(flown=completed, flights=self.needed, failed=failed, rate=rate)
+
+    def _is_narrow_enough(self) -> bool:
         """Return whether the interval is narrow enough after the first n flights, for the smallest such n.
 
         Only flights without a gap before them count, so that the answer does not depend on which came back first.
         """
-        if self._width is None or self.wanted < self.outcomes.size:
-            return self._width is not None
-        whole = int(np.argmax(np.append(self.outcomes, -1) < 0))
+        if self._width is None:
+            return False
+        if self.needed < self.outcomes.size:
+            return True
+        without_gap = int(np.argmax(np.append(self.outcomes, -1) < 0))
         every = math.lcm(CHECK_EVERY, self._plan.spec.cells)  # whole turns of the grids
-        for count in range(self._checked + every, whole + 1, every):
+        for count in range(self._checked + every, without_gap + 1, every):
             self._checked = count
-            share = proportion(int(np.count_nonzero(self.outcomes[:count] == 1)), count)
+            failures = int(np.count_nonzero(self.outcomes[:count] == 1))
+            share = proportion(failures, count)
             if share["upper"] - share["lower"] <= self._width:
-                self.wanted = count
+                self.needed = count
                 return True
         return False
 
 
-def _put_report(files: Growing, names: Sequence[str], write: Callable[[Path], object] | None) -> None:
-    """Move the files that a function writes into a directory; without a function, remove an earlier report.
+def _close(plan: Plan, flying: _Session, manifest: dict[str, Any], files: Growing) -> tuple[pa.Table, dict[str, Any]]:
+    """Write the final tables and the manifest of them; return the table of flights and its summary.
 
     Raises:
         OutputError: they cannot be written.
     """
+    table, times = flying.store.close(flying.needed)
+    summary = {"campaign": plan.spec.name, "scenario": plan.scenario.name, "failure": [*plan.spec.failure]}
+    summary |= estimate(table, plan.limits)
+    # flights by the processor that flew them; those that raised, or that no process came back from, have none
+    processors = times["machine"].drop_null().to_pylist()
+    manifest["machines"] = dict(sorted(Counter(processors).items()))
+    if flying.needed == plan.spec.flights:
+        manifest["status"] = "complete"
+    else:
+        manifest["status"] = "stopped"
+    manifest["files"] = {TIMES_FILE: digest_of(files.path / TIMES_FILE)}
+    write_manifest(manifest, files)
+    return table, summary
+
+
+def _replace_report(files: Growing, table: pa.Table, summary: CampaignSummary, spec: CampaignFile) -> None:
+    """Write the report in place of an earlier one, of which no file stays.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
     with tempfile.TemporaryDirectory() as scratch:
-        if write is not None:
-            write(Path(scratch))
-        made = {path.name: path.read_bytes() for path in Path(scratch).iterdir()}
-    files.remove([name for name in names if name not in made])
-    files.write(made)
+        write_report(Path(scratch), table, summary, spec, campaign=files.path)
+        written = {path.name: path.read_bytes() for path in Path(scratch).iterdir()}
+    files.remove([name for name in REPORT_FILES if name not in written])
+    files.write(written)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,7 +301,7 @@ class Recorded:
     row: Mapping[str, Any]  # of `flights.parquet`
     plan: Plan
     scenario: Scenario
-    notes: Sequence[str]  # what a person should know before it is flown again
+    notes: Sequence[str]  # reasons for which its numbers may differ when it is flown again
 
 
 def recorded_flight(directory: Path, number: int | None) -> Recorded:
@@ -289,7 +315,8 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
         raise ParameterError("", "--flight", number, f"one of the flights 0 to {flights[-1]} of {directory}")
     row = table.slice(flights.index(number), 1).to_pylist()[0]
     notes = []
-    if differing := other_than_flew(read_manifest(directory), plan):
+    differing = other_than_flew(read_manifest(directory), plan)
+    if differing:
         notes.append(f"other {', '.join(differing)} flew that campaign, so numbers may differ")
     if row["verdict"] in (TIMEOUT, MEMORY):
         ended = f"flight {number} was ended in the campaign ({row['reason']})"
@@ -341,5 +368,8 @@ def compare_replay(flight: Flight, recorded: Recorded) -> Replay:
     """Compare a replayed flight with the campaign's record of it."""
     row = recorded.plan.row_of(recorded.number, flight)
     (again,) = make_table([row], recorded.plan.schema).to_pylist()
-    differing = [name for name, value in recorded.row.items() if name not in again or again[name] != value]
+    differing = []
+    for name, value in recorded.row.items():
+        if name not in again or again[name] != value:
+            differing.append(name)
     return Replay(recorded=recorded, flight=flight, differing=differing)

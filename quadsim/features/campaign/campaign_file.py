@@ -1,8 +1,8 @@
 """The campaign file: scenario, number of flights, varied fields, failure; and the draws of each flight.
 
 Each flight's own generator is seeded by `SeedSequence([campaign seed, flight])`, so that neither the number of flights
-nor the worker matters; spread samplings take the points of `scipy.stats.qmc` in order instead.  Points in the unit
-cube become values through the inverse of each distribution function.
+nor the worker matters; spread samplings take the points of `scipy.stats.qmc` in order instead.  A coordinate u of a
+point in the unit cube becomes the value x = F^-1(u), F the distribution function.  `plan` puts it into the scenario.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ Unit = Annotated[str, MaxLen(20), doc("of the values, for tables and plots")]
 Value = bool | WholeNumber | Number | str | list[Number]
 """Values of a list to draw from: any value of a scenario's field except tables."""
 MOST_FLIGHTS: Final = 1_000_000
-_TAIL: Final = 1e-3  # share of a distribution beyond the values taken as its ends
+_TAIL: Final = 1e-3  # probability beyond the quantiles taken as the ends of an unbounded distribution
+_MOST_DEVIATIONS: Final = 8.0  # from the mean to a range from which something is still drawn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +60,7 @@ class Varied:
         raise NotImplementedError
 
     def extremes(self) -> list[Value]:
-        """Return the values at the ends, or all of a list: if these can be flown, so can the others."""
+        """Return the values at the ends of the range, or all values of a list: where these fly, so do the others."""
         raise NotImplementedError
 
 
@@ -125,25 +126,38 @@ class Normal(Varied):
     def __post_init__(self) -> None:
         low, high = self._ends
         _require_range(low, high)
-        if low > self.mean + 8.0 * self.deviation or high < self.mean - 8.0 * self.deviation:
+        reach = _MOST_DEVIATIONS * self.deviation
+        if low > self.mean + reach or high < self.mean - reach:
             raise ValueError(
-                f"mean must be within 8 standard deviations of the range {low:g} to {high:g}, or nothing is ever drawn "
-                f"from there; got {self.mean:g} with deviation {self.deviation:g}"
+                f"mean must be within {_MOST_DEVIATIONS:g} standard deviations of the range {low:g} to {high:g}, or "
+                f"nothing is ever drawn from there; got {self.mean:g} with deviation {self.deviation:g}"
             )
 
     @property
     def _ends(self) -> tuple[float, float]:
-        return -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
+        """The ends of the range; infinite where there is none."""
+        low = -math.inf
+        high = math.inf
+        if self.low is not None:
+            low = self.low
+        if self.high is not None:
+            high = self.high
+        return low, high
 
     def quantile(self, share: float) -> Value:
         """See `Varied`."""
-        low, high = ((end - self.mean) / self.deviation for end in self._ends)
-        return float(scipy.stats.truncnorm.ppf(share, low, high, loc=self.mean, scale=self.deviation))
+        low, high = self._ends
+        standard_low = (low - self.mean) / self.deviation
+        standard_high = (high - self.mean) / self.deviation
+        return float(scipy.stats.truncnorm.ppf(share, standard_low, standard_high, loc=self.mean, scale=self.deviation))
 
     def extremes(self) -> list[Value]:
         """See `Varied`."""
-        tails = zip(self._ends, (_TAIL, 1.0 - _TAIL), strict=True)
-        return [end if math.isfinite(end) else self.quantile(share) for end, share in tails]
+        low, high = self._ends
+        return [
+            low if math.isfinite(low) else self.quantile(_TAIL),
+            high if math.isfinite(high) else self.quantile(1.0 - _TAIL),
+        ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,10 +165,16 @@ class _Listed(Varied):
     values: Annotated[list[Value], MinLen(1), MaxLen(MOST_ENTRIES)]
 
     def __post_init__(self) -> None:
-        kinds = {type(value) if isinstance(value, bool | str | list) else float for value in self.values}
+        kinds: set[type] = set()
+        for value in self.values:
+            if isinstance(value, bool | str | list):
+                kinds.add(type(value))
+            else:
+                kinds.add(float)  # a whole number is of the same kind as any other
         if len(kinds) > 1:
             raise ValueError(f"values must all be of one kind; got {self.values}")
-        if len(set(map(str, self.values))) < len(self.values):
+        distinct = set(map(str, self.values))
+        if len(distinct) < len(self.values):
             raise ValueError(f"values must be distinct; got {self.values}")
 
     def extremes(self) -> list[Value]:
@@ -180,8 +200,10 @@ class Choice(_Listed):
 
     def quantile(self, share: float) -> Value:
         """See `Varied`."""
-        edges = np.cumsum(self.weights or [1.0] * len(self.values))
-        return self.values[int(np.searchsorted(edges, share * edges[-1], side="right"))]
+        weights = self.weights or [1.0] * len(self.values)
+        cumulative = np.cumsum(weights)
+        place = np.searchsorted(cumulative, share * cumulative[-1], side="right")
+        return self.values[int(place)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,14 +226,25 @@ def _require_separate_fields(entries: Sequence[Varied]) -> None:
     owners: dict[str, str] = {}
     for entry in entries:
         for path in entry.fields:
-            why = {"seed": "seed: every flight has one of its own"}.get(path)
+            refused = ""
             if path.split(".")[-1] == "name":
-                why = f"{path}: results are identified by names"
+                refused = f"{path}: results are identified by names"
             elif path in owners:
-                why = f"{path}, which {owners[path]} draws"
-            if why is not None:
-                raise ValueError(f"vary.{entry.name}.fields must not have {why}")
+                refused = f"{path}, which {owners[path]} draws"
+            elif path == "seed":
+                refused = "seed: every flight has one of its own"
+            if refused:
+                raise ValueError(f"vary.{entry.name}.fields must not have {refused}")
             owners[path] = entry.name
+
+
+def _require_failure_event(text: str) -> None:
+    """Refuse what cannot stand in the list `failure`: text that is no event, and failure itself."""
+    try:
+        if parse_event(text).text == "failure":
+            raise InputError("failure is what this list defines")
+    except InputError as error:
+        raise ValueError(f"failure has an entry {text!r} that is no event: {error}") from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,24 +298,25 @@ class CampaignFile:
         if len(set(names)) < len(names):
             raise ValueError(f"vary must have distinct names; got {names}")
         _require_separate_fields(self.vary)
-        grids = ", ".join(entry.name for entry in self.vary if isinstance(entry, GridValues))
-        if grids and self.sampling in ("sobol", "halton"):
+        grid_names = [grid.name for grid in self._grids]
+        if grid_names and self.sampling in ("sobol", "halton"):
+            grids = ", ".join(grid_names)
             rule = f"random or latin_hypercube where there are grids ({grids}), whose turns go with its points"
             raise ValueError(f"sampling must be {rule}; got {self.sampling!r}")
         if self.flights % self.cells:
             rule = f"a multiple of the {self.cells} combinations of its grids"
             raise ValueError(f"flights must be {rule}; got {self.flights}")
         for text in self.failure:
-            try:
-                if parse_event(text).text == "failure":
-                    raise InputError("failure is what this list defines")
-            except InputError as error:
-                raise ValueError(f"failure has an entry {text!r} that is no event: {error}") from None
+            _require_failure_event(text)
+
+    @property
+    def _grids(self) -> list[GridValues]:
+        return [entry for entry in self.vary if isinstance(entry, GridValues)]
 
     @property
     def cells(self) -> int:
         """Number of combinations of the grids; 1 without any."""
-        return math.prod(len(entry.values) for entry in self.vary if isinstance(entry, GridValues))
+        return math.prod(len(grid.values) for grid in self._grids)
 
     def to_toml(self) -> str:
         """Return the file with every field, defaults included; reading it gives this campaign."""
@@ -312,15 +346,18 @@ class Draws:
     def values(self, flight: int) -> dict[str, Value]:
         """Return the drawn values of a flight, by the names of the entries of `[[vary]]`."""
         if self._spread is None:
-            point = np.random.default_rng(self._sequence(flight).spawn(1)[0]).random(len(self._spec.vary))
+            (stream,) = self._sequence(flight).spawn(1)
+            point = np.random.default_rng(stream).random(len(self._spec.vary))
         else:
             point = self._spread[flight]
-        return {
-            entry.name: entry.values[flight // self._repeats[entry.name] % len(entry.values)]
-            if isinstance(entry, GridValues)
-            else entry.quantile(share)
-            for entry, share in zip(self._spec.vary, point.tolist(), strict=True)
-        }
+        values: dict[str, Value] = {}
+        for entry, share in zip(self._spec.vary, point.tolist(), strict=True):
+            if isinstance(entry, GridValues):
+                turn = flight // self._repeats[entry.name]
+                values[entry.name] = entry.values[turn % len(entry.values)]
+            else:
+                values[entry.name] = entry.quantile(share)
+        return values
 
     def _sequence(self, flight: int) -> np.random.SeedSequence:
         return np.random.SeedSequence([self._spec.seed, flight])
@@ -331,9 +368,11 @@ def _spread_points(spec: CampaignFile) -> Array:
     if not spec.vary:
         return np.empty((spec.flights, 0))
     qmc = scipy.stats.qmc
-    kinds = {"latin_hypercube": qmc.LatinHypercube, "sobol": qmc.Sobol, "halton": qmc.Halton}
-    sampler = kinds[spec.sampling](len(spec.vary), rng=np.random.default_rng(np.random.SeedSequence(spec.seed)))
+    samplers = {"latin_hypercube": qmc.LatinHypercube, "sobol": qmc.Sobol, "halton": qmc.Halton}
+    rng = np.random.default_rng(np.random.SeedSequence(spec.seed))
+    sampler = samplers[spec.sampling](len(spec.vary), rng=rng)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # Sobol's points are balanced best in powers of two
         points: Array = sampler.random(spec.flights)
-    return np.minimum(points, np.nextafter(1.0, 0.0))
+    below_one = np.nextafter(1.0, 0.0)
+    return np.minimum(points, below_one)

@@ -1,4 +1,8 @@
-"""Report of a campaign: outcome in a sentence, tables, figure, and a page that works offline."""
+"""Report of a campaign: its outcome in a sentence, tables and figures, and a page that works offline.
+
+Everything is made from the summary of `statistics.estimate`; histograms and scatters also from the table of flights.
+`campaign_lines` is for the console, `write_report` for the directory, `campaign_overview` for `campaign.png`.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +42,18 @@ if TYPE_CHECKING:
 
 
 _TITLES: Final = {
-    **{"events": "How often", "constraints": "Constraints", "metrics": "All metrics", "worst": "Worst flights"},
-    **{"worst-draws": "Their parameters", "drivers-table": "Which parameters matter"},
+    "events": "How often",
+    "constraints": "Constraints",
+    "metrics": "All metrics",
+    "worst": "Worst flights",
+    "worst-draws": "Their parameters",
+    "drivers-table": "Which parameters matter",
     "groups": "Failures over each varied parameter",
 }
-_MOST_LINES: Final = 8  # of a table on the console; the report has them all
-_MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN, UNAUDITED: Mark.WARN}
-_ENDS: Final = ("lower", "upper")
-_ALWAYS: Final = ("failure", "violation", "lost")  # events that are listed even where they never happened
+_CONSOLE_LINES: Final = 8  # of a table on the console; the report has them all
+_CONSOLE_WIDTH: Final = 60  # characters of a line's last cell on the console
+_VERDICT_MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN, UNAUDITED: Mark.WARN}  # of others: bad
+_ALWAYS_LISTED: Final = ("failure", "violation", "lost")  # events that are listed even where they never happened
 
 
 def campaign_lines(
@@ -59,13 +67,17 @@ def campaign_lines(
     yield definition_sentence(summary, summary["failure"])
     if summary["parameters"]:
         yield driver_sentence(summary)
-    tables = [event_table(summary), constraint_table(summary), worst_table(summary, where)]
-    yield from console.grids([_brief(grid) for grid in tables if grid.lines], left=("constraint", "reason"))
+    tables = []
+    for grid in (event_table(summary), constraint_table(summary), worst_table(summary, where)):
+        if grid.lines:
+            tables.append(_brief(grid))
+    yield from console.grids(tables, left=("constraint", "reason"))
     if summary["worst"]:
         command = replay_command(where, summary["worst"][0]["flight"])
         yield console.styled("to fly one of them again: ", (command, "bold"))
     for judgement in judgements:
-        yield console.styled((judgement.sentence, "green" if judgement.holds else "red"))
+        colour = "green" if judgement.holds else "red"
+        yield console.styled((judgement.sentence, colour))
     yield console.written_to(directory)
     if (directory / PAGE_FILE).exists():
         yield console.to_open(directory / PAGE_FILE)
@@ -73,10 +85,12 @@ def campaign_lines(
 
 def _brief(grid: Grid) -> Grid:
     """The first lines of a table, with a short last column."""
-    ends = [(line, " ".join(line[-1].text.split())) for line in grid.lines[:_MOST_LINES]]
     lines = []
-    for row, end in ends:
-        lines.append((*row[:-1], replace(row[-1], text=end if len(end) <= 60 else f"{end[:57]}...")))
+    for *cells, last in grid.lines[:_CONSOLE_LINES]:
+        text = " ".join(last.text.split())
+        if len(text) > _CONSOLE_WIDTH:
+            text = f"{text[: _CONSOLE_WIDTH - 3]}..."
+        lines.append((*cells, replace(last, text=text)))
     return replace(grid, note="", lines=tuple(lines))
 
 
@@ -96,15 +110,20 @@ def verdict_sentence(summary: CampaignSummary) -> str:
 
 def definition_sentence(summary: CampaignSummary, failure: Sequence[str]) -> str:
     """Return what counts as failure, and how many flights violated a constraint where that alone does not count."""
-    units = {name: metric["unit"] for name, metric in summary["metrics"].items()}
-    units |= {MARGIN + name: constraint["unit"] for name, constraint in summary["constraints"].items()}
+    units: dict[str, str] = {}
+    for name, metric in summary["metrics"].items():
+        units[name] = metric["unit"]
+    for name, constraint in summary["constraints"].items():
+        units[MARGIN + name] = constraint["unit"]
     events = [parse_event(text) for text in failure]
-    violation = summary["events"]["violation"]
     listed = []
-    for text in (f"{event.text} {units.get(event.column_name, '')}" for event in events):
-        listed.append(text.rstrip(" -"))
+    for event in events:
+        unit = units.get(event.column_name, "")
+        listed.append(f"{event.text} {unit}".rstrip(" -"))
     sentence = f"Counted as failure: {', '.join(listed)}."
-    if violation["count"] and "violation" not in (event.text for event in events):
+    violation = summary["events"]["violation"]
+    violation_counts = any(event.text == "violation" for event in events)
+    if violation["count"] and not violation_counts:
         flights = count_of(violation["flights"], "flight")
         sentence += f" A violation alone does not count: {violation['count']} of {flights} had one."
     return sentence
@@ -114,18 +133,18 @@ def driver_sentence(summary: CampaignSummary) -> str:
     """Return the parameters on which the worst margin, or else failure, depends significantly, strongest first."""
     if any(related["worst_margin"] for related in drivers(summary).values()):
         outcome = "worst_margin"
-    else:
-        outcome = "failed"
-    sure = {}
-    for name, related in drivers(summary).items():
-        if related[outcome] and min(related[outcome]["p_holm"], related[outcome]["p_xi_holm"]) < ALPHA:
-            sure[name] = related[outcome]
-    if outcome == "worst_margin":
         noun = "The worst margin"
     else:
+        outcome = "failed"
         noun = "Failure"
-    listed = ", ".join(f"{name} (rho {related['rho']:+.2f}, xi {related['xi']:.2f})" for name, related in sure.items())
-    return f"{noun} depends on {listed or 'no varied parameter beyond chance'}."
+    listed = []
+    for name, related in drivers(summary).items():
+        measured = related[outcome]
+        if measured and min(measured["p_holm"], measured["p_xi_holm"]) < ALPHA:
+            listed.append(f"{name} (rho {measured['rho']:+.2f}, xi {measured['xi']:.2f})")
+    if not listed:
+        return f"{noun} depends on no varied parameter beyond chance."
+    return f"{noun} depends on {', '.join(listed)}."
 
 
 def _grid(key: str, head: Sequence[str], lines: Iterable[tuple[Cell, ...]], note: str = "") -> Grid:
@@ -134,13 +153,14 @@ def _grid(key: str, head: Sequence[str], lines: Iterable[tuple[Cell, ...]], note
 
 def event_table(summary: CampaignSummary) -> Grid:
     """Return the frequency of each event that happened."""
-    sure = f"{100.0 * summary['confidence']:g} %"
-    head = ("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}")
-    lines = (
-        line(name, str(share["count"]), *_shares(share), *(percent(share[f"{end}_one_sided"]) for end in _ENDS))
-        for name, share in summary["events"].items()
-        if share["count"] or name in _ALWAYS
-    )
+    level = f"{100.0 * summary['confidence']:g} %"
+    head = ("event", "flights", "share", f"{level} interval", f"at least, with {level}", f"at most, with {level}")
+    lines = []
+    for name, share in summary["events"].items():
+        if share["count"] or name in _ALWAYS_LISTED:
+            at_least = percent(share["lower_one_sided"])
+            at_most = percent(share["upper_one_sided"])
+            lines.append(line(name, str(share["count"]), *_shares(share), at_least, at_most))
     note = (
         "Violation: a required constraint did not hold, or the flight was lost, raised an error or met a limit. Shares "
         "of failure and violation leave out incomplete flights, which ended before a required constraint was reached, "
@@ -153,16 +173,19 @@ def event_table(summary: CampaignSummary) -> Grid:
 
 def constraint_table(summary: CampaignSummary) -> Grid:
     """Return the number of violations and the worst margin of each constraint."""
-    sure = f"{100.0 * summary['confidence']:g} % interval"
     lines = []
     for name, constraint in summary["constraints"].items():
-        failed = constraint["not_satisfied"]
-        worst = (ABSENT, ABSENT)
+        not_held = constraint["not_satisfied"]
+        mark = Mark.BAD if not_held["count"] else Mark.NONE
+        margin = ABSENT
+        flight = ABSENT
         if constraint["worst_margin"] is not None:
-            worst = f"{format_number(constraint['worst_margin'])} {constraint['unit']}", str(constraint["worst_flight"])
-        count = Cell(text=str(failed["count"]), mark=Mark.BAD if failed["count"] else Mark.NONE)
-        lines.append(line(name, count, *_shares(failed), *worst))
-    head = ("constraint", "not held", "share", sure, "worst margin", "in flight")
+            margin = f"{format_number(constraint['worst_margin'])} {constraint['unit']}"
+            flight = str(constraint["worst_flight"])
+        count = Cell(text=str(not_held["count"]), mark=mark)
+        lines.append(line(name, count, *_shares(not_held), margin, flight))
+    interval_head = f"{100.0 * summary['confidence']:g} % interval"
+    head = ("constraint", "not held", "share", interval_head, "worst margin", "in flight")
     note = (
         "Margins are at the physics rate, without the tolerance; negative is beyond the bound. Shares are of the "
         "flights that reached the constraint or were lost before it; the latter did not hold it and have no margin."
@@ -173,10 +196,10 @@ def constraint_table(summary: CampaignSummary) -> Grid:
 def metric_table(summary: CampaignSummary) -> Grid:
     """Return the distribution of every metric."""
     measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
-    lines = (
-        line(label(name, metric["unit"]), *(format_number(metric[m]) for m in measures), str(metric["flights"]))
-        for name, metric in summary["metrics"].items()
-    )
+    lines = []
+    for name, metric in summary["metrics"].items():
+        values = [format_number(metric[measure]) for measure in measures]
+        lines.append(line(label(name, metric["unit"]), *values, str(metric["flights"])))
     note = "Over the flights that have the number, lost ones, up to where they were aborted, included."
     return _grid("metrics", ("metric", *measures, "flights"), lines, note)
 
@@ -184,16 +207,13 @@ def metric_table(summary: CampaignSummary) -> Grid:
 def worst_table(summary: CampaignSummary, directory: str) -> Grid:
     """Return the worst flights and the commands that replay them."""
     worst = summary["worst"]
-    lines = (
-        line(
-            str(flight["flight"]),
-            Cell(text=flight["verdict"], mark=_MARKS.get(flight["verdict"], Mark.BAD)),
-            *_worst_margin(summary, flight),
-            format_number(flight["duration"]),
-            Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
-        )
-        for flight in worst
-    )
+    lines = []
+    for flight in worst:
+        verdict = Cell(text=flight["verdict"], mark=_VERDICT_MARKS.get(flight["verdict"], Mark.BAD))
+        reason = Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT)
+        margin, constraint = _worst_margin(summary, flight)
+        duration = format_number(flight["duration"])
+        lines.append(line(str(flight["flight"]), verdict, margin, constraint, duration, reason))
     note = "Lost flights first, then errors, limits, violations and the rest; among these, failed ones first, then "
     note += "the smaller worst margin as a share of half the band."
     if worst:
@@ -202,6 +222,7 @@ def worst_table(summary: CampaignSummary, directory: str) -> Grid:
 
 
 def _worst_margin(summary: CampaignSummary, flight: Mapping[str, Any]) -> tuple[str, str]:
+    """Return a flight's worst margin with its unit, and the constraint's name."""
     name = flight["worst_constraint"]
     if name is None:
         return ABSENT, ABSENT
@@ -211,11 +232,13 @@ def _worst_margin(summary: CampaignSummary, flight: Mapping[str, Any]) -> tuple[
 def worst_draws_table(summary: CampaignSummary) -> Grid:
     """Return the parameters of the worst flights, one column each."""
     worst = summary["worst"]
-    lines = (
-        line(label(name, parameter["unit"]), *(_drawn(flight["draws"][name]) for flight in worst))
-        for name, parameter in summary["parameters"].items()
-    )
-    return _grid("worst-draws", ("flight", *(str(flight["flight"]) for flight in worst)), lines if worst else ())
+    flights = [str(flight["flight"]) for flight in worst]
+    lines = []
+    if worst:
+        for name, parameter in summary["parameters"].items():
+            values = [_drawn(flight["draws"][name]) for flight in worst]
+            lines.append(line(label(name, parameter["unit"]), *values))
+    return _grid("worst-draws", ("flight", *flights), lines)
 
 
 def replay_command(directory: str, flight: int) -> str:
@@ -230,17 +253,20 @@ def _drawn(value: Any) -> str:
 
 
 def _shares(share: Mapping[str, Any]) -> tuple[str, str]:
+    """Return a `proportion` and its interval as text."""
     return percent(share["share"]), interval(share["lower"], share["upper"])
 
 
 def driver_table(summary: CampaignSummary) -> Grid:
     """Return how the worst margin and failure depend on each varied parameter."""
-    lines = (
-        line(label(name, related["unit"]), *_association(related["worst_margin"]), *_association(related["failed"]))
-        for name, related in drivers(summary).items()
-    )
-    measures = ("rho", "after Holm", "xi", "after Holm")
-    head = ("varied parameter", *(f"{of}: {measure}" for of in ("worst margin", "failure") for measure in measures))
+    head = ["varied parameter"]
+    for outcome in ("worst margin", "failure"):
+        head += [f"{outcome}: rho", f"{outcome}: after Holm", f"{outcome}: xi", f"{outcome}: after Holm"]
+    lines = []
+    for name, related in drivers(summary).items():
+        with_margin = _dependence_cells(related["worst_margin"])
+        with_failure = _dependence_cells(related["failed"])
+        lines.append(line(label(name, related["unit"]), *with_margin, *with_failure))
     note = (
         "rho: Spearman's rank correlation. xi: Chatterjee's (2021), of any dependence, also of harm at both ends "
         "of a range. p-values are corrected by Holm's method for all of this table; bold: beyond chance at "
@@ -252,56 +278,84 @@ def driver_table(summary: CampaignSummary) -> Grid:
 def group_table(summary: CampaignSummary) -> Grid:
     """Return failures over each varied parameter, lowest values first; no lines if none or all flights failed."""
     failure = summary["events"]["failure"]
-    listed = {}
-    for name, parameter in summary["parameters"].items() if 0 < failure["count"] < failure["flights"] else ():
-        levels = []
-        for level, share in parameter.get("levels", {}).items():
-            levels.append(f"{level}: {percent(share['share'])}")
-        if cells := levels + [_group(group) for group in parameter.get("groups", ())]:
-            listed[label(name, parameter["unit"])] = cells
-    size = max(map(len, listed.values()), default=0)
-    lines = (line(name, *cells, *[ABSENT] * (size - len(cells))) for name, cells in listed.items())
+    cells: dict[str, list[str]] = {}
+    if 0 < failure["count"] < failure["flights"]:
+        for name, parameter in summary["parameters"].items():
+            groups = _group_cells(parameter)
+            if groups:
+                cells[label(name, parameter["unit"])] = groups
+    size = max(map(len, cells.values()), default=0)
+    lines = []
+    for name, groups in cells.items():
+        missing = [ABSENT] * (size - len(groups))
+        lines.append(line(name, *groups, *missing))
+    head = ["varied parameter"]
+    for k in range(size):
+        head.append(f"group {k + 1}")
     note = "Share of failed flights among those with such values; groups are of about equal size, or by value where "
     note += f"there are few. Over all flights it is {percent(failure['share'])}."
-    return _grid("groups", ("varied parameter", *(f"group {k + 1}" for k in range(size))), lines, note)
+    return _grid("groups", head, lines, note)
 
 
-def _association(related: Mapping[str, Any] | None) -> tuple[Cell, ...]:
+def _group_cells(parameter: Mapping[str, Any]) -> list[str]:
+    """Return the share of failures for each level of a parameter, or for each group of its values."""
+    cells = []
+    for level, share in parameter.get("levels", {}).items():
+        cells.append(f"{level}: {percent(share['share'])}")
+    for group in parameter.get("groups", ()):
+        low = format_number(group["low"])
+        high = format_number(group["high"])
+        if low == high:
+            values = low
+        else:
+            values = f"{low} to {high}"
+        cells.append(f"{values}: {percent(group['share'])}")
+    return cells
+
+
+def _dependence_cells(related: Mapping[str, Any] | None) -> tuple[Cell, ...]:
+    """Return how an outcome depends on a parameter: rho, its p-value, xi, its p-value; bold beyond chance."""
     if related is None:
         return line(*[ABSENT] * 4)
-    sure = [Mark.BEST if related[p] < ALPHA else Mark.NONE for p in ("p_holm", "p_xi_holm")]
-    rho = Cell(text=f"{related['rho']:+.2f}", mark=sure[0])
-    xi = Cell(text=f"{related['xi']:.2f}", mark=sure[1])
+    rho_mark = Mark.BEST if related["p_holm"] < ALPHA else Mark.NONE
+    xi_mark = Mark.BEST if related["p_xi_holm"] < ALPHA else Mark.NONE
+    rho = Cell(text=f"{related['rho']:+.2f}", mark=rho_mark)
+    xi = Cell(text=f"{related['xi']:.2f}", mark=xi_mark)
     return line(rho, p_value(related["p_holm"]), xi, p_value(related["p_xi_holm"]))
 
 
-def _group(group: Mapping[str, Any]) -> str:
-    low = format_number(group["low"])
-    high = format_number(group["high"])
-    return f"{low if low == high else f'{low} to {high}'}: {percent(group['share'])}"
-
-
-_FILES: Final = (
-    *("campaign.toml", "scenario.toml", "flights.parquet", "timing.parquet", SUMMARY_FILE, "manifest.json"),
+_LINKED_FILES: Final = (
+    "campaign.toml",
+    "scenario.toml",
+    "flights.parquet",
+    "timing.parquet",
+    SUMMARY_FILE,
+    "manifest.json",
     "campaign.png",
 )
 """Files that the page links to, if they exist."""
-_MARGINS: Final = (
+_HISTOGRAM_NOTE: Final = (
     "The worst margin is that of a flight's required constraints, as a share of half the "
     "constraint's band: 1 in the middle, 0 (dashed) at its bound, negative beyond. What is measured "
     "of a lost flight ends where it was aborted. Flights beyond an axis are in its end bars."
 )
-_POINTS: Final = "Triangles at the edges are flights beyond the axes; at the foot also those without a margin."
+_SCATTER_NOTE: Final = "Triangles at the edges are flights beyond the axes; at the foot also those without a margin."
 
 
 MAIN_METRICS: Final = (
     "worst_margin",
-    *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
-    *("peak_tilt", "total_variation", "fallback_periods"),
+    "rmse.x",
+    "rmse.y",
+    "rmse.z",
+    "rmse.yaw",
+    "peak_tilt",
+    "total_variation",
+    "fallback_periods",
 )
 """Metrics shown first."""
 _MARGIN_LABEL: Final = "worst margin [half bands]"
-_BINS: Final = 40
+_FEWEST_BINS: Final = 8
+_MOST_BINS: Final = 40
 _MOST_SCATTERS: Final = 3  # in the overview
 _MOST_POINTS: Final = 9000  # of one verdict in all scatters of a page, which has a few MB then
 _GAP: Final = 0.06  # from the axis' end to what is drawn at the edge, as a share of the axis
@@ -323,44 +377,69 @@ def write_report(
     with optional("campaign.png"):
         figure = campaign_overview(table, summary, f"{spec.name}: {sentence}")
         write_pngs([figure] if figure.panels else [], directory)
-    often = (event_table(summary), constraint_table(summary))
-    shapes = _plots("metrics", "Flights by verdict", histograms(table), _MARGINS)
-    clouds = _plots("scatter", "Worst margin over each parameter", scatters(table), _POINTS)
-    worst = (worst_table(summary, str(campaign)), worst_draws_table(summary))
-    sections = [
-        Section(title="How often", tables=often),
-        Section(title="Distributions", plots=shapes, folded=(metric_table(summary),)),
-        Section(
-            title="What drives failure",
-            text=(driver_sentence(summary),) if summary["parameters"] else (),
-            plots=clouds,
-            tables=(driver_table(summary), group_table(summary)),
-        ),
-        Section(title="Worst flights", tables=worst),
-    ]
-    files = {}
-    for name in _FILES:
-        if name == SUMMARY_FILE or any((d / name).is_file() for d in (directory, campaign)):
-            files[name] = name
-    if not summary["flights"]:
-        mark = Mark.NONE
-    elif summary["events"]["failure"]["count"]:
-        mark = Mark.BAD
-    else:
-        mark = Mark.GOOD
-    verdict = Cell(text=sentence, mark=mark)
-    if summary["flights"] == spec.flights:
-        ended = "complete"
-    else:
-        ended = "stopped"
-    status = f"Status: {ended}, {summary['flights']} of {count_of(spec.flights, 'flight')} flown."
-    notes = [definition_sentence(summary, spec.failure), spec.description, status]
-    page = render_page("campaign", spec.name, sections, notes=[*filter(None, notes)], verdict=verdict, files=files)
+    links = {}
+    for name in _LINKED_FILES:
+        exists = (directory / name).is_file() or (campaign / name).is_file()
+        if exists or name == SUMMARY_FILE:
+            links[name] = name
+    page = render_page(
+        "campaign",
+        spec.name,
+        _sections(table, summary, campaign),
+        notes=_page_notes(summary, spec),
+        verdict=Cell(text=sentence, mark=_page_mark(summary)),
+        files=links,
+    )
     (directory / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
 
 
+def _sections(table: pa.Table, summary: CampaignSummary, campaign: Path) -> list[Section]:
+    """Return the parts of the page, in order."""
+    driver_text: tuple[str, ...] = ()
+    if summary["parameters"]:
+        driver_text = (driver_sentence(summary),)
+    return [
+        Section(title="How often", tables=(event_table(summary), constraint_table(summary))),
+        Section(
+            title="Distributions",
+            plots=_plots("metrics", "Flights by verdict", histograms(table), _HISTOGRAM_NOTE),
+            folded=(metric_table(summary),),
+        ),
+        Section(
+            title="What drives failure",
+            text=driver_text,
+            plots=_plots("scatter", "Worst margin over each parameter", scatters(table), _SCATTER_NOTE),
+            tables=(driver_table(summary), group_table(summary)),
+        ),
+        Section(title="Worst flights", tables=(worst_table(summary, str(campaign)), worst_draws_table(summary))),
+    ]
+
+
+def _page_notes(summary: CampaignSummary, spec: CampaignFile) -> list[str]:
+    """Return what the page says below its verdict."""
+    if summary["flights"] == spec.flights:
+        status = "complete"
+    else:
+        status = "stopped"
+    notes = [definition_sentence(summary, spec.failure)]
+    if spec.description:
+        notes.append(spec.description)
+    notes.append(f"Status: {status}, {summary['flights']} of {count_of(spec.flights, 'flight')} flown.")
+    return notes
+
+
+def _page_mark(summary: CampaignSummary) -> Mark:
+    """Return the mark of the page's verdict."""
+    if not summary["flights"]:
+        return Mark.NONE
+    if summary["events"]["failure"]["count"]:
+        return Mark.BAD
+    return Mark.GOOD
+
+
 def _plots(key: str, title: str, panels: Sequence[Panel], note: str) -> tuple[Plot, ...]:
+    """Return panels as one interactive plot; none without panels."""
     if panels:
         return (to_plot(Figure(key=key, title=title, panels=tuple(panels)), note=note),)
     return ()
@@ -369,13 +448,21 @@ def _plots(key: str, title: str, panels: Sequence[Panel], note: str) -> tuple[Pl
 def campaign_overview(table: pa.Table, summary: CampaignSummary, title: str) -> Figure:
     """Worst margins, or else the first metric that differs between flights, and the parameters that matter."""
     strongest = list(drivers(summary))
-    clouds = {panel.x_label.partition(" [")[0]: panel for panel in scatters(table)}
-    ranked = sorted(clouds, key=lambda name: strongest.index(name) if name in strongest else len(strongest))
-    panels = [
-        *histograms(table)[:1],
-        *(clouds[name] for name in ranked[:_MOST_SCATTERS]),
-    ]
-    return Figure(key="campaign", title=title, panels=tuple(replace(panel, height=1.4) for panel in panels))
+
+    def rank(name: str) -> int:
+        if name in strongest:
+            return strongest.index(name)
+        return len(strongest)
+
+    chosen = histograms(table)[:1]
+    by_name = {}
+    for panel in scatters(table):
+        name, _, _unit = panel.x_label.partition(" [")
+        by_name[name] = panel
+    for name in sorted(by_name, key=rank)[:_MOST_SCATTERS]:
+        chosen.append(by_name[name])
+    panels = tuple(replace(panel, height=1.4) for panel in chosen)
+    return Figure(key="campaign", title=title, panels=panels)
 
 
 def histograms(table: pa.Table) -> list[Panel]:
@@ -384,79 +471,114 @@ def histograms(table: pa.Table) -> list[Panel]:
     for name in MAIN_METRICS:
         values = numbers(table, name)
         finite = values[np.isfinite(values)]
-        if finite.size < 2 or np.ptp(finite) == 0.0:
-            continue
-        low, high = _ends(finite)
-        width = (high - low or 1.0) / min(_BINS, max(8, int(2.0 * np.sqrt(finite.size))))
-        edges = width * np.arange(np.floor(low / width), np.ceil(high / width) + 1.0)  # 0 is one, where it is inside
-        inside = np.clip(values, edges[0], edges[-1])
-        below = np.zeros(edges.size - 1)
-        bars = []
-        for verdict, rows in verdicts(table).items():
-            counts = np.histogram(inside[rows & np.isfinite(values)], edges)[0].astype(float)
-            if counts.any():
-                middles = 0.5 * (edges[:-1] + edges[1:])
-                colour = VERDICTS[verdict].colour
-                bars.append(Series(x=middles, y=counts, base=below, colour=colour, label=verdict, style="bars"))
-            below = below + counts
-        beyond = int(np.count_nonzero((finite < edges[0]) | (finite > edges[-1])))
-        zero = (Bound(value=0.0, vertical=True),) if name == "worst_margin" and edges[0] <= 0.0 <= edges[-1] else ()
-        x_label = _MARGIN_LABEL if name == "worst_margin" else label(name, unit_of(table, name))
-        x_label += f"; {beyond} beyond" if beyond else ""
-        panels.append(Panel(title="", x_label=x_label, y_label="flights", series=tuple(bars), bounds=zero, whole=True))
+        if finite.size >= 2 and np.ptp(finite) > 0.0:
+            panels.append(_histogram(table, name, values, finite))
     return panels
+
+
+def _histogram(table: pa.Table, name: str, values: Array, finite: Array) -> Panel:
+    """Plot the distribution of a metric, (K,) and its finite values, as bars stacked by verdict."""
+    edges = _bin_edges(finite)
+    middles = 0.5 * (edges[:-1] + edges[1:])
+    inside = np.clip(values, edges[0], edges[-1])
+    below = np.zeros(edges.size - 1)
+    bars = []
+    for verdict, rows in verdicts(table).items():
+        counts = np.histogram(inside[rows & np.isfinite(values)], edges)[0].astype(float)
+        if counts.any():
+            colour = VERDICTS[verdict].colour
+            bars.append(Series(x=middles, y=counts, base=below, colour=colour, label=verdict, style="bars"))
+        below = below + counts
+    x_label = label(name, unit_of(table, name))
+    bounds: tuple[Bound, ...] = ()
+    if name == "worst_margin":
+        x_label = _MARGIN_LABEL
+        if edges[0] <= 0.0 <= edges[-1]:
+            bounds = (Bound(value=0.0, vertical=True),)
+    beyond = int(np.count_nonzero((finite < edges[0]) | (finite > edges[-1])))
+    if beyond:
+        x_label += f"; {beyond} beyond"
+    return Panel(title="", x_label=x_label, y_label="flights", series=tuple(bars), bounds=bounds, whole=True)
+
+
+def _bin_edges(finite: Array) -> Array:
+    """Return the edges of a histogram's bins: whole multiples of their width, so that 0 is one where it is inside."""
+    low, high = _ends(finite)
+    bins = min(_MOST_BINS, max(_FEWEST_BINS, int(2.0 * np.sqrt(finite.size))))
+    width = (high - low or 1.0) / bins
+    return np.asarray(width * np.arange(np.floor(low / width), np.ceil(high / width) + 1.0))
 
 
 def scatters(table: pa.Table) -> list[Panel]:
     """The worst margin of each flight over each varied parameter; triangles are beyond the axes, or have no margin."""
     margins = numbers(table, "worst_margin")
-    names = draw_names(table)
-    if not np.isfinite(margins).any():
+    known = np.isfinite(margins)
+    if not known.any():
         return []
-    low, high = _ends(margins[np.isfinite(margins)])
+    low, high = _ends(margins[known])
     # 0, the end of what is allowed, is among them
     low = min(0.0, low)
     high = max(0.0, high)
-    y, beyond_y = _clip(np.where(np.isfinite(margins), margins, -np.inf), low, high, "down", "up")
+    y, beyond_y = _clip(np.where(known, margins, -np.inf), low, high, "down", "up")
     padding = 0.6 * _GAP * ((high - low) or 1.0)
+    y_range = (float(y.min()) - padding, float(y.max()) + padding)
+    names = draw_names(table)
     panels = []
     for name in names:
-        kinds: tuple[str, ...] = ()
-        if is_number(table, DRAW + name):
-            values = numbers(table, DRAW + name)
-        else:
-            listed = texts(table, DRAW + name)
-            kinds = tuple(sorted(set(listed)))
-            spread = np.random.default_rng(0).uniform(-0.3, 0.3, listed.size)  # the same every time
-            values = np.array([kinds.index(value) for value in listed], float) + spread
+        values, levels = _drawn_values(table, name)
         x, beyond_x = _clip(values, *_ends(values[np.isfinite(values)]), "left", "right")
         beyond = np.where(beyond_y == "", beyond_x, beyond_y)
-        points = list[Series]()
-        for verdict, flown in verdicts(table).items():
-            rows = np.flatnonzero(flown)
-            _, colour, symbol = VERDICTS[verdict]
-            even = np.linspace(0.0, rows.size - 1.0, min(rows.size, _MOST_POINTS // len(names)))
-            rows = rows[np.unique(even.astype(int))]
-            for edge in ("", "down", "up", "left", "right"):
-                there = rows[beyond[rows] == edge]
-                marker = f"triangle-{edge}" if edge else symbol
-                if there.size:
-                    points.append(
-                        Series(x=x[there], y=y[there], flights=numbers(table, "flight")[there], colour=colour,
-                               label=verdict, style="points", marker=marker, width=5.0 if edge else 3.5, opacity=0.7)
-                    )  # fmt: skip
         panels.append(
             Panel(
                 title="",
                 x_label=label(name, unit_of(table, DRAW + name)),
                 y_label="worst margin",
-                series=tuple(points),
+                series=tuple(_points(table, x, y, beyond, _MOST_POINTS // len(names))),
                 bounds=(Bound(value=0.0),),
-                x_names=kinds,
-                y_range=(float(y.min()) - padding, float(y.max()) + padding),
+                x_names=levels,
+                y_range=y_range,
             )
         )
     return panels
+
+
+def _drawn_values(table: pa.Table, name: str) -> tuple[Array, tuple[str, ...]]:
+    """Return a parameter's values (K,) and its levels, empty for a number; a level's flights are spread about it."""
+    if is_number(table, DRAW + name):
+        return numbers(table, DRAW + name), ()
+    drawn = texts(table, DRAW + name)
+    levels = tuple(sorted(set(drawn)))
+    spread = np.random.default_rng(0).uniform(-0.3, 0.3, drawn.size)  # the same every time
+    return np.array([levels.index(value) for value in drawn], float) + spread, levels
+
+
+def _points(table: pa.Table, x: Array, y: Array, beyond: np.ndarray, most: int) -> Iterator[Series]:
+    """Yield the points of the flights, `most` of each verdict at most, with a marker for each edge they are beyond."""
+    for verdict, flown in verdicts(table).items():
+        rows = np.flatnonzero(flown)
+        even = np.linspace(0.0, rows.size - 1.0, min(rows.size, most))
+        rows = rows[np.unique(even.astype(int))]
+        _, colour, symbol = VERDICTS[verdict]
+        for edge in ("", "down", "up", "left", "right"):
+            at_edge = rows[beyond[rows] == edge]
+            if not at_edge.size:
+                continue
+            marker = symbol
+            width = 3.5
+            if edge:
+                marker = f"triangle-{edge}"
+                width = 5.0
+            yield Series(
+                x=x[at_edge],
+                y=y[at_edge],
+                flights=numbers(table, "flight")[at_edge],
+                colour=colour,
+                label=verdict,
+                style="points",
+                marker=marker,
+                width=width,
+                opacity=0.7,
+            )
 
 
 def _ends(finite: Array) -> tuple[float, float]:

@@ -1,4 +1,8 @@
-"""The commands `quadsim campaign` and `quadsim replay`, and `quadsim.sweep`."""
+"""The commands `quadsim campaign` and `quadsim replay`, and `quadsim.sweep`.
+
+Each reads its arguments, calls `plan`, `campaign` or `sweep` for the work, and returns a result.  The last functions
+are those of a feature that owns directories; see `quadsim.features.entries.Feature`.
+"""
 
 from __future__ import annotations
 
@@ -32,6 +36,7 @@ if TYPE_CHECKING:
     from quadsim.features.campaign.paired import PairedComparison
     from quadsim.features.campaign.plan import Plan
     from quadsim.features.campaign.sweep import Sweep
+    from quadsim.flight.audit import Limit
     from quadsim.scenarios.schema.scenario import Scenario
 
     CampaignName: TypeAlias = ScenarioName
@@ -89,7 +94,8 @@ def sweep(
     from quadsim.scenarios.user_code import importable
 
     with reporting(progress, "the sweep") as report:
-        return fly_sweep(importable(load_scenario(scenario), controller, forces), values, workers, report)
+        swept = importable(load_scenario(scenario), controller, forces)
+        return fly_sweep(swept, values, workers, report)
 
 
 def campaign(
@@ -158,21 +164,18 @@ def campaign(
     from quadsim.console.results import after
     from quadsim.features.campaign.campaign import fly_campaign
     from quadsim.features.campaign.events import parse_event
-    from quadsim.features.campaign.plan import load_plan, make_plan
+    from quadsim.features.campaign.plan import load_plan
     from quadsim.features.campaign.statistics import judge, parse_requirement
     from quadsim.scenarios.schema.scenario import Scenario
-    from quadsim.scenarios.user_code import importable
 
     if junit is not None and not require:
         raise ParameterError("", "--junit", junit, "given with --require, whose verdicts it writes")
-    file = None if junit is None else junit_file(junit)
+    verdict_file = None if junit is None else junit_file(junit)
     requirements = [parse_requirement(text) for text in require]
     if isinstance(campaign, Scenario):
         if changes:
             raise InputError("changes apply to a campaign file; change a scenario by its replace")
-        settings = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **(fields or {})}
-        settings = {name: value for name, value in settings.items() if value is not None}
-        plan = make_plan(importable(campaign, controller, forces), settings)
+        plan = _scenario_plan(campaign, vary, fields, controller, forces, flights=flights, seed=seed)
     elif vary or fields or controller is not None or forces:
         raise InputError("vary, controller, forces and fields apply to a scenario; a campaign file sets them itself")
     else:
@@ -185,11 +188,31 @@ def campaign(
         target = Path(out)
     with _growing(target, progress, resume=resume, overwrite=overwrite) as options:
         result = fly_campaign(plan, workers=workers, cluster=cluster, report=report, until_width=until_width, **options)
-    result = replace(result, judgements=tuple(judge(result.table, requirement) for requirement in requirements))
-    if file is not None:
-        with after(result, file):
-            write_junit(result, file)
+    judgements = tuple(judge(result.table, requirement) for requirement in requirements)
+    result = replace(result, judgements=judgements)
+    if verdict_file is not None:
+        with after(result, verdict_file):
+            write_junit(result, verdict_file)
     return result
+
+
+def _scenario_plan(
+    scenario: Scenario,
+    vary: Draws,
+    fields: Fields,
+    controller: UserCode,
+    forces: UserForces,
+    *,
+    flights: Whole | None,
+    seed: Whole | None,
+) -> Plan:
+    """Return the campaign of a scenario that is given in Python, of the settings that are stated."""
+    from quadsim.features.campaign.plan import make_plan
+    from quadsim.scenarios.user_code import importable
+
+    settings = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **(fields or {})}
+    stated = {name: value for name, value in settings.items() if value is not None}
+    return make_plan(importable(scenario, controller, forces), stated)
 
 
 def replay(
@@ -311,9 +334,9 @@ def compare_directories(
         OutputError: the directory cannot be written.
     """
     from quadsim.console.results import after
-    from quadsim.features.campaign.again import judged_by
     from quadsim.features.campaign.paired import compare_pairs
     from quadsim.features.campaign.plan import plan_differences
+    from quadsim.features.campaign.reaudit import judged_by
     from quadsim.features.campaign.store import FLIGHTS_FILE, read_flights, stored_plan
     from quadsim.flight.audit import limit_differences
     from quadsim.report.comparison import check_names
@@ -322,27 +345,38 @@ def compare_directories(
     if len(directories) != 2:
         raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")
     first, second = directories
-    plans = (stored_plan(first), stored_plan(second))
+    first_plan = stored_plan(first)
+    second_plan = stored_plan(second)
     check_names(names, 2)
     if names:
         names = (names[0], names[1])
     else:
-        names = (plans[0].spec.name, plans[1].spec.name)
-    failures = (plans[0].spec.failure, plans[1].spec.failure)
-    a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
-    limits = []
-    for plan in plans:
-        limits.append(tuple(limit.with_tolerances() for limit in plan.limits))
-    if constraints is not None:
-        whose = place_of(constraints, directories)
-        a, b = (
-            judged_by(limits[whose], of, table, plan.failure)
-            for of, table, plan in zip(limits, (a, b), plans, strict=True)
-        )
-        limits = [limits[whose]] * 2
-    differences = limit_differences(*limits)
-    comparison = compare_pairs(a, b, names, failures, plan_differences(*plans), tuple(differences))
+        names = (first_plan.spec.name, second_plan.spec.name)
+    first_table = read_flights(first / FLIGHTS_FILE, first_plan.schema)
+    second_table = read_flights(second / FLIGHTS_FILE, second_plan.schema)
+    first_limits = _audited_limits(first_plan)
+    second_limits = _audited_limits(second_plan)
+    audits: list[str] = []
+    if constraints is None:
+        audits = limit_differences(first_limits, second_limits)
+    else:  # both are judged by the same limits
+        limits = (first_limits, second_limits)[place_of(constraints, directories)]
+        first_table = judged_by(limits, first_limits, first_table, first_plan.failure)
+        second_table = judged_by(limits, second_limits, second_table, second_plan.failure)
+    comparison = compare_pairs(
+        first_table,
+        second_table,
+        names,
+        failures=(first_plan.spec.failure, second_plan.spec.failure),
+        differences=plan_differences(first_plan, second_plan),
+        audits=audits,
+    )
     if out is None:
         return comparison
     with after(comparison, out):
         return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))
+
+
+def _audited_limits(plan: Plan) -> tuple[Limit, ...]:
+    """Return the limits of a campaign's audit with both tolerances stated."""
+    return tuple(limit.with_tolerances() for limit in plan.limits)

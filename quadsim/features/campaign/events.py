@@ -1,6 +1,7 @@
-"""Events of a flight as text: `lost`, `violation`, `rmse.z > 0.5`.
+"""Events of a flight as text: `lost`, `violation`, `rmse.z > 0.5`; and the verdicts that a flight can have.
 
 One rule for what is not known: where a flight has no value, the event holds, since the flight did not show otherwise.
+`plan` decides by events which flights failed; `statistics` and `paired` count them.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import contextlib
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -49,12 +50,14 @@ VERDICTS: Final = {
 }
 """In the order in which they are drawn and counted."""
 
+_VERDICT_EVENTS: Final = [verdict for verdict in VERDICTS if verdict not in (HARMLESS, "violated")]
+"""Verdicts that are events; `violated` has a column of its own, which counts lost flights too."""
 _NAMED: Final[dict[str, tuple[str, bool | str]]] = {
     "failure": ("failed", True),
     "violation": ("violated", True),
     "lost": ("verdict", "lost"),
     "crash": ("crashed", True),
-    **{verdict: ("verdict", verdict) for verdict in VERDICTS if verdict not in (HARMLESS, "violated")},
+    **{verdict: ("verdict", verdict) for verdict in _VERDICT_EVENTS},
 }
 """Column of each event that has a name, and its value there where the event holds."""
 _SPELLINGS: Final = {"failed": "failure", "violated": "violation", "crashed": "crash"}
@@ -95,8 +98,10 @@ class CountedEvent(NamedTuple):
     def column(self, table: pa.Table) -> FlightFlags:
         """(K,) whether it happened, flight by flight; the same as `holds` of every row, with the same refusals."""
         if self.operation != "==":
-            _require_number(self.text, self.column_name, {field.name: field.type for field in table.schema})
-        return np.array([self.holds(row) for row in table.select([self.column_name]).to_pylist()], bool)
+            types = {field.name: field.type for field in table.schema}
+            _require_number(self.text, self.column_name, types)
+        rows = table.select([self.column_name]).to_pylist()
+        return np.array([self.holds(row) for row in rows], bool)
 
 
 def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> CountedEvent:
@@ -128,10 +133,17 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> 
         )
     if columns is not None:
         _require_number(text, column, columns)
+    number = math.nan
     with contextlib.suppress(ValueError):
-        if math.isfinite(number := float(threshold)):
-            return CountedEvent(f"{column} {operation} {number:.15g}", column, operation, number)
-    raise ParameterError(f"event {text!r}", "number", threshold, "a finite number")
+        number = float(threshold)
+    if not math.isfinite(number):
+        raise ParameterError(f"event {text!r}", "number", threshold, "a finite number")
+    return CountedEvent(f"{column} {operation} {number:.15g}", column, operation, number)
+
+
+def standard_forms(texts: Iterable[str]) -> list[str]:
+    """Events in their standard form, see `CountedEvent.text`."""
+    return [parse_event(text).text for text in texts]
 
 
 def is_comparable(kind: pa.DataType) -> bool:
@@ -143,7 +155,8 @@ def is_comparable(kind: pa.DataType) -> bool:
 
 def _require_number(event: str, column: str, columns: Mapping[str, pa.DataType]) -> None:
     if column not in columns:
-        raise UnknownNameError("column", column, [name for name, kind in columns.items() if is_comparable(kind)])
+        comparable = [name for name, kind in columns.items() if is_comparable(kind)]
+        raise UnknownNameError("column", column, comparable)
     if not is_comparable(columns[column]):
         raise _no_number(event, column)
 

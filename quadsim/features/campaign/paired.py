@@ -1,7 +1,8 @@
 """Two campaigns flown on the same draws: is the second significantly better?
 
 Flights of one number have the same drawn values and random numbers, so they are compared in pairs: this detects
-far smaller differences than two campaigns side by side would.
+far smaller differences than two campaigns side by side would.  Events: McNemar's exact test, on the pairs in which one
+flight alone had them; metrics: Student's t interval of the differences (`statistics`).  `quadsim compare` shows it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,14 @@ import pyarrow as pa
 
 from quadsim.console.results import Shown, Tabular
 from quadsim.errors import InputError
-from quadsim.features.campaign.events import EVENT_NAMES, INCOMPLETE, UNAUDITED, FlightFlags, parse_event
+from quadsim.features.campaign.events import (
+    EVENT_NAMES,
+    INCOMPLETE,
+    UNAUDITED,
+    FlightFlags,
+    parse_event,
+    standard_forms,
+)
 from quadsim.features.campaign.rows import (
     DRAW,
     MARGIN,
@@ -58,21 +66,32 @@ from quadsim.scenarios.schema.settings import field_text
 
 COMPARISON_FILE: Final = "comparison.json"
 COMPARED: Final = (
-    *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
-    *(f"max_error.{name}" for name in ("x", "y", "z")),
-    *("peak_tilt", "worst_margin", "total_variation", "fallback_periods"),
+    "rmse.x",
+    "rmse.y",
+    "rmse.z",
+    "rmse.yaw",
+    "max_error.x",
+    "max_error.y",
+    "max_error.z",
+    "peak_tilt",
+    "worst_margin",
+    "total_variation",
+    "fallback_periods",
 )
 """Metrics that are compared, where both campaigns have them."""
-_BY_AUDIT: Final = (VIOLATION, INCOMPLETE, UNAUDITED)  # events that depend on it, by name
-_POSITION_ERROR: Final = "rmse."
-_AXES: Final = ("x", "y", "z")
+_AUDIT_EVENTS: Final = (VIOLATION, INCOMPLETE, UNAUDITED)
+"""Events that depend on what flights are audited against."""
+_AUDIT_COLUMNS: Final = (MARGIN, SAMPLED, SATISFIED, TIME_VIOLATED, "worst_")
+"""How the columns begin that depend on it."""
+_POSITION_ERRORS: Final = {"rmse.x": "x", "rmse.y": "y", "rmse.z": "z"}
+"""Axis of each metric that the sentence on tracking is about."""
 _VERDICT_MARKS: Final = {
     "better": Mark.GOOD,
     "worse": Mark.BAD,
     "not distinguishable": Mark.NONE,
     "not comparable": Mark.WARN,
 }
-_MOST_EVENTS: Final = 8  # events that are drawn
+_EVENTS_DRAWN: Final = 8  # largest number of events in the figure
 Differences = tuple[tuple[str, Any, Any], ...]
 """Fields, with the value of the first and of the second; None where it is absent."""
 
@@ -154,39 +173,43 @@ class PairedComparison(Tabular):
     @property
     def sentence(self) -> str:
         """Return the verdict with its numbers."""
-        (a, b) = self.names
+        a, b = self.names
         if self.verdict == "not comparable":
             return different_audits(a, b, self.audits)
         failure = self.events[0]
-        phrase = f"{b} is {self.verdict} than {a}"
+        failures_a, failures_b = failure.counts
         if self.verdict == "not distinguishable":
             phrase = f"{b} and {a} are not distinguishable by their failures"
+        else:
+            phrase = f"{b} is {self.verdict} than {a}"
         return (
-            f"{phrase}: of {self.flights} paired flights, {failure.counts[1]} failed with {b} and {failure.counts[0]} "
+            f"{phrase}: of {self.flights} paired flights, {failures_b} failed with {b} and {failures_a} "
             f"with {a} (McNemar's exact test, {p_value(failure.p)})."
         )
 
     @property
     def tracking(self) -> str:
         """Return in which axes the second campaign tracks closer or farther beyond chance; empty without errors."""
-        parts: dict[str, list[str]] = {"closer": [], "farther": [], "not distinguishable": []}
+        axes: dict[str, list[str]] = {"closer": [], "farther": [], "not distinguishable": []}
         for metric in self.metrics:
-            axis = metric.name.removeprefix(_POSITION_ERROR)
-            if axis not in _AXES or metric.difference.lower is None or metric.difference.upper is None:
+            difference = metric.difference
+            if metric.name not in _POSITION_ERRORS or difference.lower is None or difference.upper is None:
                 continue
-            if metric.is_beyond_chance:
-                closer = metric.difference.upper < 0.0
-                errors = f"{format_number(metric.mean_b)} against {format_number(metric.mean_a)} {metric.unit}"
-                parts["closer" if closer else "farther"].append(f"{axis} ({errors})")
+            axis = _POSITION_ERRORS[metric.name]
+            errors = f"{format_number(metric.mean_b)} against {format_number(metric.mean_a)} {metric.unit}"
+            if not metric.is_beyond_chance:
+                axes["not distinguishable"].append(axis)
+            elif difference.upper < 0.0:
+                axes["closer"].append(f"{axis} ({errors})")
             else:
-                parts["not distinguishable"].append(axis)
-        told = []
-        for verdict, axes in parts.items():
-            if axes:
-                told.append(f"{verdict} in {', '.join(axes)}")
-        if not told:
+                axes["farther"].append(f"{axis} ({errors})")
+        findings = []
+        for verdict, listed in axes.items():
+            if listed:
+                findings.append(f"{verdict} in {', '.join(listed)}")
+        if not findings:
             return ""
-        return f"RMS error, where both flights were completed: {self.names[1]} is {'; '.join(told)}."
+        return f"RMS error, where both flights were completed: {self.names[1]} is {'; '.join(findings)}."
 
     @property
     def pairing(self) -> str:
@@ -206,10 +229,13 @@ class PairedComparison(Tabular):
 
         Fields that only one of them has, and files by their paths, come last.
         """
-        ordered = sorted(self.differences or (), key=_is_minor)
-        lines = tuple(line(field, field_text(a), field_text(b)) for field, a, b in ordered)
-        grid = Grid(key="differences", title="What differs", head=("field", *self.names), lines=lines)
-        return (grid,) if lines else ()
+        if not self.differences:
+            return ()
+        lines = []
+        for field, a, b in sorted(self.differences, key=_is_minor):
+            lines.append(line(field, field_text(a), field_text(b)))
+        head = ("field", *self.names)
+        return (Grid(key="differences", title="What differs", head=head, lines=tuple(lines)),)
 
     @property
     def tables(self) -> tuple[Grid, Grid]:
@@ -229,8 +255,11 @@ class PairedComparison(Tabular):
             yield console.to_open(self.page)
 
     def _answer(self) -> list[str]:
-        """Return the verdict on failures, and on tracking."""
-        return [self.sentence, *filter(None, [self.tracking])]
+        """Return the verdict on failures, and on tracking where it is known."""
+        sentences = [self.sentence]
+        if self.tracking:
+            sentences.append(self.tracking)
+        return sentences
 
     def small_plot(self) -> Figure | None:
         """See `Result.small_plot`: differences of the metrics with their intervals."""
@@ -241,23 +270,49 @@ class PairedComparison(Tabular):
         rows: list[dict[str, Any]] = []
         for event in self.events:
             first, second = event.counts
-            row: dict[str, Any] = {"kind": "event", "name": event.event, "unit": "-", "pairs": event.pairs}
-            row |= {"first": first / event.pairs, "second": second / event.pairs, "difference": event.difference}
-            rows.append({**row, "lower": None, "upper": None, "p_holm": event.p_holm})
+            rows.append(
+                {
+                    "kind": "event",
+                    "name": event.event,
+                    "unit": "-",
+                    "pairs": event.pairs,
+                    "first": first / event.pairs,
+                    "second": second / event.pairs,
+                    "difference": event.difference,
+                    "lower": None,
+                    "upper": None,
+                    "p_holm": event.p_holm,
+                }
+            )
         for metric in self.metrics:
             difference = metric.difference
-            row = {"kind": "metric", "name": metric.name, "unit": metric.unit, "pairs": difference.pairs}
-            row |= {"first": metric.mean_a, "second": metric.mean_b, "difference": difference.mean}
-            rows.append({**row, "lower": difference.lower, "upper": difference.upper, "p_holm": None})
+            rows.append(
+                {
+                    "kind": "metric",
+                    "name": metric.name,
+                    "unit": metric.unit,
+                    "pairs": difference.pairs,
+                    "first": metric.mean_a,
+                    "second": metric.mean_b,
+                    "difference": difference.mean,
+                    "lower": difference.lower,
+                    "upper": difference.upper,
+                    "p_holm": None,
+                }
+            )
         return rows
 
     def to_markdown(self) -> str:
         """Return verdict, tables and differences as Markdown."""
-        head = f"# {self.names[1]} against {self.names[0]}\n"
-        answer = [f"{sentence}\n" for sentence in self._answer()]
-        tables = [section(table) for table in self.tables]
-        differences = [section(table) for table in self.difference_tables]
-        return "\n".join([head, *answer, *tables, f"{self.pairing}\n", *differences])
+        parts = [f"# {self.names[1]} against {self.names[0]}\n"]
+        for sentence in self._answer():
+            parts.append(f"{sentence}\n")
+        for table in self.tables:
+            parts.append(section(table))
+        parts.append(f"{self.pairing}\n")
+        for table in self.difference_tables:
+            parts.append(section(table))
+        return "\n".join(parts)
 
     def write_report(self, directory: Path, *, overwrite: bool = False) -> Path:
         """Write `index.html`, `comparison.json` and `comparison.md`, together or not at all; the page.
@@ -265,17 +320,19 @@ class PairedComparison(Tabular):
         Raises:
             OutputError: the directory cannot be written, or holds something else.
         """
-        drawn = [figure for figure in (events_figure(self), metrics_figure(self)) if figure is not None]
-        plots = tuple(map(to_plot, drawn))
+        plots = []
+        for figure in (events_figure(self), metrics_figure(self)):
+            if figure is not None:
+                plots.append(to_plot(figure))
         sections = [
-            Section(title="Which is better", plots=plots, tables=self.tables),
+            Section(title="Which is better", plots=tuple(plots), tables=self.tables),
             Section(title="What is compared", text=(self.pairing,), tables=self.difference_tables),
         ]
         title = f"{self.names[1]} against {self.names[0]}"
         verdict, *notes = self._answer()
-        files = {file: file for file in (COMPARISON_FILE, TABLE_FILE)}
+        links = {COMPARISON_FILE: COMPARISON_FILE, TABLE_FILE: TABLE_FILE}
         cell = Cell(text=verdict, mark=_VERDICT_MARKS[self.verdict])
-        page = render_page("campaign comparison", title, sections, verdict=cell, notes=notes, files=files)
+        page = render_page("campaign comparison", title, sections, verdict=cell, notes=notes, files=links)
         texts = {COMPARISON_FILE: to_json(self.to_json()), TABLE_FILE: self.to_markdown(), PAGE_FILE: page}
         with writing(directory, overwrite=overwrite) as partial:
             for name, text in texts.items():
@@ -284,18 +341,21 @@ class PairedComparison(Tabular):
 
     def to_json(self) -> dict[str, Any]:
         """Return plain data for a file; differences are second campaign minus first."""
+        differences = None
+        if self.differences is not None:
+            differences = [{"field": name, "values": [a, b]} for name, a, b in self.differences]
         return {
             "names": list(self.names),
             "verdict": self.verdict,
             "sentence": self.sentence,
             "tracking": self.tracking,
             "confidence": CONFIDENCE,
-            **{name: getattr(self, name) for name in ("flights", "left_out", "completed")},
+            "flights": self.flights,
+            "left_out": self.left_out,
+            "completed": self.completed,
             "shared_draws": list(self.shared_draws),
             "own_draws": list(self.own_draws),
-            "differences": None
-            if self.differences is None
-            else [{"field": name, "values": list(values)} for name, *values in self.differences],
+            "differences": differences,
             "events": {event.event: asdict(event) for event in self.events},
             "metrics": {metric.name: asdict(metric) for metric in self.metrics},
         }
@@ -326,33 +386,18 @@ def compare_pairs(
     """
     if names[0] == names[1]:
         names = (f"{names[0]} (first)", f"{names[1]} (second)")
-    _require_same_questions(table_a, table_b, names, failures)
-    shared = np.intersect1d(numbers(table_a, "flight"), numbers(table_b, "flight"))
-    if not shared.size:
-        raise InputError(f"campaigns {names[0]!r} and {names[1]!r} have no flight of one number: nothing can be paired")
-    a, b = (table.filter(np.isin(numbers(table, "flight"), shared)).sort_by("flight") for table in (table_a, table_b))
-    complete = is_counted(a, FAILURE) & is_counted(b, FAILURE)
-    if not complete.any():
-        raise InputError(
-            f"campaigns {names[0]!r} and {names[1]!r} have no pair of flights of which both reached every required "
-            "constraint: fly them for longer"
-        )
-    a = a.filter(complete)
-    b = b.filter(complete)
+    if failures is not None:
+        _require_same_failures(names, failures)
+    a, b = _paired_flights(table_a, table_b, names)
     draws_a = draw_names(a)
     draws_b = draw_names(b)
     shared_draws = tuple(name for name in draws_a if name in draws_b)
-    for column in ("seed", *(DRAW + name for name in shared_draws)):
-        for flight, *values in zip(
-            *(values.to_pylist() for values in (a["flight"], a[column], b[column])), strict=True
-        ):
-            if values[0] != values[1]:
-                raise InputError(
-                    f"flight {flight} of {names[0]!r} has {column} = {values[0]!r}, and of {names[1]!r} {values[1]!r}: "
-                    "only campaigns of one seed and the same draws can be compared in pairs; fly one of them again "
-                    "with the other's seed, sampling and [[vary]]"
-                )
+    _require_same_draws(a, b, names, shared_draws)
     completed = (texts(a, "status") == "completed") & (texts(b, "status") == "completed")
+    metrics = []
+    for name in COMPARED:
+        if name in a.column_names and name in b.column_names:
+            metrics.append(_compare_metric(a, b, name, completed))
     return PairedComparison(
         names=names,
         flights=a.num_rows,
@@ -363,18 +408,14 @@ def compare_pairs(
         differences=differences,
         audits=tuple(audits),
         events=_compare_events(a, b, audited_alike=not audits),
-        metrics=tuple(
-            _compare_metric(a, b, name, completed)
-            for name in COMPARED
-            if {name} <= {*a.column_names} & {*b.column_names}
-        ),
+        metrics=tuple(metrics),
     )
 
 
-def _require_same_questions(
-    a: pa.Table, b: pa.Table, names: Sequence[str], failures: tuple[Sequence[str], Sequence[str]] | None
-) -> None:
-    first, second = (sorted({parse_event(text).text for text in events}) for events in failures or ((), ()))
+def _require_same_failures(names: Sequence[str], failures: tuple[Sequence[str], Sequence[str]]) -> None:
+    """Refuse campaigns that count different events as failure."""
+    first = sorted(set(standard_forms(failures[0])))
+    second = sorted(set(standard_forms(failures[1])))
     if first != second:
         raise InputError(
             f"{names[0]!r} counts {', '.join(first)} as failure, and {names[1]!r} {', '.join(second)}: only "
@@ -382,45 +423,96 @@ def _require_same_questions(
         )
 
 
+def _paired_flights(table_a: pa.Table, table_b: pa.Table, names: Sequence[str]) -> tuple[pa.Table, pa.Table]:
+    """Return the flights that both campaigns have, in order, without pairs of which one is incomplete or unaudited."""
+    shared = np.intersect1d(numbers(table_a, "flight"), numbers(table_b, "flight"))
+    if not shared.size:
+        raise InputError(f"campaigns {names[0]!r} and {names[1]!r} have no flight of one number: nothing can be paired")
+    a = table_a.filter(np.isin(numbers(table_a, "flight"), shared)).sort_by("flight")
+    b = table_b.filter(np.isin(numbers(table_b, "flight"), shared)).sort_by("flight")
+    complete = is_counted(a, FAILURE) & is_counted(b, FAILURE)
+    if not complete.any():
+        raise InputError(
+            f"campaigns {names[0]!r} and {names[1]!r} have no pair of flights of which both reached every required "
+            "constraint: fly them for longer"
+        )
+    return a.filter(complete), b.filter(complete)
+
+
+def _require_same_draws(a: pa.Table, b: pa.Table, names: Sequence[str], shared_draws: Sequence[str]) -> None:
+    """Refuse a pair of flights that differ in their seed, or in a value that both campaigns drew."""
+    flights = a["flight"].to_pylist()
+    for column in ("seed", *(DRAW + name for name in shared_draws)):
+        for flight, value_a, value_b in zip(flights, a[column].to_pylist(), b[column].to_pylist(), strict=True):
+            if value_a != value_b:
+                raise InputError(
+                    f"flight {flight} of {names[0]!r} has {column} = {value_a!r}, and of {names[1]!r} {value_b!r}: "
+                    "only campaigns of one seed and the same draws can be compared in pairs; fly one of them again "
+                    "with the other's seed, sampling and [[vary]]"
+                )
+
+
 def _compare_events(a: pa.Table, b: pa.Table, *, audited_alike: bool) -> tuple[EventComparison, ...]:
     """Every event with its test, corrected for all of them but those that no flight of a pair had alone.
 
-    These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).  Events
-    that depend on the audit are left out unless both campaigns were audited alike.  A constraint is compared over the
-    pairs of which both flights count for it (`rows.reached`), and left out where there is none.
+    These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).
     """
-    left_out = () if audited_alike else (*_BY_AUDIT, *([FAILURE.text] if any(map(_by_audit, failure_of(a))) else []))
-    names = [name for name in EVENT_NAMES if name not in left_out]
-    happened = {name: [parse_event(name).column(table) for table in (a, b)] for name in names}
-    for name in constraint_names(a) if audited_alike else ():
-        both = reached(a, name) & reached(b, name)
-        if both.any():
-            happened[f"{name} not held"] = [not_held(table, name)[both] for table in (a, b)]
-    alone = {}
+    happened = _happened(a, b, audited_alike=audited_alike)
+    only_a = {}
+    only_b = {}
+    p = {}
+    tested = {}
     for event, (in_a, in_b) in happened.items():
-        alone[event] = (int((in_a & ~in_b).sum()), int((in_b & ~in_a).sum()))
-    p = {event: mcnemar(*counts) for event, counts in alone.items()}
-    tested = [event for event, counts in alone.items() if any(counts)]
-    corrected = dict(zip(tested, holm([p[event] for event in tested]), strict=True))
-    return tuple(
-        EventComparison(
-            event=event,
-            both=int((in_a & in_b).sum()),
-            only_a=alone[event][0],
-            only_b=alone[event][1],
-            neither=int((~in_a & ~in_b).sum()),
-            p=p[event],
-            p_holm=corrected.get(event, 1.0),
-            difference=(alone[event][1] - alone[event][0]) / in_a.size,
+        only_a[event] = int((in_a & ~in_b).sum())
+        only_b[event] = int((in_b & ~in_a).sum())
+        p[event] = mcnemar(only_a[event], only_b[event])
+        if only_a[event] or only_b[event]:
+            tested[event] = p[event]
+    p_holm = dict(zip(tested, holm([*tested.values()]), strict=True))
+    comparisons = []
+    for event, (in_a, in_b) in happened.items():
+        comparisons.append(
+            EventComparison(
+                event=event,
+                both=int((in_a & in_b).sum()),
+                only_a=only_a[event],
+                only_b=only_b[event],
+                neither=int((~in_a & ~in_b).sum()),
+                p=p[event],
+                p_holm=p_holm.get(event, 1.0),
+                difference=(only_b[event] - only_a[event]) / in_a.size,
+            )
         )
-        for event, (in_a, in_b) in happened.items()
-    )
+    return tuple(comparisons)
 
 
-def _by_audit(event: str) -> bool:
+def _happened(a: pa.Table, b: pa.Table, *, audited_alike: bool) -> dict[str, tuple[FlightFlags, FlightFlags]]:
+    """Return to which flights of either campaign each event happened.
+
+    Events that depend on the audit are left out unless both campaigns were audited alike.  A constraint is compared
+    over the pairs of which both flights count for it (`rows.reached`), and left out where there is none.
+    """
+    left_out: set[str] = set()
+    if not audited_alike:
+        left_out.update(_AUDIT_EVENTS)
+        if any(_depends_on_audit(event) for event in failure_of(a)):
+            left_out.add(FAILURE.text)
+    happened = {}
+    for name in EVENT_NAMES:
+        if name not in left_out:
+            event = parse_event(name)
+            happened[name] = (event.column(a), event.column(b))
+    if audited_alike:
+        for name in constraint_names(a):
+            both = reached(a, name) & reached(b, name)
+            if both.any():
+                happened[f"{name} not held"] = (not_held(a, name)[both], not_held(b, name)[both])
+    return happened
+
+
+def _depends_on_audit(event: str) -> bool:
     """Return whether an event depends on what flights are audited against."""
-    column = parse_event(event).column_name
-    return event in _BY_AUDIT or column.startswith((MARGIN, SAMPLED, SATISFIED, TIME_VIOLATED, "worst_"))
+    return event in _AUDIT_EVENTS or parse_event(event).column_name.startswith(_AUDIT_COLUMNS)
 
 
 def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: FlightFlags) -> MetricComparison:
@@ -442,12 +534,13 @@ def _event_table(comparison: PairedComparison) -> Grid:
     a, b = comparison.names
     lines = []
     for event in comparison.events:
+        if not any(event.counts):
+            continue
         counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
-        pairs = map(str, (event.only_a, event.only_b, event.both))
-        sure = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
-        if any(event.counts):
-            corrected = Cell(text=p_value(event.p_holm), mark=sure)
-            lines.append(line(event.event, *counts, *pairs, p_value(event.p), corrected))
+        pairs = [str(event.only_a), str(event.only_b), str(event.both)]
+        mark = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
+        corrected = Cell(text=p_value(event.p_holm), mark=mark)
+        lines.append(line(event.event, *counts, *pairs, p_value(event.p), corrected))
     return Grid(
         key="events",
         title="Events",
@@ -465,17 +558,20 @@ def _metric_table(comparison: PairedComparison) -> Grid:
     lines = []
     for metric in comparison.metrics:
         difference = metric.difference
-        ends = ABSENT
-        mark = Mark.NONE
+        mark = Mark.BEST if metric.is_beyond_chance else Mark.NONE
+        interval = ABSENT
         if difference.lower is not None and difference.upper is not None:
-            ends = f"{format_number(difference.lower)} to {format_number(difference.upper)}"
-            if metric.is_beyond_chance:
-                mark = Mark.BEST
-            else:
-                mark = Mark.NONE
-        means = map(format_number, (metric.mean_a, metric.mean_b))
-        mean = Cell(text=format_number(difference.mean), mark=mark)
-        lines.append(line(label(metric.name, metric.unit), *means, mean, ends, str(difference.pairs)))
+            interval = f"{format_number(difference.lower)} to {format_number(difference.upper)}"
+        lines.append(
+            line(
+                label(metric.name, metric.unit),
+                format_number(metric.mean_a),
+                format_number(metric.mean_b),
+                Cell(text=format_number(difference.mean), mark=mark),
+                interval,
+                str(difference.pairs),
+            )
+        )
     return Grid(
         key="metrics",
         title="Metrics",
@@ -488,8 +584,30 @@ def _metric_table(comparison: PairedComparison) -> Grid:
 
 def _is_minor(difference: tuple[str, Any, Any]) -> bool:
     """Return whether one of the campaigns lacks a field, or its values are paths of a machine."""
-    _, *values = difference
-    return any(value is None or (isinstance(value, str) and Path(value).is_absolute()) for value in values)
+    _field, first, second = difference
+    return _is_absent_or_path(first) or _is_absent_or_path(second)
+
+
+def _is_absent_or_path(value: Any) -> bool:
+    return value is None or (isinstance(value, str) and Path(value).is_absolute())
+
+
+_DIRECTION_COLOURS: Final = {
+    "better": COLOUR.satisfied,
+    "worse": COLOUR.violated,
+    "not beyond chance": COLOUR.measured,
+}
+
+
+def _direction(metric: MetricComparison, mean_difference: float) -> str:
+    """Return whether the second campaign is better or worse in a metric, beyond chance."""
+    if not metric.is_beyond_chance:
+        return "not beyond chance"
+    if metric.name == "worst_margin":  # the larger, the better; of all others the smaller
+        mean_difference = -mean_difference
+    if mean_difference < 0.0:
+        return "better"
+    return "worse"
 
 
 def metrics_figure(comparison: PairedComparison) -> Figure | None:
@@ -502,15 +620,8 @@ def metrics_figure(comparison: PairedComparison) -> Figure | None:
             continue
         scale = 100.0 / abs(metric.mean_a)
         place = np.array([float(len(names))])
-        if metric.name == "worst_margin":
-            better = difference.mean > 0.0
-        else:
-            better = difference.mean < 0.0
-        colour = COLOUR.measured
-        label = "not beyond chance"
-        if metric.is_beyond_chance:
-            colour = COLOUR.satisfied if better else COLOUR.violated
-            label = "better" if better else "worse"
+        label = _direction(metric, difference.mean)
+        colour = _DIRECTION_COLOURS[label]
         ends = scale * np.array([difference.lower, difference.upper])
         mean = scale * np.array([difference.mean])
         curves.append(Series(x=np.repeat(place, 2), y=ends, colour=colour, width=2.0))
@@ -522,24 +633,38 @@ def metrics_figure(comparison: PairedComparison) -> Figure | None:
     level = 100.0 * CONFIDENCE
     title = f"{b} less {a}, in % of {a}'s mean, with {level:g} % interval"
     panel = Panel(
-        title=title, y_label="difference [%]", x_label="metric", x_names=tuple(names), series=tuple(curves),
-        bounds=(Bound(value=0.0),), height=1.3,
-    )  # fmt: skip
+        title=title,
+        y_label="difference [%]",
+        x_label="metric",
+        x_names=tuple(names),
+        series=tuple(curves),
+        bounds=(Bound(value=0.0),),
+        height=1.3,
+    )
     return Figure(key="metrics", title="Tracking and commands", panels=(panel,), columns=1)
 
 
 def events_figure(comparison: PairedComparison) -> Figure | None:
     """Plot the shares of the pairs in which events happened to each campaign's flight; None where none did."""
-    happened = [event for event in comparison.events if any(event.counts)][:_MOST_EVENTS]
+    happened = []
+    for event in comparison.events:
+        if any(event.counts):
+            happened.append(event)
     if not happened:
         return None
+    happened = happened[:_EVENTS_DRAWN]
     curves = []
     for i, name in enumerate(comparison.names):
-        values = np.array([100.0 * event.counts[i] / event.pairs for event in happened])
-        place = np.arange(len(happened), dtype=np.float64) + 0.2 * (i - 0.5)
-        curves.append(Series(x=place, y=values, colour=line_colour(i), label=name, style="points", width=6.0))
+        shares = np.array([100.0 * event.counts[i] / event.pairs for event in happened])
+        places = np.arange(len(happened), dtype=np.float64) + 0.2 * (i - 0.5)
+        curves.append(Series(x=places, y=shares, colour=line_colour(i), label=name, style="points", width=6.0))
     panel = Panel(
-        title="share of the pairs", y_label="share [%]", x_label="event", series=tuple(curves),
-        x_names=tuple(event.event for event in happened), whole=True, height=1.3,
-    )  # fmt: skip
+        title="share of the pairs",
+        y_label="share [%]",
+        x_label="event",
+        series=tuple(curves),
+        x_names=tuple(event.event for event in happened),
+        whole=True,
+        height=1.3,
+    )
     return Figure(key="events", title="Failures and other events", panels=(panel,), columns=1)

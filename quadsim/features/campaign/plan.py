@@ -1,4 +1,8 @@
-"""A campaign ready to fly: its file and scenario, which define the scenario and the row of each flight."""
+"""A campaign ready to fly: its file and scenario, which define the scenario and the row of each flight.
+
+A flight's scenario is the campaign's with the drawn values in its fields (`changed`); where an entry is relative, a
+drawn value multiplies the scenario's own.  `campaign_file` draws, `campaign` flies the plan, `rows` has the columns.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +13,13 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 import pyarrow as pa
 
 from quadsim.errors import FileError, InputError, ParameterError, QuadsimError
 from quadsim.features.campaign.campaign_file import CampaignFile, Draws, Value, Varied
-from quadsim.features.campaign.events import CountedEvent, parse_event
+from quadsim.features.campaign.events import CountedEvent, parse_event, standard_forms
 from quadsim.features.campaign.rows import DRAW, TIMES, flown_row, make_schema
 from quadsim.flight.audit import Limit
 from quadsim.rollout.flown import Flight
@@ -41,11 +45,13 @@ from quadsim.scenarios.schema.settings import (
 )
 from quadsim.scenarios.schema.writing import plain
 
-FIRST: Final = 5  # flights of which one at least has to be possible
-DRAWN: Final = 1000
+CHECKED_FIRST: Final = 5  # flights that are built before the first is flown; one at least has to be possible
+DEFAULT_FLIGHTS: Final = 1000
 """Flights that are drawn where entries of `[[vary]]` are given without a campaign."""
 DrawnChange = tuple[Varied, Value]
-_OF_VEHICLE: Final = ("vehicle", "vehicle.file")  # fields that choose the vehicle
+_VEHICLE_FIELDS: Final = ("vehicle", "vehicle.file")  # fields that choose the vehicle
+_DRAW_FIELDS: Final[tuple[str, ...]] = ("name", "flights", "seed", "sampling", "vary")
+"""Fields of a campaign file that define its draws."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +77,8 @@ class Plan:
     @cached_property
     def schema(self) -> pa.Schema:
         """The columns of its results."""
-        kinds = {entry.name: (column_type(entry), entry.unit) for entry in self.spec.vary}
-        return make_schema(kinds, self.limits, [parse_event(text).text for text in self.spec.failure])
+        drawn = {entry.name: (column_type(entry), entry.unit) for entry in self.spec.vary}
+        return make_schema(drawn, self.limits, standard_forms(self.spec.failure))
 
     @cached_property
     def limits(self) -> tuple[Limit, ...]:
@@ -82,9 +88,11 @@ class Plan:
     @property
     def flies_user_code(self) -> bool:
         """Whether any flight uses a user-defined controller or force."""
-        drawn = {field for entry in self.spec.vary for field in entry.fields}
-        chosen = not drawn.isdisjoint(("controller", "controller.type", "forces"))
-        return chosen or isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
+        drawn: set[str] = set()
+        for entry in self.spec.vary:
+            drawn.update(entry.fields)
+        draws_it = not drawn.isdisjoint(("controller", "controller.type", "forces"))
+        return draws_it or isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
 
     @property
     def columns(self) -> dict[str, pa.DataType]:
@@ -108,13 +116,18 @@ class Plan:
         """
         values = self.draws.values(flight)
         changes = [(entry, values[entry.name]) for entry in self.spec.vary]
-        name = f"{self.spec.name[:70]}-{flight}"
-        return self._varied(changes, name=name, seed=self.scenario.seed if self.one_seed else self.draws.seed(flight))
+        if self.one_seed:
+            seed = self.scenario.seed
+        else:
+            seed = self.draws.seed(flight)
+        return self._varied(changes, name=f"{self.spec.name[:70]}-{flight}", seed=seed)
 
     def identity(self, flight: int) -> Row:
         """The columns that identify a flight."""
-        drawn = {DRAW + name: cell(value) for name, value in self.draws.values(flight).items()}
-        return {"flight": flight, "seed": self.draws.seed(flight), **drawn}
+        row: Row = {"flight": flight, "seed": self.draws.seed(flight)}
+        for name, value in self.draws.values(flight).items():
+            row[DRAW + name] = cell(value)
+        return row
 
     def check(self) -> None:
         """Refuse, before the first flight, values that cannot be flown.
@@ -123,14 +136,14 @@ class Plan:
             InputError: a value of an entry of `[[vary]]`, at the end of its range, cannot be flown; none of the first
                 flights can; or a failure event is about a column that the results do not have.
         """
-        _ = self.failure
-        check_ends(
-            self.spec.vary,
-            lambda entry, value: checked(Assembly(self._varied([(entry, value)], name=self.scenario.name, seed=0))),
-            table=self._table,
-        )
+        _ = self.failure  # refused where it is no list of events
+
+        def check_one(entry: Varied, value: Value) -> None:
+            checked(Assembly(self._varied([(entry, value)], name=self.scenario.name, seed=0)))
+
+        check_ends(self.spec.vary, check_one, table=self._table)
         refusals = []
-        for flight in range(min(FIRST, self.spec.flights)):
+        for flight in range(min(CHECKED_FIRST, self.spec.flights)):
             try:
                 checked(Assembly(self.of(flight)))
                 return
@@ -145,12 +158,10 @@ class Plan:
             flown = fly_for_table(self.of(flight))
         except QuadsimError as error:
             return self.failed(flight, str(error))
-        if raised := flown.log.traceback:  # no more of such a flight is kept than that it raised
+        if flown.log.traceback:  # no more of such a flight is kept than that it raised
             reason = str(flown.log.reason)
-            limit = f"(it may take {self.spec.limits.memory:g} MB)"
-            short = raised[-1].startswith(MemoryError.__name__)
-            if short:
-                return self.failed(flight, f"{reason} {limit}", MEMORY)
+            if flown.log.traceback[-1].startswith(MemoryError.__name__):
+                return self.failed(flight, f"{reason} (it may take {self.spec.limits.memory:g} MB)", MEMORY)
             return self.failed(flight, reason)
         return self.row_of(flight, flown, clock.perf_counter() - started)
 
@@ -158,11 +169,21 @@ class Plan:
         self, flights: Sequence[int], *, workers: int | None = None, cluster: str | None = None
     ) -> Generator[Row]:
         """The rows of flights, each once, in whatever order they come; see `quadsim.rollout.many.fly_many`."""
-        limits = {"timeout": self.spec.limits.flight, "memory": self.spec.limits.memory}
-        many = fly_many(flights, self.fly, workers=workers, cluster=cluster, isolate=self.flies_user_code, **limits)
+        many = fly_many(
+            flights,
+            self.fly,
+            workers=workers,
+            cluster=cluster,
+            isolate=self.flies_user_code,
+            timeout=self.spec.limits.flight,
+            memory=self.spec.limits.memory,
+        )
         with closing(many) as rows:
             for place, row in rows:
-                yield row if "flight" in row else self.failed(flights[place], row["reason"], row["verdict"])
+                if "flight" in row:
+                    yield row
+                else:  # it met a limit, or its process died
+                    yield self.failed(flights[place], row["reason"], row["verdict"])
 
     def row_of(self, flight: int, flown: Flight, wall_s: float = 0.0) -> Row:
         """Return the row of a flight that took `wall_s` [s] to compute."""
@@ -178,17 +199,23 @@ class Plan:
 
     def failed(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
         """The row of a flight that raised, met a limit of time or memory, or whose process died."""
-        nothing = {"status": verdict, "verdict": verdict, "reason": reason, "violated": True, "crashed": False}
-        return self._row(flight, nothing)
+        outcome = {"status": verdict, "verdict": verdict, "reason": reason, "violated": True, "crashed": False}
+        return self._row(flight, outcome)
 
     def _row(self, flight: int, outcome: Row) -> Row:
+        """Return the whole row of a flight: its identity, its outcome, null for all other columns, and `failed`."""
         row = dict.fromkeys(self.schema.names) | self.identity(flight) | outcome
-        return row | {"failed": any(event.holds(row) for event in self.failure)}
+        failed = any(event.holds(row) for event in self.failure)
+        return row | {"failed": failed}
 
     def _varied(self, changes: Sequence[DrawnChange], *, name: str, seed: int) -> Scenario:
+        """Return the scenario with drawn values; where the vehicle is drawn, relative values are shares of its own."""
         scenario = self.scenario
-        vehicles = [change for change in changes if not {*_OF_VEHICLE}.isdisjoint(change[0].fields)]
-        if vehicles:  # shares of numbers are then of the vehicle at hand
+        vehicles = []
+        for entry, value in changes:
+            if not {*_VEHICLE_FIELDS}.isdisjoint(entry.fields):
+                vehicles.append((entry, value))
+        if vehicles:
             scenario = Assembly(changed(scenario, vehicles, {}, table=self._table)).recorded.scenario
         return changed(scenario, changes, {"name": name, "seed": seed}, table=self._table)
 
@@ -212,7 +239,10 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
     """Read and check a campaign that ships, or a file, with the scenario it names; the other arguments change it."""
     path = campaign_path(name)
     data = read_campaign(name)
-    data |= {key: value for key, value in (("flights", flights), ("seed", seed)) if value is not None}
+    if flights is not None:
+        data["flights"] = flights
+    if seed is not None:
+        data["seed"] = seed
     spec = parse_campaign(data, source=path.name)
     plan = Plan(spec, flown_scenario(spec, path, settings))
     plan.check()
@@ -238,12 +268,14 @@ def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ())
     file, _ = scenario_source(spec.scenario)
     note_changes(data, spec.set)
     owners = {"seed": "give --seed"}
-    owners |= {
-        field: f"{entry.name} draws {field}" for entry in spec.vary if not entry.relative for field in entry.fields
-    }
+    for entry in spec.vary:
+        if not entry.relative:
+            owners |= {field: f"{entry.name} draws {field}" for field in entry.fields}
     for setting in settings:
-        if (field := setting.partition("=")[0].strip()) in owners:
-            rule = f"of a field that flights do not have each of their own; {owners[field]}"
+        field, _, _value = setting.partition("=")
+        owner = owners.get(field.strip())
+        if owner is not None:
+            rule = f"of a field that flights do not have each of their own; {owner}"
             raise ParameterError("", "--set", setting, rule)
     try:
         apply_settings(data, settings, file.parent)
@@ -258,15 +290,29 @@ def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], .
 
     Fields of the scenario that both draw are left out: their draws are compared.
     """
-    tables = []
-    drawn = []
-    for plan in (first, second):
-        left_out = (*NOT_DESCRIBED, RECORDED)
-        scenario = {key: value for key, value in plain(plan.scenario).items() if key not in left_out}
-        campaign = asdict(plan.spec)
-        tables.append({**scenario, **{name: campaign[name] for name in ("seed", "sampling", "limits", "vary")}})
-        drawn.append({field for entry in plan.spec.vary if not entry.relative for field in entry.fields})
-    return tuple(entry for entry in differences(*tables) if entry[0] not in drawn[0] & drawn[1])
+    both_draw = _replaced_fields(first) & _replaced_fields(second)
+    entries = differences(_described(first), _described(second))
+    return tuple(entry for entry in entries if entry[0] not in both_draw)
+
+
+def _described(plan: Plan) -> dict[str, Any]:
+    """Return the fields of a campaign's scenario, with those of its draws and limits beside them."""
+    tables = plain(plan.scenario)
+    for name in (*NOT_DESCRIBED, RECORDED):
+        tables.pop(name, None)
+    campaign = asdict(plan.spec)
+    for name in ("seed", "sampling", "limits", "vary"):
+        tables[name] = campaign[name]
+    return tables
+
+
+def _replaced_fields(plan: Plan) -> set[str]:
+    """Return the fields whose values are drawn, other than as a factor of the scenario's own."""
+    fields: set[str] = set()
+    for entry in plan.spec.vary:
+        if not entry.relative:
+            fields.update(entry.fields)
+    return fields
 
 
 def locate(data: dict[str, Any], directory: Path) -> None:
@@ -275,7 +321,8 @@ def locate(data: dict[str, Any], directory: Path) -> None:
         file = data.get(name)
         if isinstance(file, str) and file.endswith(".toml") and (directory / file).is_file():
             data[name] = str((directory / file).resolve())
-    if isinstance(changes := data.get("set"), dict):
+    changes = data.get("set")
+    if isinstance(changes, dict):
         locate_files(changes, directory)
 
 
@@ -308,11 +355,9 @@ def changed(scenario: Scenario, changes: Sequence[DrawnChange], identity: Mappin
     """
     tables = scenario.tables
     defaults = plain(scenario)
-    for entry, _ in changes:  # a field of `[actual]` is as modelled until it is drawn
-        for above, name, *_rest in (field.split(".") for field in entry.fields if "." in field):
-            if above == "actual" and name in defaults["vehicle"]:
-                for data in (tables, defaults):
-                    data.setdefault("actual", {}).setdefault(name, defaults["vehicle"][name])
+    for entry, _ in changes:
+        for field in entry.fields:
+            _state_actual(field, tables, defaults)
     modelled = merge(defaults, {})  # a copy, as looking up a field makes the tables on its way
     for entry, value in changes:
         for field, single in separate({tuple(entry.fields): value}, source=table).items():
@@ -324,14 +369,37 @@ def changed(scenario: Scenario, changes: Sequence[DrawnChange], identity: Mappin
     return scenario.derive({**tables, **identity}, source=identity.get("name"))
 
 
+def _state_actual(field: str, tables: dict[str, Any], defaults: dict[str, Any]) -> None:
+    """Give a field of `[actual]` the vehicle's value, in place: it is as modelled until it is drawn."""
+    above, *names = field.split(".")
+    if above != "actual" or not names:
+        return
+    name = names[0]
+    modelled = defaults["vehicle"]
+    if name in modelled:
+        for data in (tables, defaults):
+            data.setdefault("actual", {}).setdefault(name, modelled[name])
+
+
 def _scaled(scenario: Scenario, tables: dict[str, Any], entry: Varied, field: str, value: Value, table: str) -> Value:
+    """Return the product of a drawn value and the scenario's number in a field.
+
+    Raises:
+        InputError: there is no such field, or one of the two is no number.
+    """
     modelled = get_field(tables, field)
     if modelled is None:  # refused with its own message where there is no such field
         changed(scenario, [(replace(entry, relative=False), value)], {}, table=table)
-    for what, number in ((f"the scenario has no number at {field}", modelled), ("what is drawn is no number", value)):
-        if isinstance(number, bool) or not isinstance(number, int | float):
-            raise ParameterError(f"{table}.{entry.name}", "relative", True, f"false where {what}")
+    owner = f"{table}.{entry.name}"
+    if not _is_number(modelled):
+        raise ParameterError(owner, "relative", True, f"false where the scenario has no number at {field}")
+    if not _is_number(value):
+        raise ParameterError(owner, "relative", True, "false where what is drawn is no number")
     return value * modelled
+
+
+def _is_number(value: object) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def check_ends(entries: Iterable[Varied], check: Callable[[Varied, Value], object], *, table: str) -> None:
@@ -348,8 +416,10 @@ def check_ends(entries: Iterable[Varied], check: Callable[[Varied, Value], objec
             except ScenarioError as error:
                 raise ScenarioError(where, error.problems) from None
             except InputError as error:
-                named = str(error).startswith(f"{table}.")
-                raise InputError(str(error) if named else f"{where}: {error}") from None
+                message = str(error)
+                if not message.startswith(f"{table}."):
+                    message = f"{where}: {message}"
+                raise InputError(message) from None
 
 
 def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -> Plan:
@@ -357,29 +427,30 @@ def drawn_flights(scenario: Scenario, vary: str | Sequence[Mapping[str, Any]]) -
 
     Args:
         scenario: the scenario that they vary.
-        vary: the campaign's name or file; or entries as of its `[[vary]]`, of which `DRAWN` flights are drawn, or more
-            to have each combination of grids as often as another.
+        vary: the campaign's name or file; or entries as of its `[[vary]]`, of which `DEFAULT_FLIGHTS` flights are
+            drawn, or more to have each combination of grids as often as another.
 
     Raises:
         InputError: there is no such campaign, or what it draws cannot be flown.
     """
     if not isinstance(vary, str):
         entries = list(vary)
-        cells = math.prod(len(entry["values"]) for entry in entries if _is_grid(entry))
-        return make_plan(scenario, {"flights": max(1, -(-DRAWN // cells)) * cells, "vary": entries})
+        cells = math.prod(_grid_size(entry) for entry in entries)
+        repetitions = max(1, math.ceil(DEFAULT_FLIGHTS / cells))
+        return make_plan(scenario, {"flights": repetitions * cells, "vary": entries})
     data = read_campaign(vary)
     if data.get("set"):
         merged = merge(scenario.tables, data["set"])
         scenario = scenario.derive(merged, source=f"{scenario.name}, as {vary} sets it")
-    return make_plan(
-        scenario, {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
-    )
+    draws = {name: data[name] for name in _DRAW_FIELDS if name in data}
+    return make_plan(scenario, draws)
 
 
-def _is_grid(entry: Any) -> bool:
-    """Whether an entry has the values of a grid; what is wrong with it is told when it is parsed."""
-    if isinstance(entry, Mapping):
-        values = entry.get("values")
-    else:
-        values = None
-    return isinstance(values, list | tuple) and len(values) > 0 and entry.get("distribution") == "grid"
+def _grid_size(entry: Any) -> int:
+    """Number of a grid's values, 1 of another entry; what is wrong with an entry is told when it is parsed."""
+    if not isinstance(entry, Mapping) or entry.get("distribution") != "grid":
+        return 1
+    values = entry.get("values")
+    if isinstance(values, list | tuple) and values:
+        return len(values)
+    return 1

@@ -1,7 +1,8 @@
 """The rows of a campaign, one per flight, and their Parquet table.
 
 A column's unit stands in its metadata.  A value that does not exist, such as the tracking error of a flight that raised
-before its first period, is null.
+before its first period, is null.  `plan` fills rows, `store` writes them; the readers of columns at the end are for
+`statistics`, `paired` and the report.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
 
 DRAW: Final = "draw."  # how the columns of drawn values begin
 VIOLATION: Final = "violation"  # the event
-MARGIN = "margin."
-SAMPLED = "margin_sampled."
-TIME_VIOLATED = "time_violated."
-SATISFIED = "satisfied."
+MARGIN: Final = "margin."
+SAMPLED: Final = "margin_sampled."
+TIME_VIOLATED: Final = "time_violated."
+SATISFIED: Final = "satisfied."
 """Prefixes of the columns of a constraint."""
 _MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
 _FLOAT = pa.float64()
@@ -37,6 +38,7 @@ _WHOLE = pa.int64()
 
 
 def _fields(kind: pa.DataType, unit: str, *names: str) -> list[pa.Field]:
+    """Return columns of one type and unit."""
     return [pa.field(name, kind, metadata={"unit": unit}) for name in names]
 
 
@@ -91,7 +93,9 @@ def make_schema(
         fields += _fields(_FLOAT, limit.unit, MARGIN + limit.name, SAMPLED + limit.name)
         fields += _fields(_FLOAT, "s", TIME_VIOLATED + limit.name)
         fields += _fields(pa.bool_(), "-", SATISFIED + limit.name)
-    return pa.schema([*fields, *_WORST, *_TIMING], metadata={"format": str(FORMAT), "failure": "; ".join(failure)})
+    fields += _WORST
+    fields += _TIMING
+    return pa.schema(fields, metadata={"format": str(FORMAT), "failure": "; ".join(failure)})
 
 
 def flown_row(
@@ -116,37 +120,44 @@ def flown_row(
         "machine": machine,
     }
     for finding in findings:
-        name = finding.limit.name
-        for column, margin in ((MARGIN, finding.worst_margin), (SAMPLED, finding.worst_margin_sampled)):
-            if math.isfinite(margin):
-                row[column + name] = margin
-            else:
-                row[column + name] = None
-        row[TIME_VIOLATED + name] = finding.time_violated
-        unknown = finding.verdict == "incomplete" and verdict != "lost"  # a lost flight had to get there
-        if unknown:
-            row[SATISFIED + name] = None
-        else:
-            row[SATISFIED + name] = finding.satisfied
-    if (worst := worst_finding(findings)) is not None:
+        row |= _constraint_cells(finding, verdict)
+    worst = worst_finding(findings)
+    if worst is not None:
         row["worst_margin"] = worst_share(findings)
         row["worst_constraint"] = worst.limit.name
-    return row | (_numbers(log) if log.control.t.size else {})
+    if log.control.t.size:
+        row |= _metric_cells(log)
+    return row
+
+
+def _constraint_cells(finding: Finding, verdict: str) -> Row:
+    """Return the columns of one constraint, in a flight with this verdict."""
+    name = finding.limit.name
+    cells: Row = {MARGIN + name: None, SAMPLED + name: None}
+    if math.isfinite(finding.worst_margin):
+        cells[MARGIN + name] = finding.worst_margin
+    if math.isfinite(finding.worst_margin_sampled):
+        cells[SAMPLED + name] = finding.worst_margin_sampled
+    cells[TIME_VIOLATED + name] = finding.time_violated
+    unknown = finding.verdict == "incomplete" and verdict != "lost"  # a lost flight had to get there
+    cells[SATISFIED + name] = None if unknown else finding.satisfied
+    return cells
 
 
 def make_table(rows: Iterable[Row], schema: pa.Schema) -> pa.Table:
     """Rows as a table, sorted by flight; what a row lacks is null, and text that is no Unicode has backslashes."""
-
-    def storable(value: object) -> object:
-        if isinstance(value, str):
-            return value.encode("utf-8", "backslashreplace").decode()
-        return value
-
     ordered = sorted(rows, key=lambda row: row["flight"])
     columns = []
     for field in schema:
-        columns.append(pa.array([storable(row.get(field.name)) for row in ordered], field.type))
+        values = [_storable(row.get(field.name)) for row in ordered]
+        columns.append(pa.array(values, field.type))
     return pa.Table.from_arrays(columns, schema=schema)
+
+
+def _storable(value: object) -> object:
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    return value
 
 
 def split_times(table: pa.Table) -> tuple[pa.Table, pa.Table]:
@@ -168,29 +179,40 @@ def read_table(path: Path) -> pa.Table:
 
 def unit_of(table: pa.Table, column: str) -> str:
     """The unit of a column; `-` for none."""
-    return str((table.schema.field(column).metadata or {}).get(b"unit", b"-").decode())
+    metadata = table.schema.field(column).metadata or {}
+    unit: bytes = metadata.get(b"unit", b"-")
+    return unit.decode()
 
 
-def _numbers(log: FlightLog) -> Row:
+def _metric_cells(log: FlightLog) -> Row:
+    """Return the columns that measure a flight of at least one control period."""
     control = log.control
+    cells: Row = {}
     tracked = metrics.tracking(control)
+    for measure in _MEASURES:
+        for name in REFERENCE_NAMES:
+            cells[f"{measure}.{name}"] = tracked[measure][name]
+    cells |= metrics.control(control)
+    cells["peak_tilt"] = metrics.peak_tilt(log.plant.state)
+
     accepted = sum(status in ACCEPTED for status in control.status)
-    by_solver = np.array([by not in NO_SOLVER for by in control.answered_by])
     grounded = sum(status in (Phase.LANDED, Phase.CRASHED) for status in control.status)
-    return {
-        **{f"{measure}.{name}": tracked[measure][name] for measure in _MEASURES for name in REFERENCE_NAMES},
-        **metrics.control(control),
-        "peak_tilt": metrics.peak_tilt(log.plant.state),
-        "fallback_periods": int(np.count_nonzero(control.fallback)),
-        "fallback_max": int(control.fallback.max()),
-        "unsolved_periods": control.t.size - accepted - grounded,
-        "slack_max": float(control.slack.max()),
-        "solver_periods": int(by_solver.sum()),
-        "iterations.mean": float(control.iterations[by_solver].mean()) if by_solver.any() else None,
-        "iterations.max": int(control.iterations[by_solver].max()) if by_solver.any() else None,
-        "step_p50_ms": float(np.percentile(log.timing.step_ms, 50)),
-        "step_p99_ms": float(np.percentile(log.timing.step_ms, 99)),
-    }
+    cells["fallback_periods"] = int(np.count_nonzero(control.fallback))
+    cells["fallback_max"] = int(control.fallback.max())
+    cells["unsolved_periods"] = control.t.size - accepted - grounded
+    cells["slack_max"] = float(control.slack.max())
+
+    by_solver = np.array([by not in NO_SOLVER for by in control.answered_by])
+    cells["solver_periods"] = int(by_solver.sum())
+    cells["iterations.mean"] = None
+    cells["iterations.max"] = None
+    if by_solver.any():
+        iterations = control.iterations[by_solver]
+        cells["iterations.mean"] = float(iterations.mean())
+        cells["iterations.max"] = int(iterations.max())
+    cells["step_p50_ms"] = float(np.percentile(log.timing.step_ms, 50))
+    cells["step_p99_ms"] = float(np.percentile(log.timing.step_ms, 99))
+    return cells
 
 
 def numbers(table: pa.Table, name: str) -> Array:
@@ -230,12 +252,19 @@ def texts(table: pa.Table, name: str) -> Texts:
         words = table[name].cast(pa.string())
     else:
         words = table[name]
-    return np.array(["-" if value is None else str(value) for value in words.to_pylist()], object)
+    values = []
+    for value in words.to_pylist():
+        if value is None:
+            values.append("-")
+        else:
+            values.append(str(value))
+    return np.array(values, object)
 
 
 def verdicts(table: pa.Table) -> dict[str, FlightFlags]:
     """(K,) which flights have each verdict."""
-    return {verdict: np.asarray(texts(table, "verdict") == verdict, bool) for verdict in VERDICTS}
+    flown = texts(table, "verdict")
+    return {verdict: np.asarray(flown == verdict, bool) for verdict in VERDICTS}
 
 
 def failure_of(table: pa.Table) -> list[str]:
@@ -259,24 +288,39 @@ def is_counted(table: pa.Table, event: CountedEvent) -> FlightFlags:
     """
     if event.text not in ("failure", VIOLATION) or "verdict" not in table.column_names:
         return np.ones(table.num_rows, bool)
-    violations = event.text == VIOLATION or VIOLATION in failure_of(table)
-    unknown = (INCOMPLETE, UNAUDITED) if violations else (INCOMPLETE,)
-    return np.asarray(~np.isin(texts(table, "verdict").astype(str), unknown) | event.column(table), bool)
+    shows_nothing = [INCOMPLETE]
+    if event.text == VIOLATION or VIOLATION in failure_of(table):
+        shows_nothing.append(UNAUDITED)
+    unknown = np.isin(texts(table, "verdict").astype(str), shows_nothing)
+    return np.asarray(~unknown | event.column(table), bool)
 
 
 def draw_names(table: pa.Table) -> list[str]:
     """The varied parameters, in order."""
-    return [name.removeprefix(DRAW) for name in table.column_names if name.startswith(DRAW)]
+    return _names_after(DRAW, table)
 
 
 def constraint_names(table: pa.Table) -> list[str]:
     """The constraints of the scenario, in order."""
-    return [name.removeprefix(SATISFIED) for name in table.column_names if name.startswith(SATISFIED)]
+    return _names_after(SATISFIED, table)
+
+
+def _names_after(prefix: str, table: pa.Table) -> list[str]:
+    """The rest of the columns' names that begin so, in order."""
+    names = []
+    for name in table.column_names:
+        if name.startswith(prefix):
+            names.append(name.removeprefix(prefix))
+    return names
 
 
 def metric_names(table: pa.Table) -> list[str]:
     """The columns that measure a flight by a number, `worst_margin` included."""
-    return [name for name in table.column_names if is_number(table, name) and not name.startswith(_NO_METRIC)]
+    names = []
+    for name in table.column_names:
+        if is_number(table, name) and not name.startswith(_NO_METRIC):
+            names.append(name)
+    return names
 
 
 def is_number(table: pa.Table, name: str) -> bool:

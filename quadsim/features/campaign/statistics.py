@@ -1,7 +1,8 @@
 """Statistics of a campaign's flights with their confidence, their wording, and requirements on them.
 
-Flights are taken as independent draws.  Draws spread evenly (Latin hypercube, Sobol', Halton) make estimates vary less
-than that, so that the intervals are then wider than they need be.
+k of n flights: the share k/n with Clopper-Pearson's interval; ranks: Spearman's rho and Chatterjee's xi, by Holm's
+method.  Flights are taken as independent draws.  Draws spread evenly (Latin hypercube, Sobol', Halton) make estimates
+vary less than that, so that the intervals are then wider than they need be.  `campaign` and the reports use them.
 """
 
 from __future__ import annotations
@@ -73,7 +74,9 @@ def label(name: str, unit: str) -> str:
 
 def count_of(count: int, thing: str) -> str:
     """A count with its noun: `1 flight`, `12 flights`."""
-    return f"{count} {thing}{'' if count == 1 else 's'}"
+    if count == 1:
+        return f"1 {thing}"
+    return f"{count} {thing}s"
 
 
 def p_value(p: float) -> str:
@@ -85,9 +88,9 @@ def p_value(p: float) -> str:
 
 def _percent(share: float, digits: int = 2) -> str:
     value = 100.0 * share
-    size = min(abs(value), abs(100.0 - value))
-    if size > 1e-9:
-        decimals = max(1, digits - 1 - math.floor(math.log10(size)))
+    distance = min(abs(value), abs(100.0 - value))
+    if distance > 1e-9:
+        decimals = max(1, digits - 1 - math.floor(math.log10(distance)))
     else:
         decimals = 0
     return f"{value:.{decimals}f}"
@@ -115,25 +118,27 @@ def upper_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFI
     """
     counts = np.asarray(counts, float)
     trials = np.asarray(trials, float)
-    some = counts < trials
-    bounds = scipy.special.betaincinv(counts + 1.0, np.where(some, trials - counts, 1.0), confidence)
-    return np.where(some, bounds, 1.0)
+    not_all = counts < trials
+    failures = np.where(not_all, trials - counts, 1.0)
+    bounds = scipy.special.betaincinv(counts + 1.0, failures, confidence)
+    return np.where(not_all, bounds, 1.0)
 
 
 def lower_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> Array:
     """One-sided lower bounds on proportions, one or (K,); 0 where none happened."""
-    return 1.0 - upper_bounds(np.asarray(trials, float) - np.asarray(counts, float), trials, confidence)
+    complements = np.asarray(trials, float) - np.asarray(counts, float)
+    return 1.0 - upper_bounds(complements, trials, confidence)
 
 
 def proportion(count: int, flights: int) -> dict[str, Any]:
     """A share of flights, None of none, with its Clopper-Pearson interval and one-sided bounds: plain data for JSON."""
-    either = 0.5 * (1.0 + CONFIDENCE)
+    one_sided = 0.5 * (1.0 + CONFIDENCE)  # the confidence of either end of a two-sided interval
     return {
         "count": count,
         "flights": flights,
         "share": count / flights if flights else None,
-        "lower": float(lower_bounds(count, flights, either)),
-        "upper": float(upper_bounds(count, flights, either)),
+        "lower": float(lower_bounds(count, flights, one_sided)),
+        "upper": float(upper_bounds(count, flights, one_sided)),
         "lower_one_sided": float(lower_bounds(count, flights)),
         "upper_one_sided": float(upper_bounds(count, flights)),
     }
@@ -151,8 +156,11 @@ def holm(p_values: Sequence[float]) -> list[float]:
     """
     order = np.argsort(p_values, kind="stable")
     factors = len(p_values) - np.arange(len(p_values))
-    corrected = np.minimum(1.0, np.maximum.accumulate(factors * np.asarray(p_values, float)[order]))
-    return [float(p) for p in corrected[np.argsort(order, kind="stable")]]
+    ascending = np.asarray(p_values, float)[order]
+    corrected = np.minimum(1.0, np.maximum.accumulate(factors * ascending))
+    places = np.argsort(order, kind="stable")
+    in_place: list[float] = corrected[places].tolist()
+    return in_place
 
 
 def mcnemar(only_a: int, only_b: int) -> float:
@@ -167,17 +175,20 @@ def paired_difference(a: Array, b: Array) -> PairedDifference:
     """Mean of b - a, (K,) finite each, with Student's t interval."""
     differences = np.asarray(b, float) - np.asarray(a, float)
     n = differences.size
-    mean = float(differences.mean()) if n else None
-    if mean is None or n < 2:
-        return PairedDifference(pairs=n, mean=mean)
-    half = float(scipy.stats.t.ppf(0.5 * (1.0 + CONFIDENCE), n - 1)) * float(differences.std(ddof=1)) / math.sqrt(n)
+    if not n:
+        return PairedDifference(pairs=0)
+    mean = float(differences.mean())
+    if n == 1:
+        return PairedDifference(pairs=1, mean=mean)
+    quantile = float(scipy.stats.t.ppf(0.5 * (1.0 + CONFIDENCE), n - 1))
+    half = quantile * float(differences.std(ddof=1)) / math.sqrt(n)
     return PairedDifference(pairs=n, mean=mean, lower=mean - half, upper=mean + half)
 
 
-_FEWEST: Final = 10
-"""Pairs from which Student's t is a good law of a rank correlation: of five in order, it claims p = 0."""
+_FEWEST_PAIRS: Final = 10
+"""Pairs from which Student's t describes a rank correlation well: of five in order, it claims p = 0."""
 _PERMUTED_UP_TO: Final = 40
-"""Pairs up to which xi's p-value is from permutations; beyond, its asymptotic law is as good."""
+"""Pairs up to which xi's p-value is from permutations; beyond, its asymptotic distribution is as good."""
 _PERMUTATIONS: Final = 9999
 
 
@@ -196,40 +207,42 @@ def dependence(x: Array, y: Array, rng: np.random.Generator) -> Dependence | Non
     """How y depends on x, (K,) each, by two measures; ties have their mean rank.
 
     Pairs with a NaN do not count, infinities have their rank.  xi puts equal values of x in an order at random, as its
-    author advises; its p-value is from permutations of up to 40 pairs and from its asymptotic law beyond.  That law is
-    wrong for rare events (300 flights, 2 %: p < 0.005 in 4 of 100 by chance): for a y with two values, the p-value is
-    that of the Kolmogorov-Smirnov test of x with the one and the other.  None of fewer than ten pairs, or where one
-    side is always the same.
+    author advises; its p-value is from permutations of up to 40 pairs, and from its asymptotic distribution beyond.
+    The latter is wrong for rare events (300 flights, 2 %: p < 0.005 in 4 of 100 by chance): for a y with two values,
+    the p-value is that of the Kolmogorov-Smirnov test of x with the one and the other.  None of fewer than ten pairs,
+    or where one side is always the same.
     Source: Chatterjee, Journal of the American Statistical Association 116 (2021).
     """
-    there = ~(np.isnan(x) | np.isnan(y))
-    x = scipy.stats.rankdata(x[there])
-    y = scipy.stats.rankdata(y[there])
-    if x.size < _FEWEST or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+    known = ~(np.isnan(x) | np.isnan(y))
+    x = scipy.stats.rankdata(x[known])
+    y = scipy.stats.rankdata(y[known])
+    if x.size < _FEWEST_PAIRS or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return None
-    ranked = scipy.stats.spearmanr(x, y)
-    in_order = y[np.lexsort((rng.random(x.size), x))]
-    event = np.unique(y).size == 2
-    permuted = scipy.stats.PermutationMethod(n_resamples=_PERMUTATIONS, rng=rng)
-    if y.size <= _PERMUTED_UP_TO and not event:
-        law = permuted
-    else:
-        law = "asymptotic"
-    xi = scipy.stats.chatterjeexi(np.arange(y.size), in_order, method=law)
-    if event:
-        p_xi = scipy.stats.ks_2samp(x[y > y.min()], x[y == y.min()]).pvalue
+    rho = scipy.stats.spearmanr(x, y)
+    by_x = np.lexsort((rng.random(x.size), x))  # equal values of x in an order at random
+    is_event = np.unique(y).size == 2
+    null_distribution: Any = "asymptotic"
+    if y.size <= _PERMUTED_UP_TO and not is_event:
+        null_distribution = scipy.stats.PermutationMethod(n_resamples=_PERMUTATIONS, rng=rng)
+    xi = scipy.stats.chatterjeexi(np.arange(y.size), y[by_x], method=null_distribution)
+    if is_event:
+        happened = y > y.min()
+        p_xi = scipy.stats.ks_2samp(x[happened], x[~happened]).pvalue
     else:
         p_xi = xi.pvalue
     return Dependence(
-        rho=float(ranked.statistic), p=float(ranked.pvalue), xi=float(xi.statistic), p_xi=float(p_xi), flights=y.size
+        rho=float(rho.statistic), p=float(rho.pvalue), xi=float(xi.statistic), p_xi=float(p_xi), flights=y.size
     )
 
 
 FAILURE: Final = parse_event("failure")
 WORST_FLIGHTS: Final = 10
 _PERCENTILES: Final = {"min": 0, "p5": 5, "p50": 50, "p95": 95, "p99": 99, "max": 100}
-_GROUPS: Final = ((50, 5), (12, 3))
-"""Numbers of flights from which a varied parameter is split into this many groups of about equal size."""
+_FLIGHTS_OF_FIFTHS: Final = 50
+_FLIGHTS_OF_THIRDS: Final = 12
+"""Numbers of flights from which a varied parameter is split into five, or three, groups of about equal size."""
+_SHOWN_OF_FLIGHT: Final = ("flight", "verdict", "failed", "worst_margin", "worst_constraint", "duration", "reason")
+"""Columns that the summary has of the worst flights."""
 
 
 def estimate(table: pa.Table, limits: Sequence[Limit] = ()) -> dict[str, Any]:
@@ -247,18 +260,23 @@ def estimate(table: pa.Table, limits: Sequence[Limit] = ()) -> dict[str, Any]:
     violation, and `parameters`, leave them out.
     """
     ties = {limit.name: limit.tie for limit in limits}
+    events = {}
+    for name in EVENT_NAMES:
+        event = parse_event(name)
+        events[event.text] = share_of(event.column(table)[is_counted(table, event)])
+    constraints = {}
+    for name in constraint_names(table):
+        constraints[name] = _constraint(table, name, ties.get(name, 0.0))
+    worst_rows = ranking(table)[:WORST_FLIGHTS].tolist()
     return {
         "flights": table.num_rows,
         "confidence": CONFIDENCE,
         "verdicts": {verdict: int(flown.sum()) for verdict, flown in verdicts(table).items()},
-        "events": {
-            event.text: share_of(event.column(table)[is_counted(table, event)])
-            for event in map(parse_event, EVENT_NAMES)
-        },
+        "events": events,
         "metrics": {name: _metric(table, name) for name in metric_names(table)},
-        "constraints": {name: _constraint(table, name, ties.get(name, 0.0)) for name in constraint_names(table)},
+        "constraints": constraints,
         "parameters": parameters(table.filter(is_counted(table, FAILURE))),
-        "worst": [_flight(table, int(i)) for i in ranking(table)[:WORST_FLIGHTS]],
+        "worst": [_flight(table, row) for row in worst_rows],
     }
 
 
@@ -276,70 +294,70 @@ def worst_flight(table: pa.Table) -> int:
 def ranking(table: pa.Table) -> Indices:
     """(K,) rows of the table, from the worst flight on.
 
-    By verdict (`Verdict.badness`); of one verdict, failed ones come first, then the smaller worst margin.  Flights
-    without a margin come after those with one, by their RMS error in position, the largest first.  Margins that are
-    tied, and errors that differ by a share of `TIE_SHARE` at most, are in the order of the flights' numbers.
+    By verdict (`VerdictMeaning.badness`); of one verdict, failed ones come first, then the smaller worst margin.
+    Flights without a margin come after those with one, by their RMS error in position, the largest first.  Margins
+    that are tied, and errors that differ by a share of `TIE_SHARE` at most, are in the order of the flights' numbers.
     """
-    badness = np.array([VERDICTS[name].badness for name in texts(table, "verdict")], int)
+    badness = [VERDICTS[name].badness for name in texts(table, "verdict")]
     failed = flags(table, "failed", absent=True)
     margin = numbers(table, "worst_margin")
     errors = np.stack([np.nan_to_num(numbers(table, f"rmse.{axis}")) for axis in "xyz"])
     distance = np.linalg.norm(errors, axis=0)
-    missing = np.isnan(margin)
-    score = np.where(missing, -distance, margin)  # the smaller, the worse
-    groups: dict[tuple[int, bool, bool], list[int]] = {}
+    no_margin = np.isnan(margin)
+    score = np.where(no_margin, -distance, margin)  # the smaller, the worse
+    groups: dict[tuple[int, bool, bool], list[int]] = {}  # rows that the score alone ranks, in order of their numbers
     for row in np.argsort(numbers(table, "flight"), kind="stable").tolist():
-        kind = (-int(badness[row]), not failed[row], bool(missing[row]))
-        groups.setdefault(kind, []).append(row)
+        group = (-badness[row], not failed[row], bool(no_margin[row]))
+        groups.setdefault(group, []).append(row)
     ranked: list[int] = []
-    for kind, members in sorted(groups.items()):
+    for (_, _, by_distance), members in sorted(groups.items()):
         rows = np.array(members)
-        if kind[2]:
-            window = TIE_SHARE * float(distance[rows].max())
-        else:
-            window = TIE_SHARE
+        window = TIE_SHARE
+        if by_distance:
+            window *= float(distance[rows].max())
         ranked.extend(rows[in_order(score[rows], window)].tolist())
     return np.array(ranked, int)
 
 
 def _metric(table: pa.Table, name: str) -> dict[str, Any]:
+    """Return the distribution of a metric over the flights that have it."""
     values = numbers(table, name)
     values = values[np.isfinite(values)]
-    about: dict[str, Any] = {"unit": unit_of(table, name), "flights": int(values.size)}
-    if not values.size:
-        return about | dict.fromkeys(("mean", "sd", *_PERCENTILES))
-    percentiles = np.percentile(values, [*_PERCENTILES.values()]).tolist()
-    return about | {
-        "mean": float(values.mean()),
-        "sd": float(values.std(ddof=1)) if values.size > 1 else None,
-        **dict(zip(_PERCENTILES, percentiles, strict=True)),
-    }
+    summary: dict[str, Any] = {"unit": unit_of(table, name), "flights": int(values.size)}
+    summary |= dict.fromkeys(("mean", "sd", *_PERCENTILES))
+    if values.size:
+        percentiles = np.percentile(values, [*_PERCENTILES.values()]).tolist()
+        summary["mean"] = float(values.mean())
+        summary |= dict(zip(_PERCENTILES, percentiles, strict=True))
+    if values.size > 1:
+        summary["sd"] = float(values.std(ddof=1))
+    return summary
 
 
 def _constraint(table: pa.Table, name: str, tie: float) -> dict[str, Any]:
+    """Return how often a constraint did not hold, and its worst margin with the flight that has it."""
     margin = numbers(table, MARGIN + name)
-    about: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "unit": unit_of(table, MARGIN + name),
         "not_satisfied": share_of(not_held(table, name)[reached(table, name)]),
         "worst_margin": None,
         "worst_flight": None,
     }
-    there = np.flatnonzero(np.isfinite(margin))
-    if there.size:
-        worst = int(there[first_smallest(margin[there], tie)])
-        about["worst_margin"] = float(margin[there].min())
-        about["worst_flight"] = table["flight"][worst].as_py()
-    return about
+    rows = np.flatnonzero(np.isfinite(margin))
+    if rows.size:
+        worst = int(rows[first_smallest(margin[rows], tie)])
+        summary["worst_margin"] = float(margin[rows].min())
+        summary["worst_flight"] = table["flight"][worst].as_py()
+    return summary
 
 
 def _flight(table: pa.Table, row: int) -> dict[str, Any]:
-    shown = ("flight", "verdict", "failed", "worst_margin", "worst_constraint", "duration", "reason")
-    values = table.slice(row, 1).to_pylist()[0]
-    draws = {name: values[DRAW + name] for name in draw_names(table)}
-    return {name: values[name] for name in shown} | {
-        "margin": values.get(f"{MARGIN}{values['worst_constraint']}"),
-        "draws": draws,
-    }
+    """Return what the summary has of one of the worst flights."""
+    (values,) = table.slice(row, 1).to_pylist()
+    summary: dict[str, Any] = {name: values[name] for name in _SHOWN_OF_FLIGHT}
+    summary["margin"] = values.get(f"{MARGIN}{values['worst_constraint']}")
+    summary["draws"] = {name: values[DRAW + name] for name in draw_names(table)}
+    return summary
 
 
 def parameters(table: pa.Table) -> dict[str, Any]:
@@ -354,26 +372,35 @@ def parameters(table: pa.Table) -> dict[str, Any]:
     margin = numbers(table, "worst_margin")
     if not np.isnan(margin).all():  # one that was lost before it had any ranks below all others
         margin = np.where(np.isnan(margin) & verdicts(table)["lost"], -np.inf, margin)
-    outcomes: dict[str, Any] = {}
+    summaries: dict[str, Any] = {}
     tested: list[dict[str, Any]] = []
     for name in draw_names(table):
         if not is_number(table, DRAW + name):
-            outcomes[name] = _levels(table, name, failed)
+            summaries[name] = _levels(table, name, failed)
             continue
         values = numbers(table, DRAW + name)
-        outcomes[name] = {"kind": "number", "unit": unit_of(table, DRAW + name)}
+        summary: dict[str, Any] = {"kind": "number", "unit": unit_of(table, DRAW + name)}
         for outcome, measured in (("worst_margin", margin), ("failed", failed.astype(float))):
+            summary[outcome] = None
             related = dependence(values, measured, np.random.default_rng(0))  # the same every time
-            if related is None:
-                outcomes[name][outcome] = None
-            else:
-                outcomes[name][outcome] = asdict(related)
-            tested += [] if related is None else [outcomes[name][outcome]]
-        outcomes[name]["groups"] = _groups(values, failed)
-    corrected = iter(holm([entry[key] for entry in tested for key in ("p", "p_xi")]))
+            if related is not None:
+                summary[outcome] = asdict(related)
+                tested.append(summary[outcome])
+        summary["groups"] = _groups(values, failed)
+        summaries[name] = summary
+    _correct(tested)
+    return summaries
+
+
+def _correct(tested: Sequence[dict[str, Any]]) -> None:
+    """Add to each tested dependence, in place, its p-values corrected for all of them by Holm's method."""
+    p_values = []
     for entry in tested:
-        entry |= {"p_holm": next(corrected), "p_xi_holm": next(corrected)}
-    return outcomes
+        p_values += [entry["p"], entry["p_xi"]]
+    corrected = iter(holm(p_values))
+    for entry in tested:
+        entry["p_holm"] = next(corrected)
+        entry["p_xi_holm"] = next(corrected)
 
 
 def drivers(summary: CampaignSummary) -> dict[str, Mapping[str, Any]]:
@@ -382,30 +409,37 @@ def drivers(summary: CampaignSummary) -> dict[str, Mapping[str, Any]]:
     They are ordered by how `worst_margin` depends on them, or else `failed`.
     """
     related = {}
-    for name, effect in summary["parameters"].items():
-        if effect.get("worst_margin") or effect.get("failed"):
-            related[name] = effect
+    for name, parameter in summary["parameters"].items():
+        if parameter.get("worst_margin") or parameter.get("failed"):
+            related[name] = parameter
 
-    def weakness(parameter: tuple[str, Mapping[str, Any]]) -> tuple[float, float]:
-        related = parameter[1]["worst_margin"] or parameter[1]["failed"]
-        return min(related["p_holm"], related["p_xi_holm"]), -max(abs(related["rho"]), related["xi"])
+    def weakness(item: tuple[str, Mapping[str, Any]]) -> tuple[float, float]:
+        _name, parameter = item
+        measured = parameter["worst_margin"] or parameter["failed"]
+        p_value = min(measured["p_holm"], measured["p_xi_holm"])
+        strength = max(abs(measured["rho"]), measured["xi"])
+        return p_value, -strength
 
     return dict(sorted(related.items(), key=weakness))
 
 
 def _levels(table: pa.Table, name: str, failed: FlightFlags) -> dict[str, Any]:
-    levels = texts(table, DRAW + name)
-    shares = {level: share_of(failed[levels == level]) for level in sorted(set(levels))}
-    return {"kind": "name", "unit": unit_of(table, DRAW + name), "levels": shares}
+    """Return the failures by level of a parameter that is no number."""
+    drawn = texts(table, DRAW + name)
+    levels = {level: share_of(failed[drawn == level]) for level in sorted(set(drawn))}
+    return {"kind": "name", "unit": unit_of(table, DRAW + name), "levels": levels}
 
 
 def _groups(values: Array, failed: FlightFlags) -> list[dict[str, Any]]:
     """Failures by thirds or fifths of a varied parameter, or by its values if no more; none of few flights."""
-    there = np.isfinite(values)
-    values = values[there]
-    failed = failed[there]
-    size = next((groups for flights, groups in _GROUPS if values.size >= flights), 0)
-    if not size:
+    known = np.isfinite(values)
+    values = values[known]
+    failed = failed[known]
+    if values.size >= _FLIGHTS_OF_FIFTHS:
+        size = 5
+    elif values.size >= _FLIGHTS_OF_THIRDS:
+        size = 3
+    else:
         return []
     distinct = np.unique(values)
     if distinct.size <= size:
@@ -413,16 +447,19 @@ def _groups(values: Array, failed: FlightFlags) -> list[dict[str, Any]]:
     else:
         cuts = np.quantile(values, np.arange(1, size) / size)
     group = np.searchsorted(cuts, values, side="right")
-    return [
-        {"low": float(values[of].min()), "high": float(values[of].max()), **share_of(failed[of])}
-        for of in (group == k for k in np.unique(group))
-    ]
+    groups = []
+    for k in np.unique(group):
+        members = group == k
+        low = float(values[members].min())
+        high = float(values[members].max())
+        groups.append({"low": low, "high": high, **share_of(failed[members])})
+    return groups
 
 
 EXAMPLE: Final = "P(violation) < 0.01 @ 95%"
-_SHARES: Final = (Decimal("1e-9"), 1 - Decimal("1e-9"))
-_CONFIDENCES: Final = (Decimal("0.5"), Decimal("0.999999"))
-_FORM: Final = re.compile(
+_SHARE_RANGE: Final = (Decimal("1e-9"), 1 - Decimal("1e-9"))
+_CONFIDENCE_RANGE: Final = (Decimal("0.5"), Decimal("0.999999"))
+_REQUIREMENT: Final = re.compile(
     r"P\s*\((?P<event>[^()]*)\)\s*(?P<operation><=|>=|<|>)\s*(?P<share>[^<>=@]+?)\s*@\s*(?P<confidence>[^@%]+?)\s*%",
     re.IGNORECASE,
 )
@@ -464,21 +501,23 @@ class Judgement:
     def sentence(self) -> str:
         """Return the judgement with its numbers."""
         required = self.requirement
+        share = ""
         if self.flights:
             share = f" ({percent(self.count / self.flights)})"
-        else:
-            share = ""
+        verdict = "holds" if self.holds else "does not hold"
+        side = "most" if required.at_most else "least"
         phrase = (
-            f"{required.text} {'holds' if self.holds else 'does not hold'}: {required.event.text} in {self.count} of "
+            f"{required.text} {verdict}: {required.event.text} in {self.count} of "
             f"{count_of(self.flights, 'flight')}{share}, so with {100.0 * required.confidence:g} % confidence at "
-            f"{'most' if required.at_most else 'least'} {percent(self.bound, digits=3)}."
+            f"{side} {percent(self.bound, digits=3)}."
         )
         if self.unaudited:
             return f"{phrase} Of {count_of(self.unaudited, 'flight')}, {UNAUDITED_ADVICE}."
         if self.flights >= self.least_flights:
             return phrase
         least = count_of(self.least_flights, "flight")
-        return f"{phrase} It takes at least {least}, {'none' if required.at_most else 'all'} of them with that event."
+        which = "none" if required.at_most else "all"
+        return f"{phrase} It takes at least {least}, {which} of them with that event."
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for `summary.json`."""
@@ -498,7 +537,7 @@ def parse_requirement(text: str) -> Requirement:
     """
     text = " ".join(text.split())
     owner = f"requirement {text!r}"
-    form = _FORM.fullmatch(text)
+    form = _REQUIREMENT.fullmatch(text)
     if form is None:
         raise InputError(
             f"{owner} must read P(EVENT) OP SHARE @ CONFIDENCE%, with one of < <= > >=, such as {EXAMPLE!r}"
@@ -507,8 +546,8 @@ def parse_requirement(text: str) -> Requirement:
         text=text,
         event=parse_event(form["event"].strip()),
         operation=form["operation"],
-        share=_number(owner, "share", form["share"], *_SHARES),
-        confidence=_number(owner, "confidence", form["confidence"] + "%", *_CONFIDENCES),
+        share=_number(owner, "share", form["share"], *_SHARE_RANGE),
+        confidence=_number(owner, "confidence", form["confidence"] + "%", *_CONFIDENCE_RANGE),
     )
 
 
@@ -552,9 +591,11 @@ def least_flights(requirement: Requirement) -> int:
     else:
         per_flight = math.log(requirement.share)
     n = max(1, math.ceil(math.log1p(-requirement.confidence) / per_flight))
-    near = range(max(1, n - 1), n + 2)
-    best = ((k, _bound(requirement, 0 if requirement.at_most else k, k)) for k in near)
-    return next((k for k, bound in best if requirement.supported_by(bound)), n)
+    for flights in range(max(1, n - 1), n + 2):
+        count = 0 if requirement.at_most else flights
+        if requirement.supported_by(_bound(requirement, count, flights)):
+            return flights
+    return n
 
 
 def _bound(requirement: Requirement, count: int, flights: int) -> float:
@@ -570,7 +611,9 @@ def _number(owner: str, name: str, text: str, low: Decimal, high: Decimal) -> fl
     """A share of one, given as such or in percent."""
     in_percent = text.endswith("%")
     with contextlib.suppress(ArithmeticError):
-        value = Decimal(text.removesuffix("%").strip()) / (100 if in_percent else 1)
+        value = Decimal(text.removesuffix("%").strip())
+        if in_percent:
+            value /= 100
         if low <= value <= high:
             return float(value)
     rule = f"a number from {low} to {high}".lower()

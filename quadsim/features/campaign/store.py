@@ -1,8 +1,8 @@
 """A growing campaign directory: no stored flight is lost or stored twice, whichever process is killed.
 
 Rows are appended as files of their own below `parts/`, every few seconds; those that a killed process had not yet
-appended are flown again.  When all is flown the parts become `flights.parquet` and
-`timing.parquet`, and go.  The manifest has what was flown, by which code, and how far it is.
+appended are flown again.  When all is flown the parts become `flights.parquet` and `timing.parquet`, and go.  The
+manifest has what was flown, by which code, and how far it is.  `campaign` writes here, `paired` and replays read.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from quadsim.scenarios.plugin import Plugin, PluginForce, import_plugin
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
 CAMPAIGN: Final = "quadsim campaign"
-_FORM: Final = {"format": str, "name": str, "status": str, "flights": int, "flown": int, "sessions": list}
+_MANIFEST_TYPES: Final = {"format": str, "name": str, "status": str, "flights": int, "flown": int, "sessions": list}
 FLIGHTS_FILE: Final = "flights.parquet"
 TIMES_FILE: Final = "timing.parquet"
 FLUSH_S: Final = 5.0  # how long an answer may wait in memory before it is on the disk [s]
@@ -56,9 +56,10 @@ def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
     """
     table = read_table(path)
     require_format(format_of(table), path, f"quadsim campaign {shlex.quote(str(path.parent / CAMPAIGN_FILE))}")
-    kinds = {field.name: field.type for field in table.schema}
-    if any(kinds.get(field.name) != field.type for field in schema if field.name not in TIMES):
-        raise FileError(path, "has other columns than this campaign")
+    types = {field.name: field.type for field in table.schema}
+    for field in schema:
+        if field.name not in TIMES and types.get(field.name) != field.type:
+            raise FileError(path, "has other columns than this campaign")
     flights = table["flight"].to_numpy()
     if flights.size and (flights[0] < 0 or (np.diff(flights) <= 0).any()):
         raise FileError(path, "has flights that are not numbered upwards from 0")
@@ -82,19 +83,31 @@ class Store:
             FileError: a file is damaged or of another campaign.
         """
         tables = [self._schema.empty_table()]
-        if (path := self._directory / FLIGHTS_FILE).is_file():
-            table = read_flights(path, self._schema)
-            times = read_table(self._directory / TIMES_FILE)
-            same = times["flight"].equals(table["flight"])  # else the process died between the two files
-            for name in TIMES:
-                absent = pa.nulls(table.num_rows, self._schema.field(name).type)
-                table = table.append_column(name, times[name] if same else absent)
-            tables.append(table)
-        tables += [read_flights(self._directory / name, self._schema) for name in self._parts()]
-        columns = [[table[name] for name in self._schema.names] for table in tables]
-        whole = pa.concat_tables(pa.Table.from_arrays(arrays, schema=self._schema) for arrays in columns)
+        if (self._directory / FLIGHTS_FILE).is_file():
+            tables.append(self._final_table())
+        for name in self._parts():
+            tables.append(read_flights(self._directory / name, self._schema))
+        whole = pa.concat_tables([self._in_schema(table) for table in tables])
         _, first = np.unique(whole["flight"].to_numpy(), return_index=True)
         return whole.take(first)
+
+    def _final_table(self) -> pa.Table:
+        """Return the flights of the final two tables, with null for times that are of other flights."""
+        table = read_flights(self._directory / FLIGHTS_FILE, self._schema)
+        times = read_table(self._directory / TIMES_FILE)
+        same_flights = times["flight"].equals(table["flight"])  # else the process died between the two files
+        for name in TIMES:
+            if same_flights:
+                column = times[name]
+            else:
+                column = pa.nulls(table.num_rows, self._schema.field(name).type)
+            table = table.append_column(name, column)
+        return table
+
+    def _in_schema(self, table: pa.Table) -> pa.Table:
+        """Return the columns of the schema, in its order."""
+        columns = [table[name] for name in self._schema.names]
+        return pa.Table.from_arrays(columns, schema=self._schema)
 
     def counted(self) -> int:
         """Number of flights in the final table; 0 without one."""
@@ -123,7 +136,8 @@ class Store:
         """
         if rows:
             first = min(row["flight"] for row in rows)
-            self._files.write({f"{PARTS_DIR}/part-{first:09d}.parquet": _encoded(make_table(rows, self._schema))})
+            name = f"{PARTS_DIR}/part-{first:09d}.parquet"
+            self._files.write({name: _encoded(make_table(rows, self._schema))})
 
     def close(self, flights: int) -> tuple[pa.Table, pa.Table]:
         """Put the first `flights` flights into their final two tables, which are returned, and remove the parts.
@@ -139,10 +153,12 @@ class Store:
 
     def _parts(self) -> list[str]:
         """Return the paths of the parts, relative to the directory."""
-        return sorted(f"{PARTS_DIR}/{path.name}" for path in (self._directory / PARTS_DIR).glob("part-*.parquet"))
+        paths = (self._directory / PARTS_DIR).glob("part-*.parquet")
+        return sorted(f"{PARTS_DIR}/{path.name}" for path in paths)
 
 
 def _encoded(table: pa.Table) -> bytes:
+    """Return the bytes of a Parquet file."""
     buffer = io.BytesIO()
     pq.write_table(table, buffer, compression="zstd")
     return buffer.getvalue()
@@ -179,16 +195,14 @@ def start_session(plan: Plan, files: Growing, session: Mapping[str, Any], *, fly
         manifest = {**known, "status": "running", "flights": plan.spec.flights}
         files.remove([SUMMARY_FILE])  # which is there, with the list of all others, while nothing is being flown
     manifest["sessions"].append(session)
-    texts = {
-        CAMPAIGN_FILE: _stored(plan).to_toml(),
-        SCENARIO_FILE: plan.scenario.to_toml(),
-    }  # files that need no others
-    files.write({name: text.encode() for name, text in texts.items()})
-    write(manifest, files)
+    campaign_text = _stored(plan).to_toml()
+    scenario_text = plan.scenario.to_toml()  # neither file needs any other
+    files.write({CAMPAIGN_FILE: campaign_text.encode(), SCENARIO_FILE: scenario_text.encode()})
+    write_manifest(manifest, files)
     return manifest
 
 
-def write(manifest: Mapping[str, Any], files: Growing) -> None:
+def write_manifest(manifest: Mapping[str, Any], files: Growing) -> None:
     """Write or replace the manifest in one step."""
     files.write({MANIFEST_FILE: to_json(manifest).encode()})
 
@@ -201,20 +215,21 @@ def require_same(plan: Plan, directory: Path) -> None:
         InputError: it is another one.
     """
     known = stored_plan(directory)
+    spec = _stored(plan)
+    known_spec = _stored(known)
     differing = []
     for field in fields(CampaignFile):
-        if getattr(_stored(plan), field.name) != getattr(_stored(known), field.name):
+        if getattr(spec, field.name) != getattr(known_spec, field.name):
             differing.append(field.name)
-    grows = plan.spec.sampling != "latin_hypercube" and plan.spec.flights >= known.spec.flights
-    if differing == ["flights"] and grows:
+    may_grow = plan.spec.sampling != "latin_hypercube" and plan.spec.flights >= known.spec.flights
+    if differing == ["flights"] and may_grow:
         differing = []
     if known.scenario != plan.scenario:
         differing.append("scenario")
     if differing:
+        rule = ""
         if differing == ["flights"]:
             rule = "; more flights may follow, except of a latin_hypercube"
-        else:
-            rule = ""
         raise InputError(
             f"{directory}: --resume needs the same campaign, and its {', '.join(differing)} differs from "
             f"the one there{rule}; choose another --out"
@@ -229,21 +244,29 @@ def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
 def flown_by(plan: Plan) -> dict[str, Any]:
     """Return versions and hashes of everything outside the campaign's files that affects numbers; imports user code."""
     controller = plan.scenario.controller
+    controller_code = None
+    if isinstance(controller, Plugin):
+        controller_code = _user_code_digest(controller)
+    force_code = [_user_code_digest(force) for force in plan.scenario.forces]
     return {
         "code": code_digest(),
-        "controller": _user_code(controller) if isinstance(controller, Plugin) else None,
-        "forces": [_user_code(force) for force in plan.scenario.forces] or None,
+        "controller": controller_code,
+        "forces": force_code or None,
         "versions": versions(),
         "machine": machine(),
     }
 
 
-def _user_code(spec: Plugin | PluginForce) -> str | None:
+def _user_code_digest(spec: Plugin | PluginForce) -> str | None:
     """SHA-256 of a user's module, or of the whole package that it is in; None without a file."""
-    file = getattr(sys.modules[import_plugin(spec).__module__.partition(".")[0]], "__file__", None)
+    package, _, _rest = import_plugin(spec).__module__.partition(".")
+    file = getattr(sys.modules[package], "__file__", None)
     if file is None:
         return None
-    return digest_below([Path(file).parent if Path(file).name == "__init__.py" else Path(file)])
+    path = Path(file)
+    if path.name == "__init__.py":
+        path = path.parent
+    return digest_below([path])
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:
@@ -262,7 +285,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
-    manifest = read_json(path, _FORM, "a campaign's manifest")
+    manifest = read_json(path, _MANIFEST_TYPES, "a campaign's manifest")
     if manifest["format"] != CAMPAIGN:
         raise FileError(path, "is not a campaign's manifest: it lacks or misstates format")
     return manifest
@@ -287,13 +310,17 @@ def stored_plan(directory: Path) -> Plan:
         FileError: it is none, or a file is missing or not the one that was flown.
     """
     manifest = read_manifest(directory)
-    listed: dict[str, str] = {}
+    digests: dict[str, str] = {}
     if (directory / SUMMARY_FILE).exists():  # it is finished
         summary = read_json(directory / SUMMARY_FILE, {}, "a campaign's summary")
-        listed = {**manifest.get("files", {}), **summary.get("files", {})}
-    for name in (CAMPAIGN_FILE, SCENARIO_FILE, *(name for name in (FLIGHTS_FILE, TIMES_FILE) if name in listed)):
+        digests = {**manifest.get("files", {}), **summary.get("files", {})}
+    required = [CAMPAIGN_FILE, SCENARIO_FILE]
+    for name in (FLIGHTS_FILE, TIMES_FILE):
+        if name in digests:
+            required.append(name)
+    for name in required:
         path = directory / name
-        if not path.is_file() or (name in listed and digest_of(path) != listed[name]):
+        if not path.is_file() or (name in digests and digest_of(path) != digests[name]):
             raise FileError(path, "is missing or not the file that was written")
     return load_plan(str(directory / CAMPAIGN_FILE))
 

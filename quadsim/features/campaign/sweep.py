@@ -1,4 +1,7 @@
-"""Sweeps: flights of a scenario for every combination of the values of some fields, as a tidy table."""
+"""Sweeps: flights of a scenario for every combination of the values of some fields, as a tidy table.
+
+A sweep is a campaign of grids alone (`plan`), all of whose flights have the scenario's seed; nothing is written.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.scenarios.schema.settings import leaves, separate
 
-_FIRST: Final = ("verdict", "worst_margin", "worst_constraint", "reason")  # columns after those of the swept fields
+_FIRST_RESULTS: Final = ("verdict", "worst_margin", "worst_constraint", "reason")  # columns after the swept fields
 _SHOWN: Final = ("verdict", "rmse.x", "rmse.y", "rmse.z", "worst_margin", "worst_constraint")
 
 
@@ -78,21 +81,26 @@ class Sweep(Result):
         """See `Result.shown`."""
         from quadsim.console import console
 
-        verdicts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(self["verdict"].tolist()).items())
+        counts = Counter(self["verdict"].tolist())
+        verdicts = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
         lines = []
         for row in self.table.to_pylist():
             lines.append([_text(row[name]) for name in (*self.fields, *_SHOWN)])
-        head = (*map(self._brief, self.fields), *_SHOWN)
+        head = (*map(self._short_name, self.fields), *_SHOWN)
         title = f"sweep of {self.name}: {len(self)} flights, {verdicts}"
         yield console.table(title, head, lines, left=("verdict", "worst_constraint"))
         if self.cut:
             yield f"{self.cut} of {len(self)} flights end before their course does: the scenario states a duration"
 
-    def _brief(self, field: str) -> str:
-        """Return the last part of a field's path if it is unique."""
+    def _short_name(self, field: str) -> str:
+        """Return the shortest end of a field's path that no other field has; a number in a list has its list's name."""
         parts = field.split(".")
-        ends = (".".join(parts[-count:]) for count in range(2 if parts[-1].isdigit() else 1, len(parts)))
-        return next((end for end in ends if sum(f".{name}".endswith(f".{end}") for name in self.fields) == 1), field)
+        fewest = 2 if parts[-1].isdigit() else 1
+        for count in range(fewest, len(parts)):
+            end = ".".join(parts[-count:])
+            if sum(f".{name}".endswith(f".{end}") for name in self.fields) == 1:
+                return end
+        return field
 
     def small_plot(self) -> Figure | None:
         """See `Result.small_plot`: the worst margin over the first field that is a number."""
@@ -102,17 +110,24 @@ class Sweep(Result):
         x = numbers(self.table, names[0])
         y = numbers(self.table, "worst_margin")
         satisfied = self["verdict"] == "satisfied"
-        points = tuple(
-            Series(x=x[chosen], y=y[chosen], colour=colour, label=label, style="points", width=5.0, marker=marker)
-            for chosen, colour, label, marker in (
-                (satisfied, COLOUR.satisfied, "satisfied", "circle"),
-                (~satisfied, COLOUR.violated, "not satisfied", "x"),
-            )
-            if chosen.any()
+        kinds = (
+            (satisfied, COLOUR.satisfied, "satisfied", "circle"),
+            (~satisfied, COLOUR.violated, "not satisfied", "x"),
         )
-        label = "worst margin, as a share of half its band"
-        zero = Bound(value=0.0)
-        panel = Panel(title=label, y_label="share", x_label=names[0], series=points, bounds=(zero,), height=1.4)
+        points = []
+        for rows, colour, label, marker in kinds:
+            if rows.any():
+                points.append(
+                    Series(x=x[rows], y=y[rows], colour=colour, label=label, style="points", width=5.0, marker=marker)
+                )
+        panel = Panel(
+            title="worst margin, as a share of half its band",
+            y_label="share",
+            x_label=names[0],
+            series=tuple(points),
+            bounds=(Bound(value=0.0),),
+            height=1.4,
+        )
         return Figure(key="sweep", title="", panels=(panel,), columns=1)
 
     def to_json(self) -> list[dict[str, Any]]:
@@ -148,13 +163,22 @@ def fly_sweep(
             rows.append(row)
             progress("sweep", len(rows), count)
     cut = sum(_is_cut(plan, flight) for flight in range(count))
-    swept = _swept(entries)
-    table = make_table(rows, plan.schema)
-    dropped = ("flight", "seed", "failed", *(DRAW + entry.name for entry in entries))
-    results = table.select([*_FIRST, *(name for name in table.column_names if name not in (*_FIRST, *dropped))])
-    schema = pa.schema([*(pa.field(name, column.type) for name, column in swept.items()), *results.schema])
-    columns = [*swept.values(), *results.columns]
-    return Sweep(scenario.name, tuple(swept), pa.Table.from_arrays(columns, schema=schema), cut)
+    swept = _swept_columns(entries)
+    results = _result_columns(make_table(rows, plan.schema), entries)
+    fields = []
+    for name, column in swept.items():
+        fields.append(pa.field(name, column.type))
+    schema = pa.schema([*fields, *results.schema])
+    whole = pa.Table.from_arrays([*swept.values(), *results.columns], schema=schema)
+    return Sweep(scenario.name, tuple(swept), whole, cut)
+
+
+def _result_columns(table: pa.Table, entries: Sequence[GridValues]) -> pa.Table:
+    """Return what was measured of each flight, the most important columns first."""
+    left_out = {"flight", "seed", "failed", *_FIRST_RESULTS}
+    left_out.update(DRAW + entry.name for entry in entries)
+    others = [name for name in table.column_names if name not in left_out]
+    return table.select([*_FIRST_RESULTS, *others])
 
 
 def _is_cut(plan: Plan, flight: int) -> bool:
@@ -173,24 +197,37 @@ def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> GridValues:
         owner = f"({', '.join(fields)})"
     if isinstance(tried, str) or not hasattr(tried, "__len__") or not len(tried):
         raise ParameterError("sweep", owner, tried, "a list of values to try")
-    values = [value.tolist() if hasattr(value, "tolist") else value for value in tried]
+    values = []
+    for value in tried:
+        plain = value.tolist() if hasattr(value, "tolist") else value
+        if not isinstance(fields, str):
+            plain = tuple(separate({fields: plain}, source="sweep").values())
+        elif isinstance(plain, tuple):
+            plain = list(plain)
+        values.append(plain)
     if isinstance(fields, str):
-        values = [list(value) if isinstance(value, tuple) else value for value in values]
         fields = (fields,)
-    else:
-        values = [tuple(separate({fields: value}, source="sweep").values()) for value in values]
     try:
         return GridValues(name=owner, fields=[*fields], distribution="grid", values=values)
     except ValueError as error:
         raise InputError(f"sweep.{owner}: {error}") from None
 
 
-def _swept(entries: Sequence[GridValues]) -> dict[str, pa.Array]:
+def _swept_columns(entries: Sequence[GridValues]) -> dict[str, pa.Array]:
     """Return the columns of the swept values, by the dotted path of each number or text."""
-    rows = []
-    for combination in itertools.product(*(entry.values for entry in entries)):
-        together = {tuple(entry.fields): value for entry, value in zip(entries, combination, strict=True)}
-        changes = leaves(separate(together, source="sweep"), entries=True)
-        rows.append({path: cell(value) for path, value in changes})
-    paths = dict.fromkeys(path for row in rows for path in row)
-    return {path: pa.array([row.get(path) for row in rows]) for path in paths}
+    rows: list[dict[str, Any]] = []
+    paths: dict[str, None] = {}  # in the order in which they appear
+    values = [entry.values for entry in entries]
+    for combination in itertools.product(*values):
+        together = {}
+        for entry, value in zip(entries, combination, strict=True):
+            together[tuple(entry.fields)] = value
+        row = {}
+        for path, leaf in leaves(separate(together, source="sweep"), entries=True):
+            row[path] = cell(leaf)
+            paths[path] = None
+        rows.append(row)
+    columns = {}
+    for path in paths:
+        columns[path] = pa.array([row.get(path) for row in rows])
+    return columns

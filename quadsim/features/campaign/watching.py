@@ -1,4 +1,7 @@
-"""The progress of a campaign: a bar on a terminal, lines elsewhere."""
+"""The progress of a campaign: a bar on a terminal, lines elsewhere.
+
+`commands` passes the function that `watching` yields to `campaign.fly_campaign`, which calls it after every flight.
+"""
 
 from __future__ import annotations
 
@@ -27,18 +30,28 @@ def watching(progress: bool) -> Iterator[Watch]:
             TextColumn("flights"), BarColumn(), TextColumn("{task.description}"), console=screen, transient=True
         ) as bars:
             bar = bars.add_task("starting the campaign")
-            yield lambda state: bars.update(
-                bar, completed=state.flown, total=state.flights, description=_describe(state)
-            )
+
+            def move_bar(state: CampaignProgress) -> None:
+                bars.update(bar, completed=state.flown, total=state.flights, description=_describe(state))
+
+            yield move_bar
     else:
-        with lines(screen, "starting the campaign") as tell:
-            yield lambda state: tell(f"flights {_describe(state)}" if state.flown < state.flights else "report")
+        with lines(screen, "starting the campaign") as print_line:
+
+            def print_progress(state: CampaignProgress) -> None:
+                if state.flown < state.flights:
+                    print_line(f"flights {_describe(state)}")
+                else:
+                    print_line("report")
+
+            yield print_progress
 
 
 def _describe(state: CampaignProgress) -> str:
     """Return flights done, rate, time left and failures in one line."""
     share = proportion(state.failed, state.flown)
-    left = datetime.timedelta(seconds=round((state.flights - state.flown) / state.rate))
+    seconds_left = (state.flights - state.flown) / state.rate
+    left = datetime.timedelta(seconds=round(seconds_left))
     return (
         f"{state.flown}/{state.flights}, {state.rate:.2f}/s, {left} left; "
         f"{state.failed} failed ({interval(share['lower'], share['upper'])})"

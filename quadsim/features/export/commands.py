@@ -1,4 +1,4 @@
-"""The command `quadsim export`."""
+"""The command `quadsim export`: writes a controller as C by `exporter`, and flies it by `in_the_loop` where asked."""
 
 from __future__ import annotations
 
@@ -58,9 +58,10 @@ def export(
     with reporting(progress, "the export") as report:
         report("export", 0, 1)
         directory = exporter.export(flown, out, overwrite=overwrite, rows=rows, **options)  # type: ignore[arg-type]
-    room = exporter.room_sentence(json.loads((directory / exporter.FACTS).read_text()))
+    facts = json.loads((directory / exporter.FACTS).read_text())
+    memory = exporter.memory_sentence(facts)
     make = f"make -C {shlex.quote(str(directory))} check"
-    text = f"{precision}: {room}\nWrote {directory}: {make} compiles it and checks its recorded periods"
+    text = f"{precision}: {memory}\nWrote {directory}: {make} compiles it and checks its recorded periods"
     if not fly:
         return results.Document(f"{text}\n", {"directory": str(directory)})
     _log.info(text.replace("\n", "; "))

@@ -1,4 +1,9 @@
-"""Export of a scenario's controller as self-contained C99, with a test of its room for active rows."""
+"""Export of a scenario's controller as self-contained C99, with a test of its capacity for active rows.
+
+`quadsim.mpc.export` has the controller's files and numbers, `record` the periods of a flight as test vectors; here they
+become a directory.  The memory is sized for some active rows: `reach` draws states around the reference, and finds from
+how far away the capacity still suffices for the exact optimum.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +22,7 @@ from quadsim.features.export.record import Recording, record
 from quadsim.mpc.export.ctext import CText, Precision
 from quadsim.mpc.export.geometric import CGeometric
 from quadsim.mpc.export.nonlinear import CNonlinear
-from quadsim.mpc.export.source import BODY_FILES, CHANGES, DATA, CController, CSource, part
+from quadsim.mpc.export.source import BODY_FILES, CHANGES, DATA_FILE, CController, CSource, c_source
 from quadsim.mpc.export.targets import TARGETS, Machine
 from quadsim.mpc.laws.geometric import Geometric
 from quadsim.mpc.laws.nonlinear import Nonlinear
@@ -36,19 +41,19 @@ from quadsim.state import N_STATES, POSITION, VELOCITY, Array
 DISTANCES: Final = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Per axis [m], and speeds per axis [m/s]."""
 DRAWS: Final = 200
-"""States of each distance."""
+"""States that are drawn at each distance."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """What was found by states up to the first distance at which one ran out of room.
+    """How far from the reference the capacity for active rows suffices, of states that were drawn around it.
 
     Attributes:
-        distance: the largest one [m, m/s] up to which none did; 0 where some did at the first.
+        distance: the largest one [m, m/s] up to which it did for every state; 0 where it did not at the first.
         drawn: states up to there.
         feasible: those of them that have an optimum.
         beyond: the next distance; None where none was left to try.
-        lost: of its states with an optimum, those that ran out of room.
+        lost: of its states with an optimum, those for which the capacity did not suffice.
     """
 
     distance: float
@@ -73,42 +78,48 @@ Solves = Callable[[Array], bool]
 
 
 class LinearSearch:
-    """Cold searches of a linear controller with a room, and a number of changes, of its own; 0 for all that it needs.
+    """Cold searches of a linear controller, with a capacity for active rows and a limit of changes; 0 for all it needs.
 
     Attitude and yaw are level, rotors hover.
     """
 
-    def __init__(self, controller: CController, room: int, changes: int) -> None:
+    def __init__(self, controller: CController, capacity: int, changes: int) -> None:
         problem = controller.law.problem
         self._library = core_library()
         self._shared = CoreProblem(problem)
-        struct = self._struct = type(self._shared.struct).from_buffer_copy(self._shared.struct)
-        struct.room = room or struct.room
-        struct.changes = changes or struct.changes
+        self._struct = type(self._shared.struct).from_buffer_copy(self._shared.struct)
+        self._struct.room = capacity or self._struct.room
+        self._struct.changes = changes or self._struct.changes
         self._work = WorkStruct()
-        self._memory = np.zeros(self._library.quadsim_work_reals(struct))
-        self._library.quadsim_work_start(self._work, struct, self._memory.ctypes.data)
-        rest = np.zeros(problem.model.n)
-        speeds = np.array(problem.model.u_bar)
-        rest[N_STATES:] = speeds[: rest.size - N_STATES]
-        self._query = np.zeros((problem.horizon, len(problem.objective.C_r))), rest, speeds, speeds
+        self._memory = np.zeros(self._library.quadsim_work_reals(self._struct))
+        self._library.quadsim_work_start(self._work, self._struct, self._memory.ctypes.data)
+        self._desired = np.zeros((problem.horizon, len(problem.objective.C_r)))
+        self._hover_speeds = np.array(problem.model.u_bar)
+        self._rest = np.zeros(problem.model.n)
+        self._rest[N_STATES:] = self._hover_speeds[: self._rest.size - N_STATES]
 
     def __call__(self, offset: Array) -> bool:
         """See `Solves`."""
-        state = self._query[1].copy()
+        state = self._rest.copy()
         state[[*POSITION, *VELOCITY]] += offset
         self._library.quadsim_work_reset(self._work)
-        addresses = (part.ctypes.data for part in (state, *self._query))
-        found: int = self._library.quadsim_optimise(self._work, *addresses)
-        return found < len(Method)
+        method: int = self._library.quadsim_optimise(
+            self._work,
+            state.ctypes.data,
+            self._desired.ctypes.data,
+            self._rest.ctypes.data,
+            self._hover_speeds.ctypes.data,
+            self._hover_speeds.ctypes.data,
+        )
+        return method < len(Method)
 
 
-def nonlinear_search(controller: CNonlinear, room: int, changes: int) -> Solves:
+def nonlinear_search(controller: CNonlinear, capacity: int, changes: int) -> Solves:
     """Return the same of a nonlinear controller's first programs, along a reference at rest."""
     law = replace(controller).law
     program = law.program.struct
     hover = law.problem.model.u_bar
-    law.resize(room or program.room, changes or program.changes)
+    law.resize(capacity or program.room, changes or program.changes)
     states = np.zeros((program.horizon + 1, N_BODY))
     thrusts = np.tile(np.array(law.numbers.lifts), (program.horizon, 1))
     states[:, 3] = 1.0
@@ -124,7 +135,7 @@ def nonlinear_search(controller: CNonlinear, room: int, changes: int) -> Solves:
 
 
 def reach(whole: Solves, limited: Solves, draws: int = DRAWS) -> Reach:
-    """Draw states around a reference at rest, and search with this room and with all that can be needed.
+    """Draw states around a reference at rest, and search with a limited capacity and with all that can be needed.
 
     Position and velocity are uniform within a distance per axis; each search begins without an active set.
 
@@ -134,11 +145,13 @@ def reach(whole: Solves, limited: Solves, draws: int = DRAWS) -> Reach:
     rng = np.random.default_rng(0)
     reached = Reach(distance=0.0, drawn=0, feasible=0)
     for distance in DISTANCES:
-        feasible = lost = 0
+        feasible = 0
+        lost = 0
         for offset in rng.uniform(-distance, distance, (draws, 6)):
             if whole(offset):
                 feasible += 1
-                lost += not limited(offset)
+                if not limited(offset):
+                    lost += 1
         if lost:
             return replace(reached, beyond=distance, lost=lost)
         reached = Reach(distance=distance, drawn=reached.drawn + draws, feasible=reached.feasible + feasible)
@@ -149,9 +162,9 @@ WARM: Final = """Solve once before take-off: the first step starts without an ac
 it.  `quadsim_law_changes(&law)` is the number in each step.
 
 """
-"""What the README says of a solver."""
+"""What the README says of a controller that solves an optimisation."""
 FACTS: Final = "export.json"
-"""File with an export's memory and the range of its room."""
+"""File with an export's memory, and from how far away its capacity suffices."""
 
 
 def export(
@@ -190,17 +203,21 @@ def export(
         >>> import quadsim
         >>> directory = quadsim.export(quadsim.load("hover", {"duration": 1.0}), "c")  # doctest: +SKIP
     """
-    for name, value, allowed in (("precision", precision, get_args(Precision)), ("target", target, tuple(TARGETS))):
-        if value not in allowed:
-            raise ParameterError("", f"--{name}", value, f"one of {', '.join(allowed)}")
+    precisions = get_args(Precision)
+    if precision not in precisions:
+        raise ParameterError("", "--precision", precision, f"one of {', '.join(precisions)}")
+    if target not in TARGETS:
+        raise ParameterError("", "--target", target, f"one of {', '.join(TARGETS)}")
     if rows is not None and rows < 1:
         raise ParameterError("", "--rows", rows, "at least 1")
     scenario = load_scenario(scenario)
     with reserving(out, overwrite=overwrite) as directory:
         controller = c_controller(scenario, precision, rows)
         facts = _facts(controller)
-        files = controller.files | programs(controller, TARGETS[target]) | vector_files(record(scenario), controller)
-        files["README.md"] = _readme(scenario, controller, room_sentence(facts))
+        files = dict(controller.files)
+        files |= programs(controller, TARGETS[target])
+        files |= vector_files(record(scenario), controller)
+        files["README.md"] = _readme(scenario, controller, memory_sentence(facts))
         files[FACTS] = json.dumps(facts, indent=2) + "\n"
         with writing(directory, overwrite=overwrite) as partial:
             for name, text in files.items():
@@ -209,7 +226,7 @@ def export(
 
 
 def c_controller(scenario: Scenario | Assembly, precision: Precision = "double", rows: int | None = None) -> CSource:
-    """The controller's own files, with room for active `rows`; see `export`.
+    """The controller's own files, with memory for some active `rows`; see `export`.
 
     Raises:
         ExportError: this controller cannot be exported.
@@ -222,14 +239,18 @@ def c_controller(scenario: Scenario | Assembly, precision: Precision = "double",
     table = scenario.controller
     title = _title(scenario)
     if not isinstance(table, Nonlinear | Geometric):
-        return CController(law=exported_law(scenario), precision=precision, title=title, asked=rows)
+        return CController(law=exported_law(scenario), precision=precision, title=title, requested_rows=rows)
     if isinstance(table, Nonlinear) and table.avoidance is not None and (scenario.obstacles or assembly.regions):
         raise ExportError(AVOIDS)
     if table.commands != ROTORS and table.inner_lag is None:
         table = replace(table, inner_lag=assembly.inner_lag)
     shared: dict[str, Any] = {
-        **{"vehicle": assembly.vehicle, "control_period": scenario.control_period},
-        **{"motion": assembly.motion is not None, "precision": precision, "title": title, "asked": rows},
+        "vehicle": assembly.vehicle,
+        "control_period": scenario.control_period,
+        "motion": assembly.motion is not None,
+        "precision": precision,
+        "title": title,
+        "requested_rows": rows,
     }
     if isinstance(table, Geometric):
         if rows is not None:
@@ -247,30 +268,33 @@ def exported_law(scenario: Scenario) -> Exportable:
     controller = scenario.controller
     shapes = (*scenario.obstacles, *scenario.regions)
     if not isinstance(controller, Weighted):
-        if controller.commands == ROTORS:
-            how = ""
-        else:
-            how = f' with commands = "{controller.commands}"'
+        refused = f"it is {controller.type!r}"
+        if controller.commands != ROTORS:
+            refused += f' with commands = "{controller.commands}"'
         exported = "exported are unconstrained, constrained, robust, nonlinear, and geometric of rates"
-        raise ExportError(f"it is {controller.type!r}{how}; {exported}")
+        raise ExportError(f"{refused}; {exported}")
     return exportable(controller, Assembly(scenario).vehicle, scenario.control_period, shapes)
 
 
 def _facts(controller: CSource) -> dict[str, Any]:
-    room = controller.rows + 1
-    size = {"precision": controller.precision, "memory_bytes": controller.memory_bytes}
+    """Return the contents of `export.json`."""
+    facts: dict[str, Any] = {"precision": controller.precision, "memory_bytes": controller.memory_bytes}
     if isinstance(controller, CGeometric):
-        return size
+        return facts
+    capacity = controller.rows + 1
     if isinstance(controller, CNonlinear):
-        found = reach(nonlinear_search(controller, 0, 0), nonlinear_search(controller, room, CHANGES), DRAWS // 4)
+        whole: Solves = nonlinear_search(controller, 0, 0)
+        reached = reach(whole, nonlinear_search(controller, capacity, CHANGES), DRAWS // 4)
     else:
         assert isinstance(controller, CController)
-        found = reach(LinearSearch(controller, 0, 0), LinearSearch(controller, room, CHANGES))
-    return size | {"rows": controller.rows, "reach": asdict(found)}
+        reached = reach(LinearSearch(controller, 0, 0), LinearSearch(controller, capacity, CHANGES))
+    facts["rows"] = controller.rows
+    facts["reach"] = asdict(reached)
+    return facts
 
 
-def room_sentence(facts: Mapping[str, Any]) -> str:
-    """Return the memory of the room for active rows, and the distance from the reference up to which it suffices."""
+def memory_sentence(facts: Mapping[str, Any]) -> str:
+    """Return the memory, and the distance from the reference up to which its capacity for active rows suffices."""
     if "rows" not in facts:
         return f"{facts['memory_bytes']} bytes of memory"
     return f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory; {Reach(**facts['reach'])}"
@@ -278,9 +302,12 @@ def room_sentence(facts: Mapping[str, Any]) -> str:
 
 def programs(controller: CSource, target: Machine) -> dict[str, str]:
     """Return the files that run the controller on a target, by name."""
-    names = ("main.c", "serial.c", "target.h", *target.sources, "LICENSE")
-    makefile = f"{target.makefile(controller.defines)}CONTROLLER = {controller.objects}\n{part('Makefile')}"
-    return {name: part(name) for name in names} | {"Makefile": makefile}
+    files = {}
+    for name in ("main.c", "serial.c", "target.h", *target.sources, "LICENSE"):
+        files[name] = c_source(name)
+    settings = target.makefile(controller.defines)
+    files["Makefile"] = f"{settings}CONTROLLER = {controller.objects}\n{c_source('Makefile')}"
+    return files
 
 
 def _title(scenario: Scenario) -> str:
@@ -295,37 +322,48 @@ def _title(scenario: Scenario) -> str:
 
 def vector_files(recording: Recording, controller: CSource) -> dict[str, str]:
     """The recorded periods as C, by file name."""
-    row = CText(controller.precision).value
-    queries = zip(recording.state, recording.acting, recording.command, recording.status.tolist(), strict=True)
-    rows = [f"    {{{', '.join(map(row, arrays))}, {status}}}" for *arrays, status in queries]
-    path = [f"    {row(reference)}" for reference in recording.path]
+    text = CText(controller.precision)
+    periods = []
+    for state, acting, command, status in zip(
+        recording.state, recording.acting, recording.command, recording.status.tolist(), strict=True
+    ):
+        periods.append(f"    {{{text.value(state)}, {text.value(acting)}, {text.value(command)}, {status}}}")
+    path = [f"    {text.value(reference)}" for reference in recording.path]
     source = [
         '#include "vectors.h"\n',
         "const int quadsim_vectors_count = QUADSIM_VECTORS;\n",
-        f"const quadsim_real quadsim_vectors_before[4] = {row(recording.before)};\n",
+        f"const quadsim_real quadsim_vectors_before[4] = {text.value(recording.before)};\n",
         f"const quadsim_real quadsim_vectors_path[QUADSIM_VECTORS_ROWS][{recording.path.shape[1]}] = {{",
         ",\n".join(path) + "\n};\n",
         "const struct quadsim_vector quadsim_vectors[QUADSIM_VECTORS] = {",
-        ",\n".join(rows) + "\n};\n",
+        ",\n".join(periods) + "\n};\n",
     ]
-    sizes = {"@COUNT@": len(rows), "@PATH@": len(path)}
-    header = controller.filled(part("vectors.h"))
-    for name, size in sizes.items():
-        header = header.replace(name, str(size))
+    header = controller.filled(c_source("vectors.h"))
+    header = header.replace("@COUNT@", str(len(periods))).replace("@PATH@", str(len(path)))
     return {"vectors.h": header, "vectors.c": "\n".join(source)}
 
 
-def _readme(scenario: Scenario, controller: CSource, room: str) -> str:
+def _readme(scenario: Scenario, controller: CSource, memory: str) -> str:
+    """Return the README of an export; `memory` is the sentence on it."""
     precision = controller.precision
     law = controller.law_name
-    solves_none = isinstance(controller, CGeometric)
     flags = f"-ffp-contract=off {controller.defines}".strip()
-    what = "geometric" if solves_none else "model predictive"
-    files = *controller.law_files, *BODY_FILES
-    sources = ", ".join(f"`{name}`" for name in files if not name.startswith(("quadsim_guard", law)))
+    if isinstance(controller, CGeometric):
+        kind = "geometric"
+        facts = "what it takes"
+        warm = ""
+    else:
+        kind = "model predictive"
+        facts = "what it takes, and how far its room for active rows suffices"
+        warm = WARM
+    further = []
+    for name in (*controller.law_files, *BODY_FILES):
+        if not name.startswith(("quadsim_guard", law)):
+            further.append(f"`{name}`")
+    sources = ", ".join(further)
     return f"""# {_title(scenario)}
 
-A {what} controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
+A {kind} controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
 called every {scenario.control_period:g} s.  It needs nothing but a compiler: no allocation, no recursion, no global
 state, and of the C library `memcpy`, `memmove` and `memset`.
 
@@ -334,8 +372,8 @@ state, and of the C library `memcpy`, `memmove` and `memset`.
 | `{law}.h` | the interface: state order, units, frames |
 | `{law}.c`, {sources} | the law, the same for every controller of its kind |
 | `quadsim_guard.{{h,c}}` | what is flown without an answer of the law, and the completion of lacking measurements |
-| `{DATA}` | this controller's numbers, and the memory that it needs |
-| `{FACTS}` | what it takes{"" if solves_none else ", and how far its room for active rows suffices"} |
+| `{DATA_FILE}` | this controller's numbers, and the memory that it needs |
+| `{FACTS}` | {facts} |
 | `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
 | `main.c`, `Makefile` | `make check` runs these periods and compares |
 | `serial.c` | the controller behind a serial line, with checksums and a watchdog: a start for an integration |
@@ -350,7 +388,7 @@ quadsim_law_reset(&law, before);          /* the command in force */
 status = quadsim_law_step(&law, QUADSIM_PHASE_FLYING, state, reference, acting, command);
 ```
 
-{room[0].upper()}{room[1:]}.
+{memory[0].upper()}{memory[1:]}.
 
-{"" if solves_none else WARM}Compile with `{flags}`, as the Makefile does; every processor then gives the same bits.
+{warm}Compile with `{flags}`, as the Makefile does; every processor then gives the same bits.
 """

@@ -1,7 +1,8 @@
 """Processor in the loop: a flight whose controller is an exported one, on its target or in the target's emulator.
 
-The programs of an export are built with its Makefile and run; questions and answers pass the serial line of
-`quadsim/mpc/export/c/serial.c`.
+The programs of an export are built with its Makefile and run; queries and answers pass the serial line of
+`quadsim/mpc/export/c/serial.c` as frames with a checksum.  `MPCInTheLoop` is the controller that a rollout then flies:
+it sends each period's state and the reference's new row, and waits for the command.
 """
 
 from __future__ import annotations
@@ -72,9 +73,14 @@ def require_programs(target: Machine, what: str) -> None:
     Raises:
         MissingProgramError: one is not installed.
     """
-    for program in ("make", target.compiler, *([EMULATOR] if target.board else [])):
+    programs = ["make", target.compiler]
+    packages = HOST_PACKAGES
+    if target.board:
+        programs.append(EMULATOR)
+        packages = CROSS_PACKAGES
+    for program in programs:
         if shutil.which(program) is None:
-            raise MissingProgramError(what, program, packages=CROSS_PACKAGES if target.board else HOST_PACKAGES)
+            raise MissingProgramError(what, program, packages=packages)
 
 
 def make_program(directory: Path, program: str, *settings: str) -> Path:
@@ -85,9 +91,19 @@ def make_program(directory: Path, program: str, *settings: str) -> Path:
     """
     done = subprocess.run(["make", "-C", str(directory), program, *settings], capture_output=True, text=True)
     if done.returncode:
-        errors = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
-        raise QuadsimError(f"{directory / program} cannot be built: {errors[0] if errors else 'make fails'}")
+        raise QuadsimError(f"{directory / program} cannot be built: {_first_error(done.stderr)}")
     return directory / program
+
+
+def _first_error(output: str) -> str:
+    """Return the first line of a compiler's messages that says error, or else the first line."""
+    lines = output.splitlines()
+    for line in lines:
+        if "error" in line:
+            return line
+    if lines:
+        return lines[0]
+    return "make fails"
 
 
 class Program:
@@ -120,7 +136,10 @@ class Program:
         assert self._process.stdout is not None
         line = self._process.stdout.fileno()
         data = b""
-        while len(data) < count and select.select([line], [], [], LONGEST_ANSWER)[0]:
+        while len(data) < count:
+            readable, _, _ = select.select([line], [], [], LONGEST_ANSWER)
+            if not readable:
+                break
             more = os.read(line, count - len(data))
             if not more:
                 break
@@ -129,7 +148,8 @@ class Program:
 
 
 MARK: Final = 0x4D504351
-_LETTER: Final = {"double": "d", "float": "f"}
+"""With which every frame begins, as in `serial.c`."""
+_STRUCT_LETTERS: Final = {"double": "d", "float": "f"}
 
 
 class QueryKind(IntEnum):
@@ -145,7 +165,7 @@ Solving = Literal[QueryKind.STEP, QueryKind.STAND]
 
 
 class Reply(NamedTuple):
-    """An answer: the number of its question, u(k) (4,) [rad/s], a status of `quadsim_mpc.h`, and the fallback level."""
+    """An answer: the number of its query, u(k) (4,) [rad/s], a status of `quadsim_mpc.h`, and the fallback level."""
 
     number: int
     command: Array
@@ -166,10 +186,10 @@ class Line(Protocol):
 
 
 class Frames:
-    """Questions and answers as bytes, in a precision, of so many numbers of a state and of a row of the reference."""
+    """Queries and answers as bytes, in a precision, of so many numbers of a state and of a row of the reference."""
 
     def __init__(self, precision: str, state: int = N_STATES, row: int = len(REFERENCE_STATES)) -> None:
-        letter = _LETTER[precision]
+        letter = _STRUCT_LETTERS[precision]
         self._question = struct.Struct(f"<2I{state + row + N_ROTORS}{letter}2I")
         self._answer = struct.Struct(f"<2I{N_ROTORS}{letter}2HI")
 
@@ -179,7 +199,7 @@ class Frames:
         return self._answer.size
 
     def question(self, kind: QueryKind, number: int, state: Array, row: Array, acting: Array) -> bytes:
-        """A question with its checksum; what its kind does not take may be anything."""
+        """A query with its checksum; what its kind does not take may be anything."""
         data = self._question.pack(MARK, number % 2**32, *state, *row, *acting, kind, 0)[:-4]
         return data + zlib.crc32(data).to_bytes(4, "little")
 
@@ -245,7 +265,7 @@ class MPCInTheLoop:
         ways: how many periods had which status of `quadsim_guard.h`.
     """
 
-    predict: Callable[[Array, Array], Array]  # there is none: plans stay where they are made
+    predict: Callable[[Array, Array], Array]  # absent: the plan stays on the target
 
     def __init__(self, line: Line, source: CSource, name: str, target: Machine) -> None:
         self.name = name
@@ -271,10 +291,7 @@ class MPCInTheLoop:
         Raises:
             FlightError: no answer came over the line.
         """
-        if now.acting is None:
-            acting = self._before
-        else:
-            acting = now.acting
+        acting = self._before if now.acting is None else now.acting
         if now.phase in GROUNDED:
             if self._bounds is None:
                 self._before = np.zeros(N_ROTORS)
@@ -282,11 +299,9 @@ class MPCInTheLoop:
                 self._before = self._bounds.lowest(acting)
             self._serial.reset(self._before)
             return stopped(self._before.copy(), self.horizon, now.phase)
-        kind: Solving
+        kind: Solving = QueryKind.STAND
         if now.phase is Phase.FLYING:
             kind = QueryKind.STEP
-        else:
-            kind = QueryKind.STAND
         if self._whole:
             state = measured_state(now, state)
             reference = reference_rows(now, reference, self._rows)
@@ -342,7 +357,8 @@ def fly_exported(
     files = source.files | programs(source, machine)
     require_programs(machine, "to fly an exported controller")
     if precision == "float" and source.bounds is not None:
-        assembly = _allowing(assembly, float(np.spacing(np.float32(source.bounds.u_max.max()))))
+        spacing = np.spacing(np.float32(source.bounds.u_max.max()))
+        assembly = _with_float_tolerances(assembly, float(spacing))
     with tempfile.TemporaryDirectory(prefix="quadsim-") as scratch, reporting(progress, "the emulator") as report:
         directory = Path(scratch)
         for name, text in files.items():
@@ -360,14 +376,13 @@ def fly_exported(
                 return replace(flight, directory=place)
 
 
-def _allowing(assembly: Assembly, spacing: float) -> Assembly:
+def _with_float_tolerances(assembly: Assembly, spacing: float) -> Assembly:
     """The same with tolerances of at least `spacing` [rad/s] on speeds and their steps."""
-
-    def widened(limit: Limit) -> Limit:
-        if limit.signal not in COMMAND_SIGNALS:
-            return limit
-        plant, sampled = (max(spacing, tolerance) for tolerance in limit.tolerances)
-        return replace(limit, tolerance=plant, tolerance_sampled=sampled)
-
-    limits = [*map(widened, assembly.with_bounds.constraints)]
+    limits: list[Limit] = []
+    for limit in assembly.with_bounds.constraints:
+        if limit.signal in COMMAND_SIGNALS:
+            plant, sampled = limit.tolerances
+            limits.append(replace(limit, tolerance=max(spacing, plant), tolerance_sampled=max(spacing, sampled)))
+        else:
+            limits.append(limit)
     return assembly.of(assembly.scenario.altered(constraints=limits))

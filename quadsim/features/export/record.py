@@ -1,8 +1,13 @@
-"""Periods of a flight as test vectors: the controller's inputs and its exact answers."""
+"""Periods of a flight as test vectors: the controller's inputs and its exact answers.
+
+A scenario is flown once, and its controller's queries are noted; then the controller answers them from its reset on, as
+the exported C will.  `exporter` writes them as `vectors.c`, which `make check` of an export runs and compares.
+"""
 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -28,8 +33,8 @@ from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
 
 RecordedLaw = LinearMPC | UnconstrainedMPC | NonlinearMPC | GeometricController
-QUATERNIONS: Final = (NonlinearMPC, GeometricController)
-"""Laws that take quaternion and body rates, as exported too."""
+QUATERNION_LAWS: Final = (NonlinearMPC, GeometricController)
+"""Controllers that take quaternion and body rates, as exported too."""
 REFUSED: Final = len(Method)  # least status of a period without an optimum
 
 
@@ -45,7 +50,7 @@ class Recording:
     command: Array  # (K, 4) the optimum's first command; the one before where there is none
 
 
-class _Asked(NamedTuple):
+class _PeriodInputs(NamedTuple):
     """A period's inputs: state, command in force, reference and motion."""
 
     state: Array
@@ -55,39 +60,44 @@ class _Asked(NamedTuple):
 
 
 class Recorder:
-    """A law whose questions are noted: from where the flight begins to where it ends, or where a measurement lacks."""
+    """A controller whose inputs are noted: from take-off until the flight ends, or until a measurement lacks."""
 
     def __init__(self, inner: RecordedLaw) -> None:
         self.inner = inner
         self.name = inner.name
         self.solver = inner.solver
         self.horizon = inner.horizon
-        if isinstance(inner, QUATERNIONS):
+        if isinstance(inner, QUATERNION_LAWS):
             self.commands = inner.commands
         else:
             self.commands = ROTORS
-        self.asked: list[_Asked] = []
+        self.inputs: list[_PeriodInputs] = []
         self._before = np.zeros(4)
         self._ended = False
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
-        self.asked = []
+        self.inputs = []
         self._before = np.array(speeds, float)
         self._ended = False
         self.inner.reset(speeds)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`."""
-        flying = now.phase is Phase.FLYING and (now.unseen is None or not now.unseen.any())
-        self._ended |= bool(self.asked) and not flying
-        if flying and not self._ended:
-            if now.acting is None:
-                acting = self._before
-            else:
-                acting = now.acting
-            parts = (state.copy(), np.array(acting, float), np.array(reference, float))
-            self.asked.append(_Asked(*parts, replace(now, signals=None)))
+        all_measured = now.unseen is None or not now.unseen.any()
+        recordable = now.phase is Phase.FLYING and all_measured
+        if self.inputs and not recordable:
+            self._ended = True
+        if recordable and not self._ended:
+            acting = self._before if now.acting is None else now.acting
+            self.inputs.append(
+                _PeriodInputs(
+                    state=state.copy(),
+                    acting=np.array(acting, float),
+                    reference=np.array(reference, float),
+                    now=replace(now, signals=None),
+                )
+            )
         command = self.inner.step(now, state, reference)
         self._before = command.speeds.copy()
         return command
@@ -104,61 +114,72 @@ def record(scenario: Scenario) -> Recording:
     pilot = Assembly(scenario).controller()
     law = pilot.law
     assert isinstance(law, RecordedLaw)
-    pilot.law = recorder = Recorder(law)
+    recorder = Recorder(law)
+    pilot.law = recorder
     Rollout(scenario, pilot).fly()
-    asked = recorder.asked
-    if not asked:
+    inputs = recorder.inputs
+    if not inputs:
         raise ExportError("its flight has no period in the air, with everything measured, to record")
-    status, commands = _answers(law, scenario.control_period, asked)
-    known = len(status)
-    if isinstance(law, QUATERNIONS):
-        rows = law.motion_rows
-    else:
-        rows = 0
-    windows = [reference_rows(query.now, query.reference, rows) for query in asked[:known]]
+    status, commands = _answers(law, scenario.control_period, inputs)
+    inputs = inputs[: len(status)]
     return Recording(
-        before=asked[0].acting,
-        state=np.array([_measured(law, query) for query in asked[:known]]),
-        acting=np.array([query.acting for query in asked[:known]]),
-        path=np.concatenate([[rows[0] for rows in windows[:-1]], windows[-1]]) if known > 1 else windows[0],
+        before=inputs[0].acting,
+        state=np.array([_exported_state(law, period) for period in inputs]),
+        acting=np.array([period.acting for period in inputs]),
+        path=_path(law, inputs),
         status=status,
         command=commands,
     )
 
 
-def _measured(law: RecordedLaw, query: _Asked) -> Array:
+def _path(law: RecordedLaw, inputs: Sequence[_PeriodInputs]) -> Array:
+    """Return the references of consecutive periods as one: the first row of each, and all rows of the last."""
+    motion_rows = 0
+    if isinstance(law, QUATERNION_LAWS):
+        motion_rows = law.motion_rows
+    windows = [reference_rows(period.now, period.reference, motion_rows) for period in inputs]
+    first_rows = [window[0] for window in windows[:-1]]
+    return np.array([*first_rows, *windows[-1]])
+
+
+def _exported_state(law: RecordedLaw, period: _PeriodInputs) -> Array:
     """Return a state as an exported controller takes it."""
-    if isinstance(law, QUATERNIONS):
-        return measured_state(query.now, query.state)
-    return query.state
+    if isinstance(law, QUATERNION_LAWS):
+        return measured_state(period.now, period.state)
+    return period.state
 
 
-def _answers(law: RecordedLaw, period: float, asked: list[_Asked]) -> tuple[NDArray[np.int64], Array]:
-    """Status (K,) and command (K, 4) of a controller for these queries after its reset.
+def _answers(
+    law: RecordedLaw, control_period: float, inputs: Sequence[_PeriodInputs]
+) -> tuple[NDArray[np.int64], Array]:
+    """Status (K,) and command (K, 4) of a controller for these inputs after its reset.
 
     They end before the first period whose optimum is known as a solver's approximation alone.
     """
     if isinstance(law, UnconstrainedMPC):
-        return np.zeros(len(asked), np.int64), _free_commands(law, asked)
-    law.reset(asked[0].acting)
-    answers: list[tuple[int, Array]] = []
-    for k, query in enumerate(asked):
-        answer = REFUSED, query.acting
+        return np.zeros(len(inputs), np.int64), _unconstrained_commands(law, inputs)
+    law.reset(inputs[0].acting)
+    statuses = []
+    commands = []
+    for k, period in enumerate(inputs):
+        status = REFUSED
+        speeds = period.acting
         with contextlib.suppress(PlanExhaustedError):
-            now = replace(query.now, time=k * period, acting=query.acting)
-            command = law.step(now, query.state, query.reference)
+            now = replace(period.now, time=k * control_period, acting=period.acting)
+            command = law.step(now, period.state, period.reference)
             if command.status in ACCEPTED:
                 if isinstance(law, LinearMPC) and command.answered_by not in (GAIN, CORE):
                     break
-                answer = _found(law, command), command.speeds
-        answers.append(answer)
-    status, commands = zip(*answers, strict=True)
-    return np.array(status), np.array(commands)
+                status = _exported_status(law, command)
+                speeds = command.speeds
+        statuses.append(status)
+        commands.append(speeds)
+    return np.array(statuses), np.array(commands)
 
 
-def _found(law: LinearMPC | NonlinearMPC | GeometricController, command: Command) -> int:
+def _exported_status(law: LinearMPC | NonlinearMPC | GeometricController, command: Command) -> int:
     """Return the status of an optimum, as of `enum quadsim_status`."""
-    if isinstance(law, QUATERNIONS):
+    if isinstance(law, QUATERNION_LAWS):
         if command.status != SOLVED:
             return STATUSES.index(command.status)
         return Method.WHOLE
@@ -166,9 +187,11 @@ def _found(law: LinearMPC | NonlinearMPC | GeometricController, command: Command
     return law.answer.method
 
 
-def _free_commands(law: UnconstrainedMPC, asked: list[_Asked]) -> Array:
+def _unconstrained_commands(law: UnconstrainedMPC, inputs: Sequence[_PeriodInputs]) -> Array:
     """(K, 4) from the core: the one gain of Eq. (24) has lost half its digits at N = 100."""
     core = Core(with_constraints(law.problem))
-    desired = law.problem.desired
-    queries = (Query(state, desired(path), acting) for state, acting, path, _ in asked)
-    return np.array([core.solve(query).plan[0] for query in queries])
+    commands = []
+    for period in inputs:
+        query = Query(period.state, law.problem.desired(period.reference), period.acting)
+        commands.append(core.solve(query).plan[0])
+    return np.array(commands)

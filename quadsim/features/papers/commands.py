@@ -1,4 +1,4 @@
-"""The command `quadsim reproduce`."""
+"""The command `quadsim reproduce`: reads its arguments, and has `reproduction` fly the papers."""
 
 from __future__ import annotations
 
@@ -48,11 +48,18 @@ def reproduce(
     from quadsim.console.results import after
     from quadsim.features.papers.reproduction import Reproductions, load_paper, reproduce_paper
 
-    file = None if junit is None else junit_file(junit)
-    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
+    verdict_file = None if junit is None else junit_file(junit)
+    if paper is None:
+        names = paper_names()
+    else:
+        names = [str(paper)]
+    papers = [load_paper(name) for name in names]
+    reproduced = []
     with reporting(progress, "the flights") as report:
-        reproductions = Reproductions(reproduce_paper(spec, report) for spec in papers)
-    if file is not None:
-        with after(reproductions, file):
-            write_junit(reproductions, file)
+        for spec in papers:
+            reproduced.append(reproduce_paper(spec, report))
+    reproductions = Reproductions(reproduced)
+    if verdict_file is not None:
+        with after(reproductions, verdict_file):
+            write_junit(reproductions, verdict_file)
     return reproductions

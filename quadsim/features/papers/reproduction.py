@@ -2,13 +2,14 @@
 
 A number is of one of three kinds, which are never counted together: the paper prints it (`published`), somebody ran the
 authors' public code to obtain it (`authors_code`), or another implementation of the same rules gave it
-(`other_implementation`).
+(`other_implementation`).  Ours is an entry of the flight's summary, within the tolerance of theirs or not.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,10 +45,10 @@ _COLUMNS: Final = {"published": "published", "authors_code": "authors' code", "o
 """Their columns, short enough for a console."""
 COUNTED: Final = {**NUMBER_KINDS, "claim": "claims checked and confirmed", "bar": "bars of something else, met"}
 """What is counted apart, and its name in sentences."""
-_RULE: Final = "measure must lead to a number of the flight's summary"
+_MEASURE_RULE: Final = "measure must lead to a number of the flight's summary"
+_ROUNDING: Final = 1e-9
+"""Share of a tolerance by which a difference may exceed it: what rounding adds."""
 Text = Annotated[str, MinLen(1), MaxLen(300)]
-
-
 Stated = Number | PairList
 
 
@@ -82,11 +83,9 @@ class PaperNumber:
     source: Annotated[Text, doc("where the number is from")]
 
     def __post_init__(self) -> None:
-        given = [kind for kind in NUMBER_KINDS if getattr(self, kind) is not None]
-        if len(given) != 1:
-            raise ValueError(
-                f"exactly one of {', '.join(NUMBER_KINDS)} must be given; got {', '.join(given) or 'none'}"
-            )
+        if len(self._given) != 1:
+            given = ", ".join(self._given) or "none"
+            raise ValueError(f"exactly one of {', '.join(NUMBER_KINDS)} must be given; got {given}")
         if self.role != "number" and self.published is None:
             raise ValueError(f"role must be number where published is absent; got {self.role}")
         if (self.absolute is None) == (self.relative is None):
@@ -101,9 +100,13 @@ class PaperNumber:
                 )
 
     @property
+    def _given(self) -> list[str]:
+        return [kind for kind in NUMBER_KINDS if getattr(self, kind) is not None]
+
+    @property
     def kind(self) -> str:
         """Where the number is from: a key of `NUMBER_KINDS`."""
-        return next(kind for kind in NUMBER_KINDS if getattr(self, kind) is not None)
+        return self._given[0]
 
     @property
     def counted_as(self) -> str:
@@ -123,9 +126,8 @@ class PaperNumber:
         """The lowest and the highest of the stated numbers [unit]."""
         if isinstance(self.stated, list):
             low, high = self.stated
-        else:
-            low, high = (self.stated, self.stated)
-        return low, high
+            return low, high
+        return self.stated, self.stated
 
     @property
     def tolerance(self) -> float:
@@ -160,9 +162,10 @@ class Paper(PaperFile):
 
     def scenario_of(self, number: PaperNumber) -> Scenario:
         """Return the scenario of a number."""
-        beside = self.path.parent / number.scenario
-        own_file = number.scenario.endswith(".toml") and beside.is_file()
-        name = str(beside) if own_file else number.scenario
+        name = number.scenario
+        beside = self.path.parent / name
+        if name.endswith(".toml") and beside.is_file():
+            name = str(beside)
         data = merge(read_scenario(name), number.set)
         file, _ = scenario_source(name)
         scenario = parse_scenario(data, source=f"{number.name}: {number.scenario}", directory=file.parent)
@@ -173,7 +176,8 @@ class Paper(PaperFile):
 def load_paper(name: str) -> Paper:
     """Read and check a shipped paper, or a path ending in `.toml`."""
     path = paper_path(name)
-    return Paper(path=path, **vars(parse_table(PaperFile, read_toml(path), path.name, file="paper")))
+    file = parse_table(PaperFile, read_toml(path), path.name, file="paper")
+    return Paper(path=path, **vars(file))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,40 +191,58 @@ class Reproduced:
     @property
     def difference(self) -> float | None:
         """Ours minus theirs, or minus the nearest of several [unit]."""
-        low, high = self.spec.span
         if self.ours is None:
             return None
-        return self.ours - min(max(self.ours, low), high)
+        low, high = self.spec.span
+        nearest = min(max(self.ours, low), high)
+        return self.ours - nearest
 
     @property
     def within(self) -> bool:
         """Whether our number is within the file's tolerance; false if the flight ended early."""
         if self.difference is None:
             return False
-        beyond = {"equal": abs(self.difference), "at most": self.difference, "at least": -self.difference}
-        return beyond[self.spec.relation] <= self.spec.tolerance * (1.0 + 1e-9)
+        if self.spec.relation == "equal":
+            beyond = abs(self.difference)
+        elif self.spec.relation == "at most":
+            beyond = self.difference
+        else:
+            beyond = -self.difference
+        return beyond <= self.spec.tolerance * (1.0 + _ROUNDING)
 
     def to_json(self) -> dict[str, Any]:
         """Return the number and its reproduction as plain data."""
         spec = self.spec
         return {
-            **{name: getattr(spec, name) for name in ("name", "scenario", "set", "measure", "unit", "source")},
-            **{kind: getattr(spec, kind) for kind in NUMBER_KINDS},
-            **{name: getattr(spec, name) for name in ("kind", "role", "relation", "tolerance")},
-            **{name: getattr(self, name) for name in ("ours", "difference", "within", "reason")},
+            "name": spec.name,
+            "scenario": spec.scenario,
+            "set": spec.set,
+            "measure": spec.measure,
+            "unit": spec.unit,
+            "source": spec.source,
+            "published": spec.published,
+            "authors_code": spec.authors_code,
+            "other_implementation": spec.other_implementation,
+            "kind": spec.kind,
+            "role": spec.role,
+            "relation": spec.relation,
+            "tolerance": spec.tolerance,
+            "ours": self.ours,
+            "difference": self.difference,
+            "within": self.within,
+            "reason": self.reason,
         }
 
     @property
     def sentence(self) -> str:
         """The verdict for a report."""
-        unit = self.spec.unit
+        spec = self.spec
+        source = NUMBER_KINDS[spec.kind]
+        if spec.role != "number":
+            source += f", a {spec.role}"
+        theirs = f"{source}: {self._theirs} {spec.unit}"
         ours = self._shown(self.ours)
         difference = self._shown(self.difference, "+")
-        if self.spec.role == "number":
-            role = ""
-        else:
-            role = f", a {self.spec.role}"
-        theirs = f"{NUMBER_KINDS[self.spec.kind]}{role}: {self._theirs} {unit}"
         text = f"{theirs}; ours {ours} (difference {difference}, tolerance {self._tolerance})"
         if self.reason:
             return f"{text}: {self.reason}"
@@ -229,7 +251,9 @@ class Reproduced:
     def cells(self, kinds: Sequence[str]) -> tuple[Cell, ...]:
         """Its line of a table with a column for each of some kinds."""
         spec = self.spec
-        theirs = [self._theirs if kind == spec.kind else ABSENT for kind in kinds]
+        theirs = []
+        for kind in kinds:
+            theirs.append(self._theirs if kind == spec.kind else ABSENT)
         if self.within:
             verdict = Cell(text="yes", mark=Mark.GOOD)
         else:
@@ -247,14 +271,18 @@ class Reproduced:
     @property
     def _theirs(self) -> str:
         """What ours is compared with: `0.241`, `0.1163 to 0.1164` or `at most 0.02`."""
-        if self.spec.relation == "equal":
-            relation = ""
+        low, high = self.spec.span
+        if low == high:
+            text = f"{low:g}"
         else:
-            relation = f"{self.spec.relation} "
-        return relation + " to ".join(f"{value:g}" for value in sorted(set(self.spec.span)))
+            text = f"{low:g} to {high:g}"
+        if self.spec.relation == "equal":
+            return text
+        return f"{self.spec.relation} {text}"
 
     @property
     def _tolerance(self) -> str:
+        """The tolerance as stated: `0.01`, in the number's unit, or `5 %`."""
         spec = self.spec
         if spec.relative is None:
             return f"{spec.tolerance:.2g}"
@@ -285,11 +313,15 @@ class Reproduction:
     @property
     def counts(self) -> dict[str, tuple[int, int]]:
         """How many are within their tolerance, of how many, by `PaperNumber.counted_as`."""
-        counts: dict[str, tuple[int, int]] = {}
+        within = Counter[str]()
+        total = Counter[str]()
+        for number in self.numbers:
+            total[number.spec.counted_as] += 1
+            within[number.spec.counted_as] += number.within
+        counts = {}
         for name in COUNTED:
-            verdicts = [number.within for number in self.numbers if number.spec.counted_as == name]
-            if verdicts:
-                counts[name] = (sum(verdicts), len(verdicts))
+            if name in total:
+                counts[name] = (within[name], total[name])
         return counts
 
     @property
@@ -297,19 +329,22 @@ class Reproduction:
         """The counts, each kind apart: `published: 1 of 1; by the authors' code: 8 of 8`."""
         parts = []
         for name, (within, count) in self.counts.items():
+            part = f"{COUNTED[name]}: {within} of {count}"
             if name == "published" and self.paper.subject:
-                of = f" of {self.paper.subject}"
-            else:
-                of = ""
-            parts.append(f"{COUNTED[name]}: {within} of {count}{of}")
+                part += f" of {self.paper.subject}"
+            parts.append(part)
         return "; ".join(parts)
 
     def to_json(self) -> dict[str, Any]:
         """Return the paper, how many of its numbers are reproduced, and each of them as plain data."""
-        about = {name: getattr(self.paper, name) for name in ("name", "title", "authors", "publication")}
-        counts = {name: {"within": within, "of": count} for name, (within, count) in self.counts.items()}
+        counts = {}
+        for name, (within, count) in self.counts.items():
+            counts[name] = {"within": within, "of": count}
         return {
-            **about,
+            "name": self.paper.name,
+            "title": self.paper.title,
+            "authors": self.paper.authors,
+            "publication": self.paper.publication,
             "reproduced": self.within,
             "sentence": self.sentence,
             "counts": counts,
@@ -322,9 +357,13 @@ class Reproduction:
         paper = self.paper
         citation = ", ".join(filter(None, [paper.authors, paper.publication]))
         used = {number.spec.kind for number in self.numbers}
-        kinds = [kind for kind in NUMBER_KINDS if kind in used]
-        columns = [_COLUMNS[kind] for kind in kinds]
-        if {number.spec.counted_as for number in self.numbers} == {"claim"}:
+        kinds = []
+        columns = []
+        for kind, column in _COLUMNS.items():
+            if kind in used:
+                kinds.append(kind)
+                columns.append(column)
+        if all(number.spec.counted_as == "claim" for number in self.numbers):
             columns = ["claimed"]
         return Grid(
             key=paper.name,
@@ -347,8 +386,11 @@ class Reproductions(tuple[Reproduction, ...], Tabular):
 
     def verdicts(self) -> tuple[str, Cases]:
         """See `quadsim.console.junit.Judged`."""
-        numbers = [(entry.paper.name, number) for entry in self for number in entry.numbers]
-        return "reproduce", [(f"{paper}: {it.spec.name}", it.within, it.sentence) for paper, it in numbers]
+        cases = []
+        for entry in self:
+            for number in entry.numbers:
+                cases.append((f"{entry.paper.name}: {number.spec.name}", number.within, number.sentence))
+        return "reproduce", cases
 
     def records(self) -> list[dict[str, Any]]:
         """Return a row per number: theirs as `lowest` and `highest`, `ours`, `difference`, `tolerance`, `within`."""
@@ -356,11 +398,21 @@ class Reproductions(tuple[Reproduction, ...], Tabular):
         for entry in self:
             for number in entry.numbers:
                 lowest, highest = number.spec.span
-                row: dict[str, Any] = {"paper": entry.paper.name, "number": number.spec.name, "unit": number.spec.unit}
-                row |= {"counted_as": number.spec.counted_as, "relation": number.spec.relation}
-                row |= {"lowest": lowest, "highest": highest, "ours": number.ours, "difference": number.difference}
-                row |= {"tolerance": number.spec.tolerance, "within": number.within}
-                rows.append(row)
+                rows.append(
+                    {
+                        "paper": entry.paper.name,
+                        "number": number.spec.name,
+                        "unit": number.spec.unit,
+                        "counted_as": number.spec.counted_as,
+                        "relation": number.spec.relation,
+                        "lowest": lowest,
+                        "highest": highest,
+                        "ours": number.ours,
+                        "difference": number.difference,
+                        "tolerance": number.spec.tolerance,
+                        "within": number.within,
+                    }
+                )
         return rows
 
     def shown(self) -> Shown:
@@ -379,35 +431,53 @@ def reproduce_paper(paper: Paper, progress: Progress = silent) -> Reproduction:
     scenarios = [paper.scenario_of(number) for number in paper.numbers]
     summaries: dict[str, dict[str, Any]] = {}
     reproduced = []
-    what = f"{paper.name}: numbers"
+    stage = f"{paper.name}: numbers"
     count = len(scenarios)
     for done, (number, scenario) in enumerate(zip(paper.numbers, scenarios, strict=True)):
-        progress(what, done, count)
+        progress(stage, done, count)
         key = json.dumps([number.scenario, number.set], sort_keys=True, default=str)
         if key not in summaries:
             summaries[key] = dict(Rollout(scenario).fly().summary)
         reproduced.append(_measured(number, summaries[key]))
-    progress(what, count, count)
+    progress(stage, count, count)
     return Reproduction(paper=paper, numbers=tuple(reproduced))
 
 
 def _measured(spec: PaperNumber, summary: dict[str, Any]) -> Reproduced:
+    """Return our number, which is an entry of a flight's summary; none of a flight that ended early.
+
+    Raises:
+        InputError: the summary has no such number.
+    """
     if summary["status"] != "completed":
         return Reproduced(spec=spec, ours=None, reason=summary["reason"])
     value: Any = summary
     path = ""
     for key in spec.measure.split("."):
-        if isinstance(value, list | tuple):
-            value = {entry["name"] if path == "constraints" else str(i): entry for i, entry in enumerate(value)}
-        there = value if isinstance(value, Mapping) else {}
-        if key not in there:
-            if there:
-                has = f" ({path or 'summary.json'} has: {', '.join(there)})"
-            else:
-                has = ""
-            raise InputError(f"{spec.name}: {_RULE}; got {spec.measure!r}{has}")
+        entries = _entries(value, path)
+        if key not in entries:
+            message = f"{spec.name}: {_MEASURE_RULE}; got {spec.measure!r}"
+            if entries:
+                message += f" ({path or 'summary.json'} has: {', '.join(entries)})"
+            raise InputError(message)
+        value = entries[key]
         path = f"{path}.{key}".lstrip(".")
-        value = there[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{spec.name}: {_RULE}; got {spec.measure!r}")
+        raise InputError(f"{spec.name}: {_MEASURE_RULE}; got {spec.measure!r}")
     return Reproduced(spec=spec, ours=float(value))
+
+
+def _entries(value: Any, path: str) -> Mapping[str, Any]:
+    """Return the entries of a table or a list of a summary: constraints by their names, those of other lists by number.
+
+    Other values have none.
+    """
+    if isinstance(value, Mapping):
+        return value
+    if not isinstance(value, list | tuple):
+        return {}
+    entries = {}
+    for i, entry in enumerate(value):
+        key = entry["name"] if path == "constraints" else str(i)
+        entries[key] = entry
+    return entries

@@ -1,4 +1,4 @@
-"""The command `quadsim stability`."""
+"""The command `quadsim stability`: reads its arguments, has `margins` measure, and returns the `report`."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def stability(
     """Measure the margins of a closed loop: how fast it settles, and what makes it unstable.
 
     Two flights of one seed hold a hover, one of them pushed a little; the growth of their difference tells whether the
-    loop is stable, whatever its law.  Each quantity is then changed in both directions, by bisection to 2 %.
+    loop is stable, whatever its controller.  Each quantity is then changed in both directions, by bisection to 2 %.
 
     Args:
         scenario: library name, or path to a TOML file; its vehicle, controller, effects and sensors are used.
         over: quantities: heading, delay, lag, mass, thrust, inertia, period, drag, tilt (default: all).
-        controller: controllers side by side, in place of the scenario's: names of laws, module:Class, or scenarios
+        controller: controllers side by side, in place of the scenario's: their names, module:Class, or scenarios
             whose controller is meant; in Python also classes.
         map: two quantities; the loop is also measured over both together.
         heading: of the nominal hover [deg] (default: the one that the course has most).
@@ -68,8 +68,8 @@ def stability(
 
     Examples:
         >>> import quadsim
-        >>> found = quadsim.stability("hover", over=["delay"], workers=1, progress=False)
-        >>> loop = found.loops[0]
+        >>> report = quadsim.stability("hover", over=["delay"], workers=1, progress=False)
+        >>> loop = report.loops[0]
         >>> loop.growth.verdict, loop.growth.rate < -1.5  # [1/s]
         ('stable', True)
         >>> delay = loop.margins["delay"].upper
@@ -81,7 +81,7 @@ def stability(
     from quadsim.console.progress import reporting
     from quadsim.features.stability.margins import MeasuredLoop, Measuring
     from quadsim.features.stability.quantities import quantities_named
-    from quadsim.features.stability.report import Stability as Found
+    from quadsim.features.stability.report import Stability as Report
     from quadsim.outputs import reserving
     from quadsim.rollout.growth import SIZE, hovering
     from quadsim.scenarios.loading import load_scenario
@@ -98,23 +98,23 @@ def stability(
         if not abs(heading) <= 180.0:
             raise ParameterError("", "--heading", heading, "within +-180 deg")
         stated = hovering(stated, heading=heading)
-    sizes = [SIZE] if size is None else [SIZE, size]
     loops = []
     for name, flown in _flown(stated, controller):
-        for each in sizes:
-            loops.append(MeasuredLoop(name=name, scenario=flown, size=each))
+        loops.append(MeasuredLoop(name=name, scenario=flown, size=SIZE))
+        if size is not None:
+            loops.append(MeasuredLoop(name=name, scenario=flown, size=size))
     with (
         nullcontext() if out is None else reserving(out, overwrite=overwrite),
         reporting(progress, "the stability check") as report,
     ):
         measuring = Measuring(loops, workers=workers, progress=report)
         measured = measuring.margins(quantities)
-        maps = tuple(
-            measuring.map(loop, margins, pair)
-            for loop, margins in zip(loops, measured, strict=True)
-            if pair is not None and {*pair} <= {*margins.margins}
-        )
-    result = Found(scenario=stated.name, loops=tuple(measured), quantities=quantities, maps=maps)
+        maps = []
+        if pair is not None:
+            for loop, margins in zip(loops, measured, strict=True):
+                if {*pair} <= {*margins.margins}:
+                    maps.append(measuring.map(loop, margins, pair))
+    result = Report(scenario=stated.name, loops=tuple(measured), quantities=quantities, maps=tuple(maps))
     if out is None:
         return result
     from quadsim.console.results import after
@@ -136,20 +136,18 @@ def _flown(scenario: Scenario, controllers: object) -> list[tuple[str, Scenario]
     """Return each controller's name with the scenario that has it, with the numbers of its vehicle's file."""
     from quadsim.scenarios.assembly import Assembly
 
-    if isinstance(controllers, list | tuple):
-        several = controllers
-    else:
-        several = [controllers]
-    flown = [_with_controller(scenario, controller) for controller in several] or [
-        (str(scenario.controller.type), scenario)
-    ]
-    return [(name, Assembly(each).recorded.scenario) for name, each in _distinct(flown)]
+    if not isinstance(controllers, list | tuple):
+        controllers = [controllers]
+    flown = [_with_controller(scenario, controller) for controller in controllers]
+    if not flown:
+        flown = [(str(scenario.controller.type), scenario)]
+    return [(name, Assembly(named).recorded.scenario) for name, named in _distinct(flown)]
 
 
 def _with_controller(scenario: Scenario, controller: object) -> tuple[str, Scenario]:
     """Return a controller's name, and the scenario with it.
 
-    A law keeps the scenario's table if that is of the same type.
+    A controller of the scenario's own type keeps the scenario's settings.
     """
     from quadsim.scenarios.loading import load_scenario
     from quadsim.scenarios.plugin import is_plugin
@@ -177,5 +175,7 @@ def _distinct(flown: list[tuple[str, Scenario]]) -> list[tuple[str, Scenario]]:
     numbered = []
     for i, (name, scenario) in enumerate(flown):
         count = names[: i + 1].count(name)
-        numbered.append((name if count == 1 else f"{name} ({count})", scenario))
+        if count > 1:
+            name = f"{name} ({count})"
+        numbered.append((name, scenario))
     return numbered

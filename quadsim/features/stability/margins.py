@@ -1,4 +1,9 @@
-"""The margins of a loop: up to which value of each quantity it is stable, by bisection."""
+"""The margins of a loop: up to which value of each quantity it is stable, by bisection.
+
+From the nominal value p0 a search goes outwards to the first value at which the growth |d(t)| ~ exp(rate t) of
+`quadsim.rollout.growth` is not negative, then halves the bracket until it is `WIDTH` wide: as a share of the margin
+|p - p0|, or as a logarithm where p is a factor.  `quantities` says what p is, `report` shows what was found.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +28,11 @@ from quadsim.ties import first_smallest
 
 WIDTH: Final = 0.02
 """Width of the last bracket: as a share of a margin, or of the value where this is a factor."""
-_SHARES: Final = (1.0 / 16.0, 1.0 / 8.0, 1.0 / 4.0, 1.0 / 2.0, 1.0)
+_OUTWARD_SHARES: Final = (1.0 / 16.0, 1.0 / 8.0, 1.0 / 4.0, 1.0 / 2.0, 1.0)
 """Of the way to the end of a range, where a search looks first: a loop may be stable again beyond an unstable value."""
 _NARROWEST: Final = 5e-4  # bracket at which a search ends anyway, as a share of the way to the end of the range
 MAP_POINTS: Final = 9  # values of either quantity in a map
-_BEYOND: Final = 1.25  # how far a map reaches, over the margin
+_MAP_REACH: Final = 1.25  # how far a map reaches, over the margin
 
 PointState: TypeAlias = Literal["stable", "neutral", "unstable", "no flight"]
 
@@ -70,7 +75,8 @@ class Margin:
     @property
     def sides(self) -> tuple[MarginSide, ...]:
         """The sides that there are, the upper one first."""
-        return tuple(side for side in (self.upper, self.lower) if side is not None)
+        sides = (self.upper, self.lower)
+        return tuple(side for side in sides if side is not None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,15 +102,16 @@ class LoopMargins:
     @property
     def closest(self) -> Closest | None:
         """The smallest margin, the first of equal ones; None where nothing within its range makes the loop unstable."""
-        found: list[Closest] = []
+        limits: list[Closest] = []
         for name, margin in self.margins.items():
             for side in margin.sides:
                 if side.state in ("unstable", "neutral"):
                     share = VARIED[name].distance(margin.nominal, side.stable)
-                    found.append(Closest(quantity=name, value=side.stable, share=share))
-        if not found:
+                    limits.append(Closest(quantity=name, value=side.stable, share=share))
+        if not limits:
             return None
-        return found[first_smallest([margin.share for margin in found])]
+        shares = [limit.share for limit in limits]
+        return limits[first_smallest(shares)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,27 +167,33 @@ def find_side(at: Callable[[float], LoopPoint], value_at: Callable[[float], floa
         geometric: whether the value is a factor.
     """
     points: list[LoopPoint] = []
-    inner = 0.0
-    outer = None
-    for share in _SHARES:
-        points.append(at(value_at(share)))
-        if points[-1].state != "stable":
+    inner = 0.0  # largest share up to which every point is stable
+    outer = None  # smallest share beyond it at which the point is not
+    for share in _OUTWARD_SHARES:
+        latest = at(value_at(share))
+        points.append(latest)
+        if latest.state != "stable":
             outer = share
             break
         inner = share
     if outer is None:
         return MarginSide(stable=value_at(1.0), unstable=None, state="stable", why="", points=tuple(points))
-    last = points[-1]
+    not_stable = points[-1]
     while _is_wide(value_at, inner, outer, geometric=geometric):
         middle = 0.5 * (inner + outer)
-        points.append(at(value_at(middle)))
-        if points[-1].state == "stable":
+        latest = at(value_at(middle))
+        points.append(latest)
+        if latest.state == "stable":
             inner = middle
         else:
             outer = middle
-            last = points[-1]
+            not_stable = latest
     return MarginSide(
-        stable=value_at(inner), unstable=value_at(outer), state=last.state, why=last.why, points=tuple(points)
+        stable=value_at(inner),
+        unstable=value_at(outer),
+        state=not_stable.state,
+        why=not_stable.why,
+        points=tuple(points),
     )
 
 
@@ -207,20 +220,23 @@ class _Search:
 
 
 def _search(task: _Search) -> many.Row:
+    """Return the side of a margin, for a worker."""
     assembly = Assembly(task.loop.scenario)
     quantity = VARIED[task.quantity]
     nominal = quantity.nominal(assembly)
-    end = quantity.ends(nominal)[task.upward]
-    side = find_side(
-        lambda value: look(task.loop, {task.quantity: value}),
-        partial(quantity.between, nominal, end, step=quantity.step(assembly)),
-        geometric=quantity.geometric,
-    )
-    return {"side": side}
+    low, high = quantity.ends(nominal)
+    end = high if task.upward else low
+    value_at = partial(quantity.between, nominal, end, step=quantity.step(assembly))
+
+    def at(value: float) -> LoopPoint:
+        return look(task.loop, {task.quantity: value})
+
+    return {"side": find_side(at, value_at, geometric=quantity.geometric)}
 
 
 def _grow(loop: MeasuredLoop) -> many.Row:
-    heading, _ = point(Assembly(loop.scenario), {})
+    """Return the growth at the nominal point, for a worker."""
+    heading, _changes = point(Assembly(loop.scenario), {})
     return {"growth": measure_growth(loop.scenario, heading=heading, size=loop.size)}
 
 
@@ -233,6 +249,7 @@ class _Look:
 
 
 def _look(task: _Look) -> many.Row:
+    """Return a point of a map, for a worker."""
     return {"point": look(task.loop, task.values)}
 
 
@@ -242,13 +259,12 @@ def measured_here(loop: MeasuredLoop, quantities: Sequence[VariedQuantity]) -> L
     Raises:
         InputError: the loop cannot be built.
     """
-    result: Growth = _grow(loop)["growth"]
-    if result.stable:
-        tasks = list(_searches(loop, quantities))
-    else:
-        tasks = []
-    sides = {(task.quantity, task.upward): _search(task)["side"] for task in tasks}
-    return LoopMargins(name=loop.name, size=loop.size, growth=result, margins=_margins(loop, quantities, sides))
+    growth: Growth = _grow(loop)["growth"]
+    sides = {}
+    if growth.stable:
+        for task in _searches(loop, quantities):
+            sides[task.quantity, task.upward] = _search(task)["side"]
+    return LoopMargins(name=loop.name, size=loop.size, growth=growth, margins=_margins(loop, quantities, sides))
 
 
 class Measuring:
@@ -292,40 +308,52 @@ class Measuring:
             InputError: a loop cannot be built.
         """
         growths = self.growths()
-        tasks = [
-            task
-            for loop, result in zip(self._loops, growths, strict=True)
-            if result.stable
-            for task in _searches(loop, quantities)
-        ]
+        tasks: list[_Search] = []
+        for loop, growth in zip(self._loops, growths, strict=True):
+            if growth.stable:
+                tasks += _searches(loop, quantities)
+        rows: list[many.Row] = []
         if tasks:
             rows = self._rows("margins", tasks, _search)
-        else:
-            rows = []
-        found = list(zip(tasks, rows, strict=True))
         measured: list[LoopMargins] = []
-        for loop, result in zip(self._loops, growths, strict=True):
-            own = [(task, row) for task, row in found if task.loop is loop]
-            failures = tuple(f"{task.quantity}: {row['reason']}" for task, row in own if "side" not in row)
-            sides = {(task.quantity, task.upward): row["side"] for task, row in own if "side" in row}
-            margins = _margins(loop, quantities, sides)
+        for loop, growth in zip(self._loops, growths, strict=True):
+            sides = {}
+            failures = []
+            for task, row in zip(tasks, rows, strict=True):
+                if task.loop is not loop:
+                    continue
+                if "side" in row:
+                    sides[task.quantity, task.upward] = row["side"]
+                else:
+                    failures.append(f"{task.quantity}: {row['reason']}")
             measured.append(
-                LoopMargins(name=loop.name, size=loop.size, growth=result, margins=margins, failures=failures)
+                LoopMargins(
+                    name=loop.name,
+                    size=loop.size,
+                    growth=growth,
+                    margins=_margins(loop, quantities, sides),
+                    failures=tuple(failures),
+                )
             )
         return measured
 
     def map(self, loop: MeasuredLoop, measured: LoopMargins, pair: tuple[str, str]) -> StabilityMap:
         """Return the map of a stable loop over two quantities, somewhat beyond the margins of either."""
-        columns, rows = (_map_values(measured.margins[name]) for name in pair)
-        tasks = [_Look(loop=loop, values={pair[0]: x, pair[1]: y}) for y in rows for x in columns]
-        looked = self._rows("map", tasks, _look)
-        points = []
-        for task, row in zip(tasks, looked, strict=True):
-            points.append(
-                row["point"] if "point" in row else LoopPoint(values=task.values, state="no flight", why=row["reason"])
-            )
+        across, up = pair
+        x_values = _map_values(measured.margins[across])
+        y_values = _map_values(measured.margins[up])
+        tasks = []
+        for y in y_values:
+            for x in x_values:
+                tasks.append(_Look(loop=loop, values={across: x, up: y}))
+        points: list[LoopPoint] = []
+        for task, row in zip(tasks, self._rows("map", tasks, _look), strict=True):
+            if "point" in row:
+                points.append(row["point"])
+            else:
+                points.append(LoopPoint(values=task.values, state="no flight", why=row["reason"]))
         return StabilityMap(
-            name=loop.name, size=loop.size, quantities=pair, values=(columns, rows), points=tuple(points)
+            name=loop.name, size=loop.size, quantities=pair, values=(x_values, y_values), points=tuple(points)
         )
 
 
@@ -360,18 +388,21 @@ def _margins(
 def _map_values(margin: Margin) -> tuple[float, ...]:
     """Return the values of a map along one quantity."""
     quantity = VARIED[margin.quantity]
-    ends = list(quantity.ends(margin.nominal))
-    for i, side in enumerate((margin.lower, margin.upper)):
-        if side is None:
-            ends[i] = margin.nominal
-        elif side.unstable is not None:
-            reached = margin.nominal + _BEYOND * (side.stable - margin.nominal)
-            if i == 0:
-                ends[i] = max(reached, ends[0])
-            else:
-                ends[i] = min(reached, ends[1])
-    low, high = ends
+    low, high = quantity.ends(margin.nominal)
+    if margin.lower is None:
+        low = margin.nominal
+    elif margin.lower.unstable is not None:
+        low = max(_beyond(margin.lower, margin.nominal), low)
+    if margin.upper is None:
+        high = margin.nominal
+    elif margin.upper.unstable is not None:
+        high = min(_beyond(margin.upper, margin.nominal), high)
     return tuple(quantity.between(low, high, i / (MAP_POINTS - 1)) for i in range(MAP_POINTS))
+
+
+def _beyond(side: MarginSide, nominal: float) -> float:
+    """Return a value somewhat farther from the nominal one than a margin."""
+    return nominal + _MAP_REACH * (side.stable - nominal)
 
 
 def to_plain(margins: LoopMargins) -> dict[str, Any]:
@@ -379,11 +410,11 @@ def to_plain(margins: LoopMargins) -> dict[str, Any]:
     closest = margins.closest
     listed: dict[str, Any] = {}
     for name, margin in margins.margins.items():
-        sides = {"lower": margin.lower, "upper": margin.upper}
         listed[name] = {
             "unit": VARIED[name].unit,
             "nominal": margin.nominal,
-            **{which: None if side is None else asdict(side) for which, side in sides.items()},
+            "lower": None if margin.lower is None else asdict(margin.lower),
+            "upper": None if margin.upper is None else asdict(margin.upper),
         }
     growth = asdict(margins.growth)
     for name in ("rate", "left"):

@@ -1,4 +1,8 @@
-"""The quantities whose margins can be measured: their values, their ranges, and the fields that set them."""
+"""The quantities whose margins can be measured: their values, their ranges, and the fields that set them.
+
+A quantity changes the plant, the delay or the control period, and the controller is as the scenario has it: what it
+tolerates is the margin.  `margins` searches along a quantity; adding one is a function and an entry of `_ALL`.
+"""
 
 from __future__ import annotations
 
@@ -94,6 +98,7 @@ def _usual_heading(assembly: Assembly) -> float:
 
 
 def _delay(assembly: Assembly) -> float:
+    """Return the time from measurement to command [ms]."""
     computation = assembly.scenario.computation
     if computation is None:
         return 0.0
@@ -110,6 +115,7 @@ def _step(assembly: Assembly) -> float:
 
 
 def _lag(assembly: Assembly) -> float:
+    """Return the rotors' time constant, that of the rise where there are two [ms]."""
     rotors = assembly.effects.rotors or RotorDynamics()
     return 1e3 * (rotors.rise or rotors.fall or 0.0)
 
@@ -128,11 +134,13 @@ def _set_lag(assembly: Assembly, value: float) -> FieldValues:
 
 def _without_actual(assembly: Assembly, *names: str) -> FieldValues:
     """Remove values of `[actual]` that would contradict those of an effect."""
-    if assembly.scenario.actual is None:
-        stated = {}
-    else:
+    changes: FieldValues = {}
+    if assembly.scenario.actual is not None:
         stated = assembly.scenario.actual.overrides()
-    return {f"actual.{name}": None for name in names if name in stated}
+        for name in names:
+            if name in stated:
+                changes[f"actual.{name}"] = None
+    return changes
 
 
 def _times(value: Any, factor: float) -> Any:
@@ -146,14 +154,18 @@ def _scaled(*names: str) -> Callable[[Assembly, float], FieldValues]:
     """Return the fields that scale parameters of the actual vehicle, of those that it has."""
 
     def fields(assembly: Assembly, factor: float) -> FieldValues:
-        values = {name: getattr(assembly.actual, name) for name in names}
-        return {f"actual.{name}": _times(value, factor) for name, value in values.items() if value is not None}
+        changes: FieldValues = {}
+        for name in names:
+            value = getattr(assembly.actual, name)
+            if value is not None:
+                changes[f"actual.{name}"] = _times(value, factor)
+        return changes
 
     return fields
 
 
 def _set_period(assembly: Assembly, value: float) -> FieldValues:
-    """Set the control period, for which the law is built anew."""
+    """Set the control period, for which the controller is built anew."""
     return {"control_period": round(1e-3 * value, 12)}
 
 
@@ -190,18 +202,22 @@ def _one(assembly: Assembly) -> float:
 
 
 def _factors(nominal: float) -> tuple[float, float]:
+    """Return the range of a quantity whose equal steps are equal factors."""
     return nominal / MOST_FACTOR, nominal * MOST_FACTOR
 
 
 def _from_zero(most: float) -> Callable[[float], tuple[float, float]]:
+    """Return the range from 0 to `most` beyond the nominal value."""
     return lambda nominal: (0.0, nominal + most)
 
 
 def _lags(nominal: float) -> tuple[float, float]:
+    """Return the range of the rotors' time constant [ms], which is never 0."""
     return min(LEAST_LAG, nominal), nominal + MOST_MILLISECONDS
 
 
 def _about(most: float) -> Callable[[float], tuple[float, float]]:
+    """Return the range that reaches `most` to either side of the nominal value."""
     return lambda nominal: (nominal - most, nominal + most)
 
 
@@ -263,7 +279,7 @@ _ALL: Final = (
     ),
     VariedQuantity(
         name="period",
-        title="control period, for which the law is built anew",
+        title="control period, for which the controller is built anew",
         unit="ms",
         nominal=lambda assembly: 1e3 * assembly.scenario.control_period,
         ends=_factors,

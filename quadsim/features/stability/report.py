@@ -1,4 +1,7 @@
-"""What `quadsim stability` found: its table, sentences, figures and files."""
+"""What `quadsim stability` found: its table, sentences, figures and files.
+
+Everything is made from the `LoopMargins` and `StabilityMap` of `margins`; nothing is measured here.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +31,8 @@ from quadsim.report.to_matplotlib import write_pngs
 
 MARGINS_FILE: Final = "stability.md"
 _NO_FLIGHT: Final = "*"  # marks a value beyond which the vehicle cannot be flown
-_BAR: Final = 0.8  # width of all bars of a quantity together
-_FASTEST: Final = 4.0  # largest magnitude of a rate that is drawn [1/s]
+_BARS_WIDTH: Final = 0.8  # of all bars of a quantity together
+_LARGEST_RATE: Final = 4.0  # largest magnitude of a rate that is drawn [1/s]
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,21 +52,23 @@ class Stability(Tabular):
     @property
     def grid(self) -> Grid:
         """The margins: a line for each quantity, two columns for each loop."""
-        measured = [loop for loop in self.loops if loop.margins]
+        measured = self._measured_loops
         head = ["quantity", "nominal"]
         for name in self._names(measured):
             head += [f"{name}: from", "to"]
         lines = []
         for quantity in self.quantities:
-            margins = [loop.margins.get(quantity.name) for loop in measured]
-            nominals = [margin.nominal for margin in margins if margin is not None]
-            if not nominals:
+            nominal = _nominal_value(quantity, measured)
+            if nominal is None:
                 continue
-            cells: list[Cell | str] = [f"{nominals[0]:.3g}"]
-            for loop, margin in zip(measured, margins, strict=True):
-                lower = None if margin is None else margin.lower
-                upper = None if margin is None else margin.upper
-                cells += [_cell(lower, "<", quantity.name, loop), _cell(upper, ">", quantity.name, loop)]
+            cells: list[Cell | str] = [f"{nominal:.3g}"]
+            for loop in measured:
+                margin = loop.margins.get(quantity.name)
+                if margin is None:
+                    cells += [ABSENT, ABSENT]
+                else:
+                    cells.append(_cell(margin.lower, "<", quantity.name, loop))
+                    cells.append(_cell(margin.upper, ">", quantity.name, loop))
             lines.append(line(quantity.label, *cells))
         return Grid(
             key="margins",
@@ -73,19 +78,27 @@ class Stability(Tabular):
             note=self._note(measured),
         )
 
+    @property
+    def _measured_loops(self) -> list[LoopMargins]:
+        """The loops that have margins."""
+        return [loop for loop in self.loops if loop.margins]
+
     def _names(self, loops: Sequence[LoopMargins]) -> list[str]:
         """Return the name of each loop, with its size where they differ."""
-        several = len({loop.size for loop in self.loops}) > 1
-        return [f"{loop.name}, {loop.size:g} m/s" if several else loop.name for loop in loops]
+        sizes = {loop.size for loop in self.loops}
+        if len(sizes) > 1:
+            return [f"{loop.name}, {loop.size:g} m/s" for loop in loops]
+        return [loop.name for loop in loops]
 
     def _note(self, loops: Sequence[LoopMargins]) -> str:
-        notes = [
+        note = (
             f"Stable up to these values, to {100.0 * WIDTH:g} %; < and >: up to the end of the range that is searched."
-        ]
-        sides = [side for loop in loops for margin in loop.margins.values() for side in margin.sides]
-        if any(side.state == "no flight" for side in sides):
-            notes.append(f"{_NO_FLIGHT}: beyond it there is no flight.")
-        return " ".join(notes)
+        )
+        for loop in loops:
+            for margin in loop.margins.values():
+                if any(side.state == "no flight" for side in margin.sides):
+                    return f"{note} {_NO_FLIGHT}: beyond it there is no flight."
+        return note
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -96,12 +109,12 @@ class Stability(Tabular):
             if loop.margins:
                 sentences.append(_closest_sentence(loop))
             for margin in loop.margins.values():
-                sentences += [
-                    f"No flight with {margin.quantity} {_value(side.unstable, margin.quantity)}: {side.why}."
-                    for side in margin.sides
-                    if side.state == "no flight" and side.unstable is not None
-                ]
-            sentences += [f"Not measured: {failure}." for failure in loop.failures]
+                for side in margin.sides:
+                    if side.state == "no flight" and side.unstable is not None:
+                        value = _value(side.unstable, margin.quantity)
+                        sentences.append(f"No flight with {margin.quantity} {value}: {side.why}.")
+            for failure in loop.failures:
+                sentences.append(f"Not measured: {failure}.")
         return tuple(sentences)
 
     def records(self) -> list[dict[str, Any]]:
@@ -115,10 +128,11 @@ class Stability(Tabular):
                 row: dict[str, Any] = {"loop": loop.name, "size": loop.size, "quantity": margin.quantity}
                 row["nominal"] = margin.nominal
                 for end, side in (("lower", margin.lower), ("upper", margin.upper)):
-                    row[end] = None if side is None else side.stable
                     if side is None:
+                        row[end] = None
                         row[f"{end}_state"] = None
                     else:
+                        row[end] = side.stable
                         row[f"{end}_state"] = side.state
                 rows.append(row)
         return rows
@@ -130,9 +144,9 @@ class Stability(Tabular):
         grid = self.grid
         yield from console.grids([grid] if grid.lines else [])
         yield from self.sentences
-        for found in self.maps:
+        for stability_map in self.maps:
             yield ""
-            yield from console.grids([_map_grid(found)])
+            yield from console.grids([_map_grid(stability_map)])
 
     def outputs(self) -> Shown:
         """See `Result.outputs`."""
@@ -146,17 +160,18 @@ class Stability(Tabular):
         return {
             "scenario": self.scenario,
             "loops": [to_plain(loop) for loop in self.loops],
-            "maps": [asdict(found) for found in self.maps],
+            "maps": [asdict(stability_map) for stability_map in self.maps],
         }
 
     def to_markdown(self) -> str:
         """Return table and sentences as Markdown."""
         grid = self.grid
+        parts = []
         if grid.lines:
-            parts = [grid_to_markdown(grid), f"{grid.note}\n"]
-        else:
-            parts = []
-        return "\n".join([*parts, *(f"{sentence}\n" for sentence in self.sentences)])
+            parts += [grid_to_markdown(grid), f"{grid.note}\n"]
+        for sentence in self.sentences:
+            parts.append(f"{sentence}\n")
+        return "\n".join(parts)
 
     def small_plot(self) -> Figure | None:
         """See `Result.small_plot`."""
@@ -168,33 +183,32 @@ class Stability(Tabular):
     @property
     def figure(self) -> Figure:
         """The margins as bars, and the growth over each quantity."""
-        measured = [loop for loop in self.loops if loop.margins]
+        measured = self._measured_loops
         if not measured:
             return Figure(key="stability", title="", panels=())
         panels = [self._bars(measured)]
-        panels += [self._growths(quantity, measured) for quantity in self.quantities]
+        for quantity in self.quantities:
+            panels.append(self._growths(quantity, measured))
         title = f"{self.scenario}: growth of a small difference [1/s] over each quantity"
         return Figure(key="stability", title=title, panels=tuple(panels), columns=2)
 
     def _bars(self, loops: Sequence[LoopMargins]) -> Panel:
         """Return the margins on both sides of the nominal values, as shares."""
-        width = _BAR / len(loops)
+        width = _BARS_WIDTH / len(loops)
         series = []
         for i, (name, loop) in enumerate(zip(self._names(loops), loops, strict=True)):
             places = np.arange(len(self.quantities)) + (i - 0.5 * (len(loops) - 1)) * width
             for sign in (-1.0, 1.0):
-                shares = np.array([_share(loop, quantity, sign) for quantity in self.quantities])
-                bars = [
-                    Series(
-                        x=np.array([place, place + width]),  # the second, of no height, gives the bars their width
-                        y=np.array([share, 0.0]),
-                        colour=line_colour(i),
-                        label=name,
-                        style="bars",
+                for place, quantity in zip(places.tolist(), self.quantities, strict=True):
+                    series.append(
+                        Series(
+                            x=np.array([place, place + width]),  # the second, of no height, gives the bars their width
+                            y=np.array([_share(loop, quantity, sign), 0.0]),
+                            colour=line_colour(i),
+                            label=name,
+                            style="bars",
+                        )
                     )
-                    for place, share in zip(places.tolist(), shares.tolist(), strict=True)
-                ]
-                series += bars
         return Panel(
             title="margin over its nominal value, or over the range searched",
             unit="%",
@@ -212,14 +226,14 @@ class Stability(Tabular):
             margin = loop.margins.get(quantity.name)
             if margin is None:
                 continue
-            points = []
+            rates: dict[float, float] = {}
             for side in margin.sides:
                 for point in side.points:
                     if point.rate is not None:
-                        points.append(point)
-            rates = {point.values[quantity.name]: point.rate for point in points} | {margin.nominal: loop.growth.rate}
+                        rates[point.values[quantity.name]] = point.rate
+            rates[margin.nominal] = loop.growth.rate
             values = np.array(sorted(rates))
-            heights = np.clip([rates[value] for value in values.tolist()], -_FASTEST, _FASTEST)
+            heights = np.clip([rates[value] for value in values.tolist()], -_LARGEST_RATE, _LARGEST_RATE)
             series.append(Series(x=values, y=heights, colour=line_colour(i), label=name))
             series.append(Series(x=values, y=heights, colour=line_colour(i), style="points", width=3.0))
         return Panel(
@@ -237,12 +251,25 @@ class Stability(Tabular):
         Raises:
             OutputError: the directory cannot be written, or holds something else.
         """
-        figures = [figure for figure in (self.figure, *map(_map_figure, self.maps)) if figure.panels]
+        figures = []
+        margins_figure = self.figure
+        if margins_figure.panels:
+            figures.append(margins_figure)
+        for stability_map in self.maps:
+            figures.append(_map_figure(stability_map))
         with writing(directory, overwrite=overwrite) as partial:
             (partial / SUMMARY_FILE).write_text(to_json(self.to_json()), encoding="utf-8")
             (partial / MARGINS_FILE).write_text(self.to_markdown(), encoding="utf-8")
             write_pngs(figures, partial)
         return replace(self, directory=directory)
+
+
+def _nominal_value(quantity: VariedQuantity, loops: Sequence[LoopMargins]) -> float | None:
+    """Return a quantity's value at the nominal point; None where no loop has a margin of it."""
+    for loop in loops:
+        if quantity.name in loop.margins:
+            return loop.margins[quantity.name].nominal
+    return None
 
 
 def _cell(side: MarginSide | None, sign: str, name: str, loop: LoopMargins) -> Cell:
@@ -255,8 +282,9 @@ def _cell(side: MarginSide | None, sign: str, name: str, loop: LoopMargins) -> C
     if side.state == "no flight":
         return Cell(text=f"{text} {_NO_FLIGHT}")
     closest = loop.closest
-    is_closest = closest is not None and (closest.quantity, closest.value) == (name, side.stable)
-    return Cell(text=text, mark=Mark.BEST if is_closest else Mark.NONE)
+    if closest is not None and closest.quantity == name and closest.value == side.stable:
+        return Cell(text=text, mark=Mark.BEST)
+    return Cell(text=text)
 
 
 def _value(value: float, name: str) -> str:
@@ -294,66 +322,62 @@ def _share(loop: LoopMargins, quantity: VariedQuantity, sign: float) -> float:
     """Return a margin [%], signed, for the bars; 0 where there is none."""
     margin = loop.margins.get(quantity.name)
     if margin is None:
-        side = None
-    elif sign > 0.0:
-        side = margin.upper
-    else:
-        side = margin.lower
-    if margin is None or side is None:
         return 0.0
-    return sign * min(100.0 * quantity.distance(margin.nominal, side.stable), 100.0)
+    side = margin.upper if sign > 0.0 else margin.lower
+    if side is None:
+        return 0.0
+    percent = 100.0 * quantity.distance(margin.nominal, side.stable)
+    return sign * min(percent, 100.0)
 
 
-def _map_rows(found: StabilityMap) -> Iterator[tuple[float, tuple[LoopPoint, ...]]]:
+def _map_rows(stability_map: StabilityMap) -> Iterator[tuple[float, tuple[LoopPoint, ...]]]:
     """Yield each value of the second quantity with its points, the largest first."""
     for i in reversed(range(MAP_POINTS)):
-        yield found.values[1][i], found.points[i * MAP_POINTS : (i + 1) * MAP_POINTS]
+        yield stability_map.values[1][i], stability_map.points[i * MAP_POINTS : (i + 1) * MAP_POINTS]
 
 
-def _map_grid(found: StabilityMap) -> Grid:
+def _map_grid(stability_map: StabilityMap) -> Grid:
     """Return the rates of a map as a table."""
-    across, up = (VARIED[name] for name in found.quantities)
+    across_name, up_name = stability_map.quantities
+    across = VARIED[across_name]
+    up = VARIED[up_name]
     lines = []
-    for value, points in _map_rows(found):
+    for value, points in _map_rows(stability_map):
         cells = []
         for point in points:
-            cells.append(
-                Cell(
-                    text=ABSENT if point.rate is None else f"{point.rate:.2f}",
-                    mark=Mark.GOOD if point.state == "stable" else Mark.BAD,
-                )
-            )
+            text = ABSENT if point.rate is None else f"{point.rate:.2f}"
+            mark = Mark.GOOD if point.state == "stable" else Mark.BAD
+            cells.append(Cell(text=text, mark=mark))
         lines.append(line(f"{value:.3g}", *cells))
     return Grid(
         key=f"map-{across.name}-{up.name}",
-        title=f"{found.name}, {found.size:g} m/s: growth [1/s], {across.label} across, {up.label} up",
-        head=("", *(f"{value:.3g}" for value in found.values[0])),
+        title=f"{stability_map.name}, {stability_map.size:g} m/s: growth [1/s], {across.label} across, {up.label} up",
+        head=("", *(f"{value:.3g}" for value in stability_map.values[0])),
         lines=tuple(lines),
         note="Negative: stable.",
     )
 
 
-def _map_figure(found: StabilityMap) -> Figure:
+def _map_figure(stability_map: StabilityMap) -> Figure:
     """Return a map as a figure: a cell for each point, stable or not."""
-    across, up = (VARIED[name] for name in found.quantities)
-    columns, rows = (_edges(values) for values in found.values)
+    across_name, up_name = stability_map.quantities
+    across = VARIED[across_name]
+    up = VARIED[up_name]
+    columns = _edges(stability_map.values[0])
+    rows = _edges(stability_map.values[1])
     areas = []
-    for i, point in enumerate(found.points):
+    for i, point in enumerate(stability_map.points):
         row, column = divmod(i, MAP_POINTS)
         left, right = columns[column : column + 2]
         bottom, top = rows[row : row + 2]
-        is_stable = point.state == "stable"
-        areas.append(
-            Area(
-                outline=np.array([[left, bottom], [right, bottom], [right, top], [left, top]]),
-                colour=COLOUR.satisfied if is_stable else COLOUR.violated,
-                label="stable" if is_stable else "not stable",
-                opacity=0.6,
-            )
-        )
+        outline = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+        if point.state == "stable":
+            areas.append(Area(outline=outline, colour=COLOUR.satisfied, label="stable", opacity=0.6))
+        else:
+            areas.append(Area(outline=outline, colour=COLOUR.violated, label="not stable", opacity=0.6))
     panel = Panel(title=up.name, unit=up.unit, x_label=across.label, areas=tuple(areas), legend=True, height=2.4)
-    title = f"{found.name}, {found.size:g} m/s: stable or not"
-    key = f"map-{across.name}-{up.name}-{found.name}-{found.size:g}"
+    title = f"{stability_map.name}, {stability_map.size:g} m/s: stable or not"
+    key = f"map-{across.name}-{up.name}-{stability_map.name}-{stability_map.size:g}"
     return Figure(key=key, title=title, panels=(panel,), columns=1)
 
 

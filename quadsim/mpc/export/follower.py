@@ -1,4 +1,8 @@
-"""The C files of a controller that may follow a course's motion."""
+"""The C files of a controller that may follow a course's motion, with position, attitude and their rates.
+
+What the nonlinear and the geometric controller share: 19 numbers of a measured state, the rigid bodies by which they
+predict until a command acts, and the reference, which is a preview or the motion itself.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,11 @@ from quadsim.state import N_STATES
 from quadsim.vehicle import Vehicle
 
 BODY_AHEAD_FILES: Final = (
-    *("quadsim_delay.h", "quadsim_delay.c", "quadsim_nmpc.h", "quadsim_nmpc_math.h", "quadsim_nmpc_model.c"),
+    "quadsim_delay.h",
+    "quadsim_delay.c",
+    "quadsim_nmpc.h",
+    "quadsim_nmpc_math.h",
+    "quadsim_nmpc_model.c",
 )
 """Files of the rigid body, and of how it moves until a command acts."""
 

@@ -1,4 +1,4 @@
-"""The C files of a geometric controller."""
+"""The C files of a geometric controller; it solves no optimisation, so its memory is that of its commands alone."""
 
 from __future__ import annotations
 
@@ -27,8 +27,12 @@ class CGeometric(CFollower):
 
     law_name = "quadsim_geometric"
     law_files = (
-        *(*SHARED_FILES, *BODY_AHEAD_FILES),
-        *("quadsim_ramp.h", "quadsim_ramp.c", "quadsim_geometric.h", "quadsim_geometric.c"),
+        *SHARED_FILES,
+        *BODY_AHEAD_FILES,
+        "quadsim_ramp.h",
+        "quadsim_ramp.c",
+        "quadsim_geometric.h",
+        "quadsim_geometric.c",
     )
     motion_row = "position, quaternion, and ten that do not count"
     tolerances = ("1e-9", "5e-2")  # in floats, positions show a snap of several m/s^4 that is none
@@ -53,12 +57,14 @@ class CGeometric(CFollower):
         """See `CSource`."""
         law = self.law
         prefix = text.prefix
-        settings = USUAL_FALLBACK.within({})
-        fallback = fallback_numbers(law.model, law.bounds, settings)
-        blocks = [text.array(name, array) for name, array in law.pointed.items()]
-        values = {name: text.value(value) for name, value in fallback.items()}
-        blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **values))
-        addresses = {name: f"{prefix}{name}" for name in law.pointed} | {"fallback": f"&{prefix}fallback"}
+        blocks = []
+        addresses = {}
+        for name, array in law.pointed.items():
+            blocks.append(text.array(name, array))
+            addresses[name] = f"{prefix}{name}"
+        fallback = fallback_numbers(law.model, law.bounds, USUAL_FALLBACK.within({}))
+        blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **text.initialisers(fallback)))
+        addresses["fallback"] = f"&{prefix}fallback"
         if law.delay is not None:
             blocks += self.delay_blocks(text, law.delay, law.delay_bodies)
             addresses["delay"] = f"&{prefix}delay"

@@ -1,4 +1,7 @@
-"""The C files of a nonlinear controller."""
+"""The C files of a nonlinear controller: its quadratic program, its rigid bodies, its fallback, and its numbers.
+
+The memory has a capacity for 2 active rows per node of the horizon; the kernel is compiled for its sizes alone.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +23,20 @@ from quadsim.mpc.laws.parts.nonlinear_mpc import NonlinearMPC
 from quadsim.mpc.problem.model import LinearModel, hover_model, target_model
 from quadsim.mpc.solvers.core_tables import NO_BOUND
 
-FILES: Final = (
+NONLINEAR_FILES: Final = (
     *SHARED_FILES,
     *BODY_AHEAD_FILES,
-    *("quadsim_ramp.h", "quadsim_ramp.c", "quadsim_nmpc.c", "quadsim_nmpc_qp.h", "quadsim_nmpc_rows.c"),
-    *("quadsim_nmpc_riccati.c", "quadsim_nmpc_active_set.c", "quadsim_nmpc_interior.c", "quadsim_nmpc_solve.c"),
-    *("quadsim_nonlinear.h", "quadsim_nonlinear.c"),
+    "quadsim_ramp.h",
+    "quadsim_ramp.c",
+    "quadsim_nmpc.c",
+    "quadsim_nmpc_qp.h",
+    "quadsim_nmpc_rows.c",
+    "quadsim_nmpc_riccati.c",
+    "quadsim_nmpc_active_set.c",
+    "quadsim_nmpc_interior.c",
+    "quadsim_nmpc_solve.c",
+    "quadsim_nonlinear.h",
+    "quadsim_nonlinear.c",
 )
 """Files of `quadsim/mpc/c` to export verbatim."""
 ROWS_PER_NODE: Final = 2.0
@@ -35,7 +46,7 @@ FEWEST_ROWS: Final = 32
 
 @dataclass(frozen=True, kw_only=True)
 class CNonlinear(CFollower):
-    """A nonlinear controller as C source, with room for 2 active rows per node, and at least 32.
+    """A nonlinear controller as C source, with memory for 2 active rows per node, and for at least 32.
 
     Raises:
         ExportError: it cannot be exported.
@@ -44,7 +55,7 @@ class CNonlinear(CFollower):
     table: Nonlinear
 
     law_name = "quadsim_nonlinear"
-    law_files = FILES
+    law_files = NONLINEAR_FILES
     motion_row = "position, quaternion, velocity, body rates, thrusts of the rotors"
 
     def __post_init__(self) -> None:
@@ -71,7 +82,9 @@ class CNonlinear(CFollower):
     @property
     def tolerances(self) -> tuple[str, str]:
         """See `CSource`; of thrust [N] and rates [rad/s] as well."""
-        return "1e-9", "2.0" if self.commands == ROTORS else "0.05"
+        if self.commands == ROTORS:
+            return "1e-9", "2.0"
+        return "1e-9", "0.05"
 
     @property
     def defines(self) -> str:
@@ -83,8 +96,10 @@ class CNonlinear(CFollower):
     def rows(self) -> int:
         """See `CSource`."""
         program = self.law.program
-        usual = max(FEWEST_ROWS, math.ceil(ROWS_PER_NODE * program.struct.horizon))
-        return min(program.most_rows, usual if self.asked is None else self.asked)
+        rows = self.requested_rows
+        if rows is None:
+            rows = max(FEWEST_ROWS, math.ceil(ROWS_PER_NODE * program.struct.horizon))
+        return min(program.most_rows, rows)
 
     @property
     def reals(self) -> int:
@@ -106,20 +121,11 @@ class CNonlinear(CFollower):
     def numbers(self, text: CText) -> list[str]:
         """See `CSource`."""
         law = self.law
-        program = self.law.program
-        fallback = fallback_numbers(self._model(), self.bounds, self.table.fallback.within({}))
         prefix = text.prefix
-        blocks = []
-        pointers = {"terms": f"{prefix}terms"}
-        for name, array in program.pointed.items():
-            blocks.append(text.array(name, np.clip(array, -NO_BOUND, NO_BOUND) if array.dtype == np.double else array))
-            pointers[name] = f"{prefix}{name}"
-        blocks.append(text.structs("quadsim_nmpc_term", "terms", program.terms if program.struct.rows else ()))
-        members = text.mirrored(program.struct, pointers, room=self.rows + 1, changes=CHANGES)
-        blocks.append(text.struct("quadsim_nmpc_problem", f"{prefix}problem", **members))
+        blocks = self._program_blocks(text)
         blocks += self.body_blocks(text, law.bodies)
-        values = {name: text.value(value) for name, value in fallback.items()}
-        blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **values))
+        fallback = fallback_numbers(self._model(), self.bounds, self.table.fallback.within({}))
+        blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **text.initialisers(fallback)))
         addresses = {name: f"&{prefix}{name}" for name in ("problem", *law.bodies, "fallback")}
         if law.delay is not None:
             blocks += self.delay_blocks(text, law.delay, law.delay_bodies)
@@ -129,3 +135,20 @@ class CNonlinear(CFollower):
             addresses["ramp"] = f"&{prefix}ramp"
         members = text.mirrored(law.numbers, addresses, motion=int(self.motion))
         return [*blocks, text.struct("quadsim_nonlinear_numbers", "QUADSIM_CONTROLLER", **members)]
+
+    def _program_blocks(self, text: CText) -> list[str]:
+        """Return the quadratic program, with its `quadsim_nmpc_problem` last, after what it points to."""
+        program = self.law.program
+        prefix = text.prefix
+        blocks = []
+        pointers = {"terms": f"{prefix}terms"}
+        for name, array in program.pointed.items():
+            if array.dtype == np.double:
+                array = np.clip(array, -NO_BOUND, NO_BOUND)
+            blocks.append(text.array(name, array))
+            pointers[name] = f"{prefix}{name}"
+        terms = program.terms if program.struct.rows else ()
+        blocks.append(text.structs("quadsim_nmpc_term", "terms", terms))
+        members = text.mirrored(program.struct, pointers, room=self.rows + 1, changes=CHANGES)
+        blocks.append(text.struct("quadsim_nmpc_problem", f"{prefix}problem", **members))
+        return blocks

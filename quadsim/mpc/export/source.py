@@ -1,4 +1,8 @@
-"""The C files of a controller: the core's sources, verbatim, and one file of its numbers."""
+"""The C files of a controller: the core's sources, verbatim, and one generated file of its numbers.
+
+`CSource` is any controller as C, `CController` a linear one; the nonlinear and the geometric controller have modules of
+their own.  The files are templates with names between @, filled here; numbers are written by `ctext`.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,7 @@ CORE_FILES: Final = (*SHARED_FILES, "quadsim_core.c", "quadsim_mpc.h", "quadsim_
 """Those of the linear laws."""
 BODY_FILES: Final = ("quadsim_rigid.h",)
 """Files of `quadsim/core` to export verbatim, for every law."""
-DATA: Final = "quadsim_data.h"
+DATA_FILE: Final = "quadsim_data.h"
 """The generated file."""
 CHANGES: Final = 500
 """Limit of active-set changes in a search."""
@@ -35,7 +39,7 @@ ROWS_PER_STEP: Final = 2.56
 LEAST_ROWS: Final = 64
 
 
-def part(name: str, package: str = "quadsim.mpc.export") -> str:
+def c_source(name: str, package: str = "quadsim.mpc.export") -> str:
     """Return a hand-written C source of a package."""
     return (resources.files(package) / "c" / name).read_text(encoding="utf-8")
 
@@ -46,7 +50,7 @@ class CSource(abc.ABC):
 
     precision: Precision = "double"  # of all numbers
     title: str = ""  # a line that identifies it, in ASCII
-    asked: int | None = None  # active rows with room; None for a number that usually suffices
+    requested_rows: int | None = None  # active rows to have memory for; None for a number that usually suffices
 
     law_name: ClassVar[str]
     """Header of its law, and first word of its functions."""
@@ -126,10 +130,13 @@ class CSource(abc.ABC):
     @cached_property
     def files(self) -> dict[str, str]:
         """Its C files, by name."""
-        body = {}
+        files = {}
+        for name in self.law_files:
+            files[name] = c_source(name, "quadsim.mpc")
         for name in BODY_FILES:
-            body[name] = (resources.files("quadsim.core") / name).read_text(encoding="utf-8")
-        return {name: part(name, "quadsim.mpc") for name in self.law_files} | body | {DATA: self.filled(part(DATA))}
+            files[name] = (resources.files("quadsim.core") / name).read_text(encoding="utf-8")
+        files[DATA_FILE] = self.filled(c_source(DATA_FILE))
+        return files
 
     @property
     def defines(self) -> str:
@@ -141,29 +148,41 @@ class CSource(abc.ABC):
     @property
     def objects(self) -> str:
         """Its object files, as the Makefile lists them."""
-        return " ".join(sorted(name.replace(".c", ".o") for name in self.law_files if name.endswith(".c")))
+        objects = []
+        for name in self.law_files:
+            if name.endswith(".c"):
+                objects.append(name.replace(".c", ".o"))
+        return " ".join(sorted(objects))
 
     def filled(self, template: str) -> str:
         """Fill in the names between @ of a C file."""
-        count, width, what = self.reference
-        name = self.law_name
-        ints = self.ints
-        fits = f"{name}_reals(&QUADSIM_CONTROLLER) == QUADSIM_MEMORY"
+        rows, width, what = self.reference
+        law = self.law_name
+        wrong_precision = "ifndef"  # of QUADSIM_FLOAT, with which the file does not compile
+        if self.precision == "double":
+            wrong_precision = "ifdef"
+        integer_member = ""
+        integer_argument = ""
+        fits = f"{law}_reals(&QUADSIM_CONTROLLER) == QUADSIM_MEMORY"
+        if self.ints:
+            integer_member = f"    int ints[{self.ints}];\n"
+            integer_argument = ", memory->ints"
+            fits += f" && {law}_ints(&QUADSIM_CONTROLLER) == {self.ints}"
         values = {
-            "LAW": name,
+            "LAW": law,
             "TITLE": self.title,
             "PERIOD": f"{self.period:g}",
-            "IFN": "ifdef" if self.precision == "double" else "ifndef",
+            "IFN": wrong_precision,
             "PRECISION": self.precision,
             "HORIZON": self.horizon,
             "STATE": self.state,
-            "ROWS": count,
+            "ROWS": rows,
             "ROW": width,
             "REFERENCE": what,
             "MEMORY": self.reals,
-            "INTS": f"    int ints[{ints}];\n" if ints else "",
-            "MORE": ", memory->ints" if ints else "",
-            "FITS": f"{fits} && {name}_ints(&QUADSIM_CONTROLLER) == {ints}" if ints else fits,
+            "INTS": integer_member,
+            "MORE": integer_argument,
+            "FITS": fits,
             "PLAN": self.plan,
             "CHANGES": self.changes,
             "DOUBLE_TOLERANCE": self.tolerances[0],
@@ -179,7 +198,7 @@ class CSource(abc.ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class CController(CSource):
-    """A linear controller as C source, with room for 2.56 active rows per step of the horizon, and at least 64."""
+    """A linear controller as C source, with memory for 2.56 active rows per step of the horizon, at least for 64."""
 
     law: Exportable  # the law to export
 
@@ -212,26 +231,29 @@ class CController(CSource):
     @property
     def rows(self) -> int:
         """See `CSource`."""
-        usual = max(LEAST_ROWS, math.ceil(ROWS_PER_STEP * self.horizon))
-        return min(self.horizon * len(self.tables.rows), usual if self.asked is None else self.asked)
+        rows = self.requested_rows
+        if rows is None:
+            rows = max(LEAST_ROWS, math.ceil(ROWS_PER_STEP * self.horizon))
+        return min(self.horizon * len(self.tables.rows), rows)
 
     @property
     def reals(self) -> int:
         """See `CSource`: as counted by `quadsim_mpc_reals`."""
         N = self.horizon
-        problem = self.tables.problem
-        room = self.rows + 1
+        objective = self.tables.problem.objective
+        capacity = self.rows + 1
         rows = N * len(self.tables.rows)
-        packed = 4 * room + 3 * rows  # bytes of integers
         widest = max(len(axis.B) for axis in self.tables.axes)
-        work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + room * (room - 1) // 2
+        work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * capacity + capacity * (capacity - 1) // 2
+        integer_bytes = 4 * capacity + 3 * rows
+        packed = integer_bytes // self.real_bytes + 1
+        goals_and_plan = N * (len(objective.C_r) + N_ROTORS)
+        sent = 0  # commands that do not act yet
         settings = self.law.settings
-        period = self.law.problem.model.period
-        if settings is None:
-            sent = 0
-        else:
-            sent = N_ROTORS * split_delay(settings.delay, period)[0]
-        return work + packed // self.real_bytes + 1 + N * (len(problem.objective.C_r) + N_ROTORS) + sent
+        if settings is not None:
+            delayed_periods, _ = split_delay(settings.delay, self.law.problem.model.period)
+            sent = N_ROTORS * delayed_periods
+        return work + packed + goals_and_plan + sent
 
     def numbers(self, text: CText) -> list[str]:
         """See `CSource`."""
@@ -239,29 +261,26 @@ class CController(CSource):
         return [*optimisation, *_controller(text, self.law, self.bounds)]
 
 
-def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
+def problem_data(text: CText, tables: Tables, capacity: int) -> list[str]:
     """Return the optimisation's numbers, with its `quadsim_problem` last."""
-    blocks, entries = text.members(members(tables, room=room, changes=CHANGES))
+    blocks, entries = text.members(members(tables, room=capacity, changes=CHANGES))
     return [*blocks, text.struct("quadsim_problem", f"{text.prefix}problem", **entries)]
 
 
 def _controller(text: CText, law: Exportable, bounds: ActuatorBounds | None) -> list[str]:
     """Return the numbers apart from those of the optimisation, with the `quadsim_controller` last."""
     problem = law.problem
-    robust = "NULL"
-    model = hover_model(law.vehicle, problem.model.period)
-    members = fallback_numbers(model, bounds, law.fallback)
-    fallback = {name: text.value(value) for name, value in members.items()}
-    blocks = [text.struct("quadsim_fallback", f"{text.prefix}fallback", **fallback)]
-    if law.settings is not None:
-        numbers = robust_numbers(law.settings, law.vehicle, problem.model.period)
-        values = {name: text.value(value) for name, value in numbers.items()}
-        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **values))
-        robust = f"&{text.prefix}robust"
     addresses = {
         "problem": f"&{text.prefix}problem",
-        "robust": robust,
+        "robust": "NULL",
         "fallback": f"&{text.prefix}fallback",
     }
-    limits = {name: text.value(value) for name, value in controller_numbers(problem).items()}
+    model = hover_model(law.vehicle, problem.model.period)
+    fallback = fallback_numbers(model, bounds, law.fallback)
+    blocks = [text.struct("quadsim_fallback", f"{text.prefix}fallback", **text.initialisers(fallback))]
+    if law.settings is not None:
+        robust = robust_numbers(law.settings, law.vehicle, problem.model.period)
+        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **text.initialisers(robust)))
+        addresses["robust"] = f"&{text.prefix}robust"
+    limits = text.initialisers(controller_numbers(problem))
     return [*blocks, text.struct("quadsim_controller", "QUADSIM_CONTROLLER", **addresses, **limits)]

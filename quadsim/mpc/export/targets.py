@@ -1,4 +1,8 @@
-"""The machines that an export can be made for, as the first lines of its Makefile."""
+"""The machines that an export can be made for, as the first lines of its Makefile.
+
+A Cortex-M is emulated by QEMU on a board of its own; `posix` runs natively.  One more machine is an entry of `TARGETS`
+and a C file that implements `c/target.h`.
+"""
 
 from __future__ import annotations
 
@@ -32,11 +36,10 @@ class Machine:
 
     def makefile(self, defines: str) -> str:
         """Return the first lines of the Makefile."""
+        run = ""
         if self.board:
             run = " ".join(["timeout 600", *self.emulation, "-serial none -kernel"])
-        else:
-            run = ""
-        lines = {
+        settings = {
             "COMPILER": self.compiler,
             "MACHINE": self.machine,
             "MACHINE_LINK": self.link,
@@ -44,10 +47,14 @@ class Machine:
             "RUN": run,
             "DEFINES": defines,
         }
-        return "".join(f"{name} = {value}".rstrip() + "\n" for name, value in lines.items())
+        lines = []
+        for name, value in settings.items():
+            lines.append(f"{name} = {value}".rstrip() + "\n")
+        return "".join(lines)
 
 
 def _cortex(name: str, title: str, machine: str, board: str) -> Machine:
+    """Return a Cortex-M on a board that QEMU emulates."""
     return Machine(
         name=name,
         title=title,

@@ -14,12 +14,12 @@ import scipy.linalg
 import quadsim
 from quadsim.commands.cli import main
 from quadsim.errors import ExportError, OutputError, ParameterError
-from quadsim.features.export.exporter import FACTS, c_controller, export, exported_law, room_sentence
+from quadsim.features.export.exporter import FACTS, c_controller, export, exported_law, memory_sentence
 from quadsim.features.export.record import record
 from quadsim.mpc.export.ctext import CText
 from quadsim.mpc.export.geometric import CGeometric
-from quadsim.mpc.export.nonlinear import FILES as NONLINEAR_FILES
-from quadsim.mpc.export.source import BODY_FILES, CORE_FILES, DATA
+from quadsim.mpc.export.nonlinear import NONLINEAR_FILES
+from quadsim.mpc.export.source import BODY_FILES, CORE_FILES, DATA_FILE
 from quadsim.mpc.forms.condensing import Condensed
 from quadsim.mpc.problem.ocp import Query
 from quadsim.mpc.solvers import Method
@@ -49,7 +49,7 @@ def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
             continue
         seen.add(key)
         try:
-            _, data = c_controller(scenario).files[DATA].split("static const", 1)
+            _, data = c_controller(scenario).files[DATA_FILE].split("static const", 1)
         except ExportError as error:
             refused[name] = error.reason
             continue
@@ -66,8 +66,8 @@ def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
 @pytest.mark.parametrize("horizon", [1, 10, 20, 100])
 def test_any_horizon_is_exported(horizon: int) -> None:
     controller = c_controller(load_scenario("paper-constrained", [f"controller.horizon={horizon}"]), "float")
-    assert f"#define QUADSIM_HORIZON {horizon} " in controller.files[DATA]
-    assert f"#define QUADSIM_MEMORY {controller.reals} " in controller.files[DATA]
+    assert f"#define QUADSIM_HORIZON {horizon} " in controller.files[DATA_FILE]
+    assert f"#define QUADSIM_MEMORY {controller.reals} " in controller.files[DATA_FILE]
 
 
 def test_the_core_is_exported_byte_for_byte(tmp_path: Path) -> None:
@@ -92,7 +92,9 @@ def test_the_same_export_twice_is_the_same_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.representative("export")
 def test_both_precisions_have_the_same_numbers() -> None:
-    double, single = (c_controller(load_scenario("hover"), precision).files[DATA] for precision in ("double", "float"))
+    double, single = (
+        c_controller(load_scenario("hover"), precision).files[DATA_FILE] for precision in ("double", "float")
+    )
     numbers = [text[text.index("static const") :].split() for text in (double, single)]
     assert [re.sub(r"(\d)F\b", r"\1", word) for word in numbers[1]] == numbers[0]
 
@@ -103,8 +105,8 @@ def test_capacity_is_as_requested_and_its_reach_is_stated(tmp_path: Path) -> Non
     for rows in (40, 128):
         directory = quadsim.export(quadsim.load("paper-constrained", SHORT), tmp_path / str(rows), rows=rows)
         facts.append(json.loads((directory / FACTS).read_text()))
-        assert f".room = {rows + 1}," in (directory / DATA).read_text()
-        assert room_sentence(facts[-1]) in (directory / "README.md").read_text().lower()
+        assert f".room = {rows + 1}," in (directory / DATA_FILE).read_text()
+        assert memory_sentence(facts[-1]) in (directory / "README.md").read_text().lower()
     few, many = facts
     assert few["memory_bytes"] < many["memory_bytes"]
     assert 0.0 < few["reach"]["distance"] < many["reach"]["distance"]
@@ -123,7 +125,7 @@ def test_an_export_is_complete_and_replaces_an_earlier_one_on_request(tmp_path: 
     assert {
         *CORE_FILES,
         *BODY_FILES,
-        DATA,
+        DATA_FILE,
         FACTS,
         "vectors.h",
         "vectors.c",
