@@ -160,8 +160,9 @@ def compare_flights(
         RenderingUnavailableError: a video is requested but cannot be rendered; nothing was flown.
     """
     from quadsim.console.console import short_path
-    from quadsim.report.comparison import comparison_rows, run_names
+    from quadsim.report.comparison import run_names
     from quadsim.report.comparison_page import write_comparison
+    from quadsim.report.comparison_rows import comparison_rows
 
     if constraints is None:
         whose = None

@@ -10,7 +10,7 @@ from quadsim.console.summary_tables import summary_tables
 from quadsim.errors import FileError, printable
 from quadsim.flight import rundir
 from quadsim.flight.parquet import read_log
-from quadsim.report.comparison import comparison_rows
+from quadsim.report.comparison_rows import comparison_rows
 from quadsim.rollout.flown import Flight
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.courses.csv_course import Csv

@@ -12,7 +12,7 @@ from quadsim.errors import FileError
 from quadsim.flight.audit import Limit, Mask, margins_at, margins_sampled
 from quadsim.flight.log import FlightLog
 from quadsim.flight.record import FlightRecord
-from quadsim.report.comparison import failure_sentences
+from quadsim.report.flight_sentences import failure_sentences
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import EULER, POSITION, Array, tilt
 from quadsim.ties import in_order

@@ -16,7 +16,7 @@ from quadsim.flight.log import PlantLog, columns_of
 from quadsim.flight.metrics import never_took_off, unrecovered
 from quadsim.flight.record import FlightRecord
 from quadsim.palette import line_colour
-from quadsim.report.comparison import comparison_rows, fallback_sentence, takeoff_sentence
+from quadsim.report.comparison_rows import comparison_rows
 from quadsim.report.figure import (
     break_at_wraps,
     commanded_speeds,
@@ -24,6 +24,7 @@ from quadsim.report.figure import (
     least_range,
     reference_curve,
 )
+from quadsim.report.flight_sentences import fallback_sentence, takeoff_sentence
 from quadsim.report.recording.world import (
     BOUND,
     FRONT_PANELS,
