@@ -27,10 +27,10 @@ def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | Non
     Numbers that are not finite do not count.
     """
     span = LEAST_SPANS.get(unit, 0.0)
-    extent = _extent(curves)
-    if extent is None:
+    drawn = extent(curves)
+    if drawn is None:
         return None
-    low, high = extent
+    low, high = drawn
     if high - low >= span:
         return None
     middle = 0.5 * (low + high)
@@ -51,7 +51,7 @@ def _after_start(x: Array, y: Array) -> Array:
     return y[x > start]
 
 
-def _extent(curves: Sequence[Array]) -> tuple[float, float] | None:
+def extent(curves: Sequence[Array]) -> tuple[float, float] | None:
     """Return the lowest and the highest finite value; None without any."""
     if not curves:
         return None
@@ -243,7 +243,7 @@ class Panel:
         if self.settled_range is None:
             return heading
         low, high = self.settled_range
-        first, last = _extent(self._curves()) or self.settled_range
+        first, last = extent(self._curves()) or self.settled_range
         if last - high > low - first:
             peak = last
         else:
@@ -270,8 +270,8 @@ class Panel:
         later = [_after_start(series.x, series.y) for series in self.series]
         for band in self.bands:
             later += [_after_start(band.x, band.low), _after_start(band.x, band.high)]
-        settled = _extent([*later, bounds])
-        whole = _extent([*self._curves(), bounds])
+        settled = extent([*later, bounds])
+        whole = extent([*self._curves(), bounds])
         if settled is None or whole is None:
             return None
         low, high = settled
