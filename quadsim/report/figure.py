@@ -165,6 +165,13 @@ class Series:
     base: Array | None = None  # (K,) where bars begin, for stacked ones
     flights: Array | None = None  # (K,) number of the flight behind each point, which a page shows on hover
 
+    @property
+    def bar_width(self) -> float:
+        """The width of bars, in units of x: they touch where they are closest."""
+        if self.x.size > 1:
+            return float(np.diff(self.x).min())
+        return 0.8
+
 
 @dataclass(frozen=True, kw_only=True)
 class Bound:
@@ -313,6 +320,15 @@ class Figure:
         for panel in self.panels:
             drawn += [*panel.areas, *panel.bands, *panel.series]
         return {item.label: item.colour for item in drawn if item.label}
+
+    @property
+    def row_heights(self) -> list[float]:
+        """The height of each row of panels, relative to others."""
+        heights = []
+        for first in range(0, len(self.panels), self.columns):
+            row = self.panels[first : first + self.columns]
+            heights.append(max(panel.height for panel in row))
+        return heights
 
 
 @dataclass(frozen=True, kw_only=True)
