@@ -11,7 +11,7 @@ from quadsim.errors import printable
 from quadsim.flight.audit import Finding
 from quadsim.flight.record import FlightRecord
 from quadsim.outputs import absolute, require_file, writing_file
-from quadsim.report.comparison import failed_takeoff, failure_sentences
+from quadsim.report.flight_sentences import failed_takeoff, failure_sentences
 from quadsim.report.table import format_number
 
 Cases: TypeAlias = Sequence[tuple[str, bool | None, str]]

@@ -15,15 +15,12 @@ from quadsim.controller import OPTIMAL, Phase, counts
 from quadsim.flight.audit import VERDICT_TEXT, Finding
 from quadsim.flight.record import FlightRecord
 from quadsim.mpc.laws import law_name
-from quadsim.report.comparison import (
-    NOT_REQUIRED,
+from quadsim.report.comparison_rows import NOT_REQUIRED, required, rounded_margin, tracking_values
+from quadsim.report.flight_sentences import (
     crash,
     departing,
     event_sentences,
     failure_sentences,
-    required,
-    rounded_margin,
-    tracking_values,
     violated_otherwise,
     violated_unrequired,
 )

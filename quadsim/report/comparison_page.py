@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 import shutil
 from collections.abc import Sequence
@@ -23,9 +22,11 @@ from quadsim.flight.rundir import (
 )
 from quadsim.outputs import optional, writing
 from quadsim.palette import line_colour
-from quadsim.report.comparison import comparison_rows, conclusion, distinct_courses, mismatch, run_names
+from quadsim.report.comparison import conclusion, distinct_courses, run_names
+from quadsim.report.comparison_rows import comparison_rows
 from quadsim.report.figure import Scene
 from quadsim.report.flight_figures import overview, page_figures
+from quadsim.report.flight_sentences import with_mismatch
 from quadsim.report.page import PAGE_FILE, RunView, Section, render_page
 from quadsim.report.table import to_markdown
 from quadsim.report.to_matplotlib import write_pngs
@@ -64,6 +65,39 @@ def write_comparison(
     """
     if not runs:
         raise ParameterError("comparison", "runs", 0, "one or more")
+    _check_places(runs, directory)
+    names = run_names(runs)
+    rows = comparison_rows(runs)
+    courses = len(distinct_courses(runs))
+    if courses > 1:
+        warning = f"The runs follow {courses} different courses, so their errors are not like for like."
+        notes = (*notes, warning)
+    with writing(directory, overwrite=overwrite) as partial:
+        (partial / TABLE_FILE).write_text(to_markdown(rows, names), encoding="utf-8")
+        with optional(OVERVIEW_FILE):
+            write_pngs([overview(runs)], partial)
+        views = []
+        for i, (run, name, folder) in enumerate(zip(runs, names, _folder_names(names), strict=True)):
+            views.append(_copy_run(run, name, folder, line_colour(i), partial))
+        files = {"table (Markdown)": TABLE_FILE}
+        if (partial / OVERVIEW_FILE).exists():
+            files = {"overlay of all runs (PNG)": OVERVIEW_FILE, **files}
+        page = render_page(
+            "comparison",
+            _title(names),
+            [_plots(runs)],
+            verdict=conclusion(runs, names),
+            notes=notes,
+            runs=views,
+            rows=rows,
+            files=files,
+        )
+        (partial / PAGE_FILE).write_text(page, encoding="utf-8")
+    return directory / PAGE_FILE
+
+
+def _check_places(runs: Sequence[FlightRecord], directory: Path) -> None:
+    """Refuse runs whose directory cannot be copied from, or is inside the one to be written."""
     target = directory.resolve()
     for run in runs:
         if run.directory is None:
@@ -71,37 +105,23 @@ def write_comparison(
         require_inside(run.directory)  # copying follows links
         if run.directory.resolve().is_relative_to(target):
             raise OutputError(directory, f"it holds the run {run.directory}, which must stay; choose another --out")
-    names = run_names(runs)
-    rows = comparison_rows(runs)
-    with writing(directory, overwrite=overwrite) as partial:
-        (partial / TABLE_FILE).write_text(to_markdown(rows, names), encoding="utf-8")
-        with optional(OVERVIEW_FILE):
-            write_pngs([overview(runs)], partial)
-        views = [
-            _place(run, name, folder, line_colour(i), partial)
-            for i, (run, name, folder) in enumerate(zip(runs, names, _folder_names(names), strict=True))
-        ]
-        courses = len(distinct_courses(runs))
-        warning = f"The runs follow {courses} different courses, so their errors are not like for like."
-        figures = []
-        for figure in page_figures(runs):
-            figures.append(
-                scene_to_plot(figure) if isinstance(figure, Scene) else to_plot(figure, labelled=len(runs) == 1)
-            )
-        plots = Section(title="Plots", plots=tuple(figures))
-        if len(names) < 3:
-            title = " and ".join(names)
+
+
+def _plots(runs: Sequence[FlightRecord]) -> Section:
+    """The figures; those of several runs are labelled by the toggles of the page."""
+    plots = []
+    for figure in page_figures(runs):
+        if isinstance(figure, Scene):
+            plots.append(scene_to_plot(figure))
         else:
-            title = f"{len(names)} runs: {', '.join(names)}"
-        files = {"overlay of all runs (PNG)": OVERVIEW_FILE, "table (Markdown)": TABLE_FILE}
-        files = {label: name for label, name in files.items() if (partial / name).exists()}
-        notes = (*notes, *([warning] if courses > 1 else []))
-        verdict = conclusion(runs, names)
-        page = render_page(
-            "comparison", title, [plots], verdict=verdict, notes=notes, runs=views, rows=rows, files=files
-        )
-        (partial / PAGE_FILE).write_text(page, encoding="utf-8")
-    return directory / PAGE_FILE
+            plots.append(to_plot(figure, labelled=len(runs) == 1))
+    return Section(title="Plots", plots=tuple(plots))
+
+
+def _title(names: Sequence[str]) -> str:
+    if len(names) < 3:
+        return " and ".join(names)
+    return f"{len(names)} runs: {', '.join(names)}"
 
 
 def _folder_names(names: Sequence[str]) -> list[str]:
@@ -109,35 +129,31 @@ def _folder_names(names: Sequence[str]) -> list[str]:
     folders: list[str] = []
     for name in names:
         plain = re.sub(r"[^a-z0-9_-]+", "-", name.lower()).strip("-") or "run"
-        numbered = itertools.chain([plain], (f"{plain}-{i}" for i in itertools.count(2)))
-        folders.append(next(folder for folder in numbered if folder not in folders))
+        folder = plain
+        number = 1
+        while folder in folders:
+            number += 1
+            folder = f"{plain}-{number}"
+        folders.append(folder)
     return folders
 
 
-def _place(run: FlightRecord, name: str, folder: str, colour: str, page_directory: Path) -> RunView:
+def _copy_run(run: FlightRecord, name: str, folder: str, colour: str, page_directory: Path) -> RunView:
     """Copy what a run has to offer beside the page."""
-    place = page_directory / folder
-    place.mkdir()
-    source = run.directory
+    target = page_directory / folder
+    target.mkdir()
     files: dict[str, str] = {}
-    video = poster = None
-    if source is not None:
-        files = _copied(source, place, folder)
-    if source is not None and (source / VIDEO_FILE).is_file():
-        from quadsim.report.film.video import write_poster
-
-        video = f"{folder}.mp4"
-        shutil.copyfile(source / VIDEO_FILE, page_directory / video)
-        if write_poster(page_directory / video, page_directory / f"{folder}.jpg"):
-            poster = f"{folder}.jpg"
-        else:
-            poster = None
+    video = None
+    poster = None
+    if run.directory is not None:
+        files = _copy_files(run.directory, target, folder)
+        video, poster = _copy_video(run.directory, page_directory, folder)
     vehicle = f"Vehicle: {run.actual.description or run.actual.name}"
     return RunView(
         name=name,
         colour=colour,
         description=run.numbers.get("description", ""),
-        facts=(", modelled with ".join([vehicle, *mismatch(run)]), _made_with(run)),
+        facts=(with_mismatch(run, vehicle), _versions_and_machine(run)),
         video=video,
         length=run.end,
         poster=poster,
@@ -145,7 +161,7 @@ def _place(run: FlightRecord, name: str, folder: str, colour: str, page_director
     )
 
 
-def _copied(source: Path, place: Path, folder: str) -> dict[str, str]:
+def _copy_files(source: Path, place: Path, folder: str) -> dict[str, str]:
     """Copy the files and figures of a run directory; return the link to each by what it is."""
     files = {}
     for file, label in _FILES.items():
@@ -159,13 +175,28 @@ def _copied(source: Path, place: Path, folder: str) -> dict[str, str]:
     return files
 
 
-def _made_with(run: FlightRecord) -> str:
-    """Versions and machine: what timings, and the last digits, depend on."""
+def _copy_video(source: Path, page_directory: Path, folder: str) -> tuple[str | None, str | None]:
+    """Copy the video of a run directory, and make its poster; return the link to each, None without it."""
+    if not (source / VIDEO_FILE).is_file():
+        return None, None
+    from quadsim.report.film.video import write_poster
+
+    video = f"{folder}.mp4"
+    poster = f"{folder}.jpg"
+    shutil.copyfile(source / VIDEO_FILE, page_directory / video)
+    if write_poster(page_directory / video, page_directory / poster):
+        return video, poster
+    return video, None
+
+
+def _versions_and_machine(run: FlightRecord) -> str:
+    """What timings, and the last digits, depend on."""
     versions = run.numbers.get("versions", {})
     machine = run.numbers.get("machine", {})
     packages = [f"{name} {versions[name]}" for name in ("quadsim", "mujoco", "piqp") if name in versions]
+    parts = []
+    if packages:
+        parts.append(", ".join(packages))
     if {"processor", "cores"} <= machine.keys():
-        where = f"{machine['processor']}, {machine['cores']} cores"
-    else:
-        where = ""
-    return " on ".join(filter(None, (", ".join(packages), where)))
+        parts.append(f"{machine['processor']}, {machine['cores']} cores")
+    return " on ".join(parts)

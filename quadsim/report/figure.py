@@ -26,41 +26,39 @@ def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | Non
 
     Numbers that are not finite do not count.
     """
-    if curves:
-        values = np.concatenate([np.ravel(curve) for curve in curves])
-    else:
-        values = np.empty(0)
-    values = values[np.isfinite(values)]
     span = LEAST_SPANS.get(unit, 0.0)
-    if not values.size or values.max() - values.min() >= span:
+    drawn = extent(curves)
+    if drawn is None:
         return None
-    middle = 0.5 * float(values.min() + values.max())
+    low, high = drawn
+    if high - low >= span:
+        return None
+    middle = 0.5 * (low + high)
     if abs(middle) < 1e-3 * span:
         middle = 0.0  # an axis about zero has round ticks
     return middle - 0.5 * span, middle + 0.5 * span
 
 
-_START: Final = 0.001  # share of its time that is a curve's start, its first sample at least
-_SPIKE: Final = 3.0  # how many times its later span a panel's span has to be, for a start to be left outside
+_START_SHARE: Final = 0.001  # share of its time that is a curve's start, its first sample at least
+_LEAST_SPIKE: Final = 3.0  # how many times its later span a panel's span has to be, for a start to be left outside
 
 
-def _later(x: Array, y: Array) -> Array:
+def _after_start(x: Array, y: Array) -> Array:
     """Values y over x, both (K,), after their start."""
     if not x.size:
         return y
-    start = x[0] + _START * (x[-1] - x[0])
+    start = x[0] + _START_SHARE * (x[-1] - x[0])
     return y[x > start]
 
 
-def _extent(curves: Sequence[Array]) -> tuple[float, float] | None:
+def extent(curves: Sequence[Array]) -> tuple[float, float] | None:
     """Return the lowest and the highest finite value; None without any."""
-    if curves:
-        values = np.concatenate([np.ravel(curve) for curve in curves])
-    else:
-        values = np.empty(0)
+    if not curves:
+        return None
+    values = np.concatenate([np.ravel(curve) for curve in curves])
     values = values[np.isfinite(values)]
     if values.size:
-        return (float(values.min()), float(values.max()))
+        return float(values.min()), float(values.max())
     return None
 
 
@@ -74,13 +72,15 @@ def reference_curve(log: ControlLog, name: str) -> Array:
 
 def bounds_of(limits: Iterable[Limit], signal: str, end: float) -> list[tuple[float, float, float]]:
     """Return each distinct bound on a signal, with its start and stop in a flight that ends at `end` [s]."""
-    bounds = {
-        (bound, limit.start, min(limit.stop, end)): None
-        for limit in limits
-        for bound in (limit.lower, limit.upper)
-        if limit.signal == signal and limit.start < end and np.isfinite(bound)
-    }
-    return list(bounds)
+    bounds: list[tuple[float, float, float]] = []
+    for limit in limits:
+        if limit.signal != signal or limit.start >= end:
+            continue
+        for value in (limit.lower, limit.upper):
+            bound = (value, limit.start, min(limit.stop, end))
+            if np.isfinite(value) and bound not in bounds:
+                bounds.append(bound)
+    return bounds
 
 
 def break_at_wraps(t: Array, values: Array, unit: str) -> tuple[Array, Array]:
@@ -88,11 +88,11 @@ def break_at_wraps(t: Array, values: Array, unit: str) -> tuple[Array, Array]:
 
     Times [s] and values (K,) become (K + wraps,), with a NaN in each gap; values of another unit than `deg` never wrap.
     """
+    after = np.empty(0, int)
     if unit == "deg":
         after = np.flatnonzero(np.abs(np.diff(values)) > _HALF_TURN) + 1
-    else:
-        after = np.empty(0, int)
-    return np.insert(t, after, 0.5 * (t[after - 1] + t[after])), np.insert(values, after, np.nan)
+    middles = 0.5 * (t[after - 1] + t[after])
+    return np.insert(t, after, middles), np.insert(values, after, np.nan)
 
 
 _VISIBLE_SPEED: Final = 1e-3
@@ -112,29 +112,24 @@ class EffectCurves:
 
 def effect_curves(log: FlightLog) -> list[EffectCurves]:
     """Return external force, torque, wind, voltage and charge, unless zero throughout."""
-    if log.plant.wrench is None:
-        wrench = np.zeros((1, 6))
-    else:
-        wrench = log.plant.wrench
-    if log.plant.wind is None:
-        wind = np.zeros((1, 3))
-    else:
-        wind = log.plant.wind
-    if log.plant.battery is None:
-        battery = np.zeros((1, 2))
-    else:
-        battery = log.plant.battery
-    units = {name: unit for one in columns_of(PlantLog).values() for name, unit in one.units.items()}
-    curves = (
-        EffectCurves(key="force", title="external force, world", unit=units["force_x"], values=wrench[:, :3]),
-        EffectCurves(key="torque", title="external torque, body", unit=units["torque_x"], values=wrench[:, 3:]),
-        EffectCurves(key="wind", title="wind, world", unit=units["wind_x"], values=wind),
-        *(
-            EffectCurves(key=name, title=f"battery {name}", unit=units[name], values=values[:, None], names=(name,))
-            for name, values in zip(columns_of(PlantLog)["battery"].units, battery.T, strict=True)
-        ),
-    )
-    return [entry for entry in curves if np.any(entry.values)]
+    plant = log.plant
+    units: dict[str, str] = {}
+    for column in columns_of(PlantLog).values():
+        units.update(column.units)
+    curves = []
+    if plant.wrench is not None:
+        force = plant.wrench[:, :3]
+        torque = plant.wrench[:, 3:]
+        curves.append(EffectCurves(key="force", title="external force, world", unit=units["force_x"], values=force))
+        curves.append(EffectCurves(key="torque", title="external torque, body", unit=units["torque_x"], values=torque))
+    if plant.wind is not None:
+        curves.append(EffectCurves(key="wind", title="wind, world", unit=units["wind_x"], values=plant.wind))
+    if plant.battery is not None:
+        for name, column in zip(columns_of(PlantLog)["battery"].units, plant.battery.T, strict=True):
+            title = f"battery {name}"
+            values = column[:, None]
+            curves.append(EffectCurves(key=name, title=title, unit=units[name], values=values, names=(name,)))
+    return [curve for curve in curves if np.any(curve.values)]
 
 
 def commanded_speeds(log: FlightLog) -> Array | None:
@@ -169,6 +164,13 @@ class Series:
     opacity: float = 1.0
     base: Array | None = None  # (K,) where bars begin, for stacked ones
     flights: Array | None = None  # (K,) number of the flight behind each point, which a page shows on hover
+
+    @property
+    def bar_width(self) -> float:
+        """The width of bars, in units of x: they touch where they are closest."""
+        if self.x.size > 1:
+            return float(np.diff(self.x).min())
+        return 0.8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,22 +243,26 @@ class Panel:
     @property
     def heading(self) -> str:
         """Title and unit, and the value of a start outside the axis."""
+        heading = self.title
         unit = self.unit.replace(" ", "\u00a0")  # no line break within it
         if unit:
             heading = f"{self.title} [{unit}]"
-        else:
-            heading = self.title
         if self.settled_range is None:
             return heading
         low, high = self.settled_range
-        first, last = _extent(self._curves()) or self.settled_range
-        peak = last if last - high > low - first else first
+        first, last = extent(self._curves()) or self.settled_range
+        if last - high > low - first:
+            peak = last
+        else:
+            peak = first
         return f"{heading}, {peak:.3g} at first"
 
     def _curves(self) -> list[Array]:
         """Return what is drawn over time."""
-        edges = [edge for band in self.bands for edge in (band.low, band.high)]
-        return [*(series.y for series in self.series), *edges]
+        curves = [series.y for series in self.series]
+        for band in self.bands:
+            curves += [band.low, band.high]
+        return curves
 
     @property
     def settled_range(self) -> tuple[float, float] | None:
@@ -267,17 +273,17 @@ class Panel:
         is_timed = not (self.x_label or self.y_log or self.equal or self.y_range)
         if not is_timed or any(series.style == "bars" for series in self.series):
             return None
-        bounds = [np.array([bound.value for bound in self.bounds])]
-        later = [_later(series.x, series.y) for series in self.series]
+        bounds = np.array([bound.value for bound in self.bounds])
+        later = [_after_start(series.x, series.y) for series in self.series]
         for band in self.bands:
-            later += [_later(band.x, band.low), _later(band.x, band.high)]
-        settled = _extent([*later, *bounds])
-        every = _extent([*self._curves(), *bounds])
-        if settled is None or every is None:
+            later += [_after_start(band.x, band.low), _after_start(band.x, band.high)]
+        settled = extent([*later, bounds])
+        whole = extent([*self._curves(), bounds])
+        if settled is None or whole is None:
             return None
         low, high = settled
         span = max(high - low, LEAST_SPANS.get(self.unit, 0.0)) or max(abs(high), 1.0)
-        if every[1] - every[0] <= _SPIKE * span:
+        if whole[1] - whole[0] <= _LEAST_SPIKE * span:
             return None
         middle = 0.5 * (low + high)
         return middle - 0.55 * span, middle + 0.55 * span
@@ -290,8 +296,8 @@ class Panel:
     @property
     def least_range(self) -> tuple[float, float] | None:
         """The range of y for constant curves and bounds; None if the axis fits itself."""
-        curves = [series.y for series in self.series] + [np.array([bound.value]) for bound in self.bounds]
-        return least_range([*curves, *(edge for band in self.bands for edge in (band.low, band.high))], self.unit)
+        bounds = np.array([bound.value for bound in self.bounds])
+        return least_range([*self._curves(), bounds], self.unit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -315,6 +321,15 @@ class Figure:
             drawn += [*panel.areas, *panel.bands, *panel.series]
         return {item.label: item.colour for item in drawn if item.label}
 
+    @property
+    def row_heights(self) -> list[float]:
+        """The height of each row of panels, relative to others."""
+        heights = []
+        for first in range(0, len(self.panels), self.columns):
+            row = self.panels[first : first + self.columns]
+            heights.append(max(panel.height for panel in row))
+        return heights
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
@@ -326,13 +341,18 @@ class Scene:
     solids: tuple[tuple[Array, str], ...] = ()  # points (K, 3) [m] whose convex hull is a solid, and its name
 
 
-_ROUND: float = 1.5  # distance beyond course and path up to which unbounded regions are drawn [m]
-_LONG: float = 40.0  # distance from the middle of the course up to which a path is drawn [m]; lost vehicles go farther
+_AROUND: Final = 1.5  # distance beyond course and path up to which unbounded regions are drawn [m]
+_FARTHEST: Final = 40.0
+"""Distance from the middle of the course up to which a path is drawn [m]; lost vehicles go farther."""
 
 
 def obstacles_in(limits: Iterable[Limit]) -> list[AnyObstacle]:
     """The obstacles among limits."""
-    return [limit.shape for limit in limits if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Obstacle)]
+    obstacles = []
+    for limit in limits:
+        if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Obstacle):
+            obstacles.append(limit.shape)
+    return obstacles
 
 
 def has_space(limits: Iterable[Limit]) -> bool:
@@ -342,17 +362,21 @@ def has_space(limits: Iterable[Limit]) -> bool:
 
 def region_edges(limits: Iterable[Limit], log: FlightLog) -> Iterator[tuple[SpaceLimit, Array]]:
     """Each region with its edges (E, 2, 3) [m], cut off around course and path."""
-    regions = [limit for limit in limits if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Region)]
+    regions: list[tuple[SpaceLimit, Region]] = []
+    for limit in limits:
+        if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Region):
+            regions.append((limit, limit.shape))
     if not regions:
         return
     course = log.control.reference[:, :3]
     path = log.plant.state[:, POSITION]
     points = np.concatenate([course, path[np.isfinite(path).all(axis=1)]])
     middle = points[0]
-    points = np.clip(points, middle - _LONG, middle + _LONG)
-    for limit in regions:
-        assert isinstance(limit.shape, Region)
-        yield limit, limit.shape.edges(points.min(axis=0) - _ROUND, points.max(axis=0) + _ROUND)
+    points = np.clip(points, middle - _FARTHEST, middle + _FARTHEST)
+    lowest = points.min(axis=0) - _AROUND
+    highest = points.max(axis=0) + _AROUND
+    for limit, region in regions:
+        yield limit, region.edges(lowest, highest)
 
 
 def outlines(obstacle: Obstacle, t: float) -> list[Array]:

@@ -62,19 +62,38 @@ def render_page(
     first group stands before the sections and the others after them; plots toggle the group `run0` and so on; `files`
     has the URL of each file beside the page, by its label.
     """
-    groups = [(group, list(of_group)) for group, of_group in itertools.groupby(rows, lambda row: row.group)]
+    groups = []
+    for group, of_group in itertools.groupby(rows, lambda row: row.group):
+        groups.append((group, list(of_group)))
     shown = []
-    for part in map(_without_empty, sections):
-        if part.text or part.plots or part.tables or part.folded:
-            shown.append(part)
-    return _environment().get_template("page.html.j2").render(
-        kind=kind, title=title, sections=shown, verdict=verdict, notes=notes, runs=runs, groups=groups,
-        files=files or {}, palette=css(), plotly=plotly_script() if any(section.plots for section in shown) else "",
-    )  # fmt: skip
+    for section in map(_without_empty, sections):
+        if section.text or section.plots or section.tables or section.folded:
+            shown.append(section)
+    plotly = ""
+    if any(section.plots for section in shown):
+        plotly = plotly_script()
+    return (
+        _environment()
+        .get_template("page.html.j2")
+        .render(
+            kind=kind,
+            title=title,
+            sections=shown,
+            verdict=verdict,
+            notes=notes,
+            runs=runs,
+            groups=groups,
+            files=files or {},
+            palette=css(),
+            plotly=plotly,
+        )
+    )
 
 
 def _without_empty(section: Section) -> Section:
-    tables, folded = (tuple(grid for grid in grids if grid.lines) for grids in (section.tables, section.folded))
+    """A section without the tables that have no lines."""
+    tables = tuple(grid for grid in section.tables if grid.lines)
+    folded = tuple(grid for grid in section.folded if grid.lines)
     return Section(title=section.title, text=section.text, plots=section.plots, tables=tables, folded=folded)
 
 

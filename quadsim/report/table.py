@@ -64,7 +64,13 @@ class Grid:
 
 def line(*cells: Cell | str) -> tuple[Cell, ...]:
     """A line of a grid; a text is a cell without a mark."""
-    return tuple(cell if isinstance(cell, Cell) else Cell(text=cell) for cell in cells)
+    marked = []
+    for cell in cells:
+        if isinstance(cell, Cell):
+            marked.append(cell)
+        else:
+            marked.append(Cell(text=cell))
+    return tuple(marked)
 
 
 def to_markdown(rows: Sequence[QuantityRow], names: Sequence[str]) -> str:
@@ -72,12 +78,16 @@ def to_markdown(rows: Sequence[QuantityRow], names: Sequence[str]) -> str:
     lines = []
     group = ""
     for row in rows:
-        cells = [replace(cell, mark=Mark.BEST) if row.headline else cell for cell in row.cells]
+        heading = ""
+        if row.group != group:
+            heading = f"**{row.group}**"
+        label = row.label
         if row.unit:
             label = f"{row.label} [{row.unit}]"
-        else:
-            label = row.label
-        lines.append(line(f"**{row.group}**" if row.group != group else "", label, *cells))
+        cells = list(row.cells)
+        if row.headline:
+            cells = [replace(cell, mark=Mark.BEST) for cell in row.cells]
+        lines.append(line(heading, label, *cells))
         group = row.group
     return _markdown(("", "", *names), 2, lines)
 
@@ -89,11 +99,22 @@ def grid_to_markdown(grid: Grid) -> str:
 
 def _markdown(head: Sequence[str], names: int, lines: Sequence[Sequence[Cell]]) -> str:
     """A table whose first columns, so many, are names, aligned to the left."""
-    texts = []
+    alignment = ["---"] * names + ["---:"] * (len(head) - names)
+    rows = [_markdown_row(head), _markdown_row(alignment)]
     for cells in lines:
-        texts.append([f"**{cell.text}**" if cell.mark is Mark.BEST else cell.text for cell in cells])
-    table = [head, ["---"] * names + ["---:"] * (len(head) - names), *texts]
-    return "".join("| " + " | ".join(printable(text).replace("|", r"\|") for text in row) + " |\n" for row in table)
+        rows.append(_markdown_row([_markdown_text(cell) for cell in cells]))
+    return "".join(rows)
+
+
+def _markdown_row(texts: Sequence[str]) -> str:
+    escaped = [printable(text).replace("|", r"\|") for text in texts]
+    return "| " + " | ".join(escaped) + " |\n"
+
+
+def _markdown_text(cell: Cell) -> str:
+    if cell.mark is Mark.BEST:
+        return f"**{cell.text}**"
+    return cell.text
 
 
 def section(grid: Grid) -> str:

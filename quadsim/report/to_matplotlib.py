@@ -9,6 +9,7 @@ import re
 import textwrap
 from base64 import b64encode
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
@@ -18,7 +19,8 @@ import numpy as np
 from quadsim.errors import OutputError, ParameterError
 from quadsim.outputs import require_file, writing_file
 from quadsim.palette import COLOUR
-from quadsim.report.figure import Bound, Figure, Panel, Series
+from quadsim.report.figure import Bound, Figure, Label, Panel, Series
+from quadsim.state import Array
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -72,25 +74,39 @@ JOURNAL: Final[dict[RcKeyType, Any]] = {
 """What a figure of a stated width has besides: texts of 8 pt, and fonts that journals accept, Type 42."""
 JOURNAL_DPI: Final = 300
 SUFFIXES: Final = (".pdf", ".svg", ".png")
-# of a figure, of a row of panels and of what stands above and below them [in]
-_WIDTH = 9.6
-_ROW = 1.95
-_HEAD = 0.7
-_LETTERS: Final = 26  # characters beside a vertical axis
-# the same of a figure of a stated width
-_JOURNAL_ROW = 1.2
-_JOURNAL_HEAD = 0.5
-_JOURNAL_LETTERS = 17
-_LARGEST_SVG = 40_000
-_NOTEBOOK_DPI = 55
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Layout:
+    """Sizes of a figure's parts."""
+
+    row: float  # height of a row of panels [in]
+    head: float  # height of what stands above and below the panels [in]
+    letters: int  # characters beside a vertical axis
+
+
+_WIDTH: Final = 9.6  # of a figure without a stated width [in]
+_PAGE: Final = _Layout(row=1.95, head=0.7, letters=26)
+_JOURNAL: Final = _Layout(row=1.2, head=0.5, letters=17)
+"""Of a figure of a stated width."""
+_LARGEST_SVG: Final = 40_000  # letters of a notebook's figure above which it is a PNG
+_NOTEBOOK_DPI: Final = 55
 _READ_LATE: Final[tuple[RcKeyType, ...]] = ("pdf.fonttype", "ps.fonttype")
 """Settings that matplotlib reads when a figure is saved; its default is Type 3."""
 _MOST_COLUMNS: Final = 6  # of a legend
-_LINE: Final = 1.25  # height of a line of text [font size]
+_LINE_HEIGHT: Final = 1.25  # of a text [font size]
 _DASHES: Final = (0, (5, 2))
 _MARKERS: Final = {
-    **{"circle": "o", "diamond": "D", "square": "s", "x": "x", "cross": "P"},
-    **{"pentagon": "p", "triangle-up": "^", "triangle-down": "v", "triangle-left": "<", "triangle-right": ">"},
+    "circle": "o",
+    "diamond": "D",
+    "square": "s",
+    "x": "x",
+    "cross": "P",
+    "pentagon": "p",
+    "triangle-up": "^",
+    "triangle-down": "v",
+    "triangle-left": "<",
+    "triangle-right": ">",
 }
 
 
@@ -104,10 +120,11 @@ def write_pngs(figures: Iterable[Figure], directory: Path) -> list[Path]:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for figure in figures:
-            paths.append(directory / f"{figure.key}.png")
             png = to_png(figure)
-            with paths[-1].open("xb") as file:
+            path = directory / f"{figure.key}.png"
+            with path.open("xb") as file:
                 file.write(png)
+            paths.append(path)
     except OSError as error:
         raise OutputError(directory, error.strerror or str(error)) from error
     return paths
@@ -123,16 +140,25 @@ def to_png(figure: Figure, dpi: float | None = None) -> bytes:
 
 def figure_html(figure: Figure) -> str:
     """The figure for a notebook: SVG, or PNG where its curves make that large."""
-    svg = io.StringIO()
+    file = io.StringIO()
     with _style({"svg.fonttype": "none", "svg.hashsalt": figure.key}):
-        nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-        draw(figure).savefig(svg, format="svg", metadata=nothing, dpi=72)
-    text = svg.getvalue()
-    text = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d)\d+", r"\1", path[0]), text[text.index("<svg") :])
-    if len(text) <= _LARGEST_SVG:
-        return text
+        no_metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        draw(figure).savefig(file, format="svg", metadata=no_metadata, dpi=72)
+    text = file.getvalue()
+    svg = _rounded_paths(text[text.index("<svg") :])
+    if len(svg) <= _LARGEST_SVG:
+        return svg
     png = b64encode(to_png(figure, dpi=_NOTEBOOK_DPI)).decode()
     return f'<img alt="{figure.key}" src="data:image/png;base64,{png}">'
+
+
+def _rounded_paths(svg: str) -> str:
+    """An SVG whose curves have one decimal, finer than a pixel."""
+
+    def rounded(path: re.Match[str]) -> str:
+        return re.sub(r"(\.\d)\d+", r"\1", path[0])
+
+    return re.sub(r' d="[^"]*"', rounded, svg)
 
 
 def figure_file(path: Path | str, *, overwrite: bool = False) -> Path:
@@ -191,7 +217,10 @@ def draw(figure: Figure, *, interactive: bool = False, width: float | None = Non
     Raises:
         ParameterError: matplotlib knows no such style, or refuses a value of it.
     """
-    with _style({} if width is None else JOURNAL, style):
+    journal: Mapping[RcKeyType, Any] | None = None
+    if width is not None:
+        journal = JOURNAL
+    with _style(journal, style):
         return _draw(figure, interactive=interactive, width=width)
 
 
@@ -225,46 +254,38 @@ def _use(style: Style | Mapping[RcKeyType, Any]) -> None:
     """
     import matplotlib.style
 
+    if isinstance(style, Path):
+        style = str(style)
     try:
-        matplotlib.style.use(str(style) if isinstance(style, Path) else style)  # type: ignore[arg-type]
+        matplotlib.style.use(style)  # type: ignore[arg-type]
     except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
-        rule = "rcParams of matplotlib, or a style sheet by its name or file"
-        reason = str(error.args[0] if error.args else error).splitlines()[0]
-        shown = dict(style) if isinstance(style, Mapping) else str(style)
-        raise ParameterError("", "style", shown, f"{rule} ({reason})") from None
+        reason: object = error
+        if error.args:
+            reason = error.args[0]
+        shown: object = str(style)
+        if isinstance(style, Mapping):
+            shown = dict(style)
+        rule = f"rcParams of matplotlib, or a style sheet by its name or file ({str(reason).splitlines()[0]})"
+        raise ParameterError("", "style", shown, rule) from None
 
 
 def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
-    from matplotlib.figure import Figure as Canvas
-
-    rows = [figure.panels[i : i + figure.columns] for i in range(0, len(figure.panels), figure.columns)]
-    heights = [max(panel.height for panel in row) for row in rows]
-    if width is None:
-        row, head, letters = (_ROW, _HEAD, _LETTERS)
-    else:
-        row, head, letters = (_JOURNAL_ROW, _JOURNAL_HEAD, _JOURNAL_LETTERS)
-    size = (width or _WIDTH, head + row * sum(heights))
-    if interactive:
-        from matplotlib import pyplot
-
-        canvas = pyplot.figure(figsize=size, layout="constrained")
-        _keep_fonts(canvas)
-    else:
-        canvas = Canvas(figsize=size, layout="constrained")
-    grid = canvas.subplots(len(rows), figure.columns, squeeze=False, height_ratios=heights)
-    shown: dict[str, Artist] = {}
+    layout = _PAGE
+    if width is not None:
+        layout = _JOURNAL
+    heights = figure.row_heights
+    size = (width or _WIDTH, layout.head + layout.row * sum(heights))
+    canvas = _new_canvas(size, interactive=interactive)
+    grid = canvas.subplots(len(heights), figure.columns, squeeze=False, height_ratios=heights)
+    shared_entries: dict[str, Artist] = {}
     timed: list[Axes] = []
     for axes, panel in zip(grid.flat, figure.panels, strict=False):
-        entries = _draw_panel(axes, panel, letters)
+        entries = _draw_panel(axes, panel, layout.letters)
         if panel.legend and entries:
-            if panel.y_label:
-                beside = {}
-            else:
-                beside = {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
-            axes.legend(entries.values(), entries, loc="lower right", ncols=1 if panel.y_label else 4,
-                        columnspacing=1.0, handletextpad=0.4, **beside)  # fmt: skip
+            _draw_panel_legend(axes, panel, entries)
         else:
-            shown |= {label: artist for label, artist in entries.items() if label not in shown}
+            for label, artist in entries.items():
+                shared_entries.setdefault(label, artist)
         if not panel.x_label:
             timed.append(axes)
     for axes in grid.flat[len(figure.panels) :]:
@@ -273,12 +294,41 @@ def _draw(figure: Figure, *, interactive: bool, width: float | None) -> Canvas:
     canvas.align_ylabels()
     if figure.title:
         canvas.suptitle(figure.title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
-    if shown:
-        ncols = _legend_columns(list(shown), size[0])
-        canvas.legend(list(shown.values()), list(shown), loc="outside lower right", ncols=ncols)
-        rows_of_labels = -(-len(shown) // ncols)
-        canvas.set_figheight(size[1] + (rows_of_labels - 1) * _legend_line())  # which panels would lose otherwise
+    if shared_entries:
+        _draw_shared_legend(canvas, shared_entries, size)
     return canvas
+
+
+def _new_canvas(size: tuple[float, float], *, interactive: bool) -> Canvas:
+    """An empty figure of a width and height [in]."""
+    if not interactive:
+        from matplotlib.figure import Figure as Canvas
+
+        return Canvas(figsize=size, layout="constrained")
+    from matplotlib import pyplot
+
+    canvas = pyplot.figure(figsize=size, layout="constrained")
+    _keep_fonts(canvas)
+    return canvas
+
+
+def _draw_panel_legend(axes: Axes, panel: Panel, entries: Mapping[str, Artist]) -> None:
+    """Explain a panel's labels: inside, or above it where no title stands there."""
+    looks: dict[str, Any] = {"loc": "lower right", "columnspacing": 1.0, "handletextpad": 0.4}
+    if panel.y_label:
+        looks["ncols"] = 1
+    else:
+        looks |= {"ncols": 4, "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
+    axes.legend(entries.values(), entries, **looks)
+
+
+def _draw_shared_legend(canvas: Canvas, entries: Mapping[str, Artist], size: tuple[float, float]) -> None:
+    """Explain the labels of all panels below them, in a figure of a width and height [in]."""
+    width, height = size
+    columns = _legend_columns(list(entries), width)
+    canvas.legend(list(entries.values()), list(entries), loc="outside lower right", ncols=columns)
+    rows = -(-len(entries) // columns)
+    canvas.set_figheight(height + (rows - 1) * _legend_line())  # which panels would lose otherwise
 
 
 def _keep_fonts(canvas: Canvas) -> None:
@@ -316,7 +366,7 @@ def _legend_line() -> float:
     """Height of a line of a legend [in]."""
     from matplotlib import rcParams
 
-    return (_LINE + rcParams["legend.labelspacing"]) * _legend_size() / 72.0
+    return (_LINE_HEIGHT + rcParams["legend.labelspacing"]) * _legend_size() / 72.0
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
@@ -355,33 +405,51 @@ def _share_time(panels: list[Axes], figure: Figure) -> None:
 
 def _draw_panel(axes: Axes, panel: Panel, letters: int) -> dict[str, Artist]:
     """Draw a panel whose vertical label has so many characters a line; the legend's entries."""
+    entries: dict[str, Artist] = {}
+    for area in panel.areas:
+        entries[area.label] = axes.fill(*area.outline.T, color=area.colour, alpha=area.opacity, linewidth=0.0)[0]
+    for band in panel.bands:
+        looks: dict[str, Any] = {"color": band.colour, "alpha": band.opacity, "linewidth": 0.9}
+        entries[band.label] = axes.fill_between(band.x, band.low, band.high, **looks)
+    for series in panel.series:
+        entries.setdefault(series.label, _draw_series(axes, series))
+    for bound in panel.bounds:
+        entries["bound"] = _draw_bound(axes, bound)
+    for label in panel.labels:
+        _draw_label(axes, label)
+    _set_scales(axes, panel)
+    if panel.y_label:
+        axes.set_title(panel.heading)
+        y_label = panel.y_label
+    else:
+        y_label = textwrap.fill(panel.heading, letters)
+    axes.set(xlabel=panel.x_label, ylabel=y_label)
+    entries.pop("", None)
+    return entries
+
+
+def _draw_label(axes: Axes, label: Label) -> None:
+    looks: dict[str, Any] = {}
+    if label.bold:
+        looks["fontweight"] = "bold"
+    if label.colour:
+        looks["color"] = label.colour
+    axes.text(label.x, label.y, label.text, ha="center", va="center", **looks)
+
+
+def _set_scales(axes: Axes, panel: Panel) -> None:
+    """Set the kind of each axis, its ticks and its range, once everything is drawn."""
     from matplotlib.ticker import LogLocator, MaxNLocator
 
-    shown: dict[str, Artist] = {}
-    for area in panel.areas:
-        shown[area.label] = axes.fill(*area.outline.T, color=area.colour, alpha=area.opacity, linewidth=0.0)[0]
-    for band in panel.bands:
-        shown[band.label] = axes.fill_between(
-            band.x, band.low, band.high, color=band.colour, alpha=band.opacity, linewidth=0.9
-        )
-    for series in panel.series:
-        shown.setdefault(series.label, _draw_series(axes, series))
-    for bound in panel.bounds:
-        shown["bound"] = _draw_bound(axes, bound)
-    for label in panel.labels:
-        look: dict[str, Any]
-        if label.colour:
-            look = {"color": label.colour}
-        else:
-            look = {}
-        axes.text(label.x, label.y, label.text, ha="center", va="center", fontweight="bold" if label.bold else None,
-                  **look)  # fmt: skip
     if panel.y_log:
         axes.set_yscale("log")
         bottom, top = axes.get_ylim()
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
-        axes.yaxis.set_minor_formatter("{x:g}" if top < 100.0 * bottom else "")  # by default mathematical text
+        if top < 100.0 * bottom:
+            axes.yaxis.set_minor_formatter("{x:g}")
+        else:
+            axes.yaxis.set_minor_formatter("")  # by default mathematical text
     elif panel.whole:
         axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         axes.set_ylim(bottom=0.0, top=max(1.0, axes.get_ylim()[1]))
@@ -389,22 +457,18 @@ def _draw_panel(axes: Axes, panel: Panel, letters: int) -> dict[str, Artist]:
         axes.set_xticks(range(len(panel.x_names)), panel.x_names)
     if panel.equal:
         axes.set_aspect("equal", adjustable="datalim")
-    if ends := panel.fixed_range or panel.least_range:
-        axes.set_ylim(*ends)
-    if panel.y_label:
-        axes.set_title(panel.heading)
-    axes.set(xlabel=panel.x_label, ylabel=panel.y_label or textwrap.fill(panel.heading, letters))
-    shown.pop("", None)
-    return shown
+    y_range = panel.fixed_range or panel.least_range
+    if y_range:
+        axes.set_ylim(*y_range)
 
 
 def _draw_series(axes: Axes, series: Series) -> Artist:
-    x = series.x
-    y = series.y
     looks: dict[str, Any] = {"color": series.colour, "alpha": series.opacity}
     if series.style == "bars":
-        width = float(np.diff(x).min()) if x.size > 1 else 0.8
-        bars: Artist = axes.bar(x, y, width, series.base if series.base is not None else 0.0, **looks).patches[0]
+        base: Array | float = 0.0
+        if series.base is not None:
+            base = series.base
+        bars: Artist = axes.bar(series.x, series.y, series.bar_width, base, **looks).patches[0]
         return bars
     if series.style == "points":
         looks |= {"marker": _MARKERS[series.marker], "markersize": series.width, "linestyle": "none"}
@@ -413,9 +477,12 @@ def _draw_series(axes: Axes, series: Series) -> Artist:
         else:
             looks["markeredgewidth"] = 0.0
     else:
-        looks |= {"linewidth": series.width, "linestyle": _DASHES if series.dashed else "-"}
-        looks |= {"drawstyle": "steps-post"} if series.style == "steps" else {}
-    return axes.plot(x, y, **looks)[0]
+        looks |= {"linewidth": series.width, "linestyle": "-"}
+        if series.dashed:
+            looks["linestyle"] = _DASHES
+        if series.style == "steps":
+            looks["drawstyle"] = "steps-post"
+    return axes.plot(series.x, series.y, **looks)[0]
 
 
 def _draw_bound(axes: Axes, bound: Bound) -> Artist:

@@ -19,9 +19,9 @@ from quadsim.vehicle import Vehicle
 
 WIDTH: Final = 5.5  # of a file [in]
 _HEIGHT: Final = 4.0  # of the panel, which makes it about square
-_ARC: Final = np.radians(np.linspace(0.0, 270.0, 61))  # of an arrow
-_INNER: Final = 0.82  # radius of an arrow over the propeller's
-_DIRECTIONS: Final = {1: ("clockwise", CYCLE[1]), -1: ("counter-clockwise", CYCLE[0])}
+_ARC: Final = np.radians(np.linspace(0.0, 270.0, 61))  # angles along the arrow that shows how a rotor turns
+_ARROW_RADIUS: Final = 0.82  # of that arrow, over the propeller's
+_TURNS: Final = {1: ("clockwise", CYCLE[1]), -1: ("counter-clockwise", CYCLE[0])}
 """How a rotor turns, seen from above, by the sign of its reaction torque about body +z, which opposes the turn."""
 
 
@@ -37,52 +37,69 @@ def write_drawing(vehicle: Vehicle, path: Path, *, overwrite: bool = False) -> N
 
 def vehicle_figure(vehicle: Vehicle) -> Figure:
     """The drawing; propellers of unknown size are drawn as large as they fit."""
-    hubs = vehicle.hubs
-    places = on_page(hubs)
-    arms = np.hypot(*hubs[:, :2].T)
     radius = vehicle.rotor_radius or 0.5 * vehicle.closest_rotors
     reach = vehicle.longest_arm + radius
-    level = not np.any(hubs[:, 2])
-    digits = max(0, 2 - math.floor(math.log10(reach)))  # three, for a length of this size
-    areas: list[Area] = []
-    lines: list[Series] = []
-    labels: list[Label] = []
-    for number, (hub, place, arm, spin) in enumerate(
-        zip(hubs, places, arms.tolist(), vehicle.rotor_spins, strict=True), start=1
-    ):
-        turning, colour = _DIRECTIONS[spin]
-        arrow = place + _INNER * radius * _unit(0.5 * math.pi + spin * (0.75 * math.pi - _ARC))
-        areas.append(Area(outline=place + radius * _unit(np.linspace(0.0, math.tau, 73)), colour=colour, opacity=0.15))
-        areas.append(_arrow_head(arrow[-5], arrow[-1], 0.12 * radius, colour))
-        if arm > radius:
-            lines.append(_line(np.stack([np.zeros(2), (1.0 - radius / arm) * place]), COLOUR.measured, width=2.0))
-        lines.append(_line(arrow, colour, label=f"turns {turning}"))
-        where = ", ".join(f"{value:z.{digits}f}" for value in hub[: 2 if level else 3])
-        for height, text in ((0.32, str(number)), (0.0, where), (-0.28, f"arm {arm:.{digits}f}")):
-            labels.append(_label(place + np.array([0.0, height * radius]), text, bold=text == str(number)))
-    for tip, name, colour in (((0.0, 1.0), "x", COLOUR.axis_x), ((-1.0, 0.0), "y", COLOUR.axis_y)):
-        end = 0.28 * reach * np.array(tip)
-        areas.append(_arrow_head(0.85 * end, end, 0.03 * reach, colour))
-        lines.append(_line(np.stack([np.zeros(2), 0.9 * end]), colour, width=2.5))
-        labels.append(_label(end + _beside(end, 0.06 * reach), name, colour=colour, bold=True))
+    places = on_page(vehicle.hubs)
+    drawing = _Drawing()
+    _draw_rotors(drawing, vehicle, places, radius)
+    _draw_axis(drawing, np.array([0.0, 1.0]), "x", COLOUR.axis_x, reach)
+    _draw_axis(drawing, np.array([-1.0, 0.0]), "y", COLOUR.axis_y, reach)
     top = np.array([0.0, float(places[:, 1].max()) + 1.5 * radius])
-    areas.append(_arrow_head(top - np.array([0.0, 0.2 * radius]), top, 0.15 * radius, COLOUR.axis_x))
-    labels.append(_label(top + np.array([0.5 * radius, -0.1 * radius]), "front", bold=True))
-    if vehicle.rotor_radius:
-        unknown = ""
-    else:
-        unknown = "; propellers of unknown size, as large as fit"
+    drawing.arrow_head(top - np.array([0.0, 0.2 * radius]), top, 0.15 * radius, COLOUR.axis_x)
+    drawing.label(top + np.array([0.5 * radius, -0.1 * radius]), "front", bold=True)
+    coordinates = "x, y, z"
+    if _level(vehicle):
+        coordinates = "x, y"
+    title = f"hubs: {coordinates} [m], arm [m]; {2.0 * reach:.3g} m across"
+    if not vehicle.rotor_radius:
+        title += "; propellers of unknown size, as large as fit"
     panel = Panel(
-        title=f"hubs: {'x, y' if level else 'x, y, z'} [m], arm [m]; {2.0 * reach:.3g} m across{unknown}",
-        areas=tuple(areas),
-        series=tuple(lines),
-        labels=tuple(labels),
+        title=title,
+        areas=tuple(drawing.areas),
+        series=tuple(drawing.lines),
+        labels=tuple(drawing.labels),
         x_label="to the right, -y [m]",
         y_label="to the front, x [m]",
         equal=True,
         height=_HEIGHT,
     )
     return Figure(key="vehicle", title=f"{vehicle.name} from above, {vehicle.mass:.4g} kg", panels=(panel,), columns=1)
+
+
+def _draw_rotors(drawing: _Drawing, vehicle: Vehicle, places: Array, radius: float) -> None:
+    """Draw each rotor at its place on the page: propeller, arm, number, coordinates and how it turns."""
+    reach = vehicle.longest_arm + radius
+    digits = max(0, 2 - math.floor(math.log10(reach)))  # three, for a length of this size
+    arms = np.hypot(*vehicle.hubs[:, :2].T).tolist()
+    circle = radius * _unit(np.linspace(0.0, math.tau, 73))
+    for i, (hub, place, arm, spin) in enumerate(zip(vehicle.hubs, places, arms, vehicle.rotor_spins, strict=True)):
+        turning, colour = _TURNS[spin]
+        arrow = place + _ARROW_RADIUS * radius * _unit(0.5 * math.pi + spin * (0.75 * math.pi - _ARC))
+        drawing.areas.append(Area(outline=place + circle, colour=colour, opacity=0.15))
+        drawing.arrow_head(arrow[-5], arrow[-1], 0.12 * radius, colour)
+        if arm > radius:
+            drawing.line(np.stack([np.zeros(2), (1.0 - radius / arm) * place]), COLOUR.measured, width=2.0)
+        drawing.line(arrow, colour, label=f"turns {turning}")
+        coordinates = hub
+        if _level(vehicle):
+            coordinates = hub[:2]
+        where = ", ".join(f"{value:z.{digits}f}" for value in coordinates)
+        drawing.label(place, str(i + 1), above=0.32 * radius, bold=True)
+        drawing.label(place, where)
+        drawing.label(place, f"arm {arm:.{digits}f}", above=-0.28 * radius)
+
+
+def _draw_axis(drawing: _Drawing, direction: Array, name: str, colour: str, reach: float) -> None:
+    """Draw one of the body's axes."""
+    end = 0.28 * reach * direction
+    drawing.arrow_head(0.85 * end, end, 0.03 * reach, colour)
+    drawing.line(np.stack([np.zeros(2), 0.9 * end]), colour, width=2.5)
+    drawing.label(end + _beside(end, 0.06 * reach), name, colour=colour, bold=True)
+
+
+def _level(vehicle: Vehicle) -> bool:
+    """Whether all hubs are at the height of the centre of mass."""
+    return not np.any(vehicle.hubs[:, 2])
 
 
 def on_page(points: Array) -> Array:
@@ -100,14 +117,22 @@ def _beside(direction: Array, distance: float) -> Array:
     return distance * np.array([direction[1], -direction[0]]) / math.hypot(*direction)
 
 
-def _arrow_head(base: Array, tip: Array, half_width: float, colour: str) -> Area:
-    side = _beside(tip - base, half_width)
-    return Area(outline=np.stack([base - side, tip, base + side]), colour=colour, opacity=1.0)
+class _Drawing:
+    """What is drawn so far."""
 
+    def __init__(self) -> None:
+        self.areas: list[Area] = []
+        self.lines: list[Series] = []
+        self.labels: list[Label] = []
 
-def _line(points: Array, colour: str, label: str = "", width: float = 1.6) -> Series:
-    return Series(x=points[:, 0], y=points[:, 1], colour=colour, label=label, width=width)
+    def arrow_head(self, base: Array, tip: Array, half_width: float, colour: str) -> None:
+        side = _beside(tip - base, half_width)
+        self.areas.append(Area(outline=np.stack([base - side, tip, base + side]), colour=colour, opacity=1.0))
 
+    def line(self, points: Array, colour: str, label: str = "", width: float = 1.6) -> None:
+        self.lines.append(Series(x=points[:, 0], y=points[:, 1], colour=colour, label=label, width=width))
 
-def _label(place: Array, text: str, *, colour: str = "", bold: bool = False) -> Label:
-    return Label(x=float(place[0]), y=float(place[1]), text=text, colour=colour, bold=bold)
+    def label(self, place: Array, text: str, *, above: float = 0.0, colour: str = "", bold: bool = False) -> None:
+        """Write a text at a place, or `above` it."""
+        x, y = (place + np.array([0.0, above])).tolist()
+        self.labels.append(Label(x=x, y=y, text=text, colour=colour, bold=bold))

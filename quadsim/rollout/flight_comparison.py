@@ -214,7 +214,8 @@ def _compared(
         judge: place of the flight against whose constraints all are audited; None: each against its own.
         progress: called once, as the rows are made.
     """
-    from quadsim.report.comparison import comparison_rows, run_names
+    from quadsim.report.comparison import run_names
+    from quadsim.report.comparison_rows import comparison_rows
 
     if names:
         flights = tuple(flight.labelled(name) for flight, name in zip(flights, names, strict=True))

@@ -542,7 +542,7 @@ class Flight(Result):
 
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""
-        from quadsim.report.comparison import tolerance_text
+        from quadsim.report.comparison_rows import tolerance_text
 
         rows = ""
         for finding in self.findings:
@@ -579,7 +579,7 @@ def to_pandas(table: pa.Table) -> Any:
 
 def worst_margin(findings: Iterable[Finding]) -> str:
     """The worst margin, see `worst_finding`, as the second line of a repr."""
-    from quadsim.report.comparison import tolerance_text
+    from quadsim.report.comparison_rows import tolerance_text
 
     worst = worst_finding(findings)
     if worst is None:

@@ -15,7 +15,7 @@ from quadsim.errors import FileError, printable
 from quadsim.flight import rundir
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_log
-from quadsim.report.comparison import comparison_rows
+from quadsim.report.comparison_rows import comparison_rows
 from quadsim.rollout.flown import Flight
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.courses.csv_course import Csv

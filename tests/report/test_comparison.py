@@ -10,16 +10,9 @@ import pytest
 from support import recording, renamed
 
 from quadsim.flight.audit import Finding
-from quadsim.report.comparison import (
-    GLANCE,
-    comparison_rows,
-    conclusion,
-    distinct_courses,
-    failure_sentences,
-    run_names,
-    verdict_cell,
-    violated_otherwise,
-)
+from quadsim.report.comparison import conclusion, distinct_courses, run_names
+from quadsim.report.comparison_rows import GLANCE, comparison_rows, verdict_cell
+from quadsim.report.flight_sentences import failure_sentences, violated_otherwise
 from quadsim.report.table import Cell, Mark, QuantityRow, format_number, to_markdown
 from quadsim.rollout.flown import Flight
 from quadsim.state import VELOCITY

@@ -19,7 +19,7 @@ from quadsim.errors import FileError
 from quadsim.flight import rundir
 from quadsim.flight.departure import departure_numbers, departure_of
 from quadsim.flight.log import ControlLog
-from quadsim.report.comparison import outcome
+from quadsim.report.comparison_rows import outcome
 from quadsim.report.film.frames import filmed
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.reaudit import reaudit

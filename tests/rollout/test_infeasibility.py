@@ -23,7 +23,7 @@ from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import PlanExhaustedError
 from quadsim.mpc.laws.parts.nonlinear_mpc import CONVERGED
 from quadsim.mpc.problem.ocp import InfeasiblePeriod
-from quadsim.report.comparison import failure_sentences
+from quadsim.report.flight_sentences import failure_sentences
 from quadsim.rollout import infeasibility, remedies
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.growth import SHORT_PAIR, Growth

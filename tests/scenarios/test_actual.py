@@ -16,7 +16,7 @@ from support import NO_PRODUCTS
 import quadsim
 from quadsim.controller import StepInputs
 from quadsim.mpc.problem.ocp import Problem
-from quadsim.report.comparison import comparison_rows
+from quadsim.report.comparison_rows import comparison_rows
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.reaudit import reaudit
 from quadsim.rollout.rollout import Rollout

@@ -19,7 +19,7 @@ from quadsim.features.campaign.rows import flown_row
 from quadsim.flight.audit import COMMAND_TOLERANCE, audit, worst_finding, worst_share
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from quadsim.mpc.guard.answer import INFEASIBLE
-from quadsim.report.comparison import comparison_rows
+from quadsim.report.comparison_rows import comparison_rows
 from quadsim.rollout.flown import Flight, summarise
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.catalogue import scenario_names, scenario_source

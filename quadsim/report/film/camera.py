@@ -20,7 +20,7 @@ from quadsim.vehicle import Vehicle
 
 REQUEST: Final = Struct("15d")
 """Time [s], position [m] and quaternion wxyz of the vehicle, position of the reference [m], rotors' angles [rad]."""
-_FRAME: Final = 1.0 / 30.0  # how far rotors have turned from one picture to the next, as times their speed [s]
+_FRAME_TIME: Final = 1.0 / 30.0  # for how long the rotors turn from one picture to the next [s]
 
 
 class Camera:
@@ -57,7 +57,7 @@ class Camera:
         Raises:
             RenderingUnavailableError: the renderer has ended.
         """
-        self._turned = self._turned + _FRAME * rotors
+        self._turned = self._turned + _FRAME_TIME * rotors
         pose = [*state[list(POSITION)], *euler_to_quaternion(state[list(EULER)])]
         self._send(REQUEST.pack(time, *pose, *reference[:3], *self._turned))
         assert self._process.stdout is not None

@@ -12,15 +12,15 @@ from quadsim.errors import FileError
 from quadsim.flight.audit import Limit, Mask, margins_at, margins_sampled
 from quadsim.flight.log import FlightLog
 from quadsim.flight.record import FlightRecord
-from quadsim.report.comparison import failure_sentences
+from quadsim.report.flight_sentences import failure_sentences
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import EULER, POSITION, Array, tilt
 from quadsim.ties import in_order
 from quadsim.vehicle import Vehicle
 
+Rows = np.ndarray[Any, np.dtype[np.intp]]
 _CAMERA_MEMORY: Final = 0.7  # time constant [s] of the camera's smoothing, forward and backward
 _LEASH: Final = 0.6  # how far the camera's aim may be from the vehicle, in arm lengths per axis
-
 _TOLERANCE: Final = 0.03  # how far a drawn path may be from the real one, in arm lengths
 
 
@@ -110,7 +110,11 @@ def ranked_tracks(tracks: Iterable[MarginTrack]) -> list[MarginTrack]:
             required.append(track)
         else:
             reported.append(track)
-    return [group[i] for group in (required, reported, held) for i in in_order([track.share for track in group])]
+    ranked = []
+    for group in (required, reported, held):
+        order = in_order([track.share for track in group])
+        ranked += [group[i] for i in order]
+    return ranked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +122,7 @@ class Footage:
     """A flight at F frame times."""
 
     times: Array  # (F,) [s]
-    period: np.ndarray[Any, np.dtype[np.intp]]  # (F,) index of the control period each frame is in
+    period: Rows  # (F,) index of the control period each frame is in
     position: Array  # (F, 3) [m], world
     euler: Array  # (F, 3) roll, pitch, yaw [rad], of the plant row before the frame
     quaternion: Array  # (F, 4) attitude, scalar first
@@ -139,72 +143,91 @@ class Footage:
 def make_footage(run: Filmed, times: Array) -> Footage:
     """Read a flight at frame times; times beyond the flight show its ends."""
     plant = run.log.plant
-    control = run.log.control
     times = np.clip(times, 0.0, run.end)
-    row = np.clip(np.searchsorted(plant.t, times + 1e-9, side="right") - 1, 0, max(plant.t.size - 2, 0))
-    after = np.minimum(row + 1, plant.t.size - 1)
-    share = ((times - plant.t[row]) / np.where(after > row, plant.t[after] - plant.t[row], 1.0))[:, None]
+    before = np.clip(np.searchsorted(plant.t, times + 1e-9, side="right") - 1, 0, max(plant.t.size - 2, 0))
+    after = np.minimum(before + 1, plant.t.size - 1)
+    share = ((times - plant.t[before]) / np.where(after > before, plant.t[after] - plant.t[before], 1.0))[:, None]
     positions = plant.state[:, POSITION]
-    attitudes = euler_to_quaternion(plant.state[:, EULER])
-    here = attitudes[row]
-    there = attitudes[after]
-    there = np.where((here * there).sum(axis=1, keepdims=True) < 0.0, -there, there)
-    quaternion = (1.0 - share) * here + share * there
-    position = (1.0 - share) * positions[row] + share * positions[after]
-    leash = _LEASH * run.vehicle.longest_arm
-    aim = np.stack([np.interp(times, plant.t, _smooth(plant.t, axis)) for axis in positions.T], axis=1)
+    position = (1.0 - share) * positions[before] + share * positions[after]
+    steps = np.diff(plant.t, prepend=plant.t[:1])[:, None]
+    turned = np.cumsum(steps * np.abs(plant.speeds), axis=0)
     tolerance = _TOLERANCE * run.vehicle.longest_arm
     seconds = np.searchsorted(plant.t, np.arange(plant.t[0], plant.t[-1]))
     path_rows = np.union1d(thin(positions, tolerance), seconds)
-    steps = np.diff(plant.t, prepend=plant.t[:1])[:, None]
-    turned = np.cumsum(steps * np.abs(plant.speeds), axis=0)
-    course = control.reference[:, :3]
-    if plant.wrench is None:
-        force = None
-    else:
-        force = plant.wrench[:, :3]
+    course = run.log.control.reference[:, :3]
+    tilts = None
+    if plant.attitude is not None:
+        tilts = tilt(plant.state[before])
+    wind = None
+    if plant.wind is not None:
+        wind = plant.wind[before]
+    force = None
+    if plant.wrench is not None and np.any(plant.wrench[:, :3]):
+        force = plant.wrench[before, :3]
     return Footage(
         times=times,
-        period=_row_before(control.t, times),
+        period=_row_before(run.log.control.t, times),
         position=position,
-        euler=plant.state[row][:, EULER],
-        tilt=None if plant.attitude is None else tilt(plant.state[row]),
-        quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
-        speeds=plant.speeds[row],
-        turned=(1.0 - share) * turned[row] + share * turned[after],
-        aim=position + np.clip(aim - position, -leash, leash),
+        euler=plant.state[before][:, EULER],
+        tilt=tilts,
+        quaternion=_attitude_between(euler_to_quaternion(plant.state[:, EULER]), before, after, share),
+        speeds=plant.speeds[before],
+        turned=(1.0 - share) * turned[before] + share * turned[after],
+        aim=_camera_aim(run, times, position),
         margins=tuple(_track(run, limit, times) for limit in run.limits),
         path_times=plant.t[path_rows],
         path=positions[path_rows],
         course=course[thin(course, tolerance)],
-        wind=None if plant.wind is None else plant.wind[row],
-        force=None if force is None or not np.any(force) else force[row],
+        wind=wind,
+        force=force,
     )
 
 
-def _row_before(t: Array, times: Array) -> np.ndarray[Any, np.dtype[np.intp]]:
+def _attitude_between(attitudes: Array, before: Rows, after: Rows, share: Array) -> Array:
+    """Quaternions (F, 4) at a share (F, 1) of the way from rows to others, by the shorter turn."""
+    start = attitudes[before]
+    end = attitudes[after]
+    end = np.where((start * end).sum(axis=1, keepdims=True) < 0.0, -end, end)
+    quaternion = (1.0 - share) * start + share * end
+    return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+
+
+def _camera_aim(run: Filmed, times: Array, position: Array) -> Array:
+    """What the camera looks at (F, 3) [m]: the smoothed path, never far from the vehicle's position (F, 3)."""
+    plant = run.log.plant
+    axes = plant.state[:, POSITION].T
+    smooth = np.stack([np.interp(times, plant.t, _smooth(plant.t, axis)) for axis in axes], axis=1)
+    leash = _LEASH * run.vehicle.longest_arm
+    return position + np.clip(smooth - position, -leash, leash)
+
+
+def _row_before(t: Array, times: Array) -> Rows:
+    """The last row of increasing instants t at each of the times."""
     return np.clip(np.searchsorted(t, times + 1e-9, side="right") - 1, 0, t.size - 1)
 
 
 def _track(run: Filmed, limit: Limit, times: Array) -> MarginTrack:
+    """Follow a limit's margin at frame times."""
     t, values = limit.source.finest(run.log)
     margin = margins_at(limit, t, values)
     violated = limit.violated(margin)
     sampled = margins_sampled(limit, run.log)
-    rows = _row_before(t, run.log.control.t)
-    np.fmin.at(margin, rows, sampled)  # a violating command does not show in saturated rotors
-    np.logical_or.at(violated, rows, limit.violated(sampled, sampled=True))
-    row = _row_before(t, times)
+    sample_rows = _row_before(t, run.log.control.t)
+    np.fmin.at(margin, sample_rows, sampled)  # a violating command does not show in saturated rotors
+    np.logical_or.at(violated, sample_rows, limit.violated(sampled, sampled=True))
     worst = np.fmin.accumulate(margin)
     violated_before = np.logical_or.accumulate(violated)
     share = float(worst[-1]) / limit.half_band
+    if np.isnan(share):
+        share = np.inf
+    frame_rows = _row_before(t, times)
     return MarginTrack(
         limit=limit,
-        now=margin[row],
-        worst=worst[row],
-        violated=violated[row],
-        violated_before=violated_before[row],
-        share=np.inf if np.isnan(share) else share,
+        now=margin[frame_rows],
+        worst=worst[frame_rows],
+        violated=violated[frame_rows],
+        violated_before=violated_before[frame_rows],
+        share=share,
     )
 
 
@@ -221,7 +244,7 @@ def _smooth(t: Array, values: Array) -> Array:
     return values
 
 
-def thin(points: Array, tolerance: float) -> np.ndarray[Any, np.dtype[np.intp]]:
+def thin(points: Array, tolerance: float) -> Rows:
     """Rows of a path (n, 3) that show it within `tolerance` [m], first and last included (Ramer-Douglas-Peucker)."""
     thinned = {0, len(points) - 1}
     open_spans = [(0, len(points) - 1)]

@@ -139,6 +139,7 @@ class FilmStage:
     def _connect(
         self, kind: mujoco.mjtGeom, width: float, start: Array, stop: Array, colour: tuple[float, float, float, float]
     ) -> None:
+        """Draw a line, tube or arrow from one point to another, while the scene has room for it."""
         scene = self._renderer.scene
         if scene.ngeom >= scene.maxgeom:
             return
@@ -201,16 +202,24 @@ def frames(run: Filmed, shot: Shot) -> Iterator[Picture]:
     with FilmStage(run, footage, width=shot.width, height=shot.height) as stage:
         for i in range(shot.count):
             picture = stage.render(i)
-            yield picture if overlay is None else overlay.draw(picture, i)
+            if overlay is not None:
+                picture = overlay.draw(picture, i)
+            yield picture
 
 
 def film_shot(run: Filmed, shot: Shot, path: Path) -> None:
     """Render a shot and encode it as H.264, reporting frames done on stdout."""
-    options = ["-preset", "veryfast", "-crf", "23", "-threads", "1"]
     writer: Any = imageio.get_writer(
-        path, format="FFMPEG", fps=shot.fps, codec="libx264", pixelformat="yuv420p", quality=None,
-        macro_block_size=1, ffmpeg_log_level="error", output_params=options,
-    )  # fmt: skip
+        path,
+        format="FFMPEG",
+        fps=shot.fps,
+        codec="libx264",
+        pixelformat="yuv420p",
+        quality=None,
+        macro_block_size=1,
+        ffmpeg_log_level="error",
+        output_params=["-preset", "veryfast", "-crf", "23", "-threads", "1"],
+    )
     with writer:
         for i, picture in enumerate(frames(run, shot), start=1):
             writer.append_data(picture)
@@ -228,20 +237,26 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
     with _renderer(model, width, height) as renderer:
         while len(request := requests.read(REQUEST.size)) == REQUEST.size:
             time, *numbers = REQUEST.unpack(request)
-            lowest = max(min(lowest, numbers[2]), -_DEEPEST_FLOOR)
+            pose = numbers[:7]
+            reference = numbers[7:10]
+            turned = numbers[10:]
+            lowest = max(min(lowest, pose[2]), -_DEEPEST_FLOOR)
             model.geom(FLOOR).pos[2] = lowest + floor
-            _place(data, vehicle, obstacles, numbers[:7], numbers[10:], time)
-            camera.lookat = numbers[:3]
+            _place(data, vehicle, obstacles, pose, turned, time)
+            camera.lookat = pose[:3]
             renderer.update_scene(data, camera)
-            scene = renderer.scene
-            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-            size = np.full(3, 0.15 * vehicle.longest_arm)
-            colour = np.array(_COURSE_COLOUR, np.float32)
-            goal = np.array(numbers[7:10])
-            mujoco.mjv_initGeom(scene.geoms[scene.ngeom], sphere, size, goal, np.eye(3).ravel(), colour)
-            scene.ngeom += 1
+            _draw_sphere(renderer.scene, np.array(reference), 0.15 * vehicle.longest_arm)
             pictures.write(renderer.render().tobytes())
             pictures.flush()
+
+
+def _draw_sphere(scene: mujoco.MjvScene, centre: Array, radius: float) -> None:
+    """Add a sphere in the colour of the reference to a scene."""
+    size = np.full(3, radius)
+    colour = np.array(_COURSE_COLOUR, np.float32)
+    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+    mujoco.mjv_initGeom(scene.geoms[scene.ngeom], sphere, size, centre, np.eye(3).ravel(), colour)
+    scene.ngeom += 1
 
 
 def carry_out(arguments: list[str]) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import itertools
 import json
 import logging
 import os
@@ -47,8 +46,9 @@ _LEAST_FREE_BYTES: Final = 1024 * 1024
 _FEWEST_FRAMES: Final = 30  # smallest number of frames that justifies a further worker
 _LONG: Final = 30.0
 """Length of a flight [s] from which on its film has fewer frames per second, and beyond which it is shown faster."""
-_FAST: Final = 3.0  # how many times as fast
-_TIMED: Final = 2.0  # for how long frames are timed before an estimate [s]
+"""Length of a flight [s] from which on its film has fewer frames per second, and beyond which it is shown faster."""
+_LONG_SPEED: Final = 3.0  # how many times as fast as it was flown a long flight is shown
+_TIMING: Final = 2.0  # for how long frames are timed before an estimate [s]
 FPS_RANGE: Final = (1, 120)  # frames per second that a film may have
 _log: Final = logging.getLogger("quadsim")
 
@@ -61,9 +61,9 @@ def rendering_backend() -> str:
     Raises:
         RenderingUnavailableError: none does; with the output of each.
     """
-    preferred = (
-        os.environ.get("QUADSIM_GL") or os.environ.get("MUJOCO_GL", "").strip().lower()
-    )  # see quadsim/commands/entry.py
+    preferred = os.environ.get("QUADSIM_GL")  # MUJOCO_GL as it was set, see quadsim/commands/entry.py
+    if not preferred:
+        preferred = os.environ.get("MUJOCO_GL", "").strip().lower()
     tried: dict[str, str] = {}
     for backend in sorted(BACKENDS, key=lambda name: name != preferred):
         try:
@@ -79,6 +79,7 @@ def rendering_backend() -> str:
 
 @functools.cache  # a success is cached for this process; an exception is not
 def _probe(backend: str) -> None:
+    """Render one picture in a child process; it fails where the back end does."""
     command = (sys.executable, "-P", "-c", _PROBE)
     subprocess.run(command, env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS)
 
@@ -106,7 +107,9 @@ def frame_rate(length: float, fps: int | None = None) -> int:
         ParameterError: `fps` is no whole number within `FPS_RANGE`.
     """
     if fps is None:
-        return 30 if length < _LONG else 20
+        if length < _LONG:
+            return 30
+        return 20
     least, most = FPS_RANGE
     if isinstance(fps, bool) or not isinstance(fps, int) or not least <= fps <= most:
         raise ParameterError("", "--fps", fps, f"a whole number from {least} to {most}")
@@ -116,13 +119,15 @@ def frame_rate(length: float, fps: int | None = None) -> int:
 def film_speed(length: float) -> float:
     """How many times as fast as it was flown a flight of a length [s] is shown: three times if it is long."""
     if length > _LONG:
-        return _FAST
+        return _LONG_SPEED
     return 1.0
 
 
 def frame_count(length: float, fps: int, speed: float | None = None) -> int:
     """Number of frames of a film of a flight of a length [s], at a speed; None: `film_speed`."""
-    return max(1, round(length / (film_speed(length) if speed is None else speed) * fps))
+    if speed is None:
+        speed = film_speed(length)
+    return max(1, round(length / speed * fps))
 
 
 class Estimate:
@@ -136,9 +141,9 @@ class Estimate:
     def __init__(self, frames: Sequence[int] = (), note: str = "") -> None:
         self._frames = frames
         self._note = note
-        self._film = 0
+        self._film = 0  # number of the present film
         self._told = False
-        self._begun = clock.monotonic()
+        self._begun = clock.monotonic()  # when the present film was begun
         self._first: tuple[float, int] | None = None  # when frames of this film were first reported, and how many
 
     def __call__(self, done: int, total: int) -> None:
@@ -147,21 +152,28 @@ class Estimate:
         if self._told or not done:
             return
         if self._first is None:
-            self._first = now, done
-        since, before = self._first
+            self._first = (now, done)
+        first_time, first_done = self._first
         if done == total:
-            self._film = self._film + 1
+            self._film += 1
             self._begun = now
             self._first = None
-        elif done > before and now - since >= _TIMED:
-            starts = since - self._begun
-            per_frame = (now - since) / (done - before)
-            further = self._frames[self._film + 1 :]
-            seconds = (total - done + sum(further)) * per_frame + len(further) * starts
-            name = "films" if len(self._frames) > 1 else "film"
-            note = self._note and f"; {self._note}"
-            _log.info("%s: about %s%s", name, rough_time(seconds), note)
+        elif done > first_done and now - first_time >= _TIMING:
+            frame_time = (now - first_time) / (done - first_done)
+            start_time = first_time - self._begun
+            later_films = self._frames[self._film + 1 :]
+            seconds = (total - done + sum(later_films)) * frame_time + len(later_films) * start_time
+            self._tell(seconds)
             self._told = True
+
+    def _tell(self, seconds: float) -> None:
+        subject = "film"
+        if len(self._frames) > 1:
+            subject = "films"
+        note = ""
+        if self._note:
+            note = f"; {self._note}"
+        _log.info("%s: about %s%s", subject, rough_time(seconds), note)
 
 
 def rough_time(seconds: float) -> str:
@@ -216,7 +228,9 @@ def render_gif(
     """
     run = filmed(flight)
     speed = 6.0
-    rate = frame_rate(0.0, 8 if fps is None else fps)
+    if fps is None:
+        fps = 8
+    rate = frame_rate(0.0, fps)
     count = frame_count(run.end, rate, speed)
     shot = Shot(width=960, height=540, fps=rate, speed=speed, count=count, captions=False)
     with _making(path, overwrite) as new:
@@ -232,26 +246,36 @@ def render_gif(
 def write_poster(film: Path, poster: Path) -> bool:
     """Write a film's frame at 2 s, or its last, as a JPEG; return whether the film can be read."""
     frame = ("-t", "2", "-vf", "scale=640:-2", "-q:v", "4", "-update", "1", str(poster))
-    return subprocess.run([*_ffmpeg(), "-i", str(film), *frame], capture_output=True).returncode == 0
+    done = subprocess.run([*_ffmpeg(), "-i", str(film), *frame], capture_output=True)
+    return done.returncode == 0
 
 
 def _film(run: Filmed, shot: Shot, path: Path, workers: int | None, progress: FrameProgress | None) -> str:
     """Film a shot in pieces and join them; the back end that did it."""
+    folder = path.parent
     pieces = worker_count(shot.count, workers)
     backend = rendering_backend()
-    edges = [shot.count * piece // pieces for piece in range(pieces + 1)]
-    shots = [replace(shot, first=a, count=b - a) for a, b in itertools.pairwise(edges)]
-    names = [f"piece{piece}.mp4" for piece in range(pieces)]
-    content = path.parent / "flight.pickle"
+    content = folder / "flight.pickle"
     content.write_bytes(pickle.dumps(run))
     commands = []
-    for part, name in zip(shots, names, strict=True):
-        commands.append((*_WORKER, "film", str(content), json.dumps(asdict(part)), str(path.parent / name)))
-    _work(commands, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
-    listing = path.parent / "pieces.txt"
-    listing.write_text("".join(f"file '{name}'\n" for name in names), encoding="utf-8")
+    listed = []
+    for piece in range(pieces):
+        first = shot.count * piece // pieces
+        stop = shot.count * (piece + 1) // pieces
+        part = replace(shot, first=first, count=stop - first)
+        name = f"piece{piece}.mp4"
+        commands.append((*_WORKER, "film", str(content), json.dumps(asdict(part)), str(folder / name)))
+        listed.append(f"file '{name}'\n")
+
+    def report(done: int) -> None:
+        if progress is not None:
+            progress(done, shot.count)
+
+    _work(commands, backend, folder, report)
+    listing = folder / "pieces.txt"
+    listing.write_text("".join(listed), encoding="utf-8")
     joined = ("-f", "concat", "-safe", "0", "-i", listing.name, "-c", "copy", "-movflags", "+faststart", path.name)
-    _work([(*_ffmpeg(), *joined)], backend, path.parent, there=True)  # in a path, `#` and `?` would be a URL's
+    _work([(*_ffmpeg(), *joined)], backend, folder, there=True)  # in a path, `#` and `?` would be a URL's
     return backend
 
 
@@ -288,11 +312,13 @@ def worker_process(task: str, backend: str) -> subprocess.Popen[bytes]:
 
 
 def _environment(backend: str, workers: int = 1) -> dict[str, str]:
-    # Side by side each worker keeps a core busy: threads of Mesa's software renderer would but take turns with them.
-    threads = {"LP_NUM_THREADS": "0"} if workers > 1 else {}
-    # It then takes the floor's texture from one mipmap instead of two: no eye sees that, and it is a tenth of the time.
-    texture = {"LP_PERF": "no_mip_linear"}
-    return {**threads, **texture, **os.environ, **own_packages(), "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+    """The environment of each of so many workers that render with a back end; the user's settings come before ours."""
+    # Mesa's software renderer takes the floor's texture from one mipmap instead of two: no eye sees that, and it is a
+    # tenth of the time.
+    mesa = {"LP_PERF": "no_mip_linear"}
+    if workers > 1:  # side by side each keeps a core busy: threads of Mesa's would but take turns with them
+        mesa["LP_NUM_THREADS"] = "0"
+    return {**mesa, **os.environ, **own_packages(), "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
 
 
 def _work(
@@ -308,39 +334,44 @@ def _work(
     Their stderr goes to `folder`, which is their working directory where they are to be `there`; `report` is called
     with the sum of the last numbers that they printed.
     """
+    working_directory = None
+    if there:
+        working_directory = folder
     with contextlib.ExitStack() as stack:
-        watched = stack.enter_context(selectors.DefaultSelector())
+        running = stack.enter_context(selectors.DefaultSelector())
         logs: list[IO[bytes]] = []
         done = [0] * len(commands)
         environment = _environment(backend, len(commands))
         for i, command in enumerate(commands):
-            logs.append(stack.enter_context((folder / f"worker{i}.log").open("w+b")))
+            log = stack.enter_context((folder / f"worker{i}.log").open("w+b"))
+            logs.append(log)
             process = stack.enter_context(
-                subprocess.Popen(
-                    command,
-                    cwd=folder if there else None,
-                    env=environment,
-                    stdout=subprocess.PIPE,
-                    stderr=logs[i],
-                )
+                subprocess.Popen(command, cwd=working_directory, env=environment, stdout=subprocess.PIPE, stderr=log)
             )
             stack.callback(process.kill)  # runs before Popen's own exit, which waits; kills none that has ended
             assert process.stdout is not None
-            watched.register(process.stdout, selectors.EVENT_READ, (i, process))
-        while watched.get_map():
-            for key, _ in watched.select():
+            running.register(process.stdout, selectors.EVENT_READ, (i, process))
+        while running.get_map():
+            for key, _ in running.select():
                 i, process = key.data
                 line = process.stdout.readline()
                 if line:
                     done[i] = int(line)
                     if report is not None:
                         report(sum(done))
-                    continue
-                watched.unregister(process.stdout)
-                if process.wait() != 0:
-                    logs[i].seek(0)
-                    full = shutil.disk_usage(folder).free < _LEAST_FREE_BYTES  # it could not even write that down
-                    raise _WorkerFailure("the disk is full" if full else _last_line(logs[i].read()))
+                else:
+                    running.unregister(process.stdout)
+                    _check_end(process, logs[i], folder)
+
+
+def _check_end(process: subprocess.Popen[bytes], log: IO[bytes], folder: Path) -> None:
+    """Wait for a worker to end, and raise `_WorkerFailure` if it ended badly."""
+    if process.wait() == 0:
+        return
+    if shutil.disk_usage(folder).free < _LEAST_FREE_BYTES:  # it could not even write that down
+        raise _WorkerFailure("the disk is full")
+    log.seek(0)
+    raise _WorkerFailure(_last_line(log.read()))
 
 
 def _last_line(text: bytes) -> str:

@@ -27,7 +27,7 @@ import time as clock
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -35,11 +35,14 @@ from quadsim.errors import FileError, OutputError, ViewerUnavailableError
 from quadsim.flight.record import FlightRecord
 from quadsim.outputs import writing_file
 
+if TYPE_CHECKING:
+    from rerun import RecordingStream
+
 _CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
 _VIEWER: Final = (sys.executable, "-P", "-c", _CALL, "--bind=127.0.0.1", "--port=auto")
 """Starts a viewer of its own, which only this machine can reach."""
 _INTERRUPTED: Final = 130  # the viewer's exit status after Ctrl-C
-_PATIENCE: Final = 2.0  # time that a viewer has to end by itself [s]
+_GRACE: Final = 2.0  # time that a viewer has to end by itself [s]
 
 
 def write_recording(run: FlightRecord, path: Path) -> None:
@@ -55,42 +58,51 @@ def write_recording(run: FlightRecord, path: Path) -> None:
 def _encode(run: FlightRecord, path: Path) -> bytes:
     """The file's content, made in memory: rerun's own file writer hides from Python why it failed."""
     import rerun as rr
-    import rerun.blueprint as rrb
 
-    from quadsim.report.recording.plots import send_plots, send_texts
-    from quadsim.report.recording.world import TIMELINE, scene_views, send_airframe, send_scene, send_space
-
-    digest = hashlib.sha256(repr((asdict(run.actual), run.limits)).encode())
-    for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    # the viewer merges recordings that share an identity
-    identity = f"{run.name}-{digest.hexdigest()[:16]}"
-    recording = rr.RecordingStream(f"quadsim {run.name}", recording_id=identity, send_properties=False)
+    recording = rr.RecordingStream(f"quadsim {run.name}", recording_id=_identity(run), send_properties=False)
     if not rr.is_enabled(recording):
         raise OutputError(path, "rerun is switched off by the environment variable RERUN")
     memory = recording.memory_recording()
     strict = rr.strict_mode()
     rr.set_strict_mode(True)  # otherwise what cannot be recorded is left out with a warning
     try:
-        recording.send_recording_name(run.name)
-        send_airframe(recording, run.actual)
-        send_scene(recording, run)
-        send_space(recording, run)
-        send_texts(recording, run)
-        views = rrb.Horizontal(scene_views(run), send_plots(recording, run), column_shares=[4, 5])
-        layout = rrb.Blueprint(  # nothing is left to be clicked or unfolded
-            views,
-            rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="playing", loop_mode="all"),
-            rrb.BlueprintPanel(state="collapsed"),
-            rrb.SelectionPanel(state="collapsed"),
-            auto_layout=False,
-            auto_views=False,
-        )
-        recording.send_blueprint(layout, make_active=True, make_default=True)
+        _send(recording, run)
         return bytes(memory.drain_as_bytes())
     finally:
         rr.set_strict_mode(strict)
         recording.disconnect()
+
+
+def _identity(run: FlightRecord) -> str:
+    """A name of its own for each flight: the viewer merges recordings that share one."""
+    digest = hashlib.sha256(repr((asdict(run.actual), run.limits)).encode())
+    for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return f"{run.name}-{digest.hexdigest()[:16]}"
+
+
+def _send(recording: RecordingStream, run: FlightRecord) -> None:
+    """Send everything there is of a flight, and the layout in which the viewer shows it."""
+    import rerun.blueprint as rrb
+
+    from quadsim.report.recording.plots import send_plots, send_texts
+    from quadsim.report.recording.world import TIMELINE, scene_views, send_airframe, send_scene, send_space
+
+    recording.send_recording_name(run.name)
+    send_airframe(recording, run.actual)
+    send_scene(recording, run)
+    send_space(recording, run)
+    send_texts(recording, run)
+    views = rrb.Horizontal(scene_views(run), send_plots(recording, run), column_shares=[4, 5])
+    layout = rrb.Blueprint(  # nothing is left to be clicked or unfolded
+        views,
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="playing", loop_mode="all"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_layout=False,
+        auto_views=False,
+    )
+    recording.send_blueprint(layout, make_active=True, make_default=True)
 
 
 def viewer_problem() -> str | None:
@@ -111,16 +123,21 @@ def open_viewer(path: Path, *, web: bool = False) -> None:
     """
     if not path.is_file():
         raise FileError(path, "there is no such recording")
-    problem = None if web else viewer_problem()
-    if problem:
-        raise ViewerUnavailableError(f"{problem}: show it in a browser with --web, or open {path} on another machine")
-    browser = ("--web-viewer", "--web-viewer-port=0") if web else ()
+    command = list(_VIEWER)
+    advice = "see its message above"
+    if web:
+        command += ["--web-viewer", "--web-viewer-port=0"]
+    else:
+        advice += ", or show it in a browser with --web"
+        problem = viewer_problem()
+        if problem:
+            remedy = f"show it in a browser with --web, or open {path} on another machine"
+            raise ViewerUnavailableError(f"{problem}: {remedy}")
     try:
-        status = _run([*_VIEWER, *browser, str(path)])
+        status = _run([*command, str(path)])
     except KeyboardInterrupt:  # also of SIGTERM and SIGHUP, see `quadsim.commands.entry`
         return
     if status not in (0, _INTERRUPTED):
-        advice = "see its message above" if web else "see its message above, or show it in a browser with --web"
         raise ViewerUnavailableError(f"the rerun viewer ended with status {status}; {advice}")
 
 
@@ -141,7 +158,7 @@ def _end_group(leader: subprocess.Popen[bytes]) -> None:
     """End the processes of a group: by SIGTERM, and by SIGKILL those that do not heed it."""
     with contextlib.suppress(ProcessLookupError, PermissionError):  # all of them have ended
         os.killpg(leader.pid, signal.SIGTERM)
-        deadline = clock.monotonic() + _PATIENCE
+        deadline = clock.monotonic() + _GRACE
         while clock.monotonic() < deadline:
             clock.sleep(0.02)
             leader.poll()  # until then an ended leader counts as one of the group

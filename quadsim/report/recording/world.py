@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ import rerun.blueprint as rrb
 
 from quadsim.controller import Phase
 from quadsim.flight.audit import SIGNALS
-from quadsim.flight.log import FlightLog
+from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.flight.record import FlightRecord
 from quadsim.palette import COLOUR, line_colour, on_dark, rgb
 from quadsim.report.figure import obstacles_in, region_edges
@@ -40,7 +41,7 @@ PANELS: Final[dict[str, tuple[str, ...]]] = {
     "Attitude as measured, less the true one": ("roll_estimate_error", "pitch_estimate_error", "yaw_estimate_error"),
 }
 """Title of each plot, and its signals; every signal is in one, so that every limit is drawn."""
-assert sorted(name for names in PANELS.values() for name in names) == sorted(SIGNALS)
+assert sorted(itertools.chain.from_iterable(PANELS.values())) == sorted(SIGNALS)
 _ANY_ATTITUDE: Final = {
     "Roll and pitch": ("Tilt", ("tilt",)),
     "Yaw and tilt": ("Roll, pitch and yaw", ("roll", "pitch", "yaw", "yaw_error")),
@@ -55,7 +56,11 @@ def panels(log: FlightLog) -> dict[str, tuple[str, ...]]:
     """The plots of a flight, `FRONT_PANELS` of them first."""
     if log.plant.attitude is None:
         return PANELS
-    return dict(_ANY_ATTITUDE.get(title, (title, names)) for title, names in PANELS.items())
+    shown = {}
+    for title, names in PANELS.items():
+        other_title, other_names = _ANY_ATTITUDE.get(title, (title, names))
+        shown[other_title] = other_names
+    return shown
 
 
 def on_screen(colour: str, opacity: int = 255) -> Colour:
@@ -84,9 +89,8 @@ def time_column(t: Array) -> rr.TimeColumn:
 
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
-# length of a dash of the reference, in arm lengths, and of dashes and gaps together
-_DASH = 0.8
-_MOST_DASHES = 500
+_DASH: Final = 0.8  # length of a dash of the reference, in arm lengths; a gap is as long
+_MOST_DASHES: Final = 500  # dashes and gaps together, of a path
 _WIND_LENGTH: Final = 1.5  # how long a flight's strongest wind is drawn, in arm lengths
 
 
@@ -95,15 +99,18 @@ def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
     model = compile_model(vehicle, visuals=True)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    colours = dict(zip(DISC_NAMES, ((*colour[:3], 110) for colour in SERIES), strict=True))
+    disc_colours = {}
+    for name, colour in zip(DISC_NAMES, SERIES, strict=True):
+        disc_colours[name] = (*colour[:3], 110)
     for i in range(model.ngeom):
         geom = model.geom(i)
-        if geom.name != FLOOR and not geom.name.startswith("blades"):
-            kind = mujoco.mjtGeom(int(geom.type[0])).name.removeprefix("mjGEOM_").lower()
-            solid = Solid(kind, tuple(geom.size), data.geom_xpos[i].copy(), data.geom_xmat[i].reshape(3, 3).copy())
-            lightened = 76 + 179 * model.mat_rgba[geom.matid[0]]  # the viewer's background may be black
-            colour = colours.get(geom.name) or tuple(int(shade) for shade in lightened)
-            recording.log(f"world/vehicle/body/{geom.name}", _part(solid, colour), static=True)
+        if geom.name == FLOOR or geom.name.startswith("blades"):
+            continue
+        kind = mujoco.mjtGeom(int(geom.type[0])).name.removeprefix("mjGEOM_").lower()
+        solid = Solid(kind, tuple(geom.size), data.geom_xpos[i].copy(), data.geom_xmat[i].reshape(3, 3).copy())
+        lightened = 76 + 179 * model.mat_rgba[geom.matid[0]]  # the viewer's background may be black
+        drawn_colour = disc_colours.get(geom.name) or tuple(map(int, lightened))
+        recording.log(f"world/vehicle/body/{geom.name}", _part(solid, drawn_colour), static=True)
     unit = vehicle.longest_arm / DRAWN_ARM
     origins = vehicle.hubs + np.array([0.0, 0.0, 0.036 * unit])
     arrows = rr.Arrows3D.from_fields(origins=origins, radii=0.01 * unit, colors=list(SERIES))
@@ -123,62 +130,92 @@ def _part(solid: Solid, colour: Any) -> rr.AsComponents:
         case "capsule":
             bottom = solid.centre - b * solid.turn[:, 2]
             return rr.Capsules3D(translations=[bottom], lengths=[2.0 * b], radii=[a], **turned)
-    if solid.kind == "sphere":
-        half = (a, a, a)
-    else:
-        half = solid.size
-    return rr.Ellipsoids3D(centers=centres, half_sizes=[half], **turned)
+        case "sphere":
+            return rr.Ellipsoids3D(centers=centres, half_sizes=[(a, a, a)], **turned)
+    return rr.Ellipsoids3D(centers=centres, half_sizes=[solid.size], **turned)
 
 
 def send_scene(recording: rr.RecordingStream, run: FlightRecord) -> None:
     """Axes and paths, how the vehicle moves through them, and what the controller predicts."""
-    control = run.log.control
     plant = run.log.plant
-    position = plant.state[:, POSITION]
-    thickness = min(0.02, 0.06 * run.actual.longest_arm)
-    axes = rr.Arrows3D(
-        origins=np.zeros((3, 3)), vectors=np.eye(3), radii=thickness, colors=AXIS_COLOURS, labels=["x", "y", "z"]
-    )
-    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    recording.log("world/axes", axes, static=True)
-    dashes = _dashes(control.reference[:, :3], _DASH * run.actual.longest_arm)
-    _log_lines(recording, "world/reference", REFERENCE, 1.2, dashes)
-    _log_lines(recording, "world/path", on_screen(COLOUR.flown, 60), 1.0, [position])
-
-    # The body turns below an entity that only moves: views that start there follow the vehicle without tilting.
-    thrusts = np.zeros((plant.t.size, N_ROTORS, 3))
-    thrusts[..., 2] = run.actual.longest_arm * np.square(plant.speeds / run.actual.hover_speed)
-    if plant.attitude is None:
-        turned = euler_to_quaternion(plant.state[:, EULER])
-    else:
-        turned = plant.attitude
-    attitude = _vector_first(turned)
-    arrows = rr.Arrows3D.columns(vectors=thrusts.reshape(-1, 3)).partition([N_ROTORS] * plant.t.size)
-    recording.send_columns("world/vehicle", [time_column(plant.t)], rr.Transform3D.columns(translation=position))
-    recording.send_columns("world/vehicle/body", [time_column(plant.t)], rr.Transform3D.columns(quaternion=attitude))
-    recording.send_columns("world/vehicle/body/thrust", [time_column(plant.t)], arrows)
+    arm = run.actual.longest_arm
+    _send_axes_and_paths(recording, run)
+    _send_vehicle(recording, run)
     if plant.wrench is not None and np.any(plant.wrench[:, :3]):
-        vehicle = run.actual
-        scale = _FORCE_SCALE * vehicle.longest_arm / (vehicle.mass * vehicle.gravity / N_ROTORS)
+        hover_thrust = run.actual.mass * run.actual.gravity / N_ROTORS
+        scale = _FORCE_SCALE * arm / hover_thrust
         _send_arrows(recording, run, "external_force", scale * plant.wrench[:, :3], DISTURBANCE, behind=0.0)
     if plant.wind is not None and np.any(plant.wind):
         strongest = float(np.linalg.norm(plant.wind, axis=1).max())
-        drawn = _WIND_LENGTH * run.actual.longest_arm / strongest * plant.wind
+        drawn = _WIND_LENGTH * arm / strongest * plant.wind
         _send_arrows(recording, run, "wind", drawn, DISTURBANCE, behind=1.3)
+    if run.log.control.t.size:
+        _send_flown(recording, run)
+        if run.log.predicted is not None:
+            _send_horizons(recording, run.log.control, run.log.predicted)
 
-    if control.t.size:
-        starts = np.searchsorted(plant.t, control.t - 1e-9)
-        ends = np.append(starts[1:], plant.t.size - 1)
-        pieces = [position[start : end + 1] for start, end in zip(starts, ends, strict=True)]
-        _log_lines(recording, "world/flown", on_screen(COLOUR.flown), 2.2)
-        recording.send_columns("world/flown", [time_column(plant.t[ends])], rr.LineStrips3D.columns(strips=pieces))
-    if control.t.size and run.log.predicted is not None:
-        horizons = np.concatenate([control.state[:, None, POSITION], run.log.predicted], axis=1)
-        flying = np.array([phase == Phase.FLYING for phase in control.phase])
+
+def _send_axes_and_paths(recording: rr.RecordingStream, run: FlightRecord) -> None:
+    """What stays: the world's axes, the whole reference as dashes, and faintly the whole path."""
+    arm = run.actual.longest_arm
+    axes = rr.Arrows3D(
+        origins=np.zeros((3, 3)),
+        vectors=np.eye(3),
+        radii=min(0.02, 0.06 * arm),
+        colors=AXIS_COLOURS,
+        labels=["x", "y", "z"],
+    )
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    recording.log("world/axes", axes, static=True)
+    dashes = _dashes(run.log.control.reference[:, :3], _DASH * arm)
+    _log_lines(recording, "world/reference", REFERENCE, 1.2, dashes)
+    _log_lines(recording, "world/path", on_screen(COLOUR.flown, 60), 1.0, [run.log.plant.state[:, POSITION]])
+
+
+def _send_vehicle(recording: rr.RecordingStream, run: FlightRecord) -> None:
+    """Where the vehicle is at each instant, how it is turned, and its thrusts.
+
+    The body turns below an entity that only moves: views that start there follow the vehicle without tilting.
+    """
+    plant = run.log.plant
+    thrusts = np.zeros((plant.t.size, N_ROTORS, 3))
+    thrusts[..., 2] = run.actual.longest_arm * np.square(plant.speeds / run.actual.hover_speed)
+    if plant.attitude is None:
+        quaternions = euler_to_quaternion(plant.state[:, EULER])
+    else:
+        quaternions = plant.attitude
+    moved = rr.Transform3D.columns(translation=plant.state[:, POSITION])
+    turned = rr.Transform3D.columns(quaternion=_vector_first(quaternions))
+    arrows = rr.Arrows3D.columns(vectors=thrusts.reshape(-1, 3)).partition([N_ROTORS] * plant.t.size)
+    recording.send_columns("world/vehicle", [time_column(plant.t)], moved)
+    recording.send_columns("world/vehicle/body", [time_column(plant.t)], turned)
+    recording.send_columns("world/vehicle/body/thrust", [time_column(plant.t)], arrows)
+
+
+def _send_flown(recording: rr.RecordingStream, run: FlightRecord) -> None:
+    """The path of each control period, there from its end on."""
+    plant = run.log.plant
+    position = plant.state[:, POSITION]
+    starts = np.searchsorted(plant.t, run.log.control.t - 1e-9)
+    ends = np.append(starts[1:], plant.t.size - 1)
+    pieces = [position[start : end + 1] for start, end in zip(starts, ends, strict=True)]
+    _log_lines(recording, "world/flown", on_screen(COLOUR.flown), 2.2)
+    recording.send_columns("world/flown", [time_column(plant.t[ends])], rr.LineStrips3D.columns(strips=pieces))
+
+
+def _send_horizons(
+    recording: rr.RecordingStream, control: ControlLog, predicted: np.ndarray[Any, np.dtype[np.float32]]
+) -> None:
+    """The predicted positions (K, N, 3), each from the measured one, while the vehicle flies."""
+    strips = []
+    for state, horizon, phase in zip(control.state, predicted, control.phase, strict=True):
+        strip = np.concatenate([state[None, POSITION], horizon])
         # A prediction ignores the ground: below it, it would fall on.
-        shown = [horizon if aloft else horizon[:0] for horizon, aloft in zip(horizons, flying, strict=True)]
-        _log_lines(recording, "world/horizon", on_screen(COLOUR.predicted), 2.5)
-        recording.send_columns("world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=shown))
+        if phase != Phase.FLYING:
+            strip = strip[:0]
+        strips.append(strip)
+    _log_lines(recording, "world/horizon", on_screen(COLOUR.predicted), 2.5)
+    recording.send_columns("world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=strips))
 
 
 def send_space(recording: rr.RecordingStream, run: FlightRecord) -> None:
@@ -196,9 +233,13 @@ def send_space(recording: rr.RecordingStream, run: FlightRecord) -> None:
     for limit, edges in region_edges(run.limits, run.log):
         entity = f"world/regions/{limit.name}"
         _log_lines(recording, entity, BOUND, 1.2)
-        times = np.array([max(limit.start, 0.0), limit.stop])
-        strips = rr.LineStrips3D.columns(strips=[*edges]).partition([len(edges), 0][: 1 + np.isfinite(limit.stop)])
-        recording.send_columns(entity, [time_column(times[np.isfinite(times)])], strips)
+        times = [max(limit.start, 0.0)]
+        counts = [len(edges)]
+        if np.isfinite(limit.stop):
+            times.append(limit.stop)
+            counts.append(0)
+        strips = rr.LineStrips3D.columns(strips=[*edges]).partition(counts)
+        recording.send_columns(entity, [time_column(np.array(times))], strips)
 
 
 def scene_views(run: FlightRecord) -> rrb.Vertical:
@@ -217,9 +258,10 @@ def scene_views(run: FlightRecord) -> rrb.Vertical:
 def _overview(run: FlightRecord) -> tuple[Array, Array]:
     """Where the eye is and where it looks [m] to see the whole course."""
     path = run.log.plant.state[:, POSITION]
-    course = run.log.control.reference[:, :3]
     path = path[np.isfinite(path).all(axis=1)]  # a flight that diverged ends in anything
-    course = course if len(course) else path
+    course = run.log.control.reference[:, :3]
+    if not len(course):
+        course = path
     low = course.min(axis=0)
     high = course.max(axis=0)
     least = 10 * run.actual.longest_arm
@@ -272,9 +314,10 @@ def _log_lines(
 
 def _dashes(points: Array, length: float) -> list[Array]:
     """A path (K, 3) [m] as dashes of a length [m], or longer where there would be very many; each follows the path."""
-    walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])[: len(points)]
-    if not walked.size:
+    if not len(points):
         return []
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    walked = np.concatenate([[0.0], np.cumsum(steps)])
     marks = np.arange(0.0, walked[-1], max(length, walked[-1] / _MOST_DASHES))
     stations = np.union1d(marks, walked)
     path = np.stack([np.interp(stations, walked, column) for column in points.T], axis=1)
