@@ -160,7 +160,8 @@ def assess(
         needed: the demands.
         vehicle: its rotor limits count.
         bounds: lower and upper bounds by name, in file units: a state of `quadsim.state`, `speed` [rad/s] of the rotors
-            or `slew` [rad/s per period]; or `thrust` [N] and the `BODY_RATES` [deg/s] of an autopilot's targets.
+            or `slew` [rad/s per period]; or `thrust` [N] and the `BODY_RATES` [deg/s] of an autopilot's targets;
+            `climb_acceleration` [m/s^2].
         tightened: the bounds on states after tightening at the end of the horizon; checked if the bounds themselves
             hold.
         jumps: times [s] at which the course jumps.
@@ -220,6 +221,8 @@ def _problems(
             problems += _beyond("change of rotor speed", "rad/s per period", slews, (lower, upper), "bound")
         elif name == "thrust":
             problems += _beyond("thrust", "N", needed.thrust, (lower, upper), "bound")
+        elif name == "climb_acceleration":
+            problems += _beyond("climb acceleration", "m/s^2", needed.acceleration[:, 2], (lower, upper), "bound")
         elif name in BODY_RATES:
             rates = euler_to_body_rates(needed.state[:, ANGLES], needed.state[:, ANGLE_RATES])
             about_axis = np.degrees(rates[:, BODY_RATES.index(name)])
