@@ -35,6 +35,9 @@ LEAST_SHARE: Final = 1e-3
 """Least share of the weight that a rotor carries in hover."""
 BALANCED: Final = 1e-9
 """Largest torque of four equal thrusts, per arm or drag_to_thrust, that counts as none."""
+_LEAST_OFFSET: Final = -1.0
+_MOST_OFFSET: Final = 0.9
+"""Of `throttle_offset`: rotors at half their largest speed without throttle, and at rest below nearly all of it."""
 SLOWEST_ROTOR: Final = 1.0
 """Longest time constant of a rotor [s]; propellers of 30 inch have some 0.3 s."""
 
@@ -49,7 +52,9 @@ class Vehicle:
     `hover_speeds` in hover, which are equal only where their torques then cancel.
 
     A map may replace `thrust_coefficient`.  `thrust_of_throttle`, T(u) = a_1 u + a_2 u^2 of the throttle u, gives
-    b = T(1) / speed_max^2; identification starts from the speeds sqrt(T(u) / b) that it gives a throttle.
+    b = T(1) / speed_max^2; identification starts from the speeds sqrt(T(u) / b) that it gives a throttle.  With a
+    `throttle_offset` u_0, v = (u - u_0) / (1 - u_0) takes the place of u, and a rotor stands still while v < 0; without
+    a map of the throttle the speed is v speed_max.
     `thrust_of_speed`, f(w) = a_1 w + a_2 w^2, is what the plant flies, reaction torque and power in proportion; a rotor
     so slow that f is negative gives no thrust.  The autopilot and the allocation of a wrench invert it.  Where MPC and
     estimator model b w^2, each rotor has the b of hover, f(w_i) / w_i^2: their trim is exact, and the slope of the
@@ -111,6 +116,13 @@ class Vehicle:
         Pair | None,
         doc("[N] a1 and a2, thrust a1 u + a2 u^2 of a rotor at throttle u, 0 to 1, in place of thrust_coefficient"),
     ] = None
+    throttle_offset: Annotated[
+        float | None,
+        doc(
+            "[-] u0, throttle at which a rotor begins to turn, below 0 where it turns without any; (u - u0) / (1 - u0) "
+            "takes the place of the throttle u"
+        ),
+    ] = None
     drag_to_thrust: Annotated[float, doc("[m] d / b, reaction torque d w^2")]
     speed_min: Annotated[float, doc("[rad/s] lowest speed that a rotor holds")]
     speed_max: Annotated[float, doc("[rad/s] highest speed that a rotor holds")]
@@ -142,6 +154,8 @@ class Vehicle:
             self._refuse("rate_damping", ">= 0 N m s/rad about each axis")
         if (self.inflow or 0.0) < 0.0:
             self._refuse("inflow", ">= 0 N s^2/(m rad)")
+        if not _LEAST_OFFSET <= (self.throttle_offset or 0.0) <= _MOST_OFFSET:
+            self._refuse("throttle_offset", f"between {_LEAST_OFFSET:g} and {_MOST_OFFSET:g}, a share of full throttle")
         if self.speed_min < 0.0:
             self._refuse("speed_min", ">= 0 rad/s")
         if self.speed_min >= self.speed_max:
@@ -225,6 +239,9 @@ class Vehicle:
         u = "u"
         low, top = (0.0, 1.0)
         unit = ""
+        if self.throttle_offset:
+            u = "v"
+            low = float(self.effective_throttle(np.zeros(1))[0])
         if name == "thrust_of_speed":
             u = "w"
             low, top = (self.speed_min, self.speed_max)
@@ -320,10 +337,15 @@ class Vehicle:
 
     @property
     def throttle_share(self) -> float:
-        """Share a of (w / speed_max)^2 = (1 - a) u + a u^2, u the throttle; 1, where no map states it: w ~ u."""
+        """Share a of (w / speed_max)^2 = (1 - a) v + a v^2, v of `effective_throttle`; 1 without a map of it: w ~ v."""
         if self.thrust_of_throttle is None:
             return 1.0
         return self.thrust_of_throttle[1] / sum(self.thrust_of_throttle)
+
+    def effective_throttle(self, throttle: Array) -> Array:
+        """Return v = (u - u_0) / (1 - u_0), at least 0, of throttles u of any shape, with u_0 the `throttle_offset`."""
+        offset = self.throttle_offset or 0.0
+        return np.clip((throttle - offset) / (1.0 - offset), 0.0, 1.0)
 
     @property
     def inertia_matrix(self) -> Array:
@@ -676,5 +698,5 @@ _LENGTHS: Final = {
 _ANY_SIGN: Final = (
     *("rotor_azimuths", "rotor_positions", "rotor_spins", "speed_min"),
     *("products_of_inertia", "rotor_moment", "inflow_moment", "rate_damping", "inflow"),
-    *("thrust_of_speed", "thrust_of_throttle"),
+    *("thrust_of_speed", "thrust_of_throttle", "throttle_offset"),
 )

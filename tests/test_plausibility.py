@@ -128,5 +128,6 @@ def test_every_number_of_a_vehicle_is_in_a_ratio_or_checked_by_its_construction(
     from quadsim.plausibility import RATIOS
 
     built = {"rotor_positions", "products_of_inertia", "speed_min", "thrust_of_speed", "thrust_of_throttle"}
+    built |= {"throttle_offset"}
     covered = {name for ratio in RATIOS for name in ratio.of} | built
     assert {field.name for field in fields(Vehicle)} - {"name", "description"} == covered

@@ -156,6 +156,11 @@ def test_six_laws_hold_the_height(law: str) -> None:
             {"thrust_of_throttle": (7.0, -3.6), "thrust_coefficient": None},
             r"thrust_of_throttle must be such that a1 u \+ a2 u\^2 is not negative and rises from u = 0 to 1; got",
         ),
+        ({"throttle_offset": 15.0}, "throttle_offset must be between -1 and 0.9, a share of full throttle; got 15.0"),
+        (
+            {"thrust_of_throttle": (-2.0, 8.0), "thrust_coefficient": None, "throttle_offset": -0.2},
+            r"thrust_of_throttle must be such that a1 v \+ a2 v\^2 is not negative and rises from v = 0.166667 to 1",
+        ),
         (
             {"thrust_of_speed": (1e-4, 1e-6), "thrust_coefficient": None},
             r"thrust_of_speed must be such that a rotor lifts 1\.756 N or more, or it cannot hover: it lifts 0\.786 N",

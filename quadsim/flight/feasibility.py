@@ -153,7 +153,8 @@ def assess(
         needed: the demands.
         vehicle: its rotor limits count.
         bounds: lower and upper bounds by name, in file units: a state of `quadsim.state`, `speed` [rad/s] of the rotors
-            or `slew` [rad/s per period]; or `thrust` [N] and the `BODY_RATES` [deg/s] of an autopilot's targets.
+            or `slew` [rad/s per period]; or `thrust` [N] and the `BODY_RATES` [deg/s] of an autopilot's targets;
+            `climb_acceleration` [m/s^2].
         tightened: the bounds on states after tightening at the end of the horizon; checked if the bounds themselves
             hold.
         jumps: times [s] at which the course jumps.
@@ -257,6 +258,8 @@ def _bounded(name: str, needed: Demand) -> tuple[str, str, Array]:
         return "rotor speed change per period", "rad/s", needed.slews[np.isfinite(needed.slews)]
     if name == "thrust":
         return "thrust", "N", needed.thrust
+    if name == "climb_acceleration":
+        return "climb acceleration", "m/s^2", needed.acceleration[:, 2]
     if name in BODY_RATES:
         rates = euler_to_body_rates(needed.state[:, ANGLES], needed.state[:, ANGLE_RATES])
         return name, "deg/s", np.degrees(rates[:, BODY_RATES.index(name)])

@@ -247,6 +247,9 @@ class Assembly:
             ParameterError: the vehicle is impossible.
         """
         modelled = self.vehicle
+        if "throttle_offset" in self._stated:
+            rule = "absent: the plant takes rotor speeds, only logs have a throttle"
+            raise ParameterError("actual", "throttle_offset", self._stated["throttle_offset"], rule)
         try:
             return altered(modelled, self._stated)
         except ParameterError as error:

@@ -15,6 +15,7 @@ from support import NO_PRODUCTS
 
 import quadsim
 from quadsim.controller import StepInputs
+from quadsim.errors import ParameterError
 from quadsim.mpc.problem.ocp import Problem
 from quadsim.report.comparison_rows import comparison_rows
 from quadsim.rollout.flown import Flight
@@ -93,7 +94,7 @@ def acting(*changes: str) -> Acting:
     return Acting(flown(scenario), rollout.vehicle, Assembly(scenario).problem(), plan)
 
 
-@pytest.mark.parametrize("name", VEHICLE_UNITS)
+@pytest.mark.parametrize("name", ACTUAL)
 def test_each_parameter_moves_the_plant_and_not_the_controller(name: str) -> None:
     lag = LAGGING if name == "rotor_inertia" else []
     modelled, real = acting(*lag), acting(*lag, f"actual.{name}={ACTUAL[name]}")
@@ -102,6 +103,14 @@ def test_each_parameter_moves_the_plant_and_not_the_controller(name: str) -> Non
     for of in (lambda p: p.model.A, lambda p: p.model.B, lambda p: p.model.u_bar, lambda p: p.bounds.u_max):
         np.testing.assert_array_equal(of(modelled.problem), of(real.problem))
     np.testing.assert_array_equal(modelled.plan, real.plan)
+
+
+def test_a_throttle_is_refused_that_the_plant_does_not_have() -> None:
+    """Of all parameters, it alone has no effect on the plant."""
+    assert {*VEHICLE_UNITS} - {*ACTUAL} == {"throttle_offset"}
+    rule = r"actual\.throttle_offset must be absent: the plant takes rotor speeds, only logs have a throttle; got 0\.1"
+    with pytest.raises(ParameterError, match=rule):
+        quadsim.fly(load_scenario("hover", ["actual.throttle_offset=0.1"]))
 
 
 @pytest.fixture(scope="module")

@@ -258,4 +258,5 @@ def _by_stand(
         return results.Document(text, numbers)
     with writing_file(target, overwrite=overwrite) as new:
         new.write_text(text, encoding="utf-8")
-    return results.Document(f"written to {target}\n", numbers)
+    notes = "".join(f"{note}\n" for note in numbers["notes"])
+    return results.Document(f"written to {target}\n{notes}", numbers)

@@ -82,7 +82,7 @@ class Identification:
     offset: tuple[float, float]  # x and y of the centre of mass in the rotors' frame [m]
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)  # mean, world [m/s]
     flights: tuple[FlightNumbers, ...] = ()  # of each log, what the three above are the means of
-    throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle [-]
+    throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) v + a v^2, v `Vehicle.effective_throttle` [-]
     yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
     voltage_exponent: float = 0.0  # n of thrust over voltage, (V / V0)^n [-]
     voltage: float | None = None  # V0, at which the thrust coefficient holds [V]; None without a battery in the log

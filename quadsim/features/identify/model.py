@@ -43,7 +43,7 @@ class Parameters:
     """(W, 3) world, linear between W instants from first sample to last [m/s]."""
     inflow: float = 0.0  # thrust lost per rotor speed and air speed along the axis [N s^2/(m rad)]
     yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
-    throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle [-]
+    throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) v + a v^2, v `Vehicle.effective_throttle` [-]
     voltage_exponent: float = 0.0  # n of thrust over voltage, (V / V0)^n
     voltage: float = 0.0  # V0, at which the thrust coefficient holds [V]
 
@@ -156,7 +156,7 @@ def commanded(record: Record, vehicle: Vehicle, p: Parameters) -> Array:
         commands = record.commands
     else:
         assert record.throttle is not None
-        share = np.clip(record.throttle, 0.0, 1.0)
+        share = vehicle.effective_throttle(np.clip(record.throttle, 0.0, 1.0))
         slope = np.maximum(1.0 - p.throttle_curve * (1.0 - share), 1e-3)
         commands = vehicle.speed_max * np.sqrt(slope * share)
     if record.voltage is not None and p.voltage_exponent:

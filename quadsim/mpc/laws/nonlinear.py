@@ -29,6 +29,7 @@ from quadsim.mpc.problem.polytope import Polytope, rows_of
 from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.problem.rigidbody import RATE_SCALE
 from quadsim.mpc.space import Avoidance, Shape, Space
+from quadsim.mpc.tables.climb import CLIMB, ClimbBounds, require_climb
 from quadsim.mpc.tables.commands import (
     COMMANDS,
     TARGET_BOUNDS,
@@ -185,6 +186,7 @@ class Nonlinear(ControllerTable):
         Rates | None, doc("[deg/s] largest magnitude, one or about body x, y, z; absent: no bound")
     ] = None
     soft: Annotated[Soft | None, doc("penalty of the three above; absent: hard")] = None
+    climb_acceleration: ClimbBounds | None = None
     avoidance: Annotated[
         Avoidance | None,
         doc("absent: the controller ignores obstacles, corridors and fence; the audit does not"),
@@ -217,6 +219,9 @@ class Nonlinear(ControllerTable):
                 rule = f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
                 raise ValueError(rule)
             require_ordered(f"output_bounds.{name}", pair)
+        require_climb(self.climb_acceleration)
+        if self.climb_acceleration is not None and self.tilt is None:
+            raise ValueError("tilt must be given with climb_acceleration, or the vehicle turns over to descend")
         of_rotors = {
             "inputs": "thrust",
             "rotor_lag": 0.0,
@@ -274,6 +279,8 @@ class Nonlinear(ControllerTable):
         bounds = ranges(self.output_bounds)
         if self.tilt is not None:
             bounds["tilt"] = (-math.inf, self.tilt)
+        if self.climb_acceleration is not None:
+            bounds |= ranges({CLIMB: self.climb_acceleration})
         if self.body_rate is not None:
             rates = _three(self.body_rate).tolist()
             bounds |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", rates, strict=True)}

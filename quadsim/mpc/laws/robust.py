@@ -36,7 +36,7 @@ from quadsim.mpc.tables.commands import (
     attitude_targets,
     require_targets,
 )
-from quadsim.mpc.tables.controller import Range, ranges
+from quadsim.mpc.tables.controller import Range
 from quadsim.mpc.tables.lags import (
     ATTITUDE_LAG,
     INNER_LAG,
@@ -181,7 +181,7 @@ class Robust(Bounded):
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
         if self.commands == ROTORS:
             return super().audited(vehicle)
-        return ranges(self.output_bounds) | self.target_bounds.audited(vehicle)
+        return self.audited_motion() | self.target_bounds.audited(vehicle)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
@@ -226,7 +226,7 @@ class Robust(Bounded):
         if self.terminal == "lqr":
             objective = replace(objective, P=lqr_terminal_weight(model, objective))
         if self.commands != ROTORS:
-            constraints = (*self._target_constraints(vehicle), *self.constraints())
+            constraints = (*self._target_constraints(vehicle), *self.constraints(vehicle))
             return Problem(model=model, horizon=self.horizon, objective=objective, constraints=constraints)
         bounds = self.bounds()
         if self.soft is None:
@@ -239,7 +239,7 @@ class Robust(Bounded):
             objective=objective,
             bounds=replace(bounds, C_c=_widened(bounds.C_c, n), penalty=penalty, margins=self.margins(vehicle, period)),
             constraints=tuple(
-                part if part.C is None else replace(part, C=_widened(part.C, n)) for part in self.constraints()
+                part if part.C is None else replace(part, C=_widened(part.C, n)) for part in self.constraints(vehicle)
             ),
         )
 

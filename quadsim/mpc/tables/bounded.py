@@ -14,7 +14,7 @@ from typing import Annotated, ClassVar, Final, Literal
 import numpy as np
 from annotated_types import Len, MaxLen, doc
 
-from quadsim.controller import CORE
+from quadsim.controller import CORE, ROTORS
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import Pair, Weight
 from quadsim.input_limits import MOST_ENTRIES
@@ -27,6 +27,7 @@ from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.solvers import ALIASES, SOLVERS, Solver, find_solver
 from quadsim.mpc.solvers.by_name import make_solver
 from quadsim.mpc.space import Avoidance, Shape, Space
+from quadsim.mpc.tables.climb import CLIMB, ClimbBounds, climb_of_rotors, climb_of_targets, require_climb
 from quadsim.mpc.tables.commands import InputBounds, InputWeights
 from quadsim.mpc.tables.controller import ControllerTable, Horizon, KktEvery, Law, Range, ranges, require_ordered
 from quadsim.state import REFERENCE_RATES, STATE_NAMES, Array
@@ -100,6 +101,7 @@ class Bounded(Weighted):
         dict[str, Pair], doc("[deg, deg/s, m, m/s] y_c_min, y_c_max; the states named here are C_c")
     ] = field(default_factory=dict)
     input_bounds: InputBounds
+    climb_acceleration: ClimbBounds | None = None
     polytopes: Annotated[
         tuple[Polytope, ...],
         MaxLen(MOST_ENTRIES),
@@ -123,12 +125,20 @@ class Bounded(Weighted):
         require_states(self.output_bounds, "output_bounds")
         for name, pair in self.output_bounds.items():
             require_ordered(f"output_bounds.{name}", pair)
+        require_climb(self.climb_acceleration)
         if self.solver is not None:
             require_solver(self.solver)
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
-        return ranges(self.output_bounds) | self.input_bounds.audited(vehicle)
+        return self.audited_motion() | self.input_bounds.audited(vehicle)
+
+    def audited_motion(self) -> dict[str, Range]:
+        """Return its bounds on audited signals but those of the commands, in file units."""
+        bounds = dict(self.output_bounds)
+        if self.climb_acceleration is not None:
+            bounds[CLIMB] = self.climb_acceleration
+        return ranges(bounds)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
@@ -148,14 +158,21 @@ class Bounded(Weighted):
         C_c, lower, upper = self.output_limits()
         return Bounds(C_c=C_c, y_min=lower, y_max=upper, delta_min=down, delta_max=up, u_min=u_min, u_max=u_max)
 
-    def constraints(self) -> tuple[Constraint, ...]:
+    def constraints(self, vehicle: Vehicle) -> tuple[Constraint, ...]:
         """Return the rows in addition to `bounds`."""
-        return rows_of(self.polytopes)
+        polytopes = rows_of(self.polytopes)
+        if self.climb_acceleration is None:
+            return polytopes
+        if self.commands == ROTORS:
+            climb = climb_of_rotors(vehicle, self.climb_acceleration)
+        else:
+            climb = climb_of_targets(vehicle, self.climb_acceleration)
+        return climb, *polytopes
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
         """See `Weighted.problem`."""
         problem = super().problem(vehicle, period)
-        return replace(problem, bounds=self.bounds(), constraints=self.constraints())
+        return replace(problem, bounds=self.bounds(), constraints=self.constraints(vehicle))
 
     def space(self, shapes: Sequence[Shape], vehicle: Vehicle, period: float) -> Space | None:
         """Return the half-spaces of obstacles and regions; None without any."""

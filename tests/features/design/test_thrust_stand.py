@@ -90,6 +90,66 @@ def test_headers_as_stands_write_them(tmp_path: Path, head: str, columns: tuple[
     assert fit.thrust_of_throttle == pytest.approx((2.0, 5.0), rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("offset", "linear"), [(0.05, 0.0), (0.15, 0.0), (0.15, 0.4), (0.2, 1.0), (0.3, 0.0), (-0.25, 0.0), (-0.25, 0.4)]
+)
+def test_a_curve_that_does_not_begin_at_no_throttle_has_its_offset(
+    tmp_path: Path, offset: float, linear: float
+) -> None:
+    """With a dead band, or with an idle speed; the file is one of a vehicle, and the next stand takes it back."""
+    u = np.linspace(0.0, 1.0, 21)
+    v = np.maximum((u - offset) / (1.0 - offset), 0.0)
+    thrust = 7.0 * (linear * v + (1.0 - linear) * v**2)
+    path, mine = stand(tmp_path / "stand.csv", "throttle,thrust [N]", u, thrust), tmp_path / "mine.toml"
+    assert main(["vehicle", "hummingbird", "--thrust-stand", str(path), "--out", str(mine)]) == 0
+    vehicle = load_vehicle(mine)
+    assert vehicle.thrust_of_throttle is not None
+    found = vehicle.effective_throttle(u)
+    a1, a2 = vehicle.thrust_of_throttle
+    np.testing.assert_allclose(a1 * found + a2 * found**2, thrust, atol=0.02 * 7.0)
+    again = stand(tmp_path / "again.csv", "throttle,thrust [N]", u, LIFT[-1] * (0.3 * u + 0.7 * u**2))
+    mine.write_text(quadsim.vehicle_report(mine, thrust_stand=again).content, encoding="utf-8")
+    assert load_vehicle(mine).throttle_offset == 0.0
+
+
+def test_a_line_of_speed_over_throttle_has_its_offset(tmp_path: Path) -> None:
+    u = np.linspace(0.1, 1.0, 10)
+    head = "throttle,speed [rad/s],thrust [N]"
+    speed = 160.0 + 640.0 * u
+    fit = fit_stand(stand(tmp_path / "idle.csv", head, u, speed, B * speed**2))
+    assert fit.throttle_offset == pytest.approx(-0.25)
+    assert fit.thrust_coefficient == pytest.approx(B)
+    straight = fit_stand(stand(tmp_path / "straight.csv", head, u, 800.0 * u, B * (800.0 * u) ** 2))
+    assert straight.throttle_offset == 0.0
+    above = fit_stand(stand(tmp_path / "above.csv", head, u[4:], speed[4:], B * speed[4:] ** 2))
+    assert above.throttle_offset is None
+
+
+def test_a_linear_term_of_the_speed_is_taken_where_it_leaves_less(tmp_path: Path) -> None:
+    share = SPEEDS / SPEEDS[-1]
+    head = "speed [rad/s],thrust [N]"
+    fit = fit_stand(stand(tmp_path / "linear.csv", head, SPEEDS, 7.0 * (0.3 * share + 0.7 * share**2)))
+    assert fit.thrust_of_speed == pytest.approx((7.0 * 0.3 / 800.0, 7.0 * 0.7 / 800.0**2))
+    assert fit.thrust_coefficient is None
+    late = stand(tmp_path / "late.csv", head, SPEEDS, 7.0 * (1.2 * share**2 - 0.2 * share))
+    assert fit_stand(late, speed_min=0.0).thrust_coefficient is not None, "it would pull at low speeds"
+    assert fit_stand(late, speed_min=140.0).thrust_of_speed == pytest.approx((-1.4 / 800.0, 8.4 / 800.0**2))
+
+
+def test_a_vehicle_that_is_too_heavy_for_the_rotors_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The template's mass is an example: the file is written, to be filled in."""
+    path, mine = (
+        stand(tmp_path / "small.csv", "speed [rad/s],thrust [N]", SPEEDS, 1e-6 * SPEEDS**2),
+        tmp_path / "m.toml",
+    )
+    assert main(["vehicle", "--thrust-stand", str(path), "--out", str(mine)]) == 0
+    printed = capsys.readouterr().out
+    assert "not yet a vehicle, other numbers than the stand's must suit it: vehicle.speed_max must be" in printed
+    assert "# not yet a vehicle" in mine.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("unit", ["N m", "N*m", "N\u00b7m", "N-m", "Nm"])
 def test_units_of_torque(tmp_path: Path, unit: str) -> None:
     columns = SPEEDS * 60.0 / math.tau, B * SPEEDS**2, RATIO * B * SPEEDS**2
@@ -192,6 +252,11 @@ def test_a_stand_that_stops_below_full_throttle_says_so(tmp_path: Path) -> None:
         ("rpm,thrust [N]", lambda rows: rows * [1.0, -1.0], "row 13: thrust must be 0 or above but for a tare;"),
         ("throttle,thrust [N]", lambda rows: rows, "throttle must be a share, 0 to 1, throttle [%], or [us]"),
         ("rpm,thrust [N]", lambda rows: rows + np.array([0.0, 5.0]), "thrust does not follow b w^2: 25%"),
+        (
+            "rpm,thrust [N]",
+            lambda rows: np.vstack([[0.0, 0.3], rows]),
+            "row 2: thrust must be at most 0.141 N at speed 0, 2% of the largest; got 0.3 N. Tare the stand",
+        ),
         ("throttle,thrust [N]", lambda rows: rows / 1000.0, "throttle must reach 95% where no speed is measured"),
         ("rpm,thrust [N]", lambda rows: rows * np.nan, "row 2: speed must be a number; got 'nan'"),
     ],

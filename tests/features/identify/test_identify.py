@@ -195,6 +195,22 @@ def test_a_throttle_map_gives_the_speeds_of_the_throttle() -> None:
     assert search.parameters(search.x, 0).throttle_curve == pytest.approx(0.6)
 
 
+@pytest.mark.parametrize("offset", [0.2, -0.25])
+def test_a_throttle_offset_is_where_the_speeds_begin(offset: float) -> None:
+    """A line of speed over throttle, with a dead band or an idle speed, and a map of its thrust."""
+    start = replace(load_vehicle(vehicle_path(TRUE)), throttle_offset=offset)
+    u = np.linspace(0.0, 1.0, 11)
+    columns = {name: np.zeros((11, 3)) for name in ("rates", "velocity")}
+    throttle, level = np.stack([u] * 4, axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (11, 1))
+    record = Record(name="a", t=0.01 * np.arange(11), attitude=level, throttle=throttle, **columns)
+    line = start.speed_max * np.maximum((throttle - offset) / (1.0 - offset), 0.0)
+    np.testing.assert_allclose(commanded(record, start, Parameters.of(start)), line, rtol=1e-12, atol=1e-9)
+    top = start.mean_coefficient * start.speed_max**2
+    mapped, v = altered(start, {"thrust_of_throttle": (0.4 * top, 0.6 * top)}), line / start.speed_max
+    speeds = commanded(record, mapped, Parameters.of(mapped))
+    np.testing.assert_allclose(mapped.thrusts(speeds), top * (0.4 * v + 0.6 * v**2), rtol=1e-12, atol=1e-9)
+
+
 def test_a_parameter_that_the_start_lacks_is_added(place: Path) -> None:
     start = replace(load_vehicle(vehicle_path("lopes2011")), rotor_rise=0.03)
     estimates = (estimate("rotor_rise", 0.03, None), estimate("rotor_fall", 0.9, None, refused="never slows down"))

@@ -12,6 +12,7 @@ import scipy.linalg
 
 from quadsim.controller import ROTORS
 from quadsim.errors import ParameterError
+from quadsim.fields import Pair
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.laws.nonlinear import Nonlinear
 from quadsim.mpc.laws.parts.body import linearise
@@ -20,6 +21,7 @@ from quadsim.mpc.problem.constraints import Constraint, Penalty
 from quadsim.mpc.problem.model import LinearModel
 from quadsim.mpc.problem.ocp import Objective, Problem, lqr_terminal_weight
 from quadsim.mpc.problem.rigidbody import N_BODY, Inputs, P, RigidBody, V, W, rigid_body
+from quadsim.mpc.tables.climb import climb_constraint, climb_of_rotors, climb_of_targets, climb_speeds, within_tilt
 from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.state import EULER, EULER_RATE, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -141,7 +143,7 @@ def nonlinear_problem(
 def _own_bounds(
     settings: Nonlinear, vehicle: Vehicle, model: RigidBody, bounds: ActuatorBounds, n: int, nodes: int, stride: int
 ) -> Iterator[Constraint]:
-    """Yield the bounds on slew, tilt and body rates, in a problem with n states."""
+    """Yield the bounds on slew, tilt, climb acceleration and body rates, in a problem with n states."""
     if np.isfinite(bounds.delta_min).any() or np.isfinite(bounds.delta_max).any():
         if model.inputs is not Inputs.SPEED:
             rule = 'left out where inputs = "thrust": a step of a speed is not linear in thrusts; inputs = "speed"'
@@ -160,10 +162,24 @@ def _own_bounds(
         upper = np.full(TILT_SIDES, math.sin(tilt) * math.cos(math.pi / TILT_SIDES))
         penalty = _penalty(settings, TILT_SIDES, 1.0 / math.cos(tilt))  # in the sine of the tilt
         yield Constraint(name="tilt", lower=np.full(TILT_SIDES, -math.inf), upper=upper, C=rows, penalty=penalty)
+    if settings.climb_acceleration is not None:
+        assert settings.tilt is not None
+        yield _climb(within_tilt(vehicle, settings.climb_acceleration, settings.tilt), vehicle, model)
     rates = settings.largest_rates
     if np.isfinite(rates).any():
         penalty = _penalty(settings, 3, 1.0)
         yield Constraint(name="body_rates", lower=-rates, upper=rates, C=np.eye(n)[W], penalty=penalty)
+
+
+def _climb(pair: Pair, vehicle: Vehicle, model: RigidBody) -> Constraint:
+    """Return the bounds on the climb acceleration as a row over the inputs."""
+    if model.targets:
+        return climb_of_targets(vehicle, pair, model.scale)
+    if model.inputs is Inputs.SPEED:
+        return climb_of_rotors(vehicle, pair, vehicle.speed_max)
+    row = model.effectiveness[0] * model.largest_thrust  # in the thrusts it is linear
+    lower, upper = (commands_to_inputs(model, vehicle, speeds) for speeds in climb_speeds(vehicle, pair))
+    return climb_constraint(row, lower, upper)
 
 
 def _penalty(settings: Nonlinear, rows: int, scale: float) -> Penalty | None:
