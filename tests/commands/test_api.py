@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 import quadsim
 import quadsim.gym
@@ -60,7 +61,8 @@ def flight() -> Flight:
 
 CONSTANTS = {"STATE_NAMES", "TASKS"}
 """Public names that are no functions or classes, and so have no docstring to run."""
-SLOW, WITNESS = pytest.mark.slow("docstrings"), pytest.mark.representative("docstrings")
+SLOW = pytest.mark.slow("docstrings")
+REPRESENTATIVE = pytest.mark.representative("docstrings")
 NAMES = [
     *sorted({*quadsim.__all__} - CONSTANTS),
     *(f"gym.{name}" for name in quadsim.gym.__all__ if name not in CONSTANTS),
@@ -69,10 +71,13 @@ RENDERS = {"film"}
 """Whose examples need a machine that renders."""
 
 
+def marked(name: str) -> ParameterSet:
+    marks = [SLOW, REPRESENTATIVE] if name in ("fly", "load") else [SLOW]
+    return pytest.param(name, marks=marks)
+
+
 @pytest.mark.usefixtures("undrawn", "campaigns_here")
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[SLOW, WITNESS] if name in ("fly", "load") else SLOW) for name in NAMES]
-)
+@pytest.mark.parametrize("name", [marked(name) for name in NAMES])
 def test_every_docstring_has_an_example_that_runs(
     name: str, fly_known: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
