@@ -189,6 +189,18 @@ def test_documents_link_to_files_that_exist_and_the_site_has_every_page() -> Non
     assert set(re.findall(r"[a-z-]+\.md", site)) == {path.name for path in pages}
 
 
+def anchor(heading: str) -> str:
+    """Return the anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
+
+
+def test_links_within_contributing_lead_to_its_headings() -> None:
+    """The site's own pages are checked where it is built."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    anchors = {anchor(heading) for heading in re.findall(r"^#+ (.+)$", text, re.MULTILINE)}
+    assert {*re.findall(r"\]\(#([^)]+)\)", text)} <= anchors
+
+
 def marked_page(page: Path) -> ParameterSet:
     """A page among the slow ones, of which `make test` runs the README."""
     marks = [SLOW, REPRESENTATIVE] if page.name == "README.md" else [SLOW]

@@ -27,6 +27,7 @@ from quadsim.errors import InputError
 from quadsim.features.campaign.campaign_file import CampaignFile
 from quadsim.features.campaign.plan import load_plan, parse_campaign, read_campaign
 from quadsim.fields import floor_of
+from quadsim.mpc.laws import laws
 from quadsim.scenarios.catalogue import campaign_names, scenario_names
 from quadsim.scenarios.loading import load_scenario, parse_scenario
 from quadsim.scenarios.schema.base import fields_of
@@ -336,7 +337,7 @@ def load_campaign(path: Path, change: str) -> None:
 
 SEED = "must be a whole number >= 0 and <= 9223372036854775807"
 NESTED = "--set must be of at most 20 tables and lists within one another@"
-LAWS = "'unconstrained', 'constrained', 'robust', 'nonlinear', 'lqr', 'pid', 'geometric', 'package.module:Class'"
+LAWS = ", ".join(repr(name) for name in (*laws(), "package.module:Class"))
 DRAGLESS = (
     "effects.air.rotor_drag must be positive, or body_drag given, for the wind to push: the vehicle 'lopes2011' states "
     "no drag; got 0.0"
