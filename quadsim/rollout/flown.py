@@ -356,6 +356,12 @@ class Flight(Result):
 
         Raises:
             UnknownNameError: the flight has no such table.
+
+        Examples:
+            >>> import quadsim
+            >>> table = quadsim.fly(quadsim.load("hover", {"duration": 1.0})).to_arrow()
+            >>> table.num_rows, table.column_names[:3], table.schema.field("vx").metadata[b"unit"]
+            (20, ['t', 'x', 'vx'], b'm/s')
         """
         tables = log_tables(self.log, metadata=self.metadata)
         if table not in tables:
@@ -367,6 +373,12 @@ class Flight(Result):
 
         Raises:
             MissingPackageError: pandas is not installed.
+
+        Examples:
+            >>> import quadsim
+            >>> frame = quadsim.fly(quadsim.load("hover", {"duration": 1.0})).to_pandas()
+            >>> frame.shape[0], round(float(frame["z"].mean()), 6)
+            (20, 1.0)
         """
         return to_pandas(self.to_arrow(table))
 
@@ -382,6 +394,12 @@ class Flight(Result):
 
         Raises:
             InputError: as in `quadsim.plot`.
+
+        Examples:
+            >>> import quadsim
+            >>> axes = quadsim.fly(quadsim.load("hover", {"duration": 1.0})).plot("z", "roll")
+            >>> [panel.get_ylabel() for panel in axes]
+            ['z [m]', 'roll [deg]']
         """
         from quadsim.rollout.flight_plot import plot_runs
 
@@ -417,6 +435,13 @@ class Flight(Result):
             RenderingUnavailableError: a video is requested but cannot be rendered.
             OutputError: the directory cannot be written or contains other files, the flight was read from a directory,
                 or a requested product failed; in that case the tables and the summary are written.
+
+        Examples:
+            >>> import quadsim
+            >>> flight = quadsim.fly(quadsim.load("hover", {"duration": 1.0}))
+            >>> directory = flight.save("saved", video=False, recording=False, figures=False)
+            >>> quadsim.read(directory).outcome
+            'satisfied'
         """
         if self.thinned:
             raise OutputError(directory, f"this flight is on disk already, in {self.directory}; copy that directory")

@@ -129,6 +129,13 @@ class Assembly:
     Attributes:
         scenario: the file's content.
         user_autopilot: an inner loop that flies in place of the built-in autopilot, for one flight at a time; or None.
+
+    Examples:
+        >>> import quadsim
+        >>> from quadsim.scenarios.assembly import Assembly
+        >>> assembly = Assembly(quadsim.load("paper-constrained"))
+        >>> assembly.vehicle.name, assembly.controller().horizon, assembly.reference(100).shape
+        ('lopes2011', 50, (100, 4))
     """
 
     user_autopilot: AutopilotLoop | None = None

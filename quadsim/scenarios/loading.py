@@ -25,7 +25,13 @@ from quadsim.scenarios.schema.writing import plain
 def load_scenario(
     source: Scenario | str | Path, changes: Mapping[str, Any] | Sequence[str] = (), seed: int | None = None
 ) -> Scenario:
-    """Return the scenario of `assemble`; see `quadsim.commands.app.load`."""
+    """Return the scenario of `assemble`; see `quadsim.commands.app.load`.
+
+    Examples:
+        >>> from quadsim.scenarios.loading import load_scenario
+        >>> load_scenario("hover", ["duration=2.0", "controller.horizon=30"]).controller.horizon
+        30
+    """
     return assemble(source, changes, seed).scenario
 
 

@@ -128,6 +128,15 @@ class LQR(FeedbackLaw):
     Attributes:
         objective: the weights of one period.
         gain: (4, 12) K.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> vehicle = quadsim.load_vehicle("lopes2011")
+        >>> controller = quadsim.load("hover", {"controller": "lqr"}).controller.law(vehicle, 0.05)
+        >>> A, B = controller.model.A, controller.model.B
+        >>> bool(np.abs(np.linalg.eigvals(A - B @ controller.gain)).max() < 1.0)  # the loop is stable
+        True
     """
 
     name: Final = "lqr"

@@ -48,7 +48,19 @@ def sequence_gains(problem: Problem) -> SequenceGains:
 
 
 class UnconstrainedMPC:
-    """The linear feedback law of Eq. (23), which also reports the rest of its optimal sequence."""
+    """The linear feedback law of Eq. (23), which also reports the rest of its optimal sequence.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> problem = quadsim.problem("paper-unconstrained")
+        >>> controller = mpc.UnconstrainedMPC(problem)
+        >>> reference = np.tile([0.0, 0.0, 1.0, 0.0], (problem.horizon, 1))  # 1 m up
+        >>> command = controller.step(quadsim.StepInputs(), np.zeros(12), reference)
+        >>> command.speeds.shape, bool((command.speeds > problem.model.u_bar).all())
+        ((4,), True)
+    """
 
     name: Final = "unconstrained"
     solver: Final = ""

@@ -26,6 +26,15 @@ class LinearModel:
 
     Eq. (1) prints u(k) for the deviation; taken literally, hover would predict a climb. A xi_bar = xi_bar at any hover
     position, so only the input needs the offset. `docs/conventions.md` lists the states.
+
+    Examples:
+        >>> import numpy as np
+        >>> from quadsim import mpc
+        >>> A = np.array([[1.0, 0.1], [0.0, 1.0]])  # a double integrator: position, velocity
+        >>> B = np.array([[0.005], [0.1]])
+        >>> model = mpc.LinearModel(A=A, B=B, u_bar=np.zeros(1), period=0.1)
+        >>> model.n, model.nu
+        (2, 1)
     """
 
     A: Array  # (n, n) state matrix
@@ -96,7 +105,15 @@ def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
 
 
 def hover_model(vehicle: Vehicle, period: float, *, moment: bool = False) -> LinearModel:
-    """The vehicle's discrete model at hover, for a control period tau_s [s]; `moment` as in `continuous_model`."""
+    """The vehicle's discrete model at hover, for a control period tau_s [s]; `moment` as in `continuous_model`.
+
+    Examples:
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> model = mpc.hover_model(quadsim.load_vehicle("lopes2011"), 0.05)
+        >>> model.A.shape, model.B.shape, model.u_bar.round(1).tolist()
+        ((12, 12), (12, 4), [192.8, 192.8, 192.8, 192.8])
+    """
     A, B = discretise(*continuous_model(vehicle, moment=moment), period)
     return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(vehicle.hover_speeds), period=period)
 

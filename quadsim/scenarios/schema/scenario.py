@@ -134,7 +134,16 @@ BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Scenario:
-    """A flight: vehicle, course, controller, effects, events and constraints."""
+    """A flight: vehicle, course, controller, effects, events and constraints.
+
+    Examples:
+        >>> import quadsim
+        >>> scenario = quadsim.load("paper-constrained")
+        >>> scenario.duration, scenario.control_period, scenario.controller.horizon
+        (60.0, 0.05, 50)
+        >>> [constraint.name for constraint in scenario.constraints[:2]]
+        ['roll', 'pitch']
+    """
 
     name: Annotated[str, MaxLen(80), doc("letters a-z, digits and . _ -; names the run directory")] = field(
         metadata={"pattern": r"^[a-z0-9][a-z0-9._-]*$"}
@@ -486,7 +495,13 @@ class Scenario:
         return self.derive(tables)
 
     def fly(self, **options: Any) -> Any:
-        """Return the `quadsim.Flight`; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
+        """Return the `quadsim.Flight`; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`.
+
+        Examples:
+            >>> import quadsim
+            >>> quadsim.load("hover", {"duration": 1.0}).fly().outcome
+            'satisfied'
+        """
         return shorthands.fly_scenario(self, **options)
 
     def to_toml(self) -> str:
