@@ -1,4 +1,9 @@
-"""Pure functions from a flight to the numbers of its summary."""
+"""Pure functions from a flight to the numbers of its summary.
+
+Errors are the true state minus the filtered reference at the control samples: RMS, largest, final, overshoot; of
+commands the range of speeds and steps; of the controller its statuses and times.  `quadsim.rollout.flown.summarise`
+collects them for summary.json.
+"""
 
 from __future__ import annotations
 

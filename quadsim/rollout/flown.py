@@ -1,4 +1,8 @@
-"""A flown scenario in memory: named arrays, numbers, pictures, and its run directory."""
+"""A flown scenario in memory: named arrays, numbers, pictures, and its run directory.
+
+The end of a flight: `Flight` joins scenario, log and audit findings.  Text, JSON, tables, figures and films are made of
+it, and of nothing that was written.  Tables and summary are written first, then recording, figures and film.
+"""
 
 from __future__ import annotations
 

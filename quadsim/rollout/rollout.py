@@ -1,4 +1,9 @@
-"""From a scenario to its flight: the one loop for batches, live sessions, learning environments and scripts."""
+"""From a scenario to its flight: the one loop for batches, live sessions, learning environments and scripts.
+
+`Rollout` takes the parts from `quadsim.scenarios.assembly`, starts a `quadsim.sim.loop.ClosedLoop`, carries out events,
+and makes a `quadsim.rollout.flown.Flight` of the log and its audit.  Flights that need nothing from Python in between
+are flown by the core in one call (`quadsim.sim.core_loop`), with the same bits.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Build the parts of a scenario's flight once each: vehicle, course, controller, plant and sensors."""
+"""Build the parts of a scenario's flight once each: vehicle, course, controller, plant and sensors.
+
+Between the file (`quadsim.scenarios.schema.scenario`) and the flight (`quadsim.rollout.rollout`).  Here file units
+become SI units, and numbers that the file leaves out are derived: the vehicle's own numbers, the duration of a course,
+the solver.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Find, read, change and check scenario files."""
+"""Find, read, change and check scenario files.
+
+The start of a flight: a name of the library or a path, and changes as `--set` takes them, become a frozen `Scenario`.
+A file's `base` is read first, then the file itself, then the changes; every invalid field is named at once.
+`quadsim.scenarios.assembly` builds the parts of what is returned.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The commands `quadsim campaign` and `quadsim replay`, and `quadsim.sweep`."""
+"""The commands `quadsim campaign` and `quadsim replay`, and `quadsim.sweep`.
+
+A campaign draws parameters of a scenario at random and flies each draw (`quadsim.rollout.many`): how often does it
+fail, with which confidence?  A sweep flies every combination of given values.  `replay` flies one draw again.
+"""
 
 from __future__ import annotations
 

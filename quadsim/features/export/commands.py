@@ -1,4 +1,8 @@
-"""The command `quadsim export`."""
+"""The command `quadsim export`.
+
+It writes a scenario's controller as self-contained C99: the files that fly in simulation (`quadsim/mpc/c`), this
+controller's numbers, and recorded periods to check them by.
+"""
 
 from __future__ import annotations
 

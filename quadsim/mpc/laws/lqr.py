@@ -1,4 +1,9 @@
-"""The infinite-horizon linear-quadratic regulator, which follows a moving reference."""
+"""The infinite-horizon linear-quadratic regulator, which follows a moving reference.
+
+u = u_bar - K (xi - xi_r) with K from the Riccati equation of the hover model (`quadsim.mpc.problem.regulator`), in axes
+turned by the measured yaw, and errors of position limited to what a stated tilt corrects.  Default weights follow
+Bryson's rule.
+"""
 
 from __future__ import annotations
 

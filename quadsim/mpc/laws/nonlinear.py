@@ -1,4 +1,8 @@
-"""`[controller] type = "nonlinear"`: the nonlinear MPC, with fields for its model, weights, bounds and iteration."""
+"""`[controller] type = "nonlinear"`: the nonlinear MPC, with fields for its model, weights, bounds and iteration.
+
+The table states the optimal control problem of `quadsim.mpc.laws.parts.nonlinear_mpc`, which solves it by sequential
+quadratic programming on the rigid body with a quaternion (`quadsim.mpc.problem.rigidbody`), at any attitude.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""`[controller] type = "robust"`: the MPC for imperfect vehicles, one field per part."""
+"""`[controller] type = "robust"`: the MPC for imperfect vehicles, one field per part.
+
+The constrained MPC with soft bounds, rotor lag, a known delay, disturbance estimates, tightened bounds and any heading,
+each switched on alone.  The table states problem and parts; `quadsim.mpc.laws.parts.preparation` makes the query of a
+period, in C.
+"""
 
 from __future__ import annotations
 

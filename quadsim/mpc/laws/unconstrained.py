@@ -1,4 +1,9 @@
-"""The unconstrained MPC: a constant gain.  Eqs. (21)-(26)."""
+"""The unconstrained MPC: a constant gain.  Eqs. (21)-(26).
+
+Without constraints the optimum is linear in the query, u(k) = K_N xi(k) + G_N y_d + L_N u_bar, and the controller is
+this gain.  The constrained MPCs test the same optimum first (`quadsim.mpc.forms.condensing.FreeOptimum`): where it
+satisfies every row, they solve no QP.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Constraints as values, and the stacked rows of all of them, which every formulation of a problem is built from."""
+"""Constraints as values, and the stacked rows of all of them, which every formulation of a problem is built from.
+
+A constraint is lower <= C x(k+i) + D u(k+i) + E (u(k+i) - u(k+i-1)) <= upper, hard, or soft with a penalty.  `Bounds`
+has those of the paper, Eqs. (12)-(20); `Rows` stacks all constraints of a `quadsim.mpc.problem.ocp.Problem`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-"""The linear model: linearised at hover, discretised exactly.  Eq. (1)."""
+"""The linear model: linearised at hover, discretised exactly.  Eq. (1).
+
+From the vehicle's equations of motion come the Jacobians at hover, dxi/dt = A_c (xi - xi_bar) + B_c (u - u_bar), and
+with a zero-order hold over the period tau_s
+
+    xi(k+1) = A xi(k) + B (u(k) - u_bar),    [[A, B], [0, 1]] = exp([[A_c, B_c], [0, 0]] tau_s).
+
+`quadsim.mpc.problem.ocp` predicts with it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""The whole scenario file."""
+"""The whole scenario file.
+
+`Scenario` is the file as a frozen dataclass, in the file's units (deg, rad/s, s): vehicle, course, controller, effects,
+events, constraints.  It holds what was stated; what follows from it, such as the duration of a course, is derived in
+`quadsim.scenarios.assembly`.  The fields' annotations are the declaration that `--set`, the JSON Schema, the printed
+file and the messages follow from.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The linear MPC: in every period the optimum of Eq. (27), from a query that a preparation makes of the measurement."""
+"""The linear MPC: in every period the optimum of Eq. (27), from a query that a preparation makes of the measurement.
+
+A step is: measurement -> `Preparation.prepare` -> `Query` -> solver -> `Answer` -> check -> `Command`.  The problem
+(model, cost, constraints) is built once; the query has the vectors of the period.  The paper's constrained MPC and the
+robust MPC differ only in their preparation.
+"""
 
 from __future__ import annotations
 
