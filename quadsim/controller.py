@@ -1,4 +1,9 @@
-"""The controller protocol: one command per control period."""
+"""The controller protocol: one command per control period.
+
+`Controller.step(now, state, reference)` receives the measured state (12,) and the reference (N, 4) at t_{k+1} ..
+t_{k+N}, and returns a `Command`: rotor speeds u(k) (4,) [rad/s], the plan and a status.  `quadsim.sim.loop` calls it.
+Optional abilities (to predict, to adopt a predecessor's memory, ...) are protocols of their own, found by `isinstance`.
+"""
 
 from __future__ import annotations
 

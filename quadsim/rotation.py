@@ -112,7 +112,14 @@ def quaternion_to_euler(quaternion: Array) -> Array:
 
 
 def euler_to_quaternion(euler: Array) -> Array:
-    """Unit quaternions (..., 4), scalar first, body to world, of roll, pitch, yaw (..., 3) [rad]."""
+    """Unit quaternions (..., 4), scalar first, body to world, of roll, pitch, yaw (..., 3) [rad].
+
+    Examples:
+        >>> import numpy as np
+        >>> from quadsim.rotation import euler_to_quaternion
+        >>> euler_to_quaternion(np.array([0.0, 0.0, np.pi])).round(6).tolist()  # half a turn about z
+        [0.0, 0.0, 0.0, 1.0]
+    """
     half = 0.5 * np.asarray(euler, float)
     cosines = np.cos(half)
     sines = np.sin(half)
@@ -185,7 +192,15 @@ def _body_rates(sin_roll: Any, cos_roll: Any, sin_pitch: Any, cos_pitch: Any, eu
 
 
 def body_to_world(euler: Array) -> Array:
-    """Rotation matrices (..., 3, 3) from body to world for roll, pitch, yaw (..., 3) [rad]."""
+    """Rotation matrices (..., 3, 3) from body to world for roll, pitch, yaw (..., 3) [rad].
+
+    Examples:
+        >>> import numpy as np
+        >>> from quadsim.rotation import body_to_world
+        >>> pitched = body_to_world(np.array([0.0, np.pi / 6.0, 0.0]))
+        >>> (pitched @ [0.0, 0.0, 1.0]).round(3).tolist()  # the thrust axis points forward
+        [0.5, 0.0, 0.866]
+    """
     cr, cp, cy = np.moveaxis(np.cos(euler), -1, 0)
     sr, sp, sy = np.moveaxis(np.sin(euler), -1, 0)
     rows = [

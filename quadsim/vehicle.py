@@ -1,4 +1,12 @@
-"""A vehicle: mass, inertia, four rotors and their limits, read from one TOML file."""
+"""A vehicle: mass, inertia, four rotors and their limits, read from one TOML file.
+
+Thrust U and torques follow from the rotors' speeds (Sec. 2.2) by the allocation M that `Vehicle` computes from the
+layout,
+
+    [U, tau_x, tau_y, tau_z] = M [w_1^2, ..., w_4^2],    f_i = b w_i^2,    hover: U = m g, tau = 0.
+
+The plant flies these equations; the controllers' models are linearised from them.
+"""
 
 from __future__ import annotations
 

@@ -140,14 +140,23 @@ def mix(vehicle: Vehicle, settings: AutopilotSettings, thrust: float, torque: Ar
     signs = np.concatenate([np.eye(4), -np.eye(4)])
     differences = np.eye(4)[:, None] - np.eye(4)
     rows = differences.reshape(16, 4) if airmode else signs
-    rooms = (high[:, None] - low).ravel() if airmode else np.tile(np.minimum(base - low, high - base), 2)
+    if airmode:
+        limits = (high[:, None] - low).ravel()
+    else:
+        limits = np.tile(np.minimum(base - low, high - base), 2)
     parts = rows @ level
-    share = min([1.0, *(room / part for room, part in zip(rooms, parts, strict=True) if part > 0.0)])
+    share = 1.0
+    for limit, part in zip(limits, parts, strict=True):
+        if part > 0.0:
+            share = min(share, limit / part)
     level = share * level
-    # With airmode the parts need room for their differences alone: the collective thrust yields.
+    # With airmode only the differences of the parts are limited: the collective thrust yields.
     least = 1e-9 * float(np.abs(yaw).max())  # rotors that turn alike differ by rounding
-    left = zip(rooms, rows @ level, rows @ yaw, strict=True)
-    turn = max(min([1.0, *((room - part) / change for room, part, change in left if change > least)]), 0.0)
+    turn = 1.0
+    for limit, part, change in zip(limits, rows @ level, rows @ yaw, strict=True):
+        if change > least:
+            turn = min(turn, (limit - part) / change)
+    turn = max(turn, 0.0)
     parts = level + turn * yaw
     if airmode:
         base = min(max(base, float((low - parts).max())), float((high - parts).min()))

@@ -57,7 +57,7 @@ def level() -> Trim:
 
 @cache
 def pressed() -> Trim:
-    """Of a vehicle that is heavier than believed, blown along x and turned about its own."""
+    """Of a vehicle that is heavier than its model, blown along x and turned by a torque of its own."""
     return Trim(speeds=model().u_bar + np.array([27.0, 31.0, 27.0, 23.0]), lift=np.array([-0.3, 0.0, 9.81]))
 
 

@@ -207,7 +207,7 @@ def with_terms(rng: np.random.Generator, problem: Problem, terms: Collection[str
 
 
 def random_rows(rng: np.random.Generator, problem: Problem, *, soft: bool, rows: int = 2) -> Constraint:
-    """C x + D u + E (u - u_before), one- and two-sided, with room around hover."""
+    """C x + D u + E (u - u_before), one- and two-sided, with bounds on both sides of hover."""
     n, nu = problem.model.n, problem.model.nu
     D = rng.normal(size=(rows, nu))
     lower, upper = (

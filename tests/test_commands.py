@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from _pytest.mark.structures import ParameterSet
 from flown_logs import fly_eight, write_log
 from support import NO_PRODUCTS, fly_here
 
@@ -37,7 +38,7 @@ ADDED = {
 
 
 OWN_VEHICLE = ROOT / "docs" / "own-vehicle.md"
-"""Its lines build on each other, and have a test of their own: scenarios/design/test_own_vehicle_page.py."""
+"""Its lines build on each other, and have a test of their own: features/design/test_own_vehicle_page.py."""
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted({*(ROOT / "docs").glob("*.md")} - {OWN_VEHICLE})]
 DOCUMENTS = "\n".join(path.read_text() for path in PAGES)
 LINES = [
@@ -49,13 +50,18 @@ QUADSIM = [*dict.fromkeys(line.partition("#")[0].strip() for line in LINES if li
 ELSEWHERE = ("quadsim view", "--cluster", "--fly", "casadi")
 """`view` opens a window and stays; a cluster, and what takes an emulator or CasADi, have tests of their own."""
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-SLOW, WITNESS = pytest.mark.slow("commands"), pytest.mark.representative("commands")
-RUNNABLE = [
-    pytest.param(line, marks=[SLOW, WITNESS] if line in README else SLOW)
-    for line in QUADSIM
-    if not any(word in line for word in ELSEWHERE)
-]
-"""`make test` runs those of the README."""
+SLOW = pytest.mark.slow("commands")
+REPRESENTATIVE = pytest.mark.representative("commands")
+
+
+def marked(line: str) -> ParameterSet:
+    """A documented command among the slow ones, of which `make test` runs those of the README."""
+    marks = [SLOW, REPRESENTATIVE] if line in README else [SLOW]
+    return pytest.param(line, marks=marks)
+
+
+def runs_here(line: str) -> bool:
+    return not any(word in line for word in ELSEWHERE)
 
 
 def arguments_of(line: str) -> list[str]:
@@ -134,7 +140,7 @@ def test_every_command_is_documented_and_every_documented_one_exists() -> None:
 
 
 @pytest.mark.usefixtures("workplace", "undrawn", "campaigns_here")
-@pytest.mark.parametrize("line", RUNNABLE)
+@pytest.mark.parametrize("line", [marked(line) for line in QUADSIM if runs_here(line)])
 def test_documented_command_runs(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = arguments_of(line)
     command = arguments[0]

@@ -21,6 +21,7 @@ import matplotlib as mpl
 import notebook
 import pytest
 import remake
+from _pytest.mark.structures import ParameterSet
 from golden_numbers import ABLATION, PAPER, ablation_entry, paper_entry, read
 
 from quadsim.rollout.flown import Flight
@@ -36,7 +37,8 @@ PYTHON = {page: blocks for page in PAGES if (blocks := BLOCKS.findall(page.read_
 SOURCES = [path for folder in ("quadsim", "benchmarks", "examples") for path in (ROOT / folder).rglob("*.py")]
 RUN_ON = re.compile(r"^ *(?:Args|Attributes|Examples|Raises|Returns|Yields):[ ]*\S", re.MULTILINE)
 """A section of a docstring that starts on the line of its title, which no tool then takes for a section."""
-SLOW, WITNESS = pytest.mark.slow("pages"), pytest.mark.representative("pages")
+SLOW = pytest.mark.slow("pages")
+REPRESENTATIVE = pytest.mark.representative("pages")
 ENTRY_POINTS = {"quadsim.controllers"}
 """Groups of entry points, which are written like modules."""
 
@@ -187,10 +189,26 @@ def test_documents_link_to_files_that_exist_and_the_site_has_every_page() -> Non
     assert set(re.findall(r"[a-z-]+\.md", site)) == {path.name for path in pages}
 
 
+def anchor(heading: str) -> str:
+    """Return the anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
+
+
+def test_links_within_contributing_lead_to_its_headings() -> None:
+    """The site's own pages are checked where it is built."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    anchors = {anchor(heading) for heading in re.findall(r"^#+ (.+)$", text, re.MULTILINE)}
+    assert {*re.findall(r"\]\(#([^)]+)\)", text)} <= anchors
+
+
+def marked_page(page: Path) -> ParameterSet:
+    """A page among the slow ones, of which `make test` runs the README."""
+    marks = [SLOW, REPRESENTATIVE] if page.name == "README.md" else [SLOW]
+    return pytest.param(page, id=page.name, marks=marks)
+
+
 @pytest.mark.usefixtures("campaigns_here")
-@pytest.mark.parametrize(
-    "page", [pytest.param(page, id=page.name, marks=[SLOW, WITNESS] if page == PAGES[0] else SLOW) for page in PYTHON]
-)
+@pytest.mark.parametrize("page", [marked_page(page) for page in PYTHON])
 def test_python_on_the_pages_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The blocks of a page in their order, as the notebook that it is too."""
     mpl.use("Agg")
@@ -228,24 +246,11 @@ def test_rows_of_a_table_stand_together() -> None:
             assert rule.startswith("| ---"), f"{page.name}: {head}"
 
 
-def test_pages_open_with_what_their_reader_can_do() -> None:
-    pages = {page.name: page.read_text(encoding="utf-8") for page in PAGES if page.parent == ROOT / "docs"}
-    for name, text in pages.items():
-        opening = " ".join(text[text.index("# ") :].split()[:60])
-        assert re.search(r"\bAfter (this page|these five steps) you (can|have|know) ", opening), name
-
-
-def test_guides_have_figures_and_every_picture_says_what_it_shows() -> None:
-    site = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    guides = re.findall(r"[a-z-]+\.md", site[site.index("- Do:") : site.index("- Look up:")])
-    drawn = set()
+def test_every_picture_has_a_description() -> None:
+    """Which a screen reader reads in place of the picture."""
     for page in PAGES:
-        text = page.read_text(encoding="utf-8")
-        pictures = re.findall(r"!\[(.*?)\]\((.*?)\)", text)
-        assert all(shows for shows, _ in pictures), page.name
-        if "quadsim.plot(" in text or any("figures/" in file for _, file in pictures):
-            drawn.add(page.name)
-    assert {*guides} - drawn == {"audit.md", "campaigns.md", "export.md", "live.md", "stability.md"}
+        for description, file in re.findall(r"!\[(.*?)\]\((.*?)\)", page.read_text(encoding="utf-8")):
+            assert description, f"{page.name}: {file}"
 
 
 def test_sections_of_docstrings_have_their_titles_on_lines_of_their_own() -> None:
@@ -253,7 +258,7 @@ def test_sections_of_docstrings_have_their_titles_on_lines_of_their_own() -> Non
     documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
     nodes = ((path, node) for path in SOURCES for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
     texts = [(path, ast.get_docstring(node) or "") for path, node in nodes if isinstance(node, documented)]
-    assert sum("Raises:\n" in text for _, text in texts) > 100
+    assert any("Raises:\n" in text for _, text in texts)
     assert not [(path.name, text) for path, text in texts if RUN_ON.search(text)]
 
 
@@ -261,7 +266,7 @@ def test_documents_name_what_exists() -> None:
     """Every dotted name of a package in backticks is a module, or something in one."""
     pages = (path.read_text(encoding="utf-8") for path in [*PAGES, ROOT / "CONTRIBUTING.md"])
     named = {name for text in pages for name in re.findall(r"`((?:quadsim)(?:\.[A-Za-z_]+)+)`", text)}
-    assert len(named) > 60
+    assert "quadsim.rollout.many.fly_many" in named
     for name in sorted(named - ENTRY_POINTS):
         resolve_name(name)
 

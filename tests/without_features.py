@@ -85,6 +85,7 @@ USING: Final = {
     "rollout/test_verdicts.py": ("campaign",),
     "commands/test_versions.py": ("campaign",),
     "test_commands.py": EVERY,
+    "test_docstrings.py": EVERY,
     "test_documents.py": EVERY,
     "test_examples.py": EVERY,
     "test_groups.py": EVERY,

@@ -255,7 +255,7 @@ def moment(made: Record) -> str:
         error = f"{100.0 * flown['share']:.1f} %"
         return f"**{error}**" if flown["outcome"] == "satisfied" else error
 
-    head = ["law", "course", *(f"{1e3 * lag:.0f} ms, {known}" for lag in lags for known in ("without", "with"))]
+    head = ["controller", "course", *(f"{1e3 * lag:.0f} ms, {known}" for lag in lags for known in ("without", "with"))]
     rows = [
         (f"`{law}`", course, *(cell(law, course, lag, known) for lag in lags for known in ("without", "with")))
         for law in laws
@@ -365,9 +365,10 @@ def identification(data: Any) -> str:
 def stability(data: Any) -> str:
     """Up to where each law is stable on each vehicle."""
     rows = records(data)
-    head = [*rows[0]]
+    names = [*rows[0]]
+    head = ["controller" if name == "law" else name for name in names]
     note = "`<` and `>`: up to the end of the range searched; `*`: no flight beyond; `core`: processor time.\n"
-    return table(head, [[row.get(name, "-") for name in head] for row in rows]) + "\n" + note
+    return table(head, [[row.get(name, "-") for name in names] for row in rows]) + "\n" + note
 
 
 def autopilots(data: Any) -> str:

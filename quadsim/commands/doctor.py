@@ -1,4 +1,8 @@
-"""What this machine can do, tried out: render, show flights, solve."""
+"""What this machine can do, tried out: render, show flights, solve.
+
+Each check runs the real thing once (a frame, a QP of each solver, a batch of flights) and says what to install where it
+fails.
+"""
 
 from __future__ import annotations
 

@@ -246,6 +246,13 @@ class Limit:
 
     `slew` is the command's step per period; `speed` and `slew` apply to every rotor.  An infinite bound means no bound.
     An entry without bounds takes the controller's, which `quadsim.scenarios.limits` fills in.
+
+    Examples:
+        >>> import numpy as np
+        >>> from quadsim.flight.audit import Limit
+        >>> roll = Limit(name="roll", signal="roll", lower=-5.0, upper=5.0)
+        >>> roll.unit, roll.margin(np.array([0.0, 4.0, 6.0])).tolist()
+        ('deg', [5.0, 1.0, -1.0])
     """
 
     name: Annotated[str, doc("name in reports")] = field(metadata={"pattern": "^[A-Za-z0-9_.-]+$"})
@@ -404,7 +411,14 @@ class SpaceLimit(Limit):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Finding:
-    """The audit's result for one limit; margins and peaks in the limit's unit."""
+    """The audit's result for one limit; margins and peaks in the limit's unit.
+
+    Examples:
+        >>> import quadsim
+        >>> finding = quadsim.fly(quadsim.load("hover", {"duration": 1.0})).audit[0]
+        >>> finding.limit.name, finding.verdict, finding.satisfied
+        ('roll', 'satisfied', True)
+    """
 
     limit: Limit  # the limit audited
     peak_sampled: float  # value closest to (or furthest beyond) a bound at the control samples, of the first such bound
@@ -588,7 +602,17 @@ def smallest_margins(log: FlightLog | PeriodLog, limits: Sequence[Limit]) -> dic
 
 
 def audit(log: FlightLog, limits: Sequence[Limit]) -> tuple[Finding, ...]:
-    """Audit a flight, its plant rows at the physics rate, against its limits: one finding per limit, in order."""
+    """Audit a flight, its plant rows at the physics rate, against its limits: one finding per limit, in order.
+
+    Examples:
+        >>> import quadsim
+        >>> from quadsim.flight.audit import Limit, audit
+        >>> flight = quadsim.fly(quadsim.load("hover", {"duration": 1.0}))
+        >>> height = Limit(name="height", signal="z", lower=0.5, upper=1.5)
+        >>> (finding,) = audit(flight.log, [height])
+        >>> finding.satisfied, round(finding.worst_margin, 6)
+        (True, 0.5)
+    """
     return tuple(_find(log, limit.with_tolerances()) for limit in limits)
 
 

@@ -1,6 +1,8 @@
-"""The numbers of a flight's summary, from its `quadsim.flight.log`: tracking, commands, solver, faults, ground.
+"""Pure functions from a flight to the numbers of its summary.
 
-Pure functions; `flight_numbers` calls those that `quadsim.rollout.flown` writes and `quadsim.rollout.reaudit` checks.
+Errors are the true state minus the filtered reference at the control samples: RMS, largest, final, overshoot; of
+commands the range of speeds and steps; of the controller its statuses and times.  `quadsim.rollout.flown.summarise`
+collects them for summary.json.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A flown scenario in memory: named arrays, numbers, pictures, and its run directory.
 
-`quadsim.rollout.rollout` makes it, `quadsim.rollout.stored` reads one back.  From the one record `Flight` follow the
-summary, tables, figures and films, which `quadsim.flight`, `quadsim.report` and `quadsim.console` make.
+The end of a flight: `Flight` joins scenario, log and audit findings.  Text, JSON, tables, figures and films are made of
+it, and of nothing that was written.  Tables and summary are written first, then recording, figures and film.
 """
 
 from __future__ import annotations
@@ -363,6 +363,12 @@ class Flight(Result):
 
         Raises:
             UnknownNameError: the flight has no such table.
+
+        Examples:
+            >>> import quadsim
+            >>> table = quadsim.fly(quadsim.load("hover", {"duration": 1.0})).to_arrow()
+            >>> table.num_rows, table.column_names[:3], table.schema.field("vx").metadata[b"unit"]
+            (20, ['t', 'x', 'vx'], b'm/s')
         """
         tables = log_tables(self.log, metadata=self.metadata)
         if table not in tables:
@@ -374,6 +380,12 @@ class Flight(Result):
 
         Raises:
             MissingPackageError: pandas is not installed.
+
+        Examples:
+            >>> import quadsim
+            >>> frame = quadsim.fly(quadsim.load("hover", {"duration": 1.0})).to_pandas()
+            >>> frame.shape[0], round(float(frame["z"].mean()), 6)
+            (20, 1.0)
         """
         return to_pandas(self.to_arrow(table))
 
@@ -389,6 +401,12 @@ class Flight(Result):
 
         Raises:
             InputError: as in `quadsim.plot`.
+
+        Examples:
+            >>> import quadsim
+            >>> axes = quadsim.fly(quadsim.load("hover", {"duration": 1.0})).plot("z", "roll")
+            >>> [panel.get_ylabel() for panel in axes]
+            ['z [m]', 'roll [deg]']
         """
         from quadsim.rollout.flight_plot import plot_runs
 
@@ -424,6 +442,13 @@ class Flight(Result):
             RenderingUnavailableError: a video is requested but cannot be rendered.
             OutputError: the directory cannot be written or contains other files, the flight was read from a directory,
                 or a requested product failed; in that case the tables and the summary are written.
+
+        Examples:
+            >>> import quadsim
+            >>> flight = quadsim.fly(quadsim.load("hover", {"duration": 1.0}))
+            >>> directory = flight.save("saved", video=False, recording=False, figures=False)
+            >>> quadsim.read(directory).outcome
+            'satisfied'
         """
         if self.thinned:
             raise OutputError(directory, f"this flight is on disk already, in {self.directory}; copy that directory")

@@ -1,7 +1,8 @@
 """From a scenario to its flight: the one loop for batches, live sessions, learning environments and scripts.
 
-`quadsim.scenarios.assembly` builds the parts, `quadsim.sim.loop` steps them, and `quadsim.rollout.flown.Flight` is what
-came of it.
+`Rollout` takes the parts from `quadsim.scenarios.assembly`, starts a `quadsim.sim.loop.ClosedLoop`, carries out events,
+and makes a `quadsim.rollout.flown.Flight` of the log and its audit.  Flights that need nothing from Python in between
+are flown by the core in one call (`quadsim.sim.core_loop`), with the same bits.
 """
 
 from __future__ import annotations

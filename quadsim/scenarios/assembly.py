@@ -1,4 +1,9 @@
-"""Build the parts of a scenario's flight once each: vehicle, course, controller, plant and sensors."""
+"""Build the parts of a scenario's flight once each: vehicle, course, controller, plant and sensors.
+
+Between the file (`quadsim.scenarios.schema.scenario`) and the flight (`quadsim.rollout.rollout`).  Here file units
+become SI units, and numbers that the file leaves out are derived: the vehicle's own numbers, the duration of a course,
+the solver.
+"""
 
 from __future__ import annotations
 
@@ -129,6 +134,13 @@ class Assembly:
     Attributes:
         scenario: the file's content.
         user_autopilot: an inner loop that flies in place of the built-in autopilot, for one flight at a time; or None.
+
+    Examples:
+        >>> import quadsim
+        >>> from quadsim.scenarios.assembly import Assembly
+        >>> assembly = Assembly(quadsim.load("paper-constrained"))
+        >>> assembly.vehicle.name, assembly.controller().horizon, assembly.reference(100).shape
+        ('lopes2011', 50, (100, 4))
     """
 
     user_autopilot: AutopilotLoop | None = None

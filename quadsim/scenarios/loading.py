@@ -1,4 +1,9 @@
-"""Find, read, change and check scenario files."""
+"""Find, read, change and check scenario files.
+
+The start of a flight: a name of the library or a path, and changes as `--set` takes them, become a frozen `Scenario`.
+A file's `base` is read first, then the file itself, then the changes; every invalid field is named at once.
+`quadsim.scenarios.assembly` builds the parts of what is returned.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +30,13 @@ from quadsim.scenarios.schema.writing import plain
 def load_scenario(
     source: Scenario | str | Path, changes: Mapping[str, Any] | Sequence[str] = (), seed: int | None = None
 ) -> Scenario:
-    """Return the scenario of `assemble`; see `quadsim.commands.app.load`."""
+    """Return the scenario of `assemble`; see `quadsim.commands.app.load`.
+
+    Examples:
+        >>> from quadsim.scenarios.loading import load_scenario
+        >>> load_scenario("hover", ["duration=2.0", "controller.horizon=30"]).controller.horizon
+        30
+    """
     return assemble(source, changes, seed).scenario
 
 

@@ -1,4 +1,8 @@
-"""What is rejected before a flight: parts that do not fit together, and starts from which nothing can fly."""
+"""What is rejected before a flight: parts that do not fit together, and starts from which nothing can fly.
+
+`checked` builds vehicle, effects and course of an assembly without flying, so that a wrong combination of valid fields
+is an `InputError` before the first period.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The closed loop: plant -> controller -> command -> plant, once per control period."""
+"""The closed loop: plant -> controller -> command -> plant, once per control period.
+
+At t_k the loop measures the plant, through sensors and estimator where there are any, gives the controller the measured
+state and the reference of the next N periods, and receives u(k).  The plant holds u(k) until t_{k+1}; a command that is
+computed late leaves u(k-1) in force until it arrives (`quadsim.sim.computation`).  Every period is kept for the log.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The simulator's state over physics steps, its conversion to the paper's state, and flown periods as a log."""
+"""The simulator's state over physics steps, its conversion to the paper's state, and flown periods as a log.
+
+A physics step is time, position, quaternion, velocity and body rates, as MuJoCo has them; a state of the paper is
+x, vx, ..., yaw, yaw_rate (`quadsim.state`).  `Period` has what one control period recorded; `flight_log` stacks the
+periods into the `quadsim.flight.log.FlightLog` that the audit reads.
+"""
 
 from __future__ import annotations
 

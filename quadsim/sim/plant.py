@@ -1,4 +1,12 @@
-"""The plant: the only owner of the MuJoCo model and its data."""
+"""The plant: the only owner of the MuJoCo model and its data.
+
+It advances the true vehicle at the physics rate under held commands,
+
+    m dv/dt = R sum f_i e_z - m g e_z + forces,    I domega/dt = torques - omega x I omega,    f_i = b w_i^2,
+
+with the rotors' lag, air, battery, load and events of `quadsim.sim.effects`.  The steps themselves are taken in C
+(`quadsim/core/quadsim_plant.c`); `quadsim.sim.loop` calls `hold` in every period.
+"""
 
 from __future__ import annotations
 

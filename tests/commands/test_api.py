@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import doctest
 import functools
 import importlib
 import math
 import re
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from pkgutil import resolve_name
@@ -21,9 +19,8 @@ import quadsim
 import quadsim.gym
 from quadsim import mpc
 from quadsim.controller import StepInputs
-from quadsim.errors import InputError, OutputError, ParameterError, RenderingUnavailableError, UnknownNameError
+from quadsim.errors import InputError, OutputError, ParameterError, UnknownNameError
 from quadsim.flight import rundir
-from quadsim.report.film.video import rendering_backend
 from quadsim.rollout.flown import Flight
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.state import Array
@@ -56,39 +53,6 @@ def hover() -> Scenario:
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     return quadsim.fly(quadsim.load("paper-constrained").replace({"duration": 6.0}), progress=False)
-
-
-CONSTANTS = {"STATE_NAMES", "TASKS"}
-"""Public names that are no functions or classes, and so have no docstring to run."""
-SLOW, WITNESS = pytest.mark.slow("docstrings"), pytest.mark.representative("docstrings")
-NAMES = [
-    *sorted({*quadsim.__all__} - CONSTANTS),
-    *(f"gym.{name}" for name in quadsim.gym.__all__ if name not in CONSTANTS),
-]
-RENDERS = {"film"}
-"""Whose examples need a machine that renders."""
-
-
-@pytest.mark.usefixtures("undrawn", "campaigns_here")
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[SLOW, WITNESS] if name in ("fly", "load") else SLOW) for name in NAMES]
-)
-def test_every_docstring_has_an_example_that_runs(
-    name: str, fly_known: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    if name in RENDERS:
-        try:
-            rendering_backend()
-        except RenderingUnavailableError as error:
-            pytest.skip(str(error))
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("quadsim.rollout.rollout.Rollout.fly", fly_known)
-    public = functools.reduce(getattr, name.split("."), quadsim)
-    runner = doctest.DocTestRunner(verbose=False)
-    for example in doctest.DocTestFinder().find(public, name, module=sys.modules[public.__module__]):
-        runner.run(example)
-    assert runner.tries > 0
-    assert runner.failures == 0, capsys.readouterr().out
 
 
 def test_the_pages_of_the_api_have_every_name() -> None:

@@ -142,11 +142,11 @@ class Queried:
 
 @pytest.fixture(scope="session")
 def file(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A hover whose file names no solver, so that its law may be another, and with a short horizon."""
+    """A hover with a short horizon; its file names no solver, so that its controller may be another."""
     text = (FLIGHTS / "hover.toml").read_text(encoding="utf-8")
+    short = text.replace("horizon = 50 ", f"horizon = {HORIZON} ")
+    assert short != text
     path = tmp_path_factory.mktemp("diagnosis") / "hover.toml"
-    short = text.replace('solver = "piqp-multistage"\n', "").replace("horizon = 50 ", f"horizon = {HORIZON} ")
-    assert short.count(f"horizon = {HORIZON}") == 1
     path.write_text(short, encoding="utf-8")
     return str(path)
 
@@ -180,10 +180,21 @@ def names(entries: list[dict[str, Any]]) -> set[str]:
     return {f"{entry['name']} {entry['side']}" for entry in entries}
 
 
+def violated(diagnosis: dict[str, Any]) -> list[dict[str, Any]]:
+    """The bounds of the conflict that give way."""
+    return [entry for entry in diagnosis["conflict"] if entry["by"]]
+
+
+def blocking(diagnosis: dict[str, Any]) -> list[dict[str, Any]]:
+    """The bounds of the conflict that are kept."""
+    return [entry for entry in diagnosis["conflict"] if not entry["by"]]
+
+
 def setting(field: str, value: object) -> str:
     """As it is given to `--set`."""
     if isinstance(value, dict):
-        return f"{field}={{{', '.join(f'{name} = {number}' for name, number in value.items())}}}"
+        entries = ", ".join(f"{name} = {number}" for name, number in value.items())
+        return f"{field}={{{entries}}}"
     return f"{field}={json.dumps(value)}"
 
 
@@ -195,17 +206,16 @@ def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, 
     assert queried.status not in ACCEPTED
     result = queried.found
     assert result["feasible"] is False
-    assert names([entry for entry in result["conflict"] if entry["by"]]) == set(case.violated)
-    assert names([entry for entry in result["conflict"] if not entry["by"]]) >= set(case.blocking)
+    assert names(violated(result)) == set(case.violated)
+    assert names(blocking(result)) >= set(case.blocking)
     for part in (*case.violated, *case.blocking):
         word, side = part.split()
         assert re.search(rf"\b{word}\b[^;]*\b{side}\b", result["sentence"])
-    widened = [each["settings"] for each in result["suggestions"] if len(each["settings"]) == 1 and not each["after"]]
-    assert any(f"controller.{case.field}" in settings for settings in widened)
-    for suggestion in result["suggestions"]:
-        if suggestion["after"] is None:
-            changed = [setting(*item) for item in suggestion["settings"].items()]
-            assert query_case(file, case, *changed).status in ACCEPTED, changed
+    at_once = [suggestion["settings"] for suggestion in result["suggestions"] if suggestion["after"] is None]
+    assert any({*settings} == {f"controller.{case.field}"} for settings in at_once)
+    for settings in at_once:
+        changed = [setting(name, value) for name, value in settings.items()]
+        assert query_case(file, case, *changed).status in ACCEPTED, changed
 
 
 @pytest.mark.parametrize("noise", [-3e-6, 0.0, 3e-6])
@@ -213,8 +223,9 @@ def test_bounds_that_give_way_alike_stand_in_the_order_of_the_file(noise: float,
     """As far beyond the bound on roll as on pitch, but for rounding."""
     bound = math.radians(5.0)
     state = make_state(euler=(1.2 * bound, (1.2 + noise) * bound, 0.0))
-    entries = [entry for entry in query_case(file, Case(state=state)).found["conflict"] if entry["by"]]
-    assert [(entry["name"], entry["side"]) for entry in entries] == [("roll", "upper"), ("pitch", "upper")]
+    first, second = violated(query_case(file, Case(state=state)).found)
+    assert (first["name"], first["side"]) == ("roll", "upper")
+    assert (second["name"], second["side"]) == ("pitch", "upper")
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -222,94 +233,113 @@ def test_a_little_less_than_the_smallest_bound_is_not_enough(name: str, file: st
     """The suggestion is rounded up by a hundredth of the change at most."""
     case = CASES[name]
     queried = query_cached(file, name)
-    alone = [suggestion["settings"] for suggestion in queried.found["suggestions"] if len(suggestion["settings"]) == 1]
-    bounds = [item for settings in alone for item in settings.items() if isinstance(item[1], list)]
-    assert bounds
-    for path, value in bounds:
-        before = get_field(tomllib.loads(queried.scenario.to_toml()), path)
-        less = [old + 0.97 * (new - old) for old, new in zip(before, value, strict=True)]
+    stated = tomllib.loads(queried.scenario.to_toml())
+    tried = 0
+    for suggestion in queried.found["suggestions"]:
+        (path, value), *others = suggestion["settings"].items()
+        if others or not isinstance(value, list):
+            continue
+        less = [old + 0.97 * (new - old) for old, new in zip(get_field(stated, path), value, strict=True)]
         assert query_case(file, case, setting(path, less)).status not in ACCEPTED
+        tried += 1
+    assert tried
 
 
 def entry_of(queried: Queried, name: str) -> dict[str, Any]:
-    return next(entry for entry in queried.found["conflict"] if entry["name"] == name and entry["by"])
+    """The violated bound of a name."""
+    (entry,) = [entry for entry in violated(queried.found) if entry["name"] == name]
+    return entry
 
 
-def test_amounts_in_closed_form(file: str) -> None:
-    """By hand, from the model's matrices and the bounds on steps of -10 and 5 rad/s alone."""
-    tilted = query_cached(file, "start beyond the tilt bound")
-    assert tilted.infeasible_period is not None
-    model = tilted.infeasible_period.problem.model
-    row = model.B[INDEX["roll"]]
-    first = 20.0 + math.degrees(float(np.where(row > 0.0, -10.0, 5.0) @ row))
-    entry = entry_of(tilted, "roll")
-    assert entry["by"] == pytest.approx(first - 5.0, abs=1e-6)
+@pytest.fixture
+def model(file: str) -> mpc.LinearModel:
+    """The model of all cases but those with lag or delay."""
+    queried = query_cached(file, "start beyond the tilt bound")
+    assert queried.infeasible_period is not None
+    return queried.infeasible_period.problem.model
+
+
+def test_a_tilt_is_beyond_its_bound_by_what_one_step_of_the_rotors_leaves(file: str, model: mpc.LinearModel) -> None:
+    """The bounds on steps are -10 and 5 rad/s."""
+    of_roll = model.B[INDEX["roll"]]
+    steps = np.where(of_roll > 0.0, -10.0, 5.0)
+    after_a_period = 20.0 + math.degrees(float(steps @ of_roll))
+    entry = entry_of(query_cached(file, "start beyond the tilt bound"), "roll")
+    assert entry["by"] == pytest.approx(after_a_period - 5.0, abs=1e-6)
     assert (entry["start"], entry["unit"]) == (0.05, "deg")
+    delayed = entry_of(query_cached(file, "rotors that lag, and a delay"), "roll")
+    assert delayed["start"] == 0.07  # delay and period
 
+
+def test_a_fall_is_beyond_its_bound_while_the_rotors_speed_up(file: str, model: mpc.LinearModel) -> None:
     lift = float(model.B[INDEX["vz"]].sum())  # of vz in a period, per rad/s of all rotors
-    falling = entry_of(query_cached(file, "falling too fast"), "vz")
-    after = -2.0 + lift * np.cumsum(5.0 * np.arange(1, HORIZON + 1))
-    assert falling["by"] == pytest.approx(-0.5 - after[0], abs=1e-6)
-    assert (falling["start"], falling["stop"]) == (0.05, pytest.approx(0.05 * np.count_nonzero(after < -0.5)))
-
-    hovering = query_cached(file, "speeds too low to hover")
-    entry, sinking = entry_of(hovering, "vz"), lift * (190.0 - float(model.u_bar[0])) * np.arange(1, HORIZON + 1)
-    assert entry["by"] == pytest.approx(-0.1 - sinking[-1], abs=1e-6)
-    assert (entry["start"], entry["stop"]) == (
-        pytest.approx(0.05 * (1 + np.count_nonzero(sinking >= -0.1))),
-        0.05 * HORIZON,
-    )
-
-    fast = entry_of(query_cached(file, "the last command outside the bounds"), "speed")
-    assert (fast["by"], fast["start"], fast["stop"]) == (pytest.approx(30.0), 0.0, 0.1)
-    assert fast["rotors"] == [1, 2, 3, 4]
-    assert entry_of(query_cached(file, "rotors that lag, and a delay"), "roll")["start"] == 0.07  # delay and period
+    velocity = -2.0 + lift * np.cumsum(5.0 * np.arange(1, HORIZON + 1))
+    entry = entry_of(query_cached(file, "falling too fast"), "vz")
+    assert entry["by"] == pytest.approx(-0.5 - velocity[0], abs=1e-6)
+    assert entry["start"] == 0.05
+    assert entry["stop"] == pytest.approx(0.05 * np.count_nonzero(velocity < -0.5))
 
 
-def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str) -> None:
+def test_sinking_at_a_bounded_speed_is_beyond_its_bound_in_the_end(file: str, model: mpc.LinearModel) -> None:
+    lift = float(model.B[INDEX["vz"]].sum())
+    velocity = lift * (190.0 - float(model.u_bar[0])) * np.arange(1, HORIZON + 1)
+    entry = entry_of(query_cached(file, "speeds too low to hover"), "vz")
+    assert entry["by"] == pytest.approx(-0.1 - velocity[-1], abs=1e-6)
+    assert entry["start"] == pytest.approx(0.05 * (1 + np.count_nonzero(velocity >= -0.1)))
+    assert entry["stop"] == 0.05 * HORIZON
+
+
+def test_a_command_is_beyond_its_bound_until_its_steps_bring_it_back(file: str) -> None:
+    """From 290 to 250 rad/s in steps of 10, the first of which is that of the period itself."""
+    entry = entry_of(query_cached(file, "the last command outside the bounds"), "speed")
+    assert (entry["by"], entry["start"], entry["stop"]) == (pytest.approx(30.0), 0.0, 0.1)
+    assert entry["rotors"] == [1, 2, 3, 4]
+
+
+def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str, model: mpc.LinearModel) -> None:
     """The contract itself flies the model from there, and the optimum is accepted again in that period."""
     case = CASES["start beyond the tilt bound"]
     queried = query_case(file, case)
-    after = next(each["after"] for each in queried.found["suggestions"] if "controller.fallback" in each["settings"])
-    guarded, model = (
-        query_case(file, case, "controller.fallback={}").controller,
-        queried.infeasible_period.problem.model,
-    )  # type: ignore[union-attr]
+    suggestions = queried.found["suggestions"]
+    (suggested,) = [suggestion for suggestion in suggestions if "controller.fallback" in suggestion["settings"]]
+    guarded = query_case(file, case, "controller.fallback={}").controller
     assert guarded.guard is not None
-    state, acting = case.state, np.full(4, queried.vehicle.hover_speed)
+    state = case.state
+    acting = np.full(4, queried.vehicle.hover_speed)
     guarded.reset(acting)
     for k in range(50):
         command = guarded.step(StepInputs(time=0.05 * k, acting=acting), state, np.zeros((HORIZON, 4)))
         if command.status in ACCEPTED:
             break
-        state, acting = model.A @ state + model.B @ (command.speeds - model.u_bar), command.speeds
-    assert after == pytest.approx(0.05 * k)
+        state = model.A @ state + model.B @ (command.speeds - model.u_bar)
+        acting = command.speeds
+    assert suggested["after"] == pytest.approx(0.05 * k)
     assert k > 0
 
 
 def test_a_solver_that_fails_where_all_constraints_can_hold_is_distinguished(file: str) -> None:
     queried = query_case(file, CASES["start beyond the tilt bound"], "controller.output_bounds.roll=[-90.0, 90.0]")
     assert queried.infeasible_period is None
-    controller = query_cached(file, "start beyond the tilt bound").infeasible_period
-    assert controller is not None
-    level = controller.query._replace(state=make_state())
-    failed = InfeasiblePeriod(problem=controller.problem, query=level, status="max_iterations", time=1.0)
+    period = query_cached(file, "start beyond the tilt bound").infeasible_period
+    assert period is not None
+    level = period.query._replace(state=make_state())
+    failed = InfeasiblePeriod(problem=period.problem, query=level, status="max_iterations", time=1.0)
     result = diagnose(failed, queried.scenario, queried.vehicle)
     assert result is not None
-    assert (result["feasible"], result["conflict"], result["suggestions"], result["advice"]) == (True, [], [], "")
+    assert result["feasible"]
+    assert (result["conflict"], result["suggestions"], result["advice"]) == ([], [], "")
 
 
 def test_a_flight_whose_sqp_does_not_converge_says_so_and_what_helps() -> None:
     """Upside down the real-time iteration tumbles; every QP is solved, and the plans follow no dynamics."""
-    tumble = quadsim.load("nonlinear").replace(
-        {
-            "initial.euler": [180.0, 0.0, 0.0],
-            "lost.tilt": False,
-            "control_period": 0.02,
-            "controller.horizon": 40,
-            "duration": 1.5,
-        }
-    )
+    changes = {
+        "initial.euler": [180.0, 0.0, 0.0],
+        "lost.tilt": False,
+        "control_period": 0.02,
+        "controller.horizon": 40,
+        "duration": 1.5,
+    }
+    tumble = quadsim.load("nonlinear", changes)
     flight = quadsim.fly(tumble)
     summary = flight.summary
     assert summary["controller"]["statuses"] == {"not_converged": 75}
@@ -318,12 +348,9 @@ def test_a_flight_whose_sqp_does_not_converge_says_so_and_what_helps() -> None:
     assert flight.log.control.sqp[:, 0].min() > CONVERGED
     result = flight.diagnosis
     assert result is not None
-    assert (result["time"], result["status"], result["feasible"], result["conflict"]) == (
-        0.0,
-        "not_converged",
-        True,
-        [],
-    )
+    assert (result["time"], result["status"]) == (0.0, "not_converged")
+    assert result["feasible"]
+    assert result["conflict"] == []
     text = (Path(__file__).resolve().parents[2] / "docs" / "audit.md").read_text(encoding="utf-8")
     assert f"{result['sentence']}\n{result['advice']}\n" in text
     helped = quadsim.fly(tumble.replace(result["suggestions"][0]["settings"]))
@@ -341,8 +368,8 @@ def test_a_satisfied_flight_is_not_diagnosed_for_a_period_that_did_not_converge(
     assert flight.diagnosis is None
 
 
-class Keeping:
-    """A controller of one's own that keeps the problem that it could not solve."""
+class OwnMPC:
+    """A controller of the user, with the period that it could not solve."""
 
     def __init__(self, vehicle: Vehicle, period: float, horizon: int, largest: float = 2.0) -> None:
         law = load_scenario("paper-constrained").controller.law(vehicle, period)
@@ -369,21 +396,14 @@ class Keeping:
 
 def test_a_controller_of_the_user_is_diagnosed_in_the_words_of_its_problem() -> None:
     tilted = load_scenario("hover", ["duration=0.5", "initial.euler=[10.0, 0.0, 0.0]"])
-    flight = quadsim.fly(tilted, controller=Keeping)
+    flight = quadsim.fly(tilted, controller=OwnMPC)
     result = flight.diagnosis
     assert result is not None
-    assert result["conflict"][0] | {"by": 0.0} == {
-        "name": "roll",
-        "rotors": [],
-        "side": "upper",
-        "unit": "deg",
-        "field": "",
-        "by": 0.0,
-        "start": 0.05,
-        "stop": result["conflict"][0]["stop"],
-    }
+    entry = result["conflict"][0]
+    assert (entry["name"], entry["side"], entry["unit"]) == ("roll", "upper", "deg")
+    assert (entry["field"], entry["rotors"], entry["start"]) == ("", [], 0.05)
     assert re.search(r"roll upper .*\d deg", result["advice"])
-    enough = quadsim.fly(tilted, controller=partial(Keeping, largest=12.0))
+    enough = quadsim.fly(tilted, controller=partial(OwnMPC, largest=12.0))
     assert enough.diagnosis is None
 
 
@@ -397,7 +417,7 @@ def lagging() -> Flight:
 
 
 def flown_with(flight: Flight, settings: dict[str, Any], until: float) -> Flight:
-    """Fly a change without the code under test: a robust law has no field `solver`."""
+    """Fly a change without the code under test: a robust controller has no field `solver`."""
     data = tomllib.loads(flight.scenario.to_toml())
     if "controller.type" in settings:
         data["controller"].pop("solver", None)
@@ -422,13 +442,13 @@ def test_what_is_advised_keeps_the_flight_and_what_is_not_would_not_have() -> No
     assert helping["settings"] == {"controller.type": "robust", "controller.soft": {}, "controller.rotor_lag": 0.02}
     helped = flown_with(flight, helping["settings"], until)
     assert (helped.outcome, helped.infeasible_period) == ("incomplete", None)  # it holds the windows that it reaches
-    reasons = {next(iter(each["settings"])): each["why"] for each in result["rejected"]}
-    assert {"controller.output_bounds.pitch", "controller.input_bounds.slew"} <= reasons.keys()
-    for each in result["rejected"]:
-        if not each["settings"].keys() & {"controller.type", "controller.fallback"}:
-            failed = flown_with(flight, each["settings"], until)
-            lost = f"lost at t = {failed.time.size * 0.05:.4g} s"
-            assert (failed.outcome, each["why"]) == ("lost", lost)
+    refused = {next(iter(change["settings"])) for change in result["rejected"]}
+    assert {"controller.output_bounds.pitch", "controller.input_bounds.slew"} <= refused
+    for change in result["rejected"]:
+        if not change["settings"].keys() & {"controller.type", "controller.fallback"}:
+            failed = flown_with(flight, change["settings"], until)
+            assert failed.outcome == "lost"
+            assert change["why"] == f"lost at t = {failed.time.size * 0.05:.4g} s"
     assert f" {until:.4g} s: controller.type = " in result["advice"]
     text = (Path(__file__).resolve().parents[2] / "docs" / "audit.md").read_text(encoding="utf-8")
     assert f"{result['sentence']}\n{result['advice']}\n" in text
@@ -453,10 +473,9 @@ def test_a_bound_that_excludes_hover_is_named_first_and_moved_past_hover(speed: 
 
 
 def test_hover_is_noted_before_the_flight(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bounds = {"speed": [0.0, 150.0], "slew": [-10.0, 10.0]}
+    scenario = quadsim.load("hover", {"controller": {"type": "pid", "input_bounds": bounds}, "duration": 0.1})
     with caplog.at_level("INFO", logger="quadsim"):
-        changes = {"controller": {"type": "pid", "input_bounds": {"speed": [0.0, 150.0], "slew": [-10.0, 10.0]}}}
-        changes |= {"duration": 0.1}  # type: ignore[dict-item]
-        scenario = quadsim.load("hover").replace(changes)
         quadsim.run(scenario, out=tmp_path / "run", progress=False, video=False, recording=False, figures=False)
     assert [note for note in caplog.messages if "192.8 rad/s" in note and "150" in note]
 
@@ -471,9 +490,14 @@ def test_a_start_beyond_a_bound_is_advised_on_by_how_it_returns(file: str) -> No
 
 
 def test_the_flights_of_a_diagnosis_are_not_diagnosed_and_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls, flights = [], []
-    explain, fly = infeasibility.diagnose, Rollout.fly
-    monkeypatch.setattr(infeasibility, "diagnose", lambda *given: calls.append(1) or explain(*given))
+    calls: list[int] = []
+    flights: list[float | None] = []
+    explain = infeasibility.diagnose
+    fly = Rollout.fly
+
+    def explained(*given: Any) -> dict[str, Any] | None:
+        calls.append(1)
+        return explain(*given)
 
     def counted(rollout: Rollout, *given: Any, **options: Any) -> Flight:
         flights.append(options.get("until"))
@@ -481,6 +505,7 @@ def test_the_flights_of_a_diagnosis_are_not_diagnosed_and_are_few(monkeypatch: p
 
     tilted = quadsim.load("hover").replace({"duration": 0.4, "initial.euler": [20.0, 0.0, 0.0]})
     first, second = (quadsim.fly(tilted, progress=False) for _ in range(2))
+    monkeypatch.setattr(infeasibility, "diagnose", explained)
     monkeypatch.setattr(Rollout, "fly", counted)
     assert json.dumps(first.diagnosis) == json.dumps(first.summary["diagnosis"]) == json.dumps(second.diagnosis)
     assert len(calls) == 2
@@ -490,10 +515,9 @@ def test_the_flights_of_a_diagnosis_are_not_diagnosed_and_are_few(monkeypatch: p
 
 def test_nobody_but_the_summary_of_one_flight_pays_for_advice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Numbers, pictures and campaigns do not; Ctrl-C in the flights of the advice loses nothing."""
-    tilted = quadsim.load("hover").replace(
-        {"duration": 0.4, "initial.euler": [20.0, 0.0, 0.0], "controller.fallback": {}}
-    )
-    asked = []
+    changes = {"duration": 0.4, "initial.euler": [20.0, 0.0, 0.0], "controller.fallback": {}}
+    tilted = quadsim.load("hover", changes)
+    asked: list[int] = []
 
     def interrupted(*_: object) -> None:
         asked.append(1)
@@ -576,7 +600,7 @@ def test_a_heading_that_the_model_lacks_is_the_first_that_is_tried_and_helps(
 # --- what the model lacks --------------------------------------------------------------------------------------------
 
 UNAUDITED = {"constraints": [], "duration": 14.0}
-LACKING: dict[str, tuple[str, dict[str, Any], str, dict[str, Any]]] = {
+LACKING: dict[str, tuple[str, dict[str, Any], str, dict[str, Any]]] = {  # scenario, changes, what lacks, its field
     "backwards": (
         "hummingbird-real-rotors",
         {
@@ -645,12 +669,11 @@ def test_what_the_model_lacks_is_named_with_the_growth_without_it_and_with_its_f
     known = [entry for entry in loop["with"] if not entry["unstable"]]
     assert [entry["settings"] for entry in known] == [settings]
     assert known[0]["rate"] < -0.2
-    assert f"; without {lacks} it shrinks at {-without[lacks]['rate']:.3g} 1/s; with controller." in loop["sentence"]
-    fields = [path for path in settings if path != "controller.type"]
-    assert all(f"{path} = " in loop["sentence"] for path in fields)
+    assert f"without {lacks} it shrinks at {-without[lacks]['rate']:.3g} 1/s" in loop["sentence"]
+    for path in settings:
+        assert path == "controller.type" or f"{path} = " in loop["sentence"]
     advised = [change["settings"] for change in diagnosis["suggestions"]]
     assert any(settings.items() <= change.items() for change in advised)
-    assert diagnosis["advice"].startswith("to try, each flown until")
     assert loop["sentence"] in failure_sentences(flight)
     if case == "late geometric":
         text = (Path(__file__).resolve().parents[2] / "docs" / "audit.md").read_text(encoding="utf-8")
@@ -676,35 +699,27 @@ def test_a_stable_loop_is_not_taken_apart() -> None:
     loop = diagnosis["loop"]
     assert not loop["unstable"]
     assert loop["rate"] < 0.0
-    assert (loop["without"], loop["with"], "sentence" in loop) == ([], [], False)
+    assert loop["without"] == []
+    assert loop["with"] == []
+    assert "sentence" not in loop
 
 
 def test_a_lost_flight_whose_model_lacks_nothing_or_is_not_known_is_not_explained() -> None:
-    late = load_scenario("hummingbird-real-rotors").replace(
-        {"controller": "geometric", "computation": {"delay": 0.12}, "constraints": []}
-    )
+    delayed = {"controller": "geometric", "computation": {"delay": 0.12}, "constraints": []}
+    late = load_scenario("hummingbird-real-rotors").replace(delayed)
     fallen = quadsim.fly(late, controller=lambda now, state, reference: [0.0] * 4, progress=False)
-    assert (fallen.outcome, fallen.diagnosis) == ("lost", None)
-    thrown = load_scenario("hover").replace(
-        {"controller": "pid", "initial.body_rates": [2000.0, 0.0, 0.0], "constraints": [], "duration": 2.0}
-    )
-    tumbled = quadsim.fly(thrown, progress=False)
-    assert (tumbled.outcome, tumbled.diagnosis) == ("lost", None)
+    assert fallen.outcome == "lost"
+    assert fallen.diagnosis is None
+    spinning = {"controller": "pid", "initial.body_rates": [2000.0, 0.0, 0.0], "constraints": [], "duration": 2.0}
+    tumbled = quadsim.fly(load_scenario("hover").replace(spinning), progress=False)
+    assert tumbled.outcome == "lost"
+    assert tumbled.diagnosis is None
 
 
 def test_few_pairs_are_flown_however_much_the_model_lacks() -> None:
-    scenario = load_scenario("hummingbird-real-rotors").replace(
-        {
-            "computation": {"delay": 0.1},
-            "actual": {
-                "mass": 0.8,
-                "inertia": [0.008, 0.008, 0.013],
-                "thrust_coefficient": 9e-6,
-                "drag_to_thrust": 0.02,
-            },
-        }
-    )
-    assembly = Assembly(scenario)
+    actual = {"mass": 0.8, "inertia": [0.008, 0.008, 0.013], "thrust_coefficient": 9e-6, "drag_to_thrust": 0.02}
+    changes = {"computation": {"delay": 0.1}, "actual": actual}
+    assembly = Assembly(load_scenario("hummingbird-real-rotors").replace(changes))
     assert len(unmodelled(assembly)) > remedies.MOST_PAIRS
     asked: list[float] = []
 
@@ -722,7 +737,8 @@ def test_wind_that_a_nonlinear_law_could_estimate_is_tried() -> None:
     scenario = load_scenario("hummingbird-figure-eight").replace({"controller": "nonlinear", "effects.air": storm})
     diagnosis = quadsim.fly(scenario, progress=False).diagnosis
     assert diagnosis is not None
-    assert {"controller.disturbance": {}} in [change["settings"] for change in diagnosis["suggestions"]]
-    (known,) = (entry for entry in diagnosis["loop"]["with"] if not entry["unstable"])
-    assert known["settings"] == {"controller.disturbance": {}}
+    observed = {"controller.disturbance": {}}
+    assert observed in [change["settings"] for change in diagnosis["suggestions"]]
+    stable = [entry["settings"] for entry in diagnosis["loop"]["with"] if not entry["unstable"]]
+    assert stable == [observed]
     assert "; without wind it shrinks at" in diagnosis["loop"]["sentence"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import re
 from pathlib import Path
@@ -13,7 +12,6 @@ import pytest
 from support import scenario_table
 
 import quadsim
-from quadsim.console.console import PlainConsole, show
 from quadsim.flight.feasibility import Feasibility
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.catalogue import scenario_names
@@ -51,12 +49,9 @@ def test_the_papers_course_steps_and_what_its_filter_leaves_is_beyond_the_bound(
 
 
 @pytest.mark.slow("library")
-def test_a_note_on_a_shipped_course_has_at_most_two_lines_of_100_columns() -> None:
+def test_a_shipped_course_beyond_a_bound_has_advice_or_is_called_not_flyable() -> None:
     for name in scenario_names():
         result = report(Assembly(load_scenario(name)))
-        screen = PlainConsole(file=io.StringIO(), width=100)
-        show([f"{result.sentence} {result.advice}".rstrip()], screen)
-        assert len(screen.export_text().splitlines()) <= 2, (name, result)
         assert bool(result.advice or "not flyable" in result.sentence) == bool(result.problems)
 
 

@@ -207,12 +207,12 @@ def test_the_controller_receives_the_sensors_samples(vehicle: Vehicle, speeds: A
 def test_the_estimator_receives_the_saturated_command(vehicle: Vehicle) -> None:
     received: list[Array] = []
 
-    class Witness(Navigation):
+    class Recording(Navigation):
         def record(self, flown: PhysicsSteps, *, on_ground: bool = False) -> None:
             received.append(flown["commands"][0].copy())
             super().record(flown, on_ground=on_ground)
 
-    navigation = Witness(vehicle, timestep=1e-3, sensors={}, rng=np.random.default_rng(0))
+    navigation = Recording(vehicle, timestep=1e-3, sensors={}, rng=np.random.default_rng(0))
     with Plant(vehicle, limit_speeds=True) as plant:
         fly_scripted(plant, Scripted(np.full((2, 4), 300.0)), navigation=navigation)
     np.testing.assert_array_equal(received, np.full((2, 4), vehicle.speed_max))

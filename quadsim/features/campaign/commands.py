@@ -1,7 +1,7 @@
 """The commands `quadsim campaign` and `quadsim replay`, and `quadsim.sweep`.
 
-Each reads its arguments, calls `plan`, `campaign` or `sweep` for the work, and returns a result.  The last functions
-are those of a feature that owns directories; see `quadsim.features.entries.Feature`.
+A campaign draws parameters of a scenario at random and flies each draw (`quadsim.rollout.many`): how often does it
+fail, with which confidence?  A sweep flies every combination of given values.  `replay` flies one draw again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""The commands that start a scenario and a vehicle of one's own: `quadsim scenario` and `quadsim vehicle`."""
+"""The commands that start a scenario and a vehicle of one's own: `quadsim scenario` and `quadsim vehicle`.
+
+`scenario` prints a resolved file, or one with weights, bounds and course scaled for a vehicle; `vehicle` prints a
+template, or what a vehicle can do (thrust to weight, fastest flight, endurance).
+"""
 
 from __future__ import annotations
 

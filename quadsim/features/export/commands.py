@@ -1,4 +1,8 @@
-"""The command `quadsim export`: writes a controller as C by `exporter`, and flies it by `in_the_loop` where asked."""
+"""The command `quadsim export`.
+
+It writes a scenario's controller as self-contained C99: the files that fly in simulation (`quadsim/mpc/c`), this
+controller's numbers, and recorded periods to check them by.
+"""
 
 from __future__ import annotations
 

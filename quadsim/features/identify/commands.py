@@ -1,4 +1,8 @@
-"""The command `quadsim identify`."""
+"""The command `quadsim identify`.
+
+It estimates a vehicle's parameters from flight logs, each with an interval, by maximum likelihood of the prediction
+errors (`quadsim.features.identify.search`), and compares predictions on logs that were held back.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The command `quadsim live`."""
+"""The command `quadsim live`.
+
+It flies a scenario in real time behind a page in the browser, where the vehicle can be pulled and its controller tuned;
+what happened is saved as a run, and as a scenario that repeats it.
+"""
 
 from __future__ import annotations
 

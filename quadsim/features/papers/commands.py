@@ -1,4 +1,8 @@
-"""The command `quadsim reproduce`: reads its arguments, and has `reproduction` fly the papers."""
+"""The command `quadsim reproduce`.
+
+It flies the scenarios of a paper and compares each published number with ours; a difference beyond its tolerance gives
+exit status 1.
+"""
 
 from __future__ import annotations
 

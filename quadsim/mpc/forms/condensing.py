@@ -115,6 +115,17 @@ class Condensed:
     """min 1/2 x' P x + c' x over x = [u(k); ...; u(k+N-1); e], with e (N, m_s) the slacks of soft rows.
 
     `qp` is the QP for xi(k) = 0, y_d = 0 and u(k-1) = u_bar, its rows ordered by time; `cost` covers the inputs alone.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> problem = quadsim.problem("paper-constrained")
+        >>> form = mpc.Condensed(problem)
+        >>> query = mpc.Query(np.zeros(12), np.zeros((50, 4)), problem.model.u_bar)
+        >>> qp = form.assemble(query)
+        >>> qp.P.shape, bool(qp.P is form.qp.P)
+        ((200, 200), True)
     """
 
     def __init__(self, problem: Problem) -> None:

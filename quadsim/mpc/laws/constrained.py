@@ -1,4 +1,9 @@
-"""`[controller] type = "constrained"`: the MPC of Eqs. (27)-(29)."""
+"""`[controller] type = "constrained"`: the MPC of Eqs. (27)-(29).
+
+In every period it minimises the cost of Eq. (5) over N steps of the linear model, with hard bounds on outputs, rotor
+speeds and their steps, and flies the first input.  The table builds `quadsim.mpc.laws.parts.linear.LinearMPC` with the
+paper's own query (`NominalPreparation`).
+"""
 
 from __future__ import annotations
 

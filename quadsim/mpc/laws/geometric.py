@@ -155,6 +155,15 @@ class GeometricController(FeedbackLaw):
         observer: of disturbances; None for none.
         k_R: (3,) gains of the attitude error about body x, y, z [1/s^2].
         k_Omega: (3,) gains of the rate error [1/s].
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> vehicle = quadsim.load_vehicle("hummingbird")
+        >>> controller = quadsim.load("hover", {"controller": "geometric"}).controller.law(vehicle, 0.05)
+        >>> command = controller.step(quadsim.StepInputs(), np.zeros(12), np.zeros((controller.horizon, 4)))
+        >>> bool(np.allclose(command.speeds, vehicle.hover_speeds))
+        True
     """
 
     name: Final = "geometric"

@@ -1,4 +1,8 @@
-"""`[controller] type = "nonlinear"`: the nonlinear MPC, with fields for its model, weights, bounds and iteration."""
+"""`[controller] type = "nonlinear"`: the nonlinear MPC, with fields for its model, weights, bounds and iteration.
+
+The table states the optimal control problem of `quadsim.mpc.laws.parts.nonlinear_mpc`, which solves it by sequential
+quadratic programming on the rigid body with a quaternion (`quadsim.mpc.problem.rigidbody`), at any attitude.
+"""
 
 from __future__ import annotations
 
@@ -111,7 +115,16 @@ def _three(weight: AxisWeights) -> Array:
 )
 @dataclass(frozen=True, kw_only=True)
 class Nonlinear(ControllerTable):
-    """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period."""
+    """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period.
+
+    Examples:
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> table = mpc.Nonlinear(horizon=30, rotor_lag=0.02)
+        >>> controller = table.law(quadsim.load_vehicle("hummingbird"), 0.05)
+        >>> controller.horizon, controller.model.n  # 13 of the body, 4 of the rotors
+        (30, 17)
+    """
 
     any_attitude: ClassVar = True
 

@@ -75,6 +75,15 @@ class CascadedPID(FeedbackLaw):
     Attributes:
         gains: of the loops.
         allocation: the mixer.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> vehicle = quadsim.load_vehicle("lopes2011")
+        >>> controller = quadsim.load("hover", {"controller": "pid"}).controller.law(vehicle, 0.05)
+        >>> command = controller.step(quadsim.StepInputs(), np.zeros(12), np.zeros((controller.horizon, 4)))
+        >>> bool(np.allclose(command.speeds, vehicle.hover_speeds))
+        True
     """
 
     name: Final = "pid"

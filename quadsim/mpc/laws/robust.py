@@ -1,4 +1,9 @@
-"""`[controller] type = "robust"`: the MPC for imperfect vehicles, one field per part."""
+"""`[controller] type = "robust"`: the MPC for imperfect vehicles, one field per part.
+
+The constrained MPC with soft bounds, rotor lag, a known delay, disturbance estimates, tightened bounds and any heading,
+each switched on alone.  The table states problem and parts; `quadsim.mpc.laws.parts.preparation` makes the query of a
+period, in C.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +72,17 @@ TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that depend o
 )
 @dataclass(frozen=True, kw_only=True)
 class Robust(Bounded):
-    """The robust MPC: soft bounds, rotor lag, delay, disturbances, heading and more, each switched on separately."""
+    """The robust MPC: soft bounds, rotor lag, delay, disturbances, heading and more, each switched on separately.
+
+    Examples:
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> table = quadsim.load("robust", {"controller.rotor_lag": 0.02}).controller
+        >>> isinstance(table, mpc.Robust)
+        True
+        >>> table.problem(quadsim.load_vehicle("lopes2011"), 0.05).model.n  # 12 states and 4 rotors
+        16
+    """
 
     type: Annotated[Literal["robust"], doc("the control law, by its name in `quadsim list`")] = "robust"
     commands: Annotated[Literal["rotors", "rates", "attitude"], doc(COMMANDS)] = "rotors"

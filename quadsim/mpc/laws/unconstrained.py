@@ -1,4 +1,9 @@
-"""The unconstrained MPC: a constant gain.  Eqs. (21)-(26)."""
+"""The unconstrained MPC: a constant gain.  Eqs. (21)-(26).
+
+Without constraints the optimum is linear in the query, u(k) = K_N xi(k) + G_N y_d + L_N u_bar, and the controller is
+this gain.  The constrained MPCs test the same optimum first (`quadsim.mpc.forms.condensing.FreeOptimum`): where it
+satisfies every row, they solve no QP.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +53,19 @@ def sequence_gains(problem: Problem) -> SequenceGains:
 
 
 class UnconstrainedMPC:
-    """The linear feedback law of Eq. (23), which also reports the rest of its optimal sequence."""
+    """The linear feedback law of Eq. (23), which also reports the rest of its optimal sequence.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> problem = quadsim.problem("paper-unconstrained")
+        >>> controller = mpc.UnconstrainedMPC(problem)
+        >>> reference = np.tile([0.0, 0.0, 1.0, 0.0], (problem.horizon, 1))  # 1 m up
+        >>> command = controller.step(quadsim.StepInputs(), np.zeros(12), reference)
+        >>> command.speeds.shape, bool((command.speeds > problem.model.u_bar).all())
+        ((4,), True)
+    """
 
     name: Final = "unconstrained"
     solver: Final = ""

@@ -49,6 +49,16 @@ class Pilot:
         guard: the fallback contract; None for none.
         inner: the inner loop; None where the rotors hold each command.
         attitudes: what makes attitudes of the law's body rates; None where the law's commands are flown as they are.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> vehicle = quadsim.load_vehicle("hummingbird")
+        >>> law = mpc.Nonlinear().law(vehicle, 0.05)
+        >>> pilot = mpc.Pilot(law, vehicle)
+        >>> pilot.step(quadsim.StepInputs(), np.zeros(12), np.zeros((law.horizon, 4))).status
+        'unconstrained'
     """
 
     def __init__(

@@ -1,4 +1,8 @@
-"""Constraints as values, and the stacked rows of all of them, which every formulation of a problem is built from."""
+"""Constraints as values, and the stacked rows of all of them, which every formulation of a problem is built from.
+
+A constraint is lower <= C x(k+i) + D u(k+i) + E (u(k+i) - u(k+i-1)) <= upper, hard, or soft with a penalty.  `Bounds`
+has those of the paper, Eqs. (12)-(20); `Rows` stacks all constraints of a `quadsim.mpc.problem.ocp.Problem`.
+"""
 
 from __future__ import annotations
 
@@ -42,6 +46,17 @@ class Penalty:
     While l1 exceeds the multiplier that the hard row would have, the penalty is exact: e is zero wherever the hard
     problem is feasible (Kerrigan and Maciejowski, 2000, "Soft constraints and exact penalty functions in model
     predictive control").
+
+    Examples:
+        >>> from dataclasses import replace
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> problem = quadsim.problem("paper-constrained")  # with hard bounds on roll and pitch
+        >>> penalty = mpc.Penalty(l1=np.full(2, 1e3), l2=np.full(2, 1e3))
+        >>> soft = replace(problem, bounds=replace(problem.bounds, penalty=penalty))
+        >>> soft.rows.soft.size
+        2
     """
 
     l1: Array  # (m,) at least 0
@@ -82,6 +97,19 @@ class Constraint:
 
     Rows on states alone hold at x(k+1) .. x(k+N), all others at i = 0 .. N-1.  Where rows differ from step to step, as
     half-spaces along a plan do, C stacks them: entry i is for x(k+i+1).
+
+    Examples:
+        >>> from dataclasses import replace
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> problem = quadsim.problem("paper-constrained")
+        >>> collective = mpc.Constraint(
+        ...     name="collective", lower=np.array([700.0]), upper=np.array([800.0]), D=np.ones((1, 4))
+        ... )
+        >>> bounded = replace(problem, constraints=(collective,))
+        >>> [constraint.name for constraint in bounded.constraints]
+        ['collective']
     """
 
     name: str  # used in messages and audits
@@ -141,7 +169,15 @@ def tightened(constraint: Constraint, margins: Array) -> Constraint:
 
 @dataclass(frozen=True, kw_only=True)
 class Bounds:
-    """The constraints of Eqs. (12)-(20); an infinite entry means no bound."""
+    """The constraints of Eqs. (12)-(20); an infinite entry means no bound.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> bounds = quadsim.problem("paper-constrained").bounds
+        >>> np.degrees(bounds.y_max).round(6).tolist(), bounds.delta_max.tolist()  # roll, pitch; steps of four speeds
+        ([5.0, 5.0], [5.0, 5.0, 5.0, 5.0])
+    """
 
     C_c: Array  # (n_c, n) constrained outputs y_c = C_c xi. Eq. (12)
     y_min: Array  # (n_c,) output bounds. Eq. (13)

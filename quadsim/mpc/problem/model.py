@@ -1,4 +1,12 @@
-"""The linear model: linearised at hover, discretised exactly.  Eq. (1)."""
+"""The linear model: linearised at hover, discretised exactly.  Eq. (1).
+
+From the vehicle's equations of motion come the Jacobians at hover, dxi/dt = A_c (xi - xi_bar) + B_c (u - u_bar), and
+with a zero-order hold over the period tau_s
+
+    xi(k+1) = A xi(k) + B (u(k) - u_bar),    [[A, B], [0, 1]] = exp([[A_c, B_c], [0, 0]] tau_s).
+
+`quadsim.mpc.problem.ocp` predicts with it.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +34,15 @@ class LinearModel:
 
     Eq. (1) prints u(k) for the deviation; taken literally, hover would predict a climb. A xi_bar = xi_bar at any hover
     position, so only the input needs the offset. `docs/conventions.md` lists the states.
+
+    Examples:
+        >>> import numpy as np
+        >>> from quadsim import mpc
+        >>> A = np.array([[1.0, 0.1], [0.0, 1.0]])  # a double integrator: position, velocity
+        >>> B = np.array([[0.005], [0.1]])
+        >>> model = mpc.LinearModel(A=A, B=B, u_bar=np.zeros(1), period=0.1)
+        >>> model.n, model.nu
+        (2, 1)
     """
 
     A: Array  # (n, n) state matrix
@@ -96,7 +113,15 @@ def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
 
 
 def hover_model(vehicle: Vehicle, period: float, *, moment: bool = False) -> LinearModel:
-    """The vehicle's discrete model at hover, for a control period tau_s [s]; `moment` as in `continuous_model`."""
+    """The vehicle's discrete model at hover, for a control period tau_s [s]; `moment` as in `continuous_model`.
+
+    Examples:
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> model = mpc.hover_model(quadsim.load_vehicle("lopes2011"), 0.05)
+        >>> model.A.shape, model.B.shape, model.u_bar.round(1).tolist()
+        ((12, 12), (12, 4), [192.8, 192.8, 192.8, 192.8])
+    """
     A, B = discretise(*continuous_model(vehicle, moment=moment), period)
     return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(vehicle.hover_speeds), period=period)
 

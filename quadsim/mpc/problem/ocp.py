@@ -36,7 +36,16 @@ class Equilibrium(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
-    """The cost of Eq. (5), with two further terms."""
+    """The cost of Eq. (5), with two further terms.
+
+    Examples:
+        >>> import numpy as np
+        >>> from quadsim import mpc
+        >>> position = np.array([[1.0, 0.0]])  # of a double integrator: position, velocity
+        >>> objective = mpc.Objective(C_r=position, Q_y=np.eye(1), Q_u=0.1 * np.eye(1))
+        >>> objective.Q_u.shape, objective.Q_d is None
+        ((1, 1), True)
+    """
 
     C_r: Array  # (n_r, n) regulated outputs y_r = C_r xi. Eq. (4), where the paper prints n_r x n_r
     Q_y: Array  # (n_r, n_r) weight of the output error, symmetric positive definite
@@ -154,7 +163,16 @@ def lqr_terminal_weight(model: LinearModel, objective: Objective, states: Sequen
 
 
 class CondensedQP(NamedTuple):
-    """min 1/2 x' H x + f' x  subject to  lower <= A x <= upper,  x_min <= x <= x_max; see `Problem.qp`."""
+    """min 1/2 x' H x + f' x  subject to  lower <= A x <= upper,  x_min <= x <= x_max; see `Problem.qp`.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> problem = quadsim.problem("paper-constrained")
+        >>> qp = problem.qp(np.zeros(12), np.zeros((50, 4)), problem.model.u_bar)
+        >>> qp.H.shape, bool(np.allclose(qp.H, qp.H.T)), bool((qp.x_min <= qp.x_max).all())
+        ((200, 200), True, True)
+    """
 
     H: Array
     f: Array
@@ -167,7 +185,30 @@ class CondensedQP(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Problem:
-    """A complete definition of a controller, apart from how its optimum is computed."""
+    """A complete definition of a controller, apart from how its optimum is computed.
+
+    Examples:
+        >>> import numpy as np
+        >>> from quadsim import mpc
+        >>> A = np.array([[1.0, 0.1], [0.0, 1.0]])  # a double integrator: position, velocity
+        >>> model = mpc.LinearModel(A=A, B=np.array([[0.005], [0.1]]), u_bar=np.zeros(1), period=0.1)
+        >>> objective = mpc.Objective(C_r=np.array([[1.0, 0.0]]), Q_y=np.eye(1), Q_u=0.1 * np.eye(1))
+        >>> bounds = mpc.Bounds(
+        ...     C_c=np.array([[0.0, 1.0]]),  # the velocity
+        ...     y_min=np.array([-0.5]),
+        ...     y_max=np.array([0.5]),
+        ...     delta_min=np.array([-np.inf]),
+        ...     delta_max=np.array([np.inf]),
+        ...     u_min=np.array([-1.0]),
+        ...     u_max=np.array([1.0]),
+        ... )
+        >>> problem = mpc.Problem(model=model, horizon=20, objective=objective, bounds=bounds)
+        >>> query = mpc.Query(state=np.array([2.0, 0.0]), desired=np.zeros((20, 1)), u_before=np.zeros(1))
+        >>> answer = mpc.QPSolver("piqp", problem).solve(query)
+        >>> velocity = 0.1 * np.cumsum(answer.plan[:, 0])
+        >>> answer.status, answer.plan.shape, round(float(velocity.min()), 3)
+        ('solved', (20, 1), -0.5)
+    """
 
     model: LinearModel  # the prediction model
     horizon: int  # N, steps
@@ -267,8 +308,8 @@ class Problem:
             >>> import numpy as np
             >>> import quadsim
             >>> problem = quadsim.problem("paper-unconstrained")
-            >>> H, f, A, lower, upper, x_min, x_max = problem.qp(np.zeros(12), np.zeros((50, 4)), np.full(4, 200.0))
-            >>> bool(np.allclose(np.linalg.solve(H, -f)[:4], problem.model.u_bar))
+            >>> qp = problem.qp(np.zeros(12), np.zeros((problem.horizon, 4)), np.full(4, 200.0))
+            >>> bool(np.allclose(np.linalg.solve(qp.H, -qp.f)[:4], problem.model.u_bar))
             True
         """
         return self._condensed.period(state, reference, u_before, equilibrium)
@@ -351,7 +392,18 @@ def _largest_coefficients(C: Array, D: Array, E: Array) -> Array:
 
 
 class Query(NamedTuple):
-    """The data of one period: the arguments of the problem."""
+    """The data of one period: the arguments of the problem.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> problem = quadsim.problem("paper-constrained")
+        >>> reference = np.tile([1.0, 0.0, 0.0, 0.0], (50, 1))  # x, y, z [m], yaw [rad]
+        >>> query = mpc.Query(state=np.zeros(12), desired=problem.desired(reference), u_before=problem.model.u_bar)
+        >>> query.desired.shape
+        (50, 4)
+    """
 
     state: Array  # (n,) x(k)
     desired: Array  # (N, n_r) y_d for x(k+1) .. x(k+N)
@@ -383,7 +435,15 @@ def predicted(problem: Problem, query: Query, plan: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class InfeasiblePeriod:
-    """The first period of a flight without an answer, or whose SQP did not converge."""
+    """The first period of a flight without an answer, or whose SQP did not converge.
+
+    Examples:
+        >>> import quadsim
+        >>> tilted = quadsim.load("hover", {"initial.euler": [20.0, 0.0, 0.0], "duration": 0.2})
+        >>> period = quadsim.fly(tilted).infeasible_period
+        >>> period.time, bool(period.query.state[6] > 0.3)  # roll [rad]
+        (0.0, True)
+    """
 
     problem: Problem  # the problem
     query: Query  # the state and reference without a solution; state and input are copied

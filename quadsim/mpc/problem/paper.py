@@ -1,4 +1,9 @@
-"""The paper's prediction and cost, condensed to the inputs alone, as printed.  Eqs. (2)-(10)."""
+"""The paper's prediction and cost, condensed to the inputs alone, as printed.  Eqs. (2)-(10).
+
+With u the inputs of N steps, the states are [xi(k+1); ...; xi(k+N)] = Phi xi(k) + Psi (u - u_bar), and the cost is
+J(u) = 1/2 u' H u + [F1 xi(k) + F2 y_d + (F3 + F4) u_bar]' u.  `quadsim.mpc.forms.condensing` uses the prediction for
+any problem.
+"""
 
 from __future__ import annotations
 

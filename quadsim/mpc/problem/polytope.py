@@ -1,4 +1,8 @@
-"""Polytopes of scenario files: linear constraints on states and rotor speeds, in file units."""
+"""Polytopes of scenario files: linear constraints on states and rotor speeds, in file units.
+
+A table `[[controller.polytopes]]` states lower <= A v <= upper; `Polytope.constraint` converts it to SI units for the
+optimal control problem, and the audit checks the same rows at the physics rate.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""A quadratic program and its solution as values, and the KKT residuals that relate them."""
+"""A quadratic program and its solution as values, and the KKT residuals that relate them.
+
+    min 1/2 x' P x + c' x    subject to    A x = b,  h_l <= G x <= h_u,  x_l <= x <= x_u    Eq. (27)
+
+`quadsim.mpc.forms` makes a QP of a problem and a query; a `Backend` of `quadsim.mpc.solvers` solves it; the residuals
+of its solution (stationarity, complementarity, signs, feasibility) are logged in flight.
+"""
 
 from __future__ import annotations
 

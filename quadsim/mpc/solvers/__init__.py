@@ -196,6 +196,17 @@ class QPSolver:
 
     With `free_first`, the unconstrained optimum is tried first: if it satisfies every constraint, it is the optimum,
     and no QP is solved.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> problem = quadsim.problem("paper-constrained")
+        >>> reference = np.tile([1.0, 0.0, 0.0, 0.0], (50, 1))  # x, y, z [m], yaw [rad]
+        >>> query = mpc.Query(np.zeros(12), problem.desired(reference), problem.model.u_bar)
+        >>> answer = mpc.QPSolver("piqp", problem).solve(query)
+        >>> answer.status, answer.plan.shape
+        ('solved', (50, 4))
     """
 
     def __init__(self, name: str, problem: Problem, *, free_first: bool = False) -> None:

@@ -1,4 +1,9 @@
-"""PIQP: a proximal interior-point method, with a dense Cholesky factorisation or one in stages."""
+"""PIQP: a proximal interior-point method, with a dense Cholesky factorisation or one in stages.
+
+`Piqp.setup` takes the QP's matrices once, `solve` the vectors of a period.  In stages it exploits the block-banded form
+of `quadsim.mpc.forms.staged`, linear in the horizon.  Schwan, Jiang, Kuhn and Jones, "PIQP: A Proximal Interior-Point
+Quadratic Programming Solver", 2023.
+"""
 
 from __future__ import annotations
 

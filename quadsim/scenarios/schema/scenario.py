@@ -1,4 +1,10 @@
-"""The whole scenario file."""
+"""The whole scenario file.
+
+`Scenario` is the file as a frozen dataclass, in the file's units (deg, rad/s, s): vehicle, course, controller, effects,
+events, constraints.  It holds what was stated; what follows from it, such as the duration of a course, is derived in
+`quadsim.scenarios.assembly`.  The fields' annotations are the declaration that `--set`, the JSON Schema, the printed
+file and the messages follow from.
+"""
 
 from __future__ import annotations
 
@@ -134,7 +140,16 @@ BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Scenario:
-    """A flight: vehicle, course, controller, effects, events and constraints."""
+    """A flight: vehicle, course, controller, effects, events and constraints.
+
+    Examples:
+        >>> import quadsim
+        >>> scenario = quadsim.load("paper-constrained")
+        >>> scenario.duration, scenario.control_period, scenario.controller.horizon
+        (60.0, 0.05, 50)
+        >>> [constraint.name for constraint in scenario.constraints[:2]]
+        ['roll', 'pitch']
+    """
 
     name: Annotated[str, MaxLen(80), doc("letters a-z, digits and . _ -; names the run directory")] = field(
         metadata={"pattern": r"^[a-z0-9][a-z0-9._-]*$"}
@@ -486,7 +501,13 @@ class Scenario:
         return self.derive(tables)
 
     def fly(self, **options: Any) -> Any:
-        """Return the `quadsim.Flight`; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
+        """Return the `quadsim.Flight`; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`.
+
+        Examples:
+            >>> import quadsim
+            >>> quadsim.load("hover", {"duration": 1.0}).fly().outcome
+            'satisfied'
+        """
         return shorthands.fly_scenario(self, **options)
 
     def to_toml(self) -> str:

@@ -20,7 +20,6 @@ def test_its_commands_end_with_a_good_flight(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     commands = re.findall(r"^quadsim (.*)$", PAGE.partition("```sh\n")[2].partition("```")[0], flags=re.MULTILINE)
-    assert 3 <= len(commands) <= 5
     output = ""
     for command in commands:
         line, _, file = command.partition(" > ")

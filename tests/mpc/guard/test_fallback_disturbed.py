@@ -1,4 +1,4 @@
-"""The fallback contract where a disturbance is believed: each level holds against it."""
+"""The fallback contract with an estimated disturbance: each level holds against it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole flights of all three laws, on ideal vehicles and on others than the laws believe in."""
+"""Whole flights of the three linear MPCs, on their model's vehicle and on vehicles that differ from the model."""
 
 from __future__ import annotations
 

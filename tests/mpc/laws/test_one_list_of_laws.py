@@ -1,9 +1,10 @@
-"""One list of laws: a file in `quadsim/mpc/laws` is all that a new one takes."""
+"""One list of laws: a file in `quadsim/mpc/laws` is all that a new one takes, as CONTRIBUTING.md shows."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -27,51 +28,11 @@ from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.vehicle import Vehicle
 
 ROOT = Path(__file__).resolve().parents[3]
-ADDED = '''
-"""A law of one speed: the share of hover's that its table states."""
-
-from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Final, Literal
-
-import numpy as np
-from annotated_types import Gt, Le, doc
-
-from quadsim.controller import Command, StepInputs
-from quadsim.mpc.laws.parts.feedback import Baseline, FeedbackLaw
-from quadsim.mpc.laws import register
-from quadsim.mpc.space import Shape
-from quadsim.state import Array
-from quadsim.vehicle import Vehicle
-
-
-class OneSpeed(FeedbackLaw):
-    """Four rotors at one speed."""
-
-    name: Final = "one-speed"
-
-    def __init__(self, vehicle: Vehicle, period: float, settings: OneSpeedTable) -> None:
-        self._speed = settings.share * vehicle.hover_speeds
-        super().__init__(vehicle, period, settings)
-
-    def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
-        return self._held_for_a_period(np.array(self._speed))
-
-
-@register(title="a single speed", description="hover's rotor speed, times a share")
-@dataclass(frozen=True, kw_only=True)
-class OneSpeedTable(Baseline):
-    """One speed."""
-
-    type: Annotated[Literal["one-speed"], doc("the control law, by its name in `quadsim list`")] = "one-speed"
-    share: Annotated[float, Gt(0.0), Le(2.0), doc("[-] of the hover speed")] = 1.0
-
-    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> OneSpeed:
-        """See `quadsim.mpc.tables.controller.ControllerTable.law`."""
-        return OneSpeed(vehicle, period, self)
-'''
+EXAMPLE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Example: a controller\n")[2]
+LAW, LAW_TEST = re.findall(r"^```python\n(.*?)^```", EXAMPLE, re.DOTALL | re.MULTILINE)
+(TRANSCRIPT,) = re.findall(r"^```console\n\$ (.*?)^```", EXAMPLE, re.DOTALL | re.MULTILINE)
+SHOWN = [entry.splitlines() for entry in TRANSCRIPT.split("\n$ ")]
+"""A command and the lines of its output that the example shows, each."""
 COMMANDS = """
 import contextlib, io, json, sys
 from pathlib import Path
@@ -92,80 +53,91 @@ FLY = ["run", "hover", *BARE, "--set", "duration=0.5"]
 
 
 @pytest.fixture(scope="module")
-def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Exit status, output and messages of commands in a copy of the tree with a law more, in one new file."""
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the tree with the example's two files."""
     load_library()  # so that it is current, and not compiled again in the copy
-    copy = tmp_path_factory.mktemp("copy")
-    for folder in ("quadsim", "models", "scenarios"):
-        shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    (copy / "quadsim" / "mpc" / "laws" / "one_speed.py").write_text(ADDED.lstrip(), encoding="utf-8")
+    folder = tmp_path_factory.mktemp("copy")
+    for name in ("quadsim", "models", "scenarios"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "quadsim" / "mpc" / "laws" / "pd.py").write_text(LAW, encoding="utf-8")
+    (folder / "test_pd.py").write_text(LAW_TEST, encoding="utf-8")
+    return folder
+
+
+def run_python(folder: Path, *arguments: str) -> str:
+    """Return what Python prints in a copy of the tree."""
+    command = [sys.executable, *arguments]
+    environment = os.environ | {"PYTHONPATH": str(folder)}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def answers(copy: Path) -> dict[str, Any]:
+    """Exit status, output and messages of commands, by name or as the example has them."""
     commands = {
         "list": ["list", "--json"],
         "schema": ["scenario", "--schema"],
-        "run": [*FLY, "--set", "controller=one-speed", "--out", "flown"],
+        "run": [*FLY, "--set", "controller=pd", "--out", "flown"],
         "check": ["check", "flown", "--json"],
-        "resolved": ["scenario", "hover", "--set", "controller=one-speed"],
-        "value": [*FLY, "--set", "controller=one-speed", "--set", "controller.share=3", "--out", "value"],
-        "field": [*FLY, "--set", "controller=one-speed", "--set", "controller.shore=1", "--out", "field"],
-        "name": [*FLY, "--set", "controller=one-sped", "--out", "name"],
+        "field": [*FLY, "--set", "controller=pd", "--set", "controller.bandwith=1", "--out", "field"],
+        "name": [*FLY, "--set", "controller=pdd", "--out", "name"],
     }
-    done = subprocess.run(
-        [sys.executable, "-c", COMMANDS, json.dumps(commands)],
-        cwd=copy,
-        env=os.environ | {"PYTHONPATH": str(copy)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    result: dict[str, Any] = json.loads(done.stdout)
-    result["left"] = sorted(path.name for path in copy.iterdir())
-    result["summary"] = json.loads((copy / "flown" / "summary.json").read_text(encoding="utf-8"))
+    for line, *_ in SHOWN:
+        _, *words = line.split()
+        commands[line] = [*words, *BARE] if words[0] == "run" else words
+    result: dict[str, Any] = json.loads(run_python(copy, "-c", COMMANDS, json.dumps(commands)))
     assert Path(result["from"]).resolve() == copy.resolve()
     return result
+
+
+@pytest.mark.parametrize("command", [line for line, *_ in SHOWN])
+def test_commands_of_the_example_print_what_it_shows(command: str, answers: dict[str, Any]) -> None:
+    _, out, err = answers[command]
+    printed = [line.split() for line in (out + err).splitlines()]
+    ((_, *lines),) = [entry for entry in SHOWN if entry[0] == command]
+    assert lines
+    for line in lines:
+        assert line.split() in printed
+
+
+def test_the_test_of_the_example_passes(copy: Path) -> None:
+    printed = run_python(copy, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, "test_pd.py")
+    assert "2 passed" in printed
+    assert "ends with `2 passed`" in EXAMPLE
 
 
 def test_a_law_in_one_new_file_is_in_the_list_after_those_that_ship(answers: dict[str, Any]) -> None:
     status, out, _ = answers["list"]
     listed = json.loads(out)["controllers"]
-    assert (status, [*listed]) == (0, [*LAWS, "one-speed"])
-    assert listed["one-speed"] == "hover's rotor speed, times a share"
+    assert (status, [*listed]) == (0, [*LAWS, "pd"])
 
 
 def test_it_is_in_the_json_schema_with_its_field(answers: dict[str, Any]) -> None:
     status, out, _ = answers["schema"]
     definitions = json.loads(out)["$defs"]
-    field = definitions["OneSpeedTable"]["properties"]["share"]
-    assert (status, field["exclusiveMinimum"], field["maximum"]) == (0, 0.0, 2.0)
-    assert "one-speed" in definitions["Plugin"]["properties"]["type"]["not"]["enum"]
+    field = definitions["PDTable"]["properties"]["bandwidth"]
+    assert (status, field["exclusiveMinimum"], field["maximum"]) == (0, 0.0, 10.0)
+    assert "pd" in definitions["Plugin"]["properties"]["type"]["not"]["enum"]
 
 
-def test_it_flies_and_is_called_by_its_display_name(answers: dict[str, Any]) -> None:
+def test_it_flies_under_its_display_name_and_passes_its_audit(copy: Path, answers: dict[str, Any]) -> None:
     status, out, err = answers["run"]
     assert status == 0, err
-    assert answers["summary"]["controller"]["name"] == "one-speed"
-    assert "a single speed" in out
-
-
-def test_its_run_passes_its_audit(answers: dict[str, Any]) -> None:
+    assert "PD: 10 periods commanded" in out
+    summary = json.loads((copy / "flown" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["controller"]["name"] == "pd"
     status, out, err = answers["check"]
     assert status == 0, out + err
 
 
-def test_its_fields_are_written_with_their_meaning(answers: dict[str, Any]) -> None:
-    status, out, _ = answers["resolved"]
-    assert status == 0
-    assert "share = 1.0" in out
-    assert "[-] of the hover speed" in out
-
-
-def test_a_wrong_value_field_or_name_is_refused(answers: dict[str, Any]) -> None:
-    assert [answers[name][0] for name in ("value", "field", "name")] == [2, 2, 2]
-    assert "controller.share must be a number > 0 and <= 2; got 3" in answers["value"][2]
-    assert "controller.shore" in answers["field"][2]
-    assert "did you mean 'share'?" in answers["field"][2]
-    assert "did you mean 'one-speed'?" in answers["name"][2]
-    assert answers["left"] == ["flown", "models", "quadsim", "scenarios"]
+def test_a_wrong_field_or_name_is_refused_with_the_right_one(copy: Path, answers: dict[str, Any]) -> None:
+    assert [answers[name][0] for name in ("field", "name")] == [2, 2]
+    assert "did you mean 'bandwidth'?" in answers["field"][2]
+    assert "did you mean 'pd'?" in answers["name"][2]
+    assert not (copy / "field").exists()
+    assert not (copy / "name").exists()
 
 
 def test_every_file_of_the_folder_registers_one_law() -> None:

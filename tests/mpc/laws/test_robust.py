@@ -74,8 +74,8 @@ def preparation_of(controller: LinearMPC) -> RobustPreparation:
     return controller.preparation
 
 
-def believing(controller: LinearMPC, estimate: Array) -> None:
-    """Let it have estimated (6,)."""
+def set_estimate(controller: LinearMPC, estimate: Array) -> None:
+    """Replace the estimated force and torque (6,)."""
     preparation_of(controller).adopt(None, estimate)
 
 
@@ -141,7 +141,7 @@ def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle, delay: floa
 def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float) -> None:
     """Also of the controller: at rest at its set-point, it commands what holds it there."""
     controller = robust(vehicle, rotor_lag=0.03, heading=True, offset_free=ObserverSettings())
-    believing(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
+    set_estimate(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
     force, torque = np.split(preparation_of(controller).disturbance, 2)
     model = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
     model = replace(model, acceleration=force, angular_acceleration=torque)
@@ -150,7 +150,7 @@ def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float
     world[INDEX["yaw"]] = yaw
     np.testing.assert_allclose(derivative(model, world, u), 0.0, atol=1e-9)
     controller.reset(u)
-    believing(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
+    set_estimate(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
     reference = np.tile([0.0, 0.0, 0.0, yaw], (50, 1))
     np.testing.assert_allclose(controller.step(StepInputs(acting=u), world[:12], reference).speeds, u, atol=1e-4)
 
@@ -193,7 +193,7 @@ def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> N
     reference = np.zeros((200, 4))
     reference[60:120, 0] = 2.0
     controller = robust(vehicle, weight=0.1, soft=SOFT, offset_free=ObserverSettings(), move_weight=20.0)
-    believing(controller, np.zeros(6))
+    set_estimate(controller, np.zeros(6))
     tilts, sideways = [], []
     for state, _ in flown(controller, heavy, make_state(), reference, 150):
         tilts.append(abs(state[INDEX["pitch"]]))
@@ -283,9 +283,9 @@ def test_predictions_and_trim_are_of_what_is_believed(vehicle: Vehicle) -> None:
     controller = robust(vehicle, offset_free=ObserverSettings(), heading=True)
     np.testing.assert_allclose(preparation_of(controller).trim.speeds, vehicle.hover_speed, rtol=1e-12)
     estimate = np.array([0.0, 0.0, -2.9, 0.5, 0.0, 0.0])
-    believing(controller, estimate)
+    set_estimate(controller, estimate)
     controller.reset(preparation_of(controller).trim.speeds)
-    believing(controller, estimate)
+    set_estimate(controller, estimate)
     plan = np.tile(preparation_of(controller).trim.speeds, (1, 50, 1))
     np.testing.assert_allclose(controller.predict(np.zeros((1, 12)), plan), 0.0, atol=1e-9)
     assert preparation_of(controller).trim.speeds.min() > vehicle.hover_speed + 15.0

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import ocp_peer
 import pytest
+from _pytest.mark.structures import ParameterSet
 from hypothesis import given
 from hypothesis import strategies as st
 from support import flight_queries, paper_problem, random_axes, random_problem
@@ -92,12 +93,16 @@ SCENARIOS = {  # periods by who answered them; what these would be, were they th
 }
 
 
-SLOW, WITNESS = pytest.mark.slow("core"), pytest.mark.representative("core")
+SLOW = pytest.mark.slow("core")
+REPRESENTATIVE = pytest.mark.representative("core")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[SLOW, WITNESS] if name == "paper-constrained" else SLOW) for name in SCENARIOS]
-)
+def marked(name: str) -> ParameterSet:
+    marks = [SLOW, REPRESENTATIVE] if name == "paper-constrained" else [SLOW]
+    return pytest.param(name, marks=marks)
+
+
+@pytest.mark.parametrize("name", [marked(name) for name in SCENARIOS])
 def test_flights_are_exact_in_every_period_and_those_of_piqp(name: str) -> None:
     settings = [*SCENARIOS[name], "controller.kkt_every=1"]
     flight, other = (Rollout(load_scenario(name, [*settings, f"controller.solver={by}"])).fly() for by in (CORE, PIQP))

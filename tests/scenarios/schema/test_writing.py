@@ -73,7 +73,6 @@ def test_every_field_is_printed_also_of_absent_tables(name: str) -> None:
     declared = [*fields_below(assembly.scenario, Scenario, "")]
     there = {(kind, field) for kind, path, field in declared if (path, field) in printed}
     missing = {(path, field) for kind, path, field in declared if (kind, field) not in there}
-    assert len(declared) > 100
     assert not missing
 
 

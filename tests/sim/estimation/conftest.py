@@ -1,4 +1,4 @@
-"""A vehicle that is disturbed exactly as the filter believes: white force and torque on a rigid body."""
+"""A vehicle that is disturbed exactly as the filter assumes: by white force and torque on a rigid body."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def run(
     settings: EstimatorSettings,
     *,
     seed: int,
-    believed: dict[SensorName, Sensor] | None = None,
+    assumed: dict[SensorName, Sensor] | None = None,
     chunk: int = 50,
     standing: range = range(0),
     **faults: Any,
@@ -111,7 +111,7 @@ def run(
     for name, sensor in known.items():
         latency[KINDS[name]] = sensor.latency(name, TIMESTEP)
     arrival = samples["taken"] + latency[samples["kind"]]
-    filter_ = ErrorStateFilter(vehicle, believed or sensors, settings, timestep=TIMESTEP)
+    filter_ = ErrorStateFilter(vehicle, assumed or sensors, settings, timestep=TIMESTEP)
     filter_.reset(motion.bias_free_mean(seed, 0), motion.commands[0], rng)
     errors, deviations, nees = [], [], []
     for first in range(0, len(motion.commands), chunk):

@@ -78,8 +78,8 @@ def test_errors_and_innovations_match_the_filters_covariance(
 def test_a_filter_with_the_wrong_noise_fails_the_same_test(
     factor: float, motion: Any, run_filter: Callable[..., Any]
 ) -> None:
-    believed = {name: replace(s, noise=tuple(np.sqrt(factor) * np.ones(3) * s.noise)) for name, s in SENSORS.items()}
-    runs = [run_filter(motion, SENSORS, SETTINGS, seed=seed, believed=believed, chunk=250) for seed in range(FEW)]
+    assumed = {name: replace(s, noise=tuple(np.sqrt(factor) * np.ones(3) * s.noise)) for name, s in SENSORS.items()}
+    runs = [run_filter(motion, SENSORS, SETTINGS, seed=seed, assumed=assumed, chunk=250) for seed in range(FEW)]
     assert not within(sum(nees[-1] for *_, nees in runs), 15 * FEW)
     for name in (SensorName.POSITION, SensorName.ATTITUDE):
         tallies = [filter_.tallies[name] for filter_, *_ in runs]

@@ -36,7 +36,7 @@ def hover(vehicle: Vehicle, steps: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def gentle(vehicle: Vehicle, simulate_motion: SIMULATE) -> Any:
-    """Three seconds, shaken as the filter believes, from level."""
+    """Three seconds, shaken as the filter assumes, from level."""
     return simulate_motion(SETTINGS, hover(vehicle, 3000), seeds=12, rng=np.random.default_rng(5))
 
 
@@ -55,8 +55,8 @@ def test_without_disturbance_and_with_little_noise_the_estimate_becomes_the_trut
         name: replace(sensor, noise=1e-4 if name in ("position", "velocity") else math.degrees(1e-4))
         for name, sensor in SENSORS.items()
     }
-    believed = replace(still, acceleration_noise=1e-3, angular_acceleration_noise=1e-2)
-    _, errors, _, _ = run_filter(motion, fine, believed, seed=0)
+    assumed = replace(still, acceleration_noise=1e-3, angular_acceleration_noise=1e-2)
+    _, errors, _, _ = run_filter(motion, fine, assumed, seed=0)
     assert np.abs(errors[0]).max() > 1e-3  # the gyro's bias at first
     assert np.abs(errors[-1]).max() < 3e-4
 
@@ -77,8 +77,8 @@ def test_late_samples_are_weighted_by_their_time_stamp(
     motion = simulate_motion(SETTINGS, 0.9 * hover(vehicle, 2000), seeds=2, rng=np.random.default_rng(2))
     late = SENSORS | {name: replace(SENSORS[name], delay=0.1) for name in (SensorName.POSITION, SensorName.VELOCITY)}
     prompt, fused, naive = (
-        rms([run_filter(motion, sensors, SETTINGS, seed=s, believed=believed)[1][20:] for s in range(2)], slice(0, 3))
-        for sensors, believed in ((SENSORS, SENSORS), (late, late), (late, SENSORS))
+        rms([run_filter(motion, sensors, SETTINGS, seed=s, assumed=assumed)[1][20:] for s in range(2)], slice(0, 3))
+        for sensors, assumed in ((SENSORS, SENSORS), (late, late), (late, SENSORS))
     )
     assert fused < 1.5 * prompt
     assert naive > 5.0 * fused
@@ -166,15 +166,15 @@ def test_samples_that_are_no_numbers_are_refused_and_counted(gentle: Any, run_fi
     assert np.all(np.abs(errors[-1]) < 5.0 * deviations[-1])
 
 
-def test_a_sensor_refused_for_long_is_believed_again(gentle: Any, run_filter: SIMULATE) -> None:
+def test_a_sensor_rejected_for_long_is_used_again(gentle: Any, run_filter: SIMULATE) -> None:
     moved = SensorFault(sensor=SensorName.POSITION, kind=FaultKind.BIAS, start=0.5, offset=(10.0, 0.0, 0.0))
-    for patience, believed in ((1.0, True), (0.0, False)):
+    for patience, used_again in ((1.0, True), (0.0, False)):
         settings = replace(SETTINGS, patience=patience)
         filter_, errors, _, _ = run_filter(gentle, SENSORS, settings, seed=3, faults=(moved,))
         assert abs(errors[28, 0]) < 0.3  # at 1.45 s
-        assert bool(abs(errors[-1, 0] + 10.0) < 0.3) is believed
+        assert bool(abs(errors[-1, 0] + 10.0) < 0.3) is used_again
         tally = filter_.tallies[SensorName.POSITION]
-        assert tally.rejected == (20 if believed else 51)
+        assert tally.rejected == (20 if used_again else 51)
 
 
 def test_a_velocity_far_off_is_found_again(gentle: Any, run_filter: SIMULATE) -> None:
@@ -186,7 +186,7 @@ def test_a_velocity_far_off_is_found_again(gentle: Any, run_filter: SIMULATE) ->
     settings = replace(SETTINGS, patience=0.5)
     sensors = without(SensorName.VELOCITY)
     filter_, errors, deviations, _ = run_filter(replace(gentle, physics=physics), sensors, settings, seed=0)
-    assert np.abs(errors[28, 3:6]).max() > 4.0  # at 1.45 s, still unbelieved
+    assert np.abs(errors[28, 3:6]).max() > 4.0  # at 1.45 s, still unassumed
     assert np.all(np.abs(errors[42:, :6]) < 5.0 * deviations[42:, :6])  # from 2.15 s on
     assert np.abs(errors[-1, 3:6]).max() < 0.3
     assert filter_.tallies[SensorName.POSITION].rejected <= 11

@@ -89,10 +89,10 @@ def test_rotors_lift_what_they_could_hold_in_hover(vehicle: Vehicle, model: Moti
     assert lifts(model, drive(model, np.full(4, 1.001 * vehicle.hover_speed)))
 
 
-def test_it_is_believed_to_stand_and_the_gyros_bias_is_found(takeoff: Any, run_filter: Callable[..., Any]) -> None:
-    believed = replace(SETTINGS, initial_gyro_bias=2.0)
+def test_it_is_assumed_to_stand_and_the_gyros_bias_is_found(takeoff: Any, run_filter: Callable[..., Any]) -> None:
+    assumed = replace(SETTINGS, initial_gyro_bias=2.0)
     for seed in range(3):
-        filter_, errors, deviations, _ = run_filter(takeoff, SENSORS, believed, seed=seed, standing=range(REST))
+        filter_, errors, deviations, _ = run_filter(takeoff, SENSORS, assumed, seed=seed, standing=range(REST))
         ground = slice(1, REST // 50)
         assert np.abs(errors[ground, 0:3]).max() < 0.02
         assert np.abs(errors[ground, 3:6]).max() < 1e-12  # a sample of position shows no motion

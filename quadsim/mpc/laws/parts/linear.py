@@ -1,4 +1,9 @@
-"""The linear MPC: in every period the optimum of Eq. (27), from a query that a preparation makes of the measurement."""
+"""The linear MPC: in every period the optimum of Eq. (27), from a query that a preparation makes of the measurement.
+
+A step is: measurement -> `Preparation.prepare` -> `Query` -> solver -> `Answer` -> check -> `Command`.  The problem
+(model, cost, constraints) is built once; the query has the vectors of the period.  The paper's constrained MPC and the
+robust MPC differ only in their preparation.
+"""
 
 from __future__ import annotations
 
@@ -106,7 +111,19 @@ class Preparation(Protocol):
 
 
 class NominalPreparation:
-    """The paper's query: the measured state, and the reference on the turn of its yaw, about hover."""
+    """The paper's query: the measured state, and the reference on the turn of its yaw, about hover.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> problem = quadsim.problem("paper-constrained")
+        >>> preparation = mpc.NominalPreparation(problem)
+        >>> state = np.zeros(12)
+        >>> query = preparation.prepare(quadsim.StepInputs(), state, np.zeros((50, 4)), problem.model.u_bar)
+        >>> query.state.shape, query.desired.shape
+        ((12,), (50, 4))
+    """
 
     delay = yaw = 0.0
     trim = disturbance = memory = numbers = None
@@ -152,6 +169,17 @@ class LinearMPC:
         commands: what it commands: rotor speeds, or an autopilot's targets.
         infeasible_period: the first period since `reset` whose QP had no answer; None if there was none.
         answer: the answer of the last period that solved a QP; None before the first.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> problem = quadsim.problem("paper-constrained")
+        >>> solver = mpc.QPSolver("piqp", problem, free_first=True)
+        >>> controller = mpc.LinearMPC(mpc.NominalPreparation(problem), solver, name="mine")
+        >>> command = controller.step(quadsim.StepInputs(), np.zeros(12), np.zeros((50, 4)))
+        >>> command.status, bool(np.allclose(command.speeds, problem.model.u_bar))
+        ('unconstrained', True)
     """
 
     answer: Answer | None = None

@@ -119,6 +119,16 @@ class NonlinearMPC:
         plan: (N, 4) its view of the commands of the last optimum.
         clock: returns the time [s].
         infeasible_period: the first period whose QP had no answer or, if there is none, whose SQP did not converge.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> vehicle = quadsim.load_vehicle("hummingbird")
+        >>> controller = mpc.NonlinearMPC(vehicle, period=0.05, settings=mpc.Nonlinear())
+        >>> command = controller.step(quadsim.StepInputs(), np.zeros(12), np.zeros((20, 4)))
+        >>> command.status, bool(np.allclose(command.speeds, vehicle.hover_speeds, atol=1e-3))
+        ('unconstrained', True)
     """
 
     name: Final = "nonlinear"

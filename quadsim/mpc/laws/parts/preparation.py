@@ -42,6 +42,16 @@ class RobustPreparation:
 
     Raises:
         FileError: the library cannot be compiled or loaded.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> from quadsim import mpc
+        >>> vehicle = quadsim.load_vehicle("lopes2011")
+        >>> table = quadsim.load("robust", {"controller.delay": 0.02}).controller
+        >>> preparation = mpc.RobustPreparation(vehicle, table.problem(vehicle, 0.05), table)
+        >>> preparation.delay
+        0.02
     """
 
     def __init__(self, vehicle: Vehicle, problem: Problem, settings: Robust) -> None:
