@@ -1,4 +1,7 @@
-"""What is rejected before a flight: parts that do not fit together, and starts from which nothing can fly."""
+"""What is rejected before a flight: parts that do not fit together, and starts from which nothing can fly.
+
+`quadsim.scenarios.loading.assemble` ends here: what `checked` returns can be flown.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from quadsim.state import POSITION
 if TYPE_CHECKING:
     from quadsim.scenarios.assembly import Assembly
 
-_RESTING: Final = 1e-9  # vertical speed attributed to rounding [m/s]
+_ROUNDING_SPEED: Final = 1e-9  # vertical speed attributed to rounding [m/s]
 
 
 def checked(assembly: Assembly) -> Assembly:
@@ -85,7 +88,7 @@ def _check_floor(assembly: Assembly) -> None:
         raise ParameterError("initial", "position", position, rule)
     ground = assembly.scenario.effects.ground
     sinking = -touching_speed(state, np.radians(initial.body_rates), shape)
-    if sinking > _RESTING and ground is not None and ground.contact:
+    if sinking > _ROUNDING_SPEED and ground is not None and ground.contact:
         if initial.velocity[2] < 0.0:
             name = "velocity"
         else:

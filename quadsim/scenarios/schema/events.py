@@ -7,8 +7,9 @@ declared beside the effects that they change. `quadsim.scenarios.assembly` sorts
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from annotated_types import Len, doc
 from pydantic import Field
@@ -22,6 +23,8 @@ from quadsim.sim.effects.rotors import LagChange, RotorLoss
 from quadsim.sim.effects.wind import Gust, WindChange
 from quadsim.sim.sensing import AXES, FaultKind, SensorFault, SensorName, in_si
 from quadsim.state import REFERENCE_NAMES
+
+EventType = TypeVar("EventType")
 
 MOST_EVENTS: Final = 20_000  # of one flight: a person's hand for a quarter of an hour, 20 times a second
 SensorText = Literal["position", "velocity", "attitude", "rates"]
@@ -160,3 +163,8 @@ Event = Annotated[
     Field(discriminator="type"),
 ]
 """One entry of the list, distinguished by its type."""
+
+
+def events_of(events: Iterable[Event], kind: type[EventType]) -> tuple[EventType, ...]:
+    """Return the events of one kind, in the order of the file."""
+    return tuple(event for event in events if isinstance(event, kind))
