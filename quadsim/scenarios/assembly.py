@@ -38,7 +38,7 @@ from quadsim.scenarios.courses.followed import FollowedCourse
 from quadsim.scenarios.courses.steps import Steps
 from quadsim.scenarios.limits import audit_notes, flyable, signal_limits, space_limits, sum_limits, with_law_bounds
 from quadsim.scenarios.plugin import Plugin, import_plugin, make_force, reason_of
-from quadsim.scenarios.schema.events import ControllerEvent, Event, SensorFaultEvent, SetpointEvent
+from quadsim.scenarios.schema.events import ControllerEvent, Event, SensorFaultEvent, SetpointEvent, events_of
 from quadsim.scenarios.schema.problems import parse_table
 from quadsim.scenarios.schema.writing import plain
 from quadsim.sim.airframe import outline
@@ -88,7 +88,7 @@ if TYPE_CHECKING:
     from quadsim.scenarios.schema.controllers import AnyController
     from quadsim.scenarios.schema.scenario import Scenario, VehicleTable
 
-_SIZES: Final = {
+_EFFECT_OF_PARAMETER: Final = {
     "rotor_rise": ("rotors", "rise", RotorDynamics),
     "rotor_fall": ("rotors", "fall", RotorDynamics),
     "rotor_inertia": ("rotors", "inertia", RotorDynamics),
@@ -100,8 +100,11 @@ _SIZES: Final = {
     "body_drag": ("air", "body_drag", Air),
     "rotor_radius": ("ground", "rotor_radius", None),
 }
-"""Vehicle parameters that act in an effect: its table, the field that also states it, and the switch of the effect."""
-_OF_ALL_EVENTS: Final = (
+"""Vehicle parameters that act in an effect: its table, the field that also states it, and what switches the effect on.
+
+None: the effect acts only if the scenario has its table.
+"""
+_SHARED_PARTS: Final = (
     "vehicle",
     "autopilot",
     "user_autopilot",
@@ -160,18 +163,20 @@ class Assembly:
         if scenario is self.scenario:
             return self
         other = Assembly(scenario)
-        vars(other).update({name: part for name, part in vars(self).items() if name in _OF_ALL_EVENTS})
+        for name in _SHARED_PARTS:
+            if name in vars(self):
+                vars(other)[name] = vars(self)[name]
         return other
 
     @property
     def resolved(self) -> Assembly:
         """The assembly of the scenario with every derived value stated: numbers of its vehicle, sizes and solver."""
-        return self.of(self._stating(self.scenario))
+        return self.of(self._with_derived_values(self.scenario))
 
-    def _stating(self, scenario: Scenario) -> Scenario:
+    def _with_derived_values(self, scenario: Scenario) -> Scenario:
         """Return a scenario, this one or `recording`, with every derived value stated."""
-        controller, events = self._stated_laws()
-        vehicle, autopilot = self._numbers
+        controller, events = self._controllers_with_solver()
+        vehicle, autopilot = self._whole_tables
         fields = {"vehicle": vehicle, "autopilot": autopilot, "effects": self.effects}
         return scenario.altered(**fields, controller=controller, events=events)
 
@@ -186,10 +191,11 @@ class Assembly:
 
         Effects continue to take their sizes from the vehicle.
         """
-        return self.scenario.recording(*self._numbers)
+        vehicle, autopilot = self._whole_tables
+        return self.scenario.recording(vehicle, autopilot)
 
     @property
-    def _numbers(self) -> tuple[VehicleTable, AutopilotSettings | None]:
+    def _whole_tables(self) -> tuple[VehicleTable, AutopilotSettings | None]:
         """The tables `[vehicle]` and `[autopilot]` with the numbers of the vehicle's file."""
         numbers = {name: getattr(self.vehicle, name) for name in VEHICLE_UNITS}
         return replace(self.scenario.vehicle, **numbers), self.autopilot
@@ -201,7 +207,8 @@ class Assembly:
         """
         if scenario is None:
             scenario = self.scenario
-        return scenario.written(self._stating(scenario).altered(events=scenario.events))
+        resolved = self._with_derived_values(scenario)
+        return scenario.written(resolved.altered(events=scenario.events))
 
     def audited(self) -> Assembly:
         """Return the assembly with the bounds of a user's controller, which builds it, as constraints."""
@@ -231,9 +238,15 @@ class Assembly:
         recorded = self.scenario.recorded
         if recorded is None:
             return numbers
-        stated = {name: value for name, value in numbers.items() if f"vehicle.{name}" in recorded.stated}
-        repeated = {name: value for name, value in numbers.items() if name not in stated}
-        return {name: value for name, value in overridden(repeated, stated).items() if value is not None}
+        stated = {}
+        repeated = {}
+        for name, value in numbers.items():
+            if f"vehicle.{name}" in recorded.stated:
+                stated[name] = value
+            else:
+                repeated[name] = value
+        together = overridden(repeated, stated)
+        return {name: value for name, value in together.items() if value is not None}
 
     @cached_property
     def autopilot(self) -> AutopilotSettings | None:
@@ -259,16 +272,16 @@ class Assembly:
             ParameterError: the vehicle is impossible.
         """
         modelled = self.vehicle
-        if "throttle_offset" in self._stated:
+        if "throttle_offset" in self._actual_parameters:
             rule = "absent: the plant takes rotor speeds, only logs have a throttle"
-            raise ParameterError("actual", "throttle_offset", self._stated["throttle_offset"], rule)
+            raise ParameterError("actual", "throttle_offset", self._actual_parameters["throttle_offset"], rule)
         try:
-            return altered(modelled, self._stated)
+            return altered(modelled, self._actual_parameters)
         except ParameterError as error:
             raise ParameterError("actual", error.name, error.value, error.rule) from None
 
     @property
-    def _stated(self) -> dict[str, Any]:
+    def _actual_parameters(self) -> dict[str, Any]:
         """The vehicle parameters that `[actual]` states."""
         if self.scenario.actual is None:
             return {}
@@ -286,9 +299,13 @@ class Assembly:
         """
         effects = self.scenario.effects
         acting: dict[str, Any] = {}
-        for name, size in self._stated.items():
-            table, field, kind = _SIZES.get(name, ("", "", None))
-            settings = getattr(effects, table, None) or (kind and kind())
+        for name, size in self._actual_parameters.items():
+            if name not in _EFFECT_OF_PARAMETER:
+                continue
+            table, field, make_default = _EFFECT_OF_PARAMETER[name]
+            settings = getattr(effects, table)
+            if settings is None and make_default is not None:
+                settings = make_default()
             if settings is None:
                 continue
             stated = getattr(settings, field)
@@ -368,7 +385,8 @@ class Assembly:
 
     def followed(self, course: Course | None = None) -> FollowedCourse:
         """Return the filtered reference row by row, with set-points in flight; `course` replaces the scenario's."""
-        course = self.course if course is None else course
+        if course is None:
+            course = self.course
         response_time = self.scenario.reference.response_time
         return FollowedCourse(course, response_time=response_time, period=self.scenario.control_period)
 
@@ -383,7 +401,8 @@ class Assembly:
         period = self.scenario.control_period
         if course.derivatives is None:
             return None
-        t = np.arange(max(math.floor(course.end / period + 1e-6), 1) + 1, dtype=np.float64) * period
+        periods = max(math.floor(course.end / period + 1e-6), 1)
+        t = np.arange(periods + 1, dtype=np.float64) * period
         velocity, acceleration = course.derivatives(t)
         poses = course.sample(t)
         position = poses[:, :3]
@@ -404,12 +423,15 @@ class Assembly:
         Raises:
             InputError: the reference's path ends before a window starts, or cannot be built.
         """
-        regions = self.scenario.regions
-        if all(isinstance(region, Fence) or region.path is None for region in regions):
-            return regions
+        corridors = self.scenario.corridors
+        if all(corridor.path is None for corridor in corridors):
+            return self.scenario.regions
         reference = self.reference(self.scenario.periods + 1)[:, :3]
         t = self.scenario.control_period * np.arange(len(reference), dtype=np.float64)
-        return tuple(region if isinstance(region, Fence) else region.timed(t, reference) for region in regions)
+        timed = [corridor.timed(t, reference) for corridor in corridors]
+        if self.scenario.keep_in is None:
+            return tuple(timed)
+        return (*timed, self.scenario.keep_in)
 
     @property
     def course_steps(self) -> tuple[CourseStep, ...]:
@@ -420,11 +442,12 @@ class Assembly:
         scenario = self.scenario
         if not isinstance(scenario.reference, Steps):
             return ()
-        set_points = [event for event in scenario.events if isinstance(event, SetpointEvent)]
-        taken = {name for event in set_points for name in event.values}
+        with_set_point: set[str] = set()
+        for event in events_of(scenario.events, SetpointEvent):
+            with_set_point.update(event.values)
         preview = scenario.controller.horizon * scenario.control_period
         steps = scenario.reference.course_steps(self.initial_pose, duration=scenario.duration, preview=preview)
-        return tuple(step for step in steps if step.channel not in taken)
+        return tuple(step for step in steps if step.channel not in with_set_point)
 
     # --- controller --------------------------------------------------------------------------------------------------
 
@@ -434,7 +457,8 @@ class Assembly:
         Raises:
             InputError: it cannot be built from these numbers, or its code cannot be found or called.
         """
-        spec = self.scenario.controller if spec is None else spec
+        if spec is None:
+            spec = self.scenario.controller
         if spec.commands != ROTORS and spec.inner_lag is None and is_dataclass(spec):
             spec = replace(spec, inner_lag=self.inner_lag)
         if spec.turns_by_attitude and spec.attitude_lag is None and is_dataclass(spec):
@@ -444,23 +468,22 @@ class Assembly:
         check_measured(self.scenario.computation, pilot)
         return self.with_autopilot(pilot)
 
-    def _stated_laws(self) -> tuple[AnyController, tuple[Event, ...]]:
-        """Return controller and events with the `solver` of each law stated, to fly as without."""
-        controller = law = self._stated_law(self.scenario.controller)
+    def _controllers_with_solver(self) -> tuple[AnyController, tuple[Event, ...]]:
+        """Return controller and events with the `solver` of each controller stated, to fly as without."""
+        controller = self._with_solver(self.scenario.controller)
+        solver_before = _solver_of(controller)
         changed: dict[int, Event] = {}
-        events = [event for event in self.scenario.events if isinstance(event, ControllerEvent)]
-        ordered = sorted(events, key=attrgetter("at"))
+        ordered = sorted(events_of(self.scenario.events, ControllerEvent), key=attrgetter("at"))
         for event, (_, spec) in zip(ordered, self.scenario.controller_changes, strict=True):
-            before = law
-            law = self._stated_law(spec)
-            if "type" in event.fields:  # a whole table, which states itself as the first does
-                continue
-            solver = _solver_of(law)
-            if "solver" not in event.fields and solver != _solver_of(before):
+            solver = _solver_of(self._with_solver(spec))
+            is_whole_table = "type" in event.fields  # which states itself as the first does
+            if not is_whole_table and "solver" not in event.fields and solver != solver_before:
                 changed[id(event)] = replace(event, fields={**event.fields, "solver": solver})
-        return controller, tuple(changed.get(id(event), event) for event in self.scenario.events)
+            solver_before = solver
+        events = tuple(changed.get(id(event), event) for event in self.scenario.events)
+        return controller, events
 
-    def _stated_law(self, spec: AnyController) -> AnyController:
+    def _with_solver(self, spec: AnyController) -> AnyController:
         """See `quadsim.mpc.laws.parts.builders.stated`."""
         shapes = (*self.scenario.obstacles, *self.regions)
         return stated(spec, self.vehicle, self.scenario.control_period, shapes)
@@ -569,15 +592,15 @@ class Assembly:
 
     def computation(self, spec: AnyController | None = None) -> Computation | None:
         """Return the computation time of a controller, the scenario's by default; None if commands take no time."""
-        stalls = tuple(event for event in self.scenario.events if isinstance(event, Stall))
+        if spec is None:
+            spec = self.scenario.controller
+        stalls = events_of(self.scenario.events, Stall)
         settings = self.scenario.computation
         if settings is None and not stalls:
             return None
-        fallback = (self.scenario.controller if spec is None else spec).fallback
-        guarded = fallback is not None and fallback.enabled  # within the fallback contract
-        law = self.scenario.controller if spec is None else spec
-        stated = filled(settings or ComputationTime(), plan=guarded and not law.turns_by_attitude)
-        if stated.plan and law.turns_by_attitude:
+        has_fallback = spec.fallback is not None and spec.fallback.enabled
+        stated = filled(settings or ComputationTime(), plan=has_fallback and not spec.turns_by_attitude)
+        if stated.plan and spec.turns_by_attitude:
             rule = f'false where controller.commands = "{ATTITUDE}": a plan has body rates, not later attitudes'
             raise ParameterError("computation", "plan", True, rule)
         per_iteration = times_by_solver(stated.per_iteration)
@@ -596,14 +619,14 @@ class Assembly:
             InputError: effects exclude each other, or a force cannot be imported.
         """
         scenario = self.scenario
-        rng = self.generator("forces")
         if forces is None:
-            forces = [make_force(import_plugin(spec), spec, self.actual, rng) for spec in scenario.forces]
+            forces = self._forces()
+        states_speed_limits = "speed_min" in self._actual_parameters or "speed_max" in self._actual_parameters
         return Plant(
             self.actual,
             timestep=scenario.plant.timestep,
             integrator=scenario.plant.integrator,
-            limit_speeds=scenario.plant.limit_speeds or not {"speed_min", "speed_max"}.isdisjoint(self._stated),
+            limit_speeds=scenario.plant.limit_speeds or states_speed_limits,
             effects=self.effects,
             changes=self.changes(),
             wind=self.wind(),
@@ -612,14 +635,25 @@ class Assembly:
             rng=self.generator("disturbance"),
         )
 
+    def _forces(self) -> list[Force]:
+        """Return the user-defined forces of the scenario, which share one random generator."""
+        rng = self.generator("forces")
+        forces = []
+        for spec in self.scenario.forces:
+            code = import_plugin(spec)
+            forces.append(make_force(code, spec, self.actual, rng))
+        return forces
+
     def ground(self) -> PhaseMonitor | None:
         """Return the monitor of contact with ground and obstacles; None if there are none."""
         ground = self.scenario.effects.ground
         obstacles = self.scenario.obstacles
-        there = ground is not None and ground.contact
-        if not there and not obstacles:
+        has_floor = ground is not None and ground.contact
+        if not has_floor and not obstacles:
             return None
-        shape = outline(self.actual) if there else None
+        shape = None
+        if has_floor:
+            shape = outline(self.actual)
         radius = self.actual.enclosing_radius
         return PhaseMonitor(shape, period=self.scenario.control_period, obstacles=obstacles, radius=radius)
 
@@ -639,7 +673,8 @@ class Assembly:
 
     def wind(self) -> WindField | None:
         """Return the wind field, or None if the air is always still; raises as `moving_air`."""
-        if (air := self.moving_air) is None:
+        air = self.moving_air
+        if air is None:
             return None
         gusts, changes = self.winds
         return WindField(
@@ -655,8 +690,7 @@ class Assembly:
     def winds(self) -> tuple[tuple[Gust, ...], tuple[WindChange, ...]]:
         """The gusts, and the steps of the mean wind."""
         events = self.scenario.events
-        gusts = tuple(event for event in events if isinstance(event, Gust))
-        return gusts, tuple(event for event in events if isinstance(event, WindChange))
+        return events_of(events, Gust), events_of(events, WindChange)
 
     def changes(self, events: Sequence[Event] | None = None) -> tuple[Change, ...]:
         """Return the changes by these events, or by all, to rotors, mass, payload and pushes, in any order.
@@ -667,16 +701,12 @@ class Assembly:
         if events is None:
             events = self.scenario.events
         rotors = self.effects.rotors or RotorDynamics()
-        for event in events:
-            if isinstance(event, LagChange):
-                rotors.lagging(event)
-        losses = [event for event in events if isinstance(event, RotorLoss)]
-        pushes = [event for event in events if isinstance(event, Push)]
-        return (
-            *efficiency_changes(losses, rotors.efficiency),
-            *push_changes(pushes),
-            *(event for event in events if isinstance(event, Change)),
-        )
+        for event in events_of(events, LagChange):
+            rotors.lagging(event)
+        losses = events_of(events, RotorLoss)
+        pushes = events_of(events, Push)
+        of_plant = [event for event in events if isinstance(event, Change)]
+        return (*efficiency_changes(losses, rotors.efficiency), *push_changes(pushes), *of_plant)
 
     # --- sensors -----------------------------------------------------------------------------------------------------
 
@@ -705,7 +735,8 @@ class Assembly:
     @property
     def faults(self) -> tuple[SensorFault, ...]:
         """The faults of the sensors."""
-        return tuple(event.in_si() for event in self.scenario.events if isinstance(event, SensorFaultEvent))
+        faults = events_of(self.scenario.events, SensorFaultEvent)
+        return tuple(event.in_si() for event in faults)
 
 
 def stated_autopilot(path: Path, stated: AutopilotSettings | None = None) -> AutopilotSettings | None:
@@ -717,7 +748,9 @@ def stated_autopilot(path: Path, stated: AutopilotSettings | None = None) -> Aut
     of_file = vehicle_table(path, AUTOPILOT)
     if not of_file:
         return stated
-    table = {**of_file, **(plain(stated) if stated is not None else {})}
+    table = dict(of_file)
+    if stated is not None:
+        table |= plain(stated)
     return parse_table(_Piloted, {AUTOPILOT: table}, str(path), file="vehicle").autopilot
 
 

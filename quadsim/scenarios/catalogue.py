@@ -1,9 +1,13 @@
-"""The shipped scenarios, campaigns, papers and controllers by name; found without heavy imports."""
+"""The shipped scenarios, campaigns, papers and controllers by name; found without heavy imports.
+
+A name is that of a file of the library, or of a row of `variants.toml`, which changes fields of a file. `Catalogue` is
+what `quadsim list` prints.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias, get_args
@@ -14,13 +18,17 @@ from quadsim.errors import FileError, UnknownNameError
 from quadsim.outputs import SUMMARY_FILE
 
 _LIBRARY: Final = library_dir()
-FLIGHTS, CAMPAIGNS, PAPERS = (_LIBRARY / name for name in ("flights", "campaigns", "papers"))
+FLIGHTS: Final = _LIBRARY / "flights"
+CAMPAIGNS: Final = _LIBRARY / "campaigns"
+PAPERS: Final = _LIBRARY / "papers"
 VARIANTS: Final = _LIBRARY / "variants.toml"
 
 Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
 
-_MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
-"""Marks scenarios that are meant to defeat their controller."""
+_MARKS: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
+"""By expected verdict, what the list says of scenarios that are meant to defeat their controller."""
+_DESCRIBED: Final = ("campaigns", "vehicles", "controllers", "papers", "solvers")
+"""Kinds that the catalogue has as descriptions by name."""
 
 
 def _names(folder: Path) -> list[str]:
@@ -48,7 +56,7 @@ class Variant:
     set: Mapping[str, Any]  # values by dotted path, as after `--set`
 
 
-_ROW: Final = {"base": (str, "a text"), "description": (str, "a text"), "set": (dict, "a table")}
+_FIELDS_OF_VARIANT: Final = {"base": (str, "a text"), "description": (str, "a text"), "set": (dict, "a table")}
 
 
 def read_variants(path: Path) -> dict[str, Variant]:
@@ -62,9 +70,9 @@ def read_variants(path: Path) -> dict[str, Variant]:
     for name, row in read_toml(path).items():
         if name in files:
             raise FileError(path, f"{name} must not have the name of a file in {FLIGHTS.name}/")
-        if not isinstance(row, dict) or row.keys() != _ROW.keys():
-            raise FileError(path, f"{name} must be a table of {', '.join(_ROW)}; got {row!r:.200}")
-        for key, (kind, rule) in _ROW.items():
+        if not isinstance(row, dict) or row.keys() != _FIELDS_OF_VARIANT.keys():
+            raise FileError(path, f"{name} must be a table of {', '.join(_FIELDS_OF_VARIANT)}; got {row!r:.200}")
+        for key, (kind, rule) in _FIELDS_OF_VARIANT.items():
             if not isinstance(row[key], kind) or not row[key]:
                 raise FileError(path, f"{name}.{key} must be {rule} that is not empty; got {row[key]!r}")
         if row["base"] not in files:
@@ -134,7 +142,7 @@ class LibraryScenario:
     @property
     def line(self) -> str:
         """Its line in the list."""
-        return self.description + _MEANT.get(self.expect, "")
+        return self.description + _MARKS.get(self.expect, "")
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -152,43 +160,58 @@ class Catalogue(Tabular):
         """See `Result.shown`; a variant stands below its base, indented."""
         from quadsim.console import console
 
-        groups: dict[str, dict[str, str]] = {f"scenarios: {group}": {} for group in get_args(Group)}
-        bases = {name: entry.variant.base for name, entry in self.scenarios.items() if entry.variant is not None}
+        lines_by_title: dict[str, Mapping[str, str]] = {}
+        for group in get_args(Group):
+            lines = self._lines_of(group)
+            if lines:
+                lines_by_title[f"scenarios: {group}"] = lines
+        for title in _DESCRIBED:
+            lines_by_title[title] = getattr(self, title)
+        return console.listing(lines_by_title)
+
+    def _lines_of(self, group: Group) -> dict[str, str]:
+        """Return the lines of a group's scenarios by name, each with its variants below it, indented."""
+        lines = {}
         for name, entry in self.scenarios.items():
-            if name not in bases:
-                below = {}
-                for variant in bases:
-                    if bases[variant] == name:
-                        below[f"  {variant}"] = self.scenarios[variant].line
-                groups[f"scenarios: {entry.group}"] |= {name: entry.line, **below}
-        others = ("campaigns", "vehicles", "controllers", "papers", "solvers")
-        groups = {title: lines for title, lines in groups.items() if lines}
-        return console.listing({**groups, **{title: getattr(self, title) for title in others}})
+            if entry.group != group or entry.variant is not None:
+                continue
+            lines[name] = entry.line
+            for variant_name, other in self.scenarios.items():
+                if other.variant is not None and other.variant.base == name:
+                    lines[f"  {variant_name}"] = other.line
+        return lines
 
     def records(self) -> list[dict[str, Any]]:
         """Return a row per name: its `kind`, `group` of a scenario, and `description`."""
         rows: list[dict[str, Any]] = []
         for name, entry in self.scenarios.items():
             rows.append({"kind": "scenario", "name": name, "group": entry.group, "description": entry.description})
-        for title in ("campaigns", "vehicles", "controllers", "papers", "solvers"):
+        for title in _DESCRIBED:
             for name, text in getattr(self, title).items():
                 rows.append({"kind": title.removesuffix("s"), "name": name, "group": None, "description": text})
         return rows
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values; those of scenarios by field."""
-        shipped = self.scenarios.items()
-        columns = {"scenarios": "description", "groups": "group", "expected": "expect"}
-        by_field = {}
-        for title, field in columns.items():
-            by_field[title] = {name: getattr(entry, field) for name, entry in shipped}
-        rows = {name: entry.variant for name, entry in shipped if entry.variant is not None}
-        variants = {"variants": {name: {"base": row.base, "set": row.set} for name, row in rows.items()}}
-        return {
-            **by_field,
-            **variants,
-            **{title: value for title, value in asdict(self).items() if title != "scenarios"},
+        descriptions = {}
+        groups = {}
+        expected = {}
+        rows = {}
+        for name, entry in self.scenarios.items():
+            descriptions[name] = entry.description
+            groups[name] = entry.group
+            expected[name] = entry.expect
+            if entry.variant is not None:
+                rows[name] = {"base": entry.variant.base, "set": entry.variant.set}
+        values: dict[str, Any] = {
+            "scenarios": descriptions,
+            "groups": groups,
+            "expected": expected,
+            "variants": rows,
         }
+        for title in _DESCRIBED:
+            values[title] = dict(getattr(self, title))
+        return values
 
 
 def read_catalogue() -> Catalogue:

@@ -1,4 +1,8 @@
-"""The bounds of a user's controller as limits of the audit, from its `problem`, `bounds` or `constraints`."""
+"""The bounds of a user's controller as limits of the audit, from its `problem`, `bounds` or `constraints`.
+
+A constraint is lower <= C x + D u + E (u(k) - u(k-1)) <= upper. Its rows become bounds on a state, on the speed or the
+slew of all rotors alike, or on a sum of states and rotor speeds. `quadsim.scenarios.limits` puts them into a scenario.
+"""
 
 from __future__ import annotations
 
@@ -54,9 +58,10 @@ def _limits(stated: Any, source: str) -> Iterator[Limit]:
     elif isinstance(stated, Bounds):
         stated = stated.constraints
     elif isinstance(stated, Mapping):
-        stated = [
-            {"name": name, "signal": name, "lower": lower, "upper": upper} for name, (lower, upper) in stated.items()
-        ]
+        entries = []
+        for name, (lower, upper) in stated.items():
+            entries.append({"name": name, "signal": name, "lower": lower, "upper": upper})
+        stated = entries
     if stated is None or callable(stated):
         return
     for entry in stated:
@@ -79,11 +84,21 @@ def _rows(constraint: Constraint) -> Iterator[Limit]:
         _log.warning("%s is not audited: its rows change from step to step", constraint.name)
         return
     m = constraint.lower.size
-    C, D, E = (np.zeros((m, 0)) if matrix is None else matrix for matrix in (constraint.C, constraint.D, constraint.E))
-    if D.any() and not C.any() and not E.any() and (pair := _alike(D, constraint)) is not None:
-        yield Limit(name="speed", signal="speed", lower=pair[0], upper=pair[1])
-    elif E.any() and not C.any() and not D.any() and (pair := _alike(E, constraint)) is not None:
-        yield Limit(name="slew", signal="slew", lower=pair[0], upper=pair[1])
+    C = _matrix(constraint.C, m)
+    D = _matrix(constraint.D, m)
+    E = _matrix(constraint.E, m)
+    if D.any() and not C.any() and not E.any():
+        signal = "speed"
+        pair = _common_bounds(D, constraint)
+    elif E.any() and not C.any() and not D.any():
+        signal = "slew"
+        pair = _common_bounds(E, constraint)
+    else:
+        signal = ""
+        pair = None
+    if pair is not None:
+        lower, upper = pair
+        yield Limit(name=signal, signal=signal, lower=lower, upper=upper)
     elif E.any() or (C.size and C.shape[1] < N_STATES) or C[:, N_STATES:].any():
         _log.warning("%s is not audited: the audit knows the 12 states and rotor speeds", constraint.name)
     else:
@@ -91,7 +106,14 @@ def _rows(constraint: Constraint) -> Iterator[Limit]:
             yield from _row(constraint, i, C[i], D[i])
 
 
-def _alike(matrix: Array, constraint: Constraint) -> tuple[float, float] | None:
+def _matrix(matrix: Array | None, rows: int) -> Array:
+    """Return a matrix of a constraint; one without columns where it has none."""
+    if matrix is None:
+        return np.zeros((rows, 0))
+    return matrix
+
+
+def _common_bounds(matrix: Array, constraint: Constraint) -> tuple[float, float] | None:
     """Return the bounds of rows that bound every rotor alike, None of others."""
     lower = constraint.lower
     upper = constraint.upper
@@ -103,9 +125,15 @@ def _alike(matrix: Array, constraint: Constraint) -> tuple[float, float] | None:
 
 
 def _row(constraint: Constraint, i: int, C: Array, D: Array) -> Iterator[Limit]:
-    scale = [shown_unit(unit)[1] for unit in STATE_UNITS]
-    terms = {name: float(c / s) for name, c, s in zip(STATE_NAMES, C[:N_STATES], scale, strict=False) if c}
-    terms |= {name: float(d) for name, d in zip(_SPEEDS, D, strict=False) if d}
+    """Yield row i of a constraint, with factors in the units of the audit; nothing where it bounds nothing."""
+    terms: dict[str, float] = {}
+    for name, unit, factor in zip(STATE_NAMES, STATE_UNITS, C[:N_STATES], strict=False):
+        if factor:
+            _, scale = shown_unit(unit)
+            terms[name] = float(factor / scale)
+    for name, factor in zip(_SPEEDS, D, strict=False):
+        if factor:
+            terms[name] = float(factor)
     lower = float(constraint.lower[i])
     upper = float(constraint.upper[i])
     if not terms or (math.isinf(lower) and math.isinf(upper)):

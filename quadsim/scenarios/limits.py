@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from quadsim.controller import Controller
 from quadsim.flight.audit import SUM, UNAUDITED_ADVICE, Limit, SpaceLimit
 from quadsim.mpc.pilot.pilot import Pilot
+from quadsim.mpc.problem.polytope import Polytope
 from quadsim.mpc.tables.controller import Range
 from quadsim.report.table import format_number
 from quadsim.scenarios.law_bounds import law_limits
@@ -58,48 +59,69 @@ def audit_notes(scenario: Scenario, vehicle: Vehicle, bounds: Mapping[str, Range
         bounds: the controller's, see `Assembly.bounds`.
         audited: whether anything is audited at all.
     """
+    notes = []
     unnamed = [limit.name for limit in _unnamed(scenario, bounds)]
+    if len(unnamed) == 1:
+        notes.append(f"{unnamed[0]}: audited as the controller bounds it")
+    elif unnamed:
+        notes.append(f"{', '.join(unnamed)}: audited as the controller bounds them")
+    if not audited:
+        notes.append(UNAUDITED_ADVICE)
     absent = []
     for entry in scenario.constraints:
         if not (entry.has_bounds or entry.signal in bounds):
             absent.append(entry.name)
-    notes = []
-    if unnamed:
-        notes.append(f"{', '.join(unnamed)}: audited as the controller bounds {'it' if len(unnamed) == 1 else 'them'}")
-    if not audited:
-        notes.append(UNAUDITED_ADVICE)
     if absent:
         notes.append(f"{', '.join(absent)}: not audited, the controller has no such bound and the entry states none")
-    specs = [(0.0, scenario.controller), *scenario.controller_changes]
-    changes = [(at, spec.audited(vehicle)) for at, spec in specs]
-    for limit in signal_limits(scenario, bounds):
-        for (at, now), (_, before) in zip(changes, [(0.0, {}), *changes], strict=False):
-            pair = now.get(limit.signal)
-            if pair is not None and pair not in (before.get(limit.signal), (limit.lower, limit.upper)):
-                since = f" from {at:g} s" if at else ""
-                notes.append(
+    return notes + _differing_bounds(scenario, vehicle, signal_limits(scenario, bounds))
+
+
+def _differing_bounds(scenario: Scenario, vehicle: Vehicle, limits: Iterable[Limit]) -> list[str]:
+    """Return a note on each bound of a controller of the flight that differs from the limit on the same signal."""
+    bounds_from = [(0.0, scenario.controller.audited(vehicle))]
+    for at, spec in scenario.controller_changes:
+        bounds_from.append((at, spec.audited(vehicle)))
+    notes = []
+    for limit in limits:
+        before = None
+        for at, bounds in bounds_from:
+            pair = bounds.get(limit.signal)
+            if pair is not None and pair not in (before, (limit.lower, limit.upper)):
+                note = (
                     f"{limit.name}: audited against {_range(limit.lower, limit.upper)} {limit.unit}, the controller "
-                    f"bounds {_range(*pair)} {limit.unit}{since}"
+                    f"bounds {_range(*pair)} {limit.unit}"
                 )
+                if at:
+                    note += f" from {at:g} s"
+                notes.append(note)
+            before = pair
     return notes
 
 
 def flyable(bounds: Mapping[str, Range], vehicle: Vehicle) -> dict[str, Range]:
     """Return a controller's bounds, those on speeds within the range that the actual vehicle's rotors have."""
+    flown = dict(bounds)
     if "speed" in bounds:
-        lower = max(bounds["speed"][0], vehicle.speed_min)
-        upper = min(bounds["speed"][1], vehicle.speed_max)
-        bounds = {**bounds, "speed": (lower, upper) if lower < upper else (vehicle.speed_min, vehicle.speed_max)}
-    return dict(bounds)
+        slowest, fastest = bounds["speed"]
+        lower = max(slowest, vehicle.speed_min)
+        upper = min(fastest, vehicle.speed_max)
+        if lower < upper:
+            flown["speed"] = (lower, upper)
+        else:
+            flown["speed"] = (vehicle.speed_min, vehicle.speed_max)
+    return flown
 
 
 def _stated(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit]:
     """Return the entries of `[[constraints]]` with their bounds; those without any available are dropped."""
-    return [
-        entry if entry.has_bounds else replace(entry, lower=bounds[entry.signal][0], upper=bounds[entry.signal][1])
-        for entry in scenario.constraints
-        if entry.has_bounds or entry.signal in bounds
-    ]
+    limits = []
+    for entry in scenario.constraints:
+        if entry.has_bounds:
+            limits.append(entry)
+        elif entry.signal in bounds:
+            lower, upper = bounds[entry.signal]
+            limits.append(replace(entry, lower=lower, upper=upper))
+    return limits
 
 
 def _unnamed(scenario: Scenario, bounds: Mapping[str, Range]) -> Iterator[Limit]:
@@ -117,14 +139,16 @@ def _unnamed(scenario: Scenario, bounds: Mapping[str, Range]) -> Iterator[Limit]
 
 def _named(scenario: Scenario) -> set[str]:
     """Return the signals whose entry replaces the controller's bounds."""
-    return {
-        entry.signal
-        for entry in scenario.constraints
-        if not entry.has_bounds or (entry.start <= 0.0 and math.isinf(entry.stop))
-    }
+    signals = set()
+    for entry in scenario.constraints:
+        applies_throughout = entry.start <= 0.0 and math.isinf(entry.stop)
+        if applies_throughout or not entry.has_bounds:
+            signals.add(entry.signal)
+    return signals
 
 
 def _range(lower: float, upper: float) -> str:
+    """Return bounds in words."""
     if math.isinf(lower) or math.isinf(upper):
         if math.isinf(upper):
             return f"at least {format_number(lower)}"
@@ -138,37 +162,55 @@ def space_limits(
     obstacles: Iterable[AnyObstacle], regions: Iterable[Corridor | Fence], radius: float
 ) -> tuple[SpaceLimit, ...]:
     """Return the obstacles, then the regions, as limits of a vehicle within a ball of a radius [m]."""
-    return (
-        *(SpaceLimit(name=obstacle.name, shape=obstacle, radius=radius) for obstacle in obstacles),
-        *(
-            SpaceLimit(
-                name=region.name,
-                shape=region,
-                radius=radius,
-                tolerance=region.tolerance,
-                tolerance_sampled=region.tolerance,
-                required=region.required,
-                start=region.start,
-                stop=region.stop,
-            )
-            for region in regions
-        ),
-    )
+    limits = []
+    for obstacle in obstacles:
+        limits.append(SpaceLimit(name=obstacle.name, shape=obstacle, radius=radius))
+    for region in regions:
+        limit = SpaceLimit(
+            name=region.name,
+            shape=region,
+            radius=radius,
+            tolerance=region.tolerance,
+            tolerance_sampled=region.tolerance,
+            required=region.required,
+            start=region.start,
+            stop=region.stop,
+        )
+        limits.append(limit)
+    return tuple(limits)
 
 
 def sum_limits(scenario: Scenario) -> tuple[Limit, ...]:
     """Return the rows of the controller's polytopes as limits."""
-    return tuple(
-        Limit(
+    limits: list[Limit] = []
+    for polytope in scenario.polytopes:
+        limits += _row_limits(polytope)
+    return tuple(limits)
+
+
+def _row_limits(polytope: Polytope) -> list[Limit]:
+    """Return the rows of a polytope as limits, lower <= sum of factor * signal <= upper."""
+    limits = []
+    for i, name in enumerate(polytope.row_names):
+        terms = {}
+        for signal, factor in zip(polytope.of, polytope.rows[i], strict=True):
+            if factor:
+                terms[signal] = factor
+        lower = -math.inf
+        if polytope.lower is not None:
+            lower = polytope.lower[i]
+        upper = math.inf
+        if polytope.upper is not None:
+            upper = polytope.upper[i]
+        limit = Limit(
             name=name,
             signal=SUM,
-            terms={of: factor for of, factor in zip(polytope.of, row, strict=True) if factor},
-            lower=-math.inf if polytope.lower is None else polytope.lower[i],
-            upper=math.inf if polytope.upper is None else polytope.upper[i],
+            terms=terms,
+            lower=lower,
+            upper=upper,
             tolerance=polytope.tolerance,
             tolerance_sampled=polytope.tolerance_sampled,
             required=polytope.required,
         )
-        for polytope in scenario.polytopes
-        for i, (name, row) in enumerate(zip(polytope.row_names, polytope.rows, strict=True))
-    )
+        limits.append(limit)
+    return limits

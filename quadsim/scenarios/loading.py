@@ -53,29 +53,36 @@ def assemble(
     Raises:
         InputError: the file is missing or malformed, a field is invalid, or a part that it names cannot be flown.
     """
-    if not isinstance(source, str | Path) and not changes:
-        changes = {}
-    if seed is not None:
-        if isinstance(changes, Mapping):
-            changes = {**changes, "seed": seed}
-        else:
-            changes = [*changes, f"seed={seed}"]
-    if not isinstance(source, str | Path) and changes and not isinstance(changes, Mapping):
+    is_file = isinstance(source, str | Path)
+    by_path: dict[Any, Any] = {}
+    settings: list[str] = []
+    if isinstance(changes, Mapping):
+        by_path |= changes
+    else:
+        settings += changes
+    if settings and not is_file:
         raise InputError("changes of a Scenario are a mapping: {'controller.horizon': 30}")
+    if seed is not None:
+        if isinstance(changes, Mapping) or not is_file:
+            by_path["seed"] = seed
+        else:
+            settings.append(f"seed={seed}")
     if isinstance(source, str | Path) and Path(source).is_dir() and str(source) not in scenario_names():
         raise InputError(f"{source} is a directory; give a scenario's name or its TOML file")
     try:
-        scenario = source
-        if isinstance(scenario, str | Path):
-            scenario = _read(str(scenario), () if isinstance(changes, Mapping) else changes)
-        if isinstance(changes, Mapping) and changes:
-            scenario = scenario.replace(changes)
+        if isinstance(source, str | Path):
+            scenario = _read(str(source), settings)
+        else:
+            scenario = source
+        if by_path:
+            scenario = scenario.replace(by_path)
         return checked(Assembly(scenario))
     except OSError as error:  # of looking whether a file is there, e.g. under a name longer than the system takes
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
 
 
 def _read(name: str, settings: Sequence[str]) -> Scenario:
+    """Return the scenario of a name or file, with `dotted.path=value` texts applied to its tables."""
     data = read_scenario(name)
     file, changes = scenario_source(name)
     label = source_label((file, changes))
@@ -104,21 +111,23 @@ def apply_settings(data: dict[str, Any], settings: Sequence[str], directory: Pat
 
 def _of_types(problems: Sequence[str], name: str, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
     """Explain why a table lacks fields or has too many: its type differs from that in the file."""
-    unfit = (problem for problem in problems if problem.endswith(" is missing") or " is not a field of " in problem)
-    wrong = {problem.partition(".")[0] for problem in unfit}
+    lacking = set()
+    exceeding = set()
+    for problem in problems:
+        table = problem.partition(".")[0]
+        if problem.endswith(" is missing"):
+            lacking.add(table)
+        elif " is not a field of " in problem:
+            exceeding.add(table)
     types_before = retyped(read, data)
     for table, before in types_before.items():
-        if table in wrong:
+        if table in lacking | exceeding:
             changed = f"--set changed its type from {before!r} to {data[table]['type']!r}, and all other fields stayed"
             base = Path(name).name
             yield f'{table}: {changed}; a file with base = "{base}" and a whole [{table}] replaces them'
-    missing = set()
-    for problem in problems:
-        if problem.endswith(" is missing"):
-            missing.add(problem.partition(".")[0])
     file, _ = scenario_source(name)
     for table, before in replaced_tables(file).items():
-        if table in missing - {*types_before}:
+        if table in lacking and table not in types_before:
             other = f"of another type than that of its base ({before})"
             yield f"{table}: {other}, it replaces it whole and inherits nothing"
 
@@ -148,8 +157,14 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
         FileError: the course's table is invalid.
     """
     if directory is not None:
-        data = {name: {**value} if isinstance(value, dict) else value for name, value in data.items()}
-        locate_files(data, directory)
+        tables = {}
+        for name, value in data.items():
+            if isinstance(value, dict):
+                tables[name] = {**value}  # the caller's stay as they are
+            else:
+                tables[name] = value
+        locate_files(tables, directory)
+        data = tables
     scenario = Scenario.parse(data, source=source)
     if directory is not None and isinstance(scenario.reference, Csv):
         scenario = scenario.altered(reference=scenario.reference.located(directory))

@@ -1,4 +1,8 @@
-"""What a controller's model lacks of the plant that it flies, where the scenario states both."""
+"""What a controller's model lacks of the plant that it flies, where the scenario states both.
+
+`unmodelled` is what moves the limits of the loop: heading, delay, lag of the rotors, numbers of `[actual]`.
+`unpredicted` is what hardly does: drag, moments of the air, wind. Each comes with the fields by which the model has it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ from quadsim.mpc.tables.lags import resolved_lag
 from quadsim.scenarios.assembly import Assembly
 from quadsim.scenarios.plugin import Plugin
 from quadsim.scenarios.schema.controllers import AnyController
-from quadsim.scenarios.schema.events import SetpointEvent
+from quadsim.scenarios.schema.events import SetpointEvent, events_of
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import Array, wrapped
 from quadsim.vehicle import AIR_MOMENT, N_ROTORS
@@ -100,7 +104,9 @@ def _delay(assembly: Assembly) -> list[Unmodelled]:
     """Return the delay that the law does not bridge."""
     computation = assembly.scenario.computation
     spec = assembly.scenario.controller
-    delay = 0.0 if computation is None else computation.delay
+    delay = 0.0
+    if computation is not None:
+        delay = computation.delay
     fields = vars(spec)
     known = fields.get("delay", 0.0)
     if delay == known:
@@ -131,14 +137,12 @@ def _lag(assembly: Assembly) -> list[Unmodelled]:
 
 def _ideal_rotors(assembly: Assembly) -> dict[str, Any]:
     """Return the fields with which the plant's rotors follow as good as at once."""
-    if assembly.scenario.actual is None:
-        stated = {}
-    else:
-        stated = assembly.scenario.actual.overrides()
     absent: dict[str, Any] = {}
-    for name in ("rotor_rise", "rotor_fall"):
-        if name in stated:
-            absent[f"actual.{name}"] = None
+    if assembly.scenario.actual is not None:
+        stated = assembly.scenario.actual.overrides()
+        for name in ("rotor_rise", "rotor_fall"):
+            if name in stated:
+                absent[f"actual.{name}"] = None
     if assembly.effects.rotors is not None:  # not 0: rotors with inertia need a lag
         absent |= {"effects.rotors.rise": 0.5 * SHORTEST_LAG, "effects.rotors.fall": 0.5 * SHORTEST_LAG}
     return absent
@@ -149,25 +153,26 @@ def _actual(assembly: Assembly) -> list[Unmodelled]:
     actual = assembly.scenario.actual
     if actual is None:
         return []
-    found: list[Unmodelled] = []
+    entries: list[Unmodelled] = []
     for name, value in actual.overrides().items():
         if value == getattr(assembly.vehicle, name) or name in ("rotor_rise", "rotor_fall"):
             continue
-        stated = [*value] if isinstance(value, tuple) else value
-        quantity = _VARIED.get(name, "")
-        remedy = f"vehicle.{name} = {stated}"
+        stated = value
+        if isinstance(value, tuple):
+            stated = [*value]
         entry = Unmodelled(
-            quantity=quantity,
+            quantity=_QUANTITY_OF_PARAMETER.get(name, ""),
             text=f"actual.{name}",
-            remedy=remedy,
+            remedy=f"vehicle.{name} = {stated}",
             absent={f"actual.{name}": None},
             settings={f"vehicle.{name}": stated},
         )
-        found.append(entry)
-    return found
+        entries.append(entry)
+    return entries
 
 
-_VARIED: Final = {"mass": "mass", "inertia": "inertia", "thrust_coefficient": "thrust"}
+_QUANTITY_OF_PARAMETER: Final = {"mass": "mass", "inertia": "inertia", "thrust_coefficient": "thrust"}
+"""What `quadsim stability --over` calls parameters of the vehicle that it varies."""
 
 
 def unpredicted(assembly: Assembly) -> tuple[Unmodelled, ...]:
@@ -192,9 +197,9 @@ def _drag(spec: Nonlinear, assembly: Assembly) -> list[Unmodelled]:
     air = assembly.effects.air
     if air is None or spec.disturbance is not None or any((*spec.drag, *spec.quadratic_drag)):
         return []
-    of_rotors = N_ROTORS * assembly.vehicle.hover_speed * (air.rotor_drag or 0.0)
+    rotor_drag = N_ROTORS * assembly.vehicle.hover_speed * (air.rotor_drag or 0.0)
     x, y, z = air.linear_drag
-    linear = [float(f"{drag:.4g}") for drag in (x + of_rotors, y + of_rotors, z)]
+    linear = [float(f"{drag:.4g}") for drag in (x + rotor_drag, y + rotor_drag, z)]
     quadratic = [*air.quadratic_drag]
     settings: dict[str, Any] = {}
     if any(linear):
@@ -216,8 +221,10 @@ def _moments(spec: AnyController, assembly: Assembly) -> list[Unmodelled]:
     air = assembly.effects.air
     vehicle = assembly.vehicle
     fields = vars(spec)
-    modelled = any(np.any(getattr(vehicle, name) or 0.0) for name in AIR_MOMENT)
-    if air is None or not modelled or fields.get("moment", False) or fields.get("commands", ROTORS) != ROTORS:
+    vehicle_has_moments = any(np.any(getattr(vehicle, name) or 0.0) for name in AIR_MOMENT)
+    is_predicted = fields.get("moment", False)
+    commands_rotors = fields.get("commands", ROTORS) == ROTORS
+    if air is None or not vehicle_has_moments or is_predicted or not commands_rotors:
         return []
     absent = {
         "effects.air.rotor_moment": [0.0, 0.0],
@@ -261,11 +268,12 @@ def _forces(spec: Nonlinear | Bounded, assembly: Assembly) -> list[Unmodelled]:
 def worst_heading(assembly: Assembly) -> float:
     """Return the heading farthest from zero that the course, or a set-point, has for `HELD_FOR` seconds [deg]."""
     headings = wrapped(course_headings(assembly))
-    held = min(max(round(HELD_FOR / assembly.scenario.control_period), 1), headings.size)
-    farthest = headings[np.argsort(np.abs(headings), kind="stable")[-held]]
+    periods_held = min(max(round(HELD_FOR / assembly.scenario.control_period), 1), headings.size)
+    nearest_first = np.argsort(np.abs(headings), kind="stable")
+    farthest = headings[nearest_first[-periods_held]]
     stated = [float(farthest)]
-    for event in assembly.scenario.events:
-        if isinstance(event, SetpointEvent) and "yaw" in event.values:
+    for event in events_of(assembly.scenario.events, SetpointEvent):
+        if "yaw" in event.values:
             stated.append(float(wrapped(event.values["yaw"])))
     return round(math.degrees(max(stated, key=abs)), 9)
 
@@ -277,7 +285,7 @@ def modelling_changes(assembly: Assembly) -> list[dict[str, Any]]:
     with them, as a state that the old model led to may lie beyond hard ones; a heading comes without them, too.
     """
     spec = assembly.scenario.controller
-    lacking = [dict(entry.settings) for entry in unmodelled(assembly)]
+    lacking = [{**entry.settings} for entry in unmodelled(assembly)]
     others = [_softened(spec, entry.settings) for entry in unpredicted(assembly)]
     if not lacking:
         return others
@@ -295,25 +303,29 @@ def modelling_changes(assembly: Assembly) -> list[dict[str, Any]]:
 
 def _softened(spec: AnyController, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return a change with soft bounds, named after the law, where it is one of `robust` with hard ones."""
-    law = {path: name for path, name in settings.items() if path == "controller.type"}
-    is_robust = isinstance(spec, Robust) or law.get("controller.type") == "robust"
+    new_type = settings.get("controller.type")
+    is_robust = isinstance(spec, Robust) or new_type == "robust"
     if not is_robust or vars(spec).get("soft") is not None:
         return {**settings}
-    return {**law, "controller.soft": {}, **settings}
+    softened: dict[str, Any] = {}
+    if new_type is not None:  # first: it replaces the whole table
+        softened["controller.type"] = new_type
+    softened["controller.soft"] = {}
+    return {**softened, **settings}
 
 
 def model_notes(assembly: Assembly) -> list[str]:
     """Return a line if the plant's rotors lag and a predictive controller of the scenario predicts none."""
     scenario = assembly.scenario
     lag = _stated_lag(assembly)
-    laws = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
-    ideal = [spec for spec in laws if _predicts_ideal_rotors(spec, assembly)]
-    if lag < SHORTEST_LAG or not ideal:
+    if lag < SHORTEST_LAG:
         return []
-    remedy = _lag_remedy(ideal[0], assembly, lag)
-    return [
-        f"the rotors lag by {1e3 * lag:.4g} ms, and {ideal[0].type} predicts none; to predict it: {', '.join(remedy)}"
-    ]
+    controllers = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
+    for spec in controllers:
+        if _predicts_ideal_rotors(spec, assembly):
+            remedy = ", ".join(_lag_remedy(spec, assembly, lag))
+            return [f"the rotors lag by {1e3 * lag:.4g} ms, and {spec.type} predicts none; to predict it: {remedy}"]
+    return []
 
 
 def _stated_lag(assembly: Assembly) -> float:
@@ -335,6 +347,7 @@ def _lag_remedy(spec: AnyController, assembly: Assembly, lag: float) -> list[str
 
 
 def _predicts_ideal_rotors(spec: AnyController, assembly: Assembly) -> bool:
+    """Return whether a predictive law commands rotor speeds and takes the rotors to follow at once."""
     if isinstance(spec, Robust | Nonlinear):  # an autopilot's lags include that of its rotors
         return spec.commands == ROTORS and resolved_lag(spec.rotor_lag, assembly.vehicle) == 0.0
     return isinstance(spec, Weighted)

@@ -1,6 +1,7 @@
 """User-defined controllers and forces: located by name, imported, called, and adapted to the protocol.
 
-`controller = "my_package.my_module:MyController"`
+`controller = "my_package.my_module:MyController"` in a file becomes a `Plugin`. `import_plugin` imports its code,
+`make_law` calls that and wraps the object in a `PluginController`, which the loop calls as any other controller.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from importlib.machinery import PathFinder
@@ -141,21 +142,21 @@ def located(controller: Any, beside: Path) -> Any:
     `beside` is the default folder if the module is there.
     """
     if isinstance(controller, str):
-        table = {"type": controller}
+        table: Any = {"type": controller}
     else:
         table = controller
-    if isinstance(table, Mapping):
-        name = table.get("type")
-    else:
-        name = None
+    if not isinstance(table, Mapping):
+        return controller
+    name = table.get("type")
     if not isinstance(name, str) or ":" not in name:
         return controller
     folder = table.get("folder")
     if isinstance(folder, str) and (beside / folder).is_dir():
         return {**table, "folder": str((beside / folder).resolve())}
-    first = beside / name.partition(":")[0].partition(".")[0]
-    is_beside = "folder" not in table and (first.is_dir() or first.with_suffix(".py").is_file())
-    if is_beside:
+    module, _, _ = name.partition(":")
+    package = beside / module.partition(".")[0]
+    is_beside = package.is_dir() or package.with_suffix(".py").is_file()
+    if is_beside and "folder" not in table:
         return {**table, "folder": str(beside.resolve())}
     return controller
 
@@ -207,7 +208,9 @@ class PluginController:
     def adopt(self, previous: object) -> None:
         """See `quadsim.controller.Adopting`; from another user's law to the law itself."""
         if isinstance(self.law, Adopting):
-            self.law.adopt(previous.law if isinstance(previous, PluginController) else previous)
+            if isinstance(previous, PluginController):
+                previous = previous.law
+            self.law.adopt(previous)
 
     def predict(self, states: Array, plans: Array) -> Array | None:
         """See `quadsim.controller.Predicting`; raises InputError if the law's answer has another shape."""
@@ -230,47 +233,83 @@ class PluginController:
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError if the answer is not a command."""
-        acting, attitude, rates, unseen = (
-            None if rows is None else rows.copy() for rows in (now.acting, now.attitude, now.body_rates, now.unseen)
-        )
-        if now.motion is None:
-            motion = None
-        else:
-            motion = now.motion.read_only()
-        given = replace(now, acting=acting, attitude=attitude, body_rates=rates, motion=motion, unseen=unseen)
-        named = state.copy().view(State)
-        answer: Any = self.law.step(given, named, reference.copy())
+        state_with_names = state.copy().view(State)
+        answer: Any = self.law.step(_copied(now), state_with_names, reference.copy())
         try:
             if not isinstance(answer, Command):
-                answer = Command(speeds=answer, plan=np.tile(_numbers(answer, (self._size,), "it"), (self.horizon, 1)))
-            parts: dict[str, Any] = {"fallback": operator.index(answer.fallback), "stats": _checked(answer.stats)}
-            parts |= {name: printable(getattr(answer, name))[:200] for name in ("status", "answered_by")}
-            parts["iterations_by"] = LAW
-            parts["speeds"] = _numbers(answer.speeds, (self._size,), "its speeds")
-            parts["plan"] = _numbers(answer.plan, (self.horizon, self._size), "its plan")
-            if self._size > N_ROTORS:
-                for row in (parts["speeds"], *parts["plan"]):
-                    if not abs(float(np.linalg.norm(row[N_ROTORS:])) - 1.0) < 1e-6:
-                        raise ValueError("its attitude must be a unit quaternion")
-            if answer.inner is not None and self.commands != ROTORS:
-                raise ValueError("it commands targets, so the autopilot is its inner loop")
-            if answer.inner is not None and not answer.inner.rate > 0.0:
-                raise ValueError("its inner loop must have a positive rate")
-            return replace(answer, **parts)
+                numbers = _numbers(answer, (self._size,), "it")
+                answer = Command(speeds=answer, plan=np.tile(numbers, (self.horizon, 1)))
+            return self._checked_command(answer)
         except (AttributeError, TypeError, ValueError) as error:
             what = COMMANDED_NUMBERS[self.commands]
             problem = f"{self.name} answered {answer!r:.100}, neither a Command nor {what}: {error}"
             raise CommandError(problem, time=now.time) from error
 
+    def _checked_command(self, command: Command) -> Command:
+        """Return a user's command with plain values and copied arrays.
 
-def _checked(stats: Any) -> Statistics:
+        Raises:
+            AttributeError, TypeError, ValueError: a part of it is not what it must be.
+        """
+        fallback = operator.index(command.fallback)
+        stats = _checked_statistics(command.stats)
+        status = printable(command.status)[:200]
+        answered_by = printable(command.answered_by)[:200]
+        speeds = _numbers(command.speeds, (self._size,), "its speeds")
+        plan = _numbers(command.plan, (self.horizon, self._size), "its plan")
+        if self._size > N_ROTORS:
+            for row in (speeds, *plan):
+                length = float(np.linalg.norm(row[N_ROTORS:]))
+                if not abs(length - 1.0) < 1e-6:
+                    raise ValueError("its attitude must be a unit quaternion")
+        if command.inner is not None and self.commands != ROTORS:
+            raise ValueError("it commands targets, so the autopilot is its inner loop")
+        if command.inner is not None and not command.inner.rate > 0.0:
+            raise ValueError("its inner loop must have a positive rate")
+        return replace(
+            command,
+            fallback=fallback,
+            stats=stats,
+            status=status,
+            answered_by=answered_by,
+            iterations_by=LAW,
+            speeds=speeds,
+            plan=plan,
+        )
+
+
+def _copied(now: StepInputs) -> StepInputs:
+    """Return the inputs of a step with arrays of their own, so that a user's controller may write to them."""
+    motion = now.motion
+    if motion is not None:
+        motion = motion.read_only()
+    return replace(
+        now,
+        acting=_copy(now.acting),
+        attitude=_copy(now.attitude),
+        body_rates=_copy(now.body_rates),
+        motion=motion,
+        unseen=_copy(now.unseen),
+    )
+
+
+def _copy(rows: Array | None) -> Array | None:
+    if rows is None:
+        return None
+    return rows.copy()
+
+
+def _checked_statistics(stats: Any) -> Statistics:
     """Return statistics as plain numbers, whole where they are counts."""
     if not isinstance(stats, Statistics):
         raise TypeError(f"its stats must be quadsim.Statistics; got {stats!r:.80}")
     values: tuple[Any, ...] = stats
     numbers: list[Any] = []
-    for usual, value in zip(NO_STATISTICS, values, strict=True):
-        numbers.append(operator.index(value) if isinstance(usual, int) else float(numbers_of(value)))
+    for default, value in zip(NO_STATISTICS, values, strict=True):
+        if isinstance(default, int):
+            numbers.append(operator.index(value))
+        else:
+            numbers.append(float(numbers_of(value)))
     return Statistics(*numbers)
 
 
@@ -283,6 +322,7 @@ def _optional(read: Callable[[], Any], default: Any) -> Any:
 
 
 def _numbers(numbers: Any, shape: tuple[int, ...], name: str) -> Array:
+    """Return a copy of a user's numbers, which messages call `name`; they must have the shape."""
     array = numbers_of(numbers)
     if array.shape != shape:
         raise InputError(f"{name} must have shape {shape}; got {array.shape}")
@@ -291,31 +331,41 @@ def _numbers(numbers: Any, shape: tuple[int, ...], name: str) -> Array:
 
 def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginController:
     """Return the controller of a function law(now, state, reference), a class, an object, or a factory of one."""
-    if (code := _code_of(law)) is not type(law):
+    code = _code_of(law)
+    is_object = code is type(law)
+    if not is_object:
         if isinstance(code, type) or "vehicle" in inspect.signature(code).parameters:
             law = _call(code, spec, {"vehicle": vehicle}, period=period, horizon=spec.horizon)
         else:
-            try:
-                inspect.signature(code).bind(None, None, None, **spec.settings)
-            except TypeError as error:
-                if inspect.ismethod(code):
-                    what = "bound method"
-                else:
-                    what = "function"
-                given = f"the {what} {code.__qualname__}{inspect.signature(code)}"
-                raise InputError(f"controller must be {_STEP}; got {given}: {error}") from error
-            law = SimpleNamespace(step=functools.partial(code, **spec.settings), name=code.__name__)
+            law = _stepping_by(code, spec)
     with user_code(lambda error: InputError(f"{_table(spec)}: {spec.type} cannot be used: {reason_of(error)}")):
-        steps = isinstance(law, Stepping) and callable(law.step)
-    if not steps:
+        has_step = isinstance(law, Stepping) and callable(law.step)
+    if not has_step:
         raise ParameterError("controller", "type", f"{spec.type} ({law!r:.100})", _STEP)
     return PluginController(law, spec.horizon)
 
 
+def _stepping_by(function: Any, spec: Plugin) -> SimpleNamespace:
+    """Return an object whose step is a function law(now, state, reference), with the settings as further arguments."""
+    signature = inspect.signature(function)
+    try:
+        signature.bind(None, None, None, **spec.settings)
+    except TypeError as error:
+        if inspect.ismethod(function):
+            what = "bound method"
+        else:
+            what = "function"
+        given = f"the {what} {function.__qualname__}{signature}"
+        raise InputError(f"controller must be {_STEP}; got {given}: {error}") from error
+    return SimpleNamespace(step=functools.partial(function, **spec.settings), name=function.__name__)
+
+
 def make_force(force: Any, spec: PluginForce, vehicle: Vehicle, rng: np.random.Generator) -> Force:
     """Return the force of a function force(time, state), a callable object, or a class of such; see `make_law`."""
-    if isinstance(code := _code_of(force), type):
-        if code is not type(force):
+    code = _code_of(force)
+    if isinstance(code, type):
+        is_object = code is type(force)
+        if not is_object:
             force = _call(code, spec, {"vehicle": vehicle}, rng=rng)
     else:
         _call(inspect.signature(code).bind, spec, dict.fromkeys(("time", "state")))
@@ -344,12 +394,13 @@ def import_plugin(spec: Plugin | PluginForce) -> Any:
     else:
         place = metadata.entry_points(group=ENTRY_POINTS)[spec.type].value
     module, _, attribute = place.partition(":")
-    folders = [*filter(None, [spec.folder]), str(Path.cwd())]
+    folders = [str(Path.cwd())]
+    if spec.folder:
+        folders.insert(0, spec.folder)
     top = module.partition(".")[0]
     imported: Any = _import(module, folders, _table(spec))
     file = getattr(sys.modules[top], "__file__", None) or "Python"
-    files = [Path(folder, name) for folder in folders for name in (f"{top}.py", f"{top}/__init__.py")]
-    hidden_file = next(filter(Path.is_file, files), None)
+    hidden_file = _first_file(top, folders)
     if hidden_file is not None and hidden_file.resolve() != Path(file).resolve():
         raise InputError(
             f"{_table(spec)}.type: {hidden_file} is hidden by another module {top}, from {file}; rename it"
@@ -364,6 +415,16 @@ def import_plugin(spec: Plugin | PluginForce) -> Any:
             raise UnknownNameError(f"{_table(spec)}.type in {getattr(imported, '__name__', module)}", part, names)
         imported = getattr(imported, part)
     return imported
+
+
+def _first_file(module: str, folders: Sequence[str]) -> Path | None:
+    """Return the file of a module or package in the first of the folders that has one."""
+    for folder in folders:
+        for name in (f"{module}.py", f"{module}/__init__.py"):
+            file = Path(folder, name)
+            if file.is_file():
+                return file
+    return None
 
 
 _imported: Final[dict[str, str]] = {}
@@ -381,15 +442,7 @@ def _import(module: str, folders: Sequence[str], table: str) -> Any:
     writes = sys.dont_write_bytecode
     search = [*path, *folders]  # last, so that installed modules take precedence
     importlib.invalidate_caches()
-    if getattr(sys.modules.get(top), "__file__", None) in _imported:
-        spec = PathFinder.find_spec(top, search)
-        changed = [file for file, digest in _digests(_imported).items() if digest != _imported[file]]
-        changed += [spec.origin] if spec is not None and spec.origin and spec.origin not in _imported else []
-        if changed:
-            _log.warning("%s changed: %s is imported again", ", ".join(changed), module)
-            for name in [name for name, held in sys.modules.items() if getattr(held, "__file__", None) in _imported]:
-                del sys.modules[name]
-            _imported.clear()
+    _forget_if_changed(module, search)
     before = {*sys.modules}
     try:
         sys.path[:] = search
@@ -399,28 +452,57 @@ def _import(module: str, folders: Sequence[str], table: str) -> Any:
     finally:
         sys.path[:] = path
         sys.dont_write_bytecode = writes
-        new = [name for name in sys.modules if name not in before or name.partition(".")[0] == top]
-        files = {getattr(sys.modules[name], "__file__", None) or "" for name in new}
-        installed = (*_INSTALLED, *OUR_FOLDERS)
-        users = []
-        for file in files - {*_imported}:
+        for file in _files_of_users(top, before) - {*_imported}:
+            _imported[file] = _digest(file)
+
+
+def _forget_if_changed(module: str, search: Sequence[str]) -> None:
+    """Forget all modules of users if a file of theirs has changed, or `module` is in another file now."""
+    top = module.partition(".")[0]
+    if getattr(sys.modules.get(top), "__file__", None) not in _imported:
+        return
+    changed = []
+    for file, digest in _imported.items():
+        if _digest(file) != digest:
+            changed.append(file)
+    spec = PathFinder.find_spec(top, search)
+    if spec is not None and spec.origin and spec.origin not in _imported:
+        changed.append(spec.origin)
+    if not changed:
+        return
+    _log.warning("%s changed: %s is imported again", ", ".join(changed), module)
+    for name, loaded in [*sys.modules.items()]:
+        if getattr(loaded, "__file__", None) in _imported:
+            del sys.modules[name]
+    _imported.clear()
+
+
+def _files_of_users(top: str, before: Set[str]) -> set[str]:
+    """Return the files of users' modules that are not among those loaded before, or are in the package `top`."""
+    installed = (*_INSTALLED, *OUR_FOLDERS)
+    files = set()
+    for name, loaded in [*sys.modules.items()]:
+        if name not in before or name.partition(".")[0] == top:
+            file = getattr(loaded, "__file__", None) or ""
             if file.endswith(".py") and not file.startswith(installed):
-                users.append(file)
-        _imported.update(_digests(users))
+                files.add(file)
+    return files
 
 
-def _digests(files: Iterable[str]) -> dict[str, str]:
-    """Return the digest of each file; of one that is gone, an empty text."""
-    return {file: digest_of(Path(file)) if Path(file).is_file() else "" for file in files}
+def _digest(file: str) -> str:
+    """Return the digest of a file; of one that is gone, an empty text."""
+    if Path(file).is_file():
+        return digest_of(Path(file))
+    return ""
 
 
 def _no_module(module: str, folders: Sequence[str], table: str, error: BaseException) -> InputError:
+    """Return the error about a module that cannot be imported; one that is absent, with where it is looked for."""
+    problem = f"{table}.type: {module} cannot be imported: {reason_of(error)}"
     absent = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
     if absent:
-        where = f"; it is looked for among what is installed, and in {', '.join(folders)}"
-    else:
-        where = ""
-    return InputError(f"{table}.type: {module} cannot be imported: {reason_of(error)}{where}")
+        problem += f"; it is looked for among what is installed, and in {', '.join(folders)}"
+    return InputError(problem)
 
 
 def refer_to(law: object, horizon: int = 1) -> Plugin:
@@ -429,13 +511,13 @@ def refer_to(law: object, horizon: int = 1) -> Plugin:
     file = getattr(sys.modules.get(code.__module__), "__file__", None)
     folder = None
     if file is not None and not file.startswith(_INSTALLED):
-        folder = str(Path(file).resolve().parents[code.__module__.count(".") + file.endswith("__init__.py")])
-    place = f"{code.__module__}:{code.__qualname__.replace('<locals>.', '').replace('<lambda>', 'law')}"
+        depth = code.__module__.count(".") + file.endswith("__init__.py")  # of the file below that folder
+        folder = str(Path(file).resolve().parents[depth])
+    name = code.__qualname__.replace("<locals>.", "").replace("<lambda>", "law")
+    settings: dict[str, Any] = {}
     if isinstance(law, functools.partial):
         settings = law.keywords
-    else:
-        settings = {}
-    return Plugin(type=place, horizon=horizon, folder=folder, settings=settings)
+    return Plugin(type=f"{code.__module__}:{name}", horizon=horizon, folder=folder, settings=settings)
 
 
 def require_importable(law: object, what: str = "controller") -> None:
@@ -451,18 +533,18 @@ def require_importable(law: object, what: str = "controller") -> None:
 
 def _code_of(law: Any) -> Any:
     """Return the class or function of a law, directly or in a partial; the class of an object."""
+    code = law
     if isinstance(law, functools.partial):
+        if law.args:
+            raise ParameterError("", "controller", law, "a partial with keyword arguments only")
         code = law.func
-    else:
-        code = law
-    if isinstance(law, functools.partial) and law.args:
-        raise ParameterError("", "controller", law, "a partial with keyword arguments only")
     if isinstance(code, type) or inspect.isroutine(code):
         return code
     return type(code)
 
 
 def _table(spec: Plugin | PluginForce) -> str:
+    """Return the table of the scenario file that names the code."""
     if isinstance(spec, PluginForce):
         return "forces"
     return "controller"

@@ -21,7 +21,7 @@ from quadsim.state import POSITION
 if TYPE_CHECKING:
     from quadsim.scenarios.assembly import Assembly
 
-_RESTING: Final = 1e-9  # vertical speed attributed to rounding [m/s]
+_ROUNDING_SPEED: Final = 1e-9  # vertical speed attributed to rounding [m/s]
 
 
 def checked(assembly: Assembly) -> Assembly:
@@ -89,7 +89,7 @@ def _check_floor(assembly: Assembly) -> None:
         raise ParameterError("initial", "position", position, rule)
     ground = assembly.scenario.effects.ground
     sinking = -touching_speed(state, np.radians(initial.body_rates), shape)
-    if sinking > _RESTING and ground is not None and ground.contact:
+    if sinking > _ROUNDING_SPEED and ground is not None and ground.contact:
         if initial.velocity[2] < 0.0:
             name = "velocity"
         else:

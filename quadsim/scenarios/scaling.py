@@ -97,8 +97,10 @@ def scaled_table(table: Any, scale: Scale) -> Any:
     if isinstance(table, Headed) and not table.looks_ahead:
         changed["yaw_rate"] = table.yaw_rate  # without effect
     if isinstance(table, Region) and table.rows is not None:
-        raised = zip(changed["upper"], table.rows, strict=True)
-        changed["upper"] = tuple(significant(upper + row[2] * scale.lift) for upper, row in raised)
+        raised = []
+        for upper, row in zip(changed["upper"], table.rows, strict=True):
+            raised.append(significant(upper + row[2] * scale.lift))
+        changed["upper"] = tuple(raised)
     return replace(table, **changed)
 
 
@@ -154,13 +156,12 @@ def _scaled_steps(table: Steps, scale: Scale) -> Steps:
             result.append(Window(start=start, stop=stop, value=value))
         return tuple(result)
 
-    return replace(
-        table,
-        response_time=scale.number(table.response_time, "s"),
-        repeat=None if table.repeat is None else scale.number(table.repeat, "s"),
-        x=windows("x"),
-        y=windows("y"),
-        z=windows("z"),
-        yaw=table.yaw if isinstance(table.yaw, str) else windows("yaw"),
-        yaw_rate=scale.number(table.yaw_rate, "deg/s") if table.looks_ahead else table.yaw_rate,
-    )
+    changed: dict[str, Any] = {"x": windows("x"), "y": windows("y"), "z": windows("z")}
+    changed["response_time"] = scale.number(table.response_time, "s")
+    if table.repeat is not None:
+        changed["repeat"] = scale.number(table.repeat, "s")
+    if not isinstance(table.yaw, str):
+        changed["yaw"] = windows("yaw")
+    if table.looks_ahead:
+        changed["yaw_rate"] = scale.number(table.yaw_rate, "deg/s")
+    return replace(table, **changed)

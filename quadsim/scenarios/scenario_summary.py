@@ -26,16 +26,21 @@ def scenario_html(scenario: Scenario) -> str:
         True
     """
     controller = scenario.controller
-    bounds = {name: f"{low:g} to {high:g}" for name, (low, high) in controller.output_bounds.items()}
+    bounds = []
+    for name, (low, high) in controller.output_bounds.items():
+        bounds.append(f"{name} {low:g} to {high:g}")
     rows = {
         "duration": f"{scenario.duration:g} s, {scenario.periods} periods of {scenario.control_period:g} s",
         "vehicle": str(scenario.vehicle.file),
         "course": scenario.reference.type,
         "controller": f"{controller.type}, horizon {controller.horizon}",
-        "output bounds": ", ".join(f"{name} {ends}" for name, ends in bounds.items()),
+        "output bounds": ", ".join(bounds),
         "audited": ", ".join(scenario.audited_names),
     }
-    table = "".join(f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in rows.items() if text)
+    table = ""
+    for name, text in rows.items():
+        if text:
+            table += f"<tr><th>{name}</th><td>{escape(text)}</td></tr>"
     head = f"<p><b>{escape(scenario.name)}</b>: {escape(scenario.description)}</p><table>{table}</table>"
     try:
         figure = course_figure(scenario)
@@ -48,10 +53,8 @@ def course_figure(scenario: Scenario) -> Figure:
     """The filtered reference of x, y and z over time."""
     reference = assemble(scenario).reference(scenario.periods)
     t = scenario.control_period * np.arange(len(reference), dtype=np.float64)
-    panels = tuple(
-        Panel(
-            title=name, unit="m", series=(Series(x=t, y=column, colour=COLOUR.reference, label="reference, filtered"),)
-        )
-        for name, column in zip("xyz", reference.T[:3], strict=True)
-    )
-    return Figure(key="course", title="", panels=panels, columns=1, end=scenario.duration)
+    panels = []
+    for name, column in zip("xyz", reference.T[:3], strict=True):
+        curve = Series(x=t, y=column, colour=COLOUR.reference, label="reference, filtered")
+        panels.append(Panel(title=name, unit="m", series=(curve,)))
+    return Figure(key="course", title="", panels=tuple(panels), columns=1, end=scenario.duration)

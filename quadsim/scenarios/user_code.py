@@ -33,8 +33,12 @@ def named(scenario: Scenario, controller: object, forces: Sequence[object] = ())
     elif controller is not None:
         changes["controller"] = plain(refer_to(controller, horizon))
     if forces:
-        specs = [*scenario.forces, *(refer_to(force) for force in forces)]
-        changes["forces"] = [{name: part for name, part in plain(spec).items() if name != "horizon"} for spec in specs]
+        tables = []
+        for spec in (*scenario.forces, *map(refer_to, forces)):
+            table = plain(spec)
+            table.pop("horizon", None)  # which a controller has
+            tables.append(table)
+        changes["forces"] = tables
     if changes:
         return scenario.replace(changes)
     return scenario
@@ -62,16 +66,21 @@ def following(assembly: Assembly, reference: object) -> Assembly:
     scenario = assembly.scenario
     if not callable(reference):
         raise ParameterError("", "reference", reference, "a function f(t) that returns x, y, z [m], yaw [rad]")
-    specs = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
-    samples = scenario.periods + max(spec.horizon for spec in specs) + 1
+    longest_horizon = scenario.controller.horizon
+    for _, spec in scenario.controller_changes:
+        longest_horizon = max(longest_horizon, spec.horizon)
+    samples = scenario.periods + longest_horizon + 1
     t = scenario.control_period * np.arange(samples, dtype=np.float64)
-    course = tabulated("reference.csv", t, np.array([_pose(reference, time) for time in t.tolist()]))
+    poses = np.array([_pose(reference, time) for time in t.tolist()])
+    course = tabulated("reference.csv", t, poses)
     return checked(Assembly(scenario.altered(reference=course, duration=scenario.duration), assembly.vehicle))
 
 
 def _pose(reference: Callable[[float], Any], time: float) -> Array:
+    """Return (4,) what the function gives for a time [s]: x, y, z [m], yaw [rad]."""
     with user_code(lambda error: InputError(f"reference: f({time:g}) cannot be used: {reason_of(error)}")):
-        pose = numbers_of(answer := reference(time))
+        answer = reference(time)
+        pose = numbers_of(answer)
     if pose.shape != (4,) or not (np.abs(pose) <= LARGEST_NUMBER).all():
         rule = f"four numbers within +-{LARGEST_NUMBER:g}: x, y, z [m], yaw [rad]"
         raise InputError(f"reference: f({time:g}) must be {rule}; got {answer!r:.200}")
@@ -94,16 +103,17 @@ def set_up(
         assembly = following(assembly, reference)
     assembly.user_autopilot = autopilot
     scenario = assembly.scenario
-    law = None
+    pilot = None
     acting = None
     flown = named(scenario, controller, forces)
     if controller is not None and not isinstance(controller, str):
         spec = refer_to(controller, scenario.controller.horizon)
-        own = make_law(controller, spec, assembly.vehicle, scenario.control_period)
-        law = assembly.with_autopilot(Pilot(own, assembly.vehicle))
+        user_controller = make_law(controller, spec, assembly.vehicle, scenario.control_period)
+        pilot = assembly.with_autopilot(Pilot(user_controller, assembly.vehicle))
     if forces:
+        codes = [*map(import_plugin, scenario.forces), *forces]
         rng = assembly.generator("forces")
-        pairs = [(import_plugin(spec), spec) for spec in scenario.forces]
-        pairs += zip(forces, flown.forces[len(pairs) :], strict=True)
-        acting = [make_force(force, spec, assembly.actual, rng) for force, spec in pairs]
-    return assembly.of(flown), law, acting
+        acting = []
+        for code, force_spec in zip(codes, flown.forces, strict=True):
+            acting.append(make_force(code, force_spec, assembly.actual, rng))
+    return assembly.of(flown), pilot, acting

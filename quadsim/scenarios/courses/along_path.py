@@ -45,11 +45,11 @@ def along_path(course: Course, *, response_time: float, rate: float) -> Course:
         response_time: tau_r of the filter that follows [s]; 0 for none.
         rate: at which the heading turns at most [rad/s].
     """
-    known = _Headings(course, response_time=response_time, rate=rate)
+    headings = _Headings(course, response_time=response_time, rate=rate)
 
     def sample(t: Array) -> Array:
         poses = course.sample(t)
-        return np.column_stack([poses[:, :3], known.at(t)])
+        return np.column_stack([poses[:, :3], headings.at(t)])
 
     jumps = np.array(course.jumps)
     if jumps.size:
@@ -84,18 +84,20 @@ class _Headings:
         if math.isinf(span):
             span = _BLOCK * 2.0 ** max(math.ceil(math.log2((latest + _AHEAD) / _BLOCK)), 0)
         count = min(math.ceil(span / _INTERVAL), _MOST_SAMPLES) + 1
-        t, interval = np.linspace(0.0, span, count, retstep=True)
+        t, step = np.linspace(0.0, span, count, retstep=True)
+        interval = float(step)
         positions = self._course.sample(t)[:, :3]
         if self._response_time:
-            keep = math.exp(-3.0 * float(interval) / self._response_time)
-            start = keep * self._course.initial[None, :3]
-            positions = lfilter([1.0 - keep], [1.0, -keep], positions, axis=0, zi=start)[0]
+            decay = math.exp(-3.0 * interval / self._response_time)
+            start = decay * self._course.initial[None, :3]
+            positions, _ = lfilter([1.0 - decay], [1.0, -decay], positions, axis=0, zi=start)
         before = float(self._course.initial[3])
-        heading = turned(directions(positions, float(interval), before), self._rate * float(interval), before)
-        heading = _rounded_off(heading, max(round(_AVERAGED / float(interval)), 1))
-        heading = limited(heading, self._rate * float(interval), before)
+        largest_change = self._rate * interval
+        heading = turned(directions(positions, interval, before), largest_change, before)
+        heading = _rounded_off(heading, max(round(_AVERAGED / interval), 1))
+        heading = limited(heading, largest_change, before)
         self._t = t
-        self._yaw = heading + self._response_time / 3.0 * np.gradient(heading, float(interval))
+        self._yaw = heading + self._response_time / 3.0 * np.gradient(heading, interval)
 
 
 def directions(positions: Array, interval: float, before: float) -> Array:

@@ -1,4 +1,8 @@
-"""Courses: a position and a yaw at any time; common fields of the tables `[reference]`."""
+"""Courses: a position and a yaw at any time; common fields of the tables `[reference]`.
+
+A table builds a `Path`, poses from time 0 to an end. `begin` makes a `Course` of it, poses at any time of the flight,
+which `quadsim.scenarios.courses.followed` samples and filters.
+"""
 
 from __future__ import annotations
 
@@ -64,10 +68,11 @@ def begin(path: Path, *, start: float, initial: Array) -> Course:
 
     A path that begins elsewhere makes the course jump at its start, but by less than a turn.
     """
-    turned = np.array([0.0, 0.0, 0.0, TURN * whole_turns(path.pose(np.zeros(1)).item(3) - float(initial[3]))])
-    if turned.any():
-        given = path.pose
-        path = replace(path, pose=lambda t: given(t) - turned)
+    first_yaw = path.pose(np.zeros(1)).item(3)
+    surplus_turns = np.array([0.0, 0.0, 0.0, TURN * whole_turns(first_yaw - float(initial[3]))])
+    if surplus_turns.any():
+        pose = path.pose
+        path = replace(path, pose=lambda t: pose(t) - surplus_turns)
 
     def sample(t: Array) -> Array:
         since = t - start
@@ -82,15 +87,21 @@ def begin(path: Path, *, start: float, initial: Array) -> Course:
         velocity, acceleration = path.derivatives(np.clip(since, 0.0, path.duration))
         return np.where(on_way, velocity, 0.0), np.where(on_way, acceleration, 0.0)
 
-    elsewhere = not np.allclose(path.pose(np.zeros(1))[0], initial, rtol=0.0, atol=1e-9)
+    jumps: tuple[float, ...] = ()
+    if not np.allclose(path.pose(np.zeros(1))[0], initial, rtol=0.0, atol=1e-9):
+        jumps = (start,)
     ends = {0.0, path.duration}  # a path need not begin or end at rest
+    kinks = tuple(start + time for time in sorted(ends | set(path.kinks)))
+    known_derivatives = None
+    if path.derivatives is not None:
+        known_derivatives = derivatives
     return Course(
         sample=sample,
         initial=initial,
-        jumps=(start,) if elsewhere else (),
-        kinks=tuple(start + time for time in sorted(ends | set(path.kinks))),
+        jumps=jumps,
+        kinks=kinks,
         resolution=path.resolution,
-        derivatives=None if path.derivatives is None else derivatives,
+        derivatives=known_derivatives,
         end=start + path.duration,
         free_heading=path.free_heading,
         notes=path.notes,
@@ -107,16 +118,27 @@ def repeated(course: Course, period: float, *, until: float) -> Course:
 
     def sample(t: Array) -> Array:
         rounds, since = np.divmod(np.round(t, 9), period)
-        return course.sample(since if closed else np.where(rounds % 2.0 == 0.0, since, period - since))
+        if closed:
+            return course.sample(since)
+        is_forward = rounds % 2.0 == 0.0
+        return course.sample(np.where(is_forward, since, period - since))
 
-    def spread(times: Sequence[float]) -> tuple[float, ...]:
-        within = [time for time in times if time <= period]
-        starts = [(i * period, closed or i % 2 == 0) for i in range(math.ceil(until / period))]
-        each = {start + (time if forward else period - time) for start, forward in starts for time in within}
-        return tuple(sorted(time for time in each if time < until))
+    def in_every_round(times: Sequence[float]) -> tuple[float, ...]:
+        instants = set()
+        for i in range(math.ceil(until / period)):
+            is_forward = closed or i % 2 == 0
+            for time in times:
+                if time > period:
+                    continue
+                if is_forward:
+                    instants.add(i * period + time)
+                else:
+                    instants.add(i * period + (period - time))
+        return tuple(sorted(instant for instant in instants if instant < until))
 
-    kinks = spread((0.0, *course.kinks, period))
-    return replace(course, sample=sample, jumps=spread(course.jumps), kinks=kinks, derivatives=None, end=math.inf)
+    jumps = in_every_round(course.jumps)
+    kinks = in_every_round((0.0, *course.kinks, period))
+    return replace(course, sample=sample, jumps=jumps, kinks=kinks, derivatives=None, end=math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,8 @@
-"""Courses from a CSV file."""
+"""Courses from a CSV file: its text becomes a `Table` of rows, and that a path through them.
+
+`quadsim.scenarios.courses.table_formats` says which column is which quantity, and
+`quadsim.scenarios.courses.table_checks` doubts or refuses numbers that contradict each other.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path as FilePath
@@ -22,6 +26,14 @@ from quadsim.input_limits import LARGEST_CSV
 from quadsim.rotation import quaternion_to_euler
 from quadsim.scenarios.courses.course import CLOSEST, EXACT, Course, Path, Travelled, begin
 from quadsim.scenarios.courses.legs import polyline
+from quadsim.scenarios.courses.table_checks import (
+    acceleration_notes,
+    check_turns,
+    distance_notes,
+    speed_notes,
+    velocity_notes,
+    yaw_notes,
+)
 from quadsim.scenarios.courses.table_formats import (
     ACCELERATION_QUANTITIES,
     PIECE_DURATION,
@@ -40,27 +52,11 @@ from quadsim.ties import TIE_SHARE, first_smallest
 POSE_HEADER: Final = ("t", "x", "y", "z", "yaw")
 LARGEST_NUMBER: Final = 1e6  # largest magnitude of a number in the table, as in the scenario file
 MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
-ROUNDED: Final = range(2, 8)
+ROUNDED_DECIMALS: Final = range(2, 8)
 """Decimals of a rounded column: with fewer its numbers are exact, with more rounding cannot be detected."""
-FAR = 50.0
-FAST = 50.0
-FASTEST = 340.0
-"""Distance of the first row from the vehicle [m] and mean speed [m/s] above which a table is doubted, those at which a
-flight is lost by default, and mean speed above which it is refused, that of sound."""
-TURNS = 5.0
-TURNING = 180.0
-FASTEST_TURNING = 2000.0
-"""The same for yaw: turns in all, and mean rates [deg/s]; the last is the full scale of the usual gyroscopes."""
-DISAGREEMENT: Final = 0.25
-"""Mean difference between stated and covered velocity, over the larger of both, above which a table is doubted."""
-SMALL: Final = 0.05  # such a difference that is never doubted [m/s]
-ALIKE: Final = 0.04  # relative difference up to which a ratio is that of a unit
-OVERSTATED: Final = 5.0  # stated over covered velocity, plus 1 m/s, above which a table is refused
 TableFactor = Annotated[float, Ge(1e-3), Le(1e3)]  # of a table's lengths or times
-UNIT_QUATERNION: Final = 0.01  # largest difference of a quaternion's length from 1
+QUATERNION_TOLERANCE: Final = 0.01  # largest difference of a quaternion's length from 1
 LARGEST_GAP: Final = 0.01  # between a piece and the next [m, rad]
-MILLIMETRES: Final = 1000.0  # per m
-SPEED_UNITS: Final = {"mm/s": 1000.0, "cm/s": 100.0, "km/h": 3.6, "ft/s": 3.281, "knots": 1.944}  # per m/s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,19 +114,26 @@ class Csv(Travelled):
         if self.sha256 not in (None, table.sha256):
             raise FileError(self.file, f"is not the file of the scenario: its SHA-256 is not {self.sha256}")
         if not table.has_yaw:
-            table = replace(table, poses=np.column_stack([table.poses[:, :3], np.full(len(table.t), initial[3])]))
+            initial_yaw = np.full(len(table.t), initial[3])
+            table = replace(table, poses=np.column_stack([table.poses[:, :3], initial_yaw]))
         table = self._rescaled_rows(table)
         course = begin(through_rows(table), start=self.start + float(table.t[0]), initial=initial)
-        return replace(course, notes=(*course.notes, *_far(table.poses[0, :3], initial[:3])))
+        return replace(course, notes=(*course.notes, *distance_notes(table.poses[0, :3], initial[:3])))
 
     def rescaled(self, *, length: float, time: float, lift: float) -> Csv:
         """Return the course with lengths and times multiplied, `start` included, and then raised [m]."""
+        repeat = self.repeat
+        if repeat is not None:
+            repeat = time * repeat
+        yaw_rate = self.yaw_rate
+        if self.looks_ahead:
+            yaw_rate = yaw_rate / time
         return replace(
             self,
             start=time * self.start,
             response_time=time * self.response_time,
-            repeat=None if self.repeat is None else time * self.repeat,
-            yaw_rate=self.yaw_rate / time if self.looks_ahead else self.yaw_rate,
+            repeat=repeat,
+            yaw_rate=yaw_rate,
             length_factor=length * self.length_factor,
             time_factor=time * self.time_factor,
             lift=length * self.lift + lift,
@@ -170,7 +173,8 @@ class Csv(Travelled):
         """
         for path in (directory / self.file, FilePath(self.file)):
             if path.is_file():
-                return replace(self, file=str(path.resolve()), sha256=self.sha256 or read_course_table(path).sha256)
+                digest = self.sha256 or read_course_table(path).sha256
+                return replace(self, file=str(path.resolve()), sha256=digest)
         return self
 
 
@@ -179,8 +183,10 @@ def tabulated(file: str, t: Array, poses: Array) -> Csv:
 
     Every digit is written, with an exponent: no column looks rounded.
     """
-    rows = (",".join(f"{value:.16e}" for value in row) for row in np.column_stack([t, poses]))
-    content = "\n".join([",".join(POSE_HEADER), *rows, ""]).encode()
+    lines = [",".join(POSE_HEADER)]
+    for row in np.column_stack([t, poses]):
+        lines.append(",".join(f"{value:.16e}" for value in row))
+    content = "".join(f"{line}\n" for line in lines).encode()
     course = Csv(type="csv", file=file, sha256=hashlib.sha256(content).hexdigest())
     vars(course).update(content=content)
     return course
@@ -195,7 +201,8 @@ def read_course_table(path: FilePath) -> Table:
     try:
         if path.exists() and not path.is_file():
             raise FileError(path, "cannot be read (it is not a file)")
-        if (size := path.stat().st_size) > LARGEST_CSV:
+        size = path.stat().st_size
+        if size > LARGEST_CSV:
             raise FileError(path, f"must be of {LARGEST_CSV} or fewer bytes; got {size}")
         content = path.read_bytes()
     except FileError:
@@ -214,6 +221,32 @@ def parse_rows(path: FilePath, content: bytes) -> Table:
         FileError: naming the row (the header is row 1) and the column that is wrong; or columns contradict each other,
             or are in another unit, beyond doubt.
     """
+    rows = _read_cells(path, content)
+    header: tuple[str, ...] = ()
+    if rows:
+        header = tuple(cell.strip().lower() for cell in rows[0])
+    if not header:
+        raise FileError(path, "row 1: must be a header, such as t,x,y,z,yaw; the file is empty")
+    known = table_format(header)
+    if known is None:
+        raise FileError(path, f"row 1: no known header, of {len(header)} columns; {nearest_format(header)}")
+    kind, places = known
+    fewest_rows = 2
+    if kind is POLYNOMIALS:
+        fewest_rows = 1
+    if len(rows) < fewest_rows + 1:
+        raise FileError(path, f"must have {fewest_rows} or more rows below its header; got {len(rows) - 1}")
+    if len(rows) > MOST_ROWS + 1:
+        raise FileError(path, f"must have {MOST_ROWS} or fewer rows below its header")
+    numbers = np.array([_parse_row(path, number, row, header) for number, row in enumerate(rows[1:], start=2)])
+    digest = hashlib.sha256(content).hexdigest()
+    if kind is POLYNOMIALS:
+        return _table_of_pieces(path, numbers, places, digest)
+    return _table_of_rows(path, rows, numbers, places, digest)
+
+
+def _read_cells(path: FilePath, content: bytes) -> list[list[str]]:
+    """Return the cells of a file, row by row, without empty rows at its end and an empty last column."""
     try:
         lines = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
         rows = list(islice(lines, MOST_ROWS + 2))
@@ -222,80 +255,39 @@ def parse_rows(path: FilePath, content: bytes) -> Table:
     while rows and not rows[-1]:
         rows.pop()
     if rows and len(rows[0]) > 1 and not any(row[-1].strip() for row in rows if row):
-        rows = [row[:-1] for row in rows]  # lines that end with a comma
-    if rows:
-        header = tuple(cell.strip().lower() for cell in rows[0])
-    else:
-        header = ()
-    if not header:
-        raise FileError(path, "row 1: must be a header, such as t,x,y,z,yaw; the file is empty")
-    known = table_format(header)
-    if known is None:
-        raise FileError(path, f"row 1: no known header, of {len(header)} columns; {nearest_format(header)}")
-    kind, places = known
-    least = 1 if kind is POLYNOMIALS else 2
-    if len(rows) < least + 1:
-        raise FileError(path, f"must have {least} or more rows below its header; got {len(rows) - 1}")
-    if len(rows) > MOST_ROWS + 1:
-        raise FileError(path, f"must have {MOST_ROWS} or fewer rows below its header")
-    numbers = np.array([_parse_row(path, number, row, header) for number, row in enumerate(rows[1:], start=2)])
-    digest = hashlib.sha256(content).hexdigest()
-    if kind is POLYNOMIALS:
-        return _table_of_pieces(path, numbers, places, digest)
-    return _table_of_rows(path, rows, header, numbers, places, digest)
+        return [row[:-1] for row in rows]  # lines that end with a comma
+    return rows
 
 
 def _table_of_rows(
-    path: FilePath,
-    rows: list[list[str]],
-    header: tuple[str, ...],
-    numbers: Array,
-    places: Mapping[str, int],
-    digest: str,
+    path: FilePath, rows: list[list[str]], numbers: Array, places: Mapping[str, int], digest: str
 ) -> Table:
     """Return the table of a file with a row per instant."""
     t = numbers[:, places["t"]]
-    if t[0] < 0.0:
-        raise FileError(path, f"row 2, column t: must be >= 0; got {rows[1][places['t']]}")
-    (late,) = np.nonzero(np.diff(t) <= 0.0)
-    if late.size:
-        number = int(late[0]) + 3
-        rule = f"must be above that of the row before = {rows[number - 2][places['t']]}"
-        raise FileError(path, f"row {number}, column t: {rule}; got {rows[number - 1][places['t']]}")
-
-    def columns(quantities: Sequence[str]) -> Array | None:
-        """(n, k) the numbers of quantities; None where the file has none."""
-        if quantities[0] not in places:
-            return None
-        return numbers[:, [places[quantity] for quantity in quantities]]
-
+    _check_increasing(path, t, rows, places["t"])
     positions = numbers[:, [places[quantity] for quantity in POSITION_QUANTITIES]]
-    yaw = columns(("yaw",))
-    quaternion = columns(QUATERNION_QUANTITIES)
+    yaw = _columns(numbers, places, ("yaw",))
+    quaternion = _columns(numbers, places, QUATERNION_QUANTITIES)
     heading = np.zeros(len(t))
     if yaw is not None:
         heading = yaw[:, 0].copy()
     elif quaternion is not None:
         heading = _yaw_of(path, quaternion)
-    _check_turns(path, heading)
+    check_turns(path, heading)
     poses = np.column_stack([positions, unwrapped(heading, float(heading[0]))])
-    velocities = columns(VELOCITY_QUANTITIES)
-    accelerations = columns(ACCELERATION_QUANTITIES)
-    rounded = [places[quantity] for quantity in POSITION_QUANTITIES] + ([places["yaw"]] if yaw is not None else [])
-    resolution = []
-    for column in rounded:
-        resolution.append(_resolution(row[column] for row in rows[1:]))
-    resolution += [0.0] * (len(EXACT) - len(resolution))
-    notes = [*_speed_notes(path, t, positions), *_yaw_notes(path, t, poses[:, 3])]
+    velocities = _columns(numbers, places, VELOCITY_QUANTITIES)
+    accelerations = _columns(numbers, places, ACCELERATION_QUANTITIES)
+    resolution = _resolutions(rows, places)
+    notes = [*speed_notes(path, t, positions), *yaw_notes(path, t, poses[:, 3])]
     if velocities is not None:
-        notes += _velocity_notes(path, t, poses, velocities, resolution)
-    if accelerations is not None and velocities is None:
+        notes += velocity_notes(path, t, poses, velocities, resolution)
+        if accelerations is not None:
+            notes += acceleration_notes(t, velocities, accelerations)
+    elif accelerations is not None:
         notes.append(
             f"columns {','.join(ACCELERATION_QUANTITIES)} are not used without {','.join(VELOCITY_QUANTITIES)}"
         )
         accelerations = None
-    if accelerations is not None and velocities is not None:
-        notes += _acceleration_notes(t, velocities, accelerations)
     return Table(
         t=t,
         poses=poses,
@@ -303,40 +295,49 @@ def _table_of_rows(
         accelerations=accelerations,
         has_yaw=yaw is not None or quaternion is not None,
         sha256=digest,
-        resolution=tuple(resolution),
+        resolution=resolution,
         notes=tuple(notes),
     )
+
+
+def _check_increasing(path: FilePath, t: Array, rows: list[list[str]], column: int) -> None:
+    """Refuse times (n,) [s] that begin before 0 or do not increase; messages quote them as the file has them."""
+    if t[0] < 0.0:
+        raise FileError(path, f"row 2, column t: must be >= 0; got {rows[1][column]}")
+    (late,) = np.nonzero(np.diff(t) <= 0.0)
+    if late.size:
+        number = int(late[0]) + 3
+        rule = f"must be above that of the row before = {rows[number - 2][column]}"
+        raise FileError(path, f"row {number}, column t: {rule}; got {rows[number - 1][column]}")
+
+
+def _columns(numbers: Array, places: Mapping[str, int], quantities: Sequence[str]) -> Array | None:
+    """(n, k) the numbers of quantities; None where the file has none."""
+    if quantities[0] not in places:
+        return None
+    return numbers[:, [places[quantity] for quantity in quantities]]
+
+
+def _resolutions(rows: list[list[str]], places: Mapping[str, int]) -> tuple[float, ...]:
+    """Return the resolutions of x, y, z [m] and yaw [rad]; 0 for a yaw that the file does not have."""
+    resolutions = []
+    for quantity in (*POSITION_QUANTITIES, "yaw"):
+        if quantity in places:
+            column = places[quantity]
+            resolutions.append(_resolution(row[column] for row in rows[1:]))
+        else:
+            resolutions.append(0.0)
+    return tuple(resolutions)
 
 
 def _yaw_of(path: FilePath, quaternion: Array) -> Array:
     """Return the yaw (n,) [rad] of attitudes (n, 4), scalar first."""
     lengths = np.linalg.norm(quaternion, axis=1)
-    (wrong,) = np.nonzero(np.abs(lengths - 1.0) > UNIT_QUATERNION)
+    (wrong,) = np.nonzero(np.abs(lengths - 1.0) > QUATERNION_TOLERANCE)
     if wrong.size:
         row = int(wrong[0]) + 2
         raise FileError(path, f"row {row}: the quaternion must be of length 1; got {lengths[wrong[0]]:.4g}")
     return quaternion_to_euler(quaternion / lengths[:, None])[:, 2]
-
-
-def _acceleration_notes(t: Array, velocities: Array, accelerations: Array) -> Iterator[str]:
-    """Yield a note on stated accelerations (n, 3) [m/s^2] that contradict the velocities."""
-    periods = np.diff(t)
-
-    def mean(values: Array) -> float:
-        return float(periods @ np.abs(values) / periods.sum())
-
-    for name, velocity, acceleration in zip("xyz", velocities.T, accelerations.T, strict=True):
-        gained = np.diff(velocity) / periods
-        stated = 0.5 * (acceleration[1:] + acceleration[:-1])
-        if mean(stated - gained) > DISAGREEMENT * max(mean(gained), mean(stated)) + SMALL:
-            if name == "z" and abs(float(np.mean(stated - gained)) - 9.8) < 0.5:
-                hint = "; is gravity in it?"
-            else:
-                hint = ""
-            yield (
-                f"column a{name} is {mean(stated):.4g} m/s^2 on average, but column v{name} changes by "
-                f"{mean(gained):.4g} m/s^2{hint}"
-            )
 
 
 def _table_of_pieces(path: FilePath, numbers: Array, places: Mapping[str, int], digest: str) -> Table:
@@ -358,11 +359,11 @@ def _table_of_pieces(path: FilePath, numbers: Array, places: Mapping[str, int], 
     gaps = np.abs(pieces[1:, :, 0] - ends[:-1])
     (apart,) = np.nonzero(gaps.max(axis=1, initial=0.0) > LARGEST_GAP)
     if apart.size:
-        place = int(apart[0])
-        gap = float(gaps[place].max())
-        column = POLYNOMIAL_AXES[first_smallest(-gaps[place], TIE_SHARE * gap)]
+        i = int(apart[0])
+        gap = float(gaps[i].max())
+        axis_name = POLYNOMIAL_AXES[first_smallest(-gaps[i], TIE_SHARE * gap)]
         rule = "must be where the piece before it ends"
-        raise FileError(path, f"row {place + 3}, column {column}^0: {rule}; it is {gap:.4g} off")
+        raise FileError(path, f"row {i + 3}, column {axis_name}^0: {rule}; it is {gap:.4g} off")
     t = np.concatenate([[0.0], np.cumsum(durations)])
     poses = np.vstack([pieces[:, :, 0], ends[-1:]])
     return Table(
@@ -372,101 +373,8 @@ def _table_of_pieces(path: FilePath, numbers: Array, places: Mapping[str, int], 
         pieces=pieces,
         has_yaw=has_yaw,
         sha256=digest,
-        notes=(*_speed_notes(path, t, poses[:, :3]), *_yaw_notes(path, t, poses[:, 3])),
+        notes=(*speed_notes(path, t, poses[:, :3]), *yaw_notes(path, t, poses[:, 3])),
     )
-
-
-def _far(first: Array, vehicle: Array) -> Iterator[str]:
-    """Yield a note on a first row (3,) [m] far from the vehicle (3,) [m]."""
-    if (distance := math.dist(first, vehicle)) > FAR:
-        millimetres = math.dist(first / MILLIMETRES, vehicle)
-        yield (
-            f"columns x, y, z begin {distance:.4g} m from the vehicle; if they are in mm instead of m, "
-            f"{millimetres:.4g} m"
-        )
-
-
-def _speed_notes(path: FilePath, t: Array, positions: Array) -> Iterator[str]:
-    """Yield a note on positions (n, 3) [m] that move too fast on average; refuse what cannot be meant."""
-    lengths = np.abs(np.diff(positions, axis=0)).sum(axis=0)
-    speed = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum() / (t[-1] - t[0]))
-    column = "xyz"[first_smallest(-lengths, TIE_SHARE * float(lengths.max()))]
-    if speed > FASTEST:
-        rule = f"column {column}: must not make the course faster than {FASTEST:g} m/s on average; got {speed:.4g}"
-        raise FileError(path, f"{rule} (if it is in mm instead of m, {speed / MILLIMETRES:.4g} m/s)")
-    if speed > FAST:
-        yield (
-            f"column {column}: the course moves at {speed:.4g} m/s on average; if it is in mm instead of m, "
-            f"{speed / MILLIMETRES:.4g} m/s"
-        )
-
-
-def _check_turns(path: FilePath, yaw: Array) -> None:
-    """Refuse a column (n,) [rad] that counts turns, and so is not wrapped, with rows over half a turn apart."""
-    if np.ptp(yaw) <= math.tau + 1e-3:
-        return
-    steps = np.diff(yaw)
-    (beyond,) = np.nonzero(np.abs(steps) > math.pi)
-    if beyond.size:
-        i = int(beyond[0])
-        rule = f"must be within half a turn, {math.pi:.4g} rad, of the row before = {yaw[i]:.6g}"
-        why = f"the column spans {np.ptp(yaw) / math.tau:.3g} turns; is it in degrees instead of radians?"
-        raise FileError(path, f"row {i + 3}, column yaw: {rule}; got {yaw[i + 1]:.6g} ({why})")
-
-
-def _yaw_notes(path: FilePath, t: Array, yaw: Array) -> Iterator[str]:
-    """Yield a note on an unwrapped yaw (n,) [rad] that turns too fast or too far; refuse what cannot be meant."""
-    rate = math.degrees(float(np.abs(np.diff(yaw)).sum() / (t[-1] - t[0])))
-    many = float(np.ptp(yaw)) > TURNS * math.tau or abs(float(yaw[0])) > math.tau
-    if rate > FASTEST_TURNING:
-        rule = f"column yaw: must not turn faster than {FASTEST_TURNING:g} deg/s on average; got {rate:.4g}"
-        raise FileError(path, f"{rule} (if it is in degrees instead of radians, {math.radians(rate):.4g} deg/s)")
-    if rate > TURNING:
-        yield (
-            f"column yaw turns at {rate:.4g} deg/s on average; if it is in degrees instead of radians, "
-            f"{math.radians(rate):.4g} deg/s"
-        )
-    elif many:
-        low = float(yaw.min())
-        high = float(yaw.max())
-        yield (
-            f"column yaw goes from {math.degrees(low):.4g} to {math.degrees(high):.4g} deg; if it is in degrees "
-            f"instead of radians, from {low:.4g} to {high:.4g} deg"
-        )
-
-
-def _velocity_notes(
-    path: FilePath, t: Array, poses: Array, velocities: Array, resolution: Sequence[float]
-) -> Iterator[str]:
-    """Yield notes on stated velocities (n, 3) [m/s] that contradict the positions; refuse what cannot be meant.
-
-    Between rows, the mean of the two stated velocities is that of the covered distance up to the third derivative.
-    """
-    periods = np.diff(t)
-
-    def mean(values: Array) -> float:
-        return float(periods @ np.abs(values) / periods.sum())
-
-    for name, place, velocity, unit in zip("xyz", poses.T, velocities.T, resolution, strict=False):
-        covered = np.diff(place) / periods
-        stated = 0.5 * (velocity[1:] + velocity[:-1])
-        moved = mean(covered)
-        said = mean(stated)
-        off = mean(stated - covered)
-        rounding = 2.0 * unit * periods.size / float(periods.sum())
-        if off <= DISAGREEMENT * max(moved, said) or off <= SMALL + rounding:
-            continue
-        ratio = said / moved if moved > 0.0 else math.inf
-        likely = []
-        for known, factor in SPEED_UNITS.items():
-            if abs(ratio / factor - 1.0) < ALIKE:
-                likely.append(f"; is it in {known}?")
-        likely += ["; is its sign wrong?"] if mean(stated + covered) < DISAGREEMENT * said else []
-        hint = likely[0] if likely else ""
-        if said > OVERSTATED * (moved + rounding) + 1.0:
-            rule = f"column v{name}: must agree with column {name}, which moves at {moved:.4g} m/s on average"
-            raise FileError(path, f"{rule}; got {said:.4g} m/s{hint}")
-        yield f"column v{name} is {said:.4g} m/s on average, but column {name} moves at {moved:.4g} m/s{hint}"
 
 
 def through_rows(table: Table) -> Path:
@@ -518,12 +426,13 @@ def _resolution(cells: Iterable[str]) -> float:
     for cell in cells:
         digits, _, exponent = cell.strip().lower().partition("e")
         decimals = max(decimals, len(digits.partition(".")[2]) - int(exponent or 0))
-    if decimals in ROUNDED:
+    if decimals in ROUNDED_DECIMALS:
         return 10.0**-decimals
     return 0.0
 
 
 def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, ...]) -> list[float]:
+    """Return the numbers of a row; the header is row 1."""
     if len(row) != len(header):
         raise FileError(path, f"row {number}: must have {len(header)} cells ({','.join(header)}); got {len(row)}")
     values = []
@@ -544,4 +453,7 @@ def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, .
 
 
 def _short(text: str) -> str:
-    return repr(text if len(text) <= 60 else text[:57] + "...")
+    """Return a cell in quotes, its end cut off where it is long."""
+    if len(text) > 60:
+        text = text[:57] + "..."
+    return repr(text)

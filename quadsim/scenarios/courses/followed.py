@@ -59,19 +59,27 @@ class FollowedCourse:
         samples = self._samples[:count].copy()
         places = np.arange(count)
         for channel, name in enumerate(REFERENCE_NAMES):
-            given = [(k, values[name]) for k, values in setpoints if name in values]
-            if given:
-                first, value = (np.array(column) for column in zip(*given, strict=True))
-                latest = np.searchsorted(first, places, side="left") - 1  # from the row after the set-point on
-                samples[:, channel] = np.where(latest < 0, samples[:, channel], value[np.maximum(latest, 0)])
+            set_at = []
+            targets = []
+            for k, values in setpoints:
+                if name in values:
+                    set_at.append(k)
+                    targets.append(values[name])
+            if not targets:
+                continue
+            latest = np.searchsorted(set_at, places, side="left") - 1  # from the row after the set-point on
+            target = np.array(targets)[np.maximum(latest, 0)]
+            samples[:, channel] = np.where(latest < 0, samples[:, channel], target)
         return samples, self._filtered(samples, self._course.initial)
 
     def set(self, k: int, values: Mapping[str, float]) -> None:
         """Apply a set-point at t_k, by the names of its axes [m, rad]."""
         self._extend(k + 1)
-        self._setpoint |= {REFERENCE_NAMES.index(name): value for name, value in values.items()}
-        if "yaw" in values:
-            self._setpoint[_YAW] = nearest_turn(values["yaw"], float(self._rows[k, _YAW]))
+        for name, value in values.items():
+            if name == "yaw":
+                self._setpoint[_YAW] = nearest_turn(value, float(self._rows[k, _YAW]))
+            else:
+                self._setpoint[REFERENCE_NAMES.index(name)] = value
         self._rows = self._rows[: k + 1]
 
     def _extend(self, count: int) -> None:
@@ -99,8 +107,7 @@ class FollowedCourse:
 
     def _filtered(self, samples: Array, before: Array) -> Array:
         """Filter samples (M, 4) that follow a row (4,)."""
-        channels = zip(samples.T, before.tolist(), strict=True)
-        further = []
-        for values, last in channels:
-            further.append(smooth(values, initial=last, response_time=self._response_time, period=self._period))
-        return np.stack(further, axis=1)
+        columns = []
+        for values, last in zip(samples.T, before.tolist(), strict=True):
+            columns.append(smooth(values, initial=last, response_time=self._response_time, period=self._period))
+        return np.stack(columns, axis=1)

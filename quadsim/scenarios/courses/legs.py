@@ -79,7 +79,10 @@ class Waypoints(Travelled):
                 times.append(self.times[i])
                 poses.append(pose)
             elif length > 0.0:
-                times.append(times[-1] + length / (self.speed if point.speed is None else point.speed))
+                speed = self.speed
+                if point.speed is not None:
+                    speed = point.speed
+                times.append(times[-1] + length / speed)
                 poses.append(pose)
             else:
                 poses[-1] = pose

@@ -1,4 +1,7 @@
-"""Closed courses: circle, helix, figure eight, with a smooth start and end."""
+"""Closed courses: circle, helix, figure eight, with a smooth start and end.
+
+A `Loop` is a curve by an angle theta; `ramped` is theta over time, which gains its rate smoothly and loses it again.
+"""
 
 from __future__ import annotations
 
@@ -139,13 +142,14 @@ class _Round(Started):
 
     def path(self, initial: Array, gravity: float) -> Path:
         """The loop, flown from and to rest."""
-        return fly_round(
-            self.loop(initial, float(initial[2]) if self.height is None else self.height),
-            turn_time=self.turn_time,
-            turns=abs(self.turns),
-            ramp=self.ramp,
-            yaw=math.radians(self.yaw) if isinstance(self.yaw, float) else float(initial[3]),
-        )
+        height = float(initial[2])
+        if self.height is not None:
+            height = self.height
+        yaw = float(initial[3])
+        if isinstance(self.yaw, float):
+            yaw = math.radians(self.yaw)
+        loop = self.loop(initial, height)
+        return fly_round(loop, turn_time=self.turn_time, turns=abs(self.turns), ramp=self.ramp, yaw=yaw)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,10 +174,16 @@ class _Circular(_Round):
         """A circle or a helix."""
         angle = math.radians(self.angle)
         from_centre = (self.radius * math.cos(angle), self.radius * math.sin(angle))
-        centre = np.array([*(initial[:2] - from_centre if self.centre is None else self.centre), height])
-        clockwise = self.turns < 0.0
-        climb = self.climb_per_turn
-        return circle(centre=centre, radius=self.radius, angle=angle, clockwise=clockwise, climb_per_turn=climb)
+        x, y = initial[:2] - from_centre
+        if self.centre is not None:
+            x, y = self.centre
+        return circle(
+            centre=np.array([x, y, height]),
+            radius=self.radius,
+            angle=angle,
+            clockwise=self.turns < 0.0,
+            climb_per_turn=self.climb_per_turn,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +220,9 @@ class FigureEight(_Round):
     @property
     def half_width(self) -> float:
         """[m]."""
-        return 0.5 * (0.5 * self.length if self.width is None else self.width)
+        if self.width is None:
+            return 0.25 * self.length
+        return 0.5 * self.width
 
     @property
     def turn_length(self) -> float:
@@ -219,8 +231,11 @@ class FigureEight(_Round):
 
     def loop(self, initial: Array, height: float) -> Loop:
         """The lemniscate."""
+        x, y = initial[:2]
+        if self.centre is not None:
+            x, y = self.centre
         return figure_eight(
-            centre=np.array([*(initial[:2] if self.centre is None else self.centre), height]),
+            centre=np.array([x, y, height]),
             half_length=0.5 * self.length,
             half_width=self.half_width,
             angle=math.radians(self.angle),

@@ -1,4 +1,7 @@
-"""The smoothest polynomials through given points at given times."""
+"""The smoothest polynomials through given points at given times.
+
+Position has the least snap, the integral of |x''''|^2, and yaw the least integral of its second derivative squared.
+"""
 
 from __future__ import annotations
 
@@ -92,9 +95,9 @@ def smoothest(times: Array, values: Array, order: int) -> BPoly:
     # Coefficients of one segment on s in [0, 1] from derivatives 0 .. order - 1 at s = 0 and at s = 1.
     from_ends = np.linalg.inv(np.vstack([_derivatives_at(0.0, order), _derivatives_at(1.0, order)]))
     cost = from_ends.T @ _squared_derivative(order) @ from_ends
-    scales = [np.tile(duration ** np.arange(order), 2) for duration in durations]
     blocks = np.zeros((n + 1, order, n + 1, order))
-    for i, (duration, scale) in enumerate(zip(durations, scales, strict=True)):
+    for i, duration in enumerate(durations):
+        scale = np.tile(duration ** np.arange(order), 2)
         block = duration ** (1 - 2 * order) * scale[:, None] * cost * scale
         blocks[i : i + 2, :, i : i + 2, :] += block.reshape(2, order, 2, order)
     R = blocks.reshape((n + 1) * order, (n + 1) * order)
@@ -123,7 +126,11 @@ def minimum_snap(start: Array, poses: Array, times: Sequence[float]) -> Path:
 
 def _derivatives_at(s: float, order: int) -> Array:
     """(order, 2 order): derivatives 0 .. order - 1 at s of 1, s, s^2, ..."""
-    return np.array([[math.perm(p, k) * s ** max(p - k, 0) for p in range(2 * order)] for k in range(order)], float)
+    derivatives = np.zeros((order, 2 * order))
+    for k in range(order):
+        for p in range(2 * order):
+            derivatives[k, p] = math.perm(p, k) * s ** max(p - k, 0)
+    return derivatives
 
 
 def _squared_derivative(order: int) -> Array:

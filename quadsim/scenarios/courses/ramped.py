@@ -54,17 +54,19 @@ def ramped_phase(*, rate: float, acceleration: float, ramp: float, step: float) 
     bend = 0.5 * math.pi / ramp
     full = rate / acceleration - ramp
 
-    def within(length: float) -> Array:
-        return step * np.arange(math.ceil(length / step - 1e-9), dtype=np.float64)
-
-    rising = within(ramp)
-    turning = within(2.0 * ramp)
-    constant = np.ones(len(within(full)))
+    rising = step * np.arange(sample_count(ramp, step), dtype=np.float64)
+    turning = step * np.arange(sample_count(2.0 * ramp, step), dtype=np.float64)
+    constant = np.ones(sample_count(full, step))
     risen = np.square(np.sin(bend * rising))
     share = np.concatenate([risen, constant, np.cos(bend * turning), -constant, risen - 1.0])
     alpha = acceleration * share
     omega = step * np.cumsum(alpha)
     return PhaseAngle(angle=step * np.cumsum(omega), rate=omega, acceleration=alpha, step=step)
+
+
+def sample_count(duration: float, step: float) -> int:
+    """Return the number of samples, a step [s] apart, of a phase of a duration [s], its end excluded."""
+    return math.ceil(duration / step - 1e-9)
 
 
 def circle_curve(radius: float) -> Curve:
@@ -130,10 +132,16 @@ def fly_ramped(curve: Curve, phase: PhaseAngle, *, initial: Array, gravity: floa
         return curve(angle(t), np.interp(t, knots, phase.rate), np.interp(t, knots, phase.acceleration))
 
     accelerations = curve(phase.angle, phase.rate, phase.acceleration)[2]
-    heading = float(initial[3]) if free_heading else np.full(len(knots), initial[3])
+    initial_yaw = np.full(len(knots), initial[3])
+    heading: Array | float = initial_yaw
+    if free_heading:
+        heading = float(initial[3])
     attitude, _ = attitudes(accelerations, period=phase.step, gravity=gravity, yaw=heading)
-    inverted = bool((accelerations[:, 2] + gravity < 0.0).any())
-    yaw = np.full(len(knots), initial[3]) if inverted else np.unwrap(quaternion_to_euler(attitude)[:, 2])
+    is_inverted = bool((accelerations[:, 2] + gravity < 0.0).any())
+    if is_inverted:
+        yaw = initial_yaw
+    else:
+        yaw = np.unwrap(quaternion_to_euler(attitude)[:, 2])
 
     def pose(t: Array) -> Array:
         return np.column_stack([initial[:3] + at(t)[0], np.interp(t, knots, yaw)])
@@ -146,6 +154,7 @@ def fly_ramped(curve: Curve, phase: PhaseAngle, *, initial: Array, gravity: floa
 
 
 def _level(x: Array, y: Array) -> Array:
+    """(M, 3) vectors without a vertical part."""
     return np.column_stack([x, y, np.zeros_like(x)])
 
 
@@ -184,8 +193,9 @@ class _Ramped(Travelled):
     @property
     def until(self) -> float:
         """Time of its end [s]; see `ramped_phase`."""
-        parts = (self.ramp, self.speed / self.acceleration - self.ramp)
-        rising, constant, turning = (math.ceil(time / self.sampling - 1e-9) for time in (*parts, 2.0 * self.ramp))
+        rising = sample_count(self.ramp, self.sampling)
+        constant = sample_count(self.speed / self.acceleration - self.ramp, self.sampling)
+        turning = sample_count(2.0 * self.ramp, self.sampling)
         return self.start + self.sampling * (2 * rising + 2 * constant + turning)
 
     def curve(self, yaw: float) -> Curve:

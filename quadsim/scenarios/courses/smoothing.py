@@ -15,6 +15,7 @@ from quadsim.state import Array, read_only
 
 _ORDER: Final = 4  # of the minimised differences: those that determine a torque, and so a rotor's speed
 _WEIGHTS: Final = tuple(10.0**exponent for exponent in range(6, -3, -1))
+"""Weights of smoothness that are tried, the largest first."""
 
 
 def smooth(values: Array, *, initial: float, response_time: float, period: float) -> Array:
@@ -25,11 +26,11 @@ def smooth(values: Array, *, initial: float, response_time: float, period: float
     """
     if response_time == 0.0:
         return values.copy()
-    keep = math.exp(-3.0 * period / response_time)
+    decay = math.exp(-3.0 * period / response_time)
     filtered = np.empty_like(values)
     last = initial
     for k, value in enumerate(values):
-        last = value + keep * (last - value)
+        last = value + decay * (last - value)
         filtered[k] = last
     return filtered
 
@@ -42,20 +43,23 @@ def within_rounding(values: Array, resolution: float, breaks: NDArray[np.bool_])
     (M - 1,) mark where a corner or a jump between a sample and the next stays.
     """
     smoothed = values.copy()
-    for piece in np.split(np.arange(values.size), np.flatnonzero(breaks) + 1) if resolution > 0.0 else ():
+    if resolution == 0.0:
+        return smoothed
+    for piece in np.split(np.arange(values.size), np.flatnonzero(breaks) + 1):
         if piece.size > 2 * _ORDER:
             smoothed[piece] = _smoothest(values[piece], resolution)
     return smoothed
 
 
 def _smoothest(values: Array, resolution: float) -> Array:
+    """Return the smoothest values within the resolution of one piece (M,); the piece itself where no weight suits."""
     roughness = _roughness(values.size)
-    one = np.zeros_like(roughness)
-    one[-1] = 1.0
+    identity = np.zeros_like(roughness)
+    identity[-1] = 1.0
     for weight in _WEIGHTS:
-        smooth: Array = solveh_banded(one + weight * roughness, values)
-        if np.abs(smooth - values).max() <= resolution:
-            return smooth
+        smoother: Array = solveh_banded(identity + weight * roughness, values)
+        if np.abs(smoother - values).max() <= resolution:
+            return smoother
     return values
 
 
@@ -65,5 +69,7 @@ def _roughness(size: int) -> Array:
     stencil = [(-1.0) ** k * math.comb(_ORDER, k) for k in range(_ORDER + 1)]
     differences = sparse.diags_array(stencil, offsets=range(_ORDER + 1), shape=(size - _ORDER, size))
     product = (differences.T @ differences).todia()
-    bands = [np.pad(product.diagonal(k), (k, 0)) for k in range(_ORDER, -1, -1)]
+    bands = []
+    for k in range(_ORDER, -1, -1):
+        bands.append(np.pad(product.diagonal(k), (k, 0)))
     return read_only(np.stack(bands))

@@ -1,8 +1,7 @@
-"""Piecewise constant courses.  Eq. (30)."""
+"""Piecewise constant courses: an axis has the value v_i for a_i < t < b_i, and its initial one elsewhere.  Eq. (30)."""
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +46,7 @@ class Steps(Headed):
     def build(self, initial: Array, gravity: float) -> Course:
         """As `Filtered.build`."""
         channels = self.channels(initial)
-        elsewhere = np.array([value for _, value in channels])
+        values_elsewhere = np.array([value for _, value in channels])
         instants = set()
         for windows, value in channels:
             for time, _, _ in switches(windows, value, initial=value):
@@ -56,7 +55,7 @@ class Steps(Headed):
         def sample(t: Array) -> Array:
             return np.stack([steps(t, windows, value) for windows, value in channels], axis=1)
 
-        return Course(sample=sample, initial=elsewhere, jumps=tuple(sorted(instants)))
+        return Course(sample=sample, initial=values_elsewhere, jumps=tuple(sorted(instants)))
 
     def channels(self, initial: Array) -> list[tuple[Sequence[Window], float]]:
         """Windows of x, y, z [m] and yaw [rad], each with the value outside them."""
@@ -77,12 +76,14 @@ class Steps(Headed):
             preview: time [s] by which the controller knows the next step, so that it ends the one before.
         """
         result = []
-        for name, (windows, elsewhere), start in zip(
-            REFERENCE_NAMES, self.channels(initial), initial.tolist(), strict=True
-        ):
+        channels = zip(REFERENCE_NAMES, self.channels(initial), initial.tolist(), strict=True)
+        for name, (windows, elsewhere), start in channels:
             reached = [step for step in switches(windows, elsewhere, initial=start) if step[0] < duration]
-            ends = [*(time - preview for time, _, _ in reached[1:]), duration]
-            for (time, before, after), until in zip(reached, ends, strict=False):
+            for i, (time, before, after) in enumerate(reached):
+                until = duration
+                if i + 1 < len(reached):
+                    time_of_next, _, _ = reached[i + 1]
+                    until = time_of_next - preview
                 result.append(CourseStep(channel=name, time=time, before=before, after=after, until=until))
         return result
 
@@ -105,10 +106,17 @@ def switches(windows: Sequence[Window], elsewhere: float, *, initial: float) -> 
 
     Of windows that overlap, the last holds; the first step is counted from `initial`, where the output is at time 0.
     """
-    instants = sorted({max(0.0, instant) for window in windows for instant in (window.start, window.stop)} | {0.0})
-    values_in_force = []
-    for t in instants:
-        values_in_force.append([window.value for window in windows if window.start <= t < window.stop])
-    values = [initial, *(values[-1] if values else elsewhere for values in values_in_force)]
-    steps = zip(instants, itertools.pairwise(values), strict=True)
-    return [(time, before, after) for time, (before, after) in steps if before != after]
+    instants = {0.0}
+    for window in windows:
+        instants |= {max(0.0, window.start), max(0.0, window.stop)}
+    result = []
+    before = initial
+    for t in sorted(instants):
+        after = elsewhere
+        for window in windows:
+            if window.start <= t < window.stop:
+                after = window.value
+        if after != before:
+            result.append((t, before, after))
+        before = after
+    return result

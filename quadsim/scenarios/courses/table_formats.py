@@ -32,10 +32,14 @@ class TableFormat:
     @property
     def header(self) -> str:
         """Its columns as a header, those that may be absent in brackets."""
-        parts = [self.columns[quantity] for quantity in self.needed]
+        parts = self._columns_of(self.needed)
         for group in self.groups:
-            parts.append(f"[{','.join(self.columns[quantity] for quantity in group)}]")
+            columns = ",".join(self._columns_of(group))
+            parts.append(f"[{columns}]")
         return ",".join(parts)
+
+    def _columns_of(self, quantities: Sequence[str]) -> list[str]:
+        return [self.columns[quantity] for quantity in quantities]
 
     def known(self) -> set[str]:
         """Return every column that it may have."""
@@ -59,18 +63,26 @@ class TableFormat:
 
     def distance(self, header: Sequence[str]) -> tuple[int, int]:
         """Return how many columns a header has and should not, and how many it lacks: (0, 0) for one of this format."""
-        foreign = sum(column not in self.known() for column in header)
-        return foreign, len(self.missing(header))
+        return self.foreign(header), len(self.missing(header))
+
+    def foreign(self, header: Sequence[str]) -> int:
+        """Return how many columns a header has that this format does not know."""
+        known = self.known()
+        return sum(column not in known for column in header)
 
     def missing(self, header: Sequence[str]) -> list[str]:
         """Return the columns that a header lacks, those of a group of which it has some included."""
-        missing = [self.columns[quantity] for quantity in self.needed if self.columns[quantity] not in header]
+        missing = _absent(self._columns_of(self.needed), header)
         for group in self.groups:
-            columns = [self.columns[quantity] for quantity in group]
-            absent = [column for column in columns if column not in header]
+            columns = self._columns_of(group)
+            absent = _absent(columns, header)
             if len(absent) < len(columns):
                 missing += absent
         return missing
+
+
+def _absent(columns: Sequence[str], header: Sequence[str]) -> list[str]:
+    return [column for column in columns if column not in header]
 
 
 def _named(pattern: str, quantities: Sequence[str], axes: Sequence[str] = ("x", "y", "z")) -> dict[str, str]:
@@ -101,12 +113,22 @@ def _coefficients(axis: str) -> tuple[str, ...]:
     return tuple(f"{axis}^{i}" for i in range(POLYNOMIAL_DEGREE + 1))
 
 
-_COEFFICIENTS: Final = tuple(column for axis in POLYNOMIAL_AXES for column in _coefficients(axis))
+def _components(names: Sequence[str], separator: str = "") -> tuple[str, ...]:
+    """Return the columns of vectors, one per axis."""
+    columns = []
+    for name in names:
+        for axis in POSITION_QUANTITIES:
+            columns.append(f"{name}{separator}{axis}")
+    return tuple(columns)
+
+
+_POSITION_COEFFICIENTS: Final = (*_coefficients("x"), *_coefficients("y"), *_coefficients("z"))
+_YAW_COEFFICIENTS: Final = _coefficients("yaw")
 POLYNOMIALS: Final = TableFormat(
     name="polynomials by piece, as of uav_trajectories",
-    columns={column: column for column in (PIECE_DURATION, *_COEFFICIENTS)},
-    needed=(PIECE_DURATION, *_coefficients("x"), *_coefficients("y"), *_coefficients("z")),
-    groups=(_coefficients("yaw"),),
+    columns={column: column for column in (PIECE_DURATION, *_POSITION_COEFFICIENTS, *_YAW_COEFFICIENTS)},
+    needed=(PIECE_DURATION, *_POSITION_COEFFICIENTS),
+    groups=(_YAW_COEFFICIENTS,),
 )
 TABLE_FORMATS: Final = (
     _with_yaw("quadsim", position="{}", velocity="v{}", acceleration="a{}"),
@@ -120,15 +142,14 @@ TABLE_FORMATS: Final = (
             **_named("a_{}", ACCELERATION_QUANTITIES),
         },
         groups=(QUATERNION_QUANTITIES, VELOCITY_QUANTITIES, ACCELERATION_QUANTITIES),
-        unused=tuple(f"{name}_{axis}" for name in ("w", "a_lin", "a_rot", "j", "s") for axis in "xyz")
-        + tuple(f"u_{i}" for i in range(1, 5)),
+        unused=(*_components(("w", "a_lin", "a_rot", "j", "s"), "_"), "u_1", "u_2", "u_3", "u_4"),
     ),
     _with_yaw(
         "uav_trajectories, sampled",
         position="pos{}",
         velocity="vel{}",
         acceleration="acc{}",
-        unused=tuple(f"{name}{axis}" for name in ("jerk", "snap") for axis in "xyz"),
+        unused=_components(("jerk", "snap")),
     ),
     POLYNOMIALS,
 )
@@ -155,11 +176,14 @@ def nearest_format(header: Sequence[str]) -> str:
     if nearest is POLYNOMIALS:
         text = f"the nearest known format is {nearest.name}: duration,x^0,...,x^7,y^0,...,z^7[,yaw^0,...,yaw^7]"
     if missing:
-        shown = ",".join(missing[:6])
-        text += f"; missing: {shown}" + (", ..." if len(missing) > 6 else "")
-    unknown = sum(column not in nearest.known() for column in header)
-    if unknown:
-        text += f"; {unknown} {'column is' if unknown == 1 else 'columns are'} not of it"
+        text += f"; missing: {','.join(missing[:6])}"
+        if len(missing) > 6:
+            text += ", ..."
+    foreign = nearest.foreign(header)
+    if foreign == 1:
+        text += "; 1 column is not of it"
+    elif foreign:
+        text += f"; {foreign} columns are not of it"
     if len(set(header)) < len(header):
         text += "; a column occurs twice"
     return text

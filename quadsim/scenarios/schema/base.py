@@ -1,4 +1,4 @@
-"""Common parts of all tables of the scenario file: strictness, number types, declaration of fields.
+"""Common parts of all tables of the scenario file: how strictly they are parsed, and which fields they declare.
 
 A table is a frozen dataclass, its only declaration; see `quadsim.fields`.
 """
@@ -40,6 +40,15 @@ def _declared(table: Any) -> dict[str, FieldInfo]:
     hints = get_type_hints(table, include_extras=True)
     declared = {}
     for field in sorted(dataclasses.fields(table), key=lambda field: _FIRST.get(field.name, len(_FIRST))):
-        declared[field.name] = info = FieldInfo.from_annotated_attribute(hints[field.name], field)
-        info.description = next((note.documentation for note in info.metadata if isinstance(note, DocInfo)), None)
+        info = FieldInfo.from_annotated_attribute(hints[field.name], field)
+        info.description = _documentation(info)
+        declared[field.name] = info
     return declared
+
+
+def _documentation(info: FieldInfo) -> str | None:
+    """Return the text of a field's `doc`; None where it has none."""
+    for note in info.metadata:
+        if isinstance(note, DocInfo):
+            return note.documentation
+    return None

@@ -1,4 +1,8 @@
-"""`base = "paper-constrained"`: a scenario file with only its differences from another one."""
+"""`base = "paper-constrained"`: a scenario file with only its differences from another one.
+
+`read_scenario` reads a file, its base, the base of that and so on, and merges their tables field by field (`merge`);
+`quadsim.scenarios.loading` parses the result.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +18,19 @@ from quadsim.scenarios.plugin import located
 from quadsim.scenarios.schema.settings import RECORDED, leaves, note_changes, restate, set_field, state_bounds
 
 _TOLERANCES: Final = ("tolerance", "tolerance_sampled")
+_NOT_INHERITED: Final = ("group", "expect")
+"""Fields that a file does not take from its base."""
 
 
 def locate_files(data: dict[str, Any], directory: Path) -> None:
     """Make paths that are relative to a file's folder independent of it, in place."""
     for name, ending in (("vehicle", ".toml"), (RECORDED, ".toml"), ("reference", "")):
-        if isinstance(data.get(name), dict):
-            file = data[name].get("file")
-        else:
-            file = None
+        table = data.get(name)
+        if not isinstance(table, dict):
+            continue
+        file = table.get("file")
         if isinstance(file, str) and file.endswith(ending) and (directory / file).is_file():
-            data[name]["file"] = str((directory / file).resolve())
+            table["file"] = str((directory / file).resolve())
     if "controller" in data:
         data["controller"] = located(data["controller"], directory)
     if isinstance(data.get("forces"), list):
@@ -82,15 +88,18 @@ def _merged(
     base_file, _ = base
     chain = (*above, path.resolve())
     if base_file.resolve() in chain:
-        raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), source_label(base)])}")
+        labels = [file.name for file in chain]
+        labels.append(source_label(base))
+        raise FileError(path, f"is its own base: {' -> '.join(labels)}")
     if len(chain) > DEEPEST:
         raise FileError(path, f"must have at most {DEEPEST} bases above one another")
     inherited = read_merged(base, find, locate, chain)
     locate(inherited, base_file.parent)
     if "controller" in data:
         state_bounds(inherited, data["controller"])
-    # Group and expected verdict are not inherited.
-    merged = merge({key: value for key, value in inherited.items() if key not in ("group", "expect")}, data)
+    for key in _NOT_INHERITED:
+        inherited.pop(key, None)
+    merged = merge(inherited, data)
     if "description" not in data:
         note_changes(merged, data)
     return merged
@@ -99,7 +108,9 @@ def _merged(
 def _find_base(path: Path, name: str, find: Callable[[str], Source]) -> Source:
     """Return where a base is: beside the file that names it, or in the library."""
     beside = path.parent / name
-    return find(str(beside) if name.endswith(".toml") and beside.is_file() else name)
+    if name.endswith(".toml") and beside.is_file():
+        return find(str(beside))
+    return find(name)
 
 
 def replaced_tables(path: Path) -> dict[str, str]:
@@ -108,22 +119,24 @@ def replaced_tables(path: Path) -> dict[str, str]:
     if "base" not in data:
         return {}
     base = _find_base(path, data["base"], scenario_source)
-    before = retyped(read_merged(base, scenario_source, locate_files), data)
+    inherited = read_merged(base, scenario_source, locate_files)
     base_file, _ = base
-    return replaced_tables(base_file) | {name: f"{kind!r} in {source_label(base)}" for name, kind in before.items()}
+    replaced = replaced_tables(base_file)
+    for name, kind in retyped(inherited, data).items():
+        replaced[name] = f"{kind!r} in {source_label(base)}"
+    return replaced
 
 
 def retyped(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, str]:
     """Return the former type of each table whose type changes, by the table's name."""
-    kinds = {}
+    former = {}
     for name, table in before.items():
-        if isinstance(table, dict) and "type" in table:
-            kinds[name] = table["type"]
-    now = {}
-    for name, table in after.items():
-        if isinstance(table, dict):
-            now[name] = table.get("type", kinds.get(name))
-    return {name: kind for name, kind in kinds.items() if name in now and now[name] != kind}
+        over = after.get(name)
+        if isinstance(table, dict) and isinstance(over, dict) and "type" in table:
+            kind = table["type"]
+            if over.get("type", kind) != kind:
+                former[name] = kind
+    return former
 
 
 def read_whole(path: Path) -> dict[str, Any]:
@@ -155,28 +168,30 @@ def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     merged = copy.deepcopy(dict(base))
     for key, value in over.items():
         before = merged.get(key)
-        if (
-            isinstance(before, dict)
-            and isinstance(value, dict)
-            and value.get("type", before.get("type")) == before.get("type")
-        ):
+        if isinstance(before, dict) and isinstance(value, dict) and _are_of_one_type(before, value):
             merged[key] = _merge(before, value)
         elif isinstance(before, list) and _named(before) and _named(value):
-            entries = {entry["name"]: entry for entry in before}
-            entries |= {
-                entry["name"]: _merge(_restated(entries.get(entry["name"], {}), entry), entry) for entry in value
-            }
-            merged[key] = list(entries.values())
+            merged[key] = _merge_entries(before, value)
         else:
             merged[key] = copy.deepcopy(value)
     return merged
 
 
-def _restated(before: Mapping[str, Any], entry: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the base's entry, without its tolerances if the entry over it states bounds or tolerances."""
-    if not {"lower", "upper", *_TOLERANCES} & entry.keys():
-        return before
-    return {key: value for key, value in before.items() if key not in _TOLERANCES}
+def _are_of_one_type(before: Mapping[str, Any], over: Mapping[str, Any]) -> bool:
+    """Return whether a table states no other type than the one that it is merged over."""
+    return bool(over.get("type", before.get("type")) == before.get("type"))
+
+
+def _merge_entries(base: list[dict[str, Any]], over: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Merge lists of tables by the tables' names."""
+    entries: dict[str, dict[str, Any]] = {entry["name"]: entry for entry in base}
+    for entry in over:
+        name = entry["name"]
+        before = entries.get(name, {})
+        if {"lower", "upper", *_TOLERANCES} & entry.keys():  # the base's tolerances belong to the base's bounds
+            before = {key: value for key, value in before.items() if key not in _TOLERANCES}
+        entries[name] = _merge(before, entry)
+    return list(entries.values())
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""`[controller]`: the table of the law named by its type, one of `quadsim.mpc.laws` or a user's."""
+"""`[controller]`: the table of the controller named by its type, one of `quadsim.mpc.laws` or a user's.
+
+Pydantic chooses the table by `type`; `changed_controller` is the table after an event that changes fields of it.
+"""
 
 from __future__ import annotations
 
@@ -16,23 +19,22 @@ from quadsim.scenarios.schema.settings import set_field
 from quadsim.scenarios.schema.writing import plain
 
 
-def _law(controller: object) -> str | None:
-    """Return the tag of a table's law; an unknown law is left for the message."""
+def _tag(controller: object) -> str | None:
+    """Return the tag of a controller's table in `TABLES`; an unknown type is left for the message."""
+    name: object = None
     if isinstance(controller, Mapping):
-        law_name = controller.get("type")
-    else:
-        law_name = None
-    if isinstance(controller, ControllerTable):
-        law_name = controller.type
-    if not isinstance(law_name, str):
+        name = controller.get("type")
+    elif isinstance(controller, ControllerTable):
+        name = controller.type
+    if not isinstance(name, str):
         return None
-    if law_name in LAWS or not is_plugin(law_name):
-        return law_name
+    if name in LAWS or not is_plugin(name):
+        return name
     return FORM
 
 
 class _OrName:
-    """In the schema a law's name alone stands for a table of defaults, see `Scenario.read`."""
+    """In the schema a controller's name alone stands for a table of defaults, see `Scenario.parse`."""
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
         return {"anyOf": [handler(schema), {"type": "string"}]}
@@ -47,8 +49,8 @@ if TYPE_CHECKING:
     AnyController: TypeAlias = ControllerTable
 else:
     _Tagged = Union[*(Annotated[table, Tag(name)] for name, table in TABLES.items())]
-    AnyController = Annotated[Annotated[_Tagged, Discriminator(_law)], _OrName()]
-"""Any law, distinguished by its type; a law whose fields all have defaults may be given by name only."""
+    AnyController = Annotated[Annotated[_Tagged, Discriminator(_tag)], _OrName()]
+"""Any controller, distinguished by its type; one whose fields all have defaults may be given by its name alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +77,7 @@ def changed_controller(controller: AnyController, fields: Mapping[str, Any]) -> 
 
 
 def _leaves(fields: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values in nested tables by dotted path; an empty table is a value, and so is a list."""
     for name, value in fields.items():
         if isinstance(value, Mapping) and value:
             yield from _leaves(value, f"{above}{name}.")

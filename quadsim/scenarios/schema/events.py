@@ -1,10 +1,15 @@
-"""`[[events]]`: timed events during the flight, "at t = 12 s rotor 2 loses 20 %"."""
+"""`[[events]]`: timed events during the flight, "at t = 12 s rotor 2 loses 20 %".
+
+Here are the events outside the plant, of reference, controller and sensors; those of the plant and the computer are
+declared beside the effects that they change. `quadsim.scenarios.assembly` sorts them by what they change.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from annotated_types import Len, doc
 from pydantic import Field
@@ -19,9 +24,11 @@ from quadsim.sim.effects.wind import Gust, WindChange
 from quadsim.sim.sensing import AXES, FaultKind, SensorFault, SensorName, in_si
 from quadsim.state import REFERENCE_NAMES
 
+EventType = TypeVar("EventType")
+
 MOST_EVENTS: Final = 20_000  # of one flight: a person's hand for a quarter of an hour, 20 times a second
 SensorText = Literal["position", "velocity", "attitude", "rates"]
-_UNITS: Final = {name: "deg" if name == "yaw" else "m" for name in REFERENCE_NAMES}
+_UNITS: Final = {"x": "m", "y": "m", "z": "m", "yaw": "deg"}
 _FAULTS: Final = {"dropout": "gives no samples", "freeze": "is frozen", "nan": "gives no numbers", "bias": "is offset"}
 
 
@@ -51,13 +58,21 @@ class SetpointEvent:
     @property
     def values(self) -> dict[str, float]:
         """New values by axis [m, rad]."""
-        values = {name: getattr(self, name) for name in REFERENCE_NAMES}
-        scales = {"yaw": math.radians(1.0)}
-        return {name: scales.get(name, 1.0) * value for name, value in values.items() if value is not None}
+        values: dict[str, float] = {}
+        for name in REFERENCE_NAMES:
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if name == "yaw":
+                values[name] = math.radians(1.0) * value
+            else:
+                values[name] = value
+        return values
 
     def text(self) -> str:
         """Return the event in words."""
-        return f"set-point {', '.join(f'{name} {getattr(self, name):g} {_UNITS[name]}' for name in self.values)}"
+        targets = ", ".join(f"{name} {getattr(self, name):g} {_UNITS[name]}" for name in self.values)
+        return f"set-point {targets}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +95,8 @@ class ControllerEvent:
 
     def text(self) -> str:
         """Return the event in words."""
-        return f"controller: {', '.join(f'{name} = {value}' for name, value in self.fields.items())}"
+        changes = ", ".join(f"{name} = {value}" for name, value in self.fields.items())
+        return f"controller: {changes}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,3 +163,8 @@ Event = Annotated[
     Field(discriminator="type"),
 ]
 """One entry of the list, distinguished by its type."""
+
+
+def events_of(events: Iterable[Event], kind: type[EventType]) -> tuple[EventType, ...]:
+    """Return the events of one kind, in the order of the file."""
+    return tuple(event for event in events if isinstance(event, kind))

@@ -40,8 +40,15 @@ class Initial:
             raise ParameterError("", "euler", list(self.euler), "within +-180 deg of roll and below +-90 deg of pitch")
         if self.on_reference and any(self.euler[:2]):
             raise ParameterError("", "euler", list(self.euler), "of roll and pitch 0 where on_reference is true")
-        given = [name for name in ("velocity", "body_rates") if any(getattr(self, name))]
-        given += ["rotor_speeds"] if self.cold and self.rotor_speeds is not None else []
-        if given and (self.cold or self.on_reference):
-            rule = f"absent where {'cold' if self.cold else 'on_reference'} is true, which states it"
-            raise ParameterError("", given[0], list(getattr(self, given[0])), rule)
+        if self.cold:
+            self._refuse_fields_stated_by("cold", ("velocity", "body_rates", "rotor_speeds"))
+        elif self.on_reference:
+            self._refuse_fields_stated_by("on_reference", ("velocity", "body_rates"))
+
+    def _refuse_fields_stated_by(self, switch: str, names: tuple[str, ...]) -> None:
+        """Refuse values of fields that the switch gives instead."""
+        for name in names:
+            values = getattr(self, name)
+            is_stated = values is not None and (name == "rotor_speeds" or any(values))
+            if is_stated:
+                raise ParameterError("", name, list(values), f"absent where {switch} is true, which states it")

@@ -73,11 +73,14 @@ def scenario_schema() -> dict[str, Any]:
     whole = adapter(Scenario).json_schema(schema_generator=_SchemaOfToml)
     tables = whole.pop("$defs")
     difference = _loosened(whole)
-    ending = {table.__name__ for table in tables_in(ReferenceTable) if hasattr(table, "until")}
-    kinds = [tables[name]["properties"]["type"]["const"] for name in sorted(ending)]
-    known = {"properties": {"reference": {"properties": {"type": {"enum": kinds}}, "required": ["type"]}}}
-    whole["anyOf"] = [{"required": ["duration"]}, known]
+    with_end = sorted(table.__name__ for table in tables_in(ReferenceTable) if hasattr(table, "until"))
+    types_with_end = [tables[name]["properties"]["type"]["const"] for name in with_end]
+    course_with_end = {
+        "properties": {"reference": {"properties": {"type": {"enum": types_with_end}}, "required": ["type"]}}
+    }
+    whole["anyOf"] = [{"required": ["duration"]}, course_with_end]
     difference["properties"] = {"base": BASE, **difference["properties"]}
+    partial = {_PARTIAL + name: _loosened(table) for name, table in tables.items()}
     return {
         "$schema": DIALECT,
         "title": "A quadsim scenario",
@@ -85,7 +88,7 @@ def scenario_schema() -> dict[str, Any]:
         "if": {"required": ["base"]},
         "then": difference,
         "else": whole,
-        "$defs": {**tables, **{_PARTIAL + name: _loosened(table) for name, table in tables.items()}},
+        "$defs": {**tables, **partial},
     }
 
 
@@ -99,5 +102,10 @@ def _loosened(schema: Any) -> Any:
         return schema
     if not isinstance(schema, dict):
         return schema
-    optional = {key: value for key, value in schema.items() if key not in ("required", "discriminator")}
-    return {"anyOf" if key == "oneOf" else key: _loosened(value) for key, value in optional.items()}
+    loosened = {}
+    for key, value in schema.items():
+        if key == "oneOf":
+            loosened["anyOf"] = _loosened(value)
+        elif key not in ("required", "discriminator"):
+            loosened[key] = _loosened(value)
+    return loosened

@@ -1,4 +1,8 @@
-"""Messages about the errors in a scenario file: one line per field, with the allowed values."""
+"""Parse nested tables as the dataclasses that declare them; what is wrong becomes one line per field.
+
+Pydantic checks the values (`parse_table`). Its errors name a path: `find` looks up where that leads in the file and
+which kinds of value are allowed there, and `describe` states field, allowed values and given value.
+"""
 
 from __future__ import annotations
 
@@ -29,21 +33,24 @@ _LISTS: Final = (list, tuple, Sequence)  # types written as lists in a file
 _TAGS: Final = ("type", "distribution")  # fields that distinguish tables
 _NAMES: Final = {float: "number", int: "whole number", str: "text"}
 _LIMITS: Final = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-_REASONS: Final = {
+_WHY_ABSENT: Final = {
     "controller.commands": " with this controller: only robust, nonlinear and geometric can command thrust and rates; "
     "models and gains of the others are for rotor speeds",
 }
 """Reasons why a controller lacks a field that a reader may expect."""
-_GONE: Final = {
+_REMOVED_FIELDS: Final = {
     "controller.compiled": "C always prepares the queries of robust, and Python those of unconstrained and "
     'constrained; solver = "core" solves in C',
 }
-"""Why fields of earlier versions went, and what is there instead."""
+"""Why fields of earlier versions were removed, and what is there instead."""
 _WRITTEN_OTHERWISE: Final = ("dataclass", "tuple", "enum")
 """Pydantic's types that a file does not have: it has a table, a list or a text instead."""
 _NO_SCHEMA: Final = ("default", "metadata", "expected")
 """Parts of pydantic's schemas that are values, not schemas."""
-_KNOWN: Final = frozenset(get_args(core_schema.ErrorType))  # pydantic's kinds of error; a custom one states its rule
+_UNKNOWN_FIELD: Final = ("extra_forbidden", "unexpected_keyword_argument")
+"""Pydantic's kinds of error for a field that no table has."""
+_PYDANTIC_ERRORS: Final = frozenset(get_args(core_schema.ErrorType))
+"""Pydantic's kinds of error; an error of another kind states its rule."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +77,11 @@ class Kind:
         """Kinds of the entries of a list, or of a table with free names."""
         origin = get_origin(self.type)
         arguments = get_args(self.type)
-        return kinds_of(arguments[0] if origin is tuple else arguments[-1]) if origin in (*_LISTS, dict) else ()
+        if origin is tuple:
+            return kinds_of(arguments[0])
+        if origin in (*_LISTS, dict):
+            return kinds_of(arguments[-1])
+        return ()
 
     @property
     def choices(self) -> tuple[Any, ...]:
@@ -84,9 +95,14 @@ class Kind:
     @property
     def labels(self) -> set[str]:
         """Names that pydantic gives this kind in a union."""
-        tags = {note.tag for note in self.metadata if isinstance(note, Tag)}
-        for name in {*_TAGS} & {*self.fields}:
-            tags |= {str(choice) for kind in kinds_of(fields_of(self.type)[name].annotation) for choice in kind.choices}
+        tags: set[str] = set()
+        for note in self.metadata:
+            if isinstance(note, Tag):
+                tags.add(note.tag)
+        for name in _TAGS:
+            if name in self.fields:
+                for kind in kinds_of(fields_of(self.type)[name].annotation):
+                    tags.update(map(str, kind.choices))
         return tags or {getattr(self.type, "__name__", "")}
 
     @property
@@ -102,35 +118,58 @@ class Kind:
     def __str__(self) -> str:
         """Return what is allowed, to end the sentence "must be ..."."""
         if self.choices:
-            *rest, last = ("false" if choice is False else repr(choice) for choice in self.choices)
-            if rest:
-                return f"one of {', '.join(rest)} or {last}"
-            return last
-        limits = self.limits
-        count = _count(*self.lengths)
+            return self._choice()
         if self.is_list:
-            held = {entry.type for entry in self.entries}
-            return f"a list of {count}{'numbers' if held <= {float, int} else 'texts' if held == {str} else 'entries'}"
+            return self._list()
         if self.type in _NAMES:
-            bounds = []
-            for name, sign in _LIMITS.items():
-                if name in limits:
-                    bounds.append(f"{sign} {_number(limits[name])}")
-            if self.type is float and not bounds:
-                finite = "finite "
-            else:
-                finite = ""
-            count = f"of {count}characters" if count else ""
-            if "pattern" in limits:
-                form = f"of the form {limits['pattern']}"
-            else:
-                form = ""
-            return " ".join(filter(None, [f"a {finite}{_NAMES[self.type]}", " and ".join(bounds), count, form]))
+            return self._number_or_text()
         if self.type is bool:
             return "true or false"
+        count = _count(*self.lengths)
         if count:
             return f"a table of {count}entries"
         return "a table"
+
+    def _choice(self) -> str:
+        texts = []
+        for choice in self.choices:
+            if choice is False:
+                texts.append("false")
+            else:
+                texts.append(repr(choice))
+        *others, last = texts
+        if others:
+            return f"one of {', '.join(others)} or {last}"
+        return last
+
+    def _list(self) -> str:
+        types = {entry.type for entry in self.entries}
+        if types <= {float, int}:
+            entries = "numbers"
+        elif types == {str}:
+            entries = "texts"
+        else:
+            entries = "entries"
+        return f"a list of {_count(*self.lengths)}{entries}"
+
+    def _number_or_text(self) -> str:
+        limits = self.limits
+        bounds = []
+        for name, sign in _LIMITS.items():
+            if name in limits:
+                bounds.append(f"{sign} {_number(limits[name])}")
+        if self.type is float and not bounds:
+            words = ["a finite number"]
+        else:
+            words = [f"a {_NAMES[self.type]}"]
+        if bounds:
+            words.append(" and ".join(bounds))
+        count = _count(*self.lengths)
+        if count:
+            words.append(f"of {count}characters")
+        if "pattern" in limits:
+            words.append(f"of the form {limits['pattern']}")
+        return " ".join(words)
 
 
 def _limits(notes: Iterable[Any]) -> Iterator[tuple[str, Any]]:
@@ -140,11 +179,14 @@ def _limits(notes: Iterable[Any]) -> Iterator[tuple[str, Any]]:
             yield from _limits(note.metadata)
         elif isinstance(note, GroupedMetadata):
             yield from _limits(note)
-        names = (*_LIMITS, "min_length", "max_length", "pattern")
-        yield from ((name, getattr(note, name)) for name in names if getattr(note, name, None) is not None)
+        for name in (*_LIMITS, "min_length", "max_length", "pattern"):
+            limit = getattr(note, name, None)
+            if limit is not None:
+                yield name, limit
 
 
 def _count(shortest: int, longest: float) -> str:
+    """Return how many entries or characters are allowed, with a space behind; empty where any number is."""
     if shortest == longest:
         return f"{shortest} "
     if math.isinf(longest):
@@ -173,13 +215,22 @@ class FilePlace:
     @property
     def fields(self) -> tuple[str, ...]:
         """Names of all fields of the tables allowed there."""
-        return tuple(dict.fromkeys(name for kind in self.kinds for name in kind.fields))
+        names: dict[str, None] = {}  # each once, in order
+        for kind in self.kinds:
+            names |= dict.fromkeys(kind.fields)
+        return tuple(names)
 
     @property
     def is_of_wrong_length(self) -> bool:
         """Whether the value is a list that is too short or too long."""
-        lists = [kind.lengths for kind in self.kinds if kind.is_list]
-        return isinstance(self.given, list) and not any(low <= len(self.given) <= high for low, high in lists)
+        if not isinstance(self.given, list):
+            return False
+        for kind in self.kinds:
+            if kind.is_list:
+                shortest, longest = kind.lengths
+                if shortest <= len(self.given) <= longest:
+                    return False
+        return True
 
 
 def find(path: Sequence[int | str], data: Any, root: type[Any]) -> FilePlace:
@@ -187,30 +238,52 @@ def find(path: Sequence[int | str], data: Any, root: type[Any]) -> FilePlace:
     names: list[str] = []
     kinds: tuple[Kind, ...] = (Kind(type=root),)
     for part in path:
-        named = tuple(kind for kind in kinds if part in kind.labels)
-        fields = []
-        for kind in kinds:
-            if part in kind.fields:
-                fields.append(fields_of(kind.type)[part])
         if isinstance(part, int):
             data = data[part]
-            if isinstance(data, Mapping):
-                name = data.get("name")
-            else:
-                name = None
-            names.append(name if isinstance(name, str) and name else str(part))
-            kinds = tuple(entry for kind in kinds for entry in kind.entries)
-        elif len(kinds) > 1 and named:
-            kinds = named
-        elif fields or (isinstance(data, Mapping) and part in data):
+            names.append(_entry_name(data, part))
+            kinds = _entries_of(kinds)
+            continue
+        labelled = tuple(kind for kind in kinds if part in kind.labels)
+        if len(kinds) > 1 and labelled:  # pydantic's name for a member of a union, which the file does not have
+            kinds = labelled
+            continue
+        fields = [fields_of(kind.type)[part] for kind in kinds if part in kind.fields]
+        if fields or (isinstance(data, Mapping) and part in data):
             names.append(part)
             if isinstance(data, Mapping):
                 data = data.get(part)
             else:
                 data = None
-            inner = [kinds_of(field.annotation, tuple(field.metadata)) for field in fields]
-            kinds = tuple(kind for group in inner or [kind.entries for kind in kinds] for kind in group)
+            if fields:
+                kinds = _kinds_of_fields(fields)
+            else:
+                kinds = _entries_of(kinds)
     return FilePlace(names=tuple(names), kinds=kinds, given=data)
+
+
+def _entry_name(entry: Any, i: int) -> str:
+    """Return the name of a list's entry, or else its index."""
+    if isinstance(entry, Mapping):
+        name = entry.get("name")
+        if isinstance(name, str) and name:
+            return name
+    return str(i)
+
+
+def _entries_of(kinds: Iterable[Kind]) -> tuple[Kind, ...]:
+    """Return the kinds of entry of lists, or of tables with free names, of these kinds."""
+    entries: list[Kind] = []
+    for kind in kinds:
+        entries += kind.entries
+    return tuple(entries)
+
+
+def _kinds_of_fields(fields: Iterable[FieldInfo]) -> tuple[Kind, ...]:
+    """Return the kinds that any of the fields allows."""
+    kinds: list[Kind] = []
+    for field in fields:
+        kinds += kinds_of(field.annotation, tuple(field.metadata))
+    return tuple(kinds)
 
 
 def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...]:
@@ -220,7 +293,10 @@ def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...
         inner, *notes = get_args(annotation)
         return kinds_of(inner, (*metadata, *notes))
     if origin in (Union, UnionType):
-        return tuple(kind for member in get_args(annotation) for kind in kinds_of(member, metadata))
+        kinds: list[Kind] = []
+        for member in get_args(annotation):
+            kinds += kinds_of(member, metadata)
+        return tuple(kinds)
     if annotation is NoneType:
         return ()
     return (Kind(type=annotation, metadata=metadata),)
@@ -232,6 +308,7 @@ _MOST_ENTRIES: Final = 10
 _LONGEST: Final = 200
 """Entries and characters of a given value that a message shows."""
 _DEEPEST_SHOWN: Final = 4
+"""Tables and lists within one another that a message shows of a given value."""
 
 
 class ScenarioError(InputError):
@@ -243,7 +320,9 @@ class ScenarioError(InputError):
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
         unsaid = len(problems) - _MOST_LINES
-        lines = [*problems[:_MOST_LINES], *([f"and {unsaid} more"] if unsaid > 0 else [])]
+        lines = [*problems[:_MOST_LINES]]
+        if unsaid > 0:
+            lines.append(f"and {unsaid} more")
         super().__init__(f"{source}: " + "\n  ".join(lines))
         self.source = source
         self.problems = tuple(problems)
@@ -291,9 +370,12 @@ def _in_types_of_files(value: Any) -> Any:
 
 def _not_unicode(data: Any, names: tuple[str, ...] = ()) -> Iterator[str]:
     """Yield a line about each text that no file of ours can hold, such as the path of a folder that is not UTF-8."""
-    if isinstance(data, Mapping | list):
-        for name, entry in data.items() if isinstance(data, Mapping) else enumerate(data):
+    if isinstance(data, Mapping):
+        for name, entry in data.items():
             yield from _not_unicode(entry, (*names, str(name)))
+    elif isinstance(data, list):
+        for i, entry in enumerate(data):
+            yield from _not_unicode(entry, (*names, str(i)))
     elif isinstance(data, str) and any("\ud800" <= character <= "\udfff" for character in data):
         yield f"{'.'.join(names)} must be UTF-8, as every path and text; got {shown(data)}; rename it"
 
@@ -322,7 +404,10 @@ def _of_dicts_and_lists(schema: Any) -> Any:
         return schema
     relaxed = {}
     for name, entry in schema.items():
-        relaxed[name] = entry if name in _NO_SCHEMA else _of_dicts_and_lists(entry)
+        if name in _NO_SCHEMA:
+            relaxed[name] = entry
+        else:
+            relaxed[name] = _of_dicts_and_lists(entry)
     if relaxed.get("type") in _WRITTEN_OTHERWISE:
         relaxed["strict"] = False
     return relaxed
@@ -336,24 +421,42 @@ def describe_all(
     Missing fields come last, since they may only be misspelt.  Arguments as for `describe`.
     """
     wrong: dict[tuple[str, ...], ErrorDetails] = {}
-    whole: set[tuple[str, ...]] = set()  # lists of a wrong length, whose entries do not matter
+    lists_of_wrong_length: set[tuple[str, ...]] = set()
     for details in sorted(error.errors(include_url=False), key=lambda details: details["type"] == "missing"):
-        for i, part in enumerate(details["loc"]):  # where a list is too long, its entries do not matter
-            if isinstance(part, int) and find(details["loc"][:i], data, root).is_of_wrong_length:
-                details = {**details, "loc": details["loc"][:i], "type": "too_long"}
-                break
+        details = _about_whole_list(details, data, root)
         place = find(details["loc"], data, root)
         wrong.setdefault(place.names, details)
         if details["type"] in ("too_short", "too_long") and place.is_of_wrong_length:
-            whole.add(place.names)
-    above = {names[:i] for names in wrong for i in range(len(names))}  # of what is wrong within
-    told = [
-        details
-        for names, details in wrong.items()
-        if not any(names[:i] in whole for i in range(len(names))) and (names in whole or names not in above)
-    ]
+            lists_of_wrong_length.add(place.names)
+    with_wrong_parts: set[tuple[str, ...]] = set()
+    for names in wrong:
+        with_wrong_parts |= _enclosing(names)
+    told = []
+    for names, details in wrong.items():
+        if lists_of_wrong_length & _enclosing(names):
+            continue
+        if names in lists_of_wrong_length or names not in with_wrong_parts:
+            told.append(details)
     lines = [describe(details, data, root, file=file) for details in told[:_MOST_DESCRIBED]]
-    return lines + [".".join(map(str, details["loc"])) for details in told[_MOST_DESCRIBED:]]
+    for details in told[_MOST_DESCRIBED:]:
+        lines.append(".".join(map(str, details["loc"])))
+    return lines
+
+
+def _about_whole_list(details: ErrorDetails, data: Any, root: type[Any]) -> ErrorDetails:
+    """Return an error about an entry as one about its list, if that has a wrong length: then its entries do not matter.
+
+    Other errors are returned as they are.
+    """
+    for i, part in enumerate(details["loc"]):
+        if isinstance(part, int) and find(details["loc"][:i], data, root).is_of_wrong_length:
+            return {**details, "loc": details["loc"][:i], "type": "too_long"}
+    return details
+
+
+def _enclosing(names: tuple[str, ...]) -> set[tuple[str, ...]]:
+    """Return the places of the tables and lists around a place."""
+    return {names[:i] for i in range(len(names))}
 
 
 def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *, file: str = "scenario") -> str:
@@ -361,43 +464,68 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *,
     place = find(details["loc"], data, root)
     field = ".".join(place.names)
     kind = details["type"]
-    given = place.given
     if kind == "missing":
         return f"{field} is missing"
-    if kind in ("extra_forbidden", "unexpected_keyword_argument") and field in _GONE:
-        return f"{field} must be left out, as it went ({_GONE[field]}); got {shown(given)}"
-    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+    if kind in _UNKNOWN_FIELD:
         allowed = find(details["loc"][:-1], data, root).fields
-        if len(place.names) == 1 and field != "base":
-            allowed += ("base",)  # which is gone once a file has been merged over its base
-        hint = _REASONS.get(field) or _guess(place.names[-1], allowed)
-        return f"{field} is not a field of the {file} file{hint} (there are: {', '.join(allowed)})"
+        return _about_unknown_field(place, allowed, file)
     if kind == "value_error":
-        cause = details["ctx"]["error"]
-        if isinstance(cause, ParameterError):  # of a dataclass, which does not know where it stands
-            return str(ParameterError(field, cause.name, cause.value, cause.rule))
-        if isinstance(cause, UnknownNameError):
-            return f"{field}.{cause.kind}: {cause}"
-        return ".".join([*place.names, str(cause)])
-    choices = [str(choice) for allowed in place.kinds for choice in allowed.choices]
-    rule = " or ".join(dict.fromkeys(map(str, place.kinds)))
+        return _about_refused_value(place, details["ctx"]["error"])
     if kind.startswith("union_tag"):
-        quoted = details["ctx"][
-            "discriminator"
-        ]  # in quotes where it is a field's name, and else a function of the spec's
-        if quoted.startswith("'"):
-            name = quoted.strip("'")
-        else:
-            name = "type"
-        expected = details["ctx"].get("expected_tags") or ", ".join(
-            repr(each) for k in place.kinds for each in k.labels
-        )
-        choices = expected.strip("'").split("', '")
-        if isinstance(given, Mapping):
-            given = given.get(name)
-        field = f"{field}.{name}"
-        rule = f"one of {expected}"
-    return f"{field} must be {rule if kind in _KNOWN else details['msg']}; got {shown(given)}{_guess(given, choices)}"
+        return _about_type(place, details["ctx"])
+    if kind in _PYDANTIC_ERRORS:
+        rule = " or ".join(dict.fromkeys(map(str, place.kinds)))
+    else:
+        rule = details["msg"]
+    choices: list[str] = []
+    for allowed_kind in place.kinds:
+        choices += map(str, allowed_kind.choices)
+    return f"{field} must be {rule}; got {shown(place.given)}{_guess(place.given, choices)}"
+
+
+def _about_unknown_field(place: FilePlace, allowed: tuple[str, ...], file: str) -> str:
+    """Return the line about a field that is none; `allowed` are the fields of its table."""
+    field = ".".join(place.names)
+    if field in _REMOVED_FIELDS:
+        return f"{field} must be left out, as it went ({_REMOVED_FIELDS[field]}); got {shown(place.given)}"
+    if len(place.names) == 1 and field != "base":
+        allowed += ("base",)  # which is gone once a file has been merged over its base
+    hint = _WHY_ABSENT.get(field) or _guess(place.names[-1], allowed)
+    return f"{field} is not a field of the {file} file{hint} (there are: {', '.join(allowed)})"
+
+
+def _about_refused_value(place: FilePlace, cause: Exception) -> str:
+    """Return the line about a value that its table refused, which does not know where in the file it stands."""
+    field = ".".join(place.names)
+    if isinstance(cause, ParameterError):
+        return str(ParameterError(field, cause.name, cause.value, cause.rule))
+    if isinstance(cause, UnknownNameError):
+        return f"{field}.{cause.kind}: {cause}"
+    return ".".join([*place.names, str(cause)])
+
+
+def _about_type(place: FilePlace, context: Mapping[str, Any]) -> str:
+    """Return the line about a table whose type, or another field that distinguishes tables, is missing or unknown.
+
+    `context` is that of pydantic's error.
+    """
+    discriminator = context["discriminator"]  # in quotes where it is a field's name, else the name of a function
+    if discriminator.startswith("'"):
+        name = discriminator.strip("'")
+    else:
+        name = "type"
+    expected = context.get("expected_tags")
+    if not expected:
+        labels: list[str] = []
+        for kind in place.kinds:
+            labels += map(repr, kind.labels)
+        expected = ", ".join(labels)
+    given = place.given
+    if isinstance(given, Mapping):
+        given = given.get(name)
+    choices = expected.strip("'").split("', '")
+    field = ".".join([*place.names, name])
+    return f"{field} must be one of {expected}; got {shown(given)}{_guess(given, choices)}"
 
 
 def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
@@ -414,10 +542,14 @@ def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
         entries = []
         for key, entry in islice(value.items(), _MOST_ENTRIES):
             entries.append(f"{shown(key)}: {shown(entry, depth - 1)}")
-        text = "{" + ", ".join([*entries, *(["..."] if len(value) > _MOST_ENTRIES else [])]) + "}"
+        if len(value) > _MOST_ENTRIES:
+            entries.append("...")
+        text = "{" + ", ".join(entries) + "}"
     elif isinstance(value, list):
         entries = [shown(entry, depth - 1) for entry in value[:_MOST_ENTRIES]]
-        text = "[" + ", ".join([*entries, *(["..."] if len(value) > _MOST_ENTRIES else [])]) + "]"
+        if len(value) > _MOST_ENTRIES:
+            entries.append("...")
+        text = "[" + ", ".join(entries) + "]"
     else:
         text = repr(value)
     if len(text) <= _LONGEST:
@@ -425,10 +557,13 @@ def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
     return text[: _LONGEST - 3] + "..."
 
 
-def _guess(given: object, allowed: Iterable[str]) -> str:
+def _guess(given: object, allowed: Sequence[str]) -> str:
+    """Return the allowed name that was probably meant, as the end of a message; empty where none is near."""
     if not isinstance(given, str):
         return ""
-    allowed = [*allowed]
-    meant = MEANT.get(given, ())
-    near = meant if meant and {*meant} <= {*allowed} else difflib.get_close_matches(given, allowed, n=1)
-    return f"; did you mean {' and '.join(map(repr, near))}?" if near else ""
+    names = [*MEANT.get(given, ())]
+    if not names or not {*names} <= {*allowed}:
+        names = difflib.get_close_matches(given, allowed, n=1)
+    if not names:
+        return ""
+    return f"; did you mean {' and '.join(map(repr, names))}?"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, get_args, get_type_hints
 
@@ -51,12 +51,17 @@ class _Overrides:
 
     def overrides(self) -> dict[str, Any]:
         """The parameters that are set."""
-        values = {name: getattr(self, name) for name in VEHICLE_UNITS}
-        return {name: value for name, value in values.items() if value is not None}
+        values = {}
+        for name in VEHICLE_UNITS:
+            value = getattr(self, name)
+            if value is not None:
+                values[name] = value
+        return values
 
 
 _VEHICLE_TYPES: Final = get_type_hints(Vehicle, include_extras=True)
-_PARAMETERS: Final = [(name, _VEHICLE_TYPES[name] | None, field(default=None)) for name in VEHICLE_UNITS]
+_OPTIONAL_PARAMETERS: Final = [(name, _VEHICLE_TYPES[name] | None, field(default=None)) for name in VEHICLE_UNITS]
+"""The parameters of a vehicle as fields that may be absent: name, type and default."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +75,8 @@ if TYPE_CHECKING:
     VehicleTable: TypeAlias = _Modelled
     ActualTable: TypeAlias = _Overrides
 else:
-    VehicleTable = make_dataclass("VehicleTable", _PARAMETERS, bases=(_Modelled,), frozen=True, kw_only=True)
-    ActualTable = make_dataclass("ActualTable", _PARAMETERS, bases=(_Overrides,), frozen=True, kw_only=True)
+    VehicleTable = make_dataclass("VehicleTable", _OPTIONAL_PARAMETERS, bases=(_Modelled,), frozen=True, kw_only=True)
+    ActualTable = make_dataclass("ActualTable", _OPTIONAL_PARAMETERS, bases=(_Overrides,), frozen=True, kw_only=True)
     VehicleTable.__doc__ = _Modelled.__doc__
     ActualTable.__doc__ = (
         "True parameters where they differ from the model: the plant uses them, the controller does not know them."
@@ -128,12 +133,16 @@ class Lost:
     @property
     def limits(self) -> dict[str, float]:
         """The criteria that are on and end a flight; see `quadsim.flight.phase`."""
-        return {name: limit for name in CRITERIA if (limit := getattr(self, name)) is not False}
+        limits = {}
+        for name in CRITERIA:
+            limit = getattr(self, name)
+            if limit is not False:
+                limits[name] = limit
+        return limits
 
 
 LONGEST_FLIGHT: Final = 86_400.0
-
-
+"""Largest duration [s]: a day."""
 BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate_z", "thrust", "speed", "slew")
 """Signals that controllers can bound."""
 
@@ -249,7 +258,11 @@ class Scenario:
 
     def __dir__(self) -> list[str]:
         """Return the fields and methods for users, for completion in an interactive session."""
-        return [name for name in super().__dir__() if name in _FOR_USERS or name.startswith("__")]
+        names = []
+        for name in super().__dir__():
+            if name in _FOR_USERS or name.startswith("__"):
+                names.append(name)
+        return names
 
     @property
     def ends_with_course(self) -> bool:
@@ -282,7 +295,11 @@ class Scenario:
     def altered(self, **fields: Any) -> Scenario:
         """Return a copy with other values of whole fields, without checking consistency; lists become tuples."""
         other = copy.copy(self)
-        vars(other).update({name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})
+        for name, value in fields.items():
+            if isinstance(value, list):
+                vars(other)[name] = tuple(value)
+            else:
+                vars(other)[name] = value
         restated = {*vars(self).get("restated", ()), *fields}
         vars(other).update(restated=tuple(sorted(restated)))
         if "duration" in fields:
@@ -293,10 +310,9 @@ class Scenario:
         """Return the scenario with these tables, in which it repeats the numbers of its vehicle's file."""
         record = self.recorded
         if record is None:
-            tables = {name: plain(getattr(self, name) or {}) for name in REPEATING}
             stated = []
-            for table in tables:
-                for name in tables[table]:
+            for table in REPEATING:
+                for name in plain(getattr(self, table) or {}):
                     if name != "file":
                         stated.append(f"{table}.{name}")
             record = RecordedVehicle(file=self.vehicle.file, stated=tuple(stated))
@@ -308,24 +324,39 @@ class Scenario:
         Raises:
             ValueError: two fields contradict each other.
         """
-        for name, value, unit in (
-            ("control_period", self.control_period, self.plant.timestep),
-            ("duration", self.duration, self.control_period),
-            ("log_rate", 1.0 / self.log_rate, self.plant.timestep),
-        ):
-            try:
-                steps_per_period(value, unit)
-            except ParameterError:
-                if name == "duration":
-                    what = "the control period"
-                else:
-                    what = "the physics step plant.timestep"
-                rate = self.log_rate if name == "log_rate" else value
-                if name == "log_rate":
-                    period = "have a period that is"
-                else:
-                    period = "be"
-                raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {rate}") from None
+        self._check_periods()
+        self._check_recorded()
+        self._check_events()
+        controllers = [self.controller, *(spec for _, spec in self.controller_changes)]
+        self._check_inner_rates(controllers)
+        self._check_size(controllers)
+        if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
+            raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
+        check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
+        self._check_constraints()
+
+    def _check_periods(self) -> None:
+        """Refuse a control period, duration or log rate that is no whole number of steps."""
+        timestep = self.plant.timestep
+        step = f"the physics step plant.timestep = {timestep} s"
+        try:
+            steps_per_period(self.control_period, timestep)
+        except ParameterError:
+            raise ValueError(f"control_period must be a whole multiple of {step}; got {self.control_period}") from None
+        try:
+            steps_per_period(self.duration, self.control_period)
+        except ParameterError:
+            period = f"the control period = {self.control_period} s"
+            raise ValueError(f"duration must be a whole multiple of {period}; got {self.duration}") from None
+        try:
+            steps_per_period(1.0 / self.log_rate, timestep)
+        except ParameterError:
+            raise ValueError(
+                f"log_rate must have a period that is a whole multiple of {step}; got {self.log_rate}"
+            ) from None
+
+    def _check_recorded(self) -> None:
+        """Refuse recorded numbers of another vehicle file."""
         if self.recorded is not None and self.recorded.file != self.vehicle.file:
             advice = (
                 "for another vehicle remove [recorded], and the numbers of [vehicle] and [autopilot] that repeat it"
@@ -333,9 +364,10 @@ class Scenario:
             raise ValueError(
                 f"recorded.file must be vehicle.file = {self.vehicle.file!r}; got {self.recorded.file!r} ({advice})"
             )
-        self._check_events()
-        specs = [self.controller, *(spec for _, spec in self.controller_changes)]
-        for spec in specs:
+
+    def _check_inner_rates(self, controllers: Sequence[AnyController]) -> None:
+        """Refuse inner loops whose period is no whole number of physics steps."""
+        for spec in controllers:
             if spec.indi is not None:
                 try:
                     inner_steps(spec.indi.rate, self.plant.timestep)
@@ -346,15 +378,20 @@ class Scenario:
                 inner_steps(self.autopilot.rate, self.plant.timestep)
             except ParameterError as error:
                 raise ValueError(f"autopilot.rate must be {error.rule}; got {self.autopilot.rate}") from None
-        for what, count in (
-            ("physics steps", self.periods * self.steps_per_period),
-            ("planned steps", self.periods * max(spec.horizon for spec in specs)),
-        ):
+
+    def _check_size(self, controllers: Sequence[AnyController]) -> None:
+        """Refuse a flight of too many steps, of the physics or of all plans together."""
+        longest_horizon = max(spec.horizon for spec in controllers)
+        counts = {
+            "physics steps": self.periods * self.steps_per_period,
+            "planned steps": self.periods * longest_horizon,
+        }
+        for what, count in counts.items():
             if count > MOST_STEPS:
                 raise ValueError(f"duration must make at most {MOST_STEPS} {what}; got {count}")
-        if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
-            raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
-        check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
+
+    def _check_constraints(self) -> None:
+        """Refuse constraints without bounds that no controller has either, and names that stand twice."""
         for entry in self.constraints:
             if not entry.has_bounds and entry.signal not in BOUNDED:
                 raise ValueError(
@@ -374,14 +411,17 @@ class Scenario:
     def audited_names(self) -> list[str]:
         """The names of constraints, rows of polytopes, obstacles and regions."""
         names = [constraint.name for constraint in self.constraints]
-        names += [name for polytope in self.polytopes for name in polytope.row_names]
-        return names + [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
+        for polytope in self.polytopes:
+            names += polytope.row_names
+        for solid in (*self.obstacles, *self.regions):
+            names.append(solid.name)
+        return names
 
     def _check_events(self) -> None:
+        """Refuse, in order of time, events that the flight as it is by then cannot have."""
+        carried = 0
         if self.effects.load is not None:
             carried = len(self.effects.load.payloads)
-        else:
-            carried = 0
         controller = self.controller
         for i, event in sorted(enumerate(self.events), key=lambda entry: entry[1].at):
             if event.at >= self.duration:
@@ -392,14 +432,8 @@ class Scenario:
                 if not carried:
                     raise ValueError(f"events.{i}.type must not be payload_drop at {event.at} s: nothing is carried")
                 carried = 0
-            elif isinstance(event, SensorFaultEvent) and self.estimator is not None:
-                if self.sensors is None:
-                    present = []
-                else:
-                    present = [str(name) for name in self.sensors.present()]
-                if event.sensor not in present:
-                    rule = f"one that the estimator has, of {', '.join(present)}"
-                    raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
+            elif isinstance(event, SensorFaultEvent):
+                self._check_has_sensor(i, event)
             elif isinstance(event, ControllerEvent):
                 try:
                     controller = changed_controller(controller, event.fields)
@@ -407,13 +441,26 @@ class Scenario:
                     problems = getattr(error, "problems", (error,))
                     raise ValueError(f"events.{i}.fields: {'; '.join(map(str, problems))}") from None
 
+    def _check_has_sensor(self, i: int, event: SensorFaultEvent) -> None:
+        """Refuse the fault of a sensor that an estimator does not have; without an estimator each is there, perfect."""
+        if self.estimator is None:
+            return
+        names: list[str] = []
+        if self.sensors is not None:
+            names += map(str, self.sensors.present())
+        if event.sensor not in names:
+            rule = f"one that the estimator has, of {', '.join(names)}"
+            raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
+
     @property
     def controller_changes(self) -> list[tuple[float, AnyController]]:
         """Time [s] of each controller change and the new controller, in order of time."""
         changes: list[tuple[float, AnyController]] = []
-        events = (event for event in self.events if isinstance(event, ControllerEvent))
-        for event in sorted(events, key=lambda event: event.at):
-            changes.append((event.at, changed_controller(changes[-1][1] if changes else self.controller, event.fields)))
+        controller = self.controller
+        for event in sorted(self.events, key=lambda event: event.at):
+            if isinstance(event, ControllerEvent):
+                controller = changed_controller(controller, event.fields)
+                changes.append((event.at, controller))
         return changes
 
     def controller_at(self, time: float) -> AnyController:
@@ -427,7 +474,9 @@ class Scenario:
     @property
     def regions(self) -> tuple[Corridor | Fence, ...]:
         """Corridors, then the fence."""
-        return (*self.corridors, *([] if self.keep_in is None else [self.keep_in]))
+        if self.keep_in is None:
+            return self.corridors
+        return (*self.corridors, self.keep_in)
 
     @property
     def periods(self) -> int:
@@ -463,7 +512,9 @@ class Scenario:
         Raises:
             ScenarioError: the message names every invalid field.
         """
-        other = Scenario.parse(tables, source=self.name if source is None else source)
+        if source is None:
+            source = self.name
+        other = Scenario.parse(tables, source=source)
         # A reference that was passed in as a function has its rows in memory.
         if other.reference == self.reference:
             return other.altered(reference=self.reference)
@@ -493,11 +544,9 @@ class Scenario:
         tables = self.tables
         defaults = plain(self)
         for path, value in separate(changes, source="replace").items():
-            if hasattr(value, "tolist"):
-                number = value.tolist()
-            else:
-                number = value
-            set_field(tables, path, number, source="replace", defaults=defaults)
+            if hasattr(value, "tolist"):  # of numpy
+                value = value.tolist()
+            set_field(tables, path, value, source="replace", defaults=defaults)
         return self.derive(tables)
 
     def fly(self, **options: Any) -> Any:
@@ -521,8 +570,12 @@ class Scenario:
         """Return the file as `to_toml`, with values of `resolved` that this scenario does not state in comments."""
         repeated: dict[str, str] = {}
         if self.recorded is not None:
-            paths = {f"{table}.{name}" for table in REPEATING for name in plain(getattr(self, table) or {})}
-            repeated = dict.fromkeys(paths - {"vehicle.file", *self.recorded.stated}, self.recorded.file)
+            stated = {"vehicle.file", *self.recorded.stated}
+            for table in REPEATING:
+                for name in plain(getattr(self, table) or {}):
+                    path = f"{table}.{name}"
+                    if path not in stated:
+                        repeated[path] = self.recorded.file
         return to_toml(resolved, self._every_field(), repeated)
 
 

@@ -37,8 +37,12 @@ class Sensors:
 
     def present(self) -> dict[SensorName, Sensor]:
         """Return the sensors of the scenario."""
-        named = {name: getattr(self, name.value) for name in SensorName}
-        return {name: sensor for name, sensor in named.items() if sensor is not None}
+        present = {}
+        for name in SensorName:
+            sensor = getattr(self, name.value)
+            if sensor is not None:
+                present[name] = sensor
+        return present
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,18 +58,25 @@ def check_sensing(sensors: Sensors | None, estimator: EstimatorSpec | None, *, t
     Raises:
         ValueError: the message starts with the field's name.
     """
-    present = {} if sensors is None else sensors.present()
+    present: dict[SensorName, Sensor] = {}
+    if sensors is not None:
+        present = sensors.present()
     for name, sensor in present.items():
         try:
             sensor.stride(name, timestep)
             sensor.latency(name, timestep)
         except ParameterError as error:
             raise ValueError(str(error)) from None
-        noise = [*sensor.noise] if isinstance(sensor.noise, tuple) else sensor.noise
-        if estimator is not None and not np.all(np.array(noise) > 0.0):
+        if estimator is not None and not np.all(np.array(sensor.noise) > 0.0):
+            noise: object = sensor.noise
+            if isinstance(noise, tuple):
+                noise = list(noise)
             raise ValueError(
                 f"sensors.{name}.noise must be positive, for the estimator to weigh its samples; got {noise}"
             )
-    missing = [name for name in (SensorName.POSITION, SensorName.ATTITUDE) if name not in present]
-    if estimator is not None and missing:
-        raise ValueError(f"estimator must have sensors.{missing[0]} to work with; got {[str(n) for n in present]}")
+    if estimator is None:
+        return
+    for name in (SensorName.POSITION, SensorName.ATTITUDE):
+        if name not in present:
+            names = [str(sensor_name) for sensor_name in present]
+            raise ValueError(f"estimator must have sensors.{name} to work with; got {names}")

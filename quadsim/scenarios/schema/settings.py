@@ -1,10 +1,14 @@
-"""Fields of a scenario's tables by dotted path, as `--set` replaces them and a campaign draws them."""
+"""Fields of a scenario's tables by dotted path, as `--set` replaces them and a campaign draws them.
+
+`set_field` changes one in place, and with it what the tables say about themselves: which numbers repeat the vehicle's
+file (`restate`), which bounds constraints took from a controller (`state_bounds`), and the description.
+"""
 
 from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
@@ -83,8 +87,10 @@ def set_field(
         ParameterError: the path leads through something that is not a table.
         UnknownNameError: a list does not have the entry.
     """
-    if path in ("controller", "controller.type"):
-        state_bounds(data, value if path == "controller" else {"type": value})
+    if path == "controller":
+        state_bounds(data, value)
+    elif path == "controller.type":
+        state_bounds(data, {"type": value})
     restate(data, path, value)
     *through, last = path.split(".")
     holder = _holder(data, through, source=source, given=given or path, defaults=defaults)
@@ -105,7 +111,9 @@ def restate(data: dict[str, Any], path: str, value: Any) -> None:
     recorded value that is replaced is stated.
     """
     table, _, field = path.partition(".")
-    reference, vehicle, recorded = (data.get(name) for name in ("reference", "vehicle", RECORDED))
+    reference = data.get("reference")
+    vehicle = data.get("vehicle")
+    recorded = data.get(RECORDED)
     if path == "reference.file" and isinstance(reference, dict) and reference.get("file") != value:
         reference.pop("sha256", None)
     if not (isinstance(recorded, dict) and isinstance(vehicle, dict)):
@@ -113,7 +121,10 @@ def restate(data: dict[str, Any], path: str, value: Any) -> None:
     stated = recorded.get("stated", [])
     if path == "vehicle" or (path == "vehicle.file" and vehicle.get("file") != value):
         for name in REPEATING:
-            kept = {key: number for key, number in _table(data, name).items() if f"{name}.{key}" in stated}
+            kept = {}
+            for key, number in _table(data, name).items():
+                if f"{name}.{key}" in stated:
+                    kept[key] = number
             data[name] = kept
         del data[RECORDED]
         if not data["autopilot"]:
@@ -123,8 +134,11 @@ def restate(data: dict[str, Any], path: str, value: Any) -> None:
             names = [field.partition(".")[0]]
         else:
             names = [*_table({table: value}, table)]
-        new = [f"{table}.{name}" for name in names if f"{table}.{name}" not in stated]
-        data[RECORDED] = {**recorded, "stated": [*stated, *new]}
+        stated_now = [*stated]
+        for name in names:
+            if f"{table}.{name}" not in stated:
+                stated_now.append(f"{table}.{name}")
+        data[RECORDED] = {**recorded, "stated": stated_now}
 
 
 def separate(changes: Mapping[Any, Any], *, source: str) -> dict[str, Any]:
@@ -158,19 +172,27 @@ def state_bounds(data: dict[str, Any], controller: Any) -> None:
         after = controller
     if not (isinstance(before, dict) and isinstance(after, dict)) or after.get("type") in (None, before.get("type")):
         return
-    names = ("output_bounds", "input_bounds")
-    bounds, others = ({k: v for name in names for k, v in _table(law, name).items()} for law in (before, after))
-    for entry in data["constraints"] if isinstance(data.get("constraints"), list) else ():
-        if isinstance(entry, dict):
-            pair = bounds.get(str(entry.get("signal")))
-        else:
-            pair = None
-        taken = pair is not None and entry["signal"] not in others and not {"lower", "upper"} & entry.keys()
-        if taken and isinstance(pair, list) and len(pair) == 2:
+    constraints = data.get("constraints")
+    if not isinstance(constraints, list):
+        return
+    bounds_before = _bounds_by_signal(before)
+    bounds_after = _bounds_by_signal(after)
+    for entry in constraints:
+        if not isinstance(entry, dict) or {"lower", "upper"} & entry.keys():
+            continue
+        signal = str(entry.get("signal"))
+        pair = bounds_before.get(signal)
+        if signal not in bounds_after and isinstance(pair, list) and len(pair) == 2:
             entry["lower"], entry["upper"] = pair
 
 
+def _bounds_by_signal(controller: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the bounds that a controller's table states on outputs and inputs."""
+    return {**_table(controller, "output_bounds"), **_table(controller, "input_bounds")}
+
+
 def _table(data: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Return a table within another one, empty where there is none."""
     table = data.get(name)
     if isinstance(table, Mapping):
         return table
@@ -188,6 +210,7 @@ def note_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> None:
 
 
 def _note(data: dict[str, Any], changes: Iterable[tuple[str, Any]]) -> None:
+    """Note changes, by path, behind those that the description has."""
     description = data.get("description")
     if not isinstance(description, str):
         return
@@ -209,23 +232,41 @@ def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tup
     """Return fields in which nested tables differ: dotted path and both values, None where one lacks the field."""
     a = dict(leaves(first, entries=True))
     b = dict(leaves(second, entries=True))
-    return [(path, a.get(path), b.get(path)) for path in {**a, **b} if a.get(path) != b.get(path)]
+    differing = []
+    for path in {**a, **b}:
+        if a.get(path) != b.get(path):
+            differing.append((path, a.get(path), b.get(path)))
+    return differing
 
 
 def leaves(data: Mapping[str, Any], above: str = "", *, entries: bool = False) -> Iterator[tuple[str, Any]]:
     """Yield numbers, texts and lists of nested tables by dotted path, as in `set_field`; `entries`: also of lists."""
     for key, value in data.items():
         below: Any = value
-        if isinstance(value, list | tuple) and value and all(isinstance(e, Mapping) and "name" in e for e in value):
-            below = {}
-            for entry in value:
-                below[str(entry["name"])] = {k: v for k, v in entry.items() if k != "name"}
-        elif entries and isinstance(value, list | tuple):
-            below = {str(i): entry for i, entry in enumerate(value)}
+        if isinstance(value, list | tuple):
+            if _all_named(value):
+                below = _by_name(value)
+            elif entries:
+                below = {str(i): entry for i, entry in enumerate(value)}
         if isinstance(below, Mapping):
             yield from leaves(below, f"{above}{key}.", entries=entries)
         else:
             yield above + key, below
+
+
+def _all_named(entries: Sequence[Any]) -> bool:
+    """Return whether a list has entries, which are tables with a name."""
+    return bool(entries) and all(isinstance(entry, Mapping) and "name" in entry for entry in entries)
+
+
+def _by_name(entries: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return a list's tables by their names, each without its name."""
+    named = {}
+    for entry in entries:
+        fields = dict(entry)
+        name = fields.pop("name")
+        named[str(name)] = fields
+    return named
 
 
 def field_text(value: Any) -> str:
@@ -281,19 +322,33 @@ def _holder(
         else:
             if key == "controller" and isinstance(holder.get(key), str):  # its name alone
                 holder[key] = {"type": holder[key]}
-            alike = isinstance(default, Mapping) and holder.get("type", default.get("type")) == default.get("type")
-            default = default.get(key) if alike else None
-            holder = holder.setdefault(key, copy.deepcopy(default) if isinstance(default, list) else {})
+            default = _default_of(holder, key, default)
+            if key not in holder and isinstance(default, list):
+                holder[key] = copy.deepcopy(default)
+            holder = holder.setdefault(key, {})
         if not isinstance(holder, dict | list) or holder == []:
             raise ParameterError("", source, given, f"a path to a field; {key} has none")
     return holder
+
+
+def _default_of(table: Mapping[str, Any], key: str, defaults: Any) -> Any:
+    """Return the default of a table's field; None where there is none, or the defaults are those of another type."""
+    if not isinstance(defaults, Mapping):
+        return None
+    type_of_defaults = defaults.get("type")
+    if table.get("type", type_of_defaults) != type_of_defaults:
+        return None
+    return defaults.get(key)
 
 
 def _index(entries: list[Any], where: str, key: str) -> int:
     """Return the position of a list's entry from its name, or from its index."""
     names = []
     for i, entry in enumerate(entries):
-        names.append(str(entry.get("name", i)) if isinstance(entry, dict) else str(i))
+        if isinstance(entry, dict):
+            names.append(str(entry.get("name", i)))
+        else:
+            names.append(str(i))
     if key not in names:
         raise UnknownNameError(f"entry of {where}", key, names)
     return names.index(key)

@@ -32,7 +32,10 @@ def tables_in(annotation: Any) -> tuple[type[Any], ...]:
     """Return the table classes in a field's type: several for a union, none for numbers and texts."""
     if is_table(annotation):
         return (annotation,)
-    return tuple(model for argument in get_args(annotation) for model in tables_in(argument))
+    tables: list[type[Any]] = []
+    for argument in get_args(annotation):
+        tables += tables_in(argument)
+    return tuple(tables)
 
 
 def is_absent(value: object) -> bool:
@@ -43,9 +46,13 @@ def is_absent(value: object) -> bool:
 def plain(value: Any) -> Any:
     """Return tables and lists as in JSON and TOML, without absent fields."""
     if is_table(type(value)):
-        value = {name: getattr(value, name) for name in fields_of(type(value))}
+        value = _present_fields(value)
     if isinstance(value, Mapping):
-        return {name: plain(entry) for name, entry in value.items() if not is_absent(entry)}
+        present = {}
+        for name, entry in value.items():
+            if not is_absent(entry):
+                present[name] = plain(entry)
+        return present
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     return value
@@ -60,7 +67,9 @@ def to_toml(model: Any, stated: Mapping[str, Any] | None = None, recorded: Mappi
             default all of `model`.
         recorded: by dotted path, the file that a field repeats; its comment names it.
     """
-    lines = _lines(model, "", set(), plain(model) if stated is None else stated, recorded or {})
+    if stated is None:
+        stated = plain(model)
+    lines = _lines(model, "", set(), stated, recorded or {})
     return "\n".join(lines) + "\n"
 
 
@@ -74,13 +83,13 @@ def stated_lines(header: str, model: Any, explained: set[object]) -> list[str]:
     """
     kind = type(model)
     lines = [header]
-    for name, field in sorted(fields_of(kind).items(), key=_type_first):
+    for name, field in _fields_type_first(kind):
         value = getattr(model, name)
         if value == field.get_default(call_default_factory=True) and name != "type":
             continue
         comment = ""
         if (kind, name) not in explained:
-            comment = " ".join((field.description or "").split())
+            comment = _description(field)
         explained.add((kind, name))
         lines += _commented(_pair(name, _without_defaults(value)), comment)
     return lines
@@ -104,56 +113,69 @@ def _lines(
     model: Any, path: str, explained: set[object], stated: Mapping[str, Any], recorded: Mapping[str, str]
 ) -> Iterator[str]:
     """Yield the lines of a table: numbers, texts and small lists, then its subtables, in order of declaration."""
-    below: list[tuple[str, Any, str]] = []
-    for name, field in sorted(fields_of(type(model)).items(), key=_type_first):
+    subtables: list[tuple[str, Any, str]] = []
+    for name, field in _fields_type_first(type(model)):
         value = getattr(model, name)
         kinds = tables_in(field.annotation)
         is_new = (type(model), name) not in explained
         explained.add((type(model), name))
+        comment = ""
         if is_new:
-            comment = " ".join((field.description or "").split())
-        else:
-            comment = ""
+            comment = _description(field)
         if is_table(type(value)):
-            below.append((name, value, comment or headline(type(value)) if is_new else ""))
-        elif isinstance(value, Mapping) or (value and kinds and not path):
-            below.append((name, value, comment))
-        elif is_absent(value) and kinds:
             if is_new:
-                below.append((name, None, comment or "; ".join(map(headline, kinds))))
+                comment = comment or headline(type(value))
+            subtables.append((name, value, comment))
+        elif isinstance(value, Mapping) or (value and kinds and not path):
+            subtables.append((name, value, comment))
         elif is_absent(value):
-            yield from _commented(f"# {name} =", comment) if is_new else ()
+            if is_new and kinds:
+                subtables.append((name, None, comment or _headlines(kinds)))
+            elif is_new:
+                yield from _commented(f"# {name} =", comment)
         elif name not in stated:
             yield from _commented(_unstated(_pair(name, value)), _labelled_as("derived", comment))
         else:
-            yield from _about_entries(kinds) if kinds not in explained else ()
+            if kinds not in explained:
+                yield from _about_entries(kinds)
             explained.add(kinds)
             source = recorded.get(f"{path}{name}")
-            yield from _commented(_pair(name, value), _labelled_as(f"of {source}", comment) if source else comment)
-    for name, value, comment in below:
+            if source:
+                comment = _labelled_as(f"of {source}", comment)
+            yield from _commented(_pair(name, value), comment)
+    for name, value, comment in subtables:
+        place = f"{path}{name}"
         if value is None:
             field = fields_of(type(model))[name]
-            yield from _absent(f"{path}{name}", tables_in(field.annotation), comment, explained)
+            yield from _absent(place, tables_in(field.annotation), comment, explained)
         elif isinstance(value, list | tuple):
-            yield from ["", *_wrapped(comment)]
-            several = len({type(entry) for entry in value}) > 1
-            for entry in value:
-                if (several or not comment) and type(entry) not in explained:
-                    about = headline(type(entry))
-                else:
-                    about = ""
-                explained.add(type(entry))
-                lines = _lines(entry, f"{name}.", explained, plain(entry), recorded)
-                yield from ["", *_commented(f"[[{name}]]", about), *lines]
+            yield from _list_of_tables(name, value, comment, explained, recorded)
         elif isinstance(value, Mapping):
-            yield from ["", *_commented(f"[{path}{name}]", comment)]
-            yield from (_pair(key, entry) for key, entry in value.items())
+            yield from ["", *_commented(f"[{place}]", comment)]
+            for key, entry in value.items():
+                yield _pair(key, entry)
         elif name in stated:
-            yield from ["", *_commented(f"[{path}{name}]", comment)]
-            yield from _lines(value, f"{path}{name}.", explained, stated[name], recorded)
+            yield from ["", *_commented(f"[{place}]", comment)]
+            yield from _lines(value, f"{place}.", explained, stated[name], recorded)
         else:
-            yield from ["", *_commented(f"# [{path}{name}]", _labelled_as("derived", comment))]
-            yield from _lines(value, f"{path}{name}.", explained, {}, recorded)
+            yield from ["", *_commented(f"# [{place}]", _labelled_as("derived", comment))]
+            yield from _lines(value, f"{place}.", explained, {}, recorded)
+
+
+def _list_of_tables(
+    name: str, entries: Sequence[Any], comment: str, explained: set[object], recorded: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield a list of tables; a kind's headline stands where it first occurs, unless the list's comment says enough."""
+    yield from ["", *_wrapped(comment)]
+    several = len({type(entry) for entry in entries}) > 1
+    for entry in entries:
+        kind = type(entry)
+        about = ""
+        if (several or not comment) and kind not in explained:
+            about = headline(kind)
+        explained.add(kind)
+        yield from ["", *_commented(f"[[{name}]]", about)]
+        yield from _lines(entry, f"{name}.", explained, plain(entry), recorded)
 
 
 def _absent(path: str, kinds: Sequence[type[Any]], comment: str, explained: set[object]) -> Iterator[str]:
@@ -163,23 +185,24 @@ def _absent(path: str, kinds: Sequence[type[Any]], comment: str, explained: set[
         yield from _about_entries(kinds)
         return
     (kind,) = kinds
-    below: list[tuple[str, tuple[type[Any], ...], str]] = []
-    for name, field in sorted(fields_of(kind).items(), key=_type_first):
+    subtables: list[tuple[str, tuple[type[Any], ...], str]] = []
+    for name, field in _fields_type_first(kind):
         is_new = (kind, name) not in explained
         explained.add((kind, name))
+        about = ""
         if is_new:
-            about = " ".join((field.description or "").split())
-        else:
-            about = ""
+            about = _description(field)
         default = field.get_default(call_default_factory=True)
         tables = tables_in(field.annotation)
         if tables and not isinstance(default, list | tuple):
-            below.append((name, tables, about or "; ".join(map(headline, tables)) if is_new else ""))
+            if is_new:
+                about = about or _headlines(tables)
+            subtables.append((name, tables, about))
         elif default is PydanticUndefined or is_absent(default):
             yield from _commented(f"# {name} =", about)
         else:
             yield from _commented(_unstated(_pair(name, plain(default))), about)
-    for name, tables, about in below:
+    for name, tables, about in subtables:
         yield from _absent(f"{path}.{name}", tables, about, explained)
 
 
@@ -189,6 +212,7 @@ def _unstated(text: str) -> str:
 
 
 def _labelled_as(label: str, comment: str) -> str:
+    """Return a comment with a label before it."""
     if comment:
         return f"{label}; {comment}"
     return label
@@ -198,26 +222,36 @@ def _about_entries(kinds: Sequence[type[Any]]) -> Iterator[str]:
     """Yield the comments on the tables in a small list; for several kinds only the fields' names."""
     for kind in kinds:
         if len(kinds) > 1:
-            names = ", ".join(_labelled(name, info) for name, info in sorted(fields_of(kind).items(), key=_type_first))
+            names = ", ".join(_with_type(name, field) for name, field in _fields_type_first(kind))
             yield from _wrapped(f"{{{names}}}: {headline(kind)}", subsequent_indent="  ", break_on_hyphens=False)
             continue
-        width = max(map(len, fields_of(kind)))
-        yield from _wrapped(f"each {{{', '.join(fields_of(kind))}}}: {headline(kind)}")
-        yield from (f"#   {name:<{width}}  {info.description or ''}" for name, info in fields_of(kind).items())
+        fields = fields_of(kind)
+        width = max(map(len, fields))
+        yield from _wrapped(f"each {{{', '.join(fields)}}}: {headline(kind)}")
+        for name, field in fields.items():
+            yield f"#   {name:<{width}}  {field.description or ''}"
 
 
-def _type_first(field: tuple[str, FieldInfo]) -> bool:
-    return field[0] != "type"
+def _fields_type_first(kind: type[Any]) -> list[tuple[str, FieldInfo]]:
+    """Return the fields of a table in order of declaration, behind its type."""
+    return sorted(fields_of(kind).items(), key=lambda named: named[0] != "type")
 
 
-def _labelled(name: str, info: FieldInfo) -> str:
-    """Return a field's name; for a type field with its value."""
-    if get_origin(info.annotation) is Literal:
-        choices = get_args(info.annotation)
-    else:
-        choices = ()
-    if name == "type" and len(choices) == 1:
-        return f'{name} = "{choices[0]}"'
+def _description(field: FieldInfo) -> str:
+    """Return what a field's comment says, on one line."""
+    return " ".join((field.description or "").split())
+
+
+def _headlines(kinds: Sequence[type[Any]]) -> str:
+    return "; ".join(map(headline, kinds))
+
+
+def _with_type(name: str, field: FieldInfo) -> str:
+    """Return a field's name; that of a type with its value, if it has only one."""
+    if name == "type" and get_origin(field.annotation) is Literal:
+        choices = get_args(field.annotation)
+        if len(choices) == 1:
+            return f'{name} = "{choices[0]}"'
     return name
 
 
@@ -228,9 +262,10 @@ def _pair(name: str, value: Any) -> str:
 def _text(value: Any) -> str:
     """Return a number, a text, a list or a small table as TOML."""
     if is_table(type(value)):
-        value = {name: entry for name in fields_of(type(value)) if not is_absent(entry := getattr(value, name))}
+        value = _present_fields(value)
     if isinstance(value, Mapping):
-        return f"{{{', '.join(_pair(name, entry) for name, entry in value.items())}}}"
+        pairs = ", ".join(_pair(name, entry) for name, entry in value.items())
+        return f"{{{pairs}}}"
     if isinstance(value, list | tuple):
         entries = [*map(_text, value)]
         line = f"[{', '.join(entries)}]"
@@ -240,9 +275,21 @@ def _text(value: Any) -> str:
     return tomlkit.item(value).as_string()
 
 
+def _present_fields(table: Any) -> dict[str, Any]:
+    """Return the fields of a table that a file has."""
+    present = {}
+    for name in fields_of(type(table)):
+        entry = getattr(table, name)
+        if not is_absent(entry):
+            present[name] = entry
+    return present
+
+
 def _commented(text: str, comment: str) -> list[str]:
     """Return a line with its comment beside it, or above it if it is long."""
-    line = f"{text}  # {comment}" if comment else text
+    line = text
+    if comment:
+        line = f"{text}  # {comment}"
     if len(line) <= WIDTH and "\n" not in text:
         return [line]
     return [*_wrapped(comment), text]
