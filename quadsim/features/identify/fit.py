@@ -26,8 +26,8 @@ from quadsim.features.identify.estimate import (
 )
 from quadsim.features.identify.model import INCREMENTS, mean_voltage, stretch
 from quadsim.features.identify.record import Record, part_of
-from quadsim.features.identify.rotor_response import RotorResponse, foretold_speeds, rotor_response
-from quadsim.features.identify.search import LEVEL_PLATE, PLATE, NormalEquations, Search
+from quadsim.features.identify.rotor_response import RotorResponse, response_speeds, rotor_response
+from quadsim.features.identify.search import DRAG_AREAS, FLAT_BODY, NormalEquations, Search
 from quadsim.state import Array
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 
@@ -139,7 +139,7 @@ def identify_records(
     if records[0].speeds is not None and (records[0].commands is not None or records[0].throttle is not None):
         voltage = mean_voltage(flown)
         response = rotor_response(flown, vehicle, voltage)
-        flown = [replace(part, foretold=foretold_speeds(part, vehicle, voltage, response)) for part in flown]
+        flown = [replace(part, instrument_speeds=response_speeds(part, vehicle, voltage, response)) for part in flown]
 
     def searched(fixed: Mapping[str, float], found: Search | None = None) -> Search:
         search = Search(flown, vehicle, wind=blows, fixed=fixed)
@@ -182,7 +182,7 @@ class _Fit:
         self.left_out = np.array([np.linalg.solve(H - block.H, block.g) for block in blocks])
         self.quantile = _quantile(len(blocks))
         self.rests = np.diag(self.cov) * np.diag(prior)
-        self._by_flight = [_alone(flight, blocks, search, whole) for flight in range(search.flights)]
+        self._by_flight = [_alone(flight, blocks, search, whole) for flight in range(search.flight_count)]
         record = search.parts[0].record
         self._blind = record.speeds is None  # to what the rotors do
         self._throttle = self._blind and record.commands is None
@@ -226,7 +226,7 @@ class _Fit:
     def _floor(self, shares: Mapping[int, float], axes: Sequence[str]) -> float:
         """Deviation of a sum of shares of x by what the prediction leaves out."""
         floor = max(_KINDS[self._kind(i)].floor for i in shares) * (_THROTTLE_FLOOR_FACTOR if self._throttle else 1.0)
-        turns = {*axes} <= {"roll", "pitch", "yaw"} and all(self.search.sought[i].scale is None for i in shares)
+        turns = {*axes} <= {"roll", "pitch", "yaw"} and all(self.search.free[i].scale is None for i in shares)
         if not turns:
             return floor
         lags = any(self._kind(i) in ("rotor_rise", "rotor_fall") for i in shares)
@@ -235,7 +235,7 @@ class _Fit:
 
     def _gusts_turn(self) -> bool:
         """Whether there is wind and, by two standard deviations, a moment that it makes a torque of."""
-        sought = self.search.sought
+        sought = self.search.free
         deviations = np.sqrt(np.diag(self.cov))
         moments = [i for i, number in enumerate(sought) if number.name.startswith("rotor_moment")]
         blows = any(number.name == "wind" for number in sought)
@@ -244,7 +244,7 @@ class _Fit:
         )
 
     def _kind(self, i: int) -> str:
-        name = self.search.sought[i].name
+        name = self.search.free[i].name
         if name == "delay" and not self._blind:
             return "lateness"
         return name
@@ -262,7 +262,7 @@ class _Fit:
     def _places(self) -> dict[str, list[int]]:
         """Where each parameter is in x: one place, or one for each flight."""
         places: dict[str, list[int]] = {}
-        for i in range(len(self.search.sought)):
+        for i in range(len(self.search.free)):
             if self._kind(i) in _KINDS:
                 places.setdefault(self._kind(i), []).append(i)
         return places
@@ -317,7 +317,7 @@ class _Fit:
     def _turns_by_a_known_amount(self) -> bool:
         shares = {"drag_to_thrust": 1.0, "thrust_coefficient": 1.0, "inertia_z": -1.0}
         sought = {}
-        for i, number in enumerate(self.search.sought):
+        for i, number in enumerate(self.search.free):
             if number.name in shares:
                 sought[i] = shares[number.name]
         return self._half_width(sought, ("yaw",)) <= WIDEST
@@ -327,7 +327,7 @@ class _Fit:
         search = self.search
         kind = _KINDS[name]
         x = search.x[list(places)]
-        number = search.sought[places[0]]
+        number = search.free[places[0]]
         if len(places) == 1 and self._speaks_against_the_start(places[0]):
             self.set_anew.add(name)
         halves = np.array([self._half_width({i: 1.0}, kind.axes) for i in places])
@@ -347,7 +347,7 @@ class _Fit:
 
     def _speaks_against_the_start(self, i: int) -> bool:
         """Whether a number is two standard deviations of what the innovations explain from the start's, or from 0."""
-        number = self.search.sought[i]
+        number = self.search.free[i]
         deviation = math.sqrt(self.cov[i, i])
         if number.name in ("body_drag", *_PER_FLIGHT):
             return False
@@ -358,7 +358,7 @@ class _Fit:
 
     def _weak(self, name: str, places: Sequence[int], half: float, value: float) -> str:
         """Why a number that is searched for tells nothing, or nothing."""
-        number = self.search.sought[places[0]]
+        number = self.search.free[places[0]]
         kind = _KINDS[name]
         scale = number.scale
         if name.startswith("inertia_") and not self.search.settled:
@@ -409,13 +409,13 @@ class _Fit:
         held |= {"delay": 0.0} if {"delay", "lateness"} & {*refused} else {}
         held |= {"throttle_curve": self.vehicle.throttle_share} if "throttle_curve" in refused else {}
         held |= {"voltage_exponent": 0.0} if "voltage_exponent" in refused else {}
-        known = {number.name for number in self.search.sought} | {*self.search.fixed}
+        known = {number.name for number in self.search.free} | {*self.search.fixed}
         return {**self.search.fixed} | {name: held[name] for name in held if name in known}
 
     def _moved_to(self, refined: Search) -> tuple[dict[str, float], dict[str, ParameterEstimate]]:
         """Values by what another search found, and the estimates that are not refused moved there."""
         numbers: dict[str, list[float]] = {}
-        for number, value in zip(refined.sought, refined.x, strict=False):
+        for number, value in zip(refined.free, refined.x, strict=False):
             numbers.setdefault(number.name, []).append(number.value(value))
         for name, value in refined.fixed.items():
             numbers.setdefault(name, [value])
@@ -437,7 +437,7 @@ class _Fit:
         for axis in "xyz":
             inertia.append(values.get(f"inertia_{axis}", number_in(self.vehicle, f"inertia_{axis}") or 0.0))
         if not _is_body(inertia):
-            values["inertia_z"] = float(f"{PLATE[0] * (inertia[0] + inertia[1]):.6g}")
+            values["inertia_z"] = float(f"{FLAT_BODY * (inertia[0] + inertia[1]):.6g}")
         moved = {}
         for name, each in found.items():
             if each and not self.estimates[name].refused:
@@ -449,9 +449,9 @@ class _Fit:
         places = self._places()
         refused = {}
         for name, estimate in self._moved_to(refined)[1].items():
-            number = self.search.sought[places[name][0]]
-            middle = number.place(estimate.value)
-            half = max(abs(number.place(end) - middle) for end in (estimate.low, estimate.high))
+            number = self.search.free[places[name][0]]
+            middle = number.coordinate(estimate.value)
+            half = max(abs(number.coordinate(end) - middle) for end in (estimate.low, estimate.high))
             if why := self._weak(name, places[name], half, estimate.value):
                 refused[name] = replace(estimate, refused=why, advice=_KINDS[name].advice)
         if not refused:
@@ -464,7 +464,7 @@ class _Fit:
         first = refined.parameters(refined.x, 0)
         values, moved = self._moved_to(refined)
         estimates = {**self.estimates, **moved}.values()
-        flights = tuple(self._numbers_of(refined, flight) for flight in range(refined.flights))
+        flights = tuple(self._numbers_of(refined, flight) for flight in range(refined.flight_count))
         delay, offset, wind = (np.mean([numbers[i] for numbers in flights], axis=0).tolist() for i in range(3))
         return Identification(
             estimates=tuple(estimates),
@@ -504,7 +504,7 @@ class _Fit:
             if known & {*(of := [f"{name}_{axis}" for axis in axes])}:
                 changes[name] = tuple(values.get(one, number_in(self.vehicle, one) or 0.0) for one in of)
         if "body_drag" in known:
-            ratio: Array = np.array(self.vehicle.body_drag or LEVEL_PLATE)
+            ratio: Array = np.array(self.vehicle.body_drag or DRAG_AREAS)
             changes["body_drag"] = tuple((values["body_drag"] * ratio / ratio[0]).tolist())
         if "thrust_coefficient" in changes:
             changes |= {"thrust_of_speed": None, "thrust_of_throttle": None}
@@ -514,7 +514,7 @@ class _Fit:
 def _impossible(search: Search) -> dict[str, float]:
     """Numbers that were found and make no vehicle, with what takes their place: they are to be held at it."""
     p = search.parameters(search.x, 0)
-    sought = {number.name for number in search.sought}
+    sought = {number.name for number in search.free}
     held = {}
     for axis, value in zip("xyz", p.rate_damping, strict=True):
         if value < 0.0:
@@ -523,7 +523,7 @@ def _impossible(search: Search) -> dict[str, float]:
         held["inflow"] = 0.0
     held = {name: value for name, value in held.items() if name in sought}
     inertia = p.inertia.tolist()
-    if not _is_body(inertia) and search.fixed.get("inertia_z") != (flat := PLATE[0] * (inertia[0] + inertia[1])):
+    if not _is_body(inertia) and search.fixed.get("inertia_z") != (flat := FLAT_BODY * (inertia[0] + inertia[1])):
         held["inertia_z"] = flat
     return held
 

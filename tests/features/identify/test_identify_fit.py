@@ -219,13 +219,13 @@ def test_the_gate_judges_the_final_interval() -> None:
     assert fit.refuse_what_moved(search) == {}
     moved = Search(search.parts, START, wind=False)
     moved.adopt(search)
-    moved.x[[number.name for number in search.sought].index("inertia_x")] += 0.4
+    moved.x[[number.name for number in search.free].index("inertia_x")] += 0.4
     held = fit.refuse_what_moved(moved)
     assert "inertia_x" not in held  # the log speaks against the start's
     refused = fit.estimates["inertia_x"]
     assert refused.refused.startswith("not excited: the interval is +-")
     assert refused.advice
-    assert refused.low < search.sought[1].value(search.x[1]) < refused.high
+    assert refused.low < search.free[1].value(search.x[1]) < refused.high
 
 
 @pytest.mark.parametrize("late", [1, -1])
