@@ -37,7 +37,7 @@ READING_COST: Final = 0.7
 COSTLY_SHIFT: Final = 0.3  # [s] of shift between the clocks that counts as much as a correlation of 1
 LIFT_LAGS: Final = (0.0, 0.05, 0.1)  # [s] of the rotors behind their inputs, of which the best counts
 FALLING: Final = -0.4  # likeness of thrust and climb below which more thrust makes the vehicle fall
-EXPLAINED: Final = 0.3  # share of the lateral acceleration that tilt must explain to tell its direction
+_LEAST_EXPLAINED: Final = 0.3  # share of the lateral acceleration that tilt must explain to tell its direction
 MIRRORED_BETTER: Final = 0.2  # by which the mirrored tilt must explain more
 OTHER_FRAME: Final = 30.0  # [deg] between the headings of tilt and velocity that is another frame
 OPPOSITE_FRAME: Final = 135.0  # [deg] from which z may point down too
@@ -192,16 +192,16 @@ def _tilt_fault(motion: Lateral, *, falls: bool) -> str:
     plain, direction = tilt_fit(motion)
     mirror, mirror_direction = tilt_fit(motion, mirrored=True)
     heading = math.degrees(cmath.phase(direction))
-    if mirror > EXPLAINED and mirror > plain + MIRRORED_BETTER:
+    if mirror > _LEAST_EXPLAINED and mirror > plain + MIRRORED_BETTER:
         quarter_turns = round(math.degrees(cmath.phase(mirror_direction)) / 90.0) % 4
         faults = ("vy is negated", "vx and vy are swapped", "vx is negated", "vx and vy are swapped and negated")
         fault = f"against the tilt, {faults[quarter_turns]}"
         if falls:
             fault += "; vz too: a world with z down"
         return fault
-    if plain > EXPLAINED and abs(heading) > OPPOSITE_FRAME and falls:
+    if plain > _LEAST_EXPLAINED and abs(heading) > OPPOSITE_FRAME and falls:
         return "world and body have z down (NED, FRD): negate qy, qz, wy, wz, vy, vz, y, z"
-    if plain > EXPLAINED and abs(heading) > OTHER_FRAME:
+    if plain > _LEAST_EXPLAINED and abs(heading) > OTHER_FRAME:
         fault = f"against the tilt, the velocity's heading is {heading:.0f} deg off: one of them is in another frame"
         if abs(heading) > OPPOSITE_FRAME:
             fault += ", or z points down (NED, FRD)"

@@ -43,8 +43,8 @@ MOST_TIMES_REPEATED: Final = 0.5  # share of rows whose repeated time is that of
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
 STAMP_JITTER: Final = 0.05  # of a period: it must neither hold a command for a period too long nor open a gap
 _LFS_POINTER: Final = b"version https://git-lfs"
-COMMANDED: Final = ("commands", "throttle")  # held from one sample to the next
-ROTOR_INPUTS: Final = (*COMMANDED, "speeds")
+HELD_INPUTS: Final = ("commands", "throttle")  # held from one sample to the next
+ROTOR_INPUTS: Final = (*HELD_INPUTS, "speeds")
 """What a log may have of the rotors' outputs, one at least."""
 
 
@@ -201,7 +201,7 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     period = float(grid[1] - grid[0])
     values: dict[str, Any] = {}
     for field, column in moving.items():
-        values[field] = _sampled(column, grid, held=field in COMMANDED)
+        values[field] = _sampled(column, grid, held=field in HELD_INPUTS)
     _normalise_rows(values["attitude"])
     if inertial:
         values["velocity"] = integrated_velocity(name, values["velocity"], values["attitude"], period)
@@ -297,7 +297,7 @@ def _thinned(grid: Array, values: Mapping[str, Array], size: int) -> tuple[Array
     means = {}
     for field, rows in values.items():
         begin = 0
-        if field in COMMANDED:
+        if field in HELD_INPUTS:
             begin = half
         blocks = rows[begin : begin + count * size]
         means[field] = blocks.reshape(count, size, *rows.shape[1:]).mean(axis=1)
