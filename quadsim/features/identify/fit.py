@@ -15,7 +15,7 @@ import numpy as np
 from quadsim.errors import InputError
 from quadsim.features.identify.disturbance import with_disturbance
 from quadsim.features.identify.estimate import VECTORS, FlightNumbers, Identification, number_in
-from quadsim.features.identify.judgement import DAMPING, Judgement, is_body
+from quadsim.features.identify.judgement import DAMPING, JudgedFit, is_body
 from quadsim.features.identify.model import Stretch, mean_voltage, stretch
 from quadsim.features.identify.record import Record, part_of
 from quadsim.features.identify.rotor_response import RotorResponse, response_speeds, rotor_response
@@ -53,11 +53,11 @@ def identify_records(
         return search
 
     search = searched({})
-    judgement = Judgement(search, response)
+    judgement = JudgedFit(search, response)
     undamped = _negative_damping(search)
     while undamped:  # negative damping would stand for lag
         search = searched({**search.fixed, **undamped}, search)
-        judgement = Judgement(search, response, judgement)
+        judgement = JudgedFit(search, response, judgement)
         undamped = _negative_damping(search)
     held = judgement.held()
     refined = searched(held, search)
@@ -113,7 +113,7 @@ def _impossible(search: Search) -> dict[str, float]:
     return held
 
 
-def _result(judgement: Judgement, refined: Search) -> Identification:
+def _result(judgement: JudgedFit, refined: Search) -> Identification:
     """Every estimate, and the vehicle with those that are not refused."""
     parameters = refined.parameters(refined.x, 0)
     values, moved = judgement.moved_to(refined)
@@ -152,7 +152,7 @@ def _flight_numbers(refined: Search, flight: int) -> FlightNumbers:
     return FlightNumbers(of_parts[0].delay, tuple(of_parts[0].offset.tolist()), tuple(wind.tolist()))
 
 
-def _vehicle(judgement: Judgement, values: Mapping[str, float]) -> Vehicle:
+def _vehicle(judgement: JudgedFit, values: Mapping[str, float]) -> Vehicle:
     """The start's vehicle with other values; a vector that the start lacks is there if a number of it is known."""
     start = judgement.vehicle
     known = {"inertia_z"}  # which may have to suit the others

@@ -104,7 +104,7 @@ _SCALED_BY_SPEED: Final = (
 """Parameters that a log of the throttle alone shows only times a power of the rotors' highest speed."""
 
 
-class Judgement:
+class JudgedFit:
     """What a search found, judged; of numbers that it held, what another found `before`.
 
     Args:
@@ -113,7 +113,7 @@ class Judgement:
         before: the judgement of the search whose numbers this one held.
     """
 
-    def __init__(self, search: Search, response: Mapping[str, RotorResponse], before: Judgement | None = None) -> None:
+    def __init__(self, search: Search, response: Mapping[str, RotorResponse], before: JudgedFit | None = None) -> None:
         self.search = search
         self.vehicle = search.vehicle
         self.intervals = Intervals(search)

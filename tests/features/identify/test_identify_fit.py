@@ -15,7 +15,7 @@ from quadsim.errors import InputError
 from quadsim.features.identify.estimate import Identification, ParameterEstimate
 from quadsim.features.identify.fit import identify_records
 from quadsim.features.identify.intervals import MAX_AUTOCORRELATION
-from quadsim.features.identify.judgement import Judgement
+from quadsim.features.identify.judgement import JudgedFit
 from quadsim.features.identify.model import stretch
 from quadsim.features.identify.prediction import predict
 from quadsim.features.identify.record import Record, to_record
@@ -216,7 +216,7 @@ def test_the_gate_judges_the_final_interval() -> None:
     record = record_of(flown())
     search = Search([stretch(record, 0)], START, wind=False)
     search.run()
-    judgement = Judgement(search, {})
+    judgement = JudgedFit(search, {})
     assert not judgement.estimates["inertia_x"].refused
     assert judgement.refuse_moved(search) == {}
     moved = Search(search.parts, START, wind=False)
