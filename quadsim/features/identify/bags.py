@@ -1,10 +1,12 @@
-"""Bags of ROS 1 and 2 (`.bag`, `.mcap`, `.db3`, or a directory), read by rosbags and a map of their columns."""
+"""Bags of ROS 1 and 2 (`.bag`, `.mcap`, `.db3`, or a directory), read by rosbags and a map of their columns.
+
+A reader as those of autopilots' formats: it gives `record` columns by name, each on the clock of its topic.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,7 +16,7 @@ from quadsim.errors import FileError, InputError
 from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity
 from quadsim.features.identify.series import Column, on_one_clock
 
-_STEP: Final = re.compile(r"\.?([A-Za-z_]\w*)|\[(\d+)\]")
+_FIELD_OR_INDEX: Final = re.compile(r"\.?([A-Za-z_]\w*)|\[(\d+)\]")
 
 
 def read_bag(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
@@ -28,35 +30,47 @@ def read_bag(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     """
     if not given:
         raise InputError(f"{path.name}: a bag names no quantities: give --columns, a map of its topics")
-    wanted: dict[str, list[str]] = {}
-    for name in dict.fromkeys(column for one in given for column in one.columns):
-        wanted.setdefault(name.partition(".")[0], []).append(name)
+    names_by_topic: dict[str, list[str]] = {}
+    for named in given:
+        for name in named.columns:
+            names = names_by_topic.setdefault(name.partition(".")[0], [])
+            if name not in names:
+                names.append(name)
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    columns: dict[str, Column] = {}
     with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
-        columns = {connection.topic: Column(np.zeros(0), np.zeros(0)) for connection in bag.connections}
-        for topic, names in wanted.items():
-            connections = [connection for connection in bag.connections if connection.topic == topic]
-            rows = []
-            for connection, arrived, raw in bag.messages(connections) if connections else ():
-                message: Any = bag.deserialize(raw, connection.msgtype)
-                stamp = getattr(getattr(message, "header", None), "stamp", None)
-                if stamp is None:
-                    t = 1e-9 * arrived
-                else:
-                    t = stamp.sec + 1e-9 * stamp.nanosec
-                rows.append([t, *map(partial(_at, path, message), names)])
+        for connection in bag.connections:
+            columns[connection.topic] = Column(np.zeros(0), np.zeros(0))
+        for topic, names in names_by_topic.items():
+            rows = _rows(path, bag, topic, names)
             if rows:
                 times, *values = np.array(rows, float).T
                 columns |= on_one_clock(times, dict(zip(names, values, strict=True)))
     return LoggedColumns(columns=columns, quantities=given)
 
 
+def _rows(path: Path, bag: Any, topic: str, names: Sequence[str]) -> list[list[float]]:
+    """The time [s] and the numbers of each message of a topic."""
+    connections = [connection for connection in bag.connections if connection.topic == topic]
+    if not connections:
+        return []  # rosbags would give the messages of all topics
+    rows = []
+    for connection, arrived, raw in bag.messages(connections):
+        message: Any = bag.deserialize(raw, connection.msgtype)
+        stamp = getattr(getattr(message, "header", None), "stamp", None)
+        t = 1e-9 * arrived
+        if stamp is not None:
+            t = stamp.sec + 1e-9 * stamp.nanosec
+        rows.append([t, *(_at(path, message, name) for name in names)])
+    return rows
+
+
 def _at(path: Path, message: Any, name: str) -> float:
     """The number at the end of a path of fields and indices, of the topic's name the rest."""
     value = message
-    for field, index in _STEP.findall(name.partition(".")[2]):
+    for field, index in _FIELD_OR_INDEX.findall(name.partition(".")[2]):
         try:
             if field:
                 value = getattr(value, field)
@@ -64,7 +78,8 @@ def _at(path: Path, message: Any, name: str) -> float:
                 value = value[int(index)]
         except (AttributeError, IndexError, TypeError) as error:
             fields = [key for key in getattr(value, "__dataclass_fields__", ()) if key != "__msgtype__"]
-            there = ", ".join(fields) or f"{np.size(value)} number{'s' * (np.size(value) > 1)}"
+            size = np.size(value)
+            there = ", ".join(fields) or f"{size} number{'s' * (size > 1)}"
             raise FileError(path, f"{name!r}: no {field or index} in {there}") from error
     try:
         return float(value)

@@ -1,4 +1,7 @@
-"""The border of logs: what libraries, files and their values raise, as our errors; and what a log says of itself."""
+"""The errors of logs: what libraries, files and their values raise, as quadsim's own; and what a log states of itself.
+
+`reading` is about each reader of a format, `judging` about checks, fit and prediction.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from quadsim.errors import FileError, InputError, MissingPackageError, QuadsimError
 
-_LARGEST: Final = 1e9  # of a number that a log states of itself
+_LARGEST_STATED: Final = 1e9  # of a number that a log states of itself
 
 
 @contextmanager
@@ -33,8 +36,7 @@ def reading(path: Path, what: str, library: str = "") -> Iterator[None]:
     except Exception as error:
         if library and isinstance(error, ModuleNotFoundError):
             raise MissingPackageError(f"a {what}", library, extra="logs") from error
-        problem = f"{type(error).__name__}: {error}"
-        raise FileError(path, f"is not a readable {what} ({problem[:120]})") from error
+        raise FileError(path, f"is not a readable {what} ({_shortened(error)})") from error
 
 
 @contextmanager
@@ -49,29 +51,32 @@ def judging(names: str) -> Iterator[None]:
     except QuadsimError:
         raise
     except (ArithmeticError, LookupError, ValueError) as error:
-        problem = f"{type(error).__name__}: {error}"
         raise InputError(
-            f"{names}: no fit is possible ({problem[:120]}); a column that stands still, or samples far beyond the "
+            f"{names}: no fit is possible ({_shortened(error)}); a column that stands still, or samples far beyond the "
             "others, do that: plot rates, velocity and the rotors' outputs"
         ) from error
+
+
+def _shortened(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"[:120]
 
 
 def stated_number(
     path: Path,
     stated: Mapping[str, Any],
     name: str,
-    usual: float,
+    default: float,
     *,
-    low: float = -_LARGEST,
-    high: float = _LARGEST,
+    low: float = -_LARGEST_STATED,
+    high: float = _LARGEST_STATED,
     whole: bool = False,
 ) -> float:
-    """Return a header or a parameter of a log; the usual number where it has none.
+    """Return a header or a parameter of a log; the default where it has none.
 
     Raises:
         FileError: it is no number, or not within its range.
     """
-    value = stated.get(name, usual)
+    value = stated.get(name, default)
     try:
         number = float(value)
     except (TypeError, ValueError):

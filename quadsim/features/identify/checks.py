@@ -1,4 +1,9 @@
-"""What of a log can be used, and whether its columns are what they should be; before any fit."""
+"""What of a log can be used, and whether its columns are what they should be; before any fit.
+
+`spans` finds the parts in the air: on the ground, the rotors carry less than the weight while the vehicle rests.
+`check_log` then makes every check of `LOG_CHECKS` on these parts, in an order in which a later one trusts what an
+earlier one saw.
+"""
 
 from __future__ import annotations
 
@@ -13,28 +18,34 @@ from quadsim.errors import InputError
 from quadsim.features.identify.axes import check_rate_axes, check_tilt, check_velocity_axes
 from quadsim.features.identify.clocks import check_clocks
 from quadsim.features.identify.quantities import RPM
-from quadsim.features.identify.record import INPUTS, SLOWEST_COMMANDS, Record, driver
+from quadsim.features.identify.record import HELD_INPUTS, ROTOR_INPUTS, SLOWEST_COMMANDS, Record, rotor_inputs
 from quadsim.features.identify.rotor_order import check_rotor_order
 from quadsim.features.identify.rotor_speeds import check_against_commands, check_against_each_other, check_not_commands
 from quadsim.features.identify.scales import check_scales
-from quadsim.features.identify.sensors import LONGEST_HELD, ROUNDING, at_rest, runs
-from quadsim.features.identify.windows import body_z, rate_over_window
+from quadsim.features.identify.sensors import LONGEST_HELD, ROUNDING, at_rest, runs, still_steps
+from quadsim.features.identify.series import interpolated
+from quadsim.features.identify.windows import load_factor, rate_over_window
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
 SHORTEST_SPAN: Final = 2.0  # [s] of a span that is used
-LEAST: Final = 4.0  # [s] that the longest must have
+LEAST_AIRBORNE: Final = 4.0  # [s] that the longest span must have
 GROUND_MARGIN: Final = 0.5  # [s] cut beside the ground, where it still acts through the air and the legs
-SLOW = 0.3
-CALM = 0.5
-"""Speed [m/s] and turn rate [rad/s] below which a vehicle may stand on the ground."""
+RESTING_SPEED: Final = 0.3  # [m/s] below which a vehicle may stand on the ground
+RESTING_RATE: Final = 0.5  # [rad/s] the same
+LEAST_LACKING: Final = 0.15  # share of the weight that the rotors leave to the ground, at least
+SUPPORTED: Final = 0.4  # of the acceleration by the lacking weight: less, and the ground carries it
+# From these shares of the largest effort and of the weight on, the rotors carry the vehicle in the air.
+CARRIED_EFFORT: Final = 0.5
+CARRIED_LOAD: Final = 0.3
 CONSTANT: Final = 3e-3  # share of the outputs below which their change in a second is none
-STILL: Final = 1e-3  # share of the largest output below which a rotor's outputs do not change
+UNCHANGED: Final = 1e-3  # share of the largest output below which a rotor's outputs never change
 MOST_REPEATED: Final = 0.05  # share of rows that may repeat the one before
 GOOD_RATE: Final = 50.0  # [Hz] below which lag and inertias are poor
-FACTOR: Final = 1.8  # by which hover speed in the log and by the start may differ
-NOTED_FACTOR: Final = 1.4
-LIKELY: Final = (
+LOAD_WINDOW: Final = 0.2  # [s] of an acceleration that tells what the rotors carry
+REFUSED_HOVER_RATIO: Final = 1.8  # of the hover speeds in the log and by the start, either way
+NOTED_HOVER_RATIO: Final = 1.4
+LIKELY_UNITS: Final = (
     (1.0 / RPM, "rpm taken for rad/s"),
     (RPM, "rad/s taken for rpm"),
     (2.0, "pole pairs given as poles, or a start with half the hover speed"),
@@ -44,14 +55,12 @@ LIKELY: Final = (
     (1e-3, "a throttle taken for a speed in rad/s"),
 )
 """Ratios of hover speeds, log over start, and their usual causes."""
-CLIPPED: Final = 0.2  # share of samples at a limit worth a note
+AT_LIMIT: Final = 2e-3  # share of an output's range within which it is at a limit
+MOST_AT_LIMIT: Final = 0.2  # share of samples at a limit from which a note says so
 
 
 def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     """Return the parts of a log in the air and without gaps, each 2 s or longer.
-
-    On the ground, the rotors carry less than the weight while the vehicle rests. A log that rests under constant
-    outputs, but for a second, never flies.
 
     Raises:
         InputError: none is 4 s long, the motors never run, or what was logged is not what was flown.
@@ -60,67 +69,72 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     if np.count_nonzero(logged) > 1:
         for check in ROW_CHECKS:
             check.run(record, logged)
-    shortest = max(round(SHORTEST_SPAN / record.period), 2)
     if record.flying is None:
-        flying = np.ones_like(logged)
+        flying = logged
     else:
-        flying = record.flying
-    if not (logged & flying).any() and logged.any():
+        flying = logged & record.flying
+    if not flying.any() and logged.any():
         raise InputError(f"{record.name}: never flies: by its autopilot it is disarmed or landed all the time")
-    aloft = runs(logged, shortest) and runs(logged & flying & ~_grounded(record, logged, vehicle.gravity), shortest)
-    longest = max((part.stop - part.start for part in aloft), default=0) * record.period
-    if longest >= LEAST * (1.0 - 1e-6):
-        return aloft
-    inputs = driver(record)[logged]
+    shortest = max(round(SHORTEST_SPAN / record.period), 2)
+    airborne = []
+    if runs(logged, shortest):
+        airborne = runs(flying & ~_grounded(record, logged, vehicle.gravity), shortest)
+    longest = max((span.stop - span.start for span in airborne), default=0) * record.period
+    if longest < LEAST_AIRBORNE * (1.0 - 1e-6):
+        raise InputError(_never_flies(record, logged, longest))
+    return airborne
+
+
+def _never_flies(record: Record, logged: NDArray[np.bool_], longest: float) -> str:
+    """Why a log that is in the air for `longest` [s] at most cannot be used, in words."""
+    inputs = rotor_inputs(record)[logged]
+    swing = 0.0
+    height = ""
     if len(inputs):
         swing = float(np.ptp(inputs, axis=0).max() / max(np.abs(inputs).max(), 1e-9))
-    else:
-        swing = 0.0
-    if record.position is None or not len(inputs):
-        height = ""
-    else:
-        height = f", its altitude by {np.ptp(record.position[logged, 2]):.2f} m"
+        if record.position is not None:
+            height = f", its altitude by {np.ptp(record.position[logged, 2]):.2f} m"
     if longest:
         flies = f"flies for {longest:.1f} s at most in one piece"
     else:
         flies = "never flies"
-    raise InputError(
-        f"{record.name}: {flies}; {LEAST:g} s in the air without a gap are needed ({100.0 * logged.mean():.0f} % of "
-        f"its samples are complete; in them the rotors' outputs change by {100.0 * swing:.0f} %{height})"
+    return (
+        f"{record.name}: {flies}; {LEAST_AIRBORNE:g} s in the air without a gap are needed "
+        f"({100.0 * logged.mean():.0f} % of its samples are complete; in them the rotors' outputs change by "
+        f"{100.0 * swing:.0f} %{height})"
     )
 
 
 def _check_motors_run(record: Record, logged: NDArray[np.bool_]) -> None:
-    inputs = driver(record)[logged]
-    still = np.ptp(inputs, axis=0) <= STILL * np.abs(inputs).max()
-    if still.all():
+    inputs = rotor_inputs(record)[logged]
+    unchanged = np.ptp(inputs, axis=0) <= UNCHANGED * np.abs(inputs).max()
+    if unchanged.all():
         raise InputError(
             f"{record.name}: the motors never run: the rotors' outputs stay at {inputs.mean():.4g}: no flight"
         )
-    if still.any():
-        rotors = " and ".join(str(i + 1) for i in np.flatnonzero(still))
+    if unchanged.any():
+        rotors = " and ".join(str(i + 1) for i in np.flatnonzero(unchanged))
         raise InputError(f"{record.name}: the outputs of rotor {rotors} never change while the others do: log all four")
 
 
 def _check_columns_move(record: Record, logged: NDArray[np.bool_]) -> None:
-    name = record.name
-    for field, columns in (("rates", "wx wy wz"), ("velocity", "vx vy vz"), ("attitude", "qw qx qy qz")):
+    columns = {"rates": "wx wy wz", "velocity": "vx vy vz", "attitude": "qw qx qy qz"}
+    for field, names in columns.items():
         rows = getattr(record, field)[logged]
-        frozen = []
-        for c, moved in zip(columns.split(), np.ptp(rows, axis=0) > ROUNDING, strict=True):
-            if not moved:
-                frozen.append(c)
+        frozen = np.flatnonzero(np.ptp(rows, axis=0) <= ROUNDING)
+        if not frozen.size:
+            continue
+        listed = ", ".join(names.split()[i] for i in frozen)
         if len(frozen) == rows.shape[1]:
-            raise InputError(f"{name}: {', '.join(frozen)} stand still while the motors run: log what was measured")
-        offsets = np.abs(rows[0, [columns.split().index(c) for c in frozen]])
-        if frozen and field != "attitude" and (offsets > ROUNDING).any():
-            raise InputError(f"{name}: {', '.join(frozen)} stands still while the others change: log all three axes")
+            raise InputError(f"{record.name}: {listed} stand still while the motors run: log what was measured")
+        elsewhere = np.abs(rows[0, frozen]) > ROUNDING
+        if field != "attitude" and elsewhere.any():
+            raise InputError(f"{record.name}: {listed} stands still while the others change: log all three axes")
 
 
 def _still(record: Record, logged: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Steps between logged rows in which nothing turns, and those of them at which the vehicle rests."""
-    turning = np.concatenate([record.rates, record.attitude], axis=1)[logged]
-    still = np.asarray((np.abs(np.diff(turning, axis=0)) <= ROUNDING).all(axis=1))
+    still = still_steps(record.rates[logged], record.attitude[logged])
     return still, at_rest(still, round(LONGEST_HELD / record.period))
 
 
@@ -137,13 +151,12 @@ def _check_rows_are_new(record: Record, logged: NDArray[np.bool_]) -> None:
 def _check_outputs_are_logged_often(record: Record, logged: NDArray[np.bool_]) -> None:
     if record.speeds is not None:
         return
-    inputs = driver(record)[logged]
+    inputs = rotor_inputs(record)[logged]
     _, rest = _still(record, logged)
     changed = (np.abs(np.diff(inputs, axis=0)) > ROUNDING * np.abs(inputs).max()).any(axis=1)
+    rate = 0.0
     if not rest.all():
         rate = float(changed[~rest].mean()) / record.period
-    else:
-        rate = 0.0
     if rate < 0.9 * SLOWEST_COMMANDS and 1.0 / record.period > 1.5 * rate:
         raise InputError(
             f"{record.name}: the rotors' outputs change {rate:.3g} times per second, and rates are logged "
@@ -160,40 +173,58 @@ def _advised(record: Record) -> str:
 
 def _logged(record: Record) -> NDArray[np.bool_]:
     """Rows (N,) in no gap."""
-    fields = [getattr(record, name) for name in ("velocity", "attitude", "rates", "position", *INPUTS)]
-    return np.logical_and.reduce([np.isfinite(rows).all(axis=1) for rows in fields if rows is not None])
+    logged = np.ones(len(record.t), bool)
+    for name in ("velocity", "attitude", "rates", "position", *ROTOR_INPUTS):
+        rows = getattr(record, name)
+        if rows is not None:
+            logged &= np.isfinite(rows).all(axis=1)
+    return logged
 
 
 def _grounded(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDArray[np.bool_]:
-    """Rows (N,) on the ground or near it; gaps are bridged by a straight line."""
-    velocity, attitude, rates, inputs = (
-        _bridged(rows, logged) for rows in (record.velocity, record.attitude, record.rates, driver(record))
-    )
+    """Rows (N,) on the ground or near it; gaps are bridged by a straight line.
+
+    A log that rests under constant outputs, but for a second, never flies.
+    """
+    velocity = _bridged(record.velocity, logged)
+    attitude = _bridged(record.attitude, logged)
+    rates = _bridged(record.rates, logged)
+    inputs = _bridged(rotor_inputs(record), logged)
     second = round(1.0 / record.period)
+    acceleration = rate_over_window(velocity, record.period, LOAD_WINDOW)
+    load = load_factor(acceleration, attitude, gravity)
     effort = uniform_filter1d(np.square(inputs).mean(axis=1), max(second // 10, 1))
-    acceleration = rate_over_window(velocity, record.period, 0.2)
-    load = ((acceleration + np.array([0.0, 0.0, gravity])) * body_z(attitude)).sum(axis=1) / gravity
-    heavy = logged & (effort > 0.5 * effort[logged].max()) & (load > 0.3)
-    if heavy.any():
-        hover = float(np.median(effort[heavy] / load[heavy]))
-    else:
-        hover = float(np.median(effort[logged]))
-    lacking = 1.0 - effort / max(hover, 1e-30)  # share of the weight that the rotors do not carry
-    calm = np.ones(len(effort), bool)
-    for rows, most in ((velocity, SLOW), (rates, CALM)):
-        calm &= np.linalg.norm(uniform_filter1d(rows, max(second // 5, 1), axis=0), axis=1) < most
+    lacking = 1.0 - effort / max(_hover_effort(effort, load, logged), 1e-30)  # share of the weight
+    calm = _slower_than(velocity, RESTING_SPEED, second) & _slower_than(rates, RESTING_RATE, second)
     change = maximum_filter1d(inputs, second, axis=0) - minimum_filter1d(inputs, second, axis=0)
     constant = calm & (change <= CONSTANT * np.abs(inputs).mean()).all(axis=1)
     if np.count_nonzero(logged & ~constant) < second:
         return constant
-    resting = calm & (lacking > 0.15) & (np.abs(acceleration[:, 2]) < 0.4 * lacking * gravity)
-    lasting = minimum_filter1d(resting.astype(np.int8), 2 * (second // 8) + 1)  # not the top of a climb
-    return np.asarray(maximum_filter1d(lasting, 2 * (round(GROUND_MARGIN * second) + second // 8) + 1) > 0)
+    supported = np.abs(acceleration[:, 2]) < SUPPORTED * lacking * gravity
+    resting = calm & (lacking > LEAST_LACKING) & supported
+    eighth = second // 8
+    lasting = minimum_filter1d(resting.astype(np.int8), 2 * eighth + 1)  # not the top of a climb
+    margin = round(GROUND_MARGIN * second)
+    return np.asarray(maximum_filter1d(lasting, 2 * (margin + eighth) + 1) > 0)
+
+
+def _hover_effort(effort: Array, load: Array, logged: NDArray[np.bool_]) -> float:
+    """Mean squared output of the rotors that carries the weight, by effort (N,) and load factor (N,)."""
+    carried = logged & (effort > CARRIED_EFFORT * effort[logged].max()) & (load > CARRIED_LOAD)
+    if carried.any():
+        return float(np.median(effort[carried] / load[carried]))
+    return float(np.median(effort[logged]))
+
+
+def _slower_than(rows: Array, most: float, second: int) -> NDArray[np.bool_]:
+    """Rows (N,) whose mean over a fifth of a second, of rows (N, 3), is shorter than `most`."""
+    means = uniform_filter1d(rows, max(second // 5, 1), axis=0)
+    return np.asarray(np.linalg.norm(means, axis=1) < most)
 
 
 def _bridged(rows: Array, logged: NDArray[np.bool_]) -> Array:
     index = np.arange(len(rows))
-    return np.stack([np.interp(index, index[logged], column[logged]) for column in rows.T], axis=1)
+    return interpolated(index, index[logged], rows[logged])
 
 
 def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
@@ -202,31 +233,46 @@ def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
         rows = getattr(record, field)
         if rows is None:
             continue
-        squares = []
-        loads = []
-        for part in parts:
-            rate = rate_over_window(record.velocity[part], record.period, 0.2) + np.array([0.0, 0.0, vehicle.gravity])
-            loads.append((rate * body_z(record.attitude[part])).sum(axis=1) / vehicle.gravity)
-            squares.append(np.square(rows[part]).mean(axis=1))
-        hover = float(np.sqrt(np.median(np.concatenate(squares)) / max(np.median(np.concatenate(loads)), 0.1)))
+        hover = _hover_speed(record, rows, parts, vehicle.gravity)
         ratio = hover / vehicle.hover_speed
         what = (
             f"{record.name}: {field} of {hover:.4g} rad/s carry the weight, {ratio:.3g} times the start's hover speed"
         )
         start = f"of {vehicle.hover_speed:.4g} rad/s"
-        if not 1.0 / FACTOR <= ratio <= FACTOR:
-            cause = min(LIKELY, key=lambda pair: abs(np.log(max(ratio, 1e-9) / pair[0])))[1]
+        if not 1.0 / REFUSED_HOVER_RATIO <= ratio <= REFUSED_HOVER_RATIO:
             raise InputError(
-                f"{what} {start}; at most a factor of {FACTOR:g} is allowed. Likely: {cause}. Correct the unit, the "
-                "poles, or the start's thrust_coefficient and mass"
+                f"{what} {start}; at most a factor of {REFUSED_HOVER_RATIO:g} is allowed. Likely: "
+                f"{_likely_unit(ratio)}. Correct the unit, the poles, or the start's thrust_coefficient and mass"
             )
-        if field == "commands" and (most := float(rows[np.isfinite(rows)].max())) > 1.02 * vehicle.speed_max:
+        most = float(rows[np.isfinite(rows)].max())
+        if field == "commands" and most > 1.02 * vehicle.speed_max:
             yield (
                 f"{record.name}: commands reach {most:.4g} rad/s, above the start's speed_max of {vehicle.speed_max:g} "
                 "rad/s: correct it"
             )
-        if not 1.0 / NOTED_FACTOR <= ratio <= NOTED_FACTOR:
+        if not 1.0 / NOTED_HOVER_RATIO <= ratio <= NOTED_HOVER_RATIO:
             yield f"{what} {start}: check unit, poles and the start's thrust_coefficient"
+
+
+def _hover_speed(record: Record, speeds: Array, parts: Sequence[slice], gravity: float) -> float:
+    """Speed [rad/s] at which the rotors carry the weight, by speeds (N, 4) and the load factor in all parts."""
+    squares = []
+    loads = []
+    for part in parts:
+        acceleration = rate_over_window(record.velocity[part], record.period, LOAD_WINDOW)
+        loads.append(load_factor(acceleration, record.attitude[part], gravity))
+        squares.append(np.square(speeds[part]).mean(axis=1))
+    load = max(np.median(np.concatenate(loads)), 0.1)
+    return float(np.sqrt(np.median(np.concatenate(squares)) / load))
+
+
+def _likely_unit(ratio: float) -> str:
+    """The usual cause of a ratio of hover speeds."""
+
+    def distance(pair: tuple[float, str]) -> float:
+        return abs(float(np.log(max(ratio, 1e-9) / pair[0])))
+
+    return min(LIKELY_UNITS, key=distance)[1]
 
 
 def _note_gaps(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
@@ -244,18 +290,21 @@ def _note_slow_logs(record: Record, parts: Sequence[slice], vehicle: Vehicle) ->
 
 
 def _note_limits(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
-    for field in INPUTS[:2]:
-        if (rows := getattr(record, field)) is not None:
-            flown = np.concatenate([rows[part] for part in parts])
-            low = flown.min()
-            high = flown.max()
-            near = 2e-3 * (high - low)
-            share = float(((flown <= low + near) | (flown >= high - near)).any(axis=1).mean())
-            if share > CLIPPED:
-                yield (
-                    f"{record.name}: in {100.0 * share:.0f} % of its samples a rotor's {field} are at a limit, "
-                    f"{low:.4g} or {high:.4g}; fly more gently"
-                )
+    for field in HELD_INPUTS:
+        rows = getattr(record, field)
+        if rows is None:
+            continue
+        flown = np.concatenate([rows[part] for part in parts])
+        low = flown.min()
+        high = flown.max()
+        near = AT_LIMIT * (high - low)
+        at_limit = (flown <= low + near) | (flown >= high - near)
+        share = float(at_limit.any(axis=1).mean())
+        if share > MOST_AT_LIMIT:
+            yield (
+                f"{record.name}: in {100.0 * share:.0f} % of its samples a rotor's {field} are at a limit, "
+                f"{low:.4g} or {high:.4g}; fly more gently"
+            )
 
 
 class RowCheck(NamedTuple):

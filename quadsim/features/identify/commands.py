@@ -67,21 +67,34 @@ def identify(
     if not logs:
         raise InputError("identify needs a flight log: CSV, Parquet, an autopilot's, or a run directory")
     if vehicle is None:
-        rotors = next((rotors for log in logs if (rotors := stated_rotors(Path(log)))), "")
-        raise InputError(
+        rotors = ""
+        for log in logs:
+            rotors = rotors or stated_rotors(Path(log))
+        advice = (
             "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template > start.toml"
             f" writes one; give your {NEEDED_PARAMETERS}, and estimates of the rest"
-            + (f". The log has the rotors, in place of arm_length and rotor_azimuths: {rotors}" if rotors else "")
         )
-    for name, path, ending in (("--out", out, ".toml"), ("--page", page, ".html")):
-        if path is not None and Path(path).suffix != ending:
-            raise ParameterError("", name, str(path), f"a file ending in {ending}")
-    fitted, tested = ([Path(log) for log in paths] for paths in (logs, test))
-    if both := [log for log in tested if log.resolve() in {log.resolve() for log in fitted}]:
-        raise ParameterError("", "--test", str(both[0]), "a log that is not fitted too")
-    files = {name: None if path is None else Path(path) for name, path in (("out", out), ("page", page))}
-    start = vehicle_path(str(vehicle))
-    meaning = () if columns is None else read_map(Path(columns))
+        if rotors:
+            advice += f". The log has the rotors, in place of arm_length and rotor_azimuths: {rotors}"
+        raise InputError(advice)
+    for option, path, suffix in (("--out", out, ".toml"), ("--page", page, ".html")):
+        if path is not None and Path(path).suffix != suffix:
+            raise ParameterError("", option, str(path), f"a file ending in {suffix}")
+    fitted = [Path(log) for log in logs]
+    tested = [Path(log) for log in test]
+    resolved = {log.resolve() for log in fitted}
+    for log in tested:
+        if log.resolve() in resolved:
+            raise ParameterError("", "--test", str(log), "a log that is not fitted too")
     return identify_logs(
-        fitted, start, test=tested, poles=poles, columns=meaning, overwrite=overwrite, wind=wind, anyway=anyway, **files
+        fitted,
+        vehicle_path(str(vehicle)),
+        test=tested,
+        poles=poles,
+        columns=() if columns is None else read_map(Path(columns)),
+        out=None if out is None else Path(out),
+        page=None if page is None else Path(page),
+        overwrite=overwrite,
+        wind=wind,
+        anyway=anyway,
     )

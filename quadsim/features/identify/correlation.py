@@ -1,4 +1,8 @@
-"""Two logged vectors side by side: how alike they are, axis by axis, and by which shift in time."""
+"""Two logged vectors a and b side by side: how alike they are, axis by axis, and by which shift in time.
+
+Their correlation at a shift s is sum a_k b_{k+s} / sqrt(sum a_k^2 sum b_{k+s}^2), each less its mean, over all parts of
+a log that fly.  The checks of axes, clocks and scales compare columns by it.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +31,10 @@ def pairs_of(
 ) -> Pairs:
     """Two vectors in each part, one row per tick."""
     step = stride(record.period)
-    return [(first(part)[::step], second(part)[::step]) for part in parts]
+    pairs = []
+    for part in parts:
+        pairs.append((first(part)[::step], second(part)[::step]))
+    return pairs
 
 
 def shifts(period: float) -> list[int]:
@@ -44,19 +51,26 @@ def aligned(first: Array, second: Array, shift: int) -> tuple[Array, Array]:
 
 def moments(pairs: Pairs, shift: int = 0) -> tuple[Array, Array, Array]:
     """Covariances (n, m), and variances (n,) and (m,), of all parts, the mean of each removed."""
-    beside = [aligned(a, b, shift) for a, b in pairs]
-    free = [(a - a.mean(axis=0), b - b.mean(axis=0)) for a, b in beside]
-    a, b = (np.concatenate(rows) for rows in zip(*free, strict=True))
+    centred_first = []
+    centred_second = []
+    for first, second in pairs:
+        a, b = aligned(first, second, shift)
+        centred_first.append(a - a.mean(axis=0))
+        centred_second.append(b - b.mean(axis=0))
+    a = np.concatenate(centred_first)
+    b = np.concatenate(centred_second)
     return a.T @ b, np.square(a).sum(axis=0), np.square(b).sum(axis=0)
 
 
 def correlations(pairs: Pairs, shift: int = 0) -> Array:
     """Correlations (n, m) of the columns of both, all parts together."""
     covariance, first, second = moments(pairs, shift)
-    return np.asarray(covariance / np.sqrt(np.maximum(np.outer(first, second), 1e-30)))
+    scale = np.sqrt(np.maximum(np.outer(first, second), 1e-30))
+    return np.asarray(covariance / scale)
 
 
-def likeness(pairs: Pairs, shift: int = 0) -> float:
+def total_correlation(pairs: Pairs, shift: int = 0) -> float:
     """Correlation of two vectors, all axes and parts together."""
     covariance, first, second = moments(pairs, shift)
-    return float(np.trace(covariance)) / math.sqrt(max(float(first.sum() * second.sum()), 1e-30))
+    scale = math.sqrt(max(float(first.sum() * second.sum()), 1e-30))
+    return float(np.trace(covariance)) / scale

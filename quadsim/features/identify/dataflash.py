@@ -1,13 +1,16 @@
-"""ArduPilot's dataflash logs (`.bin`), read by pymavlink's DFReader."""
+"""ArduPilot's dataflash logs (`.bin`), read by pymavlink's DFReader: columns `MESSAGE.Field` for `record`.
+
+Its axes are front, right, down, those of the world north, east, down.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -47,10 +50,34 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     Raises:
         FileError: it is not a dataflash log, or has a parameter that says nothing.
     """
-    used = {column.partition(".")[0].partition("[")[0] for one in (*given, *_NAMES) for column in one.columns}
+    used = set()
+    for named in (*given, *_NAMES):
+        used |= {column.partition(".")[0].partition("[")[0] for column in named.columns}
+    messages, parameters = _messages(path, used)
     columns: dict[str, Column] = {}
-    rows: dict[str, list[tuple[float, ...]]] = {}
-    fields: dict[str, list[str]] = {}
+    for name, rows in messages.items():
+        clock = next(clock for clock in _CLOCKS if clock in rows.fields)
+        table = {}
+        for field, values in zip(rows.fields, np.array(rows.values, float).T, strict=True):
+            table[f"{name}.{field}"] = values
+        columns |= on_one_clock(table[f"{name}.{clock}"] * _CLOCKS[clock], table)
+    if _samples(columns, "XKQ.Q1") < _samples(columns, "ATT.Roll"):  # the quaternion is logged more rarely
+        columns = {name: column for name, column in columns.items() if not name.startswith("XKQ")}
+    motors = _motor_outputs(path, parameters)
+    quantities = [replace(named, **motors) if named.quantity == "throttle" else named for named in _NAMES]
+    return LoggedColumns(columns=columns, quantities=quantities, advice=_ADVICE)
+
+
+class _Rows(NamedTuple):
+    """What one instance of a message logged."""
+
+    fields: list[str]  # that are numbers
+    values: list[tuple[float, ...]]
+
+
+def _messages(path: Path, used: Collection[str]) -> tuple[dict[str, _Rows], dict[str, Any]]:
+    """The rows of each message that is used and has a clock, and the parameters."""
+    messages: dict[str, _Rows] = {}
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         from pymavlink.DFReader import DFReader_binary
 
@@ -62,28 +89,38 @@ def read_dataflash(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
                 raise FileError(path, "is not a readable dataflash log: it does not begin with a message")
         with Reader(str(path), zero_time_base=True) as log:
             while (message := log.recv_match(type=[*used, "PARM"])) is not None:
-                clock = next((name for name in _CLOCKS if name in message.get_fieldnames()), None)
-                if (kind := message.get_type()) in used and clock is not None:
-                    of = message.fmt.instance_field
-                    row = message.to_dict()
-                    name = f"{kind}[{row[of]}]" if of and row[of] else kind
-                    fields.setdefault(name, [key for key, value in row.items() if isinstance(value, int | float)])
-                    rows.setdefault(name, []).append(tuple(row[key] for key in fields[name]))
-            parameters = {**log.params}
-    for name, of in fields.items():
-        table = {}
-        for field, values in zip(of, np.array(rows[name], float).T, strict=True):
-            table[f"{name}.{field}"] = values
-        clock = next(clock for clock in _CLOCKS if f"{name}.{clock}" in table)
-        columns |= on_one_clock(table[f"{name}.{clock}"] * _CLOCKS[clock], table)
-    turns = [columns[name].t.size if name in columns else 0 for name in ("XKQ.Q1", "ATT.Roll")]
-    if turns[0] < turns[1]:
-        columns = {name: column for name, column in columns.items() if not name.startswith("XKQ")}
-    functions = (stated_number(path, parameters, f"SERVO{i}_FUNCTION", 0, whole=True) for i in range(1, 1 + _OUTPUTS))
-    motors = {function: i for i, function in enumerate(functions, start=1)}
-    outputs = tuple(f"RCOU.C{motors.get(_FIRST_MOTOR + i, 1 + i)}" for i in range(N_ROTORS))
+                kind = message.get_type()
+                has_clock = any(clock in message.get_fieldnames() for clock in _CLOCKS)
+                if kind not in used or not has_clock:
+                    continue
+                row = message.to_dict()
+                instance_field = message.fmt.instance_field
+                name = kind
+                if instance_field and row[instance_field]:
+                    name = f"{kind}[{row[instance_field]}]"
+                if name not in messages:
+                    messages[name] = _Rows([key for key, value in row.items() if isinstance(value, int | float)], [])
+                rows = messages[name]
+                rows.values.append(tuple(row[field] for field in rows.fields))
+            return messages, {**log.params}
+
+
+def _samples(columns: Mapping[str, Column], name: str) -> int:
+    if name not in columns:
+        return 0
+    return columns[name].t.size
+
+
+def _motor_outputs(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Which outputs are the motors, and the pulses between which they are."""
+    outputs_by_function = {}
+    for i in range(1, 1 + _OUTPUTS):
+        function = stated_number(path, parameters, f"SERVO{i}_FUNCTION", 0, whole=True)
+        outputs_by_function[function] = i
+    columns = []
+    for i in range(N_ROTORS):
+        output = outputs_by_function.get(_FIRST_MOTOR + i, 1 + i)
+        columns.append(f"RCOU.C{output}")
     low = stated_number(path, parameters, "MOT_PWM_MIN", 0) or 1000.0  # 0: that of the radio
     high = stated_number(path, parameters, "MOT_PWM_MAX", 0) or 2000.0
-    pulses: dict[str, Any] = {"columns": outputs, **between(path, "MOT_PWM_MIN and MAX", low, high)}
-    names = [replace(one, **pulses) if one.quantity == "throttle" else one for one in _NAMES]
-    return LoggedColumns(columns=columns, quantities=names, advice=_ADVICE)
+    return {"columns": tuple(columns), **between(path, "MOT_PWM_MIN and MAX", low, high)}

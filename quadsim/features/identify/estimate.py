@@ -1,4 +1,7 @@
-"""What an identification gives: each parameter with its interval, and the verdict of its gates."""
+"""What an identification gives: each parameter with its interval, and why it is refused where it is.
+
+`fit` and `disturbance` fill these; `prediction`, `vehicle_file` and `report` read them.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +30,13 @@ def number_in(vehicle: Vehicle, name: str) -> float | None:
     """
     if name == "thrust_coefficient":
         return vehicle.mean_coefficient
-    value = getattr(vehicle, field_of(name), None)
-    axis = name[-1] if field_of(name) != name else "x"
-    if isinstance(value, tuple):
-        return value["xyz".index(axis)]
-    return value
+    file_field = field_of(name)
+    value = getattr(vehicle, file_field, None)
+    if not isinstance(value, tuple):
+        return value
+    if file_field == name:
+        return value[0]
+    return value["xyz".index(name[-1])]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,14 +50,14 @@ class ParameterEstimate:
     high: float
     start: float | None  # value of the start file, None if it has none
     refused: str = ""
-    """Why a gate refuses the value, so that the start's stays; empty where the value is identified."""
+    """Why the value is not identified, so that the start's stays; empty where it is."""
     advice: str = ""  # what to fly so that it can be identified
     in_file: bool = True  # whether a vehicle file has a field for it
 
 
 @dataclass(frozen=True, kw_only=True)
 class DisturbanceEstimate:
-    """An unknown torque about a body axis, or force along a world axis, that lasts."""
+    """An unknown torque about a body axis, or force along a world axis: a random one with a time constant."""
 
     kind: str  # torque or force
     axis: str
@@ -61,7 +66,7 @@ class DisturbanceEstimate:
     deviation_interval: tuple[float, float]  # 95 %
     time: float  # constant, with which it is forgotten [s]
     time_interval: tuple[float, float]  # 95 % [s]
-    refused: str = ""  # why it is not told; empty where it is
+    refused: str = ""  # why it is not identified; empty where it is
 
 
 class FlightNumbers(NamedTuple):

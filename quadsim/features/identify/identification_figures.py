@@ -1,9 +1,12 @@
-"""The figures of an identified vehicle: intervals, measured against predicted, errors over the horizon."""
+"""The figures of an identified vehicle: intervals, measured against predicted, residuals, errors over the horizon.
+
+`report` puts them on its page.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -25,57 +28,82 @@ from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import Figure, Panel, Series
 from quadsim.state import shown_unit
 
-_COLOURS: Final = dict(zip((IDENTIFIED, RATES_HELD, START, NO_DISTURBANCE, RATES_DECAY), CYCLE, strict=False)) | {
-    NOISE_FLOOR: COLOUR.measured
+_COLOURS: Final = {
+    IDENTIFIED: CYCLE[0],
+    RATES_HELD: CYCLE[1],
+    START: CYCLE[2],
+    NO_DISTURBANCE: CYCLE[3],
+    RATES_DECAY: CYCLE[4],
+    NOISE_FLOOR: COLOUR.measured,
 }
-_TRACED: Final = tuple(
-    (i, title, *shown_unit(si))
-    for axis, (velocity, rate) in enumerate(zip("xyz", ("roll", "pitch", "yaw"), strict=True))
-    for i, title, si in ((axis, f"v{velocity}, world", "m/s"), (3 + axis, f"{rate} rate", "rad/s"))
+
+
+class _Signal(NamedTuple):
+    """A component of velocity or body rates that is drawn."""
+
+    place: int  # among velocity and body rates
+    title: str
+    unit: str
+    scale: float  # from SI units
+
+
+def _signal(place: int, title: str, si: str) -> _Signal:
+    return _Signal(place, title, *shown_unit(si))
+
+
+_SIGNALS: Final = (
+    _signal(0, "vx, world", "m/s"),
+    _signal(3, "roll rate", "rad/s"),
+    _signal(1, "vy, world", "m/s"),
+    _signal(4, "pitch rate", "rad/s"),
+    _signal(2, "vz, world", "m/s"),
+    _signal(5, "yaw rate", "rad/s"),
 )
-"""Place, title, unit and scale of what is drawn, velocities in the left column."""
+"""What is drawn, velocities in the left column."""
 
 
 def interval_figure(estimates: Sequence[ParameterEstimate]) -> Figure:
     """Return each parameter's interval and start in percent of its value; those that a gate refuses are grey."""
     drawn = [estimate for estimate in estimates if estimate.in_file]
+    places = np.arange(float(len(drawn)))
     series = []
     for refused, colour, label in (
         (False, _COLOURS[IDENTIFIED], "95 % interval"),
         (True, COLOUR.measured, "refused by a gate"),
     ):
-        at = [(i, e) for i, e in enumerate(drawn) if bool(e.refused) is refused]
-        x = np.ravel([[i, i, np.nan] for i, _ in at])
-        y = np.ravel([[_percent(e.low, e), _percent(e.high, e), np.nan] for _, e in at])
-        series += [Series(x=x, y=y, colour=colour, label=label, width=5.0)] if at else []
-    series += [
-        Series(
-            x=np.arange(float(len(drawn))),
-            y=np.zeros(len(drawn)),
-            colour=_COLOURS[IDENTIFIED],
-            style="points",
-            width=4.0,
-        )
-    ]
-    start = Series(
-        x=np.arange(float(len(drawn))),
-        y=np.array([np.nan if e.start is None else _percent(e.start, e) for e in drawn]),
+        x = []
+        y = []
+        for place, estimate in enumerate(drawn):
+            if bool(estimate.refused) is refused:
+                x += [place, place, np.nan]
+                y += [_percent(estimate.low, estimate), _percent(estimate.high, estimate), np.nan]
+        if x:
+            series.append(Series(x=np.array(x), y=np.array(y), colour=colour, label=label, width=5.0))
+    values = Series(x=places, y=np.zeros(len(drawn)), colour=_COLOURS[IDENTIFIED], style="points", width=4.0)
+    starts = []
+    shown = [1.0]  # percent that the panel has to reach
+    for estimate in drawn:
+        start = np.nan
+        if estimate.start is not None:
+            start = _percent(estimate.start, estimate)
+        starts.append(start)
+        if not estimate.refused:
+            for end in (estimate.low, estimate.high, estimate.start or estimate.value):
+                shown.append(_percent(end, estimate))
+    start_series = Series(
+        x=places,
+        y=np.array(starts),
         colour=_COLOURS[START],
         label=START,
         style="points",
         marker="diamond",
         width=6.0,
     )
-    sure = []
-    for e in drawn:
-        if not e.refused:
-            for end in (e.low, e.high, e.start or e.value):
-                sure.append(_percent(end, e))
-    reach = 1.2 * min(max(np.abs([1.0, *sure])), 100.0)
+    reach = 1.2 * min(max(np.abs(shown)), 100.0)
     panel = Panel(
         title="relative to the estimate",
         unit="%",
-        series=(*series, start),
+        series=(*series, values, start_series),
         y_range=(-reach, reach),
         x_names=tuple(estimate.name for estimate in drawn),
         height=1.3,
@@ -90,20 +118,16 @@ def _percent(value: float, estimate: ParameterEstimate) -> float:
 def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, RATES_HELD)) -> Figure:
     """Return velocity and body rates, measured and as predicted from each window's start."""
     t = trace.t - trace.t[0, 0]
+    t_with_gaps = np.hstack([t, t[:, -1:]]).ravel()
     gap = np.full((len(t), 1), np.nan)
     panels = []
-    for i, title, unit, scale in _TRACED:
-        predicted = (
-            Series(
-                x=np.hstack([t, t[:, -1:]]).ravel(), y=np.hstack([scale * trace.predicted[name][..., i], gap]).ravel(),
-                colour=_COLOURS[name], label=f"predicted, {name}",
-            )
-            for name in models
-        )  # fmt: skip
-        measured = Series(
-            x=t.ravel(), y=scale * trace.measured[..., i].ravel(), colour=COLOUR.measured, label="measured", width=2.4
-        )
-        panels.append(Panel(title=title, unit=unit, series=(measured, *reversed([*predicted]))))
+    for place, title, unit, scale in _SIGNALS:
+        measured = scale * trace.measured[..., place].ravel()
+        series = [Series(x=t.ravel(), y=measured, colour=COLOUR.measured, label="measured", width=2.4)]
+        for name in reversed(models):  # the first is drawn last, above the others
+            predicted = np.hstack([scale * trace.predicted[name][..., place], gap]).ravel()
+            series.append(Series(x=t_with_gaps, y=predicted, colour=_COLOURS[name], label=f"predicted, {name}"))
+        panels.append(Panel(title=title, unit=unit, series=tuple(series)))
     title = f"measured and predicted: {trace.log} from {trace.t[0, 0]:.4g} s on, a prediction every {t[0, -1]:.2g} s"
     return Figure(key="trace", title=title, panels=tuple(panels), end=float(t[-1, -1]))
 
@@ -114,26 +138,34 @@ def horizon_figure(prediction: PredictionErrors) -> Figure:
     panels = []
     for j, (quantity, si) in enumerate(QUANTITIES.items()):
         unit, scale = shown_unit(si)
-        series = tuple(
-            Series(x=x, y=np.insert(scale * errors[:, j], 0, 0.0), colour=_COLOURS[name], label=name)
-            for name, errors in prediction.errors.items()
-            if np.isfinite(errors[:, j]).all()
-        )
-        panels += [Panel(title=quantity, unit=unit, x_label="horizon [s]", series=series)] if series else []
+        series = []
+        for name, errors in prediction.errors.items():
+            if np.isfinite(errors[:, j]).all():
+                y = np.insert(scale * errors[:, j], 0, 0.0)
+                series.append(Series(x=x, y=y, colour=_COLOURS[name], label=name))
+        if series:
+            panels.append(Panel(title=quantity, unit=unit, x_label="horizon [s]", series=tuple(series)))
     return Figure(key="horizon", title="mean error over the horizon", panels=tuple(panels))
 
 
 def residual_figure(prediction: PredictionErrors) -> Figure:
     """Return what is left of velocity and body rates, axis by axis, of the identified vehicle and with rates held."""
     panels = []
-    for i, title, unit, scale in _TRACED:
+    for place, title, unit, scale in _SIGNALS:
         series = []
         for name in (RATES_HELD, IDENTIFIED):
-            left = scale * prediction.residuals[name][:, i]
-            series.append(
-                Series(x=prediction.ends, y=left, colour=_COLOURS[name], label=name, style="points", width=3.0)
+            y = scale * prediction.residuals[name][:, place]
+            series.append(Series(x=prediction.ends, y=y, colour=_COLOURS[name], label=name, style="points", width=3.0))
+        of_identified = scale * prediction.residuals[IDENTIFIED][:, place]
+        rms = float(np.sqrt(np.square(of_identified).mean()))
+        panels.append(
+            Panel(
+                title=f"{title}: RMS {rms:.2g}",
+                unit=unit,
+                x_label="held-out flight [s]",
+                series=tuple(series),
+                height=0.7,
             )
-        title += f": RMS {float(np.sqrt(np.square(left).mean())):.2g}"  # of the identified vehicle
-        panels.append(Panel(title=title, unit=unit, x_label="held-out flight [s]", series=tuple(series), height=0.7))
+        )
     title = f"measured less predicted after {RESIDUAL_AFTER:g} s; RMS of the identified vehicle"
     return Figure(key="residuals", title=title, panels=tuple(panels))

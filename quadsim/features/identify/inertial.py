@@ -1,7 +1,12 @@
-"""What an accelerometer and a gyro give where a log has no velocity or attitude, or has them rarely."""
+"""What an accelerometer and a gyro give where a log has no velocity or attitude, or has them rarely.
+
+The specific force f is dv/dt - g in body axes, so v is the integral of R f + g, but for its drift; and the attitude is
+the integral of the gyro, levelled by the mean of f.  `record` takes these in place of what is not logged.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -13,10 +18,10 @@ from quadsim.rotation import euler_to_quaternion, exponential, multiply, normali
 from quadsim.state import Array
 
 _GRAVITY: Final = 9.81  # [m/s^2] of what an accelerometer shows at rest
-_UP: Final = 0.07  # by which the mean force may differ from the weight
-_FORCES: Final = ((1.0 / _GRAVITY, "in g"), (-1.0, "z points down"), (-1.0 / _GRAVITY, "in g, z points down"))
+_LOAD_TOLERANCE: Final = 0.07  # by which the mean force may differ from the weight
+_MISTAKEN_FORCES: Final = ((1.0 / _GRAVITY, "in g"), (-1.0, "z points down"), (-1.0 / _GRAVITY, "in g, z points down"))
 """Mean force over the weight, and its usual causes."""
-_AT_FIRST: Final = 1.0  # [s] whose mean force levels the first attitude
+_FIRST_LEVELLING: Final = 1.0  # [s] whose mean force levels the first attitude
 _LEVELLING: Final = 20.0  # time constant [s] by which the mean force levels all others
 
 
@@ -30,25 +35,32 @@ def integrated_velocity(name: str, force: Array, attitude: Array, period: float)
     there = np.asarray(np.isfinite(world).all(axis=1))
     if not there.any():
         return world
-    up = float(np.mean(world[there, 2])) / _GRAVITY
-    if not 1.0 / (1.0 + _UP) < up < 1.0 + _UP:
-        likely = next((what for of, what in _FORCES if abs(up / of - 1.0) < _UP), "not the specific force in body axes")
+    load = float(np.mean(world[there, 2])) / _GRAVITY
+    if not 1.0 / (1.0 + _LOAD_TOLERANCE) < load < 1.0 + _LOAD_TOLERANCE:
         raise InputError(
-            f"{name}: ax, ay, az carry {up:.3g} times the weight in the mean, 1 within {_UP:.0%} is allowed: likely "
-            f"{likely}; give the specific force in m/s^2, x forward, y left, z up"
+            f"{name}: ax, ay, az carry {load:.3g} times the weight in the mean, 1 within {_LOAD_TOLERANCE:.0%} is "
+            f"allowed: likely {_likely(load)}; give the specific force in m/s^2, x forward, y left, z up"
         )
-    rest = np.where(there[:, None], world - [0.0, 0.0, _GRAVITY], 0.0)
-    rest -= rest[there].mean(axis=0)
-    steps = np.zeros_like(rest)
-    steps[1:] = 0.5 * period * (rest[1:] + rest[:-1])
+    acceleration = np.where(there[:, None], world - [0.0, 0.0, _GRAVITY], 0.0)
+    acceleration -= acceleration[there].mean(axis=0)
+    steps = np.zeros_like(acceleration)
+    steps[1:] = 0.5 * period * (acceleration[1:] + acceleration[:-1])
     return np.where(there[:, None], np.cumsum(steps, axis=0), np.nan)
+
+
+def _likely(load: float) -> str:
+    """The usual cause of a mean force that is some times the weight."""
+    for mistaken, cause in _MISTAKEN_FORCES:
+        if abs(load / mistaken - 1.0) < _LOAD_TOLERANCE:
+            return cause
+    return "not the specific force in body axes"
 
 
 def filled_in(velocity: Array, inertial: Array, window: int) -> Array:
     """Velocity (N, 3) that follows the one logged over a window of samples, and the inertial one within it."""
-    off = velocity - inertial
-    there = np.asarray(np.isfinite(off).all(axis=1))[:, None]
-    drift = uniform_filter1d(np.where(there, off, 0.0), window, axis=0)
+    difference = velocity - inertial
+    there = np.asarray(np.isfinite(difference).all(axis=1))[:, None]
+    drift = uniform_filter1d(np.where(there, difference, 0.0), window, axis=0)
     drift /= np.maximum(uniform_filter1d(there.astype(float), window, axis=0), 1e-9)
     return np.where(there, inertial + drift, np.nan)
 
@@ -62,7 +74,7 @@ def levelled_attitude(t: Array, rates: Array, force: Array) -> Array:
     rates = np.nan_to_num(rates)
     there = np.asarray(np.isfinite(force).all(axis=1))
     force = np.where(there[:, None], force, np.nan)
-    fx, fy, fz = np.nanmean(force[t <= t[0] + _AT_FIRST], axis=0)
+    fx, fy, fz = np.nanmean(force[t <= t[0] + _FIRST_LEVELLING], axis=0)
     level = np.array([np.arctan2(fy, fz), np.arctan2(-fx, np.hypot(fy, fz)), 0.0])
     q = tuple(euler_to_quaternion(level).tolist())
     attitude = [q]
@@ -70,8 +82,9 @@ def levelled_attitude(t: Array, rates: Array, force: Array) -> Array:
     halves = 0.5 * steps[:, None] * (rates[1:] + rates[:-1])
     for dt, angle, (x, y, z) in zip(steps.tolist(), halves.tolist(), force[1:].tolist(), strict=True):
         q = multiply(q, exponential(tuple(angle)))
-        if x == x:
-            _, fx, fy, _ = multiply(multiply(q, (0.0, x, y, z)), (q[0], -q[1], -q[2], -q[3]))
+        if not math.isnan(x):
+            conjugate = (q[0], -q[1], -q[2], -q[3])
+            _, fx, fy, _ = multiply(multiply(q, (0.0, x, y, z)), conjugate)
             share = dt / (_LEVELLING * _GRAVITY)
             q = multiply(exponential((share * fy, -share * fx, 0.0)), q)  # along f x e_z
         q = normalise(q)

@@ -1,17 +1,22 @@
-"""Increments of velocity and body rates from sample to sample, as measured and as a vehicle's parameters predict."""
+"""Increments of velocity and body rates from sample to sample, as measured and as a vehicle's parameters predict.
+
+A stretch of a log is prepared once: what was measured over each period, and the mean motion in it.  The equations of
+`predicted_increments` give the same from the rotors' speeds; the search makes their difference, the misfit, small.
+"""
 
 from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from quadsim.features.identify.record import Record, part_of
+from quadsim.features.identify.record import Record, new_rows, part_of
 from quadsim.features.identify.rotors import Turning, lagging, measured, smoothed
+from quadsim.features.identify.series import interpolated
 from quadsim.rotation import exponential, multiply, normalise
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.state import Array, Indices
@@ -50,13 +55,22 @@ class Parameters:
     @classmethod
     def of(cls, vehicle: Vehicle, **others: Any) -> Parameters:
         """Those of a vehicle, with `others` for what its file has no field for."""
-        own: dict[str, Any] = {name: getattr(vehicle, name) or 0.0 for name in ("rotor_rise", "rotor_fall")}
-        own |= {name: getattr(vehicle, name) or 0.0 for name in ("rotor_inertia", "rotor_drag", "inflow")}
-        own |= {"thrust_coefficient": vehicle.mean_coefficient, "drag_to_thrust": vehicle.drag_to_thrust}
-        own |= {"throttle_curve": vehicle.throttle_share}
-        vectors = {"rotor_moment": 2, "inflow_moment": 2, "rate_damping": 3, "body_drag": 3}
-        own |= {name: np.array(getattr(vehicle, name) or (0.0,) * n) for name, n in vectors.items()}
-        return cls(**({"inertia": np.array(vehicle.inertia)} | own | others))
+        numbers: dict[str, Any] = {
+            "thrust_coefficient": vehicle.mean_coefficient,
+            "inertia": np.array(vehicle.inertia),
+            "drag_to_thrust": vehicle.drag_to_thrust,
+            "rotor_rise": vehicle.rotor_rise or 0.0,
+            "rotor_fall": vehicle.rotor_fall or 0.0,
+            "rotor_inertia": vehicle.rotor_inertia or 0.0,
+            "rotor_drag": vehicle.rotor_drag or 0.0,
+            "body_drag": np.array(vehicle.body_drag or (0.0, 0.0, 0.0)),
+            "rotor_moment": np.array(vehicle.rotor_moment or (0.0, 0.0)),
+            "inflow_moment": np.array(vehicle.inflow_moment or (0.0, 0.0)),
+            "rate_damping": np.array(vehicle.rate_damping or (0.0, 0.0, 0.0)),
+            "inflow": vehicle.inflow or 0.0,
+            "throttle_curve": vehicle.throttle_share,
+        }
+        return cls(**(numbers | others))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,14 +85,14 @@ class MeanMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class Stretch:
-    """Part of a record that flies, with what no parameter changes."""
+    """Part of a record that flies, with what no parameter changes: the measured increments and the mean motion."""
 
     record: Record
     flight: int  # which of those fitted together
     increments: Array  # (K, 6) of body rates [rad/s] and world velocity [m/s], from each new row to the next
     starts: Indices  # (K,) the period in which each begins; of a log without held rows, K = N - 1 and all of them
     motion: MeanMotion
-    foretold: Array | None = None  # (N, 4) rotor speeds by the commands, where both are logged [rad/s]
+    instrument_speeds: Array | None = None  # (N, 4) rotor speeds by the commands, where both are logged [rad/s]
 
     @property
     def seconds(self) -> float:
@@ -97,49 +111,52 @@ class Stretch:
         return self.increments - predicted
 
 
+def voltages(parts: Sequence[Stretch]) -> Array:
+    """The battery's voltage in all samples of some stretches [V]; none where it is not logged."""
+    logged = [part.record.voltage for part in parts if part.record.voltage is not None]
+    return np.concatenate([np.zeros(0), *logged])
+
+
 def mean_voltage(parts: Sequence[Stretch]) -> float:
     """Return the mean voltage of the battery in some stretches, 0 where none is logged [V]."""
-    voltages = [part.record.voltage for part in parts if part.record.voltage is not None]
-    if voltages:
-        return float(np.mean(np.concatenate(voltages)))
-    return 0.0
+    samples = voltages(parts)
+    if not samples.size:
+        return 0.0
+    return float(np.mean(samples))
 
 
 def stretch(record: Record, flight: int) -> Stretch:
     """Prepare a record, all of which flies, from its first new row to its last."""
-    if record.fresh is None:
-        rows = np.arange(len(record.t))
-    else:
-        rows = np.flatnonzero(record.fresh)
-    record = part_of(record, slice(rows[0], rows[-1] + 1))
-    rows = rows - rows[0]
+    new = new_rows(record)
+    record = part_of(record, slice(new[0], new[-1] + 1))
+    rows = new - new[0]
     if record.speeds is not None:
         record = replace(record, speeds=smoothed(record.speeds))
-    turn = Rotation.from_quat(_smoothed(record), scalar_first=True).as_matrix()
-    means = (0.5 * (rows[1:] + rows[:-1]) for rows in (record.rates, turn, record.velocity))
-    rates, turns, velocity = means
-    return Stretch(
-        record=record,
-        flight=flight,
-        increments=np.diff(np.concatenate([record.rates, record.velocity], axis=1)[rows], axis=0),
-        starts=rows[:-1],
-        motion=MeanMotion(period=record.period, rates=rates, turn=turns, velocity=velocity),
-    )
+    turn = Rotation.from_quat(_filtered_attitude(record), scalar_first=True).as_matrix()
+    motion = MeanMotion(period=record.period, rates=_mid(record.rates), turn=_mid(turn), velocity=_mid(record.velocity))
+    rates_and_velocity = np.concatenate([record.rates, record.velocity], axis=1)
+    increments = np.diff(rates_and_velocity[rows], axis=0)
+    return Stretch(record=record, flight=flight, increments=increments, starts=rows[:-1], motion=motion)
 
 
-def _smoothed(record: Record) -> Array:
-    """(N, 4) attitude as a complementary filter of attitude and gyro gives it."""
+def _mid(rows: Array) -> Array:
+    """Means (N - 1, ...) of neighbouring samples (N, ...)."""
+    return 0.5 * (rows[1:] + rows[:-1])
+
+
+def _filtered_attitude(record: Record) -> Array:
+    """(N, 4) attitude by a complementary filter: it follows the gyro, and the logged attitude slowly."""
     share = record.period / (record.period + _SMOOTHING)
-    halves = 0.5 * record.period * (record.rates[1:] + record.rates[:-1])
-    smoothed = [tuple(record.attitude[0].tolist())]
-    for angle, seen in zip(halves.tolist(), record.attitude[1:].tolist(), strict=True):
-        ahead = multiply(smoothed[-1], exponential(tuple(angle)))
-        if sum(map(operator.mul, ahead, seen)) >= 0.0:
-            sign = 1.0
-        else:
+    angles = 0.5 * record.period * (record.rates[1:] + record.rates[:-1])
+    filtered = [tuple(record.attitude[0].tolist())]
+    for angle, logged in zip(angles.tolist(), record.attitude[1:].tolist(), strict=True):
+        ahead = multiply(filtered[-1], exponential(tuple(angle)))
+        sign = 1.0
+        if sum(map(operator.mul, ahead, logged)) < 0.0:  # q and -q are the same attitude
             sign = -1.0
-        smoothed.append(normalise(tuple(a + share * (sign * b - a) for a, b in zip(ahead, seen, strict=True))))
-    return np.array(smoothed)
+        mixed = [a + share * (sign * b - a) for a, b in zip(ahead, logged, strict=True)]
+        filtered.append(normalise(tuple(mixed)))
+    return np.array(filtered)
 
 
 def turning(record: Record, vehicle: Vehicle, p: Parameters) -> Turning:
@@ -164,6 +181,14 @@ def commanded(record: Record, vehicle: Vehicle, p: Parameters) -> Array:
     return np.asarray(commands)
 
 
+class _RotorForces(NamedTuple):
+    """Forces of each rotor over M periods, body axes [N]."""
+
+    x: Array  # (M, 4)
+    y: Array  # (M, 4)
+    thrust: Array  # (M, 4)
+
+
 def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:
     """(M, 6) increments of body rates and velocity in each period, as the parameters predict them.
 
@@ -171,43 +196,70 @@ def predicted_increments(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, 
     inflow w_i v_axial,i) e_z - rotor_drag w_i v_perp,i, tau_air that of `Vehicle.air_moment` at each hub;
     m dv/dt = R (sum f_i + body drag) - m g e_z.
     """
-    x, y, _ = vehicle.hubs.T
-    spin = np.array(vehicle.rotor_spins, float)
-    dt, jx, jy, jz = motion.period, *p.inertia
-    when = np.linspace(0.0, len(p.wind) - 1.0, len(motion.rates))
-    wind = np.stack([np.interp(when, np.arange(len(p.wind)), w) for w in p.wind.T], axis=1)
-    air = np.einsum("kji,kj->ki", motion.turn, motion.velocity - wind)  # body axes
-    roll, pitch, yaw = motion.rates.T
-    axial = air[:, 2:] + roll[:, None] * y - pitch[:, None] * x
-    thrust = p.thrust_coefficient * rotors.square - p.inflow * rotors.mean * axial
-    dragging = p.rotor_drag * rotors.mean
-    every = np.ones(len(spin))
-    turning_speed = rotors.mean @ every
-    side = -(dragging * (air[:, :1] - yaw[:, None] * y)), -(dragging * (air[:, 1:2] + yaw[:, None] * x))
-    total = thrust @ every
-    force = np.stack([side[0] @ every, side[1] @ every, total], axis=1)
-    momentum = -(rotors.mean @ spin) * p.rotor_inertia
-    spun_up = -(rotors.change @ spin) * p.rotor_inertia
-    torque = np.stack(
-        [
-            thrust @ y
-            - p.offset[1] * total
-            + p.rotor_moment[0] * (turning_speed * air[:, 1] + yaw * (rotors.mean @ x))
-            - p.inflow_moment[0] * air[:, 1] * air[:, 2]
-            - momentum * pitch
-            - (jz - jy) * pitch * yaw,
-            p.offset[0] * total
-            - thrust @ x
-            - p.rotor_moment[1] * (turning_speed * air[:, 0] - yaw * (rotors.mean @ y))
-            + p.inflow_moment[1] * air[:, 0] * air[:, 2]
-            + momentum * roll
-            - (jx - jz) * roll * yaw,
-            p.drag_to_thrust * (thrust @ spin) + side[1] @ x - side[0] @ y + p.yaw_trim - (jy - jx) * roll * pitch,
-        ],
-        axis=1,
-    )
+    dt = motion.period
+    air = _air_velocity(motion, p)
+    forces = _rotor_forces(motion, rotors, vehicle, p, air)
+    torque = _torque(motion, rotors, vehicle, p, air, forces)
     angular = dt * (torque - p.rate_damping * motion.rates)
-    angular[:, 2] -= spun_up
+    spins = np.array(vehicle.rotor_spins, float)
+    momentum_change = -(rotors.change @ spins) * p.rotor_inertia
+    angular[:, 2] -= momentum_change
+    every = np.ones(len(spins))
+    force = np.stack([forces.x @ every, forces.y @ every, forces.thrust @ every], axis=1)
     body = force - 0.5 * SEA_LEVEL_DENSITY * p.body_drag * np.linalg.norm(air, axis=1, keepdims=True) * air
     linear = np.einsum("kij,kj->ki", motion.turn, body) / vehicle.mass - [0.0, 0.0, vehicle.gravity]
     return np.concatenate([angular / p.inertia, dt * linear], axis=1)
+
+
+def _air_velocity(motion: MeanMotion, p: Parameters) -> Array:
+    """(M, 3) velocity through the air, body axes [m/s]."""
+    instants = np.arange(len(p.wind))
+    when = np.linspace(0.0, len(p.wind) - 1.0, len(motion.rates))
+    wind = interpolated(when, instants, p.wind)
+    return np.asarray(np.einsum("kji,kj->ki", motion.turn, motion.velocity - wind))
+
+
+def _rotor_forces(motion: MeanMotion, rotors: Turning, vehicle: Vehicle, p: Parameters, air: Array) -> _RotorForces:
+    """Thrust less what inflow takes, and drag, by the velocity of each hub through the air."""
+    x, y, _ = vehicle.hubs.T
+    roll, pitch, yaw = motion.rates.T
+    axial = air[:, 2:] + roll[:, None] * y - pitch[:, None] * x
+    drag = p.rotor_drag * rotors.mean
+    return _RotorForces(
+        x=-(drag * (air[:, :1] - yaw[:, None] * y)),
+        y=-(drag * (air[:, 1:2] + yaw[:, None] * x)),
+        thrust=p.thrust_coefficient * rotors.square - p.inflow * rotors.mean * axial,
+    )
+
+
+def _torque(
+    motion: MeanMotion, rotors: Turning, vehicle: Vehicle, p: Parameters, air: Array, forces: _RotorForces
+) -> Array:
+    """(M, 3) torque about the body axes [N m], the gyroscopic one included, without damping and the rotors' spin-up."""
+    x, y, _ = vehicle.hubs.T
+    roll, pitch, yaw = motion.rates.T
+    jx, jy, jz = p.inertia
+    spins = np.array(vehicle.rotor_spins, float)
+    every = np.ones(len(spins))
+    thrust = forces.thrust
+    total_thrust = thrust @ every
+    total_speed = rotors.mean @ every
+    momentum = -(rotors.mean @ spins) * p.rotor_inertia
+    about_x = (
+        thrust @ y
+        - p.offset[1] * total_thrust
+        + p.rotor_moment[0] * (total_speed * air[:, 1] + yaw * (rotors.mean @ x))
+        - p.inflow_moment[0] * air[:, 1] * air[:, 2]
+        - momentum * pitch
+        - (jz - jy) * pitch * yaw
+    )
+    about_y = (
+        p.offset[0] * total_thrust
+        - thrust @ x
+        - p.rotor_moment[1] * (total_speed * air[:, 0] - yaw * (rotors.mean @ y))
+        + p.inflow_moment[1] * air[:, 0] * air[:, 2]
+        + momentum * roll
+        - (jx - jz) * roll * yaw
+    )
+    about_z = p.drag_to_thrust * (thrust @ spins) + forces.y @ x - forces.x @ y + p.yaw_trim - (jy - jx) * roll * pitch
+    return np.stack([about_x, about_y, about_z], axis=1)

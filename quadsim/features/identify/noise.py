@@ -1,15 +1,9 @@
-"""The torque and the force that a model leaves over: how large they are, how long they last, what they will be.
-
-What a flight measures of an axis from sample to sample, less what the parameters predict, is taken as
+"""The noise d that a model leaves over along an axis: how large it is, how long it lasts, and its forecasts.
 
     d_k = integral of a(t) over the period + n_k+1 - n_k
 
-with an acceleration a of standard deviation s that is forgotten with a time constant T (an Ornstein-Uhlenbeck process)
-and the sensor's white noise n of deviation r.  With q = exp(-h / T), h the period, (1 - q / z) d_k is a moving average
-of second order, so that d has the innovations e = (1 - q / z) / C(z) d of a stationary Kalman filter; C follows from
-the autocovariances by factorisation, in closed form.  s, T and r are the likeliest for the innovations.  Forecasts of d
-are those of that filter: a acts on, fading with T, and what the last sample was wrong by is taken back (Box, Jenkins,
-Reinsel and Ljung, "Time Series Analysis", 5th ed., Secs. 5.1 and 5.2).
+a: an acceleration of deviation s, forgotten with a time constant T (Ornstein-Uhlenbeck); n: the sensor's white noise of
+deviation r.  `disturbance` gives s and T as a torque or a force, `prediction` starts from the forecasts.
 """
 
 from __future__ import annotations
@@ -27,21 +21,28 @@ from quadsim.state import Array, Indices
 
 LONGEST_NOISE: Final = 10.0  # time constant [s]: what lasts longer is a trim
 SHORTEST_NOISE: Final = 0.5  # time constant over the period: what is shorter is white
-_TIMES: Final = (0.03, 0.3)  # time constants that the search starts from [s]
-_STEP: Final = 1e-3  # of the slopes of innovations, in logarithms
+_FIRST_TIMES: Final = (0.03, 0.3)  # time constants that the search starts from [s]
+_FIRST_SAMPLES: Final = 10_000  # that the search begins with
+_SIMPLEX: Final = {"xatol": 1e-3, "fatol": 1e-3, "maxiter": 1000}  # of the search by Nelder and Mead
+_MAX_SCORING_STEPS: Final = 8  # of Fisher's scoring, which ends the search
+_LONGEST_STEP: Final = 0.5  # of it, in logarithms
+_LEAST_STEP_GAIN: Final = 1e-3  # in the logarithm of the likelihood at which it ends
+_SLOPE_STEP: Final = 1e-3  # for slopes of innovations by differences, in logarithms
 _FARTHEST: Final = 50.0  # largest logarithm of a deviation that the search tries, either way
 _LEAST_SPREAD: Final = 1e-9  # of misfits [rad/s, m/s]
 _REGULAR: Final = 1e-6 * np.eye(3)  # information without which a number that nothing shows has none
-_ENOUGH: Final = 10_000  # samples that the search begins with
-_SCORING_STEPS: Final = 8  # of Fisher's scoring, which ends it
-_SMALL: Final = 1e-3  # gain in the logarithm of the likelihood at which it ends
-_REACH: Final = 2000  # samples after which a stretch has forgotten what was wrong with its first
-_SEARCH: Final = {"xatol": 1e-3, "fatol": 1e-3, "maxiter": 1000}
+_MEMORY: Final = 2000  # samples after which a stretch has forgotten the error of its first
 
 
 @dataclass(frozen=True, kw_only=True)
 class AxisNoise:
-    """What is not modelled along one axis, as an acceleration, and the noise of its sensor."""
+    """What is not modelled along one axis, as an acceleration, and the noise of its sensor.
+
+    With q = exp(-h / T), h the period, (1 - q / z) d_k is a moving average of second order, so that d has the
+    innovations e = (1 - q / z) / C(z) d of a stationary Kalman filter; C follows from the autocovariances in closed
+    form.  Forecasts of d are those of that filter: a acts on, fading with T, and the error of the last sample is taken
+    back (Box, Jenkins, Reinsel and Ljung, "Time Series Analysis", 5th ed., Secs. 5.1 and 5.2).
+    """
 
     deviation: float = 0.0  # s [rad/s^2, m/s^2]
     time: float = 1.0  # T [s]
@@ -51,35 +52,39 @@ class AxisNoise:
         """1 - q / z, C(z) and the innovations' variance."""
         kept = math.exp(-period / self.time)
         scale = (self.deviation * self.time) ** 2
-        same = 2.0 * scale * (period / self.time - 1.0 + kept)  # autocovariances of the acceleration's increments
-        next_one = scale * (1.0 - kept) ** 2
+        # autocovariances of the acceleration's increments, at lag 0 and 1
+        lag_0 = 2.0 * scale * (period / self.time - 1.0 + kept)
+        lag_1 = scale * (1.0 - kept) ** 2
         noise = self.sensor**2
-        zeroth = (1.0 + kept**2) * same - 2.0 * kept * next_one + noise * (1.0 + (1.0 + kept) ** 2 + kept**2)
-        first = next_one - kept * same - noise * (1.0 + kept) ** 2
+        zeroth = (1.0 + kept**2) * lag_0 - 2.0 * kept * lag_1 + noise * (1.0 + (1.0 + kept) ** 2 + kept**2)
+        first = lag_1 - kept * lag_0 - noise * (1.0 + kept) ** 2
         second = noise * kept
-        moving = _factor(zeroth, first, second)
-        return np.array([1.0, -kept]), moving, zeroth / float(moving @ moving)
+        moving_average = _factor(zeroth, first, second)
+        variance = zeroth / float(moving_average @ moving_average)
+        return np.array([1.0, -kept]), moving_average, variance
 
     def innovations(self, misfit: Array, period: float) -> tuple[Array, float]:
-        """(N,) innovations of a misfit (N,), less what is wrong with its first sample, and their variance."""
-        fading, moving, variance = self._innovations_form(period)
-        innovations = lfilter(fading, moving, misfit)
-        of_start = lfilter(fading, moving, np.eye(1, min(len(misfit), _REACH))[0])
-        head = innovations[: len(of_start)]
-        head -= float(of_start @ head) / float(of_start @ of_start) * of_start
+        """(N,) innovations of a misfit (N,), less the error of its first sample, and their variance."""
+        fading, moving_average, variance = self._innovations_form(period)
+        innovations = lfilter(fading, moving_average, misfit)
+        impulse = np.eye(1, min(len(misfit), _MEMORY))[0]
+        of_first_error = lfilter(fading, moving_average, impulse)
+        head = innovations[: len(of_first_error)]
+        head -= float(of_first_error @ head) / float(of_first_error @ of_first_error) * of_first_error
         return innovations, variance
 
     def forecast(self, misfit: Array, period: float, starts: Indices, length: int) -> Array:
         """(W, length) expected misfits from W starts on, each by the misfits (N,) of the periods before it alone."""
         if not self.deviation and not self.sensor:
             return np.zeros((len(starts), length))
-        fading, moving, _ = self._innovations_form(period)
+        fading, moving_average, _ = self._innovations_form(period)
         kept = -fading[1]
-        innovations = np.concatenate([[0.0, 0.0], lfilter(fading, moving, misfit)])
-        before = np.concatenate([[0.0], misfit])[starts]
+        innovations = np.concatenate([[0.0, 0.0], lfilter(fading, moving_average, misfit)])
+        last_misfit = np.concatenate([[0.0], misfit])[starts]
         last = innovations[starts + 1]
-        first = kept * before + moving[1] * last + moving[2] * innovations[starts]
-        second = kept * first + moving[2] * last
+        last_but_one = innovations[starts]
+        first = kept * last_misfit + moving_average[1] * last + moving_average[2] * last_but_one
+        second = kept * first + moving_average[2] * last
         later = second[:, None] * kept ** np.arange(length - 1)
         return np.concatenate([first[:, None], later], axis=1)
 
@@ -87,8 +92,8 @@ class AxisNoise:
         """(W, length) what comes on top of forecasts, from standard normal numbers (W, length)."""
         if not self.deviation and not self.sensor:
             return np.zeros(white.shape)
-        fading, moving, variance = self._innovations_form(period)
-        return np.asarray(math.sqrt(variance) * lfilter(moving, fading, white, axis=1))
+        fading, moving_average, variance = self._innovations_form(period)
+        return np.asarray(math.sqrt(variance) * lfilter(moving_average, fading, white, axis=1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,38 +117,40 @@ def identify_noise(misfits: Sequence[Array], periods: Sequence[float], blocks: S
     spread = max(float(np.concatenate(misfits).std()), _LEAST_SPREAD)
     least = np.array([-_FARTHEST, math.log(SHORTEST_NOISE * periods[0]), -_FARTHEST])
     most = np.array([_FARTHEST, math.log(LONGEST_NOISE), _FARTHEST])
+    samples = sum(map(len, misfits))
+    share = min(1.0, _FIRST_SAMPLES / samples)
+    first_misfits = [misfit[: math.ceil(share * len(misfit))] for misfit in misfits]
 
     def noise_of(x: Array) -> AxisNoise:
         deviation, time, sensor = np.exp(np.clip(x, least, most)).tolist()
         return AxisNoise(deviation=deviation, time=time, sensor=sensor)
 
-    share = min(1.0, _ENOUGH / sum(map(len, misfits)))
-    parts = [misfit[: math.ceil(share * len(misfit))] for misfit in misfits]
-
     def cost(x: Array) -> float:
         beyond = float(np.abs(x - np.clip(x, least, most)).sum())
-        return beyond + _cost(noise_of(x), parts, periods)
+        return beyond + _cost(noise_of(x), first_misfits, periods)
 
     searches = []
-    for time in _TIMES:
-        first = np.log([0.3 * spread / periods[0], time, 0.5 * spread])
-        searches.append(minimize(cost, first, method="Nelder-Mead", options=_SEARCH))
+    for time in _FIRST_TIMES:
+        begin = np.log([0.3 * spread / periods[0], time, 0.5 * spread])
+        searches.append(minimize(cost, begin, method="Nelder-Mead", options=_SIMPLEX))
     x = min(searches, key=lambda search: float(search.fun)).x
     reached = _cost(noise_of(x), misfits, periods)
-    for _ in range(_SCORING_STEPS):  # by all of it
+    for _ in range(_MAX_SCORING_STEPS):
         information, gradients = _information(x, noise_of, misfits, periods, blocks)
         total = information.sum(axis=0) + _REGULAR
-        moved = x - np.clip(np.linalg.solve(total, gradients.sum(axis=0)), -0.5, 0.5)
-        if (after := _cost(noise_of(moved), misfits, periods)) >= reached - _SMALL:
+        step = np.linalg.solve(total, gradients.sum(axis=0))
+        moved = x - np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+        after = _cost(noise_of(moved), misfits, periods)
+        if after >= reached - _LEAST_STEP_GAIN:
             break
         x = moved
         reached = after
-    left_out = [np.linalg.solve(total - of, g) for of, g in zip(information, gradients, strict=True)]
+    left_out = [np.linalg.solve(total - block, g) for block, g in zip(information, gradients, strict=True)]
     return NoiseFit(
         noise=noise_of(x),
         explained=np.sqrt(np.diag(np.linalg.inv(total)))[:2],
         left_out=np.array(left_out)[:, :2],
-        gain=_cost_of_silence(misfits) - reached,
+        gain=_cost_of_sensor_alone(misfits) - reached,
     )
 
 
@@ -156,11 +163,14 @@ def _cost(noise: AxisNoise, misfits: Sequence[Array], periods: Sequence[float]) 
     return cost
 
 
-def _cost_of_silence(misfits: Sequence[Array]) -> float:
+def _cost_of_sensor_alone(misfits: Sequence[Array]) -> float:
     """The same of the likeliest noise of the sensor alone: what it measured, summed up, is white about a constant."""
-    sums = [np.cumsum(misfit) for misfit in misfits]
-    squares = sum(float(np.square(of - of.mean()).sum()) for of in sums)
-    samples = sum(map(len, misfits))
+    squares = 0.0
+    samples = 0
+    for misfit in misfits:
+        measured = np.cumsum(misfit)
+        squares += float(np.square(measured - measured.mean()).sum())
+        samples += len(misfit)
     return 0.5 * samples * (1.0 + math.log(max(squares / samples, _LEAST_SPREAD**2)))
 
 
@@ -177,17 +187,19 @@ def _information(
     for misfit, period, rows in zip(misfits, periods, blocks, strict=True):
         innovations, variance = noise_of(x).innovations(misfit, period)
         slopes = np.zeros((len(misfit), 3))
-        of_variance = np.zeros(3)  # of its logarithm
-        for i, step in enumerate(_STEP * np.eye(3)):
+        variance_slopes = np.zeros(3)  # of its logarithm
+        for i, step in enumerate(_SLOPE_STEP * np.eye(3)):
             after, variance_after = noise_of(x + step).innovations(misfit, period)
             before, variance_before = noise_of(x - step).innovations(misfit, period)
-            slopes[:, i] = (after - before) / (2.0 * _STEP)
-            of_variance[i] = math.log(variance_after / variance_before) / (2.0 * _STEP)
-        for of in rows:
-            J = slopes[of]
-            excess = float(np.square(innovations[of]).sum()) / variance - len(of)
-            information.append(J.T @ J / variance + 0.5 * len(of) * np.outer(of_variance, of_variance))
-            gradients.append(J.T @ innovations[of] / variance - 0.5 * excess * of_variance)
+            slopes[:, i] = (after - before) / (2.0 * _SLOPE_STEP)
+            variance_slopes[i] = math.log(variance_after / variance_before) / (2.0 * _SLOPE_STEP)
+        by_variance = np.outer(variance_slopes, variance_slopes)
+        for block in rows:
+            J = slopes[block]
+            e = innovations[block]
+            excess = float(np.square(e).sum()) / variance - len(block)
+            information.append(J.T @ J / variance + 0.5 * len(block) * by_variance)
+            gradients.append(J.T @ e / variance - 0.5 * excess * variance_slopes)
     return np.array(information), np.array(gradients)
 
 
@@ -198,9 +210,9 @@ def _factor(zeroth: float, first: float, second: float) -> Array:
     """
     polynomial = np.ones(1, complex)
     for x in np.roots([second, first, zeroth - 2.0 * second]).astype(complex):
-        apart = np.sqrt(x * x - 4.0)
-        root = min(0.5 * (x + apart), 0.5 * (x - apart), key=abs)
-        polynomial = np.convolve(polynomial, [1.0, -root])
-    moving = np.zeros(3)
-    moving[: len(polynomial)] = polynomial.real
-    return moving
+        discriminant = np.sqrt(x * x - 4.0)
+        inner_root = min(0.5 * (x + discriminant), 0.5 * (x - discriminant), key=abs)
+        polynomial = np.convolve(polynomial, [1.0, -inner_root])
+    moving_average = np.zeros(3)
+    moving_average[: len(polynomial)] = polynomial.real
+    return moving_average

@@ -1,15 +1,8 @@
 """Open-loop prediction on flight that was not fitted: what the identified numbers are worth.
 
 From every window's start, the measured state is simulated with the rotor speeds that the log gives, and compared with
-what was measured up to 0.5 s later.  The identified vehicle starts with the unknown torque and force that a filter
-knows at that instant, of the periods before it alone, and which fade as the identified noise does (`AxisNoise`).
-
-Beside it stand the same without them; the start file with the same filter; and two that have thrust and drag alone: the
-body rates are held, as the baseline of published comparisons holds them, or decay as they did in what was fitted.
-
-The floor is what the identified noise leaves open to any prediction that knows the vehicle: the error of the simulation
-against itself with noise that comes after the start.  In a closed loop, it may exceed the errors of rates that are
-held: the rotors' coming speeds answer a torque that the model does not know, and the vehicle turns less than they say.
+what was measured up to 0.5 s later: x_{k+1} = x_k + T f(x_k + T/2 f(x_k)).  The identified vehicle stands beside the
+start file, two models of thrust and drag alone, and the floor that the identified disturbance leaves to any of them.
 """
 
 from __future__ import annotations
@@ -28,7 +21,7 @@ from quadsim.features.identify.checks import SHORTEST_SPAN
 from quadsim.features.identify.estimate import Identification
 from quadsim.features.identify.model import INCREMENTS, MeanMotion, Parameters, predicted_increments, stretch, turning
 from quadsim.features.identify.noise import AxisNoise
-from quadsim.features.identify.record import Record, part_of
+from quadsim.features.identify.record import ROTOR_INPUTS, Record, new_rows, part_of
 from quadsim.features.identify.rotors import Turning
 from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
@@ -40,20 +33,34 @@ JUDGED: Final = (0.1, 0.25, 0.5)  # horizons of the verdict [s]
 RATES_JUDGED: Final = 2  # of them for body rates: later, what is not known of the torque is most of the error
 TIE: Final = 0.05  # by which the errors of a quantity may exceed a rival's, in their geometric mean over the horizons
 NEAR_FLOOR: Final = 0.25  # by which they may exceed the floor to be said to reach it
+
 IDENTIFIED = "identified"
+"""Starts with the torque and force that a filter knows at that instant, of the periods before it alone, and which fade
+as the identified noise does (`AxisNoise`)."""
 NO_DISTURBANCE = "undisturbed"
+"""The same without them."""
 START = "start"
+"""The start file with the same filter."""
 RATES_HELD = "rates held"
+"""The identified thrust and drag alone: body rates are held, as the baseline of published comparisons holds them."""
 RATES_DECAY = "rates decay"
+"""The same, but rates decay as they did in what was fitted."""
 NOISE_FLOOR = "floor"
+"""What the identified noise leaves open to any prediction that knows the vehicle: the error of the simulation against
+itself with noise that comes after the start.  In a closed loop, it may exceed the errors of rates that are held: the
+rotors' coming speeds answer a torque that the model does not know, and the vehicle turns less than they say."""
 RIVALS: Final = (START, RATES_HELD, RATES_DECAY)
 QUANTITIES: Final = {"position": "m", "velocity": "m/s", "attitude": "rad", "body rates": "rad/s"}
-ROTOR_FIELDS: Final = ("commands", "throttle", "speeds", "voltage")  # what a record may say of them
+
 _HELD_OUT: Final = 0.2  # share of the airborne samples of a log
-_DRIFT: Final = 5.0  # [s] over which a velocity by the accelerometer is left out
-_RESIDUAL: Final = HORIZONS.index(RESIDUAL_AFTER)
-_SHOWN: Final = 10  # windows in a trace
-_VELOCITY_AND_RATES: Final = [3, 4, 5, 10, 11, 12]  # of a state
+_LONGEST_DRIFT: Final = 5.0  # [s] over which the mean of a velocity by the accelerometer is left out
+_RESIDUAL_HORIZON: Final = HORIZONS.index(RESIDUAL_AFTER)
+_TRACED_WINDOWS: Final = slice(0, 20, 2)  # of a log's: they follow one another, as windows start every half of one
+_POSITION: Final = slice(0, 3)  # of a state
+_VELOCITY: Final = slice(3, 6)
+_ATTITUDE: Final = slice(6, 10)
+_RATES: Final = slice(10, 13)
+_VELOCITY_AND_RATES: Final = [3, 4, 5, 10, 11, 12]
 _FLOOR_DRAWS: Final = 4  # of noise, for each window
 
 
@@ -83,31 +90,39 @@ class PredictionErrors:
         """Errors of the identified vehicle over a rival's at those of `JUDGED` that count, by quantity in the logs."""
         at = [HORIZONS.index(horizon) for horizon in JUDGED]
         ratios = self.errors[IDENTIFIED][at] / np.maximum(self.errors[rival][at], 1e-12)
-        found = {}
-        for name, of in zip(QUANTITIES, ratios.T.tolist(), strict=True):
-            if np.isfinite(of).all():
-                found[name] = tuple(of[:RATES_JUDGED] if name == "body rates" else of)
-        return found
+        by_quantity = {}
+        for quantity, of_quantity in zip(QUANTITIES, ratios.T.tolist(), strict=True):
+            counted = len(JUDGED)
+            if quantity == "body rates":
+                counted = RATES_JUDGED
+            if np.isfinite(of_quantity).all():
+                by_quantity[quantity] = tuple(of_quantity[:counted])
+        return by_quantity
 
     def _exceeding(self, rival: str, share: float) -> dict[str, tuple[float, ...]]:
         """The ratios of those quantities whose geometric mean over the horizons exceeds 1 by a share."""
-        return {name: of for name, of in self.ratios(rival).items() if math.prod(of) > (1.0 + share) ** len(of)}
+        exceeding = {}
+        for quantity, ratios in self.ratios(rival).items():
+            if math.prod(ratios) > (1.0 + share) ** len(ratios):
+                exceeding[quantity] = ratios
+        return exceeding
 
     @property
     def lost(self) -> tuple[str, ...]:
         """Where a rival predicts better by more than `TIE`, in words; empty where the identified vehicle wins."""
-        return tuple(
-            f"{quantity} than {rival}, {' '.join(f'{ratio:.2f}' for ratio in of)} times its error"
-            for rival in RIVALS
-            for quantity, of in self._exceeding(rival, TIE).items()
-        )
+        lost = []
+        for rival in RIVALS:
+            for quantity, ratios in self._exceeding(rival, TIE).items():
+                listed = " ".join(f"{ratio:.2f}" for ratio in ratios)
+                lost.append(f"{quantity} than {rival}, {listed} times its error")
+        return tuple(lost)
 
     @property
     def at_floor(self) -> tuple[str, ...]:
         """Quantities in which it loses to thrust and drag alone, and yet is within `NEAR_FLOOR` of the floor."""
         lost = self._exceeding(RATES_HELD, TIE) | self._exceeding(RATES_DECAY, TIE)
         above = self._exceeding(NOISE_FLOOR, NEAR_FLOOR)
-        return tuple(name for name in QUANTITIES if name in lost and name not in above)
+        return tuple(quantity for quantity in QUANTITIES if quantity in lost and quantity not in above)
 
     @property
     def verdict(self) -> str:
@@ -115,15 +130,18 @@ class PredictionErrors:
         horizons = f"at {', '.join(f'{horizon:g}' for horizon in JUDGED)} s"
         if self.lost:
             return f"predicts flight that was not fitted worse, {horizons}: {'; '.join(self.lost)}"
-        texts = []
-        for rival in RIVALS:
-            by_quantity = self.ratios(rival).values()
-            by_horizon = []
-            for i in range(len(JUDGED)):
-                by_horizon.append([of[i] for of in by_quantity if i < len(of)])
-            means = [math.exp(np.log(np.maximum(of, 1e-12)).mean()) for of in by_horizon]
-            texts.append(f"{', '.join(f'{mean:.2f}' for mean in means)} of the errors of {rival}")
-        return f"predicts flight that was not fitted better: {horizons}, {', '.join(texts[:-1])} and {texts[-1]}"
+        *others, last = (f"{self._mean_ratios(rival)} of the errors of {rival}" for rival in RIVALS)
+        return f"predicts flight that was not fitted better: {horizons}, {', '.join(others)} and {last}"
+
+    def _mean_ratios(self, rival: str) -> str:
+        """The geometric mean over the quantities of the ratios to a rival, at each horizon of the verdict."""
+        by_quantity = self.ratios(rival).values()
+        means = []
+        for i in range(len(JUDGED)):
+            at_horizon = [ratios[i] for ratios in by_quantity if i < len(ratios)]
+            mean = math.exp(np.log(np.maximum(at_horizon, 1e-12)).mean())
+            means.append(f"{mean:.2f}")
+        return ", ".join(means)
 
 
 def hold_out(record: Record, spans: Sequence[slice]) -> tuple[list[slice], list[slice]]:
@@ -131,17 +149,29 @@ def hold_out(record: Record, spans: Sequence[slice]) -> tuple[list[slice], list[
 
     Where what is left of a span is too short to be fitted, all of it is held out.
     """
-    left = round((1.0 - _HELD_OUT) * sum(span.stop - span.start for span in spans))
+    airborne = sum(span.stop - span.start for span in spans)
+    left = round((1.0 - _HELD_OUT) * airborne)
     fitted = []
-    held = []
+    held_out = []
     for span in spans:
         cut = min(span.start + left, span.stop)
         left -= cut - span.start
         if (cut - span.start) * record.period < SHORTEST_SPAN * (1.0 - 1e-6):
             cut = span.start
-        fitted += [slice(span.start, cut)] if cut > span.start else []
-        held += [slice(cut, span.stop)] if cut < span.stop else []
-    return fitted, held
+        if cut > span.start:
+            fitted.append(slice(span.start, cut))
+        if cut < span.stop:
+            held_out.append(slice(cut, span.stop))
+    return fitted, held_out
+
+
+class _SpanPrediction(NamedTuple):
+    """The windows of one span of a log."""
+
+    errors: Mapping[str, Array]  # by model, (W, len(HORIZONS), 4)
+    residuals: Mapping[str, Array]  # by model but the floor, (W, 6)
+    t: Array  # (W,) at which residuals are taken, in the log [s]
+    trace: Trace
 
 
 def predict(
@@ -157,55 +187,74 @@ def predict(
     Raises:
         InputError: no span is as long as a window.
     """
-    errors: dict[str, list[Array]] = {}
-    residuals: dict[str, list[Array]] = {}
-    traces = []
-    ends = []
-    begun = 0.0
+    spans_predicted: list[_SpanPrediction] = []
     rng = np.random.default_rng(0)
-    for flight, record, span in (
-        (i, record, span) for i, (record, own) in enumerate(zip(records, spans, strict=True)) for span in own
-    ):
-        length = max(1, round(PREDICTION_WINDOW / record.period))
-        rows = np.arange(span.start, span.stop - length, max(1, length // 2))[:, None] + np.arange(length + 1)
-        if not rows.size:
-            continue
-        measured = _measured(record)[rows]
-        at = np.rint(np.array(HORIZONS) / record.period).astype(int)
-        drawn = np.s_[: 2 * _SHOWN : 2, :, _VELOCITY_AND_RATES]
-        drawn_states = {}
+    for flight, (record, spans_of_record) in enumerate(zip(records, spans, strict=True)):
+        known = identification
         if fitted:
             known = identification.of_flight(flight)
-        else:
-            known = identification
-        predicted = _predictions(known, start, record, rows, measured, rng)
-        for name, prediction in predicted.items():
-            of_windows = _errors(prediction.states[:, at], prediction.truth[:, at])
-            of_windows[..., 1] *= np.nan if record.inertial else 1.0
-            errors.setdefault(name, []).append(of_windows)
-            if name == NOISE_FLOOR:
-                continue
-            residuals.setdefault(name, []).append((measured - prediction.states)[:, at[_RESIDUAL], _VELOCITY_AND_RATES])
-            drawn_states[name] = prediction.states[drawn]
-        taken = record.t[rows[:, at[_RESIDUAL]]]
-        ends.append(begun + taken - taken[0])
-        begun = float(ends[-1][-1]) + PREDICTION_WINDOW
-        traces.append(
-            Trace(log=record.name, t=record.t[rows[: 2 * _SHOWN : 2]], measured=measured[drawn], predicted=drawn_states)
-        )
-    if not traces:
+        for span in spans_of_record:
+            rows = _window_rows(span, record.period)
+            if rows.size:
+                spans_predicted.append(_predict_span(known, start, record, rows, rng))
+    if not spans_predicted:
         raise InputError(
             f"what is held out for the prediction is shorter than one window of {PREDICTION_WINDOW:g} s: fly longer, "
             "or give another log with --test"
         )
-    whole = {name: np.concatenate(parts) for name, parts in errors.items()}
+    errors = {}
+    for model in spans_predicted[0].errors:
+        errors[model] = np.concatenate([span.errors[model] for span in spans_predicted])
+    residuals = {}
+    for model in spans_predicted[0].residuals:
+        residuals[model] = np.concatenate([span.residuals[model] for span in spans_predicted])
     return PredictionErrors(
-        windows=len(whole[IDENTIFIED]),
-        errors={name: of.mean(axis=0) for name, of in whole.items()},
-        trace=max(traces, key=lambda trace: len(trace.t)),
-        ends=np.concatenate(ends),
-        residuals={name: np.concatenate(parts) for name, parts in residuals.items()},
+        windows=len(errors[IDENTIFIED]),
+        errors={model: of_windows.mean(axis=0) for model, of_windows in errors.items()},
+        trace=max((span.trace for span in spans_predicted), key=lambda trace: len(trace.t)),
+        ends=_one_after_the_other([span.t for span in spans_predicted]),
+        residuals=residuals,
     )
+
+
+def _window_rows(span: slice, period: float) -> Indices:
+    """(W, K) samples of the windows of a span."""
+    length = max(1, round(PREDICTION_WINDOW / period))
+    starts = np.arange(span.start, span.stop - length, max(1, length // 2))
+    return np.asarray(starts[:, None] + np.arange(length + 1))
+
+
+def _one_after_the_other(spans: Sequence[Array]) -> Array:
+    """Times of all spans, the first of each a window's length after the last of the one before [s]."""
+    begin = 0.0
+    moved = []
+    for t in spans:
+        moved.append(begin + t - t[0])
+        begin = float(moved[-1][-1]) + PREDICTION_WINDOW
+    return np.concatenate(moved)
+
+
+def _predict_span(
+    known: Identification, start: Vehicle, record: Record, rows: Indices, rng: np.random.Generator
+) -> _SpanPrediction:
+    """The windows (W, K) of a span of a record."""
+    measured = _measured(record)[rows]
+    at = np.rint(np.array(HORIZONS) / record.period).astype(int)
+    residual_at = at[_RESIDUAL_HORIZON]
+    traced = (_TRACED_WINDOWS, slice(None), _VELOCITY_AND_RATES)
+    errors = {}
+    residuals = {}
+    traces = {}
+    for model, prediction in _predictions(known, start, record, rows, measured, rng).items():
+        errors[model] = _errors(prediction.states[:, at], prediction.truth[:, at])
+        if record.inertial:
+            errors[model][..., 1] = np.nan  # a velocity by the accelerometer drifts
+        if model != NOISE_FLOOR:
+            residuals[model] = (measured - prediction.states)[:, residual_at, _VELOCITY_AND_RATES]
+            traces[model] = prediction.states[traced]
+    t = record.t[rows[_TRACED_WINDOWS]]
+    trace = Trace(log=record.name, t=t, measured=measured[traced], predicted=traces)
+    return _SpanPrediction(errors, residuals, record.t[rows[:, residual_at]], trace)
 
 
 class _Predicted(NamedTuple):
@@ -219,27 +268,30 @@ def _predictions(
     known: Identification, start: Vehicle, record: Record, rows: Indices, measured: Array, rng: np.random.Generator
 ) -> dict[str, _Predicted]:
     """The windows (W, K) of a record, by each model."""
-    held = _held(record)
-    identified = parameters_of(known)
+    steps = rows.shape[1] - 1
+    held = _with_inputs_held(record)
     windows = _Windows(rows=rows, measured=measured, period=record.period, vehicle=start)
+    identified = parameters_of(known)
     rotors = turning(held, start, identified)
     disturbance = _forecast(known.noise, identified, start, held, rotors, rows)
-    states = {
-        IDENTIFIED: windows.simulated(identified, rotors, disturbance),
-        NO_DISTURBANCE: windows.simulated(identified, rotors),
-    }
     of_start = Parameters.of(start, voltage=known.voltage or 0.0)
     rotors_of_start = turning(held, start, of_start)
     disturbance_of_start = _forecast(known.noise, of_start, start, held, rotors_of_start, rows)
-    states[START] = windows.simulated(of_start, rotors_of_start, disturbance_of_start)
-    states[RATES_HELD] = windows.simulated(identified, rotors, lasting=math.inf)
-    states[RATES_DECAY] = windows.simulated(identified, rotors, lasting=known.rates_last)
-    predicted = {name: _Predicted(of, measured) for name, of in states.items()}
+    states = {
+        IDENTIFIED: windows.simulated(identified, rotors, disturbance),
+        NO_DISTURBANCE: windows.simulated(identified, rotors),
+        START: windows.simulated(of_start, rotors_of_start, disturbance_of_start),
+        RATES_HELD: windows.simulated(identified, rotors, decay_time=math.inf),
+        RATES_DECAY: windows.simulated(identified, rotors, decay_time=known.rates_last),
+    }
+    predicted = {model: _Predicted(of_model, measured) for model, of_model in states.items()}
     again = windows.repeated(_FLOOR_DRAWS)
-    surprises = _surprises(known, record.period, (len(again.rows), rows.shape[1] - 1), rng)
-    nominal = np.tile(states[IDENTIFIED], (_FLOOR_DRAWS, 1, 1))
-    disturbed = again.simulated(identified, rotors, np.tile(disturbance, (_FLOOR_DRAWS, 1, 1)) + surprises)
-    return predicted | {NOISE_FLOOR: _Predicted(nominal, disturbed)}
+    surprises = _surprises(known, record.period, (len(again.rows), steps), rng)
+    expected = np.tile(disturbance, (_FLOOR_DRAWS, 1, 1))
+    disturbed = again.simulated(identified, rotors, expected + surprises)
+    undisturbed = np.tile(states[IDENTIFIED], (_FLOOR_DRAWS, 1, 1))
+    predicted[NOISE_FLOOR] = _Predicted(undisturbed, disturbed)
+    return predicted
 
 
 def parameters_of(known: Identification) -> Parameters:
@@ -273,18 +325,16 @@ def _forecast(
 
 def _misfit(p: Parameters, vehicle: Vehicle, held: Record, rotors: Turning, samples: slice) -> Array:
     """(N - 1, 6) measured less predicted increments of N samples; those over held rows are spread evenly."""
-    past = stretch(part_of(replace(held, speeds=None), samples), 0)
-    if held.fresh is None:
-        new = np.arange(samples.stop - samples.start)
-    else:
-        new = np.flatnonzero(held.fresh[samples])
+    past = part_of(replace(held, speeds=None), samples)
+    new = new_rows(past)
     first = int(new[0])
     last = int(new[-1])
     before = rotors.during(np.arange(samples.start + first, samples.start + last))
-    left_over = np.nan_to_num(past.misfit(predicted_increments(past.motion, before, vehicle, p)))
-    lasting = np.diff(new)
+    measured = stretch(past, 0)
+    per_row = np.nan_to_num(measured.misfit(predicted_increments(measured.motion, before, vehicle, p)))
+    periods = np.diff(new)
     misfit = np.zeros((samples.stop - samples.start - 1, len(INCREMENTS)))
-    misfit[first:last] = np.repeat(left_over / lasting[:, None], lasting, axis=0)
+    misfit[first:last] = np.repeat(per_row / periods[:, None], periods, axis=0)
     return misfit
 
 
@@ -303,18 +353,25 @@ def _measured(record: Record) -> Array:
     else:
         position = record.position
     velocity = record.velocity
-    if record.inertial:  # what it drifts by is left out
-        velocity = velocity - uniform_filter1d(np.nan_to_num(velocity), round(_DRIFT / record.period), axis=0)
+    if record.inertial:
+        drift = uniform_filter1d(np.nan_to_num(velocity), round(_LONGEST_DRIFT / record.period), axis=0)
+        velocity = velocity - drift
     return np.concatenate([position, velocity, record.attitude, record.rates], axis=1)
 
 
 def _errors(predicted: Array, measured: Array) -> Array:
     """(W, H, 4) norms of the errors of states (W, H, 13)."""
     error = predicted - measured
-    before, after = (Rotation.from_quat(x[..., 6:10].reshape(-1, 4), scalar_first=True) for x in (measured, predicted))
-    angle = (before.inv() * after).magnitude().reshape(error.shape[:-1])
-    norms = [np.linalg.norm(error[..., part], axis=-1) for part in (slice(3), slice(3, 6), slice(10, 13))]
-    return np.stack([*norms[:2], angle, norms[2]], axis=-1)
+    position = np.linalg.norm(error[..., _POSITION], axis=-1)
+    velocity = np.linalg.norm(error[..., _VELOCITY], axis=-1)
+    rates = np.linalg.norm(error[..., _RATES], axis=-1)
+    turn = _attitudes(measured).inv() * _attitudes(predicted)
+    angle = turn.magnitude().reshape(error.shape[:-1])
+    return np.stack([position, velocity, angle, rates], axis=-1)
+
+
+def _attitudes(states: Array) -> Rotation:
+    return Rotation.from_quat(states[..., _ATTITUDE].reshape(-1, 4), scalar_first=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -331,7 +388,7 @@ class _Windows:
         return replace(self, rows=np.tile(self.rows, (times, 1)), measured=np.tile(self.measured, (times, 1, 1)))
 
     def simulated(
-        self, p: Parameters, rotors: Turning, disturbance: Array | None = None, *, lasting: float | None = None
+        self, p: Parameters, rotors: Turning, disturbance: Array | None = None, *, decay_time: float | None = None
     ) -> Array:
         """(W, K, 13) states, by the midpoint rule.
 
@@ -339,25 +396,29 @@ class _Windows:
             p: the parameters.
             rotors: over the record.
             disturbance: (W, K - 1, 6) increments of body rates and velocity that the parameters do not give; or none.
-            lasting: the time constant [s] with which body rates decay, where no torque acts on them.
+            decay_time: the time constant [s] with which body rates decay, where no torque acts on them.
         """
         period = self.period
-        position, velocity, rates = (self.measured[:, 0, part] for part in (slice(3), slice(3, 6), slice(10, 13)))
-        attitude = Rotation.from_quat(self.measured[:, 0, 6:10], scalar_first=True)
-        states = [self.measured[:, 0]]
+        first = self.measured[:, 0]
+        position = first[:, _POSITION]
+        velocity = first[:, _VELOCITY]
+        rates = first[:, _RATES]
+        attitude = _attitudes(first)
+        states = [first]
 
-        def changes(periods: Indices, turn: Rotation, rates: Array, velocity: Array, extra: Array | float) -> Array:
+        def increments(step: int, turn: Rotation, rates: Array, velocity: Array) -> Array:
             motion = MeanMotion(period=period, rates=rates, turn=turn.as_matrix(), velocity=velocity)
-            change = predicted_increments(motion, rotors.during(periods), self.vehicle, p) + extra
-            if lasting is not None:
-                change[:, :3] = -period / lasting * rates
+            change = predicted_increments(motion, rotors.during(self.rows[:, step]), self.vehicle, p)
+            if disturbance is not None:
+                change += disturbance[:, step]
+            if decay_time is not None:
+                change[:, :3] = -period / decay_time * rates
             return change
 
-        for step, periods in enumerate(self.rows.T[:-1]):
-            extra = 0.0 if disturbance is None else disturbance[:, step]
-            begun = 0.5 * changes(periods, attitude, rates, velocity, extra)
-            ahead = attitude * Rotation.from_rotvec(0.5 * period * rates)
-            change = changes(periods, ahead, rates + begun[:, :3], velocity + begun[:, 3:], extra)
+        for step in range(self.rows.shape[1] - 1):
+            half = 0.5 * increments(step, attitude, rates, velocity)
+            middle = attitude * Rotation.from_rotvec(0.5 * period * rates)
+            change = increments(step, middle, rates + half[:, :3], velocity + half[:, 3:])
             position = position + period * (velocity + 0.5 * change[:, 3:])
             attitude = attitude * Rotation.from_rotvec(period * (rates + 0.5 * change[:, :3]))
             velocity = velocity + change[:, 3:]
@@ -366,9 +427,14 @@ class _Windows:
         return np.stack(states, axis=1)
 
 
-def _held(record: Record) -> Record:
+def _with_inputs_held(record: Record) -> Record:
     """The record with what it says of the rotors held through its gaps."""
-    found: dict[str, Any] = {name: rows for name in ROTOR_FIELDS if (rows := getattr(record, name)) is not None}
-    there = np.isfinite(np.column_stack([*found.values()])).all(axis=1)
-    latest = np.maximum.accumulate(np.where(there, np.arange(len(record.t)), int(there.argmax())))
-    return replace(record, **{name: rows[latest] for name, rows in found.items()})
+    inputs: dict[str, Any] = {}
+    for name in (*ROTOR_INPUTS, "voltage"):
+        rows = getattr(record, name)
+        if rows is not None:
+            inputs[name] = rows
+    there = np.isfinite(np.column_stack([*inputs.values()])).all(axis=1)
+    rows = np.where(there, np.arange(len(record.t)), int(there.argmax()))
+    latest = np.maximum.accumulate(rows)
+    return replace(record, **{name: rows[latest] for name, rows in inputs.items()})

@@ -1,6 +1,7 @@
 """Which columns of a log are which quantity, in which unit, sign and frame: by a format's own names, or by a map.
 
-A map is a TOML file with a table for each quantity that it names:
+`to_series` gives sign * (logged - zero) * scale, in our units and frames, which `record` samples on one clock.  A map
+is a TOML file with a table for each quantity that it names:
 
     [rates]
     columns = ["gyroADC[0]", "gyroADC[1]", "gyroADC[2]"]
@@ -29,13 +30,18 @@ from quadsim.state import Array
 RPM: Final = math.tau / 60.0  # [rad/s]
 NO_ERPM: Final = 65535  # of 16 bits: no value, but a gap
 HALF_TURN: Final = np.array([1.0, -1.0, -1.0])  # about x: NED to north, west, up; FRD to x forward, y left, z up
-_LISTED: Final = 40  # names in a message
+_MOST_LISTED: Final = 40  # names in a message
 _DEGREE: Final = math.pi / 180.0
+_STANDARD_GRAVITY: Final = 9.80665  # [m/s^2]
+# Zero and scale of units: (logged - zero) * scale in ours.
 _LENGTHS: Final = {"m": (0.0, 1.0), "cm": (0.0, 0.01), "mm": (0.0, 1e-3)}
-_SPEEDS: Final = {"rad/s": (0.0, 1.0), "rpm": (0.0, RPM)}
-_WORLDS = ("ENU", "NED")
-_BODIES = ("FLU", "FRD")
-_BOTH = ("ENU/FLU", "NED/FRD")
+_VELOCITIES: Final = {"m/s": (0.0, 1.0), "cm/s": (0.0, 0.01), "mm/s": (0.0, 1e-3), "km/h": (0.0, 1 / 3.6)}
+_ROTOR_SPEEDS: Final = {"rad/s": (0.0, 1.0), "rpm": (0.0, RPM)}
+_ANGLES: Final = {"rad": (0.0, 1.0), "deg": (0.0, _DEGREE)}
+# Frames with z up, which are ours, and with z down.
+_WORLDS: Final = ("ENU", "NED")
+_BODIES: Final = ("FLU", "FRD")
+_WORLDS_AND_BODIES: Final = ("ENU/FLU", "NED/FRD")
 
 
 class Quantity(NamedTuple):
@@ -49,23 +55,23 @@ class Quantity(NamedTuple):
 LOGGED: Final = {
     "t": Quantity(1, {"s": (0.0, 1.0), "ms": (0.0, 1e-3), "us": (0.0, 1e-6), "ns": (0.0, 1e-9)}),
     "position": Quantity(3, _LENGTHS, _WORLDS),
-    "velocity": Quantity(3, {f"{unit}/s": of for unit, of in _LENGTHS.items()} | {"km/h": (0.0, 1 / 3.6)}, _WORLDS),
+    "velocity": Quantity(3, _VELOCITIES, _WORLDS),
     "specific_force": Quantity(
-        3, {"m/s^2": (0.0, 1.0), "g": (0.0, 9.80665), "g/2048": (0.0, 9.80665 / 2048)}, _BODIES
+        3,
+        {"m/s^2": (0.0, 1.0), "g": (0.0, _STANDARD_GRAVITY), "g/2048": (0.0, _STANDARD_GRAVITY / 2048)},
+        _BODIES,
     ),
-    "attitude": Quantity(4, {"-": (0.0, 1.0)}, _BOTH),
-    "euler": Quantity(3, {"rad": (0.0, 1.0), "deg": (0.0, _DEGREE)}, _BOTH),
+    "attitude": Quantity(4, {"-": (0.0, 1.0)}, _WORLDS_AND_BODIES),
+    "euler": Quantity(3, _ANGLES, _WORLDS_AND_BODIES),
     "rates": Quantity(3, {"rad/s": (0.0, 1.0), "deg/s": (0.0, _DEGREE)}, _BODIES),
-    "commands": Quantity(4, _SPEEDS),
-    "throttle": Quantity(
-        4, {"-": (0.0, 1.0), "%": (0.0, 0.01), "us": (1000.0, 1e-3), "16 bit": (0.0, 1 / 65535)}
-    ),
-    "speeds": Quantity(4, _SPEEDS),
+    "commands": Quantity(4, _ROTOR_SPEEDS),
+    "throttle": Quantity(4, {"-": (0.0, 1.0), "%": (0.0, 0.01), "us": (1000.0, 1e-3), "16 bit": (0.0, 1 / 65535)}),
+    "speeds": Quantity(4, _ROTOR_SPEEDS),
     "erpm": Quantity(4, {"rpm": (0.0, 1.0), "100 rpm": (0.0, 100.0)}),
     "voltage": Quantity(1, {"V": (0.0, 1.0), "mV": (0.0, 1e-3), "cV": (0.0, 0.01)}),
-}  # fmt: skip
+}
 """Every quantity, its usual unit first."""
-MAPPED: Final = f"; --columns MAP.toml says which columns of a log are which of {', '.join(LOGGED)}"
+MAP_ADVICE: Final = f"; --columns MAP.toml says which columns of a log are which of {', '.join(LOGGED)}"
 """What a message about missing columns ends with."""
 _NEEDED: Final = {
     "velocity": ("velocity", "position", "specific_force"),
@@ -113,12 +119,18 @@ def logged_as(
     """A quantity by its columns: by their names, or one name with {} for each of some words, else for 0, 1, ..."""
     size, units, _ = LOGGED[quantity]
     if "{}" in columns:
-        names = [columns.format(i) for i in each.split() or range(size)]
+        words = each.split() or [str(i) for i in range(size)]
+        names = [columns.format(word) for word in words]
     else:
         names = columns.split()
     zero, scale = units[unit or next(iter(units))]
-    known = {"zero": zero, "scale": scale, **numbers}
-    return NamedQuantity(quantity=quantity, columns=tuple(names), down=down, **known)
+    factors = {"zero": zero, "scale": scale, **numbers}
+    return NamedQuantity(quantity=quantity, columns=tuple(names), down=down, **factors)
+
+
+def usual_names(quantity: str, *ways: str, unit: str = "") -> tuple[NamedQuantity, ...]:
+    """A quantity by each of several ways to name its columns."""
+    return tuple(logged_as(quantity, way, unit=unit) for way in ways)
 
 
 def read_map(path: Path) -> tuple[NamedQuantity, ...]:
@@ -134,32 +146,41 @@ def _named_in(path: Path, quantity: str, table: Any) -> NamedQuantity:
     if quantity not in LOGGED:
         raise FileError(path, f"has no table {quantity!r}; there are {', '.join(LOGGED)}")
     size, units, frames = LOGGED[quantity]
-    usual: dict[str, Any] = {"columns": [], "unit": next(iter(units)), "sign": [1] * size}
-    usual |= {"frame": frames[0]} if frames else {}
-    if not isinstance(table, dict) or (odd := {*table} - {*usual}):
-        if isinstance(table, dict):
-            what = f"has no {sorted(odd)[0]!r}"
-        else:
-            what = f"must be a table; got {table!r:.80}"
-        raise FileError(path, f"{quantity} {what}; its fields are {', '.join(usual)}")
-    of = usual | table
-    sizes = {field: len(of[field]) if isinstance(of[field], list) else 0 for field in ("columns", "sign")}
-    are_names = sizes["columns"] == size and all(isinstance(column, str) for column in of["columns"])
-    are_signs = sizes["sign"] == size and all(sign in (1, -1) for sign in of["sign"])
-    rules = {
-        "columns": (are_names, f"a list of {size} name{'s' * (size > 1)}"),
-        "unit": (of["unit"] in [*units], f"one of {', '.join(map(repr, units))}"),
-        "sign": (are_signs, f"a list of {size} of 1 and -1"),
-    }
-    rules |= {"frame": (of["frame"] in frames, f"one of {', '.join(map(repr, frames))}")} if frames else {}
-    for field, (right, rule) in rules.items():
+    defaults: dict[str, Any] = {"columns": [], "unit": next(iter(units)), "sign": [1] * size}
+    if frames:
+        defaults["frame"] = frames[0]
+    fields = ", ".join(defaults)
+    if not isinstance(table, dict):
+        raise FileError(path, f"{quantity} must be a table; got {table!r:.80}; its fields are {fields}")
+    unknown = sorted({*table} - {*defaults})
+    if unknown:
+        raise FileError(path, f"{quantity} has no {unknown[0]!r}; its fields are {fields}")
+    given = defaults | table
+
+    def require(field: str, right: bool, rule: str) -> None:
         if not right:
-            raise FileError(path, f"{quantity}.{field} must be {rule}; got {of[field]!r:.80}")
-    zero, scale = units[of["unit"]]
+            raise FileError(path, f"{quantity}.{field} must be {rule}; got {given[field]!r:.80}")
+
+    names = given["columns"]
+    are_names = isinstance(names, list) and len(names) == size and all(isinstance(name, str) for name in names)
+    require("columns", are_names, f"a list of {size} name{'s' * (size > 1)}")
+    require("unit", given["unit"] in [*units], f"one of {', '.join(map(repr, units))}")
+    signs = given["sign"]
+    are_signs = isinstance(signs, list) and len(signs) == size and all(sign in (1, -1) for sign in signs)
+    require("sign", are_signs, f"a list of {size} of 1 and -1")
+    down = False
+    if frames:
+        require("frame", given["frame"] in frames, f"one of {', '.join(map(repr, frames))}")
+        down = given["frame"] == frames[1]
+    zero, scale = units[given["unit"]]
     return NamedQuantity(
-        quantity=quantity, columns=tuple(of["columns"]), zero=zero, scale=scale, sign=tuple(map(float, of["sign"])),
-        down=frames is not None and of["frame"] == frames[1],
-    )  # fmt: skip
+        quantity=quantity,
+        columns=tuple(names),
+        zero=zero,
+        scale=scale,
+        sign=tuple(map(float, signs)),
+        down=down,
+    )
 
 
 def to_series(
@@ -177,70 +198,104 @@ def to_series(
         FileError: a column is missing; the message names what is allowed.
         InputError: a sample or a unit cannot be meant, or poles are missing.
     """
-    for one in given:
-        if missing := [column for column in one.columns if column not in log.columns]:
-            what = f"{one.quantity}.columns names {', '.join(map(repr, missing))}"
+    named = _named_quantities(path, log, given)
+    for quantity in named.values():
+        _check_samples(path.name, log.columns, quantity)
+    series = {}
+    for name, quantity in named.items():
+        if name != "t":
+            series[name] = _series(log.columns, quantity)
+    _set_speeds(path.name, series, poles)
+    _check_ranges(path.name, series)
+    if "throttle" in series:
+        throttle = series["throttle"]
+        series["throttle"] = throttle._replace(values=np.clip(throttle.values, 0.0, 1.0))
+    euler = series.pop("euler", None)
+    if euler is not None and "attitude" not in series:
+        series["attitude"] = Column(t=euler.t, values=euler_to_quaternion(euler.values))
+        named["attitude"] = named["euler"]
+    for name, column in series.items():
+        if name in named and named[name].down:
+            turn = HALF_TURN
+            if name == "attitude":
+                turn = np.append(1.0, HALF_TURN)
+            series[name] = column._replace(values=column.values * turn)
+    return series
+
+
+def _named_quantities(path: Path, log: LoggedColumns, given: Sequence[NamedQuantity]) -> dict[str, NamedQuantity]:
+    """The quantities of which a log has the columns, by the map first; refuse a log that lacks one that is needed."""
+    for quantity in given:
+        missing = [column for column in quantity.columns if column not in log.columns]
+        if missing:
+            what = f"{quantity.quantity}.columns names {', '.join(map(repr, missing))}"
             raise FileError(path, f"lacks what the map's {what}; it has {listed(log.columns)}")
-    known: dict[str, NamedQuantity] = {}
-    for one in (*given, *log.quantities):
-        if {*one.columns} <= {*log.columns}:
-            known.setdefault(one.quantity, one)
-    for what, needed in _NEEDED.items():
-        if not {*needed} & {*known}:
-            ways = {one.quantity: ",".join(one.columns) for one in reversed(log.quantities) if one.quantity in needed}
-            ways = ways or {quantity: f"[{quantity}] of the map" for quantity in needed}
-            columns = " or ".join(ways[quantity] for quantity in needed if quantity in ways)
-            more = "".join(f"; {text}" for text in (log.advice, *log.notes) if text)
-            raise FileError(path, f"lacks {what}: columns {columns}; it has {listed(log.columns)}{more}{MAPPED}")
-    name = path.name
-    for one in known.values():
-        _check_samples(name, log.columns, one)
-    series = {quantity: _series(log.columns, one) for quantity, one in known.items() if quantity != "t"}
-    if (erpm := series.pop("erpm", None)) is not None:
+    named: dict[str, NamedQuantity] = {}
+    for quantity in (*given, *log.quantities):
+        if {*quantity.columns} <= {*log.columns}:
+            named.setdefault(quantity.quantity, quantity)
+    for what, alternatives in _NEEDED.items():
+        if not {*alternatives} & {*named}:
+            raise FileError(path, _lacks(what, alternatives, log))
+    return named
+
+
+def _lacks(what: str, alternatives: Sequence[str], log: LoggedColumns) -> str:
+    """That a log lacks all alternatives of something, with the columns that would be one."""
+    ways = {}
+    for quantity in reversed(log.quantities):  # the best, which stands first, is kept
+        if quantity.quantity in alternatives:
+            ways[quantity.quantity] = ",".join(quantity.columns)
+    if not ways:
+        ways = {name: f"[{name}] of the map" for name in alternatives}
+    columns = " or ".join(ways[name] for name in alternatives if name in ways)
+    more = "".join(f"; {text}" for text in (log.advice, *log.notes) if text)
+    return f"lacks {what}: columns {columns}; it has {listed(log.columns)}{more}{MAP_ADVICE}"
+
+
+def _set_speeds(name: str, series: dict[str, Column], poles: int | None) -> None:
+    """Put rotor speeds in the place of electrical ones, and leave out those of controllers without telemetry."""
+    erpm = series.pop("erpm", None)
+    if erpm is not None:
         if "speeds" not in series:
             series["speeds"] = Column(t=erpm.t, values=_speeds(name, erpm.values, poles))
     elif poles is not None:
         raise InputError(f"{name}: poles turn eRPM into speeds, and there is no erpm1..4; leave poles out")
-    if (
-        {"commands", "throttle"} & {*series}
-        and "speeds" in series
-        and not np.nanmax(series["speeds"].values, initial=0)
-    ):
+    has_commands = "commands" in series or "throttle" in series
+    if has_commands and "speeds" in series and not np.nanmax(series["speeds"].values, initial=0):
         del series["speeds"]  # speed controllers without telemetry report zeros
+
+
+def _check_ranges(name: str, series: Mapping[str, Column]) -> None:
+    """Refuse a quantity beyond the values that it may have; of Euler angles, roll and pitch where they are used."""
     for quantity, (low, high, rule) in RANGES.items():
-        if quantity in series and not (quantity == "euler" and "attitude" in series):
-            rows = series[quantity].values[:, : 2 if quantity == "euler" else None]
-            if not (low <= np.nanmin(rows, initial=0.0) and np.nanmax(rows, initial=0.0) <= high):
-                raise InputError(f"{name}: {rule}; got {np.nanmin(rows):.4g} to {np.nanmax(rows):.4g}")
-    if "throttle" in series:
-        series["throttle"] = series["throttle"]._replace(values=np.clip(series["throttle"].values, 0.0, 1.0))
-    if (euler := series.pop("euler", None)) is not None and "attitude" not in series:
-        series["attitude"] = Column(t=euler.t, values=euler_to_quaternion(euler.values))
-        known["attitude"] = known["euler"]
-    for quantity in {*series} & {*known}:
-        if known[quantity].down:
-            if quantity == "attitude":
-                turn = np.append(1.0, HALF_TURN)
-            else:
-                turn = HALF_TURN
-            series[quantity] = Column(t=series[quantity].t, values=series[quantity].values * turn)
-    return series
+        if quantity not in series:
+            continue
+        rows = series[quantity].values
+        if quantity == "euler":
+            if "attitude" in series:
+                continue
+            rows = rows[:, :2]
+        least = np.nanmin(rows, initial=0.0)
+        most = np.nanmax(rows, initial=0.0)
+        if not (low <= least and most <= high):
+            raise InputError(f"{name}: {rule}; got {np.nanmin(rows):.4g} to {np.nanmax(rows):.4g}")
 
 
-def _check_samples(name: str, columns: Mapping[str, Column], one: NamedQuantity) -> None:
+def _check_samples(name: str, columns: Mapping[str, Column], named: NamedQuantity) -> None:
     """Refuse a quantity with a finite sample that no vehicle has, in whatever unit: by its column, time and value."""
-    largest = LARGEST_SAMPLES.get(one.quantity, math.inf)
-    size = len(one.columns)
-    zeros = np.broadcast_to(one.zero, size)
-    scales = np.broadcast_to(one.scale, size)
-    for column, zero, scale in zip(one.columns, zeros, scales, strict=True):
+    largest = LARGEST_SAMPLES.get(named.quantity, math.inf)
+    size = len(named.columns)
+    zeros = np.broadcast_to(named.zero, size)
+    scales = np.broadcast_to(named.scale, size)
+    for column, zero, scale in zip(named.columns, zeros, scales, strict=True):
         t, logged = columns[column]
         beyond = np.isfinite(logged) & (np.abs(logged - zero) > largest / scale)
         if beyond.any():
             row = int(np.argmax(beyond))
-            unit = next(iter(LOGGED[one.quantity].units))
+            unit = next(iter(LOGGED[named.quantity].units))
             raise InputError(
-                f"{name}: {column} is {logged[row]:.4g} at t = {t[row]:.6g} s; {one.quantity} must be within "
+                f"{name}: {column} is {logged[row]:.4g} at t = {t[row]:.6g} s; {named.quantity} must be within "
                 f"+-{largest:g} {unit}: correct the sample or its unit, or leave it empty"
             )
 
@@ -248,22 +303,28 @@ def _check_samples(name: str, columns: Mapping[str, Column], one: NamedQuantity)
 def listed(columns: Iterable[str]) -> str:
     """Names of columns; where there are many, of those with a dot the topics alone."""
     names = [*columns]
-    if len(names) > _LISTED:
-        names = [*dict.fromkeys(name.partition(".")[0] for name in names)][:_LISTED]
+    if len(names) > _MOST_LISTED:
+        topics = dict.fromkeys(name.partition(".")[0] for name in names)
+        names = [*topics][:_MOST_LISTED]
     return ", ".join(names) or "none"
 
 
-def _series(columns: Mapping[str, Column], one: NamedQuantity) -> Column:
+def _series(columns: Mapping[str, Column], named: NamedQuantity) -> Column:
     """The columns on the clock of the first of them."""
-    t = columns[one.columns[0]].t
-    rows = []
-    for c in (columns[name] for name in one.columns):
-        rows.append(c.values if c.t is t else np.interp(t, c.t, c.values))
-    values = (np.stack(rows, axis=1) - one.zero) * one.scale
-    # a motor that is stopped has a shorter pulse
-    if np.any(one.zero):
+    t = columns[named.columns[0]].t
+    logged = []
+    for name in named.columns:
+        column = columns[name]
+        if column.t is t:
+            logged.append(column.values)
+        else:
+            logged.append(np.interp(t, column.t, column.values))
+    values = (np.stack(logged, axis=1) - named.zero) * named.scale
+    if np.any(named.zero):  # a motor that is stopped has a shorter pulse
         values = np.maximum(values, 0.0)
-    return Column(t=t, values=values * one.sign if one.sign else values)
+    if named.sign:
+        values = values * named.sign
+    return Column(t=t, values=values)
 
 
 def _speeds(name: str, erpm: Array, poles: int | None) -> Array:

@@ -1,4 +1,8 @@
-"""Flight logs of any make as one record: uniform samples in quadsim's frames and units."""
+"""Flight logs of any make as one record: uniform samples in quadsim's frames and units.
+
+A format's reader gives columns, `quantities.to_series` turns them into series in our units, each on its own clock;
+`to_record` cuts the samples that failed, derives what is not logged, and samples all of it at t_k = t_0 + k T.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +22,16 @@ from quadsim.features.identify.border import reading
 from quadsim.features.identify.dataflash import read_dataflash
 from quadsim.features.identify.inertial import filled_in, integrated_velocity, levelled_attitude
 from quadsim.features.identify.quantities import LoggedColumns, NamedQuantity, to_series
-from quadsim.features.identify.sensors import without_held_rows, without_spikes, without_stopped_counters
-from quadsim.features.identify.series import Column, held
+from quadsim.features.identify.sensors import (
+    NORM_TOLERANCE,
+    without_held_rows,
+    without_spikes,
+    without_stopped_counters,
+)
+from quadsim.features.identify.series import Column, held, interpolated
 from quadsim.features.identify.tables import read_columns
 from quadsim.flight.parquet import FLIGHT_FILE
-from quadsim.state import Array
+from quadsim.state import Array, Indices
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
 SLOWEST_RATE: Final = 10.0  # [Hz] of a log
@@ -32,8 +41,11 @@ SLOWEST_VELOCITY: Final = 0.04  # period [s] of a velocity above which an accele
 LONGEST_PAUSE: Final = 600.0  # [s] between two samples of one flight
 MOST_TIMES_REPEATED: Final = 0.5  # share of rows whose repeated time is that of a row to drop, not of a coarse clock
 STAMP_ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
+STAMP_JITTER: Final = 0.05  # of a period: it must neither hold a command for a period too long nor open a gap
 _LFS_POINTER: Final = b"version https://git-lfs"
-INPUTS: Final = ("commands", "throttle", "speeds")
+HELD_INPUTS: Final = ("commands", "throttle")  # held from one sample to the next
+ROTOR_INPUTS: Final = (*HELD_INPUTS, "speeds")
+"""What a log may have of the rotors' outputs, one at least."""
 
 
 class LogFormat(NamedTuple):
@@ -46,12 +58,15 @@ class LogFormat(NamedTuple):
     library: str = ""  # that `read` imports, of the extra `logs`
 
 
+_BAG: Final = LogFormat(
+    "bag", (".bag", ".mcap", ".db3"), (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3"), read_bag, "rosbags"
+)
 FORMATS: Final = (
     LogFormat("table", (".csv", ".parquet"), (), read_columns),
     LogFormat("ULog", ulog.ULOGS, (b"ULog",), ulog.read_ulog, "pyulog"),
     LogFormat("Blackbox log", (".bbl", ".bfl"), (b"H Product:Blackbox",), read_blackbox, "orangebox"),
     LogFormat("log of a Crazyflie", (), crazyflie.FIRST_BYTES, crazyflie.read_crazyflie),
-    LogFormat("bag", (".bag", ".mcap", ".db3"), (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3"), read_bag, "rosbags"),
+    _BAG,
     LogFormat("dataflash log", (".bin",), (b"\xa3\x95",), read_dataflash, "pymavlink"),
 )
 
@@ -96,10 +111,20 @@ def part_of(record: Record, span: slice) -> Record:
     return replace(record, **cut)
 
 
-def driver(record: Record) -> Array:
+def new_rows(record: Record) -> Indices:
+    """The rows that a radio did not hold."""
+    if record.fresh is None:
+        return np.arange(len(record.t))
+    return np.flatnonzero(record.fresh)
+
+
+def rotor_inputs(record: Record) -> Array:
     """What drives the rotors (N, 4): measured speeds, else the commands or the throttle."""
-    rows = next(rows for rows in (record.speeds, record.commands, record.throttle) if rows is not None)
-    return np.asarray(rows)
+    if record.speeds is not None:
+        return record.speeds
+    if record.commands is not None:
+        return record.commands
+    return np.asarray(record.throttle)
 
 
 def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence[NamedQuantity] = ()) -> Record:
@@ -117,26 +142,29 @@ def read_record(path: Path | str, *, poles: int | None = None, columns: Sequence
         InputError: its clock stands still or goes back, or it has fewer than 10 samples per second.
     """
     given = Path(path)
-    bag = (given / "metadata.yaml").is_file()  # of ROS 2, a directory
-    if given.is_dir() and not bag:
+    is_bag = (given / "metadata.yaml").is_file()  # of ROS 2, a directory
+    if given.is_dir() and not is_bag:
         file = given / FLIGHT_FILE
     else:
         file = given
-    if not (file.is_file() or bag):
+    if not (file.is_file() or is_bag):
         raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
     kind = _format_of(file)
-    if kind.read is not read_columns and any(one.quantity == "t" for one in columns):
+    if kind.read is not read_columns and any(named.quantity == "t" for named in columns):
         raise InputError(f"{given.name}: has a clock of its own; leave [t] out of the map")
+    name = file.name
+    if name == FLIGHT_FILE:
+        name = file.resolve().parent.name
     with reading(file, kind.title, kind.library):
         log = kind.read(file, columns)
         series = to_series(file, log, columns, poles)
-        record = to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series)
+        record = to_record(name, series)
     return replace(record, advice=log.advice, notes=(*log.notes, *record.notes))
 
 
 def _format_of(file: Path) -> LogFormat:
     if file.is_dir():
-        return next(of for of in FORMATS if of.read is read_bag)
+        return _BAG
     try:
         with file.open("rb") as opened:
             first = opened.read(64)
@@ -144,12 +172,14 @@ def _format_of(file: Path) -> LogFormat:
         raise FileError(file, f"cannot be read ({error})") from error
     if first.startswith(_LFS_POINTER):
         raise FileError(file, "is a pointer of Git LFS, not the log itself: git lfs pull fetches it")
-    by_bytes = (of for of in FORMATS if first.startswith(of.first_bytes))
-    by_suffix = (of for of in FORMATS if file.suffix.lower() in of.suffixes)
-    if (found := next(by_bytes, None) or next(by_suffix, None)) is None:
-        suffixes = ", ".join(suffix for of in FORMATS for suffix in of.suffixes)
-        raise FileError(file, f"is not a log that can be read (these can: {suffixes}, and those of a Crazyflie)")
-    return found
+    for kind in FORMATS:
+        if first.startswith(kind.first_bytes):
+            return kind
+    for kind in FORMATS:
+        if file.suffix.lower() in kind.suffixes:
+            return kind
+    suffixes = ", ".join(suffix for kind in FORMATS for suffix in kind.suffixes)
+    raise FileError(file, f"is not a log that can be read (these can: {suffixes}, and those of a Crazyflie)")
 
 
 def to_record(name: str, series: Mapping[str, Column]) -> Record:
@@ -159,68 +189,105 @@ def to_record(name: str, series: Mapping[str, Column]) -> Record:
     has no gaps: it changes slowly; nor has `flying`, which changes rarely.
     """
     flying = series.get("flying")
-    series, notes = _without_repeated_times(name, {field: of for field, of in series.items() if field != "flying"})
-    for field, samples in series.items():
-        if field != "voltage":
-            _check_clock(name, field, samples.t)
-    series, spikes = without_spikes(name, series)
-    series, stops = without_stopped_counters(name, series)
-    series, repeats = without_held_rows(name, series)
-    notes = (*notes, *spikes, *stops, *repeats)
-    voltage = series.pop("voltage", None)
-    fresh = series.pop("fresh", None)
-    force = series.pop("specific_force", None)
-    optional = ("position", *INPUTS)
-    series = {f: s for f, s in series.items() if f not in optional or np.isfinite(s.values).all(axis=1).any()}
-    inertial = not {"velocity", "position"} & {*series}
-    if inertial:
-        assert force is not None
-        series = {**series, "velocity": force}
-        notes = (*notes, f"{name}: no velocity is logged; the accelerometer stands in for it")
-    elif "velocity" not in series:
-        place = series["position"]
-        slope = np.gradient(place.values, place.t, axis=0)
-        series = {**series, "velocity": Column(t=place.t, values=slope)}
-        notes = (*notes, f"{name}: no velocity is logged; it is the central difference of the position")
-    if "attitude" not in series:
-        assert force is not None
-        gyro = series["rates"]
-        known = np.stack([np.interp(gyro.t, force.t, column) for column in force.values.T], axis=1)
-        series["attitude"] = Column(t=gyro.t, values=levelled_attitude(gyro.t, gyro.values, known))
-        notes = (*notes, f"{name}: no attitude is logged; it is the gyro's, levelled by the accelerometer")
-    turn = series["attitude"]
-    series = {**series, "attitude": turn._replace(values=_continuous(name, turn.values))}
-    grid = _clock(name, series)
-    values: dict[str, Any] = {
-        field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()
-    }
-    values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
+    kept, notes = _without_failed_samples(name, {f: column for f, column in series.items() if f != "flying"})
+    voltage = kept.pop("voltage", None)
+    fresh = kept.pop("fresh", None)
+    force = kept.pop("specific_force", None)
+    kept = _without_empty(kept)
+    inertial = not {"velocity", "position"} & {*kept}
+    moving, derived = _with_motion(name, kept, force)
+    notes = [*notes, *derived]
+    grid = _clock(name, moving)
     period = float(grid[1] - grid[0])
+    values: dict[str, Any] = {}
+    for field, column in moving.items():
+        values[field] = _sampled(column, grid, held=field in HELD_INPUTS)
+    _normalise_rows(values["attitude"])
     if inertial:
         values["velocity"] = integrated_velocity(name, values["velocity"], values["attitude"], period)
-    elif force is not None and (slow := _usual_period(series["velocity"].t)) > SLOWEST_VELOCITY:
-        shown = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
-        values["velocity"] = filled_in(values["velocity"], shown, round(2.0 * slow / period))
-        notes = (*notes, f"{name}: the velocity is logged at {1.0 / slow:.3g} Hz; the accelerometer fills it in")
-    if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
-        values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
+    elif force is not None:
+        velocity_period = _usual_period(moving["velocity"].t)
+        if velocity_period > SLOWEST_VELOCITY:
+            inertial_velocity = integrated_velocity(name, _sampled(force, grid, held=False), values["attitude"], period)
+            window = round(2.0 * velocity_period / period)
+            values["velocity"] = filled_in(values["velocity"], inertial_velocity, window)
+            notes.append(
+                f"{name}: the velocity is logged at {1.0 / velocity_period:.3g} Hz; the accelerometer fills it in"
+            )
+    if voltage is not None:
+        there = np.isfinite(voltage.values[:, 0])
+        if there.any():
+            values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
     if fresh is not None:
-        fresh_rows, known_rotors = held(fresh, grid + 0.05 * period).T
+        fresh_rows, known_rotors = held(fresh, grid + STAMP_JITTER * period).T
         values["fresh"] = fresh_rows
         values["rotors_unknown"] = np.full(len(grid), 1.0 - known_rotors.mean())
-    if len(grid) > 10 * (size := int(1.0 / (FASTEST_RATE * period))) > 20:
+    size = int(1.0 / (FASTEST_RATE * period))
+    if size > 2 and len(grid) > 10 * size:
         grid, values = _thinned(grid, values, size - 1 + size % 2)
-        values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
-        rates = f"{1.0 / period:.0f} Hz, of which means at {1.0 / (grid[1] - grid[0]):.0f} Hz are used"
-        notes = (*notes, f"{name}: {rates}")
-    if flying is None:
-        aloft = None
-    else:
-        aloft = held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
+        _normalise_rows(values["attitude"])
+        mean_rate = 1.0 / (grid[1] - grid[0])
+        notes.append(f"{name}: {1.0 / period:.0f} Hz, of which means at {mean_rate:.0f} Hz are used")
     if "fresh" in values:
         values["fresh"] = values["fresh"] > 0.0
         values["rotors_unknown"] = float(values["rotors_unknown"][0])
-    return Record(name=name, t=grid, flying=aloft, notes=notes, inertial=inertial, **values)
+    if flying is not None:
+        values["flying"] = held(Column(flying.t, flying.values[:, 0]), grid) > 0.5
+    return Record(name=name, t=grid, notes=tuple(notes), inertial=inertial, **values)
+
+
+def _normalise_rows(quaternions: Array) -> None:
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+
+
+def _without_failed_samples(name: str, series: dict[str, Column]) -> tuple[dict[str, Column], list[str]]:
+    """Return the series without samples that a clock, a sensor or a radio spoilt, and a note of each fault."""
+    series, repeats = _without_repeated_times(name, series)
+    for field, column in series.items():
+        if field != "voltage":
+            _check_clock(name, field, column.t)
+    series, spikes = without_spikes(name, series)
+    series, stops = without_stopped_counters(name, series)
+    series, held_rows = without_held_rows(name, series)
+    return series, [*repeats, *spikes, *stops, *held_rows]
+
+
+def _without_empty(series: Mapping[str, Column]) -> dict[str, Column]:
+    """The series without a position or rotors' outputs of which no row is whole."""
+    kept = {}
+    for field, column in series.items():
+        optional = field == "position" or field in ROTOR_INPUTS
+        if not optional or np.isfinite(column.values).all(axis=1).any():
+            kept[field] = column
+    return kept
+
+
+def _with_motion(name: str, series: Mapping[str, Column], force: Column | None) -> tuple[dict[str, Column], list[str]]:
+    """Return the series with a velocity and a continuous attitude, derived where none is logged, and a note of each.
+
+    Without velocity and position, the specific force stands in the velocity's place.
+    """
+    result = dict(series)
+    notes = []
+    if "velocity" not in series:
+        if "position" in series:
+            position = series["position"]
+            slope = np.gradient(position.values, position.t, axis=0)
+            result["velocity"] = Column(t=position.t, values=slope)
+            notes.append(f"{name}: no velocity is logged; it is the central difference of the position")
+        else:
+            assert force is not None
+            result["velocity"] = force
+            notes.append(f"{name}: no velocity is logged; the accelerometer stands in for it")
+    if "attitude" not in series:
+        assert force is not None
+        gyro = series["rates"]
+        force_at_gyro = interpolated(gyro.t, force.t, force.values)
+        result["attitude"] = Column(t=gyro.t, values=levelled_attitude(gyro.t, gyro.values, force_at_gyro))
+        notes.append(f"{name}: no attitude is logged; it is the gyro's, levelled by the accelerometer")
+    attitude = result["attitude"]
+    result["attitude"] = attitude._replace(values=_continuous(name, attitude.values))
+    return result, notes
 
 
 def _thinned(grid: Array, values: Mapping[str, Array], size: int) -> tuple[Array, dict[str, Any]]:
@@ -229,35 +296,36 @@ def _thinned(grid: Array, values: Mapping[str, Array], size: int) -> tuple[Array
     half = size // 2
     means = {}
     for field, rows in values.items():
-        begin = half if field in INPUTS[:2] else 0
+        begin = 0
+        if field in HELD_INPUTS:
+            begin = half
         blocks = rows[begin : begin + count * size]
         means[field] = blocks.reshape(count, size, *rows.shape[1:]).mean(axis=1)
     return grid[half : half + count * size : size], means
 
 
-def _without_repeated_times(name: str, series: Mapping[str, Column]) -> tuple[dict[str, Column], tuple[str, ...]]:
+def _without_repeated_times(name: str, series: Mapping[str, Column]) -> tuple[dict[str, Column], list[str]]:
     """Return the series without rows that repeat a time, and a note of each clock; not where most rows do."""
-    kept: dict[int, tuple[Array, NDArray[np.bool_]]] = {}
+    first_rows: dict[int, NDArray[np.bool_]] = {}  # of each clock, the rows that repeat no time
+    new_clocks: dict[int, Array] = {}
     notes = []
     result = dict(series)
-    for field, samples in series.items():
-        clock = id(samples.t)
-        if clock not in kept:
-            first = np.append(True, np.diff(samples.t) != 0.0)
+    for field, column in series.items():
+        clock = id(column.t)
+        if clock not in new_clocks:
+            first = np.append(True, np.diff(column.t) != 0.0)
             repeats = np.count_nonzero(~first)
-            few = 0 < repeats <= MOST_TIMES_REPEATED * samples.t.size
-            if few:
-                kept[clock] = (samples.t[first], first)
-            else:
-                kept[clock] = (samples.t, np.ones(samples.t.size, bool))
-            if few:
+            first_rows[clock] = first
+            new_clocks[clock] = column.t
+            if 0 < repeats <= MOST_TIMES_REPEATED * column.t.size:
+                new_clocks[clock] = column.t[first]
                 row = int(np.argmin(first))
-                where = f"the first at row {row}, t = {samples.t[row]:.6g} s"
+                where = f"the first at row {row}, t = {column.t[row]:.6g} s"
                 notes.append(f"{name}: {repeats} rows of {field} repeat a time, {where}: left out")
-        t, first = kept[clock]
-        if t is not samples.t:
-            result[field] = Column(t=t, values=samples.values[first])
-    return result, tuple(notes)
+        t = new_clocks[clock]
+        if t is not column.t:
+            result[field] = Column(t=t, values=column.values[first_rows[clock]])
+    return result, notes
 
 
 def _check_clock(name: str, field: str, t: Array) -> None:
@@ -282,13 +350,14 @@ def _continuous(name: str, quaternion: Array) -> Array:
     """Unit quaternions (M, 4), each with the sign nearer to the one before; rows with NaN stay."""
     there = np.isfinite(quaternion).all(axis=1)
     norms = np.linalg.norm(quaternion[there], axis=1)
-    if norms.size and np.abs(norms - 1.0).max() > 0.02:
+    if norms.size and np.abs(norms - 1.0).max() > NORM_TOLERANCE:
         raise InputError(
             f"{name}: attitude has quaternions of norm {norms.min():.3g} to {norms.max():.3g}; all must be 1 within "
-            "2 %: look for a column that was scaled, centred or misnamed"
+            f"{100.0 * NORM_TOLERANCE:.0f} %: look for a column that was scaled, centred or misnamed"
         )
     unit = quaternion[there] / norms[:, None]
-    unit[1:] *= np.cumprod(np.where((unit[1:] * unit[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))[:, None]
+    flips = np.where((unit[1:] * unit[:-1]).sum(axis=1) < 0.0, -1.0, 1.0)
+    unit[1:] *= np.cumprod(flips)[:, None]
     result = quaternion.copy()
     result[there] = unit
     return result
@@ -301,22 +370,43 @@ def _usual_period(t: Array) -> float:
 
 
 def _clock(name: str, series: Mapping[str, Column]) -> Array:
-    """The common clock: of the rates or of the commands, whichever is slower; where all fields have samples.
+    """The common clock: the slowest of rates and rotors' outputs, uniform, where all fields have samples."""
+    slower = _slower_clock(name, series)
+    period = _usual_period(slower)
+    _check_steps(name, slower, period)
+    start = max(column.t[0] for column in series.values())
+    stop = min(column.t[-1] for column in series.values())
+    if stop - start < 2.0 * period:
+        raise InputError(f"{name}: its fields share no time: the last starts at {start:.6g} s, one ends at {stop:.6g}")
+    shared = all(column.t is slower for column in series.values())
+    if shared and _make_uniform(slower, period):
+        return slower
+    samples = int((stop - start) / period + 1e-6) + 1
+    return np.asarray(start + period * np.arange(samples))
+
+
+def _slower_clock(name: str, series: Mapping[str, Column]) -> Array:
+    """The clock of the rates or of the rotors' outputs, whichever is slower.
 
     Commands that are logged too rarely do not count: the checks name them.
     """
-    driver = next((field for field in INPUTS if field in series), None)
-    if driver is None:
+    inputs = next((field for field in ROTOR_INPUTS if field in series), None)
+    if inputs is None:
         raise InputError(f"{name}: its commands, throttle and speeds have no row with a number for each rotor")
-    clocks = [series["rates"].t, series[driver].t]
-    if driver != "speeds" and _usual_period(clocks[1]) > 1.0 / (0.9 * SLOWEST_COMMANDS):
-        del clocks[1]
-    slower = max(clocks, key=_usual_period)
-    period = _usual_period(slower)
-    pause = int(np.argmax(np.diff(slower)))
-    if slower[pause + 1] - slower[pause] > max(LONGEST_PAUSE, 100.0 * period):
+    clock_of_rates = series["rates"].t
+    clock_of_inputs = series[inputs].t
+    rare = _usual_period(clock_of_inputs) > 1.0 / (0.9 * SLOWEST_COMMANDS)
+    if inputs != "speeds" and rare:
+        return clock_of_rates
+    return max(clock_of_rates, clock_of_inputs, key=_usual_period)
+
+
+def _check_steps(name: str, clock: Array, period: float) -> None:
+    """Refuse a clock that pauses for too long, or that is too slow."""
+    pause = int(np.argmax(np.diff(clock)))
+    if clock[pause + 1] - clock[pause] > max(LONGEST_PAUSE, 100.0 * period):
         raise InputError(
-            f"{name}: its time jumps from {slower[pause]:.6g} to {slower[pause + 1]:.6g} s; at most "
+            f"{name}: its time jumps from {clock[pause]:.6g} to {clock[pause + 1]:.6g} s; at most "
             f"{LONGEST_PAUSE:g} s may be between two samples: give one flight per log"
         )
     if 1.0 / period < 0.95 * SLOWEST_RATE:
@@ -324,20 +414,19 @@ def _clock(name: str, series: Mapping[str, Column]) -> Array:
             f"{name}: {1.0 / period:.3g} samples per second, period {period:.4g} s; at least {SLOWEST_RATE:g} Hz are "
             "needed and 100 Hz or more are good (is t in seconds?)"
         )
-    start = max(s.t[0] for s in series.values())
-    stop = min(s.t[-1] for s in series.values())
-    if stop - start < 2.0 * period:
-        raise InputError(f"{name}: its fields share no time: the last starts at {start:.6g} s, one ends at {stop:.6g}")
-    if all(s.t is slower for s in series.values()):
-        ticks = np.arange(slower.size) - 0.5 * (slower.size - 1)
-        line = slower.mean() + ticks * float(ticks @ slower / (ticks @ ticks))
-        off = np.abs(slower - line).max()
-        if off <= 1e-6 * period + 4.0 * np.spacing(np.abs(slower).max()):
-            return slower
-        if off <= min(STAMP_ROUNDING, 0.25 * period):
-            slower[:] = line  # stamps in whole milliseconds: the clock is uniform, its stamps are rounded
-            return slower
-    return np.asarray(start + period * np.arange(int((stop - start) / period + 1e-6) + 1))
+
+
+def _make_uniform(clock: Array, period: float) -> bool:
+    """Whether a clock is uniform; one whose stamps are rounded, as to whole milliseconds, is made so in place."""
+    ticks = np.arange(clock.size) - 0.5 * (clock.size - 1)
+    line = clock.mean() + ticks * float(ticks @ clock / (ticks @ ticks))
+    farthest = np.abs(clock - line).max()
+    if farthest <= 1e-6 * period + 4.0 * np.spacing(np.abs(clock).max()):
+        return True
+    if farthest <= min(STAMP_ROUNDING, 0.25 * period):
+        clock[:] = line
+        return True
+    return False
 
 
 def _sampled(series: Column, grid: Array, *, held: bool) -> Array:
@@ -350,13 +439,16 @@ def _sampled(series: Column, grid: Array, *, held: bool) -> Array:
     t = series.t[there]
     values = series.values[there]
     period = max(_usual_period(series.t), float(grid[1] - grid[0]))
-    near = 0.05 * period  # a stamp's jitter must neither hold a command for a period too long nor open a gap
+    near = STAMP_JITTER * period
     before = np.clip(np.searchsorted(t, grid + near, side="right") - 1, 0, t.size - 1)
     after = np.minimum(np.searchsorted(t, grid - near, side="left"), t.size - 1)
     if held:
         sampled = values[before]
+        longest_beyond = LONGEST_GAP
     else:
-        sampled = np.stack([np.interp(grid, t, column) for column in values.T], axis=1)
-    outside = (grid < t[0] - 0.5 * period) | (grid > t[-1] + (LONGEST_GAP if held else 0.5) * period)
-    sampled[outside | (t[after] - t[before] > LONGEST_GAP * period + near)] = np.nan
+        sampled = interpolated(grid, t, values)
+        longest_beyond = 0.5
+    outside = (grid < t[0] - 0.5 * period) | (grid > t[-1] + longest_beyond * period)
+    in_gap = t[after] - t[before] > LONGEST_GAP * period + near
+    sampled[outside | in_gap] = np.nan
     return np.asarray(sampled)

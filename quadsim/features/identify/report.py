@@ -1,4 +1,7 @@
-"""The result of `quadsim identify`: the vehicle, what its numbers are worth, and what to fly for the rest."""
+"""The result of `quadsim identify`: the vehicle, what its numbers are worth, and what to fly for the rest.
+
+`identify_logs` is the whole chain: logs, records, checks, fit, prediction of what was held out, vehicle file and page.
+"""
 
 from __future__ import annotations
 
@@ -73,9 +76,12 @@ class IdentifiedVehicle(Tabular):
     def counted(self) -> str:
         """How many parameters are identified, and which are not."""
         estimates = self.identification.estimates
-        kept = [estimate.name for estimate in estimates if estimate.refused]
-        text = f"{len(estimates) - len(kept)} of {len(estimates)} parameters identified from {', '.join(self.logs)}"
-        return text + (f"; not identified: {', '.join(kept)}" if kept else "")
+        refused = [estimate.name for estimate in estimates if estimate.refused]
+        identified = len(estimates) - len(refused)
+        text = f"{identified} of {len(estimates)} parameters identified from {', '.join(self.logs)}"
+        if refused:
+            text += f"; not identified: {', '.join(refused)}"
+        return text
 
     @property
     def advice(self) -> dict[str, str]:
@@ -84,33 +90,39 @@ class IdentifiedVehicle(Tabular):
         for estimate in self.identification.estimates:
             if estimate.refused and estimate.advice:
                 names.setdefault(estimate.advice, []).append(estimate.name)
-        return {advice: ", ".join(of) for advice, of in names.items()}
+        return {advice: ", ".join(identified) for advice, identified in names.items()}
 
     @property
     def settings(self) -> dict[str, str]:
         """What is certainly not zero and has no field in a vehicle file: values by field of a scenario."""
-        certain = []
-        for e in self.identification.estimates:
-            if not (e.in_file or e.refused or e.low <= 0.0 <= e.high):
-                certain.append(e)
-        known = {estimate.name: rounded(estimate.value, estimate) for estimate in certain}
-        offset = [known.get(f"offset_{axis}", 0.0) for axis in "xy"]
-        if known.get("delay", 0.0) > 0.0:
-            settings = {"computation.delay": f"{known['delay']:g}"}
-        else:
-            settings = {}
-        return settings | ({"effects.load.centre_of_mass": f"[{offset[0]:g}, {offset[1]:g}, 0]"} if any(offset) else {})
+        certain = {}
+        for estimate in self.identification.estimates:
+            may_be_zero = estimate.low <= 0.0 <= estimate.high
+            if not (estimate.in_file or estimate.refused or may_be_zero):
+                certain[estimate.name] = rounded(estimate.value, estimate)
+        settings = {}
+        delay = certain.get("delay", 0.0)
+        if delay > 0.0:
+            settings["computation.delay"] = f"{delay:g}"
+        x = certain.get("offset_x", 0.0)
+        y = certain.get("offset_y", 0.0)
+        if x or y:
+            settings["effects.load.centre_of_mass"] = f"[{x:g}, {y:g}, 0]"
+        return settings
 
     def tables(self) -> tuple[Grid, Grid, Grid]:
         """Return the parameters, the disturbance, and the errors of the prediction."""
         known = self.identification
-        white = ", ".join(f"{axis} {value:.2f}" for axis, value in known.whiteness.items())
+        note = ""
+        if known.whiteness:
+            white = ", ".join(f"{axis} {value:.2f}" for axis, value in known.whiteness.items())
+            note = f"Largest autocorrelation of what is not predicted, 0 for noise: {white}."
         parameters = Grid(
             key="parameters",
             title="Parameters",
             head=("parameter", "unit", "start", "estimate", "95 % interval", "verdict"),
             lines=tuple(_parameter(estimate, known) for estimate in known.estimates),
-            note=f"Largest autocorrelation of what is not predicted, 0 for noise: {white}." if white else "",
+            note=note,
         )
         disturbance = Grid(
             key="disturbance",
@@ -120,41 +132,45 @@ class IdentifiedVehicle(Tabular):
             note="Random torque about body axes and force along world axes, wind's included. It is forgotten with the "
             "time constant in seconds.",
         )
-        held_out = ", ".join(self.test) or "the last fifth of each log, which is not fitted"
+        return parameters, disturbance, self._errors()
+
+    def _errors(self) -> Grid:
+        """Return the mean errors of each model by quantity and horizon, the least of them marked."""
         lines = []
         for j, (quantity, si) in enumerate(QUANTITIES.items()):
             unit, scale = shown_unit(si)
             for horizon in JUDGED:
-                errors = []
-                for of in self.prediction.errors.values():
-                    errors.append(scale * float(of[HORIZONS.index(horizon), j]))
+                row = HORIZONS.index(horizon)
+                errors = [scale * float(of_model[row, j]) for of_model in self.prediction.errors.values()]
                 if all(map(math.isfinite, errors)):
-                    *predicted, floor = errors
-                    best = min(predicted)
-                    cells = []
-                    for e in predicted:
-                        cells.append(Cell(text=format_number(e), mark=Mark.BEST if e == best else Mark.NONE))
-                    cells.append(Cell(text=format_number(floor)))  # no prediction
-                    lines.append(line(f"{quantity} [{unit}]", f"{horizon:g} s", *cells))
-        errors_grid = Grid(
+                    lines.append(line(f"{quantity} [{unit}]", f"{horizon:g} s", *_error_cells(errors)))
+        held_out = ", ".join(self.test) or "the last fifth of each log, which is not fitted"
+        rates_last = self.identification.rates_last
+        return Grid(
             key="errors",
             title="Errors of prediction",
             head=("mean error", "horizon", *self.prediction.errors),
             lines=tuple(lines),
             note=f"{self.prediction.windows} windows of {held_out}. identified: starts with the torque and force that "
             "a filter knows at that instant; undisturbed: without. start: the start file with the same filter. rates "
-            f"held, rates decay: identified thrust and drag alone; decay with {known.rates_last:.2g} s, as in what was "
+            f"held, rates decay: identified thrust and drag alone; decay with {rates_last:.2g} s, as in what was "
             "fitted. floor: what the identified disturbance leaves open to any prediction.",
         )
-        return parameters, disturbance, errors_grid
 
     def records(self) -> list[dict[str, Any]]:
         """Return a row per parameter: `start`, `estimate` with its 95 % interval, and whether that was refused."""
         rows = []
         for estimate in self.identification.estimates:
-            row: dict[str, Any] = {"parameter": estimate.name, "unit": estimate.unit, "start": estimate.start}
-            row |= {"estimate": estimate.value, "low": estimate.low, "high": estimate.high}
-            rows.append({**row, "refused": bool(estimate.refused)})
+            row = {
+                "parameter": estimate.name,
+                "unit": estimate.unit,
+                "start": estimate.start,
+                "estimate": estimate.value,
+                "low": estimate.low,
+                "high": estimate.high,
+                "refused": bool(estimate.refused),
+            }
+            rows.append(row)
         return rows
 
     def shown(self) -> Shown:
@@ -168,44 +184,49 @@ class IdentifiedVehicle(Tabular):
 
     def sentences(self) -> tuple[str, ...]:
         """Return what the checks noted, what to fly, and what a scenario has to be told."""
-        return (
-            *(f"check: {note}" for note in self.notes),
-            *(
-                f"check: the error of {name} is at the floor, what the disturbance leaves open: the true vehicle may "
-                "lose, too; fly more briskly to see what the file is worth"
-                for name in self.prediction.at_floor
-            ),
-            *(
-                f"check: the commands are logged {-1e3 * estimate.value:.0f} ms late, as a delay cannot be negative"
-                for estimate in self.identification.estimates
-                if estimate.name == "delay" and estimate.high < 0.0
-            ),
-            *(f"to identify {names}, fly: {advice}" for advice, names in self.advice.items()),
-            *(
-                f"a vehicle file has no field for it, a scenario has: {name} = {value}"
-                for name, value in self.settings.items()
-            ),
-        )
+        sentences = [f"check: {note}" for note in self.notes]
+        for quantity in self.prediction.at_floor:
+            sentences.append(
+                f"check: the error of {quantity} is at the floor, what the disturbance leaves open: the true vehicle "
+                "may lose, too; fly more briskly to see what the file is worth"
+            )
+        for estimate in self.identification.estimates:
+            if estimate.name == "delay" and estimate.high < 0.0:
+                late = -1e3 * estimate.value
+                sentences.append(f"check: the commands are logged {late:.0f} ms late, as a delay cannot be negative")
+        for advice, names in self.advice.items():
+            sentences.append(f"to identify {names}, fly: {advice}")
+        for field, value in self.settings.items():
+            sentences.append(f"a vehicle file has no field for it, a scenario has: {field} = {value}")
+        return tuple(sentences)
+
+    @property
+    def _written(self) -> list[Path]:
+        return [path for path in (self.file, self.page) if path is not None]
 
     def outputs(self) -> Shown:
         """See `Result.outputs`."""
         from quadsim.console import console
 
-        yield from (console.written_to(path) for path in (self.file, self.page) if path is not None)
+        for path in self._written:
+            yield console.written_to(path)
         if self.page is not None:
             yield console.to_open(self.page)
         if self.file is None:
             yield f"no vehicle file was written: --out mine.toml{' --anyway' * bool(self.prediction.lost)} writes it"
         elif not self.prediction.lost:
             yield console.command(f"{console.to_open(self.file, 'quadsim scenario --for')} > first.toml")
-            settings = "".join(f" --set {shlex.quote(f'{name}={value}')}" for name, value in self.settings.items())
-            yield console.command(f"quadsim run first.toml{settings}")
+            settings = [f" --set {shlex.quote(f'{field}={value}')}" for field, value in self.settings.items()]
+            yield console.command(f"quadsim run first.toml{''.join(settings)}")
 
     def to_json(self) -> dict[str, Any]:
         """All of it as plain values; a number that is not finite is None."""
         errors = {}
-        for model, of in self.prediction.errors.items():
-            errors[model] = {name: of[:, j] for j, name in enumerate(QUANTITIES)}
+        for model, of_model in self.prediction.errors.items():
+            errors[model] = {quantity: of_model[:, j] for j, quantity in enumerate(QUANTITIES)}
+        verdict: dict[str, Any] = {"better": not self.prediction.lost, "text": self.prediction.verdict}
+        for rival in RIVALS:
+            verdict[rival] = self.prediction.ratios(rival)
         data = {
             "logs": self.logs,
             "test": self.test,
@@ -213,11 +234,10 @@ class IdentifiedVehicle(Tabular):
             "notes": self.notes,
             "advice": self.advice,
             "settings": self.settings,
-            "verdict": {"better": not self.prediction.lost, "text": self.prediction.verdict}
-            | {rival: self.prediction.ratios(rival) for rival in RIVALS},
+            "verdict": verdict,
             "prediction": {"windows": self.prediction.windows, "horizons": HORIZONS, "errors": errors},
             "vehicle_file": self.content,
-            "written": [str(path) for path in (self.file, self.page) if path is not None],
+            "written": [str(path) for path in self._written],
         }
         return {name: _plain(value) for name, value in data.items()}
 
@@ -247,23 +267,23 @@ def identify_logs(
 
     A log that cannot be used is left out, and `notes` says so; the error is raised where none is left.
     """
-    places = {name: None if path is None else require_file(path, overwrite=overwrite)
-              for name, path in (("file", out), ("page", page))}  # fmt: skip
+    file = None if out is None else require_file(out, overwrite=overwrite)
+    page = None if page is None else require_file(page, overwrite=overwrite)
     vehicle = load_vehicle(start)
     usable, notes = _usable(logs, vehicle, poles, columns)
     usable_tests, test_notes = _usable(test, vehicle, poles, columns)
     both = [*usable, *usable_tests]
-    for one, other in itertools.combinations([log.record for log in both], 2):
-        if np.array_equal(one.rates, other.rates):
-            raise InputError(f"{one.name} and {other.name} are the same flight: name it once")
+    _refuse_same_flights([log.record for log in both])
     records = [log.record for log in usable]
     tested = [log.record for log in usable_tests]
     fitted = [log.spans for log in usable]
-    held = [log.spans for log in usable_tests]
+    held_out = [log.spans for log in usable_tests]
     names = tuple(record.name for record in records)
     with judging(", ".join(names)):
         if not tested:
-            fitted, held = map(list, zip(*map(hold_out, records, fitted), strict=True))
+            cuts = [hold_out(record, spans) for record, spans in zip(records, fitted, strict=True)]
+            fitted = [fitted_spans for fitted_spans, _ in cuts]
+            held_out = [held_spans for _, held_spans in cuts]
         try:
             identification = identify_records(records, fitted, vehicle, wind=wind)
         except ParameterError as error:
@@ -273,7 +293,9 @@ def identify_logs(
                 f"the logs and {start} give a vehicle that cannot be: {error}; correct mass, arm_length or speed "
                 "range, or what was kept and does not suit what was identified"
             ) from None
-        prediction = predict(tested or records, held, identification, vehicle, fitted=not tested)
+        prediction = predict(tested or records, held_out, identification, vehicle, fitted=not tested)
+    if prediction.lost and not anyway:
+        file = None
     result = IdentifiedVehicle(
         identification=identification,
         prediction=prediction,
@@ -281,18 +303,23 @@ def identify_logs(
         logs=names,
         test=tuple(record.name for record in tested),
         content=vehicle_text(identification, start, names),
-        **places,
+        file=file,
+        page=page,
     )
-    if result.prediction.lost and not anyway:
-        result = replace(result, file=None)
-    if result.file is not None:
-        with writing_file(result.file, overwrite=overwrite) as new:
+    if file is not None:
+        with writing_file(file, overwrite=overwrite) as new:
             new.write_text(result.content, encoding="utf-8")
             load_vehicle(new)  # the numbers as they are rounded
-    if result.page is not None:
-        with after(replace(result, page=None), result.page), writing_file(result.page, overwrite=overwrite) as new:
+    if page is not None:
+        with after(replace(result, page=None), page), writing_file(page, overwrite=overwrite) as new:
             new.write_text(_render(result), encoding="utf-8")
     return result
+
+
+def _refuse_same_flights(records: Sequence[Record]) -> None:
+    for one, other in itertools.combinations(records, 2):
+        if np.array_equal(one.rates, other.rates):
+            raise InputError(f"{one.name} and {other.name} are the same flight: name it once")
 
 
 def _usable(
@@ -369,6 +396,17 @@ def _disturbance(estimate: DisturbanceEstimate) -> tuple[Cell, ...]:
         factor_text(estimate.time_interval),
         Cell(text="identified", mark=Mark.TEXT),
     )
+
+
+def _error_cells(errors: Sequence[float]) -> list[Cell]:
+    """Return the cells of a line: each model's error, the least marked, then the floor, which predicts nothing."""
+    *predicted, floor = errors
+    best = min(predicted)
+    cells = []
+    for error in predicted:
+        cells.append(Cell(text=format_number(error), mark=Mark.BEST if error == best else Mark.NONE))
+    cells.append(Cell(text=format_number(floor)))
+    return cells
 
 
 def _plain(values: Any) -> Any:

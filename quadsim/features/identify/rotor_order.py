@@ -1,4 +1,8 @@
-"""Which rotor is which: does another order or layout of the rotors explain the angular acceleration better?"""
+"""Which rotor is which: does another order or layout of the rotors explain the angular acceleration better?
+
+Roll and pitch acceleration are fitted, block by block, as gain * sum of arm_i w_i^2 with the arms of every order of the
+rotors, in plus and in X layout.  One of the checks before any fit, which trusts axes, scales and clocks.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +15,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from quadsim.errors import InputError
-from quadsim.features.identify.record import Record, driver
-from quadsim.features.identify.windows import mean, rate_over_window
+from quadsim.features.identify.record import Record, rotor_inputs
+from quadsim.features.identify.windows import mean_over_window, rate_over_window
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -21,7 +25,8 @@ LAGS: Final = (0.0, 0.015, 0.03, 0.06, 0.1)  # [s] of rotors that are tried
 BLOCK: Final = 1.0  # [s] in each of which an order must prove itself
 AGREEING: Final = 0.8  # share of blocks
 INFERIOR: Final = 0.85  # of what the best order explains, at most, by the one given
-EXPLAINED: Final = 0.1  # least share of the angular acceleration that an order must explain to be believed
+EXPLAINED: Final = 0.1  # least share of roll and pitch acceleration that an order must explain to count
+YAW_EXPLAINED: Final = 0.05  # the same of yaw, by reversed spins
 
 
 class Moments(NamedTuple):
@@ -40,35 +45,48 @@ def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) 
     Raises:
         InputError: naming the order, azimuths or spins to try.
     """
-    blocks = [_moments(record, parts, lag) for lag in (LAGS if record.speeds is None else LAGS[:1])]
-    x, y, _ = vehicle.hubs.T / vehicle.longest_arm
-    usual = _best(blocks, np.stack([y, -x]))
-    best = usual
-    order = tuple(range(N_ROTORS))
-    turn = 0.0
-    for angle in (0.0, math.pi / 4.0):
-        turned_x = x * math.cos(angle) - y * math.sin(angle)
-        turned_y = x * math.sin(angle) + y * math.cos(angle)
-        for columns in permutations(range(N_ROTORS)):
+    if record.speeds is None:
+        blocks = [_moments(record, parts, lag) for lag in LAGS]
+    else:
+        blocks = [_moments(record, parts, 0.0)]
+    as_given = _best(blocks, _arms(vehicle, 0.0))
+    best = as_given
+    best_order = tuple(range(N_ROTORS))
+    best_turn = 0.0
+    for turn in (0.0, math.pi / 4.0):
+        turned_arms = _arms(vehicle, turn)
+        for order in permutations(range(N_ROTORS)):
             arms = np.empty((2, N_ROTORS))
-            arms[:, columns] = np.stack([turned_y, -turned_x])
+            arms[:, order] = turned_arms
             explained = _best(blocks, arms)
             if explained.mean() > best.mean() + 1e-9:
                 best = explained
-                order = columns
-                turn = angle
-    if best.mean() > EXPLAINED and usual.mean() < INFERIOR * best.mean() and (best > usual).mean() >= AGREEING:
+                best_order = order
+                best_turn = turn
+    is_far_better = best.mean() > EXPLAINED and as_given.mean() < INFERIOR * best.mean()
+    if is_far_better and (best > as_given).mean() >= AGREEING:
+        if best_turn:
+            advice = _layout_advice(best_order, vehicle)
+        else:
+            advice = _order_advice(best_order, vehicle, record)
         raise InputError(
-            f"{record.name}: {_named(order, turn, vehicle, record)}, which explains {100.0 * best.mean():.0f} % of the "
-            f"roll and pitch acceleration (as given: {100.0 * usual.mean():.0f} %)"
+            f"{record.name}: {advice}, which explains {100.0 * best.mean():.0f} % of the roll and pitch acceleration "
+            f"(as given: {100.0 * as_given.mean():.0f} %)"
         )
     _check_spins(record.name, blocks, vehicle)
 
 
 def explained_at_lag(record: Record, parts: Sequence[slice], vehicle: Vehicle, lag: float) -> Array:
     """Share (K,) of roll and pitch acceleration that rotors as given explain in each block, behind a lag [s]."""
+    return _explained(_moments(record, parts, lag), _arms(vehicle, 0.0))
+
+
+def _arms(vehicle: Vehicle, turn: float) -> Array:
+    """Arms (2, 4) of the rotors' thrusts about body x and y, over the longest, with the layout turned [rad]."""
     x, y, _ = vehicle.hubs.T / vehicle.longest_arm
-    return _explained(_moments(record, parts, lag), np.stack([y, -x]))
+    turned_x = x * math.cos(turn) - y * math.sin(turn)
+    turned_y = x * math.sin(turn) + y * math.cos(turn)
+    return np.stack([turned_y, -turned_x])
 
 
 def _moments(record: Record, parts: Sequence[slice], lag: float) -> Moments:
@@ -78,17 +96,18 @@ def _moments(record: Record, parts: Sequence[slice], lag: float) -> Moments:
     speeds = []
     accelerations = []
     for part in parts:
-        inputs = driver(record)[part]
+        inputs = rotor_inputs(record)[part]
         if lag:
             pole = math.exp(-period / lag)
             before = np.concatenate([inputs[:1], inputs[:-1]])  # a command moves the rotors after its sample
             inputs = lfilter([1.0 - pole], [1.0, -pole], before, axis=0, zi=pole * inputs[:1])[0]
         whole = len(inputs) // size * size
-        speeds.append(mean(np.square(inputs), period, ACCELERATION_WINDOW)[:whole].reshape(-1, size, N_ROTORS))
-        accelerations.append(
-            rate_over_window(record.rates[part], period, ACCELERATION_WINDOW)[:whole].reshape(-1, size, 3)
-        )
-    x, a = (np.concatenate(rows) for rows in (speeds, accelerations))
+        squares = mean_over_window(np.square(inputs), period, ACCELERATION_WINDOW)[:whole]
+        rates = rate_over_window(record.rates[part], period, ACCELERATION_WINDOW)[:whole]
+        speeds.append(squares.reshape(-1, size, N_ROTORS))
+        accelerations.append(rates.reshape(-1, size, 3))
+    x = np.concatenate(speeds)
+    a = np.concatenate(accelerations)
     x = x - x.mean(axis=1, keepdims=True)
     a = a - a.mean(axis=1, keepdims=True)
     return Moments(xx=x.transpose(0, 2, 1) @ x, xa=x.transpose(0, 2, 1) @ a, aa=np.square(a).sum(axis=1))
@@ -108,42 +127,49 @@ def _explained(blocks: Moments, arms: Array) -> Array:
     return np.asarray(((2.0 * gain * along - gain**2 * power) / total).mean(axis=1))
 
 
-def _named(order: Sequence[int], turn: float, vehicle: Vehicle, record: Record) -> str:
-    if turn:
-        azimuths = [0.0] * N_ROTORS
-        for place, i in enumerate(order):
-            azimuths[i] = (math.degrees(vehicle.azimuths[place]) + 45.0 + 180.0) % 360.0 - 180.0
-        return f"the arms are 45 deg off: try rotor_azimuths = [{', '.join(f'{a:g}' for a in azimuths)}]"
-    mirrored = np.allclose(vehicle.hubs[list(order)], vehicle.hubs * [-1.0, 1.0, 1.0])
-    moved = [i + 1 for i in range(N_ROTORS) if order[i] != i]
+def _layout_advice(order: Sequence[int], vehicle: Vehicle) -> str:
+    """The azimuths to try, of arms that are turned by 45 deg."""
+    azimuths = [0.0] * N_ROTORS
+    for place, i in enumerate(order):
+        azimuths[i] = (math.degrees(vehicle.azimuths[place]) + 45.0 + 180.0) % 360.0 - 180.0
+    listed = ", ".join(f"{azimuth:g}" for azimuth in azimuths)
+    return f"the arms are 45 deg off: try rotor_azimuths = [{listed}]"
+
+
+def _order_advice(order: Sequence[int], vehicle: Vehicle, record: Record) -> str:
+    """The order of columns to try."""
     if record.speeds is not None:
         column = "w"
     elif record.commands is not None:
         column = "u"
     else:
         column = "throttle"
+    moved = [i + 1 for i in range(N_ROTORS) if order[i] != i]
     if len(moved) == 2:
-        swapped = f"rotors {moved[0]} and {moved[1]} are swapped"
+        fault = f"rotors {moved[0]} and {moved[1]} are swapped"
     else:
-        swapped = "the rotors are in another order"
-    return f"{swapped}: try the order {','.join(f'{column}{i + 1}' for i in order)}" + (
-        " (or body axes are x forward, y right, z down)" if mirrored else ""
-    )
+        fault = "the rotors are in another order"
+    columns = ",".join(f"{column}{i + 1}" for i in order)
+    advice = f"{fault}: try the order {columns}"
+    if np.allclose(vehicle.hubs[list(order)], vehicle.hubs * [-1.0, 1.0, 1.0]):
+        advice += " (or body axes are x forward, y right, z down)"
+    return advice
 
 
 def _check_spins(name: str, blocks: Sequence[Moments], vehicle: Vehicle) -> None:
     """Refuse spins of which all are reversed."""
     spins = np.array(vehicle.rotor_spins, float)
-    shares = []
+    fits = []
     for xx, xa, aa in blocks:
         along = xa[:, :, 2] @ spins
         power = float((xx @ spins @ spins).sum())
         gain = float(along.sum()) / max(power, 1e-30)
-        shares.append((gain * float(along.sum()) / max(float(aa[:, 2].sum()), 1e-30), gain, (along < 0.0).mean()))
-    explained, gain, against = max(shares)
-    if gain < 0.0 and explained > 0.05 and against >= AGREEING:
+        explained = gain * float(along.sum()) / max(float(aa[:, 2].sum()), 1e-30)
+        fits.append((explained, gain, (along < 0.0).mean()))
+    explained, gain, against = max(fits)
+    if gain < 0.0 and explained > YAW_EXPLAINED and against >= AGREEING:
+        reversed_spins = [-int(spin) for spin in spins]
         raise InputError(
-            f"{name}: the yaw acceleration is against the rotors' torque: try rotor_spins = "
-            f"{[-int(spin) for spin in spins]}, which explains {100.0 * explained:.0f} % of it, or negate wz if it is "
-            "logged clockwise"
+            f"{name}: the yaw acceleration is against the rotors' torque: try rotor_spins = {reversed_spins}, which "
+            f"explains {100.0 * explained:.0f} % of it, or negate wz if it is logged clockwise"
         )

@@ -1,4 +1,8 @@
-"""Rotor speeds beside their commands, the motion, and each other: which of a log's are not what they say."""
+"""Measured rotor speeds beside their commands, the motion, and each other: a wrong scale, or commands in their place.
+
+In the mean over a flight the torques balance: sum spin_i b_i w_i^2 = 0, sum r_i b_i w_i^2 = r_c sum b_i w_i^2, r_c the
+centre of mass.  Three of the checks before any fit.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ from quadsim.vehicle import Vehicle
 
 NOTED_RATIO: Final = 1.07  # of a rotor's speed over its command to that of the others
 REFUSED_RATIO: Final = 1.15
-NOTED_SCALE: Final = 1.1  # by which one rotor's speeds alone, were they wrong, balance the torques
+REFUSED_SCALE: Final = 1.1  # by which one rotor's speeds alone, were they wrong, balance the torques
 CENTRE_LEFT: Final = 0.35  # of the centre's distance that is left where they do
 LAGGING_BETTER: Final = 1.2  # what speeds leave unexplained, over what they leave behind a rotor's lag
 SMOOTHING: Final = (0.0, 0.005, 0.01, 0.015, 0.03, 0.06)  # [s] of a filter without lag, which takes noise away too
@@ -37,25 +41,27 @@ def check_against_commands(record: Record, parts: Sequence[slice], vehicle: Vehi
         voltage = 0.0
     else:
         voltage = float(np.nanmean(record.voltage))
-    wanted = commanded(record, vehicle, Parameters.of(vehicle, voltage=voltage))
+    commands = commanded(record, vehicle, Parameters.of(vehicle, voltage=voltage))
     speeds = np.concatenate([np.asarray(record.speeds)[part] for part in parts])
-    targets = np.concatenate([wanted[part] for part in parts])
+    targets = np.concatenate([commands[part] for part in parts])
     if np.allclose(speeds, targets * (speeds.mean() / targets.mean()), rtol=1e-6):
         raise InputError(f"{record.name}: the measured speeds are the commands: leave them out")
     ratios = np.median(speeds, axis=0) / np.maximum(np.median(targets, axis=0), 1e-9)
-    i, ratio = _odd_one(ratios)
+    rotor, ratio = _outlier(ratios)
     if ratio < 1.0 / NOTED_RATIO or ratio > NOTED_RATIO:
-        what = f"{record.name}: rotor {i + 1} turns {ratio:.3g} times as fast as the others do at its command"
+        what = f"{record.name}: rotor {rotor + 1} turns {ratio:.3g} times as fast as the others do at its command"
         if ratio < 1.0 / REFUSED_RATIO or ratio > REFUSED_RATIO:
             raise InputError(f"{what}; at most {REFUSED_RATIO:g} is allowed: correct its measured speed or its command")
         yield f"{what}: look for a wrong scale, or another propeller"
 
 
-def _odd_one(ratios: Array) -> tuple[int, float]:
+def _outlier(ratios: Array) -> tuple[int, float]:
     """The rotor whose ratio is farthest from the median of the others', and by which factor."""
-    factors = [float(ratio / np.median(np.delete(ratios, i))) for i, ratio in enumerate(ratios)]
-    i = max(range(len(factors)), key=lambda i: abs(math.log(max(factors[i], 1e-9))))
-    return i, factors[i]
+    of_others = [np.median(np.delete(ratios, i)) for i in range(len(ratios))]
+    factors = ratios / np.array(of_others)
+    distances = np.abs(np.log(np.maximum(factors, 1e-9)))
+    rotor = int(np.argmax(distances))
+    return rotor, float(factors[rotor])
 
 
 def check_against_each_other(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
@@ -71,23 +77,23 @@ def check_against_each_other(record: Record, parts: Sequence[slice], vehicle: Ve
     spins = np.array(vehicle.rotor_spins, float)
     arms = vehicle.hubs[:, :2] / vehicle.longest_arm
 
-    def centre(of: Array) -> float:
-        return float(np.linalg.norm(arms.T @ of) / of.sum())
+    def centre_distance(thrusts: Array) -> float:
+        return float(np.linalg.norm(arms.T @ thrusts) / thrusts.sum())
 
     scales = np.ones(len(spins))
-    left = np.full(len(spins), np.inf)
+    distances = np.full(len(spins), np.inf)
     for i, spin in enumerate(spins):
         others = spins * thrusts
         others[i] = 0.0
-        needed = -float(others.sum()) / spin
-        if needed > 0.0:
-            scales[i] = math.sqrt(thrusts[i] / needed)
+        balancing = -float(others.sum()) / spin  # the thrust of rotor i that balances the yaw torque
+        if balancing > 0.0:
+            scales[i] = math.sqrt(thrusts[i] / balancing)
             balanced = thrusts.copy()
-            balanced[i] = needed
-            left[i] = centre(balanced)
-    i = int(np.argmin(left))
-    off = max(scales[i], 1.0 / scales[i])
-    if off > NOTED_SCALE and left[i] < CENTRE_LEFT * centre(thrusts):
+            balanced[i] = balancing
+            distances[i] = centre_distance(balanced)
+    i = int(np.argmin(distances))
+    factor = max(scales[i], 1.0 / scales[i])
+    if factor > REFUSED_SCALE and distances[i] < CENTRE_LEFT * centre_distance(thrusts):
         raise InputError(
             f"{record.name}: the measured speed of rotor {i + 1} is {scales[i]:.3g} times what balances the torques of "
             "the others about all three axes: correct its scale, or give each rotor its own thrust_coefficient"
@@ -102,13 +108,15 @@ def check_not_commands(record: Record, parts: Sequence[slice], vehicle: Vehicle)
     Raises:
         InputError: behind a lag they explain roll and pitch far better.
     """
-    lagging = [explained_at_lag(record, parts, vehicle, lag) for lag in LAGS[1:]]
-    best = int(np.argmax([of.mean() for of in lagging]))
-    as_they_are = [explained_at_lag(_smoothed(record, parts, tau), parts, vehicle, 0.0) for tau in SMOOTHING]
-    behind = lagging[best]
-    beside = max(as_they_are, key=lambda of: float(of.mean()))
+    behind_lags = [explained_at_lag(record, parts, vehicle, lag) for lag in LAGS[1:]]
+    best = int(np.argmax([shares.mean() for shares in behind_lags]))
+    behind = behind_lags[best]
+    filtered = [_filtered(record, parts, tau) for tau in SMOOTHING]
+    without_lag = [explained_at_lag(smooth, parts, vehicle, 0.0) for smooth in filtered]
+    beside = max(without_lag, key=lambda shares: float(shares.mean()))
     gain = (1.0 - beside.mean()) / max(1.0 - behind.mean(), 1e-9)
-    if behind.mean() > EXPLAINED and gain > LAGGING_BETTER and (behind > beside).mean() >= AGREEING - 0.05:
+    agreeing = (behind > beside).mean()
+    if behind.mean() > EXPLAINED and gain > LAGGING_BETTER and agreeing >= AGREEING - 0.05:
         raise InputError(
             f"{record.name}: the vehicle turns as its measured speeds were {1e3 * LAGS[1 + best]:.0f} ms ago, as it "
             f"does behind commands ({behind.mean():.0%} of roll and pitch explained, {beside.mean():.0%} without): "
@@ -116,7 +124,8 @@ def check_not_commands(record: Record, parts: Sequence[slice], vehicle: Vehicle)
         )
 
 
-def _smoothed(record: Record, parts: Sequence[slice], tau: float) -> Record:
+def _filtered(record: Record, parts: Sequence[slice], tau: float) -> Record:
+    """The record with its speeds through a first-order filter of a time constant [s], forth and back."""
     speeds = np.asarray(record.speeds).copy()
     pole = math.exp(-record.period / tau) if tau else 0.0
     for part in parts:

@@ -1,7 +1,8 @@
-"""Sensors are distrusted first: samples that jump away and back, counters that stop, rows that a radio held.
+"""Samples that a sensor, a counter or a radio spoilt: jumps away and back, counters that stop, rows that are held.
 
-Such samples are cut before anything is sampled anew, averaged or fitted, and a note names sensor, time and value; a
-sensor that fails too often makes the log one that cannot be used.
+A jump is farther from the median about it than 1.5 ranges of all medians.  Such samples are cut before `record` samples
+anything anew, averages or fits it, and a note names sensor, time and value; a sensor that fails too often makes the log
+one that cannot be used.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects, label, maximum_filter1d, median_filter
 
 from quadsim.errors import InputError
-from quadsim.features.identify.series import Column, held
+from quadsim.features.identify.series import Column, held, interpolated
 from quadsim.state import Array
 
 LONGEST_SPIKE: Final = 3  # samples, of which a log with a sample in `SPIKE_TIME` or more has one
@@ -24,10 +25,10 @@ LOUDEST: Final = 8.0  # the same in median distances, where a column hardly chan
 COMMANDS_APART: Final = 3.0  # how far a command may be from 0, in the largest median: a real one may last one sample
 LEAST_DROP: Final = 0.05  # share of a battery's voltage below which a change is no jump: it is logged to 0.1 V
 MOST_CUT: Final = 0.01  # share of a sensor's samples that may be cut
-TURN_AWAY = 1.0
-TURNED_BACK = 0.5
-"""Angles [rad]: an attitude that is farther than the first from both neighbours, which are nearer than the second."""
-LENGTH: Final = 0.02  # by which the length of a quaternion may differ from 1
+# An attitude jumps that is turned by more than the first from both neighbours, which are nearer than the second [rad].
+JUMP_ANGLE: Final = 1.0
+NEIGHBOURS_ANGLE: Final = 0.5
+NORM_TOLERANCE: Final = 0.02  # by which the norm of a quaternion may differ from 1
 CARRYING: Final = 0.5  # share of the others' usual speed above which they carry a vehicle
 LONGEST_HELD: Final = 1.0  # [s] for which a radio holds a row, and a counter a speed
 IDLE: Final = 0.1  # share of a rotor's largest command below which it may stop
@@ -43,15 +44,18 @@ class _Sensor(NamedTuple):
     unit: str
 
 
-_ROTORS: Final = tuple(f"of rotor {i}" for i in (1, 2, 3, 4))
-_AXES: Final = ("x", "y", "z")
+def _sensor(pattern: str, numbers: str, unit: str) -> _Sensor:
+    """A sensor whose columns a pattern names, with {} for each of some words."""
+    return _Sensor(tuple(pattern.format(number) for number in numbers.split()), unit)
+
+
 _SENSORS: Final = {
-    "position": _Sensor(tuple(f"position {axis}" for axis in _AXES), "m"),
-    "velocity": _Sensor(tuple(f"velocity v{axis}" for axis in _AXES), "m/s"),
-    "rates": _Sensor(tuple(f"body rate w{axis}" for axis in _AXES), "rad/s"),
-    "specific_force": _Sensor(tuple(f"specific force a{axis}" for axis in _AXES), "m/s^2"),
-    "commands": _Sensor(tuple(f"the command {rotor}" for rotor in _ROTORS), "rad/s"),
-    "speeds": _Sensor(tuple(f"the measured speed {rotor}" for rotor in _ROTORS), "rad/s"),
+    "position": _sensor("position {}", "x y z", "m"),
+    "velocity": _sensor("velocity v{}", "x y z", "m/s"),
+    "rates": _sensor("body rate w{}", "x y z", "rad/s"),
+    "specific_force": _sensor("specific force a{}", "x y z", "m/s^2"),
+    "commands": _sensor("the command of rotor {}", "1 2 3 4", "rad/s"),
+    "speeds": _sensor("the measured speed of rotor {}", "1 2 3 4", "rad/s"),
     "voltage": _Sensor(("the voltage",), "V"),
     "attitude": _Sensor(("the attitude",), "-"),
 }
@@ -60,6 +64,12 @@ _SENSORS: Final = {
 def runs(mask: NDArray[np.bool_], shortest: int = 1) -> list[slice]:
     """Runs of true samples with at least the shortest length."""
     return [run for (run,) in find_objects(label(mask)[0]) if run.stop - run.start >= shortest]
+
+
+def still_steps(rates: Array, attitude: Array) -> NDArray[np.bool_]:
+    """Steps (N - 1,) from row to row in which neither rates (N, 3) nor attitude (N, 4) change."""
+    turning = np.concatenate([rates, attitude], axis=1)
+    return np.asarray((np.abs(np.diff(turning, axis=0)) <= ROUNDING).all(axis=1))
 
 
 def without_spikes(name: str, series: Mapping[str, Column]) -> tuple[dict[str, Column], tuple[str, ...]]:
@@ -73,69 +83,77 @@ def without_spikes(name: str, series: Mapping[str, Column]) -> tuple[dict[str, C
     for field, samples in series.items():
         if field not in _SENSORS:
             continue
-        columns, unit = _SENSORS[field]
-        if field == "attitude":
-            off = _attitude_spikes(samples.values)[:, None]
-        else:
-            least = LEAST_DROP if field == "voltage" else 0.0
-            off = _spikes(samples, command=field == "commands", least=least)
-        if not off.any():
+        spikes = _spikes(field, samples)
+        if not spikes.any():
             continue
-        for i in np.flatnonzero(off.any(axis=0)):
-            row = int(np.argmax(off[:, i]))
-            count = np.count_nonzero(off[:, i])
-            if field == "attitude":
-                logged = samples.values[row]
-            else:
-                logged = samples.values[row, i : i + 1]
-            value = ", ".join(f"{number:.4g}" for number in logged)
-            what = f"{name}: {columns[i]} is {value} {unit} at t = {samples.t[row]:.6g} s"
-            if count > 1:
-                more = f" and in {count - 1} more samples"
-            else:
-                more = ""
-            if count > MOST_CUT * len(off):
-                raise InputError(
-                    f"{what}{more}, far from the samples beside; at most {MOST_CUT:.0%} of a sensor's samples may jump:"
-                    " mend or leave out that sensor"
-                )
-            notes.append(f"{what}{more}, far from the samples beside: left out")
+        for column in np.flatnonzero(spikes.any(axis=0)).tolist():
+            notes.append(_spike_note(name, field, samples, column, spikes[:, column]))
         values = samples.values.copy()
-        values[off.any(axis=1)] = np.nan
+        values[spikes.any(axis=1)] = np.nan
         result[field] = samples._replace(values=values)
     return result, tuple(notes)
 
 
-def _spikes(samples: Column, *, command: bool, least: float) -> NDArray[np.bool_]:
+def _spike_note(name: str, field: str, samples: Column, column: int, spikes: NDArray[np.bool_]) -> str:
+    """Name the first of a column's spikes (M,) and their number, or refuse the sensor where they are too many."""
+    row = int(np.argmax(spikes))
+    count = np.count_nonzero(spikes)
+    if field == "attitude":
+        logged = samples.values[row]
+    else:
+        logged = samples.values[row, column : column + 1]
+    value = ", ".join(f"{number:.4g}" for number in logged)
+    sensor = _SENSORS[field]
+    what = f"{name}: {sensor.columns[column]} is {value} {sensor.unit} at t = {samples.t[row]:.6g} s"
+    if count > 1:
+        what += f" and in {count - 1} more samples"
+    if count > MOST_CUT * len(spikes):
+        raise InputError(
+            f"{what}, far from the samples beside; at most {MOST_CUT:.0%} of a sensor's samples may jump:"
+            " mend or leave out that sensor"
+        )
+    return f"{what}, far from the samples beside: left out"
+
+
+def _spikes(field: str, samples: Column) -> NDArray[np.bool_]:
+    """Samples (M, n) that jump away and back; of an attitude (M, 1)."""
+    if field == "attitude":
+        return _attitude_spikes(samples.values)[:, None]
+    if field == "voltage":
+        return _column_spikes(samples, least=LEAST_DROP)
+    return _column_spikes(samples, command=field == "commands")
+
+
+def _column_spikes(samples: Column, *, command: bool = False, least: float = 0.0) -> NDArray[np.bool_]:
     """Samples (M, n) that are far from the median about them: by more than a share `least` of the largest median."""
     t, values = samples
-    off = np.zeros(values.shape, bool)
+    spikes = np.zeros(values.shape, bool)
     there = np.isfinite(values).all(axis=1)
     if np.count_nonzero(there) < 4 * LONGEST_SPIKE:
-        return off
+        return spikes
     rows = values[there]
     steps = np.diff(t)
     steps = steps[steps > 0.0]  # a battery's clock may be coarse
     if not steps.size:
-        return off
+        return spikes
     longest = round(SPIKE_TIME / float(np.median(steps)))
     size = 2 * min(max(longest, 1), LONGEST_SPIKE) + 1
     middle = median_filter(rows, size=(size, 1), mode="nearest")
-    distance = np.abs(rows - middle)
     if command:
-        off[there] = np.abs(rows) > COMMANDS_APART * np.abs(middle).max()
-    else:
-        farthest = FARTHEST * np.ptp(middle, axis=0) + LOUDEST * np.median(distance, axis=0)
-        farthest = np.maximum(farthest, least * np.abs(middle).max(axis=0))
-        off[there] = distance > farthest + ROUNDING
-    return off
+        spikes[there] = np.abs(rows) > COMMANDS_APART * np.abs(middle).max()
+        return spikes
+    distance = np.abs(rows - middle)
+    farthest = FARTHEST * np.ptp(middle, axis=0) + LOUDEST * np.median(distance, axis=0)
+    farthest = np.maximum(farthest, least * np.abs(middle).max(axis=0))
+    spikes[there] = distance > farthest + ROUNDING
+    return spikes
 
 
 def _attitude_spikes(quaternion: Array) -> NDArray[np.bool_]:
     """Rows (M,) of another length than 1 while most have it, and those turned away from both neighbours."""
     norms = np.linalg.norm(quaternion, axis=1)
     finite = np.isfinite(norms)
-    spikes = finite & (np.abs(norms - 1.0) > LENGTH)
+    spikes = finite & (np.abs(norms - 1.0) > NORM_TOLERANCE)
     if np.count_nonzero(spikes) > MOST_CUT * len(spikes):
         spikes = np.zeros(len(spikes), bool)  # it was scaled, centred or misnamed
     rows = np.flatnonzero(finite & ~spikes)
@@ -147,10 +165,11 @@ def _attitude_spikes(quaternion: Array) -> NDArray[np.bool_]:
         along = np.abs((unit[step:] * unit[:-step]).sum(axis=1))
         return np.asarray(2.0 * np.arccos(np.minimum(along, 1.0)))
 
-    once = turn(1)
-    twice = turn(2)
-    away = (once[:-1] > TURN_AWAY) & (once[1:] > TURN_AWAY) & (twice < TURNED_BACK)
-    spikes[rows[1:-1][away]] = True
+    to_next = turn(1)
+    to_next_but_one = turn(2)
+    far_from_both = (to_next[:-1] > JUMP_ANGLE) & (to_next[1:] > JUMP_ANGLE)
+    jumps = far_from_both & (to_next_but_one < NEIGHBOURS_ANGLE)
+    spikes[rows[1:-1][jumps]] = True
     return spikes
 
 
@@ -163,21 +182,13 @@ def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str
     Raises:
         InputError: fewer than `SLOWEST_FRESH` rows per second are new.
     """
-    if not {"rates", "attitude"} <= {*series} or series["rates"].t is not series["attitude"].t:
-        return dict(series), ()
-    t = series["rates"].t
-    turning = np.concatenate([series["rates"].values, series["attitude"].values], axis=1)
-    still = np.asarray((np.abs(np.diff(turning, axis=0)) <= ROUNDING).all(axis=1))
-    if not still.any():
-        return dict(series), ()
-    period = float(np.median(np.diff(t)))
-    repeated = np.append(False, still & ~at_rest(still, round(LONGEST_HELD / period)))
+    repeated = _repeated_rows(series)
     if not repeated.any():
         return dict(series), ()
-    moving = int(len(repeated) - np.count_nonzero(still & ~repeated[1:]))
-    rate = (moving - int(repeated.sum())) / (moving * period)
+    t = series["rates"].t
     where = f"the first at t = {t[np.argmax(repeated)]:.6g} s"
     what = f"{name}: {repeated.mean():.0%} of its rows repeat rates and attitude of the one before, {where}"
+    rate = _fresh_rate(series, repeated)
     if rate < SLOWEST_FRESH:
         raise InputError(
             f"{what}, as a radio does that holds them; {rate:.3g} rows per second are new, {SLOWEST_FRESH:g} are "
@@ -188,20 +199,42 @@ def without_held_rows(name: str, series: Mapping[str, Column]) -> tuple[dict[str
     for field, samples in series.items():
         if samples.t is not t or field == "voltage":
             continue
-        repeats = np.abs(np.diff(samples.values, axis=0)).max(axis=1, initial=0.0) <= ROUNDING
-        if repeats[repeated[1:]].mean() < HELD_TOO:
+        unchanged = np.abs(np.diff(samples.values, axis=0)).max(axis=1, initial=0.0) <= ROUNDING
+        if unchanged[repeated[1:]].mean() < HELD_TOO:
             continue
-        values = samples.values.copy()
         if field in ("commands", "throttle", "speeds"):
             known_rotors = ~repeated
         if field in ("commands", "throttle"):
-            known = [np.interp(t, t[~repeated], column[~repeated]) for column in values.T]
-            values = np.stack(known, axis=1)
+            values = interpolated(t, t[~repeated], samples.values[~repeated])
         else:
+            values = samples.values.copy()
             values[repeated] = np.nan
         result[field] = samples._replace(values=values)
     result["fresh"] = Column(t=t, values=np.stack([~repeated, known_rotors], axis=1).astype(float))
     return result, (f"{what}: left out",)
+
+
+def _repeated_rows(series: Mapping[str, Column]) -> NDArray[np.bool_]:
+    """Rows (N,) whose rates and attitude, on one clock, a radio held; none where the vehicle rests."""
+    rates = series.get("rates")
+    attitude = series.get("attitude")
+    if rates is None or attitude is None or rates.t is not attitude.t:
+        return np.zeros(0, bool)
+    still = still_steps(rates.values, attitude.values)
+    if not still.any():
+        return np.zeros(0, bool)
+    longest = round(LONGEST_HELD / float(np.median(np.diff(rates.t))))
+    return np.append(False, still & ~at_rest(still, longest))
+
+
+def _fresh_rate(series: Mapping[str, Column], repeated: NDArray[np.bool_]) -> float:
+    """New rows per second while the vehicle moves [Hz]."""
+    rates = series["rates"]
+    still = still_steps(rates.values, series["attitude"].values)
+    resting = np.count_nonzero(still & ~repeated[1:])
+    moving = int(len(repeated) - resting)
+    period = float(np.median(np.diff(rates.t)))
+    return (moving - int(repeated.sum())) / (moving * period)
 
 
 def at_rest(still: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
@@ -236,45 +269,45 @@ def without_stopped_counters(name: str, series: Mapping[str, Column]) -> tuple[d
     there = np.isfinite(speeds).all(axis=1)
     if np.count_nonzero(there) < 2:
         return result, ()
+    commands = series.get("commands", series.get("throttle"))
     period = float(np.median(np.diff(t)))
-    longest = round(LONGEST_HELD / period)
-    sent = series.get("commands", series.get("throttle"))
+    longest = max(round(LONGEST_HELD / period), 1)
     values = speeds.copy()
     notes = []
-    for i in range(speeds.shape[1]):
-        others = np.median(np.delete(speeds, i, axis=1), axis=1)
+    for rotor in range(speeds.shape[1]):
+        others = np.median(np.delete(speeds, rotor, axis=1), axis=1)
         turning = there & (np.nan_to_num(others) > CARRYING * np.quantile(others[there], 0.9))
-        if sent is not None:
-            wanted = np.nan_to_num(held(sent, t)[:, i])
-            lately = maximum_filter1d(wanted, 2 * round(SLOWS_DOWN / period) + 1)
-            turning &= lately > IDLE * wanted.max()
-        stopped = turning & ((speeds[:, i] == 0.0) | _kept(speeds, i, longest))
+        if commands is not None:
+            command = np.nan_to_num(held(commands, t)[:, rotor])
+            largest_lately = maximum_filter1d(command, 2 * round(SLOWS_DOWN / period) + 1)
+            turning &= largest_lately > IDLE * command.max()
+        stopped = turning & ((speeds[:, rotor] == 0.0) | _stuck(speeds, rotor, longest))
         if not stopped.any():
             continue
         row = int(np.argmax(stopped))
         share = np.count_nonzero(stopped) / np.count_nonzero(turning)
         what = (
-            f"{name}: the measured speed of rotor {i + 1} stays at {speeds[row, i]:.4g} rad/s from t = {t[row]:.6g} s "
-            f"on while the others turn at {others[row]:.4g}, in {share:.1%} of the time that they turn"
+            f"{name}: the measured speed of rotor {rotor + 1} stays at {speeds[row, rotor]:.4g} rad/s from "
+            f"t = {t[row]:.6g} s on while the others turn at {others[row]:.4g}, in {share:.1%} of the time that they "
+            "turn"
         )
         if share > MOST_STOPPED:
-            if {"commands", "throttle"} & {*series}:
-                way = ", or name the commands alone"
-            else:
-                way = ""
-            raise InputError(f"{what}: its counter is dead, at most {MOST_STOPPED:.0%} is allowed: mend it{way}")
+            advice = "mend it"
+            if commands is not None:
+                advice = "mend it, or name the commands alone"
+            raise InputError(f"{what}: its counter is dead, at most {MOST_STOPPED:.0%} is allowed: {advice}")
         values[stopped] = np.nan
         notes.append(f"{what}: left out")
     result["speeds"] = Column(t=t, values=values)
     return result, tuple(notes)
 
 
-def _kept(speeds: Array, rotor: int, longest: int) -> NDArray[np.bool_]:
+def _stuck(speeds: Array, rotor: int, longest: int) -> NDArray[np.bool_]:
     """Samples (M,) in which a rotor keeps its speed for long while the others change theirs."""
-    steps = np.abs(np.diff(speeds, axis=0)) <= ROUNDING
-    kept = np.zeros(len(speeds), bool)
-    for run in runs(steps[:, rotor], max(longest, 1)):
-        changing = ~np.delete(steps[run], rotor, axis=1)
+    unchanged = np.abs(np.diff(speeds, axis=0)) <= ROUNDING
+    stuck = np.zeros(len(speeds), bool)
+    for run in runs(unchanged[:, rotor], longest):
+        changing = ~np.delete(unchanged[run], rotor, axis=1)
         if changing.mean() > 0.5:
-            kept[run.start : run.stop + 1] = True
-    return kept
+            stuck[run.start : run.stop + 1] = True
+    return stuck

@@ -1,4 +1,7 @@
-"""PX4's ULog, read by pyulog."""
+"""PX4's ULog, read by pyulog: columns `topic.field` for `record`, and the rotors that its parameters state.
+
+Its axes are front, right, down, those of the world north, east, down.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,6 @@ import numpy as np
 from quadsim.features.identify.border import between, reading, stated_number
 from quadsim.features.identify.quantities import HALF_TURN, LoggedColumns, NamedQuantity, logged_as
 from quadsim.features.identify.series import Column, held, on_one_clock
-from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 
 ULOGS: Final = (".ulg", ".ulog")
@@ -46,7 +48,10 @@ def read_ulog(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
     Raises:
         FileError: a parameter of it says nothing.
     """
-    log = _parsed(path, [*_STATES, *(column.partition(".")[0] for one in (*given, *_NAMES) for column in one.columns)])
+    topics = [*_STATES]
+    for named in (*given, *_NAMES):
+        topics += [column.partition(".")[0] for column in named.columns]
+    log = _parsed(path, topics)
     columns: dict[str, Column] = {}
     notes: list[str] = []
     if log.file_corruption:
@@ -58,15 +63,19 @@ def read_ulog(path: Path, given: Sequence[NamedQuantity]) -> LoggedColumns:
         if stamps is None:
             notes.append(f"{path.name}: {data.name} has no time and is left out")
             continue
-        table = {f"{data.name}.{name}": of for name, of in data.data.items()}
+        table = {f"{data.name}.{field}": values for field, values in data.data.items()}
         columns |= on_one_clock(np.asarray(stamps, float) * 1e-6, table)
-    columns |= {name: Column(of.t, np.abs(of.values)) for name, of in columns.items() if name.endswith("esc_rpm")}
-    if flying := _flying(columns):
+    for name, column in columns.items():
+        if name.endswith("esc_rpm"):
+            columns[name] = Column(column.t, np.abs(column.values))
+    flying = _flying(columns)
+    if flying is not None:
         columns["flying"] = flying
-    names = [*_NAMES]
+    quantities = [*_NAMES]
     if _PULSES.columns[0] in columns and _MOTORS.columns[0] not in columns:
-        names[names.index(_PULSES)] = replace(_PULSES, **_by_pulses(path, log.initial_parameters))
-    return LoggedColumns(columns=columns, quantities=names, advice=_ADVICE, notes=tuple(notes))
+        motors = replace(_PULSES, **_motor_outputs(path, log.initial_parameters))
+        quantities[quantities.index(_PULSES)] = motors
+    return LoggedColumns(columns=columns, quantities=quantities, advice=_ADVICE, notes=tuple(notes))
 
 
 def stated_rotors(path: Path) -> str:
@@ -85,18 +94,20 @@ def stated_rotors(path: Path) -> str:
     if stated_number(path, stated, "CA_ROTOR_COUNT", 0, whole=True) != N_ROTORS:
         return ""
     hubs = []
+    moments = []
     for i in _ROTORS:
         hubs.append([stated_number(path, stated, f"CA_ROTOR{i}_P{axis}", 0.0) for axis in "XYZ"])
-    moments = np.array([stated_number(path, stated, f"CA_ROTOR{i}_KM", 0.05) for i in _ROTORS])
+        moments.append(stated_number(path, stated, f"CA_ROTOR{i}_KM", 0.05))
+    positions = np.round(np.array(hubs) * HALF_TURN, 4) + 0.0  # never -0
     values = {
-        "rotor_positions": ((np.round(np.array(hubs) * HALF_TURN, 4) + 0.0).tolist(), "m"),
+        "rotor_positions": (positions.tolist(), "m"),
         "rotor_spins": ([-1 if moment > 0.0 else 1 for moment in moments], "-"),
         "drag_to_thrust": (round(float(np.abs(moments).mean()), 4), "m"),
     }
-    return "; ".join(
-        f'{name} = {{value = {value}, unit = "{unit}", source = "CA_ROTOR of {path.name}"}}'
-        for name, (value, unit) in values.items()
-    )
+    lines = []
+    for name, (value, unit) in values.items():
+        lines.append(f'{name} = {{value = {value}, unit = "{unit}", source = "CA_ROTOR of {path.name}"}}')
+    return "; ".join(lines)
 
 
 def _parsed(path: Path, topics: Sequence[str]) -> Any:
@@ -108,30 +119,31 @@ def _parsed(path: Path, topics: Sequence[str]) -> Any:
 
 def _flying(columns: Mapping[str, Column]) -> Column | None:
     """Whether it is armed and not landed, as far as the log says so."""
-    states = {"actuator_armed.armed": 1.0, "vehicle_land_detected.landed": 0.0}
-    known = [(columns[name], flying) for name, flying in states.items() if name in columns]
+    flying_states = {"actuator_armed.armed": 1.0, "vehicle_land_detected.landed": 0.0}
+    known = [name for name in flying_states if name in columns]
     if not known:
         return None
-    t = np.unique(np.concatenate([column.t for column, _ in known]))
-    return Column(t, np.prod([held(column, t) == flying for column, flying in known], axis=0).astype(float))
+    t = np.unique(np.concatenate([columns[name].t for name in known]))
+    flying = np.ones(len(t), bool)
+    for name in known:
+        flying &= held(columns[name], t) == flying_states[name]
+    return Column(t, flying.astype(float))
 
 
-def _by_pulses(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
+def _motor_outputs(path: Path, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Which outputs are the motors, and their shortest and longest pulses [us]; a negative one is the common one."""
-    functions: dict[float, int] = {}
+    outputs_by_motor: dict[float, int] = {}
     for i in range(2 * N_ROTORS):
         function = stated_number(path, parameters, f"PWM_MAIN_FUNC{i + 1}", 0, whole=True)
-        functions[function - _FIRST_MOTOR] = i
-    outputs = [functions.get(motor, motor) for motor in _ROTORS]
+        outputs_by_motor[function - _FIRST_MOTOR] = i
+    outputs = [outputs_by_motor.get(motor, motor) for motor in _ROTORS]
 
-    def pulses(end: str, usual: float) -> Array:
-        names = [(f"PWM_MAIN_{end}{i + 1}", f"PWM_MAIN_{end}", f"PWM_{end}") for i in outputs]
-        stated = []
-        for ways in names:
-            stated.append([stated_number(path, parameters, way, -1.0) for way in ways])
-        return np.array([next((pulse for pulse in of if pulse >= 0.0), usual) for of in stated])
+    def pulse(output: int, end: str, usual: float) -> float:
+        names = (f"PWM_MAIN_{end}{output + 1}", f"PWM_MAIN_{end}", f"PWM_{end}")
+        stated = [stated_number(path, parameters, name, -1.0) for name in names]
+        return next((number for number in stated if number >= 0.0), usual)
 
-    low = pulses("MIN", 1000.0)
-    high = pulses("MAX", 2000.0)
-    columns = tuple(f"actuator_outputs.output[{i}]" for i in outputs)
+    low = [pulse(output, "MIN", 1000.0) for output in outputs]
+    high = [pulse(output, "MAX", 2000.0) for output in outputs]
+    columns = tuple(f"actuator_outputs.output[{output}]" for output in outputs)
     return {"columns": columns, **between(path, "pulses of PWM_MAIN", low, high)}

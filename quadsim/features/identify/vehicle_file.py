@@ -1,4 +1,7 @@
-"""The identified vehicle as a file: the start's tables and comments with the identified numbers in their place."""
+"""The identified vehicle as a file: the start's tables and comments with the identified numbers in their place.
+
+Each number's source says its interval, its start and the logs, or why it is the start's; `report` writes the file.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +29,9 @@ def verdict(estimate: ParameterEstimate, vehicle: Vehicle) -> str:
     """Return whether a number is identified, or else why it is not, and what the vehicle has."""
     if not estimate.refused:
         return "identified"
-    if not estimate.in_file or number_in(vehicle, estimate.name) is None:
-        return f"left out: {estimate.refused}"
     number = number_in(vehicle, estimate.name)
+    if number is None or not estimate.in_file:
+        return f"left out: {estimate.refused}"
     if number == estimate.start:
         return f"kept: {estimate.refused}"
     return f"set to {number:.4g}: {estimate.refused}"
@@ -54,14 +57,14 @@ def vehicle_text(identification: Identification, start: Path, logs: Sequence[str
     A value that a gate refuses is the start's, and its source says why; of a vector this is said axis by axis.
     """
     document = tomlkit.parse(start.read_text(encoding="utf-8-sig"))
-    of_field: dict[str, list[ParameterEstimate]] = {}
+    by_field: dict[str, list[ParameterEstimate]] = {}
     for estimate in identification.estimates:
         if estimate.in_file:
-            of_field.setdefault(field_of(estimate.name), []).append(estimate)
+            by_field.setdefault(field_of(estimate.name), []).append(estimate)
     for name in VEHICLE_UNITS:
         if getattr(identification.vehicle, name) is None:  # a map that an identified coefficient replaces
             document.pop(name, None)
-    for name, estimates in of_field.items():
+    for name, estimates in by_field.items():
         value = getattr(identification.vehicle, name)
         if value is None:  # neither the start has it, nor is it identified
             continue
@@ -105,34 +108,33 @@ def factor_text(interval: tuple[float, float]) -> str:
 
 def _value(value: Any, estimates: Sequence[ParameterEstimate]) -> Any:
     """Return a number, or the numbers of a vector, rounded where they are identified."""
+    by_number = [*estimates]
     numbers = np.atleast_1d(value).tolist()
-    if len(estimates) == len(numbers):
-        by_number = estimates
-    else:
+    if len(estimates) < len(numbers):
         by_number = [*estimates] * len(numbers)
-    numbers = [n if e.refused else rounded(n, e) for n, e in zip(numbers, by_number, strict=True)]
+    for i, estimate in enumerate(by_number):
+        if not estimate.refused:
+            numbers[i] = rounded(numbers[i], estimate)
     if isinstance(value, tuple):
         return numbers
     return numbers[0]
 
 
 def _source(vehicle: Vehicle, estimates: Sequence[ParameterEstimate], before: str, logs: Sequence[str]) -> str:
-    """Return where each number is from."""
+    """Return where each number is from; `before` is what the start's file says."""
     parts = []
     for estimate in estimates:
-        if estimate.start is None:
-            start = ""
-        else:
-            start = f"; start {estimate.start:.4g}"
-        if len(estimates) == 1:
-            axis = ""
-        else:
-            axis = f"{estimate.name[-1]} "
-        if estimate.refused:
-            within = ""
-        else:
-            within = f": 95 % within {interval_text(estimate)}{start}"
-        parts.append(f"{axis}{verdict(estimate, vehicle)}{within}")
+        part = verdict(estimate, vehicle)
+        if len(estimates) > 1:
+            part = f"{estimate.name[-1]} {part}"
+        if not estimate.refused:
+            part += f": 95 % within {interval_text(estimate)}"
+            if estimate.start is not None:
+                part += f"; start {estimate.start:.4g}"
+        parts.append(part)
     refused = [bool(estimate.refused) for estimate in estimates]
-    parts += [] if all(refused) else [f"logs {', '.join(logs)}"]
-    return "; ".join(parts + ([before] if any(refused) and before else []))
+    if not all(refused):
+        parts.append(f"logs {', '.join(logs)}")
+    if any(refused) and before:
+        parts.append(before)
+    return "; ".join(parts)

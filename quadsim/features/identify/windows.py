@@ -1,4 +1,7 @@
-"""Rates of change of a log's motion over short windows, against which its columns are checked."""
+"""Rates of change and means of a log's motion over short windows, from which the checks compare its columns.
+
+Over a window of 2 h steps of a period T about sample k, the rate of a signal y is (y_{k+h} - y_{k-h}) / (2 h T).
+"""
 
 from __future__ import annotations
 
@@ -18,13 +21,15 @@ def half_window(period: float, window: float) -> int:
 def rate_over_window(values: Array, period: float, window: float) -> Array:
     """Rate of change (N, n) over a window [s] about each sample; near the ends, that of the nearest whole window."""
     half = half_window(period, window)
-    return _padded((values[2 * half :] - values[: -2 * half]) / (2 * half * period), half)
+    change = values[2 * half :] - values[: -2 * half]
+    return _padded(change / (2 * half * period), half)
 
 
-def mean(values: Array, period: float, window: float) -> Array:
+def mean_over_window(values: Array, period: float, window: float) -> Array:
     """Mean (N, n) over a window [s] about each sample, as `rate_over_window` of their integral; so at the ends."""
     half = half_window(period, window)
-    inner = uniform_filter1d(0.5 * (values[1:] + values[:-1]), 2 * half, axis=0)  # of steps k - half .. k + half - 1
+    steps = 0.5 * (values[1:] + values[:-1])
+    inner = uniform_filter1d(steps, 2 * half, axis=0)  # of steps k - half .. k + half - 1
     return _padded(inner[half : len(inner) - half + 1], half)
 
 
@@ -38,13 +43,22 @@ def turn_rate(quaternion: Array, period: float, window: float) -> Array:
 
 def body_z(quaternion: Array) -> Array:
     """Thrust axis (N, 3) in the world of attitudes (N, 4), body to world."""
-    return np.asarray(Rotation.from_quat(quaternion, scalar_first=True).apply([0.0, 0.0, 1.0]))
+    attitude = Rotation.from_quat(quaternion, scalar_first=True)
+    return np.asarray(attitude.apply([0.0, 0.0, 1.0]))
+
+
+def load_factor(acceleration: Array, quaternion: Array, gravity: float) -> Array:
+    """Specific force (N,) along the thrust axis over gravity: 1 in hover; acceleration (N, 3) in the world [m/s^2]."""
+    specific_force = acceleration + np.array([0.0, 0.0, gravity])
+    along_thrust = (specific_force * body_z(quaternion)).sum(axis=1)
+    return np.asarray(along_thrust / gravity)
 
 
 def to_world(quaternion: Array, vectors: Array) -> Array:
     """Body vectors (N, 3) in the world."""
     pure = np.concatenate([np.zeros((len(vectors), 1)), vectors], axis=1)
-    return np.asarray(multiply(multiply(quaternion, pure), conjugate(quaternion)))[:, 1:]
+    turned = multiply(multiply(quaternion, pure), conjugate(quaternion))
+    return np.asarray(turned)[:, 1:]
 
 
 def _padded(inner: Array, half: int) -> Array:

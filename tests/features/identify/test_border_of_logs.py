@@ -21,7 +21,7 @@ from quadsim.features.identify.quantities import read_map
 from quadsim.features.identify.record import read_record
 from quadsim.features.identify.report import identify_logs
 from quadsim.features.identify.rotors import lagging
-from quadsim.features.identify.search import Sought
+from quadsim.features.identify.search import FreeParameter
 from quadsim.flight.parquet import write_log as write_run
 from quadsim.rollout.flown import Flight
 from quadsim.scenarios.catalogue import scenario_names
@@ -300,7 +300,7 @@ def test_rotors_without_lag_have_their_commands_at_once() -> None:
 
 
 def test_a_number_that_is_sought_stays_within_what_a_vehicle_may_have() -> None:
-    lag = Sought("rotor_rise", 0.03, None, 1.5)
+    lag = FreeParameter("rotor_rise", 0.03, None, 1.5)
     assert lag.value(0.0) == 0.03
     assert lag.value(-1e4) == pytest.approx(1e-6)
     assert lag.value(1e4) == pytest.approx(1e6)

@@ -13,7 +13,9 @@ from scipy.signal import lfilter
 import quadsim
 from quadsim.errors import InputError
 from quadsim.features.identify.estimate import Identification, ParameterEstimate
-from quadsim.features.identify.fit import MOST_COLOUR, _Fit, identify_records
+from quadsim.features.identify.fit import identify_records
+from quadsim.features.identify.intervals import MAX_AUTOCORRELATION
+from quadsim.features.identify.judgement import JudgedFit
 from quadsim.features.identify.model import stretch
 from quadsim.features.identify.prediction import predict
 from quadsim.features.identify.record import Record, to_record
@@ -214,18 +216,18 @@ def test_the_gate_judges_the_final_interval() -> None:
     record = record_of(flown())
     search = Search([stretch(record, 0)], START, wind=False)
     search.run()
-    fit = _Fit(search, {})
-    assert not fit.estimates["inertia_x"].refused
-    assert fit.refuse_what_moved(search) == {}
+    judgement = JudgedFit(search, {})
+    assert not judgement.estimates["inertia_x"].refused
+    assert judgement.refuse_moved(search) == {}
     moved = Search(search.parts, START, wind=False)
     moved.adopt(search)
-    moved.x[[number.name for number in search.sought].index("inertia_x")] += 0.4
-    held = fit.refuse_what_moved(moved)
+    moved.x[[number.name for number in search.free].index("inertia_x")] += 0.4
+    held = judgement.refuse_moved(moved)
     assert "inertia_x" not in held  # the log speaks against the start's
-    refused = fit.estimates["inertia_x"]
+    refused = judgement.estimates["inertia_x"]
     assert refused.refused.startswith("not excited: the interval is +-")
     assert refused.advice
-    assert refused.low < search.sought[1].value(search.x[1]) < refused.high
+    assert refused.low < search.free[1].value(search.x[1]) < refused.high
 
 
 @pytest.mark.parametrize("late", [1, -1])
@@ -348,7 +350,7 @@ def test_noise_that_is_not_modelled_widens_the_interval() -> None:
     ringing_width, width = (
         known["inertia_x"].high - known["inertia_x"].low for known in map(by_name, (found, of_the_eight()))
     )
-    assert found.whiteness["roll"] > MOST_COLOUR > of_the_eight().whiteness["roll"]
+    assert found.whiteness["roll"] > MAX_AUTOCORRELATION > of_the_eight().whiteness["roll"]
     assert ringing_width > width
 
 

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError
 from quadsim.features.identify.checks import LOG_CHECKS, ROW_CHECKS, check_log, spans
-from quadsim.features.identify.fit import deviation_between, identify_records
+from quadsim.features.identify.fit import identify_records
+from quadsim.features.identify.intervals import deviation_between
 from quadsim.features.identify.record import Record, read_record, to_record
 from quadsim.features.identify.rotors import lagging
 from quadsim.features.identify.sensors import without_spikes
