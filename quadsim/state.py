@@ -200,7 +200,7 @@ def follow_turns(references: Array, yaws: Array, firsts: Array) -> Array:
     return moved
 
 
-class YawTurns:
+class YawUnwrapper:
     """Counts a yaw's whole turns, sample by sample.
 
     Past the vertical, Euler's yaw turns by 180 deg either way: upside down it is unwrapped to the last one, and upright

@@ -68,7 +68,7 @@ class Reference(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rows:
+class KnownReference:
     """A reference known from the start: `values` (K + N, 4), row k at t_k."""
 
     values: Array
@@ -160,7 +160,7 @@ class ClosedLoop:
         self._navigation = navigation
         self._ground = ground
         self._turns = ReferenceTurns()
-        self.course: Reference = Rows(values=reference) if isinstance(reference, np.ndarray) else reference
+        self.course: Reference = KnownReference(values=reference) if isinstance(reference, np.ndarray) else reference
         self._steps = steps_per_period
         self._loss = loss
         self.quaternions = quaternions

@@ -24,7 +24,7 @@ from quadsim.sim.estimator import (
 )
 from quadsim.sim.physics import PHYSICS, PhysicsSteps, physics_to_state
 from quadsim.sim.sensing import KINDS, MEASURED, Sampler, Sensor, SensorFault, SensorName, truth
-from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
+from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, VELOCITIES, Array, YawUnwrapper
 from quadsim.vehicle import Vehicle
 
 _AHEAD: Final = 2000
@@ -103,7 +103,7 @@ class Navigation:
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
         """Restart at MuJoCo's state (14,) and rotor speeds [rad/s] with the same draws; yaw is near `yaw` [rad]."""
         self._step = 0
-        self._yaw = YawTurns(yaw)
+        self._yaw = YawUnwrapper(yaw)
         self._physics = physics.copy()
         self._prepared = 0  # physics steps for whose samples there is room
         self.attitude: tuple[Array, Array] = physics[PHYSICS["attitude"]].copy(), physics[PHYSICS["body_rates"]].copy()

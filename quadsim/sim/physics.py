@@ -94,7 +94,7 @@ def steps_type(*, wrench: bool = False, wind: bool = False, battery: bool = Fals
 def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
     """Convert MuJoCo's states to the paper's states (M, 12).
 
-    They have Euler-angle rates (Sec.  2.2 uses body rates), and a yaw unwrapped along the rows as by `YawTurns`.
+    They have Euler-angle rates (Sec.  2.2 uses body rates), and a yaw unwrapped along the rows as by `YawUnwrapper`.
 
     Args:
         physics: (M, 14) time, position (world), quaternion wxyz, velocity (world), angular rates (body).

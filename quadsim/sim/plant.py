@@ -29,7 +29,7 @@ from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator, PhysicsSteps, physics_to_state, steps_type
 from quadsim.space import Obstacle
-from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
+from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOCITIES, Array, YawUnwrapper
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 _FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
@@ -107,7 +107,7 @@ class Plant:
             self._speed_range = (vehicle.speed_min, vehicle.speed_max)
         else:
             self._speed_range = (0.0, math.inf)
-        self._yaw = YawTurns(0.0)
+        self._yaw = YawUnwrapper(0.0)
         self._wind = wind
         self._own = tuple(forces)
         self._integrator = integrator
@@ -218,7 +218,7 @@ class Plant:
         if state.shape != (N_STATES,) or not np.all(np.isfinite(state)):
             raise ParameterError("plant", "state", state.tolist(), f"{N_STATES} finite numbers")
         motion = self._motion_of(state)
-        self._yaw = YawTurns(float(state[EULER[2]]))
+        self._yaw = YawUnwrapper(float(state[EULER[2]]))
         self._pending = deque(self._changes)
         self._rotors = self.effects.rotors or RotorDynamics()
         self._efficiency = np.array(self._rotors.efficiency)

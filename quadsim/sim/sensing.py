@@ -134,10 +134,10 @@ class SensorFault:
         return first, math.ceil(self.stop / timestep - 1e-6) if math.isfinite(self.stop) else None
 
 
-Flags = NDArray[np.bool_]
+SampleFlags = NDArray[np.bool_]
 Fates = NDArray[np.uint8]
 """What befalls samples: sums of `Fate`s."""
-Steps = NDArray[np.int64]
+PhysicsSteps = NDArray[np.int64]
 
 
 MEASURED: Final = {name: PHYSICS["body_rates" if name is SensorName.RATES else name.value] for name in SensorName}
@@ -248,6 +248,6 @@ class Sampler:
         return noise
 
 
-def _within(taken: Steps, window: tuple[int, int | None]) -> Flags:
+def _within(taken: PhysicsSteps, window: tuple[int, int | None]) -> SampleFlags:
     start, stop = window
     return (taken >= start) & ((taken < stop) if stop is not None else True)

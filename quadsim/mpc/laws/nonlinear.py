@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 
 from quadsim import shorthands
-from quadsim.controller import ATTITUDE, ROTORS, Controller
+from quadsim.controller import ROTORS, Controller
 from quadsim.core.mirror import constant
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Seconds, Weight
@@ -21,10 +21,8 @@ from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws import register
-from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement, require_one_scale
 from quadsim.mpc.problem.constraints import Constraint, Soft, origin_of_state, selection
-from quadsim.mpc.problem.model import LinearModel, hover_model, target_model
 from quadsim.mpc.problem.polytope import Polytope, rows_of
 from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.problem.rigidbody import RATE_SCALE
@@ -36,10 +34,9 @@ from quadsim.mpc.tables.commands import (
     Rates,
     RotorBounds,
     TargetBounds,
-    attitude_targets,
     require_space,
 )
-from quadsim.mpc.tables.controller import ControllerTable, Horizon, KktEvery, Range, ranges, require_ordered
+from quadsim.mpc.tables.controller import Horizon, KktEvery, Range, ranges, require_ordered
 from quadsim.mpc.tables.lags import (
     ATTITUDE_LAG,
     INNER_LAG,
@@ -51,6 +48,7 @@ from quadsim.mpc.tables.lags import (
     require_lag,
     require_lags,
 )
+from quadsim.mpc.tables.targets import TargetTable
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
@@ -109,7 +107,7 @@ def _three(weight: AxisWeights) -> Array:
     place=4,
 )
 @dataclass(frozen=True, kw_only=True)
-class Nonlinear(ControllerTable):
+class Nonlinear(TargetTable):
     """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period."""
 
     any_attitude: ClassVar = True
@@ -225,12 +223,7 @@ class Nonlinear(ControllerTable):
             "input_bounds": VEHICLES_SPEEDS,
         }
         require_space(self, of_rotors)
-        speeds = []
-        for polytope in self.polytopes:
-            if any("speed_" in name for name in polytope.of):
-                speeds.append(polytope.name)
-        if speeds and self.commands != ROTORS:
-            raise ValueError(f'polytopes must be without rotor speeds where commands = "{self.commands}"; got {speeds}')
+        self._require_polytopes_without_speeds()
         if self.inputs == "thrust" and self.input_bounds.slew is not None:
             raise ValueError(
                 'input_bounds.slew must be absent where inputs = "thrust", in which steps of speeds are not linear: '
@@ -253,21 +246,6 @@ class Nonlinear(ControllerTable):
             kkt_every=self.kkt_every,
         )
         return law
-
-    @property
-    def turns_by_attitude(self) -> bool:
-        """See `quadsim.mpc.tables.controller.ControllerTable.turns_by_attitude`."""
-        return self.commands == ATTITUDE
-
-    def attitudes(self) -> AttitudeTargets | None:
-        """See `quadsim.mpc.tables.controller.ControllerTable.attitudes`."""
-        return attitude_targets(self)
-
-    def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
-        """See `quadsim.mpc.tables.controller.ControllerTable.level_hover`."""
-        if self.commands == ROTORS:
-            return hover_model(vehicle, period)
-        return target_model(vehicle, period, require_lags(self.inner_lag), self.attitude_lag)
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""

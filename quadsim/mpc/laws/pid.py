@@ -39,7 +39,7 @@ it to yaw."""
 
 
 YAW_WEIGHT: Final = 0.4  # share of the heading error corrected while turning the thrust; PX4's MC_YAW_WEIGHT
-LARGEST_RATES: Final = (220.0, 220.0, 200.0)  # body rates commanded [deg/s]; PX4's MC_ROLLRATE_MAX
+LARGEST_BODY_RATES: Final = (220.0, 220.0, 200.0)  # body rates commanded [deg/s]; PX4's MC_ROLLRATE_MAX
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,7 +191,7 @@ class CascadedPID(FeedbackLaw):
     def _desired_rates(self, motion: Measured, force: Array, target: Target) -> Array:
         """Return the body rates (3,) [rad/s] that the attitude loop demands."""
         k = self.gains.bandwidths
-        limit = np.radians(LARGEST_RATES)
+        limit = np.radians(LARGEST_BODY_RATES)
         error = prioritised_error(motion.attitude, attitude_for(force, target.yaw), YAW_WEIGHT)
         heading = motion.attitude[2] * target.yaw_rate  # a rotation about world z, in body axes
         return np.clip(np.array([k.attitude, k.attitude, k.yaw]) * error + heading, -limit, limit)

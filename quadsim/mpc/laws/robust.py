@@ -11,16 +11,15 @@ import numpy as np
 from annotated_types import Gt, Le, doc
 
 from quadsim import shorthands
-from quadsim.controller import ATTITUDE, CORE, ROTORS
+from quadsim.controller import CORE, ROTORS
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
 from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws import register
-from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.problem.constraints import Constraint, Origin, Soft, origin_of_state
-from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model, target_model
+from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model
 from quadsim.mpc.problem.ocp import Objective, Problem, lqr_terminal_weight, objective_of
 from quadsim.mpc.problem.tightening import TighteningSettings, margins, position_margins
 from quadsim.mpc.space import Shape, Space
@@ -33,7 +32,6 @@ from quadsim.mpc.tables.commands import (
     InputWeights,
     TargetBounds,
     TargetWeights,
-    attitude_targets,
     require_targets,
 )
 from quadsim.mpc.tables.controller import Range, ranges
@@ -46,9 +44,9 @@ from quadsim.mpc.tables.lags import (
     LagSeconds,
     require_attitude_lag,
     require_lag,
-    require_lags,
     resolved_lag,
 )
+from quadsim.mpc.tables.targets import TargetTable
 from quadsim.state import INDEX, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -66,7 +64,7 @@ TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that depend o
     place=3,
 )
 @dataclass(frozen=True, kw_only=True)
-class Robust(Bounded):
+class Robust(TargetTable, Bounded):
     """The robust MPC: soft bounds, rotor lag, delay, disturbances, heading and more, each switched on separately."""
 
     type: Annotated[Literal["robust"], doc("the control law, by its name in `quadsim list`")] = "robust"
@@ -154,28 +152,7 @@ class Robust(Bounded):
             if value is not None:
                 reason = "the autopilot turns the rotors; inner_lag, target_weights and target_bounds describe it"
                 raise ValueError(f'{name} must be absent where commands = "{self.commands}": {reason}')
-        speeds = []
-        for polytope in self.polytopes:
-            if any("speed_" in name for name in polytope.of):
-                speeds.append(polytope.name)
-        if speeds:
-            rule = f'without rotor speeds where commands = "{self.commands}"'
-            raise ValueError(f"polytopes must be {rule}; got {speeds}")
-
-    @property
-    def turns_by_attitude(self) -> bool:
-        """See `quadsim.mpc.tables.controller.ControllerTable.turns_by_attitude`."""
-        return self.commands == ATTITUDE
-
-    def attitudes(self) -> AttitudeTargets | None:
-        """See `quadsim.mpc.tables.controller.ControllerTable.attitudes`."""
-        return attitude_targets(self)
-
-    def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
-        """See `quadsim.mpc.tables.controller.ControllerTable.level_hover`."""
-        if self.commands == ROTORS:
-            return hover_model(vehicle, period)
-        return target_model(vehicle, period, require_lags(self.inner_lag), self.attitude_lag)
+        self._require_polytopes_without_speeds()
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""

@@ -15,10 +15,8 @@ from quadsim.errors import ParameterError
 from quadsim.fields import Pair, Positive, Weight
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.pilot.allocation import thrust_to_command
-from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.mpc.tables.controller import Range, require_ordered
-from quadsim.mpc.tables.lags import require_attitude_lag
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 COMMANDS: Final = (
@@ -156,13 +154,6 @@ def require_targets(table: Any) -> None:
     if table.commands != ATTITUDE and table.attitude_lag is not None:
         reason = "no attitude is commanded, behind which this is the lag"
         raise ValueError(f'attitude_lag must be absent where commands = "{table.commands}": {reason}')
-
-
-def attitude_targets(table: Any) -> AttitudeTargets | None:
-    """Return what makes attitudes of the body rates of a table's law; None where it commands none so."""
-    if not table.turns_by_attitude:
-        return None
-    return AttitudeTargets(require_attitude_lag(table.attitude_lag))
 
 
 def require_space(table: Any, of_rotors: Mapping[str, object]) -> None:
