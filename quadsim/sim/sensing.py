@@ -137,7 +137,7 @@ class SensorFault:
 SampleFlags = NDArray[np.bool_]
 Fates = NDArray[np.uint8]
 """What befalls samples: sums of `Fate`s."""
-PhysicsSteps = NDArray[np.int64]
+StepIndices = NDArray[np.int64]
 
 
 MEASURED: Final = {name: PHYSICS["body_rates" if name is SensorName.RATES else name.value] for name in SensorName}
@@ -248,6 +248,6 @@ class Sampler:
         return noise
 
 
-def _within(taken: PhysicsSteps, window: tuple[int, int | None]) -> SampleFlags:
+def _within(taken: StepIndices, window: tuple[int, int | None]) -> SampleFlags:
     start, stop = window
     return (taken >= start) & ((taken < stop) if stop is not None else True)

@@ -104,15 +104,10 @@ def solver_entries() -> dict[str, SolverEntry]:
         return entries
     from qpsolvers import available_solvers  # imports every installed solver
 
-    others = sorted({*available_solvers} - {*entries, *ALIASES})
-    return entries | {
-        name: SolverEntry(
-            description=f"{name} through qpsolvers, condensed, set up anew in each period",
-            package="qpsolvers",
-            extra="solvers",
-        )
-        for name in others
-    }
+    for name in sorted({*available_solvers} - {*entries, *ALIASES}):
+        description = f"{name} through qpsolvers, condensed, set up anew in each period"
+        entries[name] = SolverEntry(description=description, package="qpsolvers", extra="solvers")
+    return entries
 
 
 def make_backend(name: str) -> Backend:
