@@ -138,7 +138,8 @@ class RampObserver:
         # What C reads in an update, and what it writes.
         self._measured = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(N_ROTORS)
         self._foreseen = np.zeros((3, 3))
-        self._addresses = [array.ctypes.data for array in (*self._measured, *self._foreseen)]
+        arrays = (*self._measured, *self._foreseen)
+        self._addresses = [array.ctypes.data for array in arrays]
         self.reset(vehicle.mass * vehicle.gravity if self.numbers.targets else vehicle.hover_speeds)
 
     def bind(self, state: Struct) -> None:

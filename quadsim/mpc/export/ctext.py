@@ -50,10 +50,19 @@ class CText:
 
     def array(self, name: str, values: Array) -> str:
         """Return a constant array of bytes or numbers, row by row; an empty one gets a single zero."""
-        kind = _KINDS.get(values.dtype, "quadsim_real")
-        text = str if values.dtype in _KINDS else self.number
-        entries = ", ".join(map(text, values.ravel().tolist() or [0]))
-        return self._array(kind, name, values.size, textwrap.wrap(entries, 116, break_on_hyphens=False))
+        numbers = values.ravel().tolist() or [0]
+        if values.dtype in _KINDS:
+            kind = _KINDS[values.dtype]
+            entries = map(str, numbers)
+        else:
+            kind = "quadsim_real"
+            entries = map(self.number, numbers)
+        lines = textwrap.wrap(", ".join(entries), 116, break_on_hyphens=False)
+        return self._array(kind, name, values.size, lines)
+
+    def values(self, values: Mapping[str, Any]) -> dict[str, str]:
+        """Return initialisers of integers, numbers and arrays of these, by names of members."""
+        return {name: self.value(value) for name, value in values.items()}
 
     def struct(self, kind: str, name: str, **members: str) -> str:
         """A constant struct, by names of members."""
@@ -75,15 +84,19 @@ class CText:
                 initialisers[name] = (pointers or {}).get(name, "NULL")
             else:
                 value = others.get(name, getattr(struct, name))
-                if isinstance(value, ctypes.Array | float):
+                if isinstance(value, ctypes.Array):
                     value = np.clip(np.array(value, float), -NO_BOUND, NO_BOUND)
-                    value = value if value.ndim else value.item()
+                elif isinstance(value, float):
+                    value = np.clip(np.array(value, float), -NO_BOUND, NO_BOUND).item()
                 initialisers[name] = self.value(value)
         return initialisers
 
     def structs(self, kind: str, name: str, structs: Iterable[Struct]) -> str:
         """Return a constant array of structs without pointers, that Python mirrors."""
-        lines = ["{" + ", ".join(self.mirrored(struct).values()) + "}," for struct in structs]
+        lines = []
+        for struct in structs:
+            initialisers = ", ".join(self.mirrored(struct).values())
+            lines.append("{" + initialisers + "},")
         return self._array(kind, name, len(lines), lines or ["{0}"])
 
     def members(self, values: Mapping[str, Any], suffix: str = "") -> tuple[list[str], dict[str, str]]:
@@ -93,11 +106,11 @@ class CText:
         for name, value in values.items():
             initialisers[name] = f"{self.prefix}{name}{suffix}"
             if isinstance(value, list):
-                parts = [self.members(part, f"_{i}") for i, part in enumerate(value)]
-                blocks += [block for inner, _ in parts for block in inner]
                 entries = []
-                for _, part in parts:
-                    entries.append("{" + ", ".join(f".{k} = {v}" for k, v in part.items()) + "}")
+                for i, part in enumerate(value):
+                    inner_blocks, inner = self.members(part, f"_{i}")
+                    blocks += inner_blocks
+                    entries.append("{" + ", ".join(f".{member} = {text}" for member, text in inner.items()) + "}")
                 lines = ",\n".join(entries or ["{0}"]).splitlines()
                 blocks.append(self._array(ENTRIES[name].__name__, name, len(value), lines))
             elif isinstance(value, np.ndarray):

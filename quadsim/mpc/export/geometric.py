@@ -56,9 +56,9 @@ class CGeometric(CFollower):
         settings = USUAL_FALLBACK.within({})
         fallback = fallback_numbers(law.model, law.bounds, settings)
         blocks = [text.array(name, array) for name, array in law.pointed.items()]
-        values = {name: text.value(value) for name, value in fallback.items()}
-        blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **values))
-        addresses = {name: f"{prefix}{name}" for name in law.pointed} | {"fallback": f"&{prefix}fallback"}
+        blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **text.values(fallback)))
+        addresses = {name: f"{prefix}{name}" for name in law.pointed}
+        addresses["fallback"] = f"&{prefix}fallback"
         if law.delay is not None:
             blocks += self.delay_blocks(text, law.delay, law.delay_bodies)
             addresses["delay"] = f"&{prefix}delay"

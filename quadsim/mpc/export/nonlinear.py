@@ -71,7 +71,9 @@ class CNonlinear(CFollower):
     @property
     def tolerances(self) -> tuple[str, str]:
         """See `CSource`; of thrust [N] and rates [rad/s] as well."""
-        return "1e-9", "2.0" if self.commands == ROTORS else "0.05"
+        if self.commands == ROTORS:
+            return "1e-9", "2.0"
+        return "1e-9", "0.05"
 
     @property
     def defines(self) -> str:
@@ -83,8 +85,10 @@ class CNonlinear(CFollower):
     def rows(self) -> int:
         """See `CSource`."""
         program = self.law.program
-        usual = max(FEWEST_ROWS, math.ceil(ROWS_PER_NODE * program.struct.horizon))
-        return min(program.most_rows, usual if self.asked is None else self.asked)
+        rows = self.asked
+        if rows is None:
+            rows = max(FEWEST_ROWS, math.ceil(ROWS_PER_NODE * program.struct.horizon))
+        return min(program.most_rows, rows)
 
     @property
     def reals(self) -> int:
@@ -112,14 +116,18 @@ class CNonlinear(CFollower):
         blocks = []
         pointers = {"terms": f"{prefix}terms"}
         for name, array in program.pointed.items():
-            blocks.append(text.array(name, np.clip(array, -NO_BOUND, NO_BOUND) if array.dtype == np.double else array))
+            if array.dtype == np.double:
+                array = np.clip(array, -NO_BOUND, NO_BOUND)
+            blocks.append(text.array(name, array))
             pointers[name] = f"{prefix}{name}"
-        blocks.append(text.structs("quadsim_nmpc_term", "terms", program.terms if program.struct.rows else ()))
+        terms = ()
+        if program.struct.rows:
+            terms = program.terms
+        blocks.append(text.structs("quadsim_nmpc_term", "terms", terms))
         members = text.mirrored(program.struct, pointers, room=self.rows + 1, changes=CHANGES)
         blocks.append(text.struct("quadsim_nmpc_problem", f"{prefix}problem", **members))
         blocks += self.body_blocks(text, law.bodies)
-        values = {name: text.value(value) for name, value in fallback.items()}
-        blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **values))
+        blocks.append(text.struct("quadsim_fallback", f"{prefix}fallback", **text.values(fallback)))
         addresses = {name: f"&{prefix}{name}" for name in ("problem", *law.bodies, "fallback")}
         if law.delay is not None:
             blocks += self.delay_blocks(text, law.delay, law.delay_bodies)

@@ -126,10 +126,13 @@ class CSource(abc.ABC):
     @cached_property
     def files(self) -> dict[str, str]:
         """Its C files, by name."""
-        body = {}
+        files = {}
+        for name in self.law_files:
+            files[name] = part(name, "quadsim.mpc")
         for name in BODY_FILES:
-            body[name] = (resources.files("quadsim.core") / name).read_text(encoding="utf-8")
-        return {name: part(name, "quadsim.mpc") for name in self.law_files} | body | {DATA: self.filled(part(DATA))}
+            files[name] = (resources.files("quadsim.core") / name).read_text(encoding="utf-8")
+        files[DATA] = self.filled(part(DATA))
+        return files
 
     @property
     def defines(self) -> str:
@@ -141,19 +144,29 @@ class CSource(abc.ABC):
     @property
     def objects(self) -> str:
         """Its object files, as the Makefile lists them."""
-        return " ".join(sorted(name.replace(".c", ".o") for name in self.law_files if name.endswith(".c")))
+        objects = []
+        for name in self.law_files:
+            if name.endswith(".c"):
+                objects.append(name.replace(".c", ".o"))
+        return " ".join(sorted(objects))
 
     def filled(self, template: str) -> str:
         """Fill in the names between @ of a C file."""
         count, width, what = self.reference
         name = self.law_name
-        ints = self.ints
         fits = f"{name}_reals(&QUADSIM_CONTROLLER) == QUADSIM_MEMORY"
+        declaration = ""
+        argument = ""
+        if self.ints:
+            fits = f"{fits} && {name}_ints(&QUADSIM_CONTROLLER) == {self.ints}"
+            declaration = f"    int ints[{self.ints}];\n"
+            argument = ", memory->ints"
+        double_precision = self.precision == "double"
         values = {
             "LAW": name,
             "TITLE": self.title,
             "PERIOD": f"{self.period:g}",
-            "IFN": "ifdef" if self.precision == "double" else "ifndef",
+            "IFN": "ifdef" if double_precision else "ifndef",
             "PRECISION": self.precision,
             "HORIZON": self.horizon,
             "STATE": self.state,
@@ -161,9 +174,9 @@ class CSource(abc.ABC):
             "ROW": width,
             "REFERENCE": what,
             "MEMORY": self.reals,
-            "INTS": f"    int ints[{ints}];\n" if ints else "",
-            "MORE": ", memory->ints" if ints else "",
-            "FITS": f"{fits} && {name}_ints(&QUADSIM_CONTROLLER) == {ints}" if ints else fits,
+            "INTS": declaration,
+            "MORE": argument,
+            "FITS": fits,
             "PLAN": self.plan,
             "CHANGES": self.changes,
             "DOUBLE_TOLERANCE": self.tolerances[0],
@@ -212,8 +225,10 @@ class CController(CSource):
     @property
     def rows(self) -> int:
         """See `CSource`."""
-        usual = max(LEAST_ROWS, math.ceil(ROWS_PER_STEP * self.horizon))
-        return min(self.horizon * len(self.tables.rows), usual if self.asked is None else self.asked)
+        rows = self.asked
+        if rows is None:
+            rows = max(LEAST_ROWS, math.ceil(ROWS_PER_STEP * self.horizon))
+        return min(self.horizon * len(self.tables.rows), rows)
 
     @property
     def reals(self) -> int:
@@ -225,12 +240,10 @@ class CController(CSource):
         packed = 4 * room + 3 * rows  # bytes of integers
         widest = max(len(axis.B) for axis in self.tables.axes)
         work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + room * (room - 1) // 2
-        settings = self.law.settings
-        period = self.law.problem.model.period
-        if settings is None:
-            sent = 0
-        else:
-            sent = N_ROTORS * split_delay(settings.delay, period)[0]
+        sent = 0
+        if self.law.settings is not None:
+            whole_periods, _ = split_delay(self.law.settings.delay, self.law.problem.model.period)
+            sent = N_ROTORS * whole_periods
         return work + packed // self.real_bytes + 1 + N * (len(problem.objective.C_r) + N_ROTORS) + sent
 
     def numbers(self, text: CText) -> list[str]:
@@ -250,18 +263,16 @@ def _controller(text: CText, law: Exportable, bounds: ActuatorBounds | None) -> 
     problem = law.problem
     robust = "NULL"
     model = hover_model(law.vehicle, problem.model.period)
-    members = fallback_numbers(model, bounds, law.fallback)
-    fallback = {name: text.value(value) for name, value in members.items()}
+    fallback = text.values(fallback_numbers(model, bounds, law.fallback))
     blocks = [text.struct("quadsim_fallback", f"{text.prefix}fallback", **fallback)]
     if law.settings is not None:
-        numbers = robust_numbers(law.settings, law.vehicle, problem.model.period)
-        values = {name: text.value(value) for name, value in numbers.items()}
-        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **values))
+        numbers = text.values(robust_numbers(law.settings, law.vehicle, problem.model.period))
+        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **numbers))
         robust = f"&{text.prefix}robust"
     addresses = {
         "problem": f"&{text.prefix}problem",
         "robust": robust,
         "fallback": f"&{text.prefix}fallback",
     }
-    limits = {name: text.value(value) for name, value in controller_numbers(problem).items()}
+    limits = text.values(controller_numbers(problem))
     return [*blocks, text.struct("quadsim_controller", "QUADSIM_CONTROLLER", **addresses, **limits)]

@@ -141,7 +141,9 @@ class Guard:
         plan = self._kept
         if code == _CALLED:
             status, answer = self._call(law, now, reference)
-            code = _LOST if status == STATUSES[_LOST] else _FAILED
+            code = _FAILED
+            if status == STATUSES[_LOST]:
+                code = _LOST
         if answer is not None and status in ACCEPTED:
             plan = _plan_of(answer)
             code = self._library.quadsim_guard_check(self._struct, _ANSWERED, plan.ctypes.data)
@@ -189,14 +191,18 @@ class Guard:
     def _trim_of(self, law: Controller) -> object:
         if law is not self._law:  # asked once: a runtime protocol takes as long as ten array operations
             self._law = law
-            self._trimmed = law if isinstance(law, Trimmed) else None
+            self._trimmed = None
+            if isinstance(law, Trimmed):
+                self._trimmed = law
         if self._trimmed is None:
             return None
         return self._trimmed.trim
 
     def predict(self, law: Controller, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Predicting`; by the hover model where the law cannot."""
-        predicted = _tried(lambda: law.predict(states, plans) if isinstance(law, Predicting) else None)
+        predicted = None
+        if isinstance(law, Predicting):
+            predicted = _tried(lambda: law.predict(states, plans))
         if isinstance(predicted, np.ndarray) and predicted.shape == (*plans.shape[:2], N_STATES):
             return predicted
         trim = self.trim(law)
@@ -238,10 +244,10 @@ class Guard:
         answer: Command | Exception = _tried(lambda: law.step(completed, known.copy(), reference))
         if isinstance(answer, Exception):  # e.g. `PlanExhaustedError` as `plan_exhausted_error`
             return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(answer).__name__).lower(), None
-        if answer.status in ACCEPTED and (
-            np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (law.horizon, N_ROTORS)
-        ):
-            return "wrong_shape", answer
+        if answer.status in ACCEPTED:
+            shaped = np.shape(answer.speeds) == (N_ROTORS,) and np.shape(answer.plan) == (law.horizon, N_ROTORS)
+            if not shaped:
+                return "wrong_shape", answer
         return answer.status, answer
 
     def _end(self, law: Controller, phase: Phase, code: int, answered: Array) -> Array:
@@ -275,9 +281,12 @@ def completed_inputs(now: StepInputs, acting: Array, unseen: Array, known: Array
     Attitude and body rates are omitted where those of the state are predicted.  Near a pitch of 90 deg, Euler rates are
     implausibly large, but body rates are not.
     """
-    attitude = None if unseen[ANGLES].any() else now.attitude
-    turned = unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT
-    rates = None if turned else now.body_rates
+    attitude = now.attitude
+    rates = now.body_rates
+    if unseen[ANGLES].any():
+        attitude = None
+    if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
+        rates = None
     return StepInputs(  # `replace` takes five times as long, in every period
         time=now.time,
         phase=now.phase,

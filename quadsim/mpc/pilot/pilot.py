@@ -65,7 +65,9 @@ class Pilot:
         self.inner = inner
         self.attitudes = attitudes
         self.takes_targets = takes_targets(inner)
-        self.rate = 0.0 if inner is None else inner.rate
+        self.rate = 0.0
+        if inner is not None:
+            self.rate = inner.rate
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._slowest = np.full(4, vehicle.speed_min)
         # the target in force; whether the autopilot is to be reset
@@ -139,14 +141,13 @@ class Pilot:
 
     def adopt(self, previous: object) -> None:
         """Take over what the previous pilot's law, contract and inner loop know; a vehicle has one autopilot."""
-        if isinstance(previous, Pilot):
-            before = previous
-        else:
-            before = None
-        if isinstance(self.law, Adopting):
-            self.law.adopt(previous if before is None else before.law)
-        if before is None:
+        if not isinstance(previous, Pilot):
+            if isinstance(self.law, Adopting):
+                self.law.adopt(previous)
             return
+        before = previous
+        if isinstance(self.law, Adopting):
+            self.law.adopt(before.law)
         if self.guard is not None and before.guard is not None:
             self.guard.adopt(before.guard, self.horizon)
         if isinstance(self.inner, TorqueIncrement):
@@ -171,7 +172,9 @@ class Pilot:
             if self.attitudes is not None:
                 target = self.attitudes.target(command.speeds, self._attitude(now, state))
                 command = replace(command, speeds=target)
-            return replace(command, inner=self if self.takes_targets else self.inner)
+            if self.takes_targets:
+                return replace(command, inner=self)
+            return replace(command, inner=self.inner)
         if isinstance(self.inner, TorqueIncrement):
             self.inner.reset()
             return command

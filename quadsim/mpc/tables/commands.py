@@ -76,8 +76,12 @@ class RotorBounds:
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """Return the bounds on each rotor's speed [rad/s] and step [rad/s per period], where it has any."""
-        pairs = {"speed": self.speed or (vehicle.speed_min, vehicle.speed_max), "slew": self.slew}
-        return {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
+        slowest, fastest = self.speed or (vehicle.speed_min, vehicle.speed_max)
+        bounds = {"speed": (slowest, fastest)}
+        if self.slew is not None:
+            down, up = self.slew
+            bounds["slew"] = (down, up)
+        return bounds
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """Return the same bounds for the actuators."""
@@ -121,8 +125,10 @@ class TargetBounds:
             rule = f"below and above the weight, {weight:.4g} N"
             raise ParameterError("controller", "target_bounds.thrust", [lower, upper], rule)
         rates = np.broadcast_to(np.asarray(self.body_rate, float), 3).tolist()
-        sides = {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", rates, strict=True)}
-        return {"thrust": (lower, upper), **sides}
+        bounds = {"thrust": (lower, upper)}
+        for axis, rate in zip("xyz", rates, strict=True):
+            bounds[f"body_rate_{axis}"] = (-rate, rate)
+        return bounds
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """Return the same bounds on targets (4,) [N], [rad/s], with unbounded steps."""
