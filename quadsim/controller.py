@@ -484,7 +484,11 @@ def counts(answered_by: Mapping[str, int]) -> str:
     """
     texts = {GAIN: "at the unconstrained optimum, no QP", LAW: COMMANDED}
     ranked = sorted(answered_by.items(), key=lambda entry: -entry[1])
-    parts = []
-    for i, (by, count) in enumerate(ranked):
-        parts.append(f"{count}{'' if i else ' periods'} {texts.get(by, f'by {by}')}")
+    parts: list[str] = []
+    for by, count in ranked:
+        periods = f"{count}"
+        if not parts:
+            periods = f"{count} periods"
+        source = texts.get(by, f"by {by}")
+        parts.append(f"{periods} {source}")
     return "; ".join(parts)
