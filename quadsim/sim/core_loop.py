@@ -150,7 +150,9 @@ class _Flight:
         plant = self._plant
         count = len(self._truth)
         t = instants(count, self._steps * plant.timestep)
-        statistics: dict[str, Any] = {name: np.full(count, np.nan) for name in RESIDUALS}
+        statistics: dict[str, Any] = {}
+        for name in RESIDUALS:
+            statistics[name] = np.full(count, np.nan)
         statistics |= law.statistics
         control = ControlLog(
             t=t,

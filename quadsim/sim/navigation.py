@@ -70,21 +70,23 @@ class Navigation:
             ParameterError: times that are no whole physics steps, a fault of a sensor that is not there, or sensors
                 that the estimator cannot work with.
         """
-        faulty = {fault.sensor for fault in faults} - sensors.keys()
+        faulty = {fault.sensor for fault in faults}
+        faulty -= sensors.keys()
         if estimator is not None and faulty:
             rule = f"on a sensor that the estimator has ({', '.join(sensors)})"
             raise ParameterError("fault", "sensor", str(min(faulty)), rule)
-        perfect = {name: Sensor(rate=1.0 / timestep) for name in sorted(faulty)}
+        sampled = dict(sensors)
+        for name in sorted(faulty):  # of a perfect sensor
+            sampled[name] = Sensor(rate=1.0 / timestep)
         self._timestep = timestep
         self._rng, *others = rng.spawn(1 + len(SensorName))
         generators = dict(zip(SensorName, others, strict=True))
-        self._samplers = tuple(
-            Sampler(name, sensor, timestep=timestep, faults=tuple(faults), rng=generators[name])
-            for name, sensor in {**sensors, **perfect}.items()
-        )
-        if estimator is None:
-            self.filter = None
-        else:
+        samplers = []
+        for name, sensor in sampled.items():
+            samplers.append(Sampler(name, sensor, timestep=timestep, faults=tuple(faults), rng=generators[name]))
+        self._samplers = tuple(samplers)
+        self.filter: ErrorStateFilter | None = None
+        if estimator is not None:
             self.filter = ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
 
     def has(self, sensor: SensorName) -> bool:
@@ -120,7 +122,8 @@ class Navigation:
             struct.latency = sampler.latency
             struct.held[:] = truth(sampler.name, physics[None])[0]
         if self.filter is not None:
-            known = [physics[PHYSICS[name]] for name in ("position", "velocity", "attitude", "body_rates")]
+            names = ("position", "velocity", "attitude", "body_rates")
+            known = [physics[PHYSICS[name]] for name in names]
             self.filter.reset(np.concatenate([*known, np.zeros(3)]), speeds, copy.deepcopy(self._rng))
         self._prepare(1)
         motion = np.ascontiguousarray(physics[1:])
@@ -170,10 +173,9 @@ class Navigation:
                     row[MEASURED[sampler.name]] = struct.held
         quaternion = row[PHYSICS["attitude"]]
         rates = row[PHYSICS["body_rates"]]
+        sign = 1.0
         if quaternion @ self.attitude[0] < 0.0:
             sign = -1.0
-        else:
-            sign = 1.0
         self.attitude = sign * quaternion, rates
         if angles is None:
             state: Array = physics_to_state(row[None])[0]
@@ -208,10 +210,9 @@ class Navigation:
             values, fates = self._samples[k]
             first = -(-start // struct.stride)
             end = -(-stop // struct.stride)
-            if self.filter is None:
-                heard = struct.heard
-            else:
-                heard = min(struct.heard, self._passed[k])
+            heard = struct.heard
+            if self.filter is not None:
+                heard = min(heard, self._passed[k])
             drop = max(min(heard, first) - struct.first, 0)
             errors, fresh = sampler.draw(first, end - first)
             values = np.concatenate([values[drop:], errors])

@@ -66,10 +66,11 @@ class Battery:
             ParameterError: the curve is impossible, or the current needs a rotor radius.
         """
         charges = [charge for charge, _ in self.curve]
+        voltages = [voltage for _, voltage in self.curve]
         rises = all(low < high for low, high in pairwise(charges))
-        if not rises or (charges[0], charges[-1]) != (0.0, 1.0) or any(voltage <= 0.0 for _, voltage in self.curve):
+        if not rises or (charges[0], charges[-1]) != (0.0, 1.0) or min(voltages) <= 0.0:
             rule = "pairs of a charge that rises from 0 to 1 and a voltage above 0"
-            raise ParameterError("effects.battery", "curve", [list(pair) for pair in self.curve], rule)
+            raise ParameterError("effects.battery", "curve", [*map(list, self.curve)], rule)
         battery = filled(self, reference_voltage=self.cells * self.curve[-1][1])
         if self.hover_current is not None:
             return battery
