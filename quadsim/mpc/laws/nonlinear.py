@@ -82,13 +82,13 @@ class Weights:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             array = np.asarray(value, float)
-            axes = ((),) if name in ("input", "move") else ((), (3,))
             inside = np.isfinite(array) & (array >= 0.0) & ((array > 0.0) | (name == "move"))
-            if array.shape not in axes or not inside.all():
-                if len(axes) == 2:
-                    rule = "positive: one number, or three"
-                else:
-                    rule = "one positive number"
+            shapes: tuple[tuple[int, ...], ...] = ((), (3,))
+            rule = "positive: one number, or three"
+            if name in ("input", "move"):
+                shapes = ((),)
+                rule = "one positive number"
+            if array.shape not in shapes or not inside.all():
                 raise ParameterError("controller.weights", name, value, rule)
             if array.ndim:
                 object.__setattr__(self, name, tuple(array.tolist()))
@@ -254,12 +254,16 @@ class Nonlinear(TargetTable):
             bounds["tilt"] = (-math.inf, self.tilt)
         if self.body_rate is not None:
             rates = _three(self.body_rate).tolist()
-            bounds |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", rates, strict=True)}
-        if self.commands == "rotors":
+            for axis, rate in zip("xyz", rates, strict=True):
+                bounds[f"body_rate_{axis}"] = (-rate, rate)
+        if self.commands == ROTORS:
             return bounds | self.input_bounds.audited(vehicle)
-        targets = self.target_bounds.audited(vehicle)
-        tightest = {name: min(bounds.get(name, pair), pair, key=lambda side: side[1]) for name, pair in targets.items()}
-        return bounds | tightest
+        for name, target in self.target_bounds.audited(vehicle).items():
+            bound = bounds.get(name, target)
+            if target[1] < bound[1]:  # the tighter of both
+                bound = target
+            bounds[name] = bound
+        return bounds
 
     def space(self, shapes: Sequence[Shape], vehicle: Vehicle, period: float) -> Space | None:
         """Return the half-spaces of obstacles and regions; None without any."""
@@ -278,20 +282,18 @@ class Nonlinear(TargetTable):
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
-        bounds = self.input_bounds if self.commands == ROTORS else self.target_bounds
-        return bounds.actuators(vehicle)
+        if self.commands == ROTORS:
+            return self.input_bounds.actuators(vehicle)
+        return self.target_bounds.actuators(vehicle)
 
     def outputs(self) -> tuple[Array, Array]:
         """Return C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
         weights = self.weights
-        difference = self.attitude_error == "difference"
-        if difference:
+        if self.attitude_error == "difference":
             rows = np.eye(13)
-        else:
-            rows = np.delete(np.eye(13), 3, axis=0)
-        if difference:
             attitude = np.full(4, weights.attitude)
         else:
+            rows = np.delete(np.eye(13), 3, axis=0)
             attitude = 4.0 * _three(weights.attitude)
         parts = (_three(weights.position), attitude, _three(weights.velocity), _three(weights.body_rates))
         return rows, np.concatenate(parts)
@@ -299,7 +301,9 @@ class Nonlinear(TargetTable):
     @property
     def largest_rates(self) -> Array:
         """(3,) bounds on body rates [rad/s], infinite for none."""
-        return np.radians(_three(math.inf if self.body_rate is None else self.body_rate))
+        if self.body_rate is None:
+            return np.full(3, math.inf)
+        return np.radians(_three(self.body_rate))
 
     def stride(self, period: float) -> int:
         """Return the number of periods per node."""

@@ -55,7 +55,9 @@ class PIDGains:
 
 def pid_gains(vehicle: Vehicle, *, period: float, lag: float | None = None) -> PIDGains:
     """Return gains that follow from the period and the lag [s], by default the vehicle's."""
-    speeds = bandwidths(period=period, lag=lag_to_allow_for(vehicle, period) if lag is None else lag)
+    if lag is None:
+        lag = lag_to_allow_for(vehicle, period)
+    speeds = bandwidths(period=period, lag=lag)
     return PIDGains(bandwidths=speeds, velocity_integral=0.25 * speeds.position, rate_integral=0.5 * speeds.position)
 
 

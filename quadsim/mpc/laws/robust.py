@@ -113,17 +113,9 @@ class Robust(TargetTable, Bounded):
         if self.tightening is not None and not self.output_bounds:
             raise ValueError("tightening must be absent where there are no output_bounds to tighten")
         if self.heading:
-            bounded = {
-                "output_bounds": [*self.output_bounds],
-                **{polytope.name: polytope.of for polytope in self.polytopes},
-            }
-            for name, states in bounded.items():
-                turned = [state for state in states if state in TURNED]
-                if turned:
-                    raise ValueError(
-                        f"{name} must not be of {', '.join(turned)} where heading turns the model: "
-                        'heading = false, or type = "nonlinear"'
-                    )
+            _require_unturned("output_bounds", [*self.output_bounds])
+            for polytope in self.polytopes:
+                _require_unturned(polytope.name, polytope.of)
 
     def _check_commands(self) -> None:
         """Refuse fields of the other space of commands.
@@ -195,9 +187,8 @@ class Robust(TargetTable, Bounded):
         model = self._model(vehicle, period)
         objective = self.objective()
         n = model.n
-        if self.move_weight is None:
-            moves = None
-        else:
+        moves = None
+        if self.move_weight is not None:
             moves = self.move_weight * np.eye(N_ROTORS)
         objective = replace(objective, C_r=_widened(objective.C_r, n), Q_d=moves)
         if self.terminal == "lqr":
@@ -205,20 +196,18 @@ class Robust(TargetTable, Bounded):
         if self.commands != ROTORS:
             constraints = (*self._target_constraints(vehicle), *self.constraints())
             return Problem(model=model, horizon=self.horizon, objective=objective, constraints=constraints)
-        bounds = self.bounds()
-        if self.soft is None:
-            penalty = None
-        else:
+        penalty = None
+        if self.soft is not None:
             penalty = self.soft.penalty(len(self.output_bounds))
-        return Problem(
-            model=model,
-            horizon=self.horizon,
-            objective=objective,
-            bounds=replace(bounds, C_c=_widened(bounds.C_c, n), penalty=penalty, margins=self.margins(vehicle, period)),
-            constraints=tuple(
-                part if part.C is None else replace(part, C=_widened(part.C, n)) for part in self.constraints()
-            ),
-        )
+        bounds = self.bounds()
+        C_c = _widened(bounds.C_c, n)
+        bounds = replace(bounds, C_c=C_c, penalty=penalty, margins=self.margins(vehicle, period))
+        parts = []
+        for part in self.constraints():
+            if part.C is not None:
+                part = replace(part, C=_widened(part.C, n))
+            parts.append(part)
+        return Problem(model=model, horizon=self.horizon, objective=objective, bounds=bounds, constraints=tuple(parts))
 
     def _model(self, vehicle: Vehicle, period: float) -> LinearModel:
         """Return the prediction model: with rotor speeds as states if they lag, or above an autopilot."""
@@ -236,9 +225,8 @@ class Robust(TargetTable, Bounded):
         """Return the bounds on outputs and on an autopilot's targets as constraints."""
         C_c, lower, upper = self.output_limits()
         names = [name for name in STATE_NAMES if name in self.output_bounds]
-        if self.soft is None:
-            penalty = None
-        else:
+        penalty = None
+        if self.soft is not None:
             penalty = self.soft.penalty(len(names))
         origins = tuple(origin_of_state(INDEX[name]) for name in names)
         outputs = Constraint(name="outputs", lower=lower, upper=upper, C=C_c, penalty=penalty, origins=origins)
@@ -293,6 +281,16 @@ class Robust(TargetTable, Bounded):
             "delay": self.delay,
             "estimated": self.offset_free is not None,
         }
+
+
+def _require_unturned(name: str, states: Sequence[str]) -> None:
+    """Refuse bounds on states that depend on the yaw of the axes, where these are turned by the measured yaw."""
+    turned = [state for state in states if state in TURNED]
+    if turned:
+        raise ValueError(
+            f"{name} must not be of {', '.join(turned)} where heading turns the model: "
+            'heading = false, or type = "nonlinear"'
+        )
 
 
 def _widened(matrix: Array, n: int) -> Array:

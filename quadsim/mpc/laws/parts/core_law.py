@@ -160,7 +160,13 @@ class CoreLaw:
     @property
     def answered_by(self) -> tuple[str, ...]:
         """K sources of commands."""
-        return tuple(GAIN if method == Method.FREE else CORE for method in self._found[: self._k].tolist())
+        sources = []
+        for method in self._found[: self._k].tolist():
+            if method == Method.FREE:
+                sources.append(GAIN)
+            else:
+                sources.append(CORE)
+        return tuple(sources)
 
 
 def core_law(

@@ -51,7 +51,10 @@ class FeedbackLaw(ABC):
             CommandError: the state or the reference is not finite; no command is sent, and the law's state is
                 unchanged.
         """
-        before = (self._before if now.acting is None else now.acting)[: self.model.nu]
+        before = self._before
+        if now.acting is not None:
+            before = now.acting
+        before = before[: self.model.nu]
         if now.phase in GROUNDED:
             command = stopped(self.bounds.lowest(before), self.horizon, now.phase)
             self.reset(command.speeds)

@@ -207,19 +207,20 @@ class LinearMPC:
 
     def adopt(self, previous: object) -> None:
         """Take over what the previous law has learnt, and its plan, to hold if a QP has no answer."""
+        memory = None
         if isinstance(previous, LinearMPC):
-            law = previous
-        else:
-            law = None
-        if law is not None and law._plan is not None and self._holds:
-            self._plan = resized(law._plan, self.horizon)
-            self._held = law._held
-        self.preparation.adopt(None if law is None else law.preparation.memory, disturbance_of(previous))
+            memory = previous.preparation.memory
+            if previous._plan is not None and self._holds:
+                self._plan = resized(previous._plan, self.horizon)
+                self._held = previous._held
+        self.preparation.adopt(memory, disturbance_of(previous))
 
     @property
     def iterates(self) -> frozenset[str]:
         """See `quadsim.controller.Iterating`."""
-        return self._solver.iterates | frozenset({SPACE_SOLVER} if self._obstacles is not None else ())
+        if self._obstacles is None:
+            return self._solver.iterates
+        return self._solver.iterates | {SPACE_SOLVER}
 
     @property
     def trim(self) -> Trim | None:
@@ -257,7 +258,9 @@ class LinearMPC:
         answer, reason = self._check(problem, query, answer, reason)
         self.answer = answer
         if reason is None:
-            self._plan = answer.plan if self._holds else None
+            self._plan = None
+            if self._holds:
+                self._plan = answer.plan
             self._held = 0
             self._acting = self._bounds.clip(answer.plan[0], self._acting)
             return command_of(self._acting, answer.plan, answer.status, answer)
