@@ -3,8 +3,8 @@
 An existing output directory that is not empty is refused.  A new one is built beside its place and renamed into it;
 `files` in its `summary.json` has the SHA-256 of the other files, `unhashed` the names of those that differ between
 directories with the same results.  Overwriting unlinks, by name, the regular files that these list, and refuses a
-directory that holds anything else.  A directory that grows in place, such as a campaign's, is
-locked.  What a killed process of ours leaves, a lock or a half-written folder under a private name, is in nobody's way.
+directory that holds anything else.  A directory that grows in place, such as a campaign's, is locked.  What a killed
+process leaves, a lock or a half-written folder under a private name, does not block the next one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""A vehicle: mass, inertia, four rotors and their limits, read from one TOML file."""
+"""A vehicle: mass, inertia, four rotors and their limits, read from one TOML file.
+
+    thrust_i = b w_i^2,    reaction torque_i = spin_i d w_i^2,    [U, tau] = allocation w^2  (Sec. 2.2)
+
+Plant, controllers and estimators all take their numbers from here.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Computation time as simulated time: a slow solver affects the flight reproducibly."""
+"""Computation time as simulated time: a slow solver affects the flight reproducibly.
+
+    time taken = delay + per_iteration iterations + jitter,    and what is left of a stall
+
+The loop lets a command act that much later; one that misses its deadline is dropped.
+"""
 
 from __future__ import annotations
 

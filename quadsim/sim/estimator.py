@@ -238,5 +238,5 @@ class ErrorStateFilter:
     def _run(self, track: Struct, samples: NDArray[np.void], *, until: int) -> None:
         """Use samples, then predict to a step, unless that is past."""
         flown = self._commands.ctypes.data, self._grounded.ctypes.data
-        given = self.struct, track, samples.ctypes.data_as(SAMPLES), len(samples)
-        core_library().quadsim_filter_run(*given, *flown, self._base, until)
+        used = self.struct, track, samples.ctypes.data_as(SAMPLES), len(samples)
+        core_library().quadsim_filter_run(*used, *flown, self._base, until)

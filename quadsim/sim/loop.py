@@ -1,4 +1,8 @@
-"""The closed loop: plant -> controller -> command -> plant, once per control period."""
+"""The closed loop: plant -> controller -> command -> plant, once per control period.
+
+In period k: observe (navigation, reference), ask the controller, hold its command for M physics steps, keep the
+`Period`.  `quadsim.rollout` builds the parts; `ClosedLoop.log` is what a flight is audited by.
+"""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ class Margins:
         assert moment.acting is not None
         assert steps.dtype.fields is not None
         flown = PeriodStruct()
-        given: dict[str, Array] = {
+        inputs: dict[str, Array] = {
             "before": period.before,
             "rotors": period.rotors,
             "truth": observed.truth,
@@ -101,7 +101,7 @@ class Margins:
             "commanded": period.speeds,
             "earlier": moment.acting,
         }
-        kept = {name: np.ascontiguousarray(numbers, np.float64) for name, numbers in given.items()}
+        kept = {name: np.ascontiguousarray(numbers, np.float64) for name, numbers in inputs.items()}
         for name, numbers in kept.items():
             setattr(flown, name, numbers.ctypes.data)
         at = steps.ctypes.data

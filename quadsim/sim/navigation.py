@@ -1,4 +1,8 @@
-"""Navigation: the state that a controller receives, from measurements of the true state."""
+"""Navigation: the state that a controller receives, from measurements of the true state.
+
+Without an estimator it is the last sample of each sensor to arrive, with one the filter's estimate
+(`quadsim.sim.estimator`).  The loop asks for it at each control instant, an autopilot at its own rate.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The simulator's state over physics steps, its conversion to the paper's state, and flown periods as a log."""
+"""The simulator's state over physics steps, its conversion to the paper's state, and flown periods as a log.
+
+`Period` is one flown control period.  `flight_log` makes the log of a flight of all periods, `one_period` what the
+margins of one take.
+"""
 
 from __future__ import annotations
 

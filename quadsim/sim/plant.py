@@ -1,4 +1,8 @@
-"""The plant: the only owner of the MuJoCo model and its data."""
+"""The plant: the only owner of the MuJoCo model and its data.
+
+It holds commanded rotor speeds, or a target of an inner loop, over the physics steps of a control period, draws noise
+and wind, and applies events.  The equations: `quadsim/core/quadsim_plant.c`, `quadsim.sim.effects`.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +57,7 @@ _CARRYING: Final = (Payload, PayloadDrop)
 
 
 def _has_callbacks() -> bool:
-    """Return whether somebody has set callbacks of MuJoCo."""
+    """Return whether MuJoCo has callbacks."""
     getters = [name for name in dir(mujoco) if name.startswith("get_mjcb_")]
     return any(getattr(mujoco, name)() is not None for name in getters)
 

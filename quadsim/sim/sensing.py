@@ -1,4 +1,9 @@
-"""Sensors: samples of the true motion that arrive late, wrong or never, and faults of sensors."""
+"""Sensors: samples of the true motion that arrive late, wrong or never, and faults of sensors.
+
+    sample = truth + bias + random walk + noise,
+
+taken every `stride` physics steps, heard `latency` later.  Errors are drawn here; the core adds the truth.
+"""
 
 from __future__ import annotations
 
@@ -138,7 +143,7 @@ class SensorFault:
 
 SampleFlags = NDArray[np.bool_]
 Fates = NDArray[np.uint8]
-"""What befalls samples: sums of `Fate`s."""
+"""What happens to samples: sums of `Fate`s."""
 StepIndices = NDArray[np.int64]
 
 
@@ -205,7 +210,7 @@ class Sampler:
         self._fates = np.empty(0, np.uint8)
 
     def draw(self, first: int, count: int) -> tuple[Array, Fates]:
-        """Draw the errors (count, 3) of the samples from number `first` on, and what befalls each (count,).
+        """Draw the errors (count, 3) of the samples from number `first` on, and what happens to each (count,).
 
         An attitude's error is a rotation vector in the body frame.  Calls follow one another from sample 0; one may
         begin with any sample of the call before, for faults that have been rescheduled since.

@@ -109,7 +109,7 @@ class RampObserver:
     estimated then. The model knows `drag` (3,) [1/s] and `quadratic_drag` (3,) [1/m], of the square of each component,
     in body axes, and with `moment` the vehicle's `air_moment`. A command takes over `late` [s] after an update.
 
-    The core computes it, `quadsim_ramp.c`; a law in C calls it there, with the addresses of both attributes.
+    The core computes it, `quadsim_ramp.c`; a controller in C calls it there, with the addresses of both attributes.
 
     Attributes:
         numbers: what does not change.

@@ -21,7 +21,7 @@ from quadsim.state import N_STATES, REFERENCE_STATES
 from quadsim.vehicle import N_ROTORS
 
 SHARED_FILES: Final = ("quadsim_core.h", "quadsim_math.h", "quadsim_guard.h", "quadsim_guard.c")
-"""Files of `quadsim/mpc/c` that every law takes."""
+"""Files of `quadsim/mpc/c` that every controller takes."""
 CORE_FILES: Final = (*SHARED_FILES, "quadsim_core.c", "quadsim_mpc.h", "quadsim_mpc.c")
 """Those of the linear laws."""
 BODY_FILES: Final = ("quadsim_rigid.h",)
@@ -42,14 +42,14 @@ def part(name: str, package: str = "quadsim.mpc.export") -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class CSource(abc.ABC):
-    """A controller as C source: the files of its law, verbatim, and one of its numbers."""
+    """A controller as C source: its files, verbatim, and one of its numbers."""
 
     precision: Precision = "double"  # of all numbers
     title: str = ""  # a line that identifies it, in ASCII
     asked: int | None = None  # active rows with room; None for a number that usually suffices
 
     law_name: ClassVar[str]
-    """Header of its law, and first word of its functions."""
+    """Header of its controller, and first word of its functions."""
     law_files: ClassVar[tuple[str, ...]]
     """Files of `quadsim/mpc/c` to export verbatim."""
     state: ClassVar[int] = N_STATES
@@ -194,7 +194,7 @@ class CSource(abc.ABC):
 class CController(CSource):
     """A linear controller as C source, with room for 2.56 active rows per step of the horizon, and at least 64."""
 
-    law: Exportable  # the law to export
+    law: Exportable  # the controller to export
 
     law_name = "quadsim_mpc"
     law_files = CORE_FILES

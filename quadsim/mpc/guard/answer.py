@@ -1,4 +1,8 @@
-"""The one test of every solver answer: solved, finite and within the actuators' limits; otherwise the reason."""
+"""The one test of every solver answer: solved, finite and within the actuators' limits; otherwise the reason.
+
+A plan is predicted anew from the measured state, and must violate no normalised row by more than `INFEASIBLE`; KKT
+residuals are computed now and then.  `quadsim.mpc.guard.contract` then decides what is flown.
+"""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def fallback_numbers(
     Args:
         model: of level hover.
         bounds: on commands; None for none.
-        settings: the table, with the tilt that its law's bounds leave.
+        settings: the table, with the tilt that its controller's bounds leave.
     """
     period = model.period
     hover = HoverGain.of_model(model)

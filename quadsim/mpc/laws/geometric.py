@@ -75,11 +75,11 @@ class GeometricGains:
 def geometric_gains(vehicle: Vehicle, period: float, settings: Geometric) -> GeometricGains:
     """Return gains that follow from the period [s] and the lag.
 
-    The law feeds forward the rotation of the desired attitude, so its linearisation has the polynomial (s^2 + k_Omega s
-    + k_R)(s^2 + k_v s + k_x), and its gain from rate error to angular acceleration is about k_Omega + k_v.  That sum is
-    1 / (2 (period / 2 + lag)), as in `bandwidths`. The outer pair is four times slower than the inner pair (twice the
-    cascade's separation of 2), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2. The integrals of Goodarzi et
-    al.  (2013) act at a quarter of the bandwidth of the loops that they support.
+    The controller feeds forward the rotation of the desired attitude, so its linearisation has the polynomial (s^2 +
+    k_Omega s + k_R)(s^2 + k_v s + k_x), and its gain from rate error to angular acceleration is about k_Omega + k_v.
+    That sum is 1 / (2 (period / 2 + lag)), as in `bandwidths`. The outer pair is four times slower than the inner pair
+    (twice the cascade's separation of 2), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2. The integrals of
+    Goodarzi et al.  (2013) act at a quarter of the bandwidth of the loops that they support.
 
     An autopilot's rates follow with its `inner_lag`; `lag` replaces that of p and q.  About each
     axis, an attitude error has the gain k = k_R / k_Omega, with the sum k + k_v = 1 / (2 (period / 2 + lag)), that of
@@ -150,7 +150,7 @@ class GeometricController(FeedbackLaw):
 
     It commands rotor speeds, or to an autopilot targets: thrust and body rates (4,) [N, rad/s], or these and a
     quaternion wxyz (8,), with rates that are fed forward. With targets, `reset` and `StepInputs.acting` are targets.
-    The law is in C, `quadsim_geometric.c`; the core's allocation turns its wrench into rotor speeds.
+    The controller is in C, `quadsim_geometric.c`; the core's allocation turns its wrench into rotor speeds.
 
     Attributes:
         commands: what it commands.
@@ -241,7 +241,7 @@ class GeometricController(FeedbackLaw):
         return _integrals_of(self._law)
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
-        """Return the law's wrench as rotor speeds, or its targets; the integrals hold while bounds limit it."""
+        """Return the controller's wrench as rotor speeds, or its targets; the integrals hold while bounds limit it."""
         flying = now.phase is Phase.FLYING
         if self.numbers.exact:
             self._measure(state, now.attitude, now.body_rates)
@@ -259,9 +259,9 @@ class GeometricController(FeedbackLaw):
         if self._targets:
             return self._held_for_a_period(command)
         speeds = allocate(self._allocation, command, *self.bounds.reach(before))
-        given = self._allocation.wrench(speeds)
+        achieved = self._allocation.wrench(speeds)
         smallest = 1e-6 * self._allocation.scale.max()
-        if flying and np.allclose(given, command, rtol=0.0, atol=smallest):
+        if flying and np.allclose(achieved, command, rtol=0.0, atol=smallest):
             self._library.quadsim_geometric_integrate(self._law, self._motion, self._target)
         return self._held_for_a_period(speeds)
 
@@ -354,9 +354,9 @@ class GeometricController(FeedbackLaw):
     def integrate(self, integrals: Integrals, motion: Measured, target: Target, desired: DesiredAttitude) -> Integrals:
         """Return the integrals of e_v + c_1 e_x and e_Omega + c_2 e_R one period later, saturated."""
         law = self._copy(integrals)
-        measured, wanted = _structs(motion, target)
+        measured, target_struct = _structs(motion, target)
         set_members(law.desired, **vars(desired))
-        self._library.quadsim_geometric_integrate(law, measured, wanted)
+        self._library.quadsim_geometric_integrate(law, measured, target_struct)
         return _integrals_of(law)
 
     def _evaluate(
@@ -384,7 +384,7 @@ class GeometricController(FeedbackLaw):
         return result, attitude
 
     def _copy(self, integrals: Integrals) -> Struct:
-        """Return the law with other integrals."""
+        """Return the controller with other integrals."""
         law = GeometricStruct.from_buffer_copy(self._law)
         set_members(law, **vars(integrals))
         return law
@@ -397,7 +397,7 @@ def _integrals_of(law: Struct) -> Integrals:
 def _structs(motion: Measured, target: Target) -> tuple[Struct, Struct]:
     """Return both as C takes them."""
     measured = MotionStruct()
-    wanted = TargetStruct()
+    target_struct = TargetStruct()
     measured.yaw = motion.yaw
     set_members(
         measured,
@@ -407,11 +407,11 @@ def _structs(motion: Measured, target: Target) -> tuple[Struct, Struct]:
         rates=motion.rates,
     )
     path = (target.position, target.velocity, target.acceleration, target.jerk, target.snap)
-    set_members(wanted, path=np.stack(path), yaw=(target.yaw, target.yaw_rate, target.yaw_acceleration))
+    set_members(target_struct, path=np.stack(path), yaw=(target.yaw, target.yaw_rate, target.yaw_acceleration))
     if target.heading is not None:
-        wanted.headed = 1
-        set_members(wanted, heading=target.heading)
-    return measured, wanted
+        target_struct.headed = 1
+        set_members(target_struct, heading=target.heading)
+    return measured, target_struct
 
 
 def _delay_of(settings: Geometric, vehicle: Vehicle, period: float) -> tuple[Struct, Bodies]:
@@ -458,7 +458,7 @@ def _preview_degree(settings: Geometric) -> int:
 
 
 def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gains: GeometricGains) -> Struct:
-    """Return the law's numbers for C but for `k_R`, `k_Omega`, and what they point to."""
+    """Return the controller's numbers for C but for `k_R`, `k_Omega`, and what they point to."""
     numbers = GeometricNumbersStruct()
     targets = settings.commands != ROTORS
     bounds = settings.actuators(vehicle)

@@ -138,8 +138,8 @@ class CascadedPID(FeedbackLaw):
         wrench -= by_air
         speeds = allocate(self.allocation, wrench, lower, upper)
         # Anti-windup: an integral stops where it would ask for more than the mixer can give.
-        given = self._vehicle.angular_acceleration(self.allocation.wrench(speeds)[1:] + by_air[1:])
-        missed = acceleration - given
+        achieved = self._vehicle.angular_acceleration(self.allocation.wrench(speeds)[1:] + by_air[1:])
+        missed = acceleration - achieved
         windup = missed * error > 1e-9 * (1.0 + np.abs(acceleration)) * np.abs(error)
         summed = np.where(windup, 0.0, error)
         return speeds, Memory(

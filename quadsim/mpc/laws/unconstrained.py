@@ -1,4 +1,9 @@
-"""The unconstrained MPC: a constant gain.  Eqs. (21)-(26)."""
+"""The unconstrained MPC: a constant gain.  Eqs. (21)-(26).
+
+    u_opt = K xi(k) + G y_d + L u_bar,
+
+which solves H u = -F(k) once for all periods; its first inputs are flown.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +66,7 @@ class UnconstrainedMPC:
         self._turns = ReferenceTurns()
 
     def reset(self, speeds: Array) -> None:
-        """Forget the turn of the heading, the law's only state."""
+        """Forget the turn of the heading, the controller's only state."""
         self._turns.reset()
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:

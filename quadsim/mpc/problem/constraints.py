@@ -1,4 +1,9 @@
-"""Constraints as values, and the stacked rows of all of them, which every formulation of a problem is built from."""
+"""Constraints as values, and the stacked rows of all of them, which every formulation of a problem is built from.
+
+    lower <= C x + D u + E (u - u_before) <= upper
+
+`Bounds` has the paper's, Eqs. (12)-(20); `stacked_rows` stacks those of a problem (`quadsim.mpc.problem.ocp`).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The linear model: linearised at hover, discretised exactly.  Eq. (1)."""
+"""The linear model: linearised at hover, discretised exactly.  Eq. (1).
+
+    xi(k+1) = A xi(k) + B (u(k) - u_bar),    [A B; 0 1] = exp(tau_s [A_c B_c; 0 0]),
+
+with the Jacobians A_c and B_c of the nonlinear model at hover.  Linear MPCs, the LQR and the fallback predict by it.
+"""
 
 from __future__ import annotations
 

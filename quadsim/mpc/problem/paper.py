@@ -1,4 +1,9 @@
-"""The paper's prediction and cost, condensed to the inputs alone, as printed.  Eqs. (2)-(10)."""
+"""The paper's prediction and cost, condensed to the inputs alone, as printed.  Eqs. (2)-(10).
+
+    xi = Phi xi(k) + Psi (u - u_bar),    J(u) = 1/2 u' H u + F(k)' u
+
+`quadsim.mpc.forms.condensing` extends them to any weights and constraints.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""A quadratic program and its solution as values, and the KKT residuals that relate them."""
+"""A quadratic program and its solution as values, and the KKT residuals that relate them.
+
+    min 1/2 x' P x + c' x  subject to  A x = b,  h_l <= G x <= h_u,  x_l <= x <= x_u
+
+`quadsim.mpc.forms` makes it of a problem, a back end of `quadsim.mpc.solvers` solves it.
+"""
 
 from __future__ import annotations
 

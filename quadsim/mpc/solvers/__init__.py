@@ -223,8 +223,8 @@ class QPSolver:
         state, desired, u_before = query[:3]
         form = self.formulation
         if not math.isfinite(state.sum() + desired.sum() + u_before.sum()):
-            nowhere = np.full_like(form.qp.c, math.nan)
-            return Answer(form.inputs(nowhere), form.slacks(nowhere), INVALID_DATA, self.name)
+            no_solution = np.full_like(form.qp.c, math.nan)
+            return Answer(form.inputs(no_solution), form.slacks(no_solution), INVALID_DATA, self.name)
         started = clock.perf_counter()
         if self._free is None:
             answer = None

@@ -33,7 +33,7 @@ from quadsim.state import REFERENCE_RATES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 USUAL_SOLVER: Final = "piqp"
-"""The QP solver of a law whose table states none; that of `robust` is the core, where it takes the problem."""
+"""The QP solver of a controller whose table states none; that of `robust` is the core, where it takes the problem."""
 
 
 @dataclass(frozen=True, kw_only=True)

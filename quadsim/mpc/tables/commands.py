@@ -1,4 +1,4 @@
-"""Weights and bounds of what laws command: rotor speeds, or an autopilot's targets."""
+"""Weights and bounds of what controllers command: rotor speeds, or an autopilot's targets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COMMANDS: Final = (
     "what it commands: rotor speeds, or to an autopilot's inner loop collective thrust and body rates, or collective "
     "thrust and an attitude"
 )
-"""Meaning of the field `commands` of laws that command all of these."""
+"""Meaning of the field `commands` of controllers that command all of these."""
 TARGET_BOUNDS: Final = "only where an autopilot flies; of an attitude, bounds on the body rates that its error commands"
 """Meaning of the field `target_bounds` of such laws."""
 LEAST_THRUST = 0.5

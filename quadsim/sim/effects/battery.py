@@ -17,7 +17,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 LIPO: Final = ((0.0, 3.27), (0.05, 3.61), (0.1, 3.69), (0.5, 3.84), (0.6, 3.87), (0.8, 4.02), (1.0, 4.2))
 """Charge [-] and voltage at rest [V] of a lithium-polymer cell; within 15 mV of https://blog.ampow.com/lipo-voltage-chart."""
 EFFICIENCY: Final = 0.5
-"""Ours: ideal power in hover over battery power, figure of merit 0.6 to 0.7 times motor and ESC 0.8.
+"""Our choice: ideal power in hover over battery power, figure of merit 0.6 to 0.7 times motor and ESC 0.8.
 
 A Crazyflie's brushed motors have some 0.14: 250 mAh last 7 minutes."""
 

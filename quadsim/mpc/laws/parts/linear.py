@@ -1,4 +1,9 @@
-"""The linear MPC: in every period the optimum of Eq. (27), from a query that a preparation makes of the measurement."""
+"""The linear MPC: in every period the optimum of Eq. (27), from a query that a preparation makes of the measurement.
+
+    measurement -> preparation: query -> solver: answer -> checks -> command
+
+`NominalPreparation` is the paper's, `quadsim.mpc.laws.parts.preparation` that of the robust MPC.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +59,7 @@ class Preparation(Protocol):
 
     @property
     def numbers(self) -> CoreNumbers | None:
-        """The numbers of a law that is C's; None for another."""
+        """The numbers of a controller that is C's; None for another."""
         ...
 
     @property
@@ -82,7 +87,7 @@ class Preparation(Protocol):
         ...
 
     def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
-        """Take over what the previous law has learnt: its preparation's memory, if any, and its `disturbance`."""
+        """Take over what the previous controller has learnt: its preparation's memory, if any, its `disturbance`."""
         ...
 
     def stand(self, now: StepInputs, acting: Array) -> None:
@@ -172,7 +177,7 @@ class LinearMPC:
         Args:
             preparation: makes the query of each period.
             solver: the problem's (`quadsim.mpc.solvers.by_name.make_solver`).
-            name: of the law, in summaries.
+            name: of the controller, in summaries.
             holds: whether the last plan is held where a QP has no answer.
             space: the obstacles to avoid; None for none.
             kkt_every: interval of KKT checks [periods].
@@ -206,7 +211,7 @@ class LinearMPC:
             self._obstacles.reset()
 
     def adopt(self, previous: object) -> None:
-        """Take over what the previous law has learnt, and its plan, to hold if a QP has no answer."""
+        """Take over what the previous controller has learnt, and its plan, to hold if a QP has no answer."""
         memory = None
         if isinstance(previous, LinearMPC):
             memory = previous.preparation.memory
@@ -285,7 +290,7 @@ class LinearMPC:
         return self.preparation.predict(states, plans)
 
     def in_core(self, fallback: Struct) -> CoreLaw | None:
-        """Return the law with a fallback contract of these numbers in the core; None where it is not C's alone."""
+        """Return it with a fallback contract of these numbers in the core; None where it is not C's alone."""
         if self._holds or self._obstacles is not None:
             return None
         return core_law(self.problem, self.preparation.numbers, self._solver, self._check, fallback)
@@ -298,7 +303,7 @@ class LinearMPC:
 
 
 def linear_law(table: Bounded, preparation: Preparation, solver: Solver, space: Space | None = None) -> LinearMPC:
-    """Return the law of a table with the parts that it is made of; see `LinearMPC`."""
+    """Return the controller of a table with the parts that it is made of; see `LinearMPC`."""
     return LinearMPC(
         preparation,
         solver,

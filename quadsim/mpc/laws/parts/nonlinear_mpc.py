@@ -100,8 +100,8 @@ _LawStruct: Final = struct("quadsim_nonlinear")
 class NonlinearMPC:
     """One step of sequential quadratic programming per period, or more; see the module.
 
-    The law is in C, `quadsim_nonlinear.c`, around the program of `quadsim_nmpc.h`; exported controllers are the same
-    files.  Here it gets its numbers, its half-spaces and its clock, and its answers are checked.
+    The controller is in C, `quadsim_nonlinear.c`, around the program of `quadsim_nmpc.h`; exported controllers are the
+    same files.  Here it gets its numbers, its half-spaces and its clock, and its answers are checked.
 
     Attributes:
         settings: its table.
@@ -109,13 +109,13 @@ class NonlinearMPC:
         model: the rigid body from node to node.
         problem: what it solves in each step, at hover.
         program: the same for the core.
-        numbers: the law's own, for the core.
+        numbers: the controller's own, for the core.
         bodies: the numbers of the body over a control period, `period`, and of the same without lag of thrusts,
             `unlagged`, each with the array that it points to.
         delay: how late commands act, for the core; None for at once.
         delay_bodies: the bodies that it points to.
         ramp: what follows changing forces; None for nothing.
-        struct: what the law remembers, in C.
+        struct: what the controller remembers, in C.
         plan: (N, 4) its view of the commands of the last optimum.
         clock: returns the time [s].
         infeasible_period: the first period whose QP had no answer or, if there is none, whose SQP did not converge.
@@ -268,7 +268,7 @@ class NonlinearMPC:
         return numbers
 
     def _start(self) -> None:
-        """Start a law in new memory, with views of what Python reads and writes there."""
+        """Start a controller in new memory, with views of what Python reads and writes there."""
         p = self.program.struct
         N = self._nodes
         reals, ints = self.memory()
@@ -356,7 +356,7 @@ class NonlinearMPC:
         self.infeasible_period: InfeasiblePeriod | None = None
 
     def adopt(self, previous: object) -> None:
-        """Take over disturbance, rotor speeds and plan of the previous law, these only from one with like commands."""
+        """Take over the previous controller's disturbance, and from one with like commands rotor speeds and plan."""
         estimate = disturbance_of(previous)
         if isinstance(previous, NonlinearMPC):
             self._adopt_memory(previous)
@@ -605,9 +605,9 @@ class NonlinearMPC:
         code: int = self._library.quadsim_nonlinear_end(self.struct, found)
         spent_s = clock.perf_counter() - started
         if found not in _OPTIMA:
-            nowhere = np.full((self._nodes, N_ROTORS), math.nan)
+            no_plan = np.full((self._nodes, N_ROTORS), math.nan)
             stats = Statistics(iterations=self.changes, solve_s=spent_s)
-            return Answer(nowhere, np.zeros((self._nodes, 0)), STATUSES[code], CORE, stats=stats), code
+            return Answer(no_plan, np.zeros((self._nodes, 0)), STATUSES[code], CORE, stats=stats), code
         stats = Statistics(
             iterations=self.changes,
             active=self.active,

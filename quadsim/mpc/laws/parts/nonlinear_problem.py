@@ -85,7 +85,7 @@ def nonlinear_problem(
     bounds: ActuatorBounds,
     constraints: tuple[Constraint, ...],
 ) -> Problem:
-    """Return the problem of a law with this model, at hover.
+    """Return the problem of a controller with this model, at hover.
 
     Args:
         settings: its table.

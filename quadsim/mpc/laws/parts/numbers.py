@@ -1,4 +1,4 @@
-"""The numbers of a law in C except those of its problem: members of the structs of quadsim_mpc.h, in their order."""
+"""The numbers of a controller in C except its problem's: members of the structs of quadsim_mpc.h, in their order."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ANSWER: Final = SUBSTEPS * constant("QUADSIM_ANSWER")
 
 @dataclass(frozen=True, kw_only=True)
 class Exportable:
-    """The data of a law in C."""
+    """The data of a controller in C."""
 
     name: str
     problem: Problem
@@ -47,7 +47,7 @@ class Exportable:
 
 
 def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
-    """Return the data of a table's law in C.
+    """Return the data of a table's controller in C.
 
     Raises:
         ExportError: the controller cannot be exported.

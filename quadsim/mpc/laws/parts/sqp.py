@@ -1,4 +1,4 @@
-"""Programs of the nonlinear law: their numbers for the core, which solves each exactly, and what its answers mean."""
+"""Programs of the nonlinear MPC: their numbers for the core, which solves each exactly, and what its answers mean."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class _StatedRow(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SQPProgram:
-    """The numbers of a program of the nonlinear law in the core's layout, and which of the problem's rows they are.
+    """The numbers of the nonlinear controller's program in the core's layout, and which of the problem's rows they are.
 
     Attributes:
         struct: the numbers.
@@ -109,7 +109,7 @@ def nonlinear_program(
     faces: int = 0,
     price: tuple[float, float] | None = None,
 ) -> SQPProgram:
-    """Return a problem of the nonlinear law as the core's numbers.
+    """Return a problem of the nonlinear controller as the core's numbers.
 
     Args:
         model: the rigid body.
