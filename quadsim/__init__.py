@@ -87,7 +87,9 @@ _MODULES = {
     "quadsim.scenarios.schema.json_schema": "scenario_schema",
     "quadsim.scenarios.schema.scenario": "Scenario",
 }
-_PUBLIC = {name: module for module, names in _MODULES.items() for name in names.split()}
+_PUBLIC: dict[str, str] = {}
+for _module, _names in _MODULES.items():
+    _PUBLIC |= dict.fromkeys(_names.split(), _module)
 __all__ = [*_PUBLIC]
 
 
@@ -110,4 +112,5 @@ shorthands.scenario_as_html = lambda scenario: __getattr__("scenario_html")(scen
 
 def __dir__() -> list[str]:
     """The public names, imported or not, and the module's own."""
-    return [*__all__, *(name for name in globals() if name.startswith("__"))]
+    own = [name for name in globals() if name.startswith("__")]
+    return [*__all__, *own]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -108,7 +109,9 @@ def _require_small(table: Any, name: str = "") -> None:
     """Refuse tables with more keys than any has."""
     if isinstance(table, dict) and len(table) > MOST_ENTRIES:
         raise InputError(f"{name or 'the file'} must have {MOST_ENTRIES} or fewer keys; got {len(table)}")
-    entries = table.items() if isinstance(table, dict) else enumerate(table)
+    entries: Iterable[tuple[object, Any]] = enumerate(table)
+    if isinstance(table, dict):
+        entries = table.items()
     for key, entry in entries:
         if isinstance(entry, dict | list):
             _require_small(entry, f"{name}.{key}".removeprefix("."))
@@ -118,8 +121,11 @@ def _is_deeper(value: Any, levels: int) -> bool:
     """Return whether tables and lists are nested more than `levels` deep."""
     layer = [value]
     for _ in range(levels + 1):
-        tables = (
-            value.values() if isinstance(value, dict) else value for value in layer if isinstance(value, dict | list)
-        )
-        layer = [inner for table in tables for inner in table]
+        deeper: list[Any] = []
+        for table in layer:
+            if isinstance(table, dict):
+                deeper += table.values()
+            elif isinstance(table, list):
+                deeper += table
+        layer = deeper
     return bool(layer)

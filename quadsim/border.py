@@ -1,4 +1,4 @@
-"""The border to user code: whatever it raises, returns or prints, the flight and its result stay ours.
+"""The border to user code: whatever it raises, returns or prints, a flight keeps its result.
 
 Every call of a user's controller, force, autopilot or reference goes through `user_code`; `quadsim.errors.RaisedError`
 keeps the traceback, `numbers_of` what it answers.
@@ -23,14 +23,14 @@ from quadsim.state import Array
 def user_code(
     error_of: Callable[[BaseException], QuadsimError], passing: tuple[type[QuadsimError], ...] = ()
 ) -> AbstractContextManager[None]:
-    """Turn whatever user code raises into an error of ours.
+    """Turn whatever user code raises into a `QuadsimError`.
 
     That is also what is no `Exception`, such as `asyncio.CancelledError`, `GeneratorExit`, or the `SystemExit` of
     `sys.exit`; only Ctrl-C passes.
 
     Args:
-        error_of: makes our error of what was raised.
-        passing: errors of ours that pass unchanged.
+        error_of: makes the error of what was raised.
+        passing: kinds of `QuadsimError` that pass unchanged.
     """
     return _UserCode(error_of, passing)
 

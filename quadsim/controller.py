@@ -25,20 +25,20 @@ if TYPE_CHECKING:
 SOLVED: Final = "solved"  # status: a QP solver or the core computed the optimum
 UNCONSTRAINED: Final = "unconstrained"
 """Status: the unconstrained optimum satisfies every constraint, so it is also the constrained optimum."""
-COMMANDED: Final = "commanded"  # status: command of a law without a solver
+COMMANDED: Final = "commanded"  # status: command of a controller without a solver
 NOT_CONVERGED: Final = "not_converged"
 """Status: the QP was solved, but its plan does not satisfy the nonlinear dynamics that it linearises."""
-OPTIMAL: Final = frozenset({SOLVED, UNCONSTRAINED, COMMANDED})  # statuses whose command is the law's answer
+OPTIMAL: Final = frozenset({SOLVED, UNCONSTRAINED, COMMANDED})  # statuses whose command is the controller's answer
 ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}  # statuses whose command is applied unchanged
 MISSED: Final = "missed"
 """Status: the command arrived after the start of the next period, so the one before stayed in force."""
 GAIN: Final = "gain"  # source of a command: the unconstrained optimum, a product with constant gains
 CORE: Final = "core"  # the exact optimum of `quadsim.mpc.solvers.core`, compiled
-LAW: Final = "law"  # a law without a solver
+LAW: Final = "law"  # a controller without a solver
 FALLBACK: Final = "fallback"  # an earlier plan or command, or the fallback contract
 STOPPED: Final = "stopped"  # no source: the rotors are off
 NO_OPTIMUM: Final = frozenset({LAW, FALLBACK, STOPPED})
-"""Sources of a command without an optimum, whose active constraints and computing time nobody reports."""
+"""Sources of a command without an optimum, for which no active constraints and no computing time are reported."""
 NO_SOLVER: Final = frozenset({GAIN, CORE}) | NO_OPTIMUM
 """Sources of a command other than QP solvers, which are recorded by name (`quadsim.mpc.solvers.find_solver`)."""
 ROTORS: Final = "rotors"
@@ -290,7 +290,7 @@ def stopped(speeds: Array, horizon: int, phase: Phase) -> Command:
 
 @runtime_checkable
 class Named(Protocol):
-    """A law with a name."""
+    """A controller with a name."""
 
     @property
     def name(self) -> str:
@@ -300,7 +300,7 @@ class Named(Protocol):
 
 @runtime_checkable
 class Solving(Protocol):
-    """A law that names its solver."""
+    """A controller that names its solver."""
 
     @property
     def solver(self) -> str:
@@ -310,7 +310,7 @@ class Solving(Protocol):
 
 @runtime_checkable
 class Iterating(Protocol):
-    """A law whose answers take iterations."""
+    """A controller whose answers take iterations."""
 
     @property
     def iterates(self) -> frozenset[str]:
@@ -320,7 +320,7 @@ class Iterating(Protocol):
 
 @runtime_checkable
 class Resetting(Protocol):
-    """A law with a state."""
+    """A controller with a state."""
 
     def reset(self, speeds: Array) -> None:
         """Restart: the next step is the first, after `speeds` u(-1) (4,) [rad/s]."""
@@ -329,7 +329,7 @@ class Resetting(Protocol):
 
 @runtime_checkable
 class Stepping(Protocol):
-    """What a user's law is at least."""
+    """What a user's controller is at least."""
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the command for the period that starts now, from the measured state xi(k) (12,).
@@ -344,10 +344,11 @@ class Stepping(Protocol):
 
 
 class Controller(Named, Solving, Resetting, Stepping, Protocol):
-    """A feedback law run once per control period.
+    """What is asked for a command once per control period.
 
     These are the parts that every controller has.  Those that it may have are the protocols below: a controller has
-    one by having its member.  A user's law need only be `Stepping`; `quadsim.scenarios.plugin` makes it a controller.
+    one by having its member.  A user's controller need only be `Stepping`; `quadsim.scenarios.plugin` makes it a
+    controller.
     """
 
     @property
@@ -363,7 +364,7 @@ class Predicting(Protocol):
     def predict(self, states: Array, plans: Array) -> Array | None:
         """Return the predicted states (K, N, 12) from K measured states (K, 12) and plans (K, N, 4), for pictures.
 
-        None where there is no model after all, as where a law without one is wrapped.
+        None where there is no model after all, as where a controller without one is wrapped.
         """
         ...
 
@@ -382,7 +383,7 @@ class Adopting(Protocol):
     """A controller that can take over in flight."""
 
     def adopt(self, previous: object) -> None:
-        """Copy estimates, plan and the like from the law in command before; called after `reset`."""
+        """Copy estimates, plan and the like from the controller in command before; called after `reset`."""
         ...
 
 
@@ -406,7 +407,7 @@ class Diagnosable(Protocol):
 
 
 class CoreController(Protocol):
-    """A law and what guards it in the core, which answers each period in one call.
+    """A controller and what guards it in the core, which answers each period in one call.
 
     It flies as long as every period has an optimum; other periods are the controller's that it was made of.
     """
@@ -452,7 +453,7 @@ class CoreController(Protocol):
 
 @runtime_checkable
 class InCore(Protocol):
-    """A law that the core can fly alone."""
+    """A controller that the core can fly alone."""
 
     def in_core(self, fallback: Struct) -> CoreController | None:
         """Return it with a fallback contract of these numbers (`quadsim_fallback`); None where it cannot."""
@@ -489,7 +490,11 @@ def counts(answered_by: Mapping[str, int]) -> str:
     """
     texts = {GAIN: "at the unconstrained optimum, no QP", LAW: COMMANDED}
     ranked = sorted(answered_by.items(), key=lambda entry: -entry[1])
-    parts = []
-    for i, (by, count) in enumerate(ranked):
-        parts.append(f"{count}{'' if i else ' periods'} {texts.get(by, f'by {by}')}")
+    parts: list[str] = []
+    for by, count in ranked:
+        periods = f"{count}"
+        if not parts:
+            periods = f"{count} periods"
+        source = texts.get(by, f"by {by}")
+        parts.append(f"{periods} {source}")
     return "; ".join(parts)

@@ -27,10 +27,14 @@ def printable(text: str, *, keep: str = "") -> str:
     r"""Escape the characters that control a terminal, e.g. as `\x1b`, except those in `keep`."""
     if text.isprintable():
         return text
-    return "".join(
-        character if character in keep or unicodedata.category(character) not in _HIDDEN else ascii(character)[1:-1]
-        for character in text
-    )
+    escaped = []
+    for character in text:
+        hidden = character not in keep and unicodedata.category(character) in _HIDDEN
+        if hidden:
+            escaped.append(ascii(character)[1:-1])
+        else:
+            escaped.append(character)
+    return "".join(escaped)
 
 
 class QuadsimError(Exception):
@@ -67,7 +71,10 @@ class ParameterError(InputError):
     """
 
     def __init__(self, owner: str, name: str, value: object, rule: str) -> None:
-        super().__init__(f"{owner + '.' if owner else ''}{name} must be {rule}; got {value!r}")
+        full_name = name
+        if owner:
+            full_name = f"{owner}.{name}"
+        super().__init__(f"{full_name} must be {rule}; got {value!r}")
         self.owner = owner
         self.name = name
         self.value = value
@@ -104,12 +111,13 @@ class UnknownNameError(InputError):
         if successor is not None:
             super().__init__(f"the {kind} {name!r} was removed: use {successor!r}")
             return
+        guess = ""
         near = meant or difflib.get_close_matches(name, self.allowed, n=1)
         if near:
             guess = f"; did you mean {' and '.join(map(repr, near))}?"
-        else:
-            guess = ""
-        tail = f"; {hint}" if hint else ""
+        tail = ""
+        if hint:
+            tail = f"; {hint}"
         listed = f"there are: {', '.join(self.allowed)}"
         if len(listed) > _LONGEST_LIST:
             some = self.allowed[: max(1, listed[:_LONGEST_LIST].count(",") - 1)]
@@ -229,13 +237,12 @@ class InterruptedFlightError(FlightError):
 
 def failure_line(error: BaseException) -> str:
     """Return why something was not made, in one line: `failed: ValueError: no`."""
-    if isinstance(error, QuadsimError):
+    if isinstance(error, OutputError):
+        text = error.problem  # without its path, which is that of what was to be made
+    elif isinstance(error, QuadsimError):
         text = str(error)
     else:
         text = described(error)
-    # its path is that of what was to be made
-    if isinstance(error, OutputError):
-        text = error.problem
     return f"failed: {printable(' '.join(text.split()))}"[:_LONGEST]
 
 

@@ -27,7 +27,8 @@ class Motion:
     def after(self, k: int) -> Motion:
         """Return the motion from sample k on, as views; beyond the end, its last sample."""
         first = min(k, len(self) - 1)
-        return Motion(**{name: samples[first:] for name, samples in vars(self).items()})
+        rest = {name: samples[first:] for name, samples in vars(self).items()}
+        return Motion(**rest)
 
     def read_only(self) -> Motion:
         """Return it as views that user code cannot write to."""

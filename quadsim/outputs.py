@@ -3,8 +3,8 @@
 An existing output directory that is not empty is refused.  A new one is built beside its place and renamed into it;
 `files` in its `summary.json` has the SHA-256 of the other files, `unhashed` the names of those that differ between
 directories with the same results.  Overwriting unlinks, by name, the regular files that these list, and refuses a
-directory that holds anything else.  A directory that grows in place, such as a campaign's, is
-locked.  What a killed process of ours leaves, a lock or a half-written folder under a private name, is in nobody's way.
+directory that holds anything else.  A directory that grows in place, such as a campaign's, is locked.  What a killed
+process leaves, a lock or a half-written folder under a private name, does not block the next one.
 """
 
 from __future__ import annotations
@@ -64,8 +64,11 @@ def digest_of(path: Path) -> str:
 
 def file_hashes(directory: Path) -> dict[str, str]:
     """SHA-256 of every regular file below a directory except its summary and lock, by relative path, sorted."""
-    names = {name for name, mode in _below(directory).items() if S_ISREG(mode)} - {SUMMARY_FILE, LOCK_FILE}
-    return {name: digest_of(directory / name) for name in sorted(names)}
+    hashes = {}
+    for name, mode in sorted(_below(directory).items()):
+        if S_ISREG(mode) and name not in (SUMMARY_FILE, LOCK_FILE):
+            hashes[name] = digest_of(directory / name)
+    return hashes
 
 
 @contextlib.contextmanager
@@ -84,7 +87,9 @@ def reserving(
     made: list[Path] = []
     try:
         with _errors(target):
-            made += [parent for parent in target.parents if not parent.exists()]
+            for parent in target.parents:
+                if not parent.exists():
+                    made.append(parent)
             if made == [] and not target.parent.is_dir():
                 raise OutputError(target, f"{target.parent} is a file")
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -129,7 +134,9 @@ def writing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
             work.rename(target)
         except OSError as error:
             kept = work.rename(work.with_suffix(".kept"))
-            problem = error.problem if isinstance(error, OutputError) else error.strerror
+            problem = error.strerror
+            if isinstance(error, OutputError):
+                problem = error.problem
             raise OutputError(target, f"{problem}; what was made is in {kept}") from error
 
 
@@ -188,7 +195,9 @@ def require_file(path: Path | str, *, overwrite: bool = False) -> Path:
     path = absolute(path)
     with _errors(path):
         if os.path.lexists(path) and not (overwrite and path.is_file()):
-            raise OutputError(path, "is a folder" if path.is_dir() else "it already exists; choose another file")
+            if path.is_dir():
+                raise OutputError(path, "is a folder")
+            raise OutputError(path, "it already exists; choose another file")
         with tempfile.TemporaryFile(dir=path.parent):
             return path
 
@@ -221,7 +230,8 @@ class Growing:
         with _errors(self.path):
             for name in names:
                 (self.path / name).unlink(missing_ok=True)
-        for folder in {(self.path / name).parent for name in names} - {self.path}:
+        folders = {(self.path / name).parent for name in names}
+        for folder in folders - {self.path}:
             with contextlib.suppress(OSError):
                 folder.rmdir()
 
@@ -231,7 +241,11 @@ class Growing:
         Those named `unhashed` are listed without their SHA-256: it would differ where the results are the same.
         """
         hashes = file_hashes(self.path)
-        named = [name for name in unhashed if hashes.pop(name, None) is not None]
+        named = []
+        for name in unhashed:
+            if name in hashes:
+                del hashes[name]
+                named.append(name)
         listed: dict[str, Any] = {"files": hashes}
         if named:
             listed[UNHASHED] = sorted(named)
@@ -249,9 +263,15 @@ def growing(path: Path | str, mark: str, *, overwrite: bool = False, first: Sequ
     """
     directory = absolute(path)
     goes_on = (directory / mark).is_file() and not overwrite
-    place = contextlib.nullcontext() if goes_on else reserving(directory, overwrite=overwrite, first=first)
+    place: AbstractContextManager[object] = contextlib.nullcontext()
+    if not goes_on:
+        place = reserving(directory, overwrite=overwrite, first=first)
     with place, _locked(directory, mark=True):
-        if odd := [name for name, mode in _below(directory).items() if not (S_ISREG(mode) or S_ISDIR(mode))]:
+        odd = []
+        for name, mode in _below(directory).items():
+            if not (S_ISREG(mode) or S_ISDIR(mode)):
+                odd.append(name)
+        if odd:
             raise OutputError(directory, f"{_few(odd)}: links are refused; move them away first")
         _clear_partial(directory)
         if not goes_on:
@@ -281,7 +301,9 @@ def _require_replaceable(target: Path, *, overwrite: bool, first: Sequence[str] 
     if S_ISREG(there.get(LOCK_FILE, 0)):
         with _locked(target):
             content = (target / LOCK_FILE).read_bytes()[: len(_LOCK_MARK) + 1]
-        left = {LOCK_FILE, *(first if content == _LOCK_MARK else ())}
+        left = {LOCK_FILE}
+        if content == _LOCK_MARK:
+            left |= {*first}
         if content in (b"", _LOCK_MARK) and {*there} <= left and all(map(S_ISREG, there.values())):
             return
     if there and not overwrite:
@@ -289,11 +311,15 @@ def _require_replaceable(target: Path, *, overwrite: bool, first: Sequence[str] 
     if there and listed is None:
         raise OutputError(target, f"it has no {SUMMARY_FILE} that lists its files; choose another --out")
     files = {*(listed or ()), SUMMARY_FILE, LOCK_FILE}
-    folders = {str(parent) for name in files for parent in Path(name).parents}
+    folders: set[str] = set()
+    for name in files:
+        folders |= {str(parent) for parent in Path(name).parents}
     others = []
-    for n, mode in there.items():
-        if n not in (files if S_ISREG(mode) else folders if S_ISDIR(mode) else ()):
-            others.append(n)
+    for name, mode in there.items():
+        is_listed_file = S_ISREG(mode) and name in files
+        is_listed_folder = S_ISDIR(mode) and name in folders
+        if not (is_listed_file or is_listed_folder):
+            others.append(name)
     if others:
         raise OutputError(target, f"its {SUMMARY_FILE} does not list {_few(others)}; move that away first")
 
@@ -349,13 +375,17 @@ def _below(directory: Path) -> dict[str, int]:
     modes = {}
     for folder, inner, files in os.walk(directory, onerror=fail):
         inner[:] = [name for name in inner if not _PARTIAL.fullmatch(name)]
-        for path in (Path(folder, name) for name in sorted((*inner, *files))):
+        for name in sorted((*inner, *files)):
+            path = Path(folder, name)
             modes[path.relative_to(directory).as_posix()] = path.lstat().st_mode
     return modes
 
 
 def _few(names: Sequence[str]) -> str:
-    return ", ".join(map(printable, names[:3])) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    listed = ", ".join(map(printable, names[:3]))
+    if len(names) > 3:
+        listed += f" and {len(names) - 3} more"
+    return listed
 
 
 @contextlib.contextmanager

@@ -68,17 +68,28 @@ def on_light(colour: str) -> str:
 
 
 def _mixed(colour: str, other: int, share: float) -> str:
-    return "#" + "".join(f"{round((1.0 - share) * shade + share * other):02x}" for shade in rgb(colour))
+    mixed = "#"
+    for shade in rgb(colour):
+        part = round((1.0 - share) * shade + share * other)
+        mixed += f"{part:02x}"
+    return mixed
 
 
 ON_DARK: Final = Palette(*map(on_dark, COLOUR))
 ON_LIGHT: Final = Palette(*map(on_light, COLOUR))
 
 
+def _properties(palette: Palette, end: str = "") -> str:
+    """Return a palette's custom properties, their names with an end."""
+    text = ""
+    for name, colour in palette._asdict().items():
+        text += f" --{name.replace('_', '-')}{end}: {colour};"
+    return text
+
+
 def css() -> str:
     """The palette as custom properties: `--bound` for lines and areas, `--bound-text` for text in the page's theme."""
-    lines, light, dark = (
-        "".join(f" --{name.replace('_', '-')}{end}: {colour};" for name, colour in palette._asdict().items())
-        for palette, end in ((COLOUR, ""), (ON_LIGHT, "-text"), (ON_DARK, "-text"))
-    )
+    lines = _properties(COLOUR)
+    light = _properties(ON_LIGHT, "-text")
+    dark = _properties(ON_DARK, "-text")
     return f":root {{{lines}{light} }}\n@media (prefers-color-scheme: dark) {{ :root {{{dark} }} }}"

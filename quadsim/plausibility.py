@@ -57,7 +57,10 @@ class Ratio:
             if self.low > 0.0:
                 return math.inf
             return 0.0
-        return max(math.log(value / self.high), math.log(self.low / value) if self.low > 0.0 else 0.0, 0.0)
+        misfit = max(math.log(value / self.high), 0.0)
+        if self.low > 0.0:
+            misfit = max(misfit, math.log(self.low / value))
+        return misfit
 
     def is_usual(self, vehicle: Vehicle) -> bool:
         """Return whether a vehicle is within the range, and not at its edge, or states nothing."""
@@ -92,6 +95,31 @@ def _thrust_coefficient(vehicle: Vehicle) -> float:
 def _slowing(vehicle: Vehicle) -> float | None:
     """Share of the speed that the rotors' drag takes per second at hover [1/s]."""
     return _over(vehicle.rotor_drag, vehicle.mass / (N_ROTORS * vehicle.hover_speed))
+
+
+def _drag_share(vehicle: Vehicle) -> float | None:
+    """The largest area of drag over that of the arms' circle."""
+    if vehicle.body_drag is None:
+        return None
+    return max(vehicle.body_drag) / (math.pi * vehicle.longest_arm**2)
+
+
+def _fall_over_rise(vehicle: Vehicle) -> float | None:
+    """Time constant of a rotor's speed when it falls over that when it rises."""
+    if vehicle.rotor_rise is None:
+        return None
+    return _over(vehicle.rotor_fall, vehicle.rotor_rise)
+
+
+def _time_constant(name: str) -> Ratio:
+    """Return the ratio of a rotor's time constant to what its propeller's size suggests."""
+    return Ratio(
+        of=(name, "rotor_radius"),
+        text=f"{name} [s] over 0.12 s + rotor_radius / (1 m/s)",
+        value=lambda v: _over(getattr(v, name), 0.12 + _radius(v)),
+        low=5e-3,
+        high=1.0,
+    )
 
 
 RATIOS: Final = (
@@ -211,24 +239,16 @@ RATIOS: Final = (
     Ratio(
         of=("body_drag", "arm_length"),
         text="the largest body_drag over pi arm_length^2",
-        value=lambda v: _over(None if v.body_drag is None else max(v.body_drag), math.pi * v.longest_arm**2),
+        value=_drag_share,
         low=1e-3,
         high=3.0,
     ),
-    *(
-        Ratio(
-            of=(name, "rotor_radius"),
-            text=f"{name} [s] over 0.12 s + rotor_radius / (1 m/s)",
-            value=lambda v, name=name: _over(getattr(v, name), 0.12 + _radius(v)),  # type: ignore[misc]
-            low=5e-3,
-            high=1.0,
-        )
-        for name in ("rotor_rise", "rotor_fall")
-    ),
+    _time_constant("rotor_rise"),
+    _time_constant("rotor_fall"),
     Ratio(
         of=("rotor_fall", "rotor_rise"),
         text="rotor_fall over rotor_rise",
-        value=lambda v: None if v.rotor_rise is None else _over(v.rotor_fall, v.rotor_rise),
+        value=_fall_over_rise,
         low=0.4,
         high=5.0,
     ),
@@ -262,22 +282,39 @@ UNITS: Final[dict[str, Factors]] = {
 
 def implausible(vehicle: Vehicle) -> list[str]:
     """Return a line per ratio outside its range, or one about the unit that would explain all of them."""
-    off = [ratio for ratio in RATIOS if ratio.misfit(vehicle) > 0.0]
-    if off and (explanation := _explanation(vehicle)) is not None:
-        if len(off) == 1:
-            more = ""
-        else:
+    off = _ratios_off(vehicle)
+    if not off:
+        return []
+    explanation = _explanation(vehicle)
+    if explanation is not None:
+        more = ""
+        if len(off) > 1:
             more = f", and {len(off) - 1} more ratios are off"
         return [f"vehicle: {explanation}; as it is, {_line(off[0], vehicle)}{more}"]
-    return [f"vehicle: {_line(ratio, vehicle)}; check {', '.join(_stated(ratio.of, vehicle))}" for ratio in off]
+    lines = []
+    for ratio in off:
+        parameters = ", ".join(_stated(ratio.of, vehicle))
+        lines.append(f"vehicle: {_line(ratio, vehicle)}; check {parameters}")
+    return lines
+
+
+def _ratios_off(vehicle: Vehicle) -> list[Ratio]:
+    """Return the ratios outside their ranges."""
+    return [ratio for ratio in RATIOS if ratio.misfit(vehicle) > 0.0]
 
 
 def _stated(names: Sequence[str], vehicle: Vehicle) -> list[str]:
     """Return the parameters as the vehicle states them: arms by `rotor_positions`, thrust by a map."""
-    placed = vehicle.rotor_positions is not None
-    (thrust,) = (name for name in THRUST if getattr(vehicle, name) is not None)
-    names = [thrust if name == THRUST[0] else name for name in names]
-    return ["rotor_positions" if placed and name in ARMS else name for name in names]
+    (thrust,) = [name for name in THRUST if getattr(vehicle, name) is not None]
+    stated = []
+    for name in names:
+        if name == THRUST[0]:
+            stated.append(thrust)
+        elif name in ARMS and vehicle.rotor_positions is not None:
+            stated.append("rotor_positions")
+        else:
+            stated.append(name)
+    return stated
 
 
 def _line(ratio: Ratio, vehicle: Vehicle) -> str:
@@ -291,7 +328,7 @@ def _explanation(vehicle: Vehicle) -> str | None:
     """
     before = _misfit(vehicle)
     best = None
-    off = [ratio for ratio in RATIOS if ratio.misfit(vehicle) > 0.0]
+    off = _ratios_off(vehicle)
     for name, unit, other in _converted(vehicle):
         misfit = _misfit(other)
         changed = [ratio for ratio in off if ratio.value(other) != ratio.value(vehicle)]
@@ -313,10 +350,12 @@ def _converted(vehicle: Vehicle) -> Iterator[tuple[str, str, Vehicle]]:
     """Yield the vehicle with one parameter, or all that depend on rotor speeds, taken to be in another unit."""
     speeds = {name: _scaled(getattr(vehicle, name), _SPEEDS["rpm"]) for name in ("speed_min", "speed_max")}
     for name, unit in (("thrust_coefficient", "N/rpm^2"), ("thrust_of_speed", "N/rpm and N/rpm^2")):
-        if (thrust := getattr(vehicle, name)) is not None:
-            with contextlib.suppress(ParameterError):
-                together = {**speeds, name: _scaled(thrust, UNITS[name][unit])}
-                yield "speed_max", f"rpm, and {name} in {unit}", replace(vehicle, **together)
+        thrust = getattr(vehicle, name)
+        if thrust is None:
+            continue
+        with contextlib.suppress(ParameterError):
+            together = {**speeds, name: _scaled(thrust, UNITS[name][unit])}
+            yield "speed_max", f"rpm, and {name} in {unit}", replace(vehicle, **together)
     for name, units in UNITS.items():
         value: Any = getattr(vehicle, name)
         if value is None:

@@ -208,4 +208,5 @@ def body_to_world(euler: Array) -> Array:
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
         [-sp, cp * sr, cp * cr],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    stacked = [np.stack(row, axis=-1) for row in rows]
+    return np.stack(stacked, axis=-2)

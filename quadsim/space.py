@@ -86,7 +86,9 @@ class Solid(NamedTuple):
         sides = np.where(local < 0.0, -1.0, 1.0)
         if self.kind == "box":
             return self.centre + (sides * self.size) @ self.turn.T
-        core = local * (1.0, 1.0, 0.0 if self.kind == "cylinder" else 1.0)
+        core = local.copy()
+        if self.kind == "cylinder":
+            core[:, 2] *= 0.0
         length = np.linalg.norm(core, axis=1, keepdims=True)
         farthest = a * core / np.where(length > 0.0, length, 1.0)
         farthest[:, 2] += b * sides[:, 2]
@@ -134,7 +136,7 @@ class Obstacle:
             raise InputError(
                 f"path must be absent where velocity or acceleration is given; got {len(self.path)} positions"
             )
-        times = [self.start, *(place.time for place in self.path)]
+        times = self._times
         if any(later <= earlier for earlier, later in itertools.pairwise(times)):
             raise InputError(f"path must have rising times, all after start = {self.start}; got {times[1:]}")
 
@@ -154,9 +156,19 @@ class Obstacle:
         if not self.path:
             moved = since * np.array(self.velocity) + 0.5 * since**2 * np.array(self.acceleration)
             return np.array(self.position) + moved
-        times = [self.start, *(place.time for place in self.path)]
-        positions = np.array([self.position, *(place.position for place in self.path)])
-        return np.stack([np.interp(t, times, column) for column in positions.T], axis=1)
+        places = [self.position]
+        for place in self.path:
+            places.append(place.position)
+        columns = [np.interp(t, self._times, column) for column in np.array(places).T]
+        return np.stack(columns, axis=1)
+
+    @property
+    def _times(self) -> list[float]:
+        """When it starts to move, and when it is at each place of its path [s]."""
+        times = [self.start]
+        for place in self.path:
+            times.append(place.time)
+        return times
 
     def clearances(self, t: Array, points: Array) -> tuple[Array, Array]:
         """Signed distances (s, K) [m] of points (K, 3) at times (K,) to its s solids, and normals (s, K, 3)."""
@@ -172,17 +184,24 @@ class Solids:
 
     def __init__(self, obstacles: Sequence[Obstacle]) -> None:
         self._obstacles = tuple(obstacles)
-        every = [(i, solid) for i, obstacle in enumerate(obstacles) for solid in obstacle.solids]
-        self.count = len(every)
-        self._still = np.array([obstacle.position for obstacle in obstacles], float).reshape(-1, 1, 3)
+        positions = [obstacle.position for obstacle in obstacles]
+        self._still = np.array(positions, float).reshape(-1, 1, 3)
+        # Of each kind of solid, its solids, their numbers among all, and the numbers of their obstacles.
+        by_kind: dict[str, tuple[list[Solid], list[int], list[int]]] = {}
+        self.count = 0
+        for i, obstacle in enumerate(obstacles):
+            for solid in obstacle.solids:
+                solids, numbers, owners = by_kind.setdefault(solid.kind, ([], [], []))
+                solids.append(solid)
+                numbers.append(self.count)
+                owners.append(i)
+                self.count += 1
         self._groups = []
-        for kind in sorted({solid.kind for _, solid in every}):
-            at = [k for k, (_, solid) in enumerate(every) if solid.kind == kind]
-            size, centre, turn = (
-                np.array([getattr(every[k][1], name) for k in at]) for name in ("size", "centre", "turn")
-            )
-            owners = np.array([every[k][0] for k in at])
-            self._groups.append((kind, np.array(at), owners, size[:, None], centre[:, None], turn))
+        for kind, (solids, numbers, owners) in sorted(by_kind.items()):
+            size = np.array([solid.size for solid in solids])
+            centre = np.array([solid.centre for solid in solids])
+            turn = np.array([solid.turn for solid in solids])
+            self._groups.append((kind, np.array(numbers), np.array(owners), size[:, None], centre[:, None], turn))
 
     def clearances(self, t: Array, points: Array) -> tuple[Array, Array]:
         """Signed distances (s, K) [m] and normals (s, K, 3); see `Obstacle.clearances`."""
@@ -326,10 +345,11 @@ class Region:
     required: Annotated[bool, doc("false: reported only, without effect on the verdict")] = True
 
     def __post_init__(self) -> None:
-        box = (self.position, self.size)
-        polytope = (self.rows, self.upper)
-        stated = [part is not None for part in (*box, *polytope)]
-        if stated not in ([True, True, False, False], [False, False, True, True]):
+        box = (self.position is not None, self.size is not None)
+        polytope = (self.rows is not None, self.upper is not None)
+        is_box = all(box) and not any(polytope)
+        is_polytope = all(polytope) and not any(box)
+        if not is_box and not is_polytope:
             raise InputError("position must be given with size, or rows with upper, and not both")
         if self.rows is not None and self.upper is not None:
             if len(self.rows) != len(self.upper):
@@ -422,11 +442,13 @@ class Corridor(Region):
         def passed(k: np.intp, at: float) -> float:
             return float(t[k] + (at - gone[k]) / steps[k] * (t[k + 1] - t[k]))
 
-        if first == 0:
-            start = float(t[0])
-        else:
+        start = float(t[0])
+        stop = math.inf
+        if first > 0:
             start = passed(first - 1, path_start)
-        return replace(self, path=None, start=start, stop=passed(last, end) if last < len(steps) else math.inf)
+        if last < len(steps):
+            stop = passed(last, end)
+        return replace(self, path=None, start=start, stop=stop)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -446,8 +468,11 @@ SHAPES: Final[dict[str, type[Any]]] = {
 
 def shape_to_json(shape: Constraining) -> dict[str, Any]:
     """A shape's fields, less those that are absent, and its kind as `type`."""
-    stated = {name: value for name, value in asdict(shape).items() if value is not None and value != math.inf}
-    written: dict[str, Any] = json.loads(json.dumps({"type": type(shape).__name__.lower(), **stated}))
+    stated: dict[str, Any] = {"type": type(shape).__name__.lower()}
+    for name, value in asdict(shape).items():
+        if value is not None and value != math.inf:
+            stated[name] = value
+    written: dict[str, Any] = json.loads(json.dumps(stated))
     return written  # with lists for tuples, as it is read
 
 
@@ -465,7 +490,10 @@ def shape_from_json(entry: Mapping[str, Any]) -> Constraining:
         if name != "type":
             values[name] = _frozen(value)
     if "path" in values and issubclass(kind, Obstacle):
-        values["path"] = tuple(Place(time=place["time"], position=tuple(place["position"])) for place in entry["path"])
+        places = []
+        for place in entry["path"]:
+            places.append(Place(time=place["time"], position=tuple(place["position"])))
+        values["path"] = tuple(places)
     shape: Constraining = kind(**values)
     points = np.zeros((1, 3))
     if not np.isfinite(shape.clearance(np.zeros(1), points)).all():

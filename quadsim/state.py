@@ -76,8 +76,10 @@ class State(np.ndarray[tuple[int], np.dtype[np.float64]]):
     def __getattr__(self, name: str) -> float:
         if name in INDEX:
             return self.item(INDEX[name])
+        guess = ""
         near = difflib.get_close_matches(name, STATE_NAMES, n=1)
-        guess = f"; did you mean {near[0]!r}?" if near else ""
+        if near:
+            guess = f"; did you mean {near[0]!r}?"
         raise AttributeError(f"a state has no {name!r}{guess} (there are: {', '.join(STATE_NAMES)})")
 
     def __dir__(self) -> list[str]:
@@ -200,7 +202,7 @@ def follow_turns(references: Array, yaws: Array, firsts: Array) -> Array:
     return moved
 
 
-class YawTurns:
+class YawUnwrapper:
     """Counts a yaw's whole turns, sample by sample.
 
     Past the vertical, Euler's yaw turns by 180 deg either way: upside down it is unwrapped to the last one, and upright
@@ -215,9 +217,12 @@ class YawTurns:
         roll, pitch, yaw = euler.tolist()
         if math.isfinite(roll + pitch + yaw):
             upright = math.cos(roll) * math.cos(pitch) >= 0.0
-            yaw = nearest_turn(yaw, self._upright if upright else self._last)
+            if upright:
+                yaw = nearest_turn(yaw, self._upright)
+                self._upright = yaw
+            else:
+                yaw = nearest_turn(yaw, self._last)
             self._last = yaw
-            self._upright = yaw if upright else self._upright
         return float(yaw)
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -36,7 +36,7 @@ ARMS: Final = ("arm_length", "rotor_azimuths")
 THRUST: Final = ("thrust_coefficient", "thrust_of_speed", "thrust_of_throttle")
 """The parameters of which one states a rotor's thrust."""
 AIR_MOMENT: Final = ("rotor_moment", "inflow_moment", "rate_damping", "inflow")
-"""The parameters that a law or an estimator knows by its field `moment`."""
+"""The parameters that a controller or an estimator knows by its field `moment`."""
 LARGEST: Final = 1e6
 """Largest magnitude of a vehicle's numbers: larger ones overflow."""
 LEAST_SHARE: Final = 1e-3
@@ -191,10 +191,9 @@ class Vehicle:
             f"hover at {self.hover_speed:.4g} of {self.speed_max:.4g} rad/s",
             f"thrust {lift:.3g} times the weight",
         ]
+        about = ""
         if self.description:
             about = f"\n {self.description}"
-        else:
-            about = ""
         return f"<Vehicle {self.name}: {', '.join(parts)}{about}>"
 
     def _refuse(self, name: str, rule: str) -> NoReturn:
@@ -206,8 +205,11 @@ class Vehicle:
             self._refuse("rotor_positions", f"left out where {' and '.join(arms)} is given: one or the other")
         if max(map(abs, self.rotor_azimuths or (0.0,))) > 360.0:
             self._refuse("rotor_azimuths", "within -360 and 360 deg")
-        if self.rotor_positions is None and (absent := [name for name in ARMS if name not in arms]):
-            self._refuse(absent[0], f"given with {arms[0] if arms else ARMS[1]}, or rotor_positions in place of both")
+        if self.rotor_positions is None and not arms:
+            self._refuse(ARMS[0], f"given with {ARMS[1]}, or rotor_positions in place of both")
+        if self.rotor_positions is None and len(arms) < len(ARMS):
+            (absent,) = {*ARMS} - {*arms}
+            self._refuse(absent, f"given with {arms[0]}, or rotor_positions in place of both")
         if not self.longest_arm >= FLOORS["m"]:
             self._refuse("rotor_positions", "away from the centre of mass")
         rule = self._layout_problem(self.rotor_spins)
@@ -219,7 +221,9 @@ class Vehicle:
         if self._layout_problem(alternating) is None:
             expected = tuple(alternating.tolist())
             self._refuse("rotor_spins", f"alternating around the airframe, so that yaw is controlled: {expected}")
-        self._refuse("rotor_azimuths" if self.rotor_positions is None else "rotor_positions", rule)
+        if self.rotor_positions is None:
+            self._refuse("rotor_azimuths", rule)
+        self._refuse("rotor_positions", rule)
 
     def _layout_problem(self, spins: Sequence[float] | Array) -> str | None:
         """Return the missing property of the layout with these spins; None if it is complete."""
@@ -241,18 +245,21 @@ class Vehicle:
             self._refuse(THRUST[0], f"given, or {' or '.join(THRUST[1:])} in place of it")
         if len(stated) > 1:
             self._refuse(stated[1], f"left out where {stated[0]} is given: one or the other")
-        if (name := stated[0]) == THRUST[0]:
+        name = stated[0]
+        if name == THRUST[0]:
             return
         a1, a2 = getattr(self, name)
         u = "u"
-        low, top = (0.0, 1.0)
+        low = 0.0
+        top = 1.0
         unit = ""
         if self.throttle_offset:
             u = "v"
             low = float(self.effective_throttle(np.zeros(1))[0])
         if name == "thrust_of_speed":
             u = "w"
-            low, top = (self.speed_min, self.speed_max)
+            low = self.speed_min
+            top = self.speed_max
             unit = " rad/s"
         if a1 + a2 * low < 0.0 or a1 + 2.0 * a2 * low < 0.0 or a1 + 2.0 * a2 * top <= 0.0:
             rule = f"such that a1 {u} + a2 {u}^2 is not negative and rises from {u} = {low:g} to {top:g}{unit}"
@@ -270,12 +277,12 @@ class Vehicle:
             hover = sign * float((sign * self.hover_speeds).max())
             if sign * (hover - speed) > 0.0:
                 lift = self.level_thrust(speed)
-                self._refuse(
-                    name,
+                rule = (
                     f"{side} its hover speed, {hover:.6g} rad/s, or it cannot hover (rotors hold {self.speed_min:g} to "
                     f"{self.speed_max:g} rad/s; {self.mass:g} kg weigh {weight:.4g} N, the rotors lift {lift:.4g} N at "
-                    f"{speed:g} rad/s)",
+                    f"{speed:g} rad/s)"
                 )
+                self._refuse(name, rule)
 
     @property
     def coefficients(self) -> Array:
@@ -337,7 +344,9 @@ class Vehicle:
             return np.sqrt(thrusts / self.coefficients)
         a1, a2 = self.thrust_of_speed
         root = np.sqrt(np.maximum(a1**2 + 4.0 * a2 * thrusts, 0.0))  # beyond the map's top, its top
-        return np.asarray(2.0 * thrusts / (a1 + root) if a1 > 0.0 else (root - a1) / (2.0 * a2))
+        if a1 > 0.0:
+            return np.asarray(2.0 * thrusts / (a1 + root))
+        return np.asarray((root - a1) / (2.0 * a2))
 
     def level_thrust(self, speed: float) -> float:
         """Return the collective thrust [N], without torque, at which the fastest rotor has a speed [rad/s]."""
@@ -475,7 +484,9 @@ class Vehicle:
         """
         if self.extent is not None:
             return max(self.extent, self._reach + (self.rotor_radius or 0.0))
-        return self._reach + (0.5 * self.closest_rotors if self.rotor_radius is None else self.rotor_radius)
+        if self.rotor_radius is None:
+            return self._reach + 0.5 * self.closest_rotors
+        return self._reach + self.rotor_radius
 
     @property
     def _reach(self) -> float:
@@ -524,11 +535,13 @@ def _checked(name: str, value: Any) -> Any:
     if length is None:
         _check_number(name, value, positive=name not in _ANY_SIGN)
         return value
-    rule = f"a list of {length} {'lists of 3 numbers' if name == 'rotor_positions' else 'numbers'}"
-    entries = _entries(name, value, length, rule)
-    if name == "rotor_positions":
-        return tuple(_checked_numbers(name, _entries(name, entry, 3, rule)) for entry in entries)
-    return _checked_numbers(name, entries)
+    if name != "rotor_positions":
+        return _checked_numbers(name, _entries(name, value, length, f"a list of {length} numbers"))
+    rule = f"a list of {length} lists of 3 numbers"
+    positions = []
+    for position in _entries(name, value, length, rule):
+        positions.append(_checked_numbers(name, _entries(name, position, 3, rule)))
+    return tuple(positions)
 
 
 def _entries(name: str, value: Any, length: int, rule: str) -> tuple[Any, ...]:
@@ -571,40 +584,53 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
     for key in overrides or {}:
         if key not in VEHICLE_UNITS:
             raise UnknownNameError("vehicle parameter", key, VEHICLE_UNITS, meant=MEANT.get(key, ()))
-    values = overridden({**texts, **{key: entry["value"] for key, entry in entries.items()}}, overrides or {})
-    if missing := [name for name in ("name", *missing_parameters(values)) if name not in values]:
+    stated: dict[str, Any] = dict(texts)
+    for key, entry in entries.items():
+        stated[key] = entry["value"]
+    values = overridden(stated, overrides or {})
+    missing = missing_parameters(values)
+    if "name" not in values:
+        missing.insert(0, "name")
+    if missing:
         raise FileError(path, f"lacks {', '.join(missing)}")
-    with nullcontext() if overrides else _naming(path):
+    if overrides:
+        return Vehicle(**values)
+    with _naming(path):
         return Vehicle(**values)
 
 
 def overridden(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Return parameters with some replaced; another form of placing the rotors, or of their thrust, is then dropped."""
-    placed = "rotor_positions" in overrides
-    thrust = {*THRUST} & {*overrides}
-    replaced: tuple[str, ...]
-    if placed:
-        replaced = ARMS
-    elif set(ARMS) <= {*overrides}:
-        replaced = ("rotor_positions",)
-    else:
-        replaced = ()
-    replaced += THRUST if thrust else ()
-    return {**values, **dict.fromkeys(name for name in replaced if name in values), **overrides}
+    replaced: list[str] = []
+    if "rotor_positions" in overrides:
+        replaced += ARMS
+    elif {*ARMS} <= {*overrides}:
+        replaced.append("rotor_positions")
+    if {*THRUST} & {*overrides}:
+        replaced += THRUST
+    changed: dict[str, Any] = dict(values)
+    for name in replaced:
+        if name in values:
+            changed[name] = None
+    return {**changed, **overrides}
 
 
 def altered(vehicle: Vehicle, overrides: Mapping[str, Any]) -> Vehicle:
     """Return a vehicle with some parameters replaced, as `overridden`; errors as `Vehicle`."""
-    return Vehicle(**overridden({field.name: getattr(vehicle, field.name) for field in fields(vehicle)}, overrides))
+    values = {field.name: getattr(vehicle, field.name) for field in fields(vehicle)}
+    return Vehicle(**overridden(values, overrides))
 
 
 def missing_parameters(values: Mapping[str, Any]) -> list[str]:
     """Return the parameters that these lack to make a vehicle."""
-    there = {name for name, value in values.items() if value is not None}
-    needed = {name for name in VEHICLE_UNITS if name not in OPTIONAL_PARAMETERS}
-    needed |= set() if "rotor_positions" in there else {*ARMS}
-    needed |= set() if there & {*THRUST} else {THRUST[0]}
-    return [name for name in VEHICLE_UNITS if name in needed - {*values}]
+    stated = {name for name, value in values.items() if value is not None}
+    needed = {*VEHICLE_UNITS} - {*OPTIONAL_PARAMETERS}
+    if "rotor_positions" not in stated:
+        needed |= {*ARMS}
+    if not stated & {*THRUST}:
+        needed.add(THRUST[0])
+    missing = needed - {*values}
+    return [name for name in VEHICLE_UNITS if name in missing]
 
 
 @contextmanager
@@ -618,7 +644,8 @@ def _naming(path: Path) -> Iterator[None]:
 
 def vehicle_sources(path: Path) -> dict[str, str]:
     """Return the source of each parameter, in the vehicle file's order; arguments and errors as `load_vehicle`."""
-    return {key: entry["source"] for key, entry in _read_entries(path)[1].items()}
+    _, entries = _read_entries(path)
+    return {key: entry["source"] for key, entry in entries.items()}
 
 
 EXAMPLE_SOURCE: Final = "example"
@@ -635,13 +662,15 @@ def example_notes(path: Path, replaced: Collection[str] = ()) -> tuple[str, ...]
         replaced: parameters that the file's values are not used of.
     """
     texts, entries = _read_entries(path)
-    left = [name for name, entry in entries.items() if entry["source"] == EXAMPLE_SOURCE and name not in replaced]
+    left = []
+    for name, entry in entries.items():
+        if entry["source"] == EXAMPLE_SOURCE and name not in replaced:
+            left.append(name)
     notes = []
     if left:
         count = f"{len(left)} of {len(entries)} values"
-        notes.append(
-            f'{path.name}: {count} are of an example (source = "{EXAMPLE_SOURCE}"), not yours: {", ".join(left)}'
-        )
+        listed = ", ".join(left)
+        notes.append(f'{path.name}: {count} are of an example (source = "{EXAMPLE_SOURCE}"), not yours: {listed}')
     if texts.get("description", "").startswith(EXAMPLE_DESCRIPTION):
         notes.append(f"{path.name}: the description is of an example, not yours: {texts['description']!r}")
     return tuple(notes)
@@ -686,22 +715,35 @@ def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]
     return texts, entries
 
 
-VEHICLE_UNITS: Final[dict[str, str]] = {
-    name: note.documentation.partition("]")[0].removeprefix("[")
-    for name, hint in get_type_hints(Vehicle, include_extras=True).items()
-    for note in hint.__metadata__
-    if isinstance(note, DocInfo) and note.documentation.startswith("[")
-}
+def _stated_units() -> dict[str, str]:
+    """Return the units in brackets that begin the documentation of a vehicle's fields."""
+    units = {}
+    for name, hint in get_type_hints(Vehicle, include_extras=True).items():
+        for note in hint.__metadata__:
+            if isinstance(note, DocInfo) and note.documentation.startswith("["):
+                unit, _, _ = note.documentation.removeprefix("[").partition("]")
+                units[name] = unit
+    return units
+
+
+VEHICLE_UNITS: Final[dict[str, str]] = _stated_units()
 """The parameters of a vehicle file and their units."""
 MEANT: Final[dict[str, tuple[str, ...]]] = {"rotor_lag": ("rotor_rise", "rotor_fall")}
 """Parameters by other common names, where a spelling guess would name the wrong one."""
 OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if field.default is None)
 """Parameters that a vehicle file may leave out."""
 _LENGTHS: Final = {
-    **{"thrust_of_speed": 2, "thrust_of_throttle": 2},
-    **{"inertia": 3, "products_of_inertia": 3, "body_drag": 3},
-    **{"rotor_moment": 2, "inflow_moment": 2, "rate_damping": 3},
-    **{"rotor_azimuths": N_ROTORS, "rotor_positions": N_ROTORS, "rotor_spins": N_ROTORS},
+    "thrust_of_speed": 2,
+    "thrust_of_throttle": 2,
+    "inertia": 3,
+    "products_of_inertia": 3,
+    "body_drag": 3,
+    "rotor_moment": 2,
+    "inflow_moment": 2,
+    "rate_damping": 3,
+    "rotor_azimuths": N_ROTORS,
+    "rotor_positions": N_ROTORS,
+    "rotor_spins": N_ROTORS,
 }
 _ANY_SIGN: Final = (
     *("rotor_azimuths", "rotor_positions", "rotor_spins", "speed_min"),

@@ -59,8 +59,8 @@ IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
 HANDING_OUT = ("quadsim", "quadsim.mpc", "quadsim.gym")
 """Modules with a table of public names, each imported on first use; `quadsim` also starts the command."""
 DEFINED_TWICE = {
-    *("Draws", "Flags", "Guard", "LARGEST_RATES", "MOST_ROWS", "NUMBER", "Overlay", "Rows", "Solving", "Steps"),
-    *("TARGETS", "WIDTH", "YawTurns", "drawn_flights", "export", "fly", "load_vehicle", "main"),
+    *("Draws", "Guard", "MOST_ROWS", "NUMBER", "Overlay", "Solving", "TARGETS", "WIDTH"),
+    *("drawn_flights", "export", "fly", "load_vehicle", "main"),
 }
 """Public names that two modules define, for two things or as a function and its command; no name joins them."""
 FORMULAS_TWICE = {("quadsim_nonlinear.c", "quadsim_rotation.h")}

@@ -16,7 +16,7 @@ from quadsim.state import (
     Array,
     ReferenceTurns,
     State,
-    YawTurns,
+    YawUnwrapper,
     follow_turns,
     nearest_turn,
     unwrapped,
@@ -113,7 +113,7 @@ def test_turns_are_counted_from_minus_half_to_half() -> None:
 
 
 def test_a_loop_leaves_the_yaw_however_it_turns_upside_down() -> None:
-    turns, flown = YawTurns(0.0), ((math.pi, -2.78), (math.pi, 2.9), (0.1, 0.1))
+    turns, flown = YawUnwrapper(0.0), ((math.pi, -2.78), (math.pi, 2.9), (0.1, 0.1))
     yaws = [turns.unwrapped(np.array([roll, 0.0, yaw])) for roll, yaw in flown]
     assert yaws == pytest.approx([-2.78, 2.9 - TURN, 0.1])
 

@@ -37,8 +37,8 @@ COMPILERS: Final = ("cc", "gcc", "clang")
 ZIG: Final = "ziglang==0.17.1"
 """The wheel with a C compiler, for machines without one and for wheels to publish."""
 PLATFORM: Final = "QUADSIM_PLATFORM"
-"""Environment variable with the platform tag of a wheel to publish, of `TARGETS`; unset for this machine's."""
-TARGETS: Final = {
+"""Environment variable with the platform tag of a wheel to publish, of `ZIG_TARGETS`; unset for this machine's."""
+ZIG_TARGETS: Final = {
     "manylinux_2_28_x86_64": "x86_64-linux-gnu.2.28",
     "manylinux_2_28_aarch64": "aarch64-linux-gnu.2.28",
     "macosx_11_0_arm64": "aarch64-macos.11.0",
@@ -98,11 +98,11 @@ def to_publish() -> str:
     """Return the platform tag of a wheel to publish; an empty text without one.
 
     Raises:
-        CompilationError: it is not one of `TARGETS`.
+        CompilationError: it is not one of `ZIG_TARGETS`.
     """
     platform = os.environ.get(PLATFORM, "")
-    if platform and platform not in TARGETS:
-        raise CompilationError(f"{PLATFORM} must be one of {', '.join(TARGETS)}; got {platform!r}")
+    if platform and platform not in ZIG_TARGETS:
+        raise CompilationError(f"{PLATFORM} must be one of {', '.join(ZIG_TARGETS)}; got {platform!r}")
     return platform
 
 
@@ -126,7 +126,7 @@ def compiler() -> list[str]:
         lacking = f"{PLATFORM} needs the package" if platform else f"no C compiler ({', '.join(COMPILERS)}), nor"
         raise CompilationError(f"{lacking} {ZIG}")
     # Without either, zig compiles for the processor at hand.
-    target = ("-target", TARGETS[platform]) if platform else ("-mcpu=baseline",)
+    target = ("-target", ZIG_TARGETS[platform]) if platform else ("-mcpu=baseline",)
     return [sys.executable, "-m", "ziglang", "cc", *target]
 
 

@@ -40,7 +40,9 @@ class CompiledLoop:
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
         """See `quadsim.controller.InnerLoop`."""
         struct = self._engaged(commanded)
-        rates, rotors, attitude = (np.ascontiguousarray(given, np.float64) for given in (rates, rotors, attitude))
+        rates = np.ascontiguousarray(rates, np.float64)
+        rotors = np.ascontiguousarray(rotors, np.float64)
+        attitude = np.ascontiguousarray(attitude, np.float64)
         core_library().quadsim_answer(struct, time, rates.ctypes.data, rotors.ctypes.data, attitude.ctypes.data)
         return np.array(struct.answer)
 

@@ -1,4 +1,7 @@
-/* Vehicles flown together, and the margins of their bounds. */
+/* Vehicles flown together, and the margins of their bounds.
+ *
+ * The margin of a bound on a signal s is  min(s - lower, upper - s), negative where it is violated; that of a control
+ * period is the smallest one of its physics steps (`quadsim.sim.margins`). */
 #include "quadsim_batch.h"
 
 #include <stdio.h>
@@ -7,7 +10,7 @@
 #include "quadsim_rotation.h"
 
 /* What the signals of some bounds take of a physics step. */
-enum { ANGLES = 1, ANGLE_RATES = 2, YAW = 4, TILT = 8 };
+enum { NEEDS_ANGLES = 1, NEEDS_ANGLE_RATES = 2, NEEDS_YAW = 4, NEEDS_TILT = 8 };
 
 /* ---- margins ----------------------------------------------------------------------------------------------------- */
 
@@ -23,22 +26,22 @@ static int needs_of(const quadsim_bound *bounds, int64_t count)
     for (int64_t k = 0; k < count; k++) {
         const quadsim_bound *b = bounds + k;
         if (b->signal == SIGNAL_TILT) {
-            needs |= ANGLES | TILT;
+            needs |= NEEDS_ANGLES | NEEDS_TILT;
         }
         for (int64_t j = 0; b->signal == SIGNAL_SUM && j < b->terms; j++) {
             if (b->index[j] < 6 || b->index[j] >= STATE) {
                 continue;
             }
-            needs |= ANGLES;
-            needs |= b->index[j] % 2 ? ANGLE_RATES : 0;
-            needs |= b->index[j] == 10 ? YAW : 0;
+            needs |= NEEDS_ANGLES;
+            needs |= b->index[j] % 2 ? NEEDS_ANGLE_RATES : 0;
+            needs |= b->index[j] == 10 ? NEEDS_YAW : 0;
         }
     }
     return needs;
 }
 
-static void evaluate(const double *physics, const double *speeds, int needs, double *last, double *upright,
-                     step_values *at)
+static void evaluate_step(const double *physics, const double *speeds, int needs, double *last, double *upright,
+                          step_values *at)
 {
     double euler[3], rates[3];
     for (int i = 0; i < 3; i++) {
@@ -47,21 +50,21 @@ static void evaluate(const double *physics, const double *speeds, int needs, dou
         at->rates[i] = physics[11 + i];
     }
     memcpy(at->state + STATE, speeds, ROTORS * sizeof *speeds);
-    if (!(needs & ANGLES)) {
+    if (!(needs & NEEDS_ANGLES)) {
         return;
     }
     to_euler(physics + 4, euler);
-    if (needs & ANGLE_RATES) {
+    if (needs & NEEDS_ANGLE_RATES) {
         quadsim_euler_rates(euler, physics + 11, rates);
         for (int i = 0; i < 3; i++) {
             at->state[7 + 2 * i] = rates[i];
         }
     }
-    if (needs & TILT) {
+    if (needs & NEEDS_TILT) {
         const double cosine = cos(euler[0]) * cos(euler[1]);
         at->tilt = acos(cosine < -1.0 ? -1.0 : cosine > 1.0 ? 1.0 : cosine);
     }
-    if (needs & YAW) {
+    if (needs & NEEDS_YAW) {
         quadsim_turn(euler, last, upright);
         euler[2] = *last;
     }
@@ -75,7 +78,7 @@ static double smaller(double a, double b) /* NaN if either is */
     return a < b || a != a ? a : b;
 }
 
-static double margin(const quadsim_bound *b, double value)
+static double margin_of(const quadsim_bound *b, double value)
 {
     return smaller(value - b->lower, b->upper - value);
 }
@@ -83,9 +86,9 @@ static double margin(const quadsim_bound *b, double value)
 /* The smallest margin of values of the rotors. */
 static double margin_of_rotors(const quadsim_bound *b, const double *values)
 {
-    double least = margin(b, values[0]);
+    double least = margin_of(b, values[0]);
     for (int i = 1; i < ROTORS; i++) {
-        least = smaller(least, margin(b, values[i]));
+        least = smaller(least, margin_of(b, values[i]));
     }
     return least;
 }
@@ -95,25 +98,25 @@ static double margin_at(const quadsim_bound *b, const step_values *at)
     double sum = 0.0;
     switch (b->signal) {
     case SIGNAL_TILT:
-        return margin(b, b->factor[0] * at->tilt);
+        return margin_of(b, b->factor[0] * at->tilt);
     case SIGNAL_BODY_RATE:
-        return margin(b, b->factor[0] * at->rates[b->axis]);
+        return margin_of(b, b->factor[0] * at->rates[b->axis]);
     case SIGNAL_THRUST:
-        return margin(b, at->thrust);
+        return margin_of(b, at->thrust);
     case SIGNAL_SPEED:
         return margin_of_rotors(b, at->state + STATE);
     default:
         for (int64_t j = 0; j < b->terms; j++) {
             sum += b->factor[j] * at->state[b->index[j]];
         }
-        return margin(b, sum);
+        return margin_of(b, sum);
     }
 }
 
 /* A difference of angles in (-pi, pi], as `quadsim.state.wrapped`. */
 static double wrapped(double angle)
 {
-    static const double PI = 3.141592653589793, TURN = 6.283185307179586;
+    static const double PI = 3.141592653589793;
     const double left = fmod(PI - angle, TURN);
     return PI - (left < 0.0 ? fmod(left + TURN, TURN) : left);
 }
@@ -136,7 +139,7 @@ static double margin_sampled(const quadsim_bound *b, const quadsim_period *p)
         error = p->measured[b->axis] - p->truth[b->axis];
         error = b->axis == 10 ? wrapped(error) : error;
     }
-    return margin(b, b->factor[0] * error);
+    return margin_of(b, b->factor[0] * error);
 }
 
 static int holds_at(const quadsim_bound *b, int64_t step)
@@ -158,7 +161,7 @@ void quadsim_margins(const quadsim_bound *bounds, int64_t count, const quadsim_p
     for (int64_t j = first; j <= p->count; j++) {
         const double *physics = j ? p->physics + p->width * (j - 1) : p->before;
         const double *speeds = j < p->count ? p->speeds + p->width * j : p->rotors;
-        evaluate(physics, speeds, needs, &last, &upright, &at);
+        evaluate_step(physics, speeds, needs, &last, &upright, &at);
         if (p->count > 0) {
             at.thrust = p->thrust[p->width * (j < p->count ? j : p->count - 1)];
         }

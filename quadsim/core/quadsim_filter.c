@@ -1,4 +1,11 @@
-/* The error-state Kalman filter over the samples of a control period; equations of `quadsim.sim.error_state`. */
+/* The error-state Kalman filter over the samples of a control period; derivation: `quadsim.sim.estimator`.
+ *
+ * With the error e = [dp dv dtheta domega db], de/dt = D e at the middle of a step h, and A = h D,
+ *
+ *     prediction   mean by the midpoint rule;   F = 1 + A (1 + A / 2 (1 + A / 3)),   P <- F P F' + Q
+ *     update       r = z - h(x),   S = H P H' + R,   K = P H' S^-1,   x <- x + K r,   P <- P - K H P
+ *
+ * Samples come in the order in which they were taken; one with r' S^-1 r beyond the gate changes nothing. */
 #include "quadsim_plant.h"
 
 #include <string.h>
@@ -8,14 +15,14 @@
 enum { P_ = 0, V_ = 3, THETA = 6, OMEGA = 9, BIAS = 12 }; /* blocks of the error */
 enum { QUATERNION = 6, MEAN_RATES = 10, MEAN_BIAS = 13 }; /* of the mean, whose first six are p and v */
 
-static const double LARGEST = 1e6, LARGEST_VARIANCE = 1e15;
+static const double LARGEST_STATE = 1e6, LARGEST_VARIANCE = 1e15;
 static const double STILL_VELOCITY = 0.1, STILL_RATE = 0.5 * 0.017453292519943295, STILL_TIME = 0.01;
 
 typedef double square[ERRORS][ERRORS];
 
 /* ---- prediction -------------------------------------------------------------------------------------------------- */
 
-static void restore(const quadsim_filter *f, quadsim_track *t)
+static void reset_covariance(const quadsim_filter *f, quadsim_track *t)
 {
     memset(t->P, 0, sizeof t->P);
     for (int i = 0; i < ERRORS; i++) {
@@ -24,7 +31,7 @@ static void restore(const quadsim_filter *f, quadsim_track *t)
 }
 
 /* P <- F P F' for an F that is block upper triangular: what lies below its diagonal blocks is zero. */
-static void transform(square F, square P)
+static void propagate_covariance(square F, square P)
 {
     square FP;
     for (int i = 0; i < ERRORS; i++) {
@@ -49,7 +56,7 @@ static void transform(square F, square P)
 }
 
 /* B <- 1 + A B / divisor, for A of the same structure. */
-static void horner(square A, square B, double divisor)
+static void horner_step(square A, square B, double divisor)
 {
     square product;
     for (int i = 0; i < ERRORS; i++) {
@@ -70,7 +77,7 @@ static int is_diagonal(const quadsim_filter *f)
     return f->products[0] == 0.0 && f->products[1] == 0.0 && f->products[2] == 0.0;
 }
 
-static void turn_by_inverse(const quadsim_filter *f, const double *torque, double *result)
+static void times_inverse_inertia(const quadsim_filter *f, const double *torque, double *result)
 {
     for (int i = 0; i < 3; i++) {
         result[i] = f->inverse[i][0] * torque[0] + f->inverse[i][1] * torque[1] + f->inverse[i][2] * torque[2];
@@ -78,7 +85,7 @@ static void turn_by_inverse(const quadsim_filter *f, const double *torque, doubl
 }
 
 /* Angular acceleration at body rates under a torque, damped. */
-static void turn_at(const quadsim_filter *f, const double *torque, const double *rates, double *result)
+static void angular_acceleration(const quadsim_filter *f, const double *torque, const double *rates, double *result)
 {
     const double *J = f->inertia, coupling[3] = {(J[1] - J[2]) / J[0], (J[2] - J[0]) / J[1], (J[0] - J[1]) / J[2]};
     double momentum[3], gyroscopic[3], net[3];
@@ -93,15 +100,15 @@ static void turn_at(const quadsim_filter *f, const double *torque, const double 
         return;
     }
     times_inertia(J, f->products, rates, momentum);
-    cross(rates, momentum, gyroscopic);
+    cross_product(rates, momentum, gyroscopic);
     for (int i = 0; i < 3; i++) {
         net[i] -= gyroscopic[i];
     }
-    turn_by_inverse(f, net, result);
+    times_inverse_inertia(f, net, result);
 }
 
-/* The derivative of `turn_at` in the rates. */
-static void turn_slope(const quadsim_filter *f, const double *rates, double slope[3][3])
+/* The derivative of `angular_acceleration` in the rates. */
+static void angular_acceleration_slope(const quadsim_filter *f, const double *rates, double slope[3][3])
 {
     const double *J = f->inertia, p = rates[0], q = rates[1], r = rates[2];
     const double k[3] = {(J[2] - J[1]) / J[0], (J[0] - J[2]) / J[1], (J[1] - J[0]) / J[2]};
@@ -117,24 +124,25 @@ static void turn_slope(const quadsim_filter *f, const double *rates, double slop
         double unit[3] = {0.0}, column[3], one[3], other[3];
         unit[j] = 1.0;
         times_inertia(J, f->products, unit, column);
-        cross(rates, column, one);
-        cross(unit, momentum, other);
+        cross_product(rates, column, one);
+        cross_product(unit, momentum, other);
         for (int i = 0; i < 3; i++) {
             one[i] = -one[i] - other[i] - (i == j ? f->rate_damping[j] : 0.0);
         }
-        turn_by_inverse(f, one, column);
+        times_inverse_inertia(f, one, column);
         for (int i = 0; i < 3; i++) {
             slope[i][j] = column[i];
         }
     }
 }
 
-static void predict(const quadsim_filter *f, quadsim_track *t, double acceleration, const double *torque, double h)
+static void predict_flight(const quadsim_filter *f, quadsim_track *t, double acceleration, const double *torque,
+                           double h)
 {
     const double *rate = t->mean + MEAN_RATES, a = acceleration;
     const double p = rate[0], q = rate[1], r = rate[2], half = 0.5 * h, quarter = 0.25 * h;
     double turn[3];
-    turn_at(f, torque, rate, turn);
+    angular_acceleration(f, torque, rate, turn);
     const double p1 = p + half * turn[0], q1 = q + half * turn[1], r1 = r + half * turn[2];
     const double halfway[3] = {p1, q1, r1};
     const double to_middle[3] = {quarter * (p + p1), quarter * (q + q1), quarter * (r + r1)};
@@ -152,7 +160,7 @@ static void predict(const quadsim_filter *f, quadsim_track *t, double accelerati
     exponential(to_end, turned);
     multiply(t->mean + QUATERNION, turned, after + QUATERNION);
     normalise(after + QUATERNION);
-    turn_at(f, torque, halfway, turn);
+    angular_acceleration(f, torque, halfway, turn);
     after[MEAN_RATES] = p + h * turn[0];
     after[MEAN_RATES + 1] = q + h * turn[1];
     after[MEAN_RATES + 2] = r + h * turn[2];
@@ -160,7 +168,7 @@ static void predict(const quadsim_filter *f, quadsim_track *t, double accelerati
 
     const double turning[3][3] = {{0.0, r1, -q1}, {-r1, 0.0, p1}, {q1, -p1, 0.0}};
     double spinning[3][3];
-    turn_slope(f, halfway, spinning);
+    angular_acceleration_slope(f, halfway, spinning);
     square A = {{0.0}}, F = {{0.0}};
     for (int i = 0; i < 3; i++) {
         A[P_ + i][V_ + i] = A[THETA + i][OMEGA + i] = h;
@@ -173,8 +181,8 @@ static void predict(const quadsim_filter *f, quadsim_track *t, double accelerati
     for (int i = 0; i < ERRORS; i++) {
         F[i][i] = 1.0;
     }
-    horner(A, F, 3.0), horner(A, F, 2.0), horner(A, F, 1.0); /* 1 + A (1 + A / 2 (1 + A / 3)) */
-    transform(F, t->P);
+    horner_step(A, F, 3.0), horner_step(A, F, 2.0), horner_step(A, F, 1.0); /* 1 + A (1 + A / 2 (1 + A / 3)) */
+    propagate_covariance(F, t->P);
     for (int i = 0; i < ERRORS; i++) { /* white noise, through the two double integrators */
         t->P[i][i] += h * f->density[i / 3];
     }
@@ -189,7 +197,7 @@ static void predict(const quadsim_filter *f, quadsim_track *t, double accelerati
 }
 
 /* A vehicle that stands on the ground: velocity and rates are white noise. */
-static void stand(const quadsim_filter *f, quadsim_track *t, double h)
+static void predict_standing(const quadsim_filter *f, quadsim_track *t, double h)
 {
     static const double VARIANCE[2] = {STILL_VELOCITY * STILL_VELOCITY, STILL_RATE * STILL_RATE};
     for (int i = 0; i < 3; i++) {
@@ -206,7 +214,7 @@ static void stand(const quadsim_filter *f, quadsim_track *t, double h)
     }
 }
 
-static int lost(const quadsim_track *t)
+static int has_diverged(const quadsim_track *t)
 {
     double size = 0.0, spread = 0.0;
     for (int i = 0; i < MEAN; i++) {
@@ -215,11 +223,11 @@ static int lost(const quadsim_track *t)
     for (int i = 0; i < ERRORS; i++) {
         spread += t->P[i][i];
     }
-    return !(size < LARGEST * LARGEST && spread < LARGEST_VARIANCE);
+    return !(size < LARGEST_STATE * LARGEST_STATE && spread < LARGEST_VARIANCE);
 }
 
 /* Whether the same rotor speeds act in two steps, in the same contact with the ground. */
-static int alike(const double *commands, const uint8_t *grounded, int64_t one, int64_t other)
+static int same_drive(const double *commands, const uint8_t *grounded, int64_t one, int64_t other)
 {
     return grounded[one] == grounded[other] &&
            !memcmp(commands + ROTORS * one, commands + ROTORS * other, ROTORS * sizeof *commands);
@@ -227,8 +235,8 @@ static int alike(const double *commands, const uint8_t *grounded, int64_t one, i
 
 /* The moment of the air at the mean's velocity, for the rotors' speeds and their sum, and the thrust lost to inflow;
  * the covariance knows nothing of them. */
-static void add_air(const quadsim_filter *f, const quadsim_track *t, const double *speeds, double turning,
-                    double *wrench)
+static void add_air_wrench(const quadsim_filter *f, const quadsim_track *t, const double *speeds, double turning,
+                           double *wrench)
 {
     const double *rate = t->mean + MEAN_RATES;
     double R[3][3], along[3], *torque = wrench + 1;
@@ -256,7 +264,7 @@ static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *
     while (t->step < step) {
         const int64_t first = t->step - base;
         int64_t length = 1;
-        while (length < f->stride && t->step + length < step && alike(commands, grounded, first, first + length)) {
+        while (length < f->stride && t->step + length < step && same_drive(commands, grounded, first, first + length)) {
             length++;
         }
         double wrench[4] = {0.0}, mean[MEAN], speeds[ROTORS], turning = 0.0;
@@ -268,17 +276,17 @@ static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *
                 speeds[j] = speed;
             }
         }
-        add_air(f, t, speeds, turning, wrench);
+        add_air_wrench(f, t, speeds, turning, wrench);
         memcpy(mean, t->mean, sizeof mean);
         const double acceleration = wrench[0] / f->mass, h = (double)length * f->timestep;
         if (grounded[first] && !(acceleration > f->gravity)) {
-            stand(f, t, h);
+            predict_standing(f, t, h);
         } else {
-            predict(f, t, acceleration, wrench + 1, h);
+            predict_flight(f, t, acceleration, wrench + 1, h);
         }
-        if (lost(t)) { /* keep the mean, restore the initial covariance, and let the sensors correct it */
+        if (has_diverged(t)) { /* keep the mean, restore the initial covariance, and let the sensors correct it */
             memcpy(t->mean, mean, sizeof mean);
-            restore(f, t);
+            reset_covariance(f, t);
         }
         t->step += length;
     }
@@ -288,7 +296,7 @@ static void predict_to(const quadsim_filter *f, quadsim_track *t, const double *
 
 static const int BLOCK[SENSORS] = {P_, V_, THETA, OMEGA};
 
-static void innovation(const quadsim_track *t, const quadsim_sample *s, double *residual)
+static void find_innovation(const quadsim_track *t, const quadsim_sample *s, double *residual)
 {
     double back[4], measured[4];
     switch (s->kind) {
@@ -310,7 +318,7 @@ static void innovation(const quadsim_track *t, const quadsim_sample *s, double *
     }
 }
 
-static void invert(double S[3][3], double W[3][3])
+static void invert_symmetric(double S[3][3], double W[3][3])
 {
     const double a = S[0][0], b = S[0][1], c = S[0][2], d = S[1][1], e = S[1][2], f = S[2][2];
     const double A = d * f - e * e, B = c * e - b * f, C = b * e - c * d, scale = 1.0 / (a * A + b * B + c * C);
@@ -318,7 +326,7 @@ static void invert(double S[3][3], double W[3][3])
     W[0][1] = W[1][0] = scale * B, W[0][2] = W[2][0] = scale * C, W[1][2] = W[2][1] = scale * (b * c - a * e);
 }
 
-static void retract(double *mean, const double *error)
+static void apply_error(double *mean, const double *error)
 {
     double turned[4];
     exponential(error + THETA, turned);
@@ -331,11 +339,11 @@ static void retract(double *mean, const double *error)
 }
 
 /* Use a sample within the gate; false: it is outside, and changes nothing. */
-static int update(const quadsim_filter *f, quadsim_track *t, const quadsim_sample *s, double *distance)
+static int update_with_sample(const quadsim_filter *f, quadsim_track *t, const quadsim_sample *s, double *distance)
 {
     double residual[3], rows[3][ERRORS], S[3][3], W[3][3], gain[ERRORS][3], error[ERRORS];
     const int block = BLOCK[s->kind], biased = s->kind == RATES;
-    innovation(t, s, residual);
+    find_innovation(t, s, residual);
     for (int i = 0; i < 3; i++) {
         for (int j = 0; j < ERRORS; j++) {
             rows[i][j] = t->P[block + i][j] + (biased ? t->P[BIAS + i][j] : 0.0);
@@ -345,7 +353,7 @@ static int update(const quadsim_filter *f, quadsim_track *t, const quadsim_sampl
                 rows[i][block + j] + (biased ? rows[i][BIAS + j] : 0.0) + (i == j ? f->variance[s->kind][i] : 0.0);
         }
     }
-    invert(S, W);
+    invert_symmetric(S, W);
     *distance = 0.0;
     for (int i = 0; i < 3; i++) {
         *distance += residual[i] * (W[i][0] * residual[0] + W[i][1] * residual[1] + W[i][2] * residual[2]);
@@ -366,15 +374,15 @@ static int update(const quadsim_filter *f, quadsim_track *t, const quadsim_sampl
             t->P[i][j] = t->P[j][i] = 0.5 * ((t->P[i][j] - one) + (t->P[j][i] - other));
         }
     }
-    retract(t->mean, error);
+    apply_error(t->mean, error);
     return 1;
 }
 
 /* Let a sensor that has been refused for so long back in, by the variance that its sample asks for. */
-static void inflate(quadsim_track *t, const quadsim_sample *s, double refused)
+static void inflate_covariance(quadsim_track *t, const quadsim_sample *s, double refused)
 {
     double residual[3];
-    innovation(t, s, residual);
+    find_innovation(t, s, residual);
     for (int i = 0; i < 3; i++) {
         const double squared = residual[i] * residual[i], fast = squared / (refused * refused);
         const int block = BLOCK[s->kind];
@@ -386,15 +394,15 @@ static void inflate(quadsim_track *t, const quadsim_sample *s, double refused)
     }
 }
 
-static void use(const quadsim_filter *f, quadsim_track *t, const quadsim_sample *s)
+static void filter_sample(const quadsim_filter *f, quadsim_track *t, const quadsim_sample *s)
 {
     int64_t *since = t->refused + s->kind;
     const double refused = *since < 0 ? 0.0 : (double)(s->taken - *since);
     double distance;
     if (f->patience > 0.0 && refused >= f->patience) {
-        inflate(t, s, refused * f->timestep);
+        inflate_covariance(t, s, refused * f->timestep);
     }
-    if (update(f, t, s, &distance)) {
+    if (update_with_sample(f, t, s, &distance)) {
         *since = -1;
         t->accepted[s->kind]++;
         t->nis[s->kind] += distance;
@@ -411,12 +419,12 @@ void quadsim_filter_run(const quadsim_filter *f, quadsim_track *t, const quadsim
         const quadsim_sample *s = samples + k;
         const double size = fmax(fmax(fabs(s->value[0]), fabs(s->value[1])), fabs(s->value[2]));
         const int number = s->value[0] == s->value[0] && s->value[1] == s->value[1] && s->value[2] == s->value[2];
-        if (!number || !(size < LARGEST)) {
+        if (!number || !(size < LARGEST_STATE)) {
             t->rejected[s->kind]++;
             continue;
         }
         predict_to(f, t, commands, grounded, base, s->taken);
-        use(f, t, s);
+        filter_sample(f, t, s);
     }
     predict_to(f, t, commands, grounded, base, until);
 }

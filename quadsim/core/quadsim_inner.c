@@ -1,27 +1,32 @@
-/* The inner loops that fly a command between control instants: the built-in autopilot, and incremental nonlinear
- * dynamic inversion; and the allocation of a wrench to rotor speeds. */
+/* The inner loops that fly a command between control instants, and the allocation of a wrench to rotor speeds.
+ *
+ * The autopilot (`quadsim.sim.autopilot`), with filtered body rates y,
+ *
+ *     omega_c = omega_ff + k 2 vec(q* q_c),   alpha = p (omega_c - y) + I - d dy/dt,   dI/dt = i (omega_c - y),
+ *     tau = J alpha + y x J y,
+ *
+ * and incremental nonlinear dynamic inversion (`quadsim.mpc.pilot.indi`), which adds to the torque of the commanded
+ * speeds what the low-pass filter of  tau(w) - J alpha - omega x J omega  says is missed.  The allocation keeps thrust,
+ * roll and pitch torque and gives up yaw torque first, then solves weighted least squares within the bounds. */
 #include "quadsim_plant.h"
 
 #include <string.h>
 
 #include "quadsim_rotation.h"
 
-static const double DAMPING = 0.70710678118654752440;        /* of INDI's filter: Butterworth */
-static const double WEIGHT[4] = {30.0, 1000.0, 1000.0, 1.0}; /* of thrust, roll, pitch and yaw in `nearest` */
-
-static double clip(double number, double low, double high) /* what is no number stays so */
-{
-    return number < low ? low : number > high ? high : number;
-}
+/* Damping of INDI's filter: Butterworth. */
+static const double INDI_DAMPING = 0.70710678118654752440;
+/* Weights of thrust, roll, pitch and yaw torque in `nearest_wrench`. */
+static const double WRENCH_WEIGHT[4] = {30.0, 1000.0, 1000.0, 1.0};
 
 /* ---- thrust over its coefficient --------------------------------------------------------------------------------- */
 
-static double square_of(const quadsim_inner *a, int i, double speed)
+static double scaled_thrust(const quadsim_inner *a, int i, double speed)
 {
     return a->linear[i] * speed + a->quadratic[i] * (speed * speed);
 }
 
-static double speed_of(const quadsim_inner *a, int i, double square)
+static double speed_of_thrust(const quadsim_inner *a, int i, double square)
 {
     const double linear = a->linear[i], quadratic = a->quadratic[i], under = linear * linear + 4.0 * quadratic * square;
     const double root = sqrt(under < 0.0 ? 0.0 : under); /* beyond the map's top, its top; NaN stays so */
@@ -34,18 +39,18 @@ static double speed_of(const quadsim_inner *a, int i, double square)
 /* ---- autopilot --------------------------------------------------------------------------------------------------- */
 
 /* The parts of a torque need room: with airmode each pair's difference, else the size of each part, either way. */
-static double part_of(const quadsim_inner *a, const double *parts, int i, int j)
+static double torque_part(const quadsim_inner *a, const double *parts, int i, int j)
 {
     return a->airmode ? parts[i] - parts[j] : j ? -parts[i] : parts[i];
 }
 
-static double room_of(const quadsim_inner *a, double base, int i, int j)
+static double thrust_room(const quadsim_inner *a, double base, int i, int j)
 {
     return a->airmode ? a->high[i] - a->low[j] : fmin(base - a->low[i], a->high[i] - base);
 }
 
 /* Thrusts for a collective thrust and a torque; `cut` says which torques are smaller than demanded. */
-static void mix(const quadsim_inner *a, double thrust, const double *torque, double *thrusts, int *cut)
+static void mix_thrusts(const quadsim_inner *a, double thrust, const double *torque, double *thrusts, int *cut)
 {
     double level[ROTORS], yaw[ROTORS], share = 1.0, turning = 1.0, largest = 0.0;
     double slowest = -INFINITY, fastest = INFINITY; /* of all rotors alike */
@@ -61,8 +66,8 @@ static void mix(const quadsim_inner *a, double thrust, const double *torque, dou
     }
     for (int i = 0; i < ROTORS; i++) {
         for (int j = 0; j < ROTORS; j++) {
-            const double extent = part_of(a, level, i, j);
-            share = extent > 0.0 ? fmin(share, room_of(a, base, i, j) / extent) : share;
+            const double extent = torque_part(a, level, i, j);
+            share = extent > 0.0 ? fmin(share, thrust_room(a, base, i, j) / extent) : share;
         }
     }
     for (int i = 0; i < ROTORS; i++) {
@@ -70,9 +75,9 @@ static void mix(const quadsim_inner *a, double thrust, const double *torque, dou
     }
     for (int i = 0; i < ROTORS; i++) {
         for (int j = 0; j < ROTORS; j++) {
-            const double change = part_of(a, yaw, i, j);
+            const double change = torque_part(a, yaw, i, j);
             if (change > 1e-9 * largest) { /* rotors that turn alike differ by rounding */
-                turning = fmin(turning, (room_of(a, base, i, j) - part_of(a, level, i, j)) / change);
+                turning = fmin(turning, (thrust_room(a, base, i, j) - torque_part(a, level, i, j)) / change);
             }
         }
     }
@@ -111,7 +116,7 @@ static void fly_autopilot(quadsim_inner *a, const double *rates, const double *a
         a->slope[i] += a->d_share * ((a->filtered[i] - before) / a->step - a->slope[i]);
     }
     times_inertia(a->inertia, a->products, a->filtered, momentum);
-    cross(a->filtered, momentum, gyroscopic);
+    cross_product(a->filtered, momentum, gyroscopic);
     for (int i = 0; i < 3; i++) {
         target[i] -= a->filtered[i]; /* the error from here on */
         acceleration[i] = a->p[i] * target[i] + a->integral[i] - a->d[i] * a->slope[i];
@@ -120,14 +125,14 @@ static void fly_autopilot(quadsim_inner *a, const double *rates, const double *a
     for (int i = 0; i < 3; i++) {
         torque[i] += gyroscopic[i];
     }
-    mix(a, a->command[0], torque, thrusts, cut);
+    mix_thrusts(a, a->command[0], torque, thrusts, cut);
     for (int i = 0; i < 3; i++) {
         if (!cut[i]) {
             a->integral[i] = clip(a->integral[i] + a->step * a->i[i] * target[i], -a->i_max[i], a->i_max[i]);
         }
     }
     for (int i = 0; i < ROTORS; i++) {
-        answer[i] = speed_of(a, i, thrusts[i] / a->coefficient[i]);
+        answer[i] = speed_of_thrust(a, i, thrusts[i] / a->coefficient[i]);
     }
     if (a->delay > 0) {
         double *oldest = a->queue + ROTORS * a->oldest;
@@ -142,7 +147,7 @@ static void fly_autopilot(quadsim_inner *a, const double *rates, const double *a
 /* ---- allocation -------------------------------------------------------------------------------------------------- */
 
 /* Along the line on which thrust, roll and pitch torque are exact, as close as the bounds allow; false: nowhere. */
-static int less_yaw(const quadsim_inner *a, const double *low, const double *high, double *squares)
+static int reduce_yaw_torque(const quadsim_inner *a, const double *low, const double *high, double *squares)
 {
     double room = 1.0, first = -INFINITY, last = INFINITY;
     for (int i = 0; i < ROTORS; i++) {
@@ -162,7 +167,7 @@ static int less_yaw(const quadsim_inner *a, const double *low, const double *hig
 }
 
 /* Least squares of the columns in `free` by Gram-Schmidt; the residual takes the place of `rest`. */
-static void fit(double A[ROTORS][4], const int *free, double *rest, double *x)
+static void solve_free_rotors(double A[ROTORS][4], const int *free, double *rest, double *x)
 {
     double Q[ROTORS][4], upper[ROTORS][ROTORS], along[ROTORS];
     for (int j = 0; j < ROTORS; j++) {
@@ -197,8 +202,8 @@ static void fit(double A[ROTORS][4], const int *free, double *rest, double *x)
 }
 
 /* Weighted least squares within the bounds: the best of all choices of rotors at their lower or upper bound. */
-static void nearest(const quadsim_inner *a, const double *demanded, const double *low, const double *high,
-                    double *squares)
+static void nearest_wrench(const quadsim_inner *a, const double *demanded, const double *low, const double *high,
+                           double *squares)
 {
     double unit = 1.0, A[ROTORS][4], b[4], least = INFINITY, thrust[2] = {0.0, 0.0};
     for (int j = 0; j < ROTORS; j++) {
@@ -207,7 +212,7 @@ static void nearest(const quadsim_inner *a, const double *demanded, const double
         thrust[1] += a->effect[0][j] * high[j];
     }
     for (int i = 0; i < 4; i++) {
-        const double weight = WEIGHT[i] / a->scale[i];
+        const double weight = WRENCH_WEIGHT[i] / a->scale[i];
         b[i] = weight * (i ? demanded[i] : clip(demanded[0], thrust[0], thrust[1]));
         for (int j = 0; j < ROTORS; j++) {
             A[j][i] = weight * a->effect[i][j] * unit;
@@ -224,7 +229,7 @@ static void nearest(const quadsim_inner *a, const double *demanded, const double
                 rest[i] -= A[j][i] * x[j];
             }
         }
-        fit(A, free, rest, x);
+        solve_free_rotors(A, free, rest, x);
         for (int j = 0; j < ROTORS; j++) {
             within &= !free[j] || (low[j] / unit <= x[j] && x[j] <= high[j] / unit);
             cost += rest[j] * rest[j];
@@ -243,19 +248,19 @@ void quadsim_allocate(const quadsim_inner *a, const double *wrench, double *spee
     double squares[ROTORS], low[ROTORS], high[ROTORS];
     int within = 1;
     for (int i = 0; i < ROTORS; i++) {
-        low[i] = square_of(a, i, a->least[i]);
-        high[i] = square_of(a, i, a->most[i]);
+        low[i] = scaled_thrust(a, i, a->least[i]);
+        high[i] = scaled_thrust(a, i, a->most[i]);
         squares[i] = 0.0;
         for (int j = 0; j < 4; j++) {
             squares[i] += a->inverse[i][j] * wrench[j];
         }
         within &= low[i] <= squares[i] && squares[i] <= high[i];
     }
-    if (!within && !less_yaw(a, low, high, squares)) {
-        nearest(a, wrench, low, high, squares);
+    if (!within && !reduce_yaw_torque(a, low, high, squares)) {
+        nearest_wrench(a, wrench, low, high, squares);
     }
     for (int i = 0; i < ROTORS; i++) {
-        const double speed = speed_of(a, i, squares[i] < 0.0 ? 0.0 : squares[i]);
+        const double speed = speed_of_thrust(a, i, squares[i] < 0.0 ? 0.0 : squares[i]);
         speeds[i] = clip(speed, a->least[i], a->most[i]); /* NaN stays so */
     }
 }
@@ -273,15 +278,15 @@ static void invert_dynamics(quadsim_inner *a, double time, const double *rates, 
         }
         times_inertia(a->inertia, a->products, middle, momentum);
         times_inertia(a->inertia, a->products, change, gained);
-        cross(middle, momentum, gyroscopic);
+        cross_product(middle, momentum, gyroscopic);
         for (int i = 0; i < 3; i++) {
             double torque = 0.0;
             for (int j = 0; j < ROTORS; j++) {
-                torque += a->effect[1 + i][j] * square_of(a, j, rotors[j]);
+                torque += a->effect[1 + i][j] * scaled_thrust(a, j, rotors[j]);
             }
             const double missed = torque - gained[i] / step - gyroscopic[i];
             a->slope[i] = (a->slope[i] + step * (w * w) * (missed - a->filtered[i])) /
-                          (1.0 + 2.0 * DAMPING * w * step + (w * step) * (w * step));
+                          (1.0 + 2.0 * INDI_DAMPING * w * step + (w * step) * (w * step));
             a->filtered[i] += step * a->slope[i];
         }
     }
@@ -290,7 +295,7 @@ static void invert_dynamics(quadsim_inner *a, double time, const double *rates, 
     memcpy(a->last_rates, rates, sizeof a->last_rates);
     for (int i = 0; i < 4; i++) {
         for (int j = 0; j < ROTORS; j++) {
-            wrench[i] += a->effect[i][j] * square_of(a, j, a->command[j]);
+            wrench[i] += a->effect[i][j] * scaled_thrust(a, j, a->command[j]);
         }
         wrench[i] += i ? a->filtered[i - 1] : 0.0;
     }

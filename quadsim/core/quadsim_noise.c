@@ -1,4 +1,4 @@
-/* Coloured noise. */
+/* Coloured noise, in place of white samples w:  x_k = pole x_{k-1} + w_k. */
 #include "quadsim_noise.h"
 
 void quadsim_first_order(double pole, double before, int64_t count, double *samples)

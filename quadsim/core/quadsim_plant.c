@@ -1,4 +1,13 @@
-/* A vehicle over a control period, physics step by physics step. */
+/* A vehicle over a control period, physics step by physics step: inner loop, rotors, forces, motion, sensors.
+ *
+ * A rotor follows its target u by dw/dt = (u - w) / tau, at most at the given acceleration, and gives the thrust
+ * (b w^2 + l w) times the battery's factor.  The motion follows from MuJoCo's step, or from Runge-Kutta's classical
+ * method on
+ *
+ *     dp/dt = v,   dv/dt = (R(q) e_z sum T + F) / m - g e_z,   dq/dt = q (0, omega) / 2,
+ *     d(omega)/dt = J^-1 (M T + tau - omega x J omega),
+ *
+ * with force F and torque tau of `forces_at`; their equations: `quadsim.sim.effects`. */
 #include "quadsim_plant.h"
 
 #include <setjmp.h>
@@ -14,7 +23,8 @@
 #define THREAD_LOCAL __thread
 #endif
 
-static const double LOWEST_RATIO = 0.5; /* lowest height of a rotor, in radii, at which the ground effect grows */
+/* Lowest height of a rotor, in radii, at which the ground effect grows. */
+static const double LOWEST_HEIGHT_RATIO = 0.5;
 
 /* What a step's rotors give whatever the motion: sums of their speeds, and of speed by place; drag about z, angular
  * momentum, spin-up torque. */
@@ -22,11 +32,6 @@ typedef struct {
     double thrust[ROTORS], speed[ROTORS], drag, drag_x, drag_y, drag_xy, turning, turning_x, turning_y, momentum,
         spin_up;
 } rotor_state;
-
-static double clip(double number, double low, double high) /* what is no number stays so */
-{
-    return number < low ? low : number > high ? high : number;
-}
 
 /* ---- rotors ------------------------------------------------------------------------------------------------------ */
 
@@ -50,7 +55,7 @@ static double follow_target(const quadsim_vehicle *v, double speed, double targe
     return target - sign * eased * decay;
 }
 
-static void turn(quadsim_vehicle *v, double *at_start, double *midway, double *slope)
+static void turn_rotors(quadsim_vehicle *v, double *at_start, double *midway, double *slope)
 {
     double unused;
     for (int i = 0; i < ROTORS; i++) {
@@ -66,7 +71,7 @@ static void turn(quadsim_vehicle *v, double *at_start, double *midway, double *s
     }
 }
 
-static double open_circuit(const quadsim_vehicle *v)
+static double open_circuit_voltage(const quadsim_vehicle *v)
 {
     int64_t k = 1;
     while (k < v->points - 1 && v->curve[2 * k] <= v->charge) {
@@ -86,7 +91,7 @@ static double discharge(quadsim_vehicle *v, const double *speeds, double *row)
         demand += v->efficiency[i] * v->linear_demand * (ratio * ratio);
     }
     const double conductance = v->hover_current * (demand / ROTORS) / (v->reference_voltage * v->reference_voltage);
-    const double rest = fmax(open_circuit(v) - v->resistance * v->idle_current, 0.0);
+    const double rest = fmax(open_circuit_voltage(v) - v->resistance * v->idle_current, 0.0);
     const double voltage = 2.0 * rest / (1.0 + sqrt(1.0 + 4.0 * v->resistance * conductance * rest));
     const double current = conductance * (voltage * voltage) + v->idle_current;
     row[0] = voltage, row[1] = v->charge;
@@ -94,7 +99,7 @@ static double discharge(quadsim_vehicle *v, const double *speeds, double *row)
     return pow(voltage / v->reference_voltage, v->exponent);
 }
 
-static double noisy(const quadsim_vehicle *v, double thrust, double largest, double draw)
+static double noisy_thrust(const quadsim_vehicle *v, double thrust, double largest, double draw)
 {
     const double share = thrust / largest;
     const double left = share - (v->loss * (share * share) + v->deviation * sqrt(share) * draw);
@@ -106,7 +111,7 @@ static rotor_state drive_rotors(quadsim_vehicle *v, const quadsim_steps *rows, i
 {
     rotor_state state = {{0.0}, {0.0}, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     double midway[ROTORS], slope[ROTORS], factor = 1.0, total = 0.0;
-    turn(v, rows->speeds + rows->width * row, midway, slope);
+    turn_rotors(v, rows->speeds + rows->width * row, midway, slope);
     if (v->cells > 0.0) {
         factor = discharge(v, midway, rows->battery + rows->width * row);
     }
@@ -115,7 +120,7 @@ static rotor_state drive_rotors(quadsim_vehicle *v, const quadsim_steps *rows, i
         thrust = (thrust + v->efficiency[i] * v->linear * midway[i]) * factor;
         thrust = thrust < 0.0 ? 0.0 : thrust; /* NaN stays so */
         if (v->largest[i] > 0.0) {
-            thrust = noisy(v, thrust, v->largest[i], rows->noise[ROTORS * row + i]);
+            thrust = noisy_thrust(v, thrust, v->largest[i], rows->noise[ROTORS * row + i]);
         }
         state.thrust[i] = thrust;
         total += thrust;
@@ -141,7 +146,7 @@ static rotor_state drive_rotors(quadsim_vehicle *v, const quadsim_steps *rows, i
 
 static double thrust_ratio(double height, double radius)
 {
-    const double image = 0.25 * radius / fmax(height, LOWEST_RATIO * radius);
+    const double image = 0.25 * radius / fmax(height, LOWEST_HEIGHT_RATIO * radius);
     return 1.0 / (1.0 - image * image);
 }
 
@@ -154,7 +159,7 @@ static void add_pushes(const quadsim_vehicle *v, double R[3][3], double *wrench)
             wrench[i] += f[i];
             body[i] = along_axis(R, i, f);
         }
-        cross(v->pushes[k].point, body, torque);
+        cross_product(v->pushes[k].point, body, torque);
         for (int i = 0; i < 3; i++) {
             wrench[3 + i] += torque[i];
         }
@@ -293,8 +298,8 @@ static void step_mujoco(quadsim_vehicle *v, const rotor_state *rotors, const dou
     }
 }
 
-static void derive(const quadsim_vehicle *v, const double *x, const rotor_state *rotors, const double *wind,
-                   const double *held, double *wrench, double *rate)
+static void motion_slope(const quadsim_vehicle *v, const double *x, const rotor_state *rotors, const double *wind,
+                         const double *held, double *wrench, double *rate)
 {
     const double *q = x + 3, *w = x + 10, *T = rotors->thrust, *J = v->inertia, m = v->mass;
     double torque[3], load[WRENCH], momentum[3], gyroscopic[3], axis[3];
@@ -318,7 +323,7 @@ static void derive(const quadsim_vehicle *v, const double *x, const rotor_state 
     rate[9] -= v->gravity;
     if (v->products[0] != 0.0 || v->products[1] != 0.0 || v->products[2] != 0.0) {
         times_inertia(J, v->products, w, momentum);
-        cross(w, momentum, gyroscopic);
+        cross_product(w, momentum, gyroscopic);
         for (int i = 0; i < 3; i++) {
             rate[10 + i] = 0.0;
             for (int j = 0; j < 3; j++) {
@@ -340,14 +345,14 @@ static void derive(const quadsim_vehicle *v, const double *x, const rotor_state 
 static void step_runge_kutta(quadsim_vehicle *v, const rotor_state *rotors, const double *wind,
                              const double *disturbance, double *wrench)
 {
-    static const double PART[4] = {0.0, 0.5, 0.5, 1.0}, ZERO[WRENCH] = {0.0};
+    static const double STAGE_TIME[4] = {0.0, 0.5, 0.5, 1.0}, ZERO[WRENCH] = {0.0};
     const double h = v->timestep, *held = disturbance ? disturbance : ZERO;
     double k[4][MOTION], acted[4][WRENCH], x[MOTION];
     for (int stage = 0; stage < 4; stage++) {
         for (int i = 0; i < MOTION; i++) {
-            x[i] = stage ? v->motion[i] + PART[stage] * h * k[stage - 1][i] : v->motion[i];
+            x[i] = stage ? v->motion[i] + STAGE_TIME[stage] * h * k[stage - 1][i] : v->motion[i];
         }
-        derive(v, x, rotors, wind, held, acted[stage], k[stage]);
+        motion_slope(v, x, rotors, wind, held, acted[stage], k[stage]);
     }
     for (int i = 0; i < MOTION; i++) {
         v->motion[i] += h / 6.0 * (k[0][i] + 2.0 * k[1][i] + 2.0 * k[2][i] + k[3][i]);
@@ -371,7 +376,7 @@ static void motion_of(const quadsim_vehicle *v, double *motion)
     memcpy(motion + 7, v->velocity, 6 * sizeof *motion);
 }
 
-static void take(quadsim_sensor *s, int64_t j, const double *motion)
+static void take_sample(quadsim_sensor *s, int64_t j, const double *motion)
 {
     double *value = s->values + 3 * (j - s->first), turned[4];
     const double *truth = motion + COLUMN[s->kind];
@@ -401,7 +406,7 @@ void quadsim_sense(quadsim_sensing *sensed, int64_t now, const double *motion)
     for (int64_t k = 0; k < sensed->count; k++) {
         quadsim_sensor *s = sensed->sensors + k;
         if (now % s->stride == 0) {
-            take(s, now / s->stride, motion);
+            take_sample(s, now / s->stride, motion);
         }
     }
 }
@@ -445,7 +450,7 @@ void quadsim_hear(quadsim_sensing *sensed, int64_t now, const double *motion)
 }
 
 /* Let the inner loop answer if it is due. */
-static int64_t answer(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *sensed)
+static int64_t answer_if_due(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *sensed)
 {
     if (loop->until == 0) {
         const double *attitude = v->motion + 3, *rates = v->velocity + 3;
@@ -472,7 +477,7 @@ static int64_t answer(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *
 
 /* ---- a part of a control period ---------------------------------------------------------------------------------- */
 
-static int plausible(const quadsim_vehicle *v, const double *row)
+static int state_is_plausible(const quadsim_vehicle *v, const double *row)
 {
     for (int i = 0; i < PHYSICS; i++) {
         if (!(fabs(row[i]) < v->plausible)) { /* also not a number */
@@ -483,7 +488,7 @@ static int plausible(const quadsim_vehicle *v, const double *row)
 }
 
 /* Take a step with the target speeds; the rows are written from its row on. */
-static void advance(quadsim_vehicle *v, const quadsim_steps *rows, int64_t row)
+static void step_vehicle(quadsim_vehicle *v, const quadsim_steps *rows, int64_t row)
 {
     static const double STILL[3] = {0.0};
     const int64_t at = rows->width * row;
@@ -508,11 +513,11 @@ static void advance(quadsim_vehicle *v, const quadsim_steps *rows, int64_t row)
     }
 }
 
-static int64_t fly(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *sensed, quadsim_steps *rows,
-                   const double *command, int64_t end)
+static int64_t fly_steps(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *sensed, quadsim_steps *rows,
+                         const double *command, int64_t end)
 {
     while (v->now < end) {
-        const int64_t row = rows->row, why = loop ? answer(v, loop, sensed) : QUADSIM_DONE;
+        const int64_t row = rows->row, why = loop ? answer_if_due(v, loop, sensed) : QUADSIM_DONE;
         const double *physics = rows->physics + rows->width * row;
         if (why != QUADSIM_DONE) {
             return why;
@@ -520,9 +525,9 @@ static int64_t fly(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *sen
         for (int i = 0; i < ROTORS; i++) {
             v->target[i] = clip(loop ? loop->answer[i] : command[i], v->slowest, v->fastest);
         }
-        advance(v, rows, row);
+        step_vehicle(v, rows, row);
         rows->row++;
-        if (!plausible(v, physics)) {
+        if (!state_is_plausible(v, physics)) {
             return QUADSIM_DIVERGED;
         }
         if (sensed) {
@@ -536,7 +541,7 @@ static int64_t fly(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *sen
 
 static double nearest_turn(double angle, double to)
 {
-    static const double TURN = 6.283185307179586, TIE = 1e-6; /* as `quadsim.state.whole_turns` */
+    static const double TIE = 1e-6; /* as `quadsim.state.whole_turns` */
     return angle + TURN * floor(0.5 + TIE - (angle - to) / TURN);
 }
 
@@ -613,7 +618,7 @@ int64_t quadsim_fly(quadsim_vehicle *v, quadsim_inner *loop, quadsim_sensing *se
         return QUADSIM_FAILED;
     }
     landing = &here;
-    why = fly(v, loop, sensed, rows, command, end);
+    why = fly_steps(v, loop, sensed, rows, command, end);
     landing = NULL;
     return why;
 }

@@ -125,7 +125,7 @@ void quadsim_trap(const char *message);
 const char *quadsim_complaint(void);
 
 /* MuJoCo's states [count][14], `width` numbers a row, as the paper's [count][12]: Euler angles, body to world, and
- * their rates; the yaw unwrapped along the rows, as by `quadsim.state.YawTurns`, from the turn nearest to `yaw`. */
+ * their rates; the yaw unwrapped along the rows, as by `quadsim.state.YawUnwrapper`, from the turn nearest to `yaw`. */
 void quadsim_states(const double *physics, int64_t count, int64_t width, double yaw, double *states);
 
 /* One of them, from MuJoCo's [14], on the turn of the yaw nearest the last one, or upright the last upright one. */

@@ -1,6 +1,6 @@
-/* The rigid body that plant, filter and laws share.  `real`, a type, and R(), which makes a constant of it, are those
- * of the file that includes this.  Quaternions q are wxyz, body to world; body rates w; rotations turn[3][3], body to
- * world. */
+/* The rigid body that plant, filter and controllers share.  `real`, a type, and R(), which makes a constant of it, are
+ * those of the file that includes this.  Quaternions q are wxyz, body to world; body rates w; rotations turn[3][3],
+ * body to world. */
 #ifndef QUADSIM_RIGID_H
 #define QUADSIM_RIGID_H
 
@@ -11,6 +11,17 @@ static inline void quaternion_rate(const real *q, const real *w, real *rate)
     rate[1] = R(0.5) * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1]);
     rate[2] = R(0.5) * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2]);
     rate[3] = R(0.5) * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0]);
+}
+
+/* left x right; the product may take the place of either. */
+static inline void cross_product(const real *left, const real *right, real *product)
+{
+    const real x = left[1] * right[2] - left[2] * right[1];
+    const real y = left[2] * right[0] - left[0] * right[2];
+    const real z = left[0] * right[1] - left[1] * right[0];
+    product[0] = x;
+    product[1] = y;
+    product[2] = z;
 }
 
 /* Add what body rates do to each other, -w x J w, where J is diagonal: coupling is (Jyy - Jzz), (Jzz - Jxx), (Jxx -

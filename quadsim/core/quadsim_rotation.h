@@ -1,4 +1,5 @@
-/* Quaternions wxyz, body to world, rotation vectors and Z-Y-X Euler angles, as `quadsim.rotation` has them. */
+/* What plant, filter, inner loops and margins compute with: bounds, quaternions wxyz, body to world, rotation vectors
+ * and Z-Y-X Euler angles, as `quadsim.rotation` has them. */
 #ifndef QUADSIM_ROTATION_H
 #define QUADSIM_ROTATION_H
 
@@ -9,6 +10,14 @@ typedef double real;
 #define R(number) number
 
 #include "quadsim_rigid.h"
+
+static const double TURN = 6.283185307179586; /* 2 pi */
+
+/* A number within bounds; NaN stays so. */
+static inline double clip(double number, double low, double high)
+{
+    return number < low ? low : number > high ? high : number;
+}
 
 /* Angular momentum of body rates: J x, J of moments (3) and products xy, xz, yz of inertia (3). */
 static inline void times_inertia(const double *moments, const double *products, const double *x, double *result)
@@ -89,16 +98,6 @@ static inline void of_euler(const double *euler, double *q)
     q[1] = sr * cp * cy - cr * sp * sy;
     q[2] = cr * sp * cy + sr * cp * sy;
     q[3] = cr * cp * sy - sr * sp * cy;
-}
-
-static inline void cross(const double *a, const double *b, double *product)
-{
-    const double x = a[1] * b[2] - a[2] * b[1];
-    const double y = a[2] * b[0] - a[0] * b[2];
-    const double z = a[0] * b[1] - a[1] * b[0];
-    product[0] = x;
-    product[1] = y;
-    product[2] = z;
 }
 
 /* Body to world, of a quaternion that need not be of unit length. */

@@ -56,11 +56,12 @@ _MODULES = {
     "quadsim.mpc.solvers": ("QPSolver",),
     "quadsim.mpc.laws.unconstrained": ("UnconstrainedMPC",),
 }
-_PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
-_SUBPACKAGES = {
-    name: f"quadsim.mpc.{name}"
-    for name in ("estimate", "export", "forms", "guard", "laws", "pilot", "problem", "solvers", "space", "tables")
-}
+_PUBLIC: dict[str, str] = {}
+for _module, _names in _MODULES.items():
+    _PUBLIC |= dict.fromkeys(_names, _module)
+_SUBPACKAGES = {}
+for _name in ("estimate", "export", "forms", "guard", "laws", "pilot", "problem", "solvers", "space", "tables"):
+    _SUBPACKAGES[_name] = f"quadsim.mpc.{_name}"
 _SUBPACKAGES["paper"] = "quadsim.mpc.problem.paper"
 __all__ = [*_PUBLIC, *_SUBPACKAGES]
 

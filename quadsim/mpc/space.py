@@ -83,6 +83,9 @@ class Avoidance:
         """Return the half-spaces of obstacles and regions (`Space`); None without any."""
         if not shapes:
             return None
+        penalty = None
+        if self.soft is not None:
+            penalty = (self.soft.linear, self.soft.quadratic)
         return Space(
             shapes,
             radius=vehicle.enclosing_radius,
@@ -90,7 +93,7 @@ class Avoidance:
             horizon=horizon,
             settings=self,
             margins=margins,
-            penalty=None if self.soft is None else (self.soft.linear, self.soft.quadratic),
+            penalty=penalty,
             positions=positions,
             largest=largest,
         )
@@ -135,13 +138,22 @@ class Space:
             self._margins = np.zeros((horizon, 3))
         else:
             self._margins = margins
-        self._solids = Solids([shape for shape in self._shapes if isinstance(shape, Obstacle)])
-        counts = [len(s.solids) if isinstance(s, Obstacle) else len(s.half_spaces[1]) for s in self._shapes]
-        places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-        self._names = np.repeat(np.array([shape.name for shape in self._shapes], str), counts)
-        self._of_solids = np.repeat(np.array([isinstance(s, Obstacle) for s in self._shapes], bool), counts)
-        shaped = zip(self._shapes, places, strict=False)
-        self._regions = [(shape, at) for shape, at in shaped if not isinstance(shape, Obstacle)]
+        obstacles = []
+        names: list[str] = []  # of each half-space's shape
+        of_solids: list[bool] = []
+        self._regions: list[tuple[Corridor | Fence, slice]] = []
+        for shape in self._shapes:
+            if isinstance(shape, Obstacle):
+                count = len(shape.solids)
+                obstacles.append(shape)
+            else:
+                count = len(shape.half_spaces[1])
+                self._regions.append((shape, slice(len(names), len(names) + count)))
+            names += [shape.name] * count
+            of_solids += [isinstance(shape, Obstacle)] * count
+        self._solids = Solids(obstacles)
+        self._names = np.array(names, str)
+        self._of_solids = np.array(of_solids, bool)
 
     @property
     def count(self) -> int:
@@ -168,17 +180,16 @@ class Space:
         C = np.zeros((bounds.shape[1], len(bounds), states))
         C[:, :, self.positions] = normals.transpose(1, 0, 2)
         lower = bounds.T
-        if self.penalty is None:
-            l1, l2 = (0.0, 0.0)
-        else:
+        penalty = None
+        if self.penalty is not None:
             l1, l2 = self.penalty
-        penalty = Penalty(l1=np.full(len(bounds), l1), l2=np.full(len(bounds), l2), largest=self._largest)
+            penalty = Penalty(l1=np.full(len(bounds), l1), l2=np.full(len(bounds), l2), largest=self._largest)
         return Constraint(
             name=name,
             lower=lower,
             upper=np.full_like(lower, np.inf),
             C=C,
-            penalty=None if self.penalty is None else penalty,
+            penalty=penalty,
             origins=(Origin(name, "m", soft=SOFT_SPACE),) * len(bounds),
         )
 

@@ -20,9 +20,18 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 BODY: Final = "quadrotor"
 FLOOR: Final = "floor"
 IMU: Final = "imu"
-ROTOR_NAMES, ARM_NAMES, FOOT_NAMES, DISC_NAMES, PROPELLER_NAMES = (
-    tuple(f"{part}{i}" for i in range(1, N_ROTORS + 1)) for part in ("rotor", "arm", "foot", "disc", "propeller")
-)
+
+
+def _names_of(part: str) -> tuple[str, ...]:
+    """Return the names in the model of a part that each rotor has."""
+    return tuple(f"{part}{i}" for i in range(1, N_ROTORS + 1))
+
+
+ROTOR_NAMES: Final = _names_of("rotor")
+ARM_NAMES: Final = _names_of("arm")
+FOOT_NAMES: Final = _names_of("foot")
+DISC_NAMES: Final = _names_of("disc")
+PROPELLER_NAMES: Final = _names_of("propeller")
 
 DRAWN_ARM: Final = 0.3  # arm length [m] for which `quadrotor.xml` is drawn
 _WIDEST_DISC: Final = 0.48  # largest disc radius, in distances between rotors, so that discs never overlap
@@ -51,15 +60,19 @@ def outline(vehicle: Vehicle) -> Outline:
     model = compile_model(vehicle, visuals=True)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    feet = np.array([data.geom(name).xpos for name in FOOT_NAMES])
+    feet = [data.geom(name).xpos for name in FOOT_NAMES]
     around = np.linspace(0.0, 2.0 * np.pi, _RIM, endpoint=False)
     rim = np.stack([np.cos(around), np.sin(around), np.zeros(_RIM)], axis=1)
-    discs = [data.geom(name).xpos + model.geom(name).size[0] * rim for name in DISC_NAMES]
+    hull = []
+    for name in DISC_NAMES:
+        radius = model.geom(name).size[0]
+        hull.append(data.geom(name).xpos + radius * rim)
     battery = data.geom("battery").xpos - [0.0, 0.0, model.geom("battery").size[2]]
+    hull.append(battery[None, :])
     return Outline(
-        feet=feet,
+        feet=np.array(feet),
         foot_radius=float(model.geom(FOOT_NAMES[0]).size[0]),
-        hull=np.concatenate([*discs, battery[None, :]]),
+        hull=np.concatenate(hull),
         floor=float(model.geom(FLOOR).pos[2]),
         disc=float(data.geom(DISC_NAMES[0]).xpos[2]) - float(vehicle.hubs[0, 2]),
     )
@@ -132,7 +145,8 @@ def compile_model(
 def _fit_drawing(spec: mujoco.MjSpec, vehicle: Vehicle) -> None:
     """Scale the drawing to the arms, lead each to its rotor, size the discs as the rotors, colour what is in front."""
     scale = vehicle.longest_arm / DRAWN_ARM
-    for element in (*spec.geoms, *spec.cameras, *(spec.body(name) for name in PROPELLER_NAMES)):
+    propellers = [spec.body(name) for name in PROPELLER_NAMES]
+    for element in (*spec.geoms, *spec.cameras, *propellers):
         element.pos *= scale
         if isinstance(element, mujoco.MjsGeom):
             element.size *= scale
@@ -165,10 +179,12 @@ def _ground(spec: mujoco.MjSpec) -> None:
         spec.option.disableflags &= ~int(flag)
     for name in (FLOOR, "battery", *FOOT_NAMES, *DISC_NAMES):
         geom = spec.geom(name)
+        geom.contype = 0
+        geom.conaffinity = 0
         if name == FLOOR:
-            geom.contype, geom.conaffinity = (_MEETS, 0)
+            geom.contype = _MEETS
         else:
-            geom.contype, geom.conaffinity = (0, _MEETS)
+            geom.conaffinity = _MEETS
         geom.solref[: len(_STIFFNESS)] = _STIFFNESS
         geom.friction = _FRICTION
 
@@ -219,15 +235,14 @@ def obstacle_body(obstacle: Obstacle) -> str:
 
 def _strip(spec: mujoco.MjSpec, *, contact: bool) -> None:
     """Leave what moves: one free body, its rotors, what it stands on, and of each step only what acts on it."""
+    keep: set[str] = set()
+    arms = []
+    idle = [*_IDLE]
     if contact:
         keep = {FLOOR, "battery", *FOOT_NAMES, *DISC_NAMES}
     else:
-        keep = set()
-    # with what hangs on them
-    if contact:
-        arms = []
-    else:
-        arms = [spec.body(name) for name in ARM_NAMES]
+        arms = [spec.body(name) for name in ARM_NAMES]  # with what hangs on them
+        idle += _CONTACT
     for element in [*arms, *spec.cameras, *spec.lights, *spec.sensors, spec.site(IMU)]:
         spec.delete(element)
     for geom in list(spec.geoms):
@@ -237,8 +252,8 @@ def _strip(spec: mujoco.MjSpec, *, contact: bool) -> None:
             geom.material = ""
     for element in [*spec.materials, *spec.textures]:
         spec.delete(element)
-    for idle in (*_IDLE, *(() if contact else _CONTACT)):
-        spec.option.disableflags |= int(idle)
+    for stage in idle:
+        spec.option.disableflags |= int(stage)
 
 
 def semi_axes(areas: Sequence[float]) -> Array:

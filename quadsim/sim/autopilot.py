@@ -106,10 +106,9 @@ class AutopilotSettings:
         assert usual.rate is not None
         rate = usual.rate
         usual = filled(usual, delay=1.0 / rate)
+        filtering = 0.0
         if usual.gyro_cutoff:
             filtering = 1.0 / (math.tau * usual.gyro_cutoff)
-        else:
-            filtering = 0.0
         lag = (vehicle.rotor_rise or 0.0) + filtering + (usual.delay or 0.0) + 0.5 / rate
         w = min(FASTEST_RATE_LOOP, (1.0 + LARGEST_D) / (2.0 * RATE_LOOP_DAMPING * lag))
         p = w * max(w * lag, 0.5 / RATE_LOOP_DAMPING)
@@ -120,10 +119,12 @@ class AutopilotSettings:
         slowest = float(vehicle.hover_speeds.min())
         fastest = float(vehicle.hover_speeds.max())
         reserve = min(slowest**2 - vehicle.speed_min**2, vehicle.speed_max**2 - fastest**2)
+        integral_gains = [gain / INTEGRAL_TIME for gain in gains.p]
+        largest_integrals = AUTHORITY * effect * reserve
         return filled(
             gains,
-            i=tuple(gain / INTEGRAL_TIME for gain in gains.p),
-            i_max=tuple((AUTHORITY * effect * reserve).tolist()),
+            i=tuple(integral_gains),
+            i_max=tuple(largest_integrals.tolist()),
             attitude=(0.25 * w, 0.25 * w, 0.25 * min(w, gains.p[2])),
             idle=vehicle.speed_min / vehicle.speed_max,
         )
@@ -158,7 +159,8 @@ class Autopilot(CompiledLoop):
         step = 1.0 / settings.rate
         rule = f"a whole number of periods of {step:g} s"
         delay = whole("autopilot", "delay", settings.delay, settings.delay * settings.rate, rule, smallest=0)
-        if settings.idle * vehicle.speed_max >= (hover := float(vehicle.hover_speeds.min())):
+        hover = float(vehicle.hover_speeds.min())
+        if settings.idle * vehicle.speed_max >= hover:
             rule = f"below {hover / vehicle.speed_max:.3g}, at which it hovers"
             raise ParameterError("autopilot", "idle", settings.idle, rule)
         slowest, fastest = speeds or (settings.idle * vehicle.speed_max, vehicle.speed_max)
@@ -169,20 +171,17 @@ class Autopilot(CompiledLoop):
         a.i_max[:] = settings.i_max
         a.attitude[:] = settings.attitude
         a.largest[:] = np.radians(settings.largest_rate)
-        a.gyro_share, a.d_share = (
-            1.0 - math.exp(-math.tau * cutoff * step) if cutoff else 1.0
-            for cutoff in (settings.gyro_cutoff, settings.d_cutoff)
-        )
+        a.gyro_share = _filter_share(settings.gyro_cutoff, step)
+        a.d_share = _filter_share(settings.d_cutoff, step)
         a.inertia[:] = vehicle.inertia
         a.products[:] = vehicle.products_of_inertia or (0.0, 0.0, 0.0)
         share = N_ROTORS * vehicle.thrust_shares
         fill(a.to_thrusts, np.linalg.inv(vehicle.allocation / vehicle.coefficients) / share[:, None])
         b = vehicle.coefficients / share
         linear, quadratic = vehicle.square_law
-        low, high = (b * (linear * speed + quadratic * speed**2) for speed in (slowest, fastest))
         a.coefficient[:] = b
-        a.low[:] = low
-        a.high[:] = high
+        a.low[:] = b * (linear * slowest + quadratic * slowest**2)
+        a.high[:] = b * (linear * fastest + quadratic * fastest**2)
         a.linear[:] = linear
         a.quadratic[:] = quadratic
         super().__init__(a, delay=delay)
@@ -200,6 +199,13 @@ class Autopilot(CompiledLoop):
         fill(self._struct.slope, 0.0)
         self._queue[:] = rotors
         self._struct.oldest = 0
+
+
+def _filter_share(cutoff: float | None, step: float) -> float:
+    """Return the share of a change that a first-order low-pass filter takes in a step [s]; all of it without one."""
+    if not cutoff:
+        return 1.0
+    return 1.0 - math.exp(-math.tau * cutoff * step)
 
 
 STEPS: Final = (0.1, 1.0, 1.0, 0.5)
@@ -274,7 +280,9 @@ def _step_plant(vehicle: Vehicle, timestep: float) -> Plant:
     """Return a plant with the vehicle's rotor lag and without other effects, on which an autopilot is stepped."""
     rise = vehicle.rotor_rise or 0.0
     fall = vehicle.rotor_fall or rise
-    inertia = None if rise else 0.0
+    inertia = None
+    if not rise:  # rotors with inertia cannot change their speed at once
+        inertia = 0.0
     rotors = RotorDynamics(rise=rise or None, fall=fall or None, inertia=inertia).resolved(vehicle)
     return Plant(vehicle, timestep=timestep, effects=Effects(rotors=rotors), limit_speeds=True)
 
@@ -284,7 +292,9 @@ def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
     vehicle = plant.vehicle
     weight = vehicle.mass * vehicle.gravity
     target = np.array([weight, 0.0, 0.0, 0.0])
-    size = STEPS[axis] * (weight if axis == 0 else 1.0)
+    size = STEPS[axis]
+    if axis == 0:
+        size *= weight
     target[axis] += size
     _fly_target(plant, autopilot, target)
     if axis:
@@ -318,11 +328,9 @@ def _fly_target(plant: Plant, autopilot: AutopilotLoop, target: Array) -> None:
         attitude, rates = plant.attitude
         return autopilot.speeds(plant.time, target, rates, plant.speeds, attitude)
 
+    loop = InnerStruct(kind=LoopKind.OUTSIDE)
     if isinstance(autopilot, CompiledLoop):
-        struct = autopilot.engage(target, plant.speeds)
-    else:
-        struct = None
-    loop = struct or InnerStruct(kind=LoopKind.OUTSIDE)
+        loop = autopilot.engage(target, plant.speeds) or loop
     loop.until = 0
     loop.stride = stride
     plant.begin(count)

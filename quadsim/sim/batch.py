@@ -85,7 +85,9 @@ class PlantBatch:
         self.reference = self._fields["reference"]
         self.measured = self._fields["measured"]
         self.smallest, self.at_end = np.full((2, count, limits), np.inf)
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._pool: ThreadPoolExecutor | None = None
+        if threads > 1:
+            self._pool = ThreadPoolExecutor(threads)
         self._ranges = _ranges(count, threads)
 
     def close(self) -> None:
@@ -264,10 +266,9 @@ class PlantBatch:
             return
         for place in np.flatnonzero(self._fields["steps"]).tolist():
             at = self._places[place]
-            if at is not None and at.loop is None:
-                problem = check_command(commands[place])
-            else:
-                problem = None
+            if at is None or at.loop is not None:
+                continue
+            problem = check_command(commands[place])
             if problem is not None:
                 ended[place] = CommandError(problem, time=self.plant(place).time)
                 self._fields["steps"][place] = 0
@@ -277,8 +278,9 @@ class PlantBatch:
         if self._pool is None:
             fly(self._flights, 0, self._count)
             return
-        for done in [self._pool.submit(fly, self._flights, first, end) for first, end in self._ranges]:
-            done.result()
+        submitted = [self._pool.submit(fly, self._flights, first, end) for first, end in self._ranges]
+        for part in submitted:
+            part.result()
 
 
 def _fields_of(flights: Any) -> NDArray[np.void]:

@@ -1,4 +1,9 @@
-"""Computation time as simulated time: a slow solver affects the flight reproducibly."""
+"""Computation time as simulated time: a slow solver affects the flight reproducibly.
+
+    time taken = delay + per_iteration iterations + jitter,    and what is left of a stall
+
+The loop lets a command act that much later; one that misses its deadline is dropped.
+"""
 
 from __future__ import annotations
 
@@ -124,10 +129,10 @@ def times_by_solver(per_iteration: Mapping[str, float]) -> dict[str, float]:
             try:
                 find_solver(name)
             except UnknownNameError as error:
-                known = ", ".join(sorted({*_COUNT_THEMSELVES, *ALIASES, *solver_entries()}))
                 if name in SUCCESSORS:
                     rule = f"absent: {error}"
                 else:
+                    known = ", ".join(sorted({*_COUNT_THEMSELVES, *ALIASES, *solver_entries()}))
                     rule = f"absent, or one of {known}"
                 raise ParameterError("computation.per_iteration", name, seconds, rule) from None
         own_name = ALIASES.get(name, name)
@@ -139,7 +144,7 @@ def times_by_solver(per_iteration: Mapping[str, float]) -> dict[str, float]:
 
 
 def not_measured(missing: Collection[str], measured: Collection[str]) -> ParameterError:
-    """Return the error of a law whose iterations are not those that were measured."""
+    """Return the error of a controller whose iterations are not those that were measured."""
     rule = f"given for every solver that may answer for this controller, so also for {', '.join(sorted(missing))}"
     return ParameterError("computation", "per_iteration", sorted(measured), rule)
 
@@ -152,9 +157,13 @@ def check_measured(settings: ComputationTime | None, controller: object) -> None
     """
     if settings is None or not settings.per_iteration:
         return
-    law = controller.law if isinstance(controller, Pilot) else controller
+    law = controller
+    if isinstance(controller, Pilot):
+        law = controller.law
     named = times_by_solver(settings.per_iteration).keys()
-    iterates = law.iterates if isinstance(law, Iterating) else frozenset()
+    iterates: frozenset[str] = frozenset()
+    if isinstance(law, Iterating):
+        iterates = law.iterates
     if not iterates:
         rule = "absent with a controller that counts no iterations"
         raise ParameterError("computation", "per_iteration", settings.per_iteration, rule)

@@ -1,10 +1,10 @@
-"""A flight whose law is the core's: the loop of `quadsim.sim.loop` where nothing else has to be attended to.
+"""A flight whose controller is the core's: the loop of `quadsim.sim.loop` where nothing else has to be attended to.
 
 Tables of many flights need a flight's verdict, margins and metrics, not its record.  Where no user code, no events of
 the reference or the controller, no ground and no computing time are involved, a period is then what the sensors give,
-one call of the law with its contract, and one hold of the plant.  What it flies has the bits of the loop that is asked
-period by period.  It flies only what goes as usual: where a period has no optimum, or the vehicle is lost, it gives up,
-and that flight is the loop's.
+one call of the controller with its contract, and one hold of the plant.  What it flies has the bits of the loop that is
+asked period by period.  It flies only what goes as usual: where a period has no optimum, or the vehicle is lost, it
+gives up, and that flight is the loop's.
 """
 
 from __future__ import annotations
@@ -150,7 +150,9 @@ class _Flight:
         plant = self._plant
         count = len(self._truth)
         t = instants(count, self._steps * plant.timestep)
-        statistics: dict[str, Any] = {name: np.full(count, np.nan) for name in RESIDUALS}
+        statistics: dict[str, Any] = {}
+        for name in RESIDUALS:
+            statistics[name] = np.full(count, np.nan)
         statistics |= law.statistics
         control = ControlLog(
             t=t,

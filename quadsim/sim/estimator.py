@@ -144,11 +144,12 @@ class ErrorStateFilter:
         for name in NEEDED:
             if name not in sensors:
                 raise ParameterError("estimator", "sensors", [*map(str, sensors)], f"such that {name} is among them")
-        noises = {name: in_si(name, sensor.noise) for name, sensor in sensors.items()}
-        for name, noise in noises.items():
-            if min(noise) <= 0.0:
+        noises = {}
+        for name, sensor in sensors.items():
+            noises[name] = in_si(name, sensor.noise)
+            if min(noises[name]) <= 0.0:
                 rule = "positive on every axis, for the estimator to weigh it"
-                raise ParameterError(f"sensors.{name}", "noise", sensors[name].noise, rule)
+                raise ParameterError(f"sensors.{name}", "noise", sensor.noise, rule)
         self.settings = settings
         self._names = tuple(sensors)
         self._horizon = max(sensor.latency(name, timestep) for name, sensor in sensors.items())
@@ -163,8 +164,8 @@ class ErrorStateFilter:
             f.rate_damping[:] = vehicle.rate_damping or (0.0, 0.0, 0.0)
             f.inflow = vehicle.inflow or 0.0
         fill(f.allocation, vehicle.allocation)
-        deviations = settings.acceleration_noise, settings.angular_acceleration_noise
-        f.density[1], f.density[3] = (deviation**2 for deviation in deviations)
+        f.density[1] = settings.acceleration_noise**2
+        f.density[3] = settings.angular_acceleration_noise**2
         f.density[4] = math.radians(settings.gyro_bias_walk) ** 2
         for name, noise in noises.items():
             f.variance[KINDS[name]][:] = np.square(noise)
@@ -200,9 +201,12 @@ class ErrorStateFilter:
     @property
     def tallies(self) -> dict[SensorName, Tally]:
         """Counts of each sensor's samples; those after the fusion horizon are not yet included."""
-        t = self.track
-        kinds = {name: KINDS[name] for name in self._names}
-        return {name: Tally(accepted=t.accepted[k], rejected=t.rejected[k], nis=t.nis[k]) for name, k in kinds.items()}
+        track = self.track
+        tallies = {}
+        for name in self._names:
+            k = KINDS[name]
+            tallies[name] = Tally(accepted=track.accepted[k], rejected=track.rejected[k], nis=track.nis[k])
+        return tallies
 
     def advance(self, commands: Array, samples: Sequence[NDArray[np.void]], *, on_ground: bool = False) -> None:
         """Record a segment of flight and run the filter up to the fusion horizon.
@@ -234,5 +238,5 @@ class ErrorStateFilter:
     def _run(self, track: Struct, samples: NDArray[np.void], *, until: int) -> None:
         """Use samples, then predict to a step, unless that is past."""
         flown = self._commands.ctypes.data, self._grounded.ctypes.data
-        given = self.struct, track, samples.ctypes.data_as(SAMPLES), len(samples)
-        core_library().quadsim_filter_run(*given, *flown, self._base, until)
+        used = self.struct, track, samples.ctypes.data_as(SAMPLES), len(samples)
+        core_library().quadsim_filter_run(*used, *flown, self._base, until)

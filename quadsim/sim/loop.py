@@ -73,7 +73,7 @@ class Reference(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rows:
+class KnownReference:
     """A reference known from the start: `values` (K + N, 4), row k at t_k."""
 
     values: Array
@@ -165,18 +165,24 @@ class ClosedLoop:
         self._navigation = navigation
         self._ground = ground
         self._turns = ReferenceTurns()
-        self.course: Reference = Rows(values=reference) if isinstance(reference, np.ndarray) else reference
+        if isinstance(reference, np.ndarray):
+            reference = KnownReference(values=reference)
+        self.course: Reference = reference
         self._steps = steps_per_period
         self._loss = loss
         self.quaternions = quaternions
-        self._draws = rng if rng is not None else np.random.default_rng(0)
+        if rng is None:
+            rng = np.random.default_rng(0)
+        self._draws = rng
         self._start = plant.physics
         self._initial_speeds = np.array(initial_speeds, float)
         self._lowest = float(initial_state[INDEX["z"]])
         self._acting = self._initial_speeds  # the command sent last: rotor speeds, or the target of an autopilot
         self._inner: InnerLoop | None = None  # flies it
         # What acts in the coming periods: those that commands spend under way, and the one in which the next arrives.
-        self._under_way = 0 if computation is None else computation.whole_periods(steps_per_period, plant.timestep)
+        self._under_way = 0
+        if computation is not None:
+            self._under_way = computation.whole_periods(steps_per_period, plant.timestep)
         held: list[Hold] = [(self._inner, self._acting, steps_per_period)]
         self._schedule: deque[list[Hold]] = deque([held] * self._under_way)
         self._speeds = self._initial_speeds  # the rotor speeds commanded last
@@ -185,7 +191,9 @@ class ClosedLoop:
         self._plan = self._acting[None]
         self._age = 0
         self._observed: Observation | None = None
-        self._samples: list[Period] | None = [] if recorded else None
+        self._samples: list[Period] | None = None
+        if recorded:
+            self._samples = []
         self.last: Period | None = None
         self._predicted: list[_Prediction] = []  # of the controllers before this one, and how many periods they flew
         self._switched = 0
@@ -297,15 +305,21 @@ class ClosedLoop:
         """
         if self._samples is None:
             raise InputError("no period of this flight was recorded: it was begun with recorded=False")
-        timestep = self._plant.timestep
-        start = self._start
         log = flight_log(
-            self._samples, start, self._initial_speeds, self._yaw, self.period, timestep, quaternions=self.quaternions
+            self._samples,
+            self._start,
+            self._initial_speeds,
+            self._yaw,
+            self.period,
+            self._plant.timestep,
+            quaternions=self.quaternions,
         )
-        predictions = [*self._predicted, *([self._predict()] if self.k > self._switched else [])]
+        predictions = list(self._predicted)
+        if self.k > self._switched:
+            predictions.append(self._predict())
         return replace(
             log,
-            predicted=_joined([prediction.positions for prediction in predictions]),
+            predicted=_joined(predictions),
             foreseen=_foreseen(predictions),
             reason=self.reason,
             interrupted=self._interrupted,
@@ -320,14 +334,12 @@ class ClosedLoop:
     def _end(self, error: FlightError) -> None:
         """Note why the flight ended; not the error itself, which would hold all that was flown in a cycle."""
         self.reason = str(error)
+        self._criterion = None
+        self._traceback = ()
         if isinstance(error, LostError):
             self._criterion = error.criterion
-        else:
-            self._criterion = None
         if isinstance(error, RaisedError):
             self._traceback = error.traceback
-        else:
-            self._traceback = ()
 
     def _observe(self) -> Observation:
         k = self.k
@@ -338,11 +350,9 @@ class ClosedLoop:
         truth = plant.state()
         if navigation is None:
             state = truth.copy()
-        else:
-            state = navigation.state()
-        if navigation is None:
             attitude, body_rates = plant.attitude
         else:
+            state = navigation.state()
             attitude, body_rates = navigation.attitude
         rows = self.followed(float(state[INDEX["yaw"]]))
         row = rows[0]
@@ -357,13 +367,16 @@ class ClosedLoop:
         self._lowest = min(self._lowest, float(row[_HEIGHT]))
         if self._loss is not None and phase is not Phase.CRASHED:
             check_loss(self._loss, self.time, truth, row, self._lowest)
+        motion = None
+        if self.motion is not None:
+            motion = self.motion.after(k)
         now = StepInputs(
             time=self.time,
             phase=phase,
             acting=self._speeds,
             attitude=attitude,
             body_rates=body_rates,
-            motion=None if self.motion is None else self.motion.after(k),
+            motion=motion,
             signals=LoggedSignals(),
         )
         return Observation(k=k, state=state, truth=truth, reference=row, preview=preview, moment=now)
@@ -375,18 +388,18 @@ class ClosedLoop:
         nothing = _Prediction(len(samples), None, None)
         if not samples or not isinstance(controller, Predicting | Foreseeing):
             return nothing
-        states = np.stack([sample.observation.state for sample in samples])
+        measured = [sample.observation.state for sample in samples]
+        planned = [sample.command.plan for sample in samples]
+        states = np.stack(measured)
+        foreseen = None
+        predicted = None
         try:
             with user_code(lambda error: InputError(described(error))):
-                plans = np.stack([sample.command.plan for sample in samples])
+                plans = np.stack(planned)
                 if isinstance(controller, Foreseeing):
                     foreseen = controller.foresee(states, plans[:, 0])
-                else:
-                    foreseen = None
                 if isinstance(controller, Predicting):
                     predicted = controller.predict(states, plans)
-                else:
-                    predicted = None
                 if predicted is None:
                     return _Prediction(len(samples), None, foreseen)
                 if foreseen is None:
@@ -410,7 +423,9 @@ class ClosedLoop:
         now.log(TAKEOFF_LEAD, lead, "m")
         raised = preview.copy()
         raised[:, _HEIGHT] += lead
-        return replace(now, motion=None if now.motion is None else now.motion.raised(lead)), state, raised
+        if now.motion is not None:
+            now = replace(now, motion=now.motion.raised(lead))
+        return now, state, raised
 
     def _fly(self, observed: Observation, command: Command | None) -> Period:
         plant = self._plant
@@ -436,10 +451,13 @@ class ClosedLoop:
             due = min(due, physics_steps(computation.delay, plant.timestep) - self._under_way * steps)
         planned = self._plan[min(self._age + 1, len(self._plan) - 1)]  # its last row beyond its end
         inner = self._inner
-        holds: list[Hold] = [(inner, self._acting, due), (inner, planned, min(wait, steps) - due)]
+        continued = min(wait, steps) - due  # physics steps under the last plan's next row
+        holds: list[Hold] = [(inner, self._acting, due), (inner, planned, continued)]
         if missed:
             self._age += 1
-            acting = planned if holds[1][2] else self._acting
+            acting = self._acting
+            if continued:
+                acting = planned
         else:
             acting = command.speeds
             self._plan = command.plan
@@ -460,16 +478,16 @@ class ClosedLoop:
         if self._navigation is not None:
             self._navigation.record(plant.flown, on_ground=on_ground)
         self._acting = acting
-        piloted = takes_targets(self._inner)
-        if piloted:
+        target = None
+        self._speeds = acting
+        if takes_targets(self._inner):
+            target = acting
             self._speeds = plant.flown["commands"][-1].copy()
-        else:
-            self._speeds = acting
         return Period(
             observation=observed,
             command=command,
             speeds=self._speeds,
-            target=acting if piloted else None,
+            target=target,
             delay=delay,
             missed=missed,
             step_s=step_s,
@@ -498,7 +516,9 @@ class ClosedLoop:
                 struct = flying.struct
             else:
                 struct = flying.engage(row, plant.speeds) or flying.struct
-        measured = self._navigation if flying.measures else None
+        measured = None
+        if flying.measures:
+            measured = self._navigation
 
         def ask() -> Array:
             if measured is None:
@@ -522,7 +542,9 @@ class _Flying:
         self.stride = stride
         self.struct = InnerStruct()
         self.measures = takes_targets(inner)
-        self.engage = inner.engage if isinstance(inner, Engaging) else None
+        self.engage: Callable[[Array, Array], Struct | None] | None = None
+        if isinstance(inner, Engaging):
+            self.engage = inner.engage
 
 
 def fly(
@@ -603,15 +625,22 @@ def _foreseen(predictions: Sequence[_Prediction]) -> Array | None:
         return None
     parts = []
     for prediction in predictions:
-        unknown = np.full((prediction.periods, N_STATES), np.nan)
-        parts.append(unknown if prediction.next_states is None else prediction.next_states)
+        if prediction.next_states is None:
+            parts.append(np.full((prediction.periods, N_STATES), np.nan))
+        else:
+            parts.append(prediction.next_states)
     return np.concatenate(parts)
 
 
-def _joined(parts: list[Array | None]) -> np.ndarray[Any, np.dtype[np.float32]] | None:
+def _joined(predictions: Sequence[_Prediction]) -> np.ndarray[Any, np.dtype[np.float32]] | None:
     """The positions that each controller predicted, as far ahead as all of them did; None where one did not."""
-    known = [part for part in parts if part is not None]
-    if not known or len(known) < len(parts):
+    parts = []
+    for prediction in predictions:
+        if prediction.positions is None:
+            return None
+        parts.append(prediction.positions)
+    if not parts:
         return None
-    shortest = min(part.shape[1] for part in known)
-    return np.ascontiguousarray(np.concatenate([part[:, :shortest] for part in known]), dtype=np.float32)
+    shortest = min(part.shape[1] for part in parts)
+    joined = np.concatenate([part[:, :shortest] for part in parts])
+    return np.ascontiguousarray(joined, dtype=np.float32)

@@ -22,7 +22,7 @@ from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, STATE_UNITS, Array, 
 from quadsim.vehicle import N_ROTORS
 
 _DEGREE: Final = math.degrees(1.0)
-_NEVER: Final = 1 << 62  # a physics step that no flight reaches
+_LAST_STEP: Final = 1 << 62  # a physics step that no flight reaches
 _SPEEDS: Final = {f"speed_{i + 1}": N_STATES + i for i in range(N_ROTORS)}
 """Numbers in the core of the rotor speeds that a sum may have."""
 
@@ -56,8 +56,10 @@ class Margins:
             bound.first = _step_at(limit.start, timestep, after=True)
             bound.last = _step_at(limit.stop, timestep, after=False)
         self.compiled = not self._others
-        self.tolerances = np.array([limit.tolerances for limit in self.limits], float).reshape(-1, 2).T
-        self.required = np.array([limit.required for limit in self.limits], bool)
+        tolerances = [limit.tolerances for limit in self.limits]
+        required = [limit.required for limit in self.limits]
+        self.tolerances = np.array(tolerances, float).reshape(-1, 2).T
+        self.required = np.array(required, bool)
 
     def __reduce__(self) -> tuple[type[Margins], tuple[tuple[Limit, ...], float]]:
         """Pickle the arguments: structs with pointers cannot be copied."""
@@ -90,7 +92,7 @@ class Margins:
         assert moment.acting is not None
         assert steps.dtype.fields is not None
         flown = PeriodStruct()
-        given: dict[str, Array] = {
+        inputs: dict[str, Array] = {
             "before": period.before,
             "rotors": period.rotors,
             "truth": observed.truth,
@@ -99,7 +101,7 @@ class Margins:
             "commanded": period.speeds,
             "earlier": moment.acting,
         }
-        kept = {name: np.ascontiguousarray(numbers, np.float64) for name, numbers in given.items()}
+        kept = {name: np.ascontiguousarray(numbers, np.float64) for name, numbers in inputs.items()}
         for name, numbers in kept.items():
             setattr(flown, name, numbers.ctypes.data)
         at = steps.ctypes.data
@@ -152,17 +154,14 @@ def _step_at(time: float, timestep: float, *, after: bool) -> int:
     """Return the first physics step of a window that starts at a time [s], or the last of one that stops there."""
     if math.isinf(time):
         if time > 0.0:
-            return _NEVER
-        return -_NEVER
-    near = max(round(time / timestep), -_NEVER)
+            return _LAST_STEP
+        return -_LAST_STEP
+    near = max(round(time / timestep), -_LAST_STEP)
     steps = np.arange(near - 2, near + 3)
     times = np.round(steps * timestep, 9)
-    # as `Limit.holds_at`
-    if after:
-        inside = steps[times >= time - 1e-9]
-    else:
-        inside = steps[times <= time + 1e-9]
-    return int(inside[0] if after else inside[-1])
+    if after:  # as `Limit.holds_at`
+        return int(steps[times >= time - 1e-9][0])
+    return int(steps[times <= time + 1e-9][-1])
 
 
 def _translate(limit: Limit, bound: Any) -> bool:
@@ -176,11 +175,9 @@ def _translate(limit: Limit, bound: Any) -> bool:
         for k, (term, factor) in enumerate((limit.terms or {}).items()):
             if term in _SPEEDS:
                 bound.index[k] = _SPEEDS[term]
-            else:
-                bound.index[k] = INDEX[term]
-            if term in _SPEEDS:
                 bound.factor[k] = factor
             else:
+                bound.index[k] = INDEX[term]
                 bound.factor[k] = factor * _scale(INDEX[term])
             bound.terms = k + 1
         bound.signal = constant("SIGNAL_SUM")
@@ -191,7 +188,8 @@ def _translate(limit: Limit, bound: Any) -> bool:
         bound.factor[0] = _scale(INDEX[name])
     elif name in ("tilt", "thrust", "speed", "slew"):
         bound.signal = constant(f"SIGNAL_{name.upper()}")
-        bound.factor[0] = _DEGREE if name == "tilt" else 1.0
+        if name == "tilt":
+            bound.factor[0] = _DEGREE
     elif name.startswith("body_rate_"):
         bound.signal = constant("SIGNAL_BODY_RATE")
         bound.axis = "xyz".index(name[-1])

@@ -1,4 +1,8 @@
-"""Navigation: the state that a controller receives, from measurements of the true state."""
+"""Navigation: the state that a controller receives, from measurements of the true state.
+
+Without an estimator it is the last sample of each sensor to arrive, with one the filter's estimate
+(`quadsim.sim.estimator`).  The loop asks for it at each control instant, an autopilot at its own rate.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ from quadsim.sim.estimator import (
 )
 from quadsim.sim.physics import PHYSICS, PhysicsSteps, physics_to_state
 from quadsim.sim.sensing import KINDS, MEASURED, Sampler, Sensor, SensorFault, SensorName, truth
-from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
+from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, VELOCITIES, Array, YawUnwrapper
 from quadsim.vehicle import Vehicle
 
 _AHEAD: Final = 2000
@@ -70,21 +74,23 @@ class Navigation:
             ParameterError: times that are no whole physics steps, a fault of a sensor that is not there, or sensors
                 that the estimator cannot work with.
         """
-        faulty = {fault.sensor for fault in faults} - sensors.keys()
+        faulty = {fault.sensor for fault in faults}
+        faulty -= sensors.keys()
         if estimator is not None and faulty:
             rule = f"on a sensor that the estimator has ({', '.join(sensors)})"
             raise ParameterError("fault", "sensor", str(min(faulty)), rule)
-        perfect = {name: Sensor(rate=1.0 / timestep) for name in sorted(faulty)}
+        sampled = dict(sensors)
+        for name in sorted(faulty):  # of a perfect sensor
+            sampled[name] = Sensor(rate=1.0 / timestep)
         self._timestep = timestep
         self._rng, *others = rng.spawn(1 + len(SensorName))
         generators = dict(zip(SensorName, others, strict=True))
-        self._samplers = tuple(
-            Sampler(name, sensor, timestep=timestep, faults=tuple(faults), rng=generators[name])
-            for name, sensor in {**sensors, **perfect}.items()
-        )
-        if estimator is None:
-            self.filter = None
-        else:
+        samplers = []
+        for name, sensor in sampled.items():
+            samplers.append(Sampler(name, sensor, timestep=timestep, faults=tuple(faults), rng=generators[name]))
+        self._samplers = tuple(samplers)
+        self.filter: ErrorStateFilter | None = None
+        if estimator is not None:
             self.filter = ErrorStateFilter(vehicle, sensors, estimator, timestep=timestep)
 
     def has(self, sensor: SensorName) -> bool:
@@ -103,7 +109,7 @@ class Navigation:
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
         """Restart at MuJoCo's state (14,) and rotor speeds [rad/s] with the same draws; yaw is near `yaw` [rad]."""
         self._step = 0
-        self._yaw = YawTurns(yaw)
+        self._yaw = YawUnwrapper(yaw)
         self._physics = physics.copy()
         self._prepared = 0  # physics steps for whose samples there is room
         self.attitude: tuple[Array, Array] = physics[PHYSICS["attitude"]].copy(), physics[PHYSICS["body_rates"]].copy()
@@ -120,7 +126,8 @@ class Navigation:
             struct.latency = sampler.latency
             struct.held[:] = truth(sampler.name, physics[None])[0]
         if self.filter is not None:
-            known = [physics[PHYSICS[name]] for name in ("position", "velocity", "attitude", "body_rates")]
+            names = ("position", "velocity", "attitude", "body_rates")
+            known = [physics[PHYSICS[name]] for name in names]
             self.filter.reset(np.concatenate([*known, np.zeros(3)]), speeds, copy.deepcopy(self._rng))
         self._prepare(1)
         motion = np.ascontiguousarray(physics[1:])
@@ -170,10 +177,9 @@ class Navigation:
                     row[MEASURED[sampler.name]] = struct.held
         quaternion = row[PHYSICS["attitude"]]
         rates = row[PHYSICS["body_rates"]]
+        sign = 1.0
         if quaternion @ self.attitude[0] < 0.0:
             sign = -1.0
-        else:
-            sign = 1.0
         self.attitude = sign * quaternion, rates
         if angles is None:
             state: Array = physics_to_state(row[None])[0]
@@ -208,10 +214,9 @@ class Navigation:
             values, fates = self._samples[k]
             first = -(-start // struct.stride)
             end = -(-stop // struct.stride)
-            if self.filter is None:
-                heard = struct.heard
-            else:
-                heard = min(struct.heard, self._passed[k])
+            heard = struct.heard
+            if self.filter is not None:
+                heard = min(heard, self._passed[k])
             drop = max(min(heard, first) - struct.first, 0)
             errors, fresh = sampler.draw(first, end - first)
             values = np.concatenate([values[drop:], errors])

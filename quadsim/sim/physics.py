@@ -84,22 +84,25 @@ def steps_type(*, wrench: bool = False, wind: bool = False, battery: bool = Fals
     `wind` (3,) is the velocity of the air in its middle, world [m/s]; `battery` (2,) is the voltage over the step [V]
     and the charge at its start [-].
     """
-    optional = {"wrench": (6, wrench), "wind": (3, wind), "battery": (2, battery)}
-    return np.dtype(
-        [
-            ("physics", float, 14),
-            ("speeds", float, N_ROTORS),
-            ("commands", float, N_ROTORS),
-            ("thrust", float),
-            *((name, float, size) for name, (size, there) in optional.items() if there),
-        ]
-    )
+    fields: list[tuple[str, type[float], int | tuple[()]]] = [
+        ("physics", float, 14),
+        ("speeds", float, N_ROTORS),
+        ("commands", float, N_ROTORS),
+        ("thrust", float, ()),
+    ]
+    if wrench:
+        fields.append(("wrench", float, 6))
+    if wind:
+        fields.append(("wind", float, 3))
+    if battery:
+        fields.append(("battery", float, 2))
+    return np.dtype(fields)
 
 
 def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
     """Convert MuJoCo's states to the paper's states (M, 12).
 
-    They have Euler-angle rates (Sec.  2.2 uses body rates), and a yaw unwrapped along the rows as by `YawTurns`.
+    They have Euler-angle rates (Sec.  2.2 uses body rates), and a yaw unwrapped along the rows as by `YawUnwrapper`.
 
     Args:
         physics: (M, 14) time, position (world), quaternion wxyz, velocity (world), angular rates (body).
@@ -183,16 +186,25 @@ def flight_log(
     control = _control_log(samples, speeds, period)
     plant = _plant_log(samples, start, speeds, yaw, timestep)
     if quaternions:
-        moments = [sample.observation.moment for sample in samples]
-        attitudes = np.array([moment.attitude for moment in moments], float).reshape(-1, 4)
-        rates = np.array([moment.body_rates for moment in moments], float).reshape(-1, 3)
-        control = replace(control, attitude=attitudes, body_rates=rates)
-        physics = np.concatenate([start[None], *(sample.steps["physics"] for sample in samples)])
+        attitudes = []
+        rates = []
+        parts = [start[None]]
+        for sample in samples:
+            attitudes.append(sample.observation.moment.attitude)
+            rates.append(sample.observation.moment.body_rates)
+            parts.append(sample.steps["physics"])
+        control = replace(
+            control,
+            attitude=np.array(attitudes, float).reshape(-1, 4),
+            body_rates=np.array(rates, float).reshape(-1, 3),
+        )
+        physics = np.concatenate(parts)
         attitude = physics[:, PHYSICS["attitude"]]
         body_rates = physics[:, PHYSICS["body_rates"]]
         plant = replace(plant, attitude=attitude, body_rates=body_rates)
     if control.target is not None:
-        thrust = np.concatenate([_thrusts(sample) for sample in samples])
+        thrusts = [_thrusts(sample) for sample in samples]
+        thrust = np.concatenate(thrusts)
         plant = replace(plant, thrust=np.append(thrust, thrust[-1]))
     return FlightLog(control=control, timing=_timing_log(samples, control.t), plant=plant)
 
@@ -203,14 +215,13 @@ def one_period(sample: Period, timestep: float) -> PeriodLog:
     moment = sample.observation.moment
     steps = sample.steps
     assert moment.acting is not None
-    if sample.target is None:
-        target = None
-    else:
-        target = sample.target[None, :4]
-    t = moment.time + timestep * np.arange(len(steps) + 1)
+    target = None
     thrust = None
-    if target is not None:
+    if sample.target is not None:
+        target = sample.target[None, :4]
         thrust = np.append(steps["thrust"], steps["thrust"][-1:])
+    t = moment.time + timestep * np.arange(len(steps) + 1)
+    physics = np.concatenate([sample.before[None], steps["physics"]])
     return PeriodLog(
         control=Samples(
             t=np.round(t[:1], 9),
@@ -223,9 +234,7 @@ def one_period(sample: Period, timestep: float) -> PeriodLog:
         ),
         plant=PlantLog(
             t=np.round(t, 9),
-            state=physics_to_state(
-                np.concatenate([sample.before[None], steps["physics"]]), float(observed.truth[INDEX["yaw"]])
-            ),
+            state=physics_to_state(physics, float(observed.truth[INDEX["yaw"]])),
             speeds=np.concatenate([steps["speeds"], sample.rotors[None]]),
             thrust=thrust,
         ),
@@ -233,36 +242,72 @@ def one_period(sample: Period, timestep: float) -> PeriodLog:
 
 
 def _control_log(samples: Sequence[Period], initial_speeds: Array, period: float) -> ControlLog:
-    observed = [sample.observation for sample in samples]
-
-    rows = np.array([sample.command.stats for sample in samples], float).reshape(-1, len(Statistics._fields))
+    count = len(samples)
+    state = np.empty((count, N_STATES))
+    truth = np.empty((count, N_STATES))
+    reference = np.empty((count, 4))
+    speeds = np.empty((count, N_ROTORS))
+    rows = np.empty((count, len(Statistics._fields)))
+    fallback = np.empty(count, np.int64)
+    delay = np.empty(count)
+    status = []
+    answered_by = []
+    phase = []
+    signals = []
+    for k, sample in enumerate(samples):
+        observed = sample.observation
+        command = sample.command
+        state[k] = observed.state
+        truth[k] = observed.truth
+        reference[k] = observed.reference
+        speeds[k] = sample.speeds
+        rows[k] = command.stats
+        delay[k] = sample.delay
+        phase.append(str(sample.phase))
+        fallback[k] = command.fallback
+        if sample.missed:
+            fallback[k] = max(command.fallback, 1)
+            status.append(MISSED)
+        else:
+            status.append(command.status)
+        if fallback[k]:
+            answered_by.append(FALLBACK)
+        else:
+            answered_by.append(command.answered_by)
+        if isinstance(observed.moment.signals, LoggedSignals):
+            signals.append(observed.moment.signals)
     stats = dict(zip(Statistics._fields, rows.T.copy(), strict=True))
-    sqp = np.column_stack([stats.pop("sqp_defect"), stats.pop("sqp_step")])
     del stats["solve_s"]  # a clock time
-    fallback = np.array([sample.command.fallback for sample in samples], dtype=np.int64)
-    late = np.array([sample.missed for sample in samples], dtype=bool)
-    target = _targets(samples)
+    progress = np.column_stack([stats.pop("sqp_defect"), stats.pop("sqp_step")])
+    sqp = None
+    if not np.isnan(progress).all():
+        sqp = progress
+    targets = _targets(samples)
+    target = None
+    target_attitude = None
+    if targets is not None:
+        target = targets[:, :4]
+        if not np.isnan(targets[:, 4:]).all():
+            target_attitude = targets[:, 4:]
     return ControlLog(
-        t=instants(len(samples), period),
-        state=np.array([observation.state for observation in observed], float).reshape(-1, N_STATES),
-        truth=np.array([observation.truth for observation in observed], float).reshape(-1, N_STATES),
-        reference=np.array([observation.reference for observation in observed], float).reshape(-1, 4),
-        speeds=np.array([sample.speeds for sample in samples], float).reshape(-1, N_ROTORS),
+        t=instants(count, period),
+        state=state,
+        truth=truth,
+        reference=reference,
+        speeds=speeds,
         speeds_before=np.array(initial_speeds, float),
-        status=tuple(MISSED if sample.missed else sample.command.status for sample in samples),
-        answered_by=tuple(
-            FALLBACK if sample.missed or sample.command.fallback else sample.command.answered_by for sample in samples
-        ),
-        phase=tuple(str(sample.phase) for sample in samples),
+        status=tuple(status),
+        answered_by=tuple(answered_by),
+        phase=tuple(phase),
         iterations=stats.pop("iterations").astype(np.int64),
         active=stats.pop("active").astype(np.int64),
-        fallback=np.where(late, np.maximum(fallback, 1), fallback),
+        fallback=fallback,
         **stats,
-        delay=np.array([sample.delay for sample in samples], float),
-        sqp=None if np.isnan(sqp).all() else sqp,
-        target=None if target is None else target[:, :4],
-        target_attitude=None if target is None or np.isnan(target[:, 4:]).all() else target[:, 4:],
-        logged=stacked([s for o in observed if isinstance(s := o.moment.signals, LoggedSignals)]),
+        delay=delay,
+        sqp=sqp,
+        target=target,
+        target_attitude=target_attitude,
+        logged=stacked(signals),
     )
 
 
@@ -286,17 +331,16 @@ def _targets(samples: Sequence[Period]) -> Array | None:
 
 
 def _timing_log(samples: Sequence[Period], t: Array) -> TimingLog:
-    return TimingLog(
-        t=t,
-        solve_ms=np.array([1e3 * sample.command.stats.solve_s for sample in samples]),
-        step_ms=np.array([1e3 * sample.step_s for sample in samples]),
-    )
+    solve_ms = [1e3 * sample.command.stats.solve_s for sample in samples]
+    step_ms = [1e3 * sample.step_s for sample in samples]
+    return TimingLog(t=t, solve_ms=np.array(solve_ms), step_ms=np.array(step_ms))
 
 
 def _plant_log(samples: Sequence[Period], start: Array, initial_speeds: Array, yaw: float, timestep: float) -> PlantLog:
     if not samples:
         return PlantLog(t=instants(1, timestep), state=physics_to_state(start[None], yaw), speeds=initial_speeds[None])
-    return plant_log(np.concatenate([sample.steps for sample in samples]), samples[-1].rotors, start, yaw, timestep)
+    steps = [sample.steps for sample in samples]
+    return plant_log(np.concatenate(steps), samples[-1].rotors, start, yaw, timestep)
 
 
 def plant_log(steps: PhysicsSteps, rotors: Array, start: Array, yaw: float, timestep: float) -> PlantLog:

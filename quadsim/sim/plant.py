@@ -37,7 +37,7 @@ from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator, PhysicsSteps, physics_to_state, steps_type
 from quadsim.space import Obstacle
-from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
+from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOCITIES, Array, YawUnwrapper
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 _FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
@@ -60,7 +60,13 @@ _CARRYING: Final = (Payload, PayloadDrop)
 """Changes that move the centre of mass."""
 
 
-if all(getattr(mujoco, name)() is None for name in dir(mujoco) if name.startswith("get_mjcb_")):
+def _has_callbacks() -> bool:
+    """Return whether MuJoCo has callbacks."""
+    getters = [name for name in dir(mujoco) if name.startswith("get_mjcb_")]
+    return any(getattr(mujoco, name)() is not None for name in getters)
+
+
+if not _has_callbacks():
     # Its Python bindings time each part of each step, which takes two fifths of a step's time.
     mujoco.mj_resetCallbacks()
 
@@ -109,13 +115,14 @@ class Plant:
         self.effects = effects
         self._load = effects.load or _AS_IN_THE_FILE
         air = effects.air or Air()
-        self._reweighed = self._load != _AS_IN_THE_FILE or any(isinstance(change, LOADING) for change in changes)
+        loading = any(isinstance(change, LOADING) for change in changes)
+        self._reweighed = self._load != _AS_IN_THE_FILE or loading
         self._moving = [obstacle for obstacle in obstacles if obstacle.moves]
         if limit_speeds:
             self._speed_range = (vehicle.speed_min, vehicle.speed_max)
         else:
             self._speed_range = (0.0, math.inf)
-        self._yaw = YawTurns(0.0)
+        self._yaw = YawUnwrapper(0.0)
         self._wind = wind
         self._own = tuple(forces)
         self._integrator = integrator
@@ -226,7 +233,7 @@ class Plant:
         if state.shape != (N_STATES,) or not np.all(np.isfinite(state)):
             raise ParameterError("plant", "state", state.tolist(), f"{N_STATES} finite numbers")
         motion = self._motion_of(state)
-        self._yaw = YawTurns(float(state[EULER[2]]))
+        self._yaw = YawUnwrapper(float(state[EULER[2]]))
         self._pending = deque(self._changes)
         self._rotors = self.effects.rotors or RotorDynamics()
         self._efficiency = np.array(self._rotors.efficiency)
@@ -294,34 +301,37 @@ class Plant:
         v.demand[:] = N_ROTORS * power / total
         v.linear_demand = N_ROTORS * linear_power / total
         v.slowest, v.fastest = self._speed_range
-        v.spin[:] = [float(spin) for spin in vehicle.rotor_spins]
+        v.spin[:] = np.array(vehicle.rotor_spins, float)
         fill(v.place, vehicle.hubs)
         fill(v.torque_of_thrust, vehicle.allocation[1:] / vehicle.coefficients)
         if effects.rotors is not None:
             v.rotor_inertia = effects.rotors.inertia or 0.0
-        if (air := effects.air) is not None:
+        air = effects.air
+        if air is not None:
             v.rotor_drag = air.rotor_drag or 0.0
             v.rotor_moment[:] = air.rotor_moment or (0.0, 0.0)
             v.rate_damping[:] = air.rate_damping or (0.0, 0.0, 0.0)
-            if air.inflow_moment is not None:  # of which MuJoCo's ellipsoid gives a part
-                if air.body_drag is None:
-                    by_body = (0.0, 0.0)
-                else:
+            if air.inflow_moment is not None:
+                by_body = (0.0, 0.0)
+                if air.body_drag is not None:  # MuJoCo's ellipsoid gives a part
                     by_body = munk_moment(air.body_drag, air.density)
                 v.inflow_moment[:] = np.subtract(air.inflow_moment, by_body)
             v.inflow = air.inflow or 0.0
             v.linear_drag[:] = air.linear_drag
             v.quadratic_drag[:] = air.quadratic_drag
-        if (ground := effects.ground) is not None and ground.effect:
+        ground = effects.ground
+        if ground is not None and ground.effect:
             shape = outline(vehicle)
             v.floor = shape.floor
             v.disc = shape.disc
             v.radius = ground.rotor_radius
-        if (noise := effects.thrust_noise) is not None:
+        noise = effects.thrust_noise
+        if noise is not None:
             v.loss = noise.loss
             v.deviation = noise.deviation
             v.largest[:] = vehicle.thrusts(np.full(N_ROTORS, vehicle.speed_max))
-        if (battery := effects.battery) is not None:
+        battery = effects.battery
+        if battery is not None:
             self._curve = np.array(battery.curve)
             v.curve = self._curve.ctypes.data
             v.points = len(self._curve)
@@ -344,8 +354,6 @@ class Plant:
             v.fluid = data.qfrc_fluid.ctypes.data
             if self._wind is not None:
                 v.wind = self.model.opt.wind.ctypes.data
-            else:
-                v.wind = None
         if self._moving:
             v.obstacles = data.mocap_pos.ctypes.data
             v.mocaps = len(self._moving)
@@ -431,8 +439,8 @@ class Plant:
             DivergenceError: the state is no longer finite or plausible.
             FlightError: `ask`, or a force of the user, raised.
         """
-        if loop is None and (problem := check_command(command)) is not None:
-            raise CommandError(problem, time=self.time)
+        if loop is None:
+            self._require_valid(command)
         command = np.ascontiguousarray(command, dtype=np.float64)
         end = self._step + steps
         while self._step < end:
@@ -453,18 +461,27 @@ class Plant:
         fly = core_library().quadsim_fly
         while self._step < end:
             why = fly(v, loop, sensing, rows, command.ctypes.data, end)
+            complaint = b""
             if why == End.FAILED:
                 complaint = core_library().quadsim_complaint()
-            else:
-                complaint = b""
             self.check(why, loop, complaint)
             if why == End.DUE:
                 assert loop is not None
                 assert ask is not None
                 answer = np.asarray(ask())
-                if (problem := check_command(answer)) is not None:
-                    raise CommandError(problem, time=self.time)
-                loop.answer[:], loop.until = answer, loop.stride
+                self._require_valid(answer)
+                loop.answer[:] = answer
+                loop.until = loop.stride
+
+    def _require_valid(self, speeds: Array) -> None:
+        """Refuse rotor speeds that are no valid command.
+
+        Raises:
+            CommandError: they are not four finite numbers.
+        """
+        problem = check_command(speeds)
+        if problem is not None:
+            raise CommandError(problem, time=self.time)
 
     def check(self, why: int, loop: Struct | None, complaint: bytes) -> None:
         """Raise what ended a flight by the core, for this reason; `complaint` is MuJoCo's.
@@ -545,12 +562,18 @@ class Plant:
 
     def reschedule(self, changes: Sequence[Change]) -> None:
         """Schedule these changes, of kinds that it `allows`; past ones are ignored."""
-        self._pending = deque(entry for entry in self._scheduled(changes) if entry[0] >= self._step)
+        self._pending = deque()
+        for step, change in self._scheduled(changes):
+            if step >= self._step:
+                self._pending.append((step, change))
 
     def _scheduled(self, changes: Sequence[Change]) -> list[tuple[int, Change]]:
         """Return the changes in order of time, each with the physics step before which it happens."""
-        ordered = sorted(changes, key=lambda change: change.at)
-        return [(math.ceil(change.at / self.timestep - 1e-6), change) for change in ordered]
+        scheduled = []
+        for change in sorted(changes, key=lambda change: change.at):
+            step = math.ceil(change.at / self.timestep - 1e-6)
+            scheduled.append((step, change))
+        return scheduled
 
     def _change(self) -> None:
         """Apply the changes due before the next step."""
@@ -565,7 +588,10 @@ class Plant:
             elif isinstance(change, LagChange):
                 self._rotors = self._rotors.lagging(change)
             elif isinstance(change, PushChange):
-                pushes = [(*push.force, *push.point) for push in change.pushes if any(push.force)]
+                pushes = []
+                for push in change.pushes:
+                    if any(push.force):
+                        pushes.append((*push.force, *push.point))
                 self._pushes = np.array(pushes, float).reshape(-1, 6)
             elif isinstance(change, Payload):
                 self._carry((*self._payloads, change), self._mass_factor)
@@ -609,7 +635,10 @@ class Plant:
         if self._data is None:
             return
         counts = self._data.warning.number
-        if counts.any() and (raised := [kind.name for kind in _NUMERICAL_WARNINGS if counts[int(kind)]]):
+        if not counts.any():
+            return
+        raised = [kind.name for kind in _NUMERICAL_WARNINGS if counts[int(kind)]]
+        if raised:
             raise DivergenceError(f"the plant diverged: MuJoCo reports {', '.join(raised)}", time=self.time)
 
 
@@ -640,15 +669,19 @@ def check_free(effects: Effects, changes: Sequence[Change], obstacles: Sequence[
         ParameterError: there is a floor or an obstacle to touch, a load beside the origin, or MuJoCo's drag.
     """
     load = effects.load or Load()
-    unknown = {
-        "contact with the ground": effects.ground is not None and effects.ground.contact,
-        "obstacles": bool(obstacles),
-        "effects.load.centre_of_mass": any(load.centre_of_mass),
-        "a payload": bool(load.payloads) or any(isinstance(change, _CARRYING) for change in changes),
-        "effects.air.body_drag": effects.air is not None and effects.air.body_drag is not None,
-    }
-    if names := [name for name, present in unknown.items() if present]:
-        raise ParameterError("plant", "integrator", "rk4", f"mujoco with {' and '.join(names)}")
+    unknown = []
+    if effects.ground is not None and effects.ground.contact:
+        unknown.append("contact with the ground")
+    if obstacles:
+        unknown.append("obstacles")
+    if any(load.centre_of_mass):
+        unknown.append("effects.load.centre_of_mass")
+    if load.payloads or any(isinstance(change, _CARRYING) for change in changes):
+        unknown.append("a payload")
+    if effects.air is not None and effects.air.body_drag is not None:
+        unknown.append("effects.air.body_drag")
+    if unknown:
+        raise ParameterError("plant", "integrator", "rk4", f"mujoco with {' and '.join(unknown)}")
 
 
 def _weigh(v: Struct, mass: float, inertia: Array) -> None:

@@ -1,4 +1,9 @@
-"""Sensors: samples of the true motion that arrive late, wrong or never, and faults of sensors."""
+"""Sensors: samples of the true motion that arrive late, wrong or never, and faults of sensors.
+
+    sample = truth + bias + random walk + noise,
+
+taken every `stride` physics steps, heard `latency` later.  Errors are drawn here; the core adds the truth.
+"""
 
 from __future__ import annotations
 
@@ -131,16 +136,23 @@ class SensorFault:
     def window(self, timestep: float) -> tuple[int, int | None]:
         """Return the first physics step with the fault, and the first after it; None if it never ends."""
         first = math.ceil(self.start / timestep - 1e-6)  # rounding must not move an instant meant to be a step
-        return first, math.ceil(self.stop / timestep - 1e-6) if math.isfinite(self.stop) else None
+        if math.isinf(self.stop):
+            return first, None
+        return first, math.ceil(self.stop / timestep - 1e-6)
 
 
-Flags = NDArray[np.bool_]
+SampleFlags = NDArray[np.bool_]
 Fates = NDArray[np.uint8]
-"""What befalls samples: sums of `Fate`s."""
-Steps = NDArray[np.int64]
+"""What happens to samples: sums of `Fate`s."""
+StepIndices = NDArray[np.int64]
 
 
-MEASURED: Final = {name: PHYSICS["body_rates" if name is SensorName.RATES else name.value] for name in SensorName}
+MEASURED: Final = {
+    SensorName.POSITION: PHYSICS["position"],
+    SensorName.VELOCITY: PHYSICS["velocity"],
+    SensorName.ATTITUDE: PHYSICS["attitude"],
+    SensorName.RATES: PHYSICS["body_rates"],
+}
 """The columns of MuJoCo's state that each sensor measures."""
 
 
@@ -182,8 +194,11 @@ class Sampler:
 
     def reschedule(self, faults: Sequence[SensorFault]) -> None:
         """Replace the faults; those of other sensors are ignored."""
-        of_this = (fault for fault in faults if fault.sensor is self.name)
-        self._faults = tuple((fault, fault.window(self._timestep)) for fault in of_this)
+        own_faults = []
+        for fault in faults:
+            if fault.sensor is self.name:
+                own_faults.append((fault, fault.window(self._timestep)))
+        self._faults = tuple(own_faults)
 
     def reset(self) -> None:
         """Restart with the same draws."""
@@ -195,7 +210,7 @@ class Sampler:
         self._fates = np.empty(0, np.uint8)
 
     def draw(self, first: int, count: int) -> tuple[Array, Fates]:
-        """Draw the errors (count, 3) of the samples from number `first` on, and what befalls each (count,).
+        """Draw the errors (count, 3) of the samples from number `first` on, and what happens to each (count,).
 
         An attitude's error is a rotation vector in the body frame.  Calls follow one another from sample 0; one may
         begin with any sample of the call before, for faults that have been rescheduled since.
@@ -225,7 +240,8 @@ class Sampler:
                 case FaultKind.FREEZE:
                     fates[within] |= Fate.FROZEN
                 case FaultKind.NAN:
-                    fates[within] |= sum(Fate.NO_NUMBER << axis for axis in fault.axes)
+                    for axis in fault.axes:
+                        fates[within] |= Fate.NO_NUMBER << axis
         return errors, fates
 
     def _walk(self, count: int) -> Array:
@@ -248,6 +264,8 @@ class Sampler:
         return noise
 
 
-def _within(taken: Steps, window: tuple[int, int | None]) -> Flags:
+def _within(taken: StepIndices, window: tuple[int, int | None]) -> SampleFlags:
     start, stop = window
-    return (taken >= start) & ((taken < stop) if stop is not None else True)
+    if stop is None:
+        return taken >= start
+    return (taken >= start) & (taken < stop)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from quadsim.core import build, headers, library
-from quadsim.core.build import LIBRARY, PLATFORM, TARGETS, ZIG, CompilationError
+from quadsim.core.build import LIBRARY, PLATFORM, ZIG, ZIG_TARGETS, CompilationError
 from quadsim.core.library import load_from, load_library
 from quadsim.core.mirror import check_layout, make_structs
 from quadsim.errors import FileError
@@ -74,14 +74,14 @@ def test_without_one_zig_compiles_for_every_processor() -> None:
     assert build.compiler() == [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
 
 
-@pytest.mark.parametrize("platform", TARGETS)
+@pytest.mark.parametrize("platform", ZIG_TARGETS)
 @pytest.mark.usefixtures("only_zig")
 def test_zig_compiles_what_is_published(platform: str, no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program(no_compiler, "cc")
     assert build.requirements() == []
     monkeypatch.setenv(PLATFORM, platform)
     assert (build.requirements(), build.platform_tag()) == ([ZIG], platform)
-    assert build.compiler()[1:] == ["-m", "ziglang", "cc", "-target", TARGETS[platform]]
+    assert build.compiler()[1:] == ["-m", "ziglang", "cc", "-target", ZIG_TARGETS[platform]]
 
 
 @pytest.mark.parametrize(

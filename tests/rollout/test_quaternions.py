@@ -17,7 +17,7 @@ from quadsim.rollout.rollout import Rollout
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion, quaternion_to_euler
 from quadsim.scenarios.loading import load_scenario
 from quadsim.sim.physics import physics_to_state
-from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, Array, YawTurns, tilt
+from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, Array, YawUnwrapper, tilt
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_yaw_after_a_loop_is_that_before(way: float) -> None:
     yaw = physics_to_state(physics, before)[:, INDEX["yaw"]]
     assert yaw[0] == pytest.approx(before, abs=0.02)
     assert yaw[-1] == pytest.approx(before, abs=0.02)
-    turns = YawTurns(before)
+    turns = YawUnwrapper(before)
     np.testing.assert_allclose([turns.unwrapped(euler) for euler in quaternion_to_euler(noisy)], yaw, atol=1e-9)
 
 

@@ -1,4 +1,7 @@
-/* Commands under way, and the state when the next one takes over; see quadsim_delay.h. */
+/* Commands under way, and the state when the next one takes over; see quadsim_delay.h.
+ *
+ * Over m periods under a command of shares u, actuators follow  a <- u + left^m (a - u), and the body by
+ * quadsim_nmpc_model.c; first over the part `late` of a period, then over n whole ones. */
 #include "quadsim_delay.h"
 
 #include "quadsim_nmpc_math.h"
@@ -19,7 +22,7 @@ static void move_actuators(const quadsim_delay_numbers *n, const quadsim_nmpc_pr
     commands_to_shares(body, n->coefficient, n->scale, command, shares);
     for (j = 0; j < NU; j++) {
         real away = rotors[j] - shares[j];
-        for (i = 0; i < steps && i < LONG_AGO; i++) {
+        for (i = 0; i < steps && i < SETTLED_PERIODS; i++) {
             away *= left[j];
         }
         rotors[j] = shares[j] + away;

@@ -1,4 +1,10 @@
-/* Thrust along the body axis, and a moment or body rates, from errors on SE(3); see quadsim_geometric.h. */
+/* Thrust along the body axis, and a moment or body rates, from errors on SE(3); see quadsim_geometric.h.
+ *
+ *     A = m (-k_x e_x - k_v e_v - integral + g e_3 + a_d - d),   f = A . R e_3,   b_3 along A and drag,
+ *     e_R = (R_d' R - R' R_d)^vee / 2,   e_Omega = Omega - R' R_d Omega_d,
+ *     M = -J (k_R e_R + k_Omega e_Omega + integral + Omega x R' R_d Omega_d - R' R_d Omega_d' + d_R) + Omega x J Omega.
+ *
+ * Omega_d and its rate of change follow from A, A' and A'' and the heading (Lee, Leok and McClamroch 2010). */
 #include "quadsim_geometric.h"
 
 #include <string.h>
@@ -135,7 +141,7 @@ void quadsim_geometric_course(const numbers_of_law *n, int samples, int width, c
  *
  * e_R vanishes at half a turn, where it should be largest.  If the heading error exceeds a quarter turn, the desired
  * heading is a quarter turn away, at rest. */
-static void head_for(real yaw, const target_now *target, jet heading)
+static void find_desired_heading(real yaw, const target_now *target, jet heading)
 {
     const real error = target->yaw[0] - yaw, turn = error - TURN * whole_turns(error);
     const int near = magnitude(turn) <= HALF_PI;
@@ -169,7 +175,7 @@ void quadsim_geometric_limit(const quadsim_real force[3], quadsim_real least, qu
 }
 
 /* The direction of a vector that is not 0. */
-static void direct(jet v, jet u)
+static void find_direction(jet v, jet u)
 {
     const real length = length_of(v[0]);
     real along, across;
@@ -206,7 +212,7 @@ static void cross_jets(jet a, jet b, jet product)
 }
 
 /* The direction of a force and drag times momentum. */
-static void direct_with_drag(jet force, jet momentum, real drag, jet u)
+static void find_direction_with_drag(jet force, jet momentum, real drag, jet u)
 {
     jet v;
     int i, j;
@@ -215,7 +221,7 @@ static void direct_with_drag(jet force, jet momentum, real drag, jet u)
             v[i][j] = force[i][j] + drag * momentum[i][j];
         }
     }
-    direct(v, u);
+    find_direction(v, u);
 }
 
 /* R_c = [b_1, b_2, b_3], with b_1 as close to the heading as the force allows.
@@ -223,21 +229,22 @@ static void direct_with_drag(jet force, jet momentum, real drag, jet u)
  * Rotors and drag together give the force A, f b_3 - R_c diag(d) R_c' p = A.  Perpendicular to b_3,
  * b_1 . (A + d_x p) = 0 and b_2 . (A + d_y p) = 0.  Faessler et al. (2018), Eqs. (12) to (16), with body x rather than
  * body y close to a given direction. */
-static void turn_to(jet force, jet momentum, const real drag[3], jet heading, quadsim_geometric_attitude *desired)
+static void find_desired_attitude(jet force, jet momentum, const real drag[3], jet heading,
+                                  quadsim_geometric_attitude *desired)
 {
     jet beta, across, b[3];
     int order, i, j;
-    direct_with_drag(force, momentum, drag[1], beta);
+    find_direction_with_drag(force, momentum, drag[1], beta);
     cross_jets(beta, heading, across);
-    direct(across, b[1]);
+    find_direction(across, b[1]);
     if (is_equal(drag[0], drag[1])) {
         memcpy(b[2], beta, sizeof(jet));
         cross_jets(b[1], beta, b[0]);
     } else {
         jet alpha, along;
-        direct_with_drag(force, momentum, drag[0], alpha);
+        find_direction_with_drag(force, momentum, drag[0], alpha);
         cross_jets(b[1], alpha, along);
-        direct(along, b[0]);
+        find_direction(along, b[0]);
         cross_jets(b[0], b[1], b[2]);
     }
     for (order = 1; order < 3; order++) { /* of hat(Omega)^2 + hat(Omega'), the skew part */
@@ -274,8 +281,8 @@ static void attitude_error(const real *attitude, const real *desired, real error
 }
 
 /* R' R_c v: a vector from the axes of the commanded attitude to those of the body. */
-static void into_body(const motion_now *motion, const quadsim_geometric_attitude *desired, const real *vector,
-                      real result[3])
+static void desired_into_body(const motion_now *motion, const quadsim_geometric_attitude *desired, const real *vector,
+                              real result[3])
 {
     real world[3];
     turn_by(desired->attitude, vector, world);
@@ -284,7 +291,7 @@ static void into_body(const motion_now *motion, const quadsim_geometric_attitude
 
 /* ---- thrust ------------------------------------------------------------------------------------------------------ */
 
-/* A' and A'' by the equations of motion under the law's own thrust, drag and disturbance.
+/* A' and A'' by the equations of motion under the controller's own thrust, drag and disturbance.
  *
  * The disturbance is assumed to change at a constant rate; drag turns with the body. */
 static void foresee_force(const numbers_of_law *n, const motion_now *motion, const target_now *target,
@@ -358,8 +365,8 @@ static real find_thrust(quadsim_geometric *law, const motion_now *motion, const 
             momentum[2][i] = m * target->path[JERK][i];
         }
     }
-    head_for(motion->yaw, target, heading);
-    turn_to(A, momentum, n->drag, heading, &law->desired);
+    find_desired_heading(motion->yaw, target, heading);
+    find_desired_attitude(A, momentum, n->drag, heading, &law->desired);
     thrust_axis_of(motion->attitude, motion->rates, up, up1);
     if (!n->feedforward) {
         return dot(A[0], up, 3);
@@ -371,7 +378,7 @@ static real find_thrust(quadsim_geometric *law, const motion_now *motion, const 
     return thrust;
 }
 
-/* ---- the law ----------------------------------------------------------------------------------------------------- */
+/* ---- the controller ---------------------------------------------------------------------------------------------- */
 
 void quadsim_geometric_wrench(quadsim_geometric *law, const motion_now *motion, const target_now *target,
                               const quadsim_geometric_disturbance *disturbance, quadsim_real wrench[4])
@@ -382,8 +389,8 @@ void quadsim_geometric_wrench(quadsim_geometric *law, const motion_now *motion, 
     int i;
     wrench[0] = find_thrust(law, motion, target, disturbance);
     attitude_error(motion->attitude, law->desired.attitude, e_R);
-    into_body(motion, &law->desired, law->desired.rates, Omega_d);
-    into_body(motion, &law->desired, law->desired.acceleration, change);
+    desired_into_body(motion, &law->desired, law->desired.rates, Omega_d);
+    desired_into_body(motion, &law->desired, law->desired.acceleration, change);
     cross_product(Omega, Omega_d, turning);
     for (i = 0; i < 3; i++) {
         demanded[i] = n->k_R[i] * e_R[i] + n->k_Omega[i] * (Omega[i] - Omega_d[i]) + law->rotation[i] +
@@ -452,8 +459,8 @@ void quadsim_geometric_targets(quadsim_geometric *law, const motion_now *motion,
     real e_R[3], Omega_d[3], change[3], turning[3];
     int i;
     targets[0] = find_thrust(law, motion, target, disturbance);
-    into_body(motion, &law->desired, law->desired.rates, Omega_d);
-    into_body(motion, &law->desired, law->desired.acceleration, change);
+    desired_into_body(motion, &law->desired, law->desired.rates, Omega_d);
+    desired_into_body(motion, &law->desired, law->desired.acceleration, change);
     cross_product(motion->rates, Omega_d, turning);
     attitude_error(motion->attitude, law->desired.attitude, e_R);
     for (i = 0; i < 3; i++) {
@@ -473,7 +480,7 @@ void quadsim_geometric_integrate(quadsim_geometric *law, const motion_now *motio
     real e_R[3], Omega_d[3];
     int i;
     attitude_error(motion->attitude, law->desired.attitude, e_R);
-    into_body(motion, &law->desired, law->desired.rates, Omega_d);
+    desired_into_body(motion, &law->desired, law->desired.rates, Omega_d);
     for (i = 0; i < 3; i++) {
         const real e_x = motion->position[i] - target->path[POSITION][i];
         const real e_v = motion->velocity[i] - target->path[VELOCITY][i];
@@ -554,7 +561,7 @@ long quadsim_geometric_reals(const numbers_of_law *n)
     return 2L * n->horizon * NU;
 }
 
-/* The command after which a law starts: the thrust of the weight or, of rotors, rotors at rest. */
+/* The command after which a controller starts: the thrust of the weight or, of rotors, rotors at rest. */
 static void find_first_command(const numbers_of_law *n, real command[NU])
 {
     memset(command, 0, NU * sizeof(real));
@@ -626,7 +633,7 @@ void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, qu
 /* ---- with the fallback contract ------------------------------------------------------------------------------------
  */
 
-/* The law's answer to the guard's state, as law->plan. */
+/* The controller's answer to the guard's state, as law->plan. */
 static void plan_commands(quadsim_geometric *law, int flying, const real *measured, const real *reference)
 {
     const numbers_of_law *n = law->numbers;

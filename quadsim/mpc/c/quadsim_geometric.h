@@ -7,13 +7,14 @@
  *                   from the angles and their rates where it is not finite, or where `exact` is not set
  * reference         previews [N][4]: x y z yaw [m, rad], where to be one period from now, two, ... N periods from now;
  *                   whole turns of yaw make no difference.  Or where `motion` is set samples of a course [7][17], now,
- *                   one period on, ...: position, quaternion, and ten numbers that this law does not need; past the
- *                   end of the course its last one
+ *                   one period on, ...: position, quaternion, and ten numbers that are not needed here; past the end
+ *                   of the course its last one
  * acting [4]        the command before, in force up to now
  * command [4]       targets of an autopilot, to hold for the period: thrust [N] and body rates [rad/s]
  *
- * A law's numbers are read only, and may be shared.  All that a law remembers is in a quadsim_geometric and its memory
- * of quadsim_geometric_reals(numbers) reals, all of the caller's.  Nothing is allocated, nothing is shared. */
+ * A controller's numbers are read only, and may be shared.  All that a controller remembers is in a quadsim_geometric
+ * and its memory of quadsim_geometric_reals(numbers) reals, all of the caller's.  Nothing is allocated, nothing is
+ * shared. */
 #ifndef QUADSIM_GEOMETRIC_H
 #define QUADSIM_GEOMETRIC_H
 
@@ -29,7 +30,8 @@ extern "C" {
 #define quadsim_geometric_start quadsim_geometric_start_float
 #endif
 
-/* What a law commands: a wrench for its rotors [N, N m]; thrust and body rates; or these, then a quaternion wxyz. */
+/* What a controller commands: a wrench for its rotors [N, N m]; thrust and body rates; or these, then a quaternion
+ * wxyz. */
 enum { QUADSIM_GEOMETRIC_ROTORS, QUADSIM_GEOMETRIC_RATES, QUADSIM_GEOMETRIC_ATTITUDE };
 
 enum {
@@ -64,7 +66,7 @@ typedef struct quadsim_geometric_numbers {
     const quadsim_real *course;  /* [min(K, 6)][K] from samples now, one period on, ..., for K = 1, then 2, ... 7 */
     const quadsim_delay_numbers *delay; /* which is so much later; NULL where commands act at once */
     const quadsim_ramp_numbers *ramp;   /* NULL where no disturbance is observed */
-    const quadsim_fallback *fallback;   /* NULL where quadsim guards the law: quadsim_geometric_step is not for it */
+    const quadsim_fallback *fallback;   /* NULL where quadsim guards: quadsim_geometric_step is not for it */
 } quadsim_geometric_numbers;
 
 /* What is measured. */
@@ -107,7 +109,7 @@ typedef struct quadsim_geometric {
 
 long quadsim_geometric_reals(const quadsim_geometric_numbers *numbers);
 
-/* A law in memory of the caller's, after the thrust of the weight or, of rotors, with rotors at rest. */
+/* A controller in memory of the caller's, after the thrust of the weight or, of rotors, with rotors at rest. */
 void quadsim_geometric_start(quadsim_geometric *law, const quadsim_geometric_numbers *numbers, quadsim_real *memory);
 
 /* Restart after a command, targets or rotor speeds [rad/s]; after that of the start where it is not finite. */
@@ -151,9 +153,9 @@ void quadsim_geometric_integrate(quadsim_geometric *law, const quadsim_geometric
 void quadsim_geometric_solve(quadsim_geometric *law, int flying, int follows, quadsim_geometric_motion *motion,
                              const quadsim_geometric_target *target, const quadsim_real acting[4]);
 
-/* The command of the period that starts now, always finite and within its bounds: the law's, or what the fallback
- * contract flies instead (quadsim_guard.h).  Not for a law of rotors.  Channels of the state that are not measured are
- * not finite. */
+/* The command of the period that starts now, always finite and within its bounds: the controller's, or what the
+ * fallback contract flies instead (quadsim_guard.h).  Not for a controller of rotors.  Channels of the state that are
+ * not measured are not finite. */
 enum quadsim_status quadsim_geometric_step(quadsim_geometric *law, enum quadsim_phase phase,
                                            const quadsim_real state[QUADSIM_MEASURED], const quadsim_real *reference,
                                            const quadsim_real acting[4], quadsim_real command[4]);

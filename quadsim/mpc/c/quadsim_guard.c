@@ -1,6 +1,6 @@
-/* The fallback contract around a law: what is flown when it has no usable answer, and the state that it is given.
+/* The fallback contract around a controller: what is flown when it has no usable answer, and the state it is given.
  *
- * Each period flies the first of these that there is: the law's optimum; the last one's plan, shifted, with a
+ * Each period flies the first of these that there is: the controller's optimum; the last one's plan, shifted, with a
  * correction towards the states that it foresaw; level hover; descent.
  *
  * Completion.  A channel is missing if it is not finite, implausibly large, or frozen, and is replaced by its
@@ -20,15 +20,15 @@
  *
  *     u = u_s - S^-1 K e    roll and pitch demanded by horizontal errors: -(k_p e_p + k_v e_v) / k_tilt
  *
- * The demanded tilt, that at rest included, is bounded: the law is exactly the LQR within the bound, and demands no
- * more tilt beyond.  Numbers: quadsim/mpc/guard/numbers.py of quadsim. */
+ * The demanded tilt, that at rest included, is bounded: the controller is exactly the LQR within the bound, and demands
+ * no more tilt beyond.  Numbers: quadsim/mpc/guard/numbers.py of quadsim. */
 #include "quadsim_guard.h"
 
 #include <string.h>
 
 #include "quadsim_math.h"
 
-enum { NEVER = 1 << 30 }; /* periods */
+enum { MOST_PERIODS = 1 << 30 }; /* at which counts of periods stop: so long ago is never */
 
 #ifdef QUADSIM_FLOAT
 static const real BOUND_TOLERANCE = 6e-2F, RATE_ROUNDING = 1e-6F; /* [rad/s] of an optimum; relative, of a body rate */
@@ -38,7 +38,7 @@ static const real BOUND_TOLERANCE = 1e-6, RATE_ROUNDING = 1e-9;
 
 static void count_up(int *periods)
 {
-    *periods += *periods < NEVER;
+    *periods += *periods < MOST_PERIODS;
 }
 
 /* ---- the model of level hover ------------------------------------------------------------------------------------ */
@@ -87,8 +87,8 @@ static void predict_about(const quadsim_fallback *f, const real heading[2], cons
 }
 
 /* A state a period later under a command, by the model about where the vehicle rests. */
-static void predict_state(const quadsim_fallback *f, const quadsim_trim *trim, const real heading[2],
-                          const real *command, real *state)
+static void predict_by_hover_model(const quadsim_fallback *f, const quadsim_trim *trim, const real heading[2],
+                                   const real *command, real *state)
 {
     real effect[NU], level[2], lift = R(0.0);
     int j;
@@ -224,7 +224,7 @@ static void complete_state(quadsim_guard *g, const quadsim_trim *trim, const rea
     if (!all || (flying && any)) {
         memcpy(predicted, g->state, sizeof(predicted));
         find_heading(g->state[YAW], heading);
-        predict_state(f, trim, heading, g->in_force, predicted);
+        predict_by_hover_model(f, trim, heading, g->in_force, predicted);
         if (flying) {
             drop_frozen(f, predicted, measured, repeated, seen);
         }
@@ -376,7 +376,7 @@ static void hover_command(const quadsim_fallback *f, const quadsim_trim *trim, c
 }
 
 /* The command of level hover, or of the descent after it, whose target moves; returns its level. */
-static int hover(quadsim_guard *g, const quadsim_trim *trim, real *command)
+static int fly_hover(quadsim_guard *g, const quadsim_trim *trim, real *command)
 {
     const quadsim_fallback *f = g->numbers;
     const real *state = g->state;
@@ -416,7 +416,7 @@ static void plan_hover(const quadsim_guard *g, real *plan)
     find_heading(state[YAW], heading);
     for (i = 1; i < g->horizon; i++) {
         const real *before = plan + (i - 1) * NU;
-        predict_state(f, &g->trim, heading, before, state);
+        predict_by_hover_model(f, &g->trim, heading, before, state);
         target[Z] -= g->level == 3 ? f->sunk : R(0.0);
         hover_command(f, &g->trim, heading, state, target, before, plan + i * NU);
     }
@@ -447,10 +447,10 @@ void quadsim_guard_reset(quadsim_guard *guard, const quadsim_real command[4])
     memset(guard->state, 0, sizeof(guard->state));
     set_diagonal(guard->covariance, f->unknown);
     for (i = 0; i < 12; i++) {
-        guard->unseen[i] = NEVER;
+        guard->unseen[i] = MOST_PERIODS;
         guard->last[i] = guard->last_rates[i % 3] = R(-1e30); /* what no channel repeats */
     }
-    guard->since = guard->asked = guard->waiting = NEVER;
+    guard->since = guard->asked = guard->waiting = MOST_PERIODS;
 }
 
 void quadsim_guard_adopt(quadsim_guard *guard, const quadsim_guard *previous)
@@ -491,11 +491,11 @@ enum quadsim_status quadsim_guard_begin(quadsim_guard *guard, enum quadsim_phase
     }
     guard->learns = 0;
     if (oldest > f->unseen) {
-        guard->since = NEVER;
+        guard->since = MOST_PERIODS;
         return QUADSIM_STATE_UNKNOWN;
     }
     if (!is_within(reference, f->largest_reference, count)) {
-        guard->since = NEVER;
+        guard->since = MOST_PERIODS;
         return QUADSIM_INVALID_REFERENCE;
     }
     guard->asked = guard->waiting;
@@ -589,7 +589,7 @@ enum quadsim_status quadsim_guard_end(quadsim_guard *guard, enum quadsim_phase p
         count_up(&guard->age);
         guard->level = 1;
         if (!follow_plan(guard, status == QUADSIM_STATE_UNKNOWN, command)) {
-            guard->level = hover(guard, trim, command);
+            guard->level = fly_hover(guard, trim, command);
         }
     }
     memcpy(guard->before, command, sizeof(guard->before));

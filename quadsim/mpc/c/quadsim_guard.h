@@ -1,7 +1,7 @@
-/* The fallback contract around a law: what is flown when it has no usable answer, and the state that it is given.
+/* The fallback contract around a controller: what is flown when it has no usable answer, and the state it is given.
  *
- * Each period passes quadsim_guard_begin, where it returns QUADSIM_FREE the law, and quadsim_guard_end.  The law has
- * the whole state and the command in force from the guard, and states where the vehicle rests.
+ * Each period passes quadsim_guard_begin, where it returns QUADSIM_FREE the controller, and quadsim_guard_end.  The
+ * controller has the whole state and the command in force from the guard, and states where the vehicle rests.
  *
  * state [12]        x vx y vy z vz roll roll_rate pitch pitch_rate yaw yaw_rate
  *                   [m, m/s, rad, rad/s]: world axes with z up; Z-Y-X Euler angles, body to world, and their rates
@@ -33,7 +33,7 @@ enum quadsim_status {
     QUADSIM_MISSED,            /* no question came in time: of serial.c */
     QUADSIM_INFEASIBLE_ANSWER, /* the plan violates a row by more than rounding */
     QUADSIM_NOT_CONVERGED,     /* the optimum, whose plan misses the nonlinear dynamics by more than it should */
-    QUADSIM_COMMANDED          /* the command of a law that solves no problem */
+    QUADSIM_COMMANDED          /* the command of a controller that solves no problem */
 };
 
 /* Whether a status is that of a command which is flown as it is. */
@@ -66,7 +66,7 @@ typedef struct quadsim_fallback {
     quadsim_real inverse[16];       /* from accelerations along z and about x, y, z to changes of speeds */
 } quadsim_fallback;
 
-/* Where a law says that the vehicle rests under what disturbs it. */
+/* Where a controller says that the vehicle rests under what disturbs it. */
 typedef struct quadsim_trim {
     quadsim_real commands[4];
     quadsim_real lift[3];  /* along which thrust points, world axes, upwards */
@@ -78,12 +78,12 @@ typedef struct quadsim_guard {
     const quadsim_fallback *numbers;
     quadsim_real *kept; /* [horizon][4] the last plan that was flown */
     int horizon;
-    int level;                  /* of the last step: 0 the law's command, 1 the plan kept, 2 hover, 3 descent */
-    int learns;                 /* whether the law may compare this state with the one it expected */
-    int asked, waiting;         /* periods from the law's call before to this one; since the last */
+    int level;                  /* of the last step: 0 the controller's command, 1 the plan kept, 2 hover, 3 descent */
+    int learns;                 /* whether the controller may compare this state with the one it expected */
+    int asked, waiting;         /* periods from the controller's call before to this one; since the last */
     int planned, foreseeing;    /* whether a plan is kept; whether `foreseen` moves along it */
     int age, hovered, targeted; /* periods in fallback, and in hover or descent; whether these have a target */
-    int since;                  /* periods since the law was given a state that is measured */
+    int since;                  /* periods since the controller was given a state that is measured */
     int unseen[12];             /* periods since each channel was */
     quadsim_real in_force[4], before[4]; /* commands in force now, and after the last step */
     quadsim_real state[12];              /* complete */
@@ -105,13 +105,13 @@ void quadsim_guard_reset(quadsim_guard *guard, const quadsim_real command[4]);
 /* Take over what another contract remembers, its plan where it commands the same; after a reset. */
 void quadsim_guard_adopt(quadsim_guard *guard, const quadsim_guard *previous);
 
-/* Complete the state, of which channels that are not measured are not finite.  QUADSIM_FREE: ask the law; otherwise why
- * it cannot be asked.  The reference is of so many numbers. */
+/* Complete the state, of which channels that are not measured are not finite.  QUADSIM_FREE: ask the controller;
+ * otherwise why it cannot be asked.  The reference is of so many numbers. */
 enum quadsim_status quadsim_guard_begin(quadsim_guard *guard, enum quadsim_phase phase, const quadsim_trim *trim,
                                         const quadsim_real state[12], const quadsim_real *reference, int count,
                                         const quadsim_real acting[4]);
 
-/* The law's status, unless its plan [horizon][4] may not be flown. */
+/* The controller's status, unless its plan [horizon][4] may not be flown. */
 enum quadsim_status quadsim_guard_check(const quadsim_guard *guard, enum quadsim_status status,
                                         const quadsim_real *plan);
 
@@ -120,21 +120,21 @@ enum quadsim_status quadsim_guard_check(const quadsim_guard *guard, enum quadsim
 int quadsim_guard_turned(const quadsim_guard *guard);
 int quadsim_guard_has_rates(const quadsim_guard *guard);
 
-/* Whether `foreseen` is to be moved on by a period under quadsim_guard_row, as the law's answer is not flown but its
- * plan may be: by quadsim_guard_foresee, or by a model of the law's. */
+/* Whether `foreseen` is to be moved on by a period under quadsim_guard_row, as the controller's answer is not flown but
+ * its plan may be: by quadsim_guard_foresee, or by a model of the controller's. */
 int quadsim_guard_foresees(const quadsim_guard *guard, enum quadsim_phase phase, enum quadsim_status status);
 const quadsim_real *quadsim_guard_row(const quadsim_guard *guard);
 
 /* Move it on by the model of level hover, turned to the plan's yaw where `heading`, about rest at these commands. */
 void quadsim_guard_foresee(quadsim_guard *guard, int heading, const quadsim_trim *trim, const quadsim_real resting[4]);
 
-/* The command of the period, always finite and within its bounds: the law's where its status is one that is flown, with
- * its plan [horizon][4], or what is flown instead.  Returns the status of the period. */
+/* The command of the period, always finite and within its bounds: the controller's where its status is one that is
+ * flown, with its plan [horizon][4], or what is flown instead.  Returns the status of the period. */
 enum quadsim_status quadsim_guard_end(quadsim_guard *guard, enum quadsim_phase phase, const quadsim_trim *trim,
                                       enum quadsim_status status, const quadsim_real *plan, quadsim_real command[4]);
 
-/* The plan [horizon][4] of the period that quadsim_guard_end answered last, its command first: the law's plan, what is
- * left of the last one, that of hover or descent by the model, or on the ground the command, held. */
+/* The plan [horizon][4] of the period that quadsim_guard_end answered last, its command first: the controller's plan,
+ * what is left of the last one, that of hover or descent by the model, or on the ground the command, held. */
 void quadsim_guard_plan(const quadsim_guard *guard, quadsim_real *plan);
 
 /* Commands within what the bounds on them and on their steps leave after a command; where these leave nothing, within

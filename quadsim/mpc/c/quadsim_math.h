@@ -20,7 +20,17 @@ typedef quadsim_real real;
 
 enum { NU = QUADSIM_INPUTS };
 
-#define TURN R(6.283185307179586)
+#define TURN R(6.283185307179586) /* 2 pi */
+
+/* A function whose sizes are constants wherever it is called: the compiler makes one of each size, and with
+ * QUADSIM_ANY_SIZE one for all, smaller and slower. */
+#if defined QUADSIM_ANY_SIZE
+#define INLINED static
+#elif defined __GNUC__
+#define INLINED static inline __attribute__((always_inline))
+#else
+#define INLINED static inline
+#endif
 
 /* ---- numbers ---------------------------------------------------------------------------------------------------- */
 
@@ -95,6 +105,13 @@ static inline real dot(const real *left, const real *right, int count)
     return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
+/* The sum of four numbers, one of each input. */
+static inline real sum_of_inputs(const real *numbers)
+{
+    static const real ONES[NU] = {R(1.0), R(1.0), R(1.0), R(1.0)};
+    return dot(numbers, ONES, NU);
+}
+
 /* ---- elementary functions, by arithmetic alone: the same bits wherever it is IEEE 754 and not contracted -------- */
 
 /* After FreeBSD's msun, by Sun Microsystems, 1993: permission to use, copy, modify, and distribute this software is
@@ -108,9 +125,10 @@ static inline void sin_cos(real angle, real *sine, real *cosine)
 {
     /* pi / 2 in three parts, the first two with so few bits that their products with quarters are exact. */
 #ifdef QUADSIM_FLOAT
-    static const real PART[3] = {1.5703125F, 4.837512969970703125e-4F, 7.54978995489188216e-8F};
+    static const real HALF_PI_PARTS[3] = {1.5703125F, 4.837512969970703125e-4F, 7.54978995489188216e-8F};
 #else
-    static const real PART[3] = {1.57079632673412561417e+00, 6.07710050630396597660e-11, 2.02226624879595063154e-21};
+    static const real HALF_PI_PARTS[3] = {1.57079632673412561417e+00, 6.07710050630396597660e-11,
+                                          2.02226624879595063154e-21};
 #endif
     static const real SINE[6] = {R(-1.66666666666666324348e-01), R(8.33333333332248946124e-03),
                                  R(-1.98412698298579493134e-04), R(2.75573137070700676789e-06),
@@ -122,7 +140,8 @@ static inline void sin_cos(real angle, real *sine, real *cosine)
     const int far = !(turns <= most && turns >= -most);
     const int quarters = far ? 0 : (int)(turns < R(0.0) ? turns - R(0.5) : turns + R(0.5));
     const real count = (real)quarters;
-    const real x = ((angle - count * PART[0]) - count * PART[1]) - count * PART[2], square = x * x;
+    const real x = ((angle - count * HALF_PI_PARTS[0]) - count * HALF_PI_PARTS[1]) - count * HALF_PI_PARTS[2],
+               square = x * x;
     real s = SINE[5], c = COSINE[5];
     int i;
     if (far) {
@@ -215,13 +234,6 @@ static inline real square_root(real number)
 
 /* ---- vectors (3,) and matrices [3][3], row by row; results lie apart from what they are of ------------------------
  */
-
-static inline void cross_product(const real *left, const real *right, real *result)
-{
-    result[0] = left[1] * right[2] - left[2] * right[1];
-    result[1] = left[2] * right[0] - left[0] * right[2];
-    result[2] = left[0] * right[1] - left[1] * right[0];
-}
 
 /* Matrix times vector: of an attitude, from body to world. */
 static inline void turn_by(const real *matrix, const real *vector, real *result)

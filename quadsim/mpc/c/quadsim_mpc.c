@@ -1,16 +1,16 @@
-/* The query of a linear law, and its optimum.
+/* The query of a linear controller, and its optimum.
  *
- * The robust law predicts the vehicle from t_k to the instant t_k + d from which its command acts, through the commands
- * u(k-1-n) .. u(k-1) that act before.  With Z-Y-X Euler angles eta, body rates omega = E(eta) d(eta)/dt and rotor
- * speeds that follow commands as tau_r dw/dt = u - w,
+ * The robust controller predicts the vehicle from t_k to the instant t_k + d from which its command acts, through the
+ * commands u(k-1-n) .. u(k-1) that act before.  With Z-Y-X Euler angles eta, body rates omega = E(eta) d(eta)/dt and
+ * rotor speeds that follow commands as tau_r dw/dt = u - w,
  *
  *     d2(p)/dt2 = U / m R(eta) e_z - g e_z + a,
  *     d(omega)/dt = I^-1 (tau - omega x I omega) + (U / m) twist,
  *
- * with what the air does at R(eta)' d(p)/dt and omega, where the law knows it (`Vehicle.air_moment`, `lost_to_inflow`).
- * Here a has two components along world x and y and one along the thrust: a wrong mass scales the thrust in any
- * direction.  The observer of (a, twist) is quadsim_math.h's update_disturbance, of the velocities and body rates that
- * were expected a period before (quadsim/mpc/estimate/observer.py).
+ * with what the air does at R(eta)' d(p)/dt and omega, where the controller knows it (`Vehicle.air_moment`,
+ * `lost_to_inflow`). Here a has two components along world x and y and one along the thrust: a wrong mass scales the
+ * thrust in any direction.  The observer of (a, twist) is quadsim_math.h's update_disturbance, of the velocities and
+ * body rates that were expected a period before (quadsim/mpc/estimate/observer.py).
  *
  * The model is linearised where the vehicle rests under that disturbance, with thrust along g e_z - a,
  *
@@ -62,7 +62,7 @@ static void step_from(const real *reference, int i, real step[4])
 
 /* Velocities and yaw rate of the reference at row i: the mean of the steps before and after it, and at both ends those
  * of the parabola through three rows.  There are at least two rows. */
-static void rates_at(const quadsim_controller *c, const real *reference, int i, real rates[4])
+static void reference_rates(const quadsim_controller *c, const real *reference, int i, real rates[4])
 {
     const int last = c->problem->horizon - 2; /* the last step */
     const int second = last > 0 ? 1 : 0;
@@ -96,7 +96,7 @@ static void rest_at(const real *state, real *rest)
 /* ---- the vehicle's model ----------------------------------------------------------------------------------------- */
 
 /* The unit vector along which rotors push, world axes. */
-static void axis_at(const real *state, real axis[3])
+static void thrust_axis_at(const real *state, real axis[3])
 {
     real s[3], c[3];
     sines_of(state, s, c);
@@ -104,8 +104,8 @@ static void axis_at(const real *state, real axis[3])
 }
 
 /* What the air takes from U/m and adds to the angular acceleration (3,), with a sum of the rotors' speeds. */
-static real air_on(const quadsim_robust *robust, const real *state, real speed, const real *sine, const real *cosine,
-                   const real *rates, real turned[3])
+static real air_effect(const quadsim_robust *robust, const real *state, real speed, const real *sine,
+                       const real *cosine, const real *rates, real turned[3])
 {
     real velocity[3], along[3];
     velocity[0] = state[VX];
@@ -118,8 +118,8 @@ static real air_on(const quadsim_robust *robust, const real *state, real speed, 
 
 /* Rates of change of a state, of U/m, I^-1 tau and the sum of the rotors' speeds (5,) and a constant acceleration (3,).
  * Sec. 2.2. */
-static void slopes(const quadsim_robust *robust, const real *state, const real *drive, const real *disturbance,
-                   real *rates)
+static void state_slopes(const quadsim_robust *robust, const real *state, const real *drive, const real *disturbance,
+                         real *rates)
 {
     const real a = state[ROLL + 1], b = state[PITCH + 1], c = state[YAW + 1];
     real s[3], k[3], w[3], push[3], turned[3], thrust = drive[0], yaw;
@@ -133,7 +133,7 @@ static void slopes(const quadsim_robust *robust, const real *state, const real *
     add_gyroscopic(robust->gyration, w, turned);
     if (robust->moment) {
         real by_air[3];
-        thrust -= air_on(robust, state, drive[NU], s, k, w, by_air);
+        thrust -= air_effect(robust, state, drive[NU], s, k, w, by_air);
         for (i = 0; i < 3; i++) {
             turned[i] += by_air[i];
         }
@@ -149,7 +149,7 @@ static void slopes(const quadsim_robust *robust, const real *state, const real *
 }
 
 /* result = state + time rates */
-static void moved(const real *state, real time, const real *rates, real *result)
+static void state_after(const real *state, real time, const real *rates, real *result)
 {
     int i;
     for (i = 0; i < 12; i++) {
@@ -193,14 +193,16 @@ static void put_body_rates(const real w[3], real *state)
 
 /* The state some time [s] later under an inner loop's targets: place, velocity and attitude by Runge-Kutta's classical
  * method, body rates as `answer` [SUBSTEPS][4][6] has them at its instants. */
-static void predict_targets(const quadsim_mpc *mpc, real time, const real *answer, const real *command, real *state)
+static void predict_under_targets(const quadsim_mpc *mpc, real time, const real *answer, const real *command,
+                                  real *state)
 {
-    static const real PART[4] = {R(0.0), R(0.5), R(0.5), R(1.0)}, WEIGHT[4] = {R(1.0), R(2.0), R(2.0), R(1.0)};
+    static const real STAGE_TIME[4] = {R(0.0), R(0.5), R(0.5), R(1.0)},
+                      STAGE_WEIGHT[4] = {R(1.0), R(2.0), R(2.0), R(1.0)};
     const quadsim_robust *robust = mpc->controller->robust;
     const real step = time / (real)QUADSIM_SUBSTEPS;
     real start[3], w[3], axis[3], disturbance[3], rates[12];
     int k, stage, i;
-    axis_at(state, axis);
+    thrust_axis_at(state, axis);
     find_disturbance(mpc, axis, disturbance);
     body_rates(state, start);
     for (k = 0; k < QUADSIM_SUBSTEPS; k++) {
@@ -208,7 +210,7 @@ static void predict_targets(const quadsim_mpc *mpc, real time, const real *answe
         memset(rates, 0, sizeof(rates));
         for (stage = 0; stage < 4; stage++, answer += 6) {
             real at[12], s[3], c[3], push[3];
-            moved(state, PART[stage] * step, rates, at);
+            state_after(state, STAGE_TIME[stage] * step, rates, at);
             for (i = 0; i < 3; i++) {
                 const real target = command[1 + i];
                 w[i] = target + answer[i] * (start[i] - target) - answer[3 + i] * target;
@@ -223,18 +225,18 @@ static void predict_targets(const quadsim_mpc *mpc, real time, const real *answe
             }
             rates[VZ] -= robust->gravity;
             for (i = 0; i < 12; i++) {
-                sum[i] += WEIGHT[stage] * rates[i];
+                sum[i] += STAGE_WEIGHT[stage] * rates[i];
             }
         }
-        moved(state, step / R(6.0), sum, state);
+        state_after(state, step / R(6.0), sum, state);
         put_body_rates(w, state);
     }
 }
 
 /* The state some time [s] later under a command, by Runge-Kutta's classical method; decay [SUBSTEPS][4] of the rotors'
  * speeds at its instants. */
-static void predict_state(const quadsim_mpc *mpc, real time, const real *decay, const real *answer, const real *rotors,
-                          const real *command, real *state)
+static void predict_vehicle(const quadsim_mpc *mpc, real time, const real *decay, const real *answer,
+                            const real *rotors, const real *command, real *state)
 {
     const quadsim_robust *robust = mpc->controller->robust;
     const real step = time / (real)QUADSIM_SUBSTEPS;
@@ -244,22 +246,22 @@ static void predict_state(const quadsim_mpc *mpc, real time, const real *decay, 
         return;
     }
     if (robust->targets) {
-        predict_targets(mpc, time, answer, command, state);
+        predict_under_targets(mpc, time, answer, command, state);
         return;
     }
-    axis_at(state, axis);
+    thrust_axis_at(state, axis);
     find_disturbance(mpc, axis, disturbance);
     for (k = 0; k < QUADSIM_SUBSTEPS; k++, decay += 4) {
         find_drive(mpc, rotors, command, decay[0], drive);
-        slopes(robust, state, drive, disturbance, rates[0]);
+        state_slopes(robust, state, drive, disturbance, rates[0]);
         find_drive(mpc, rotors, command, decay[1], drive);
-        moved(state, R(0.5) * step, rates[0], at);
-        slopes(robust, at, drive, disturbance, rates[1]);
-        moved(state, R(0.5) * step, rates[1], at);
-        slopes(robust, at, drive, disturbance, rates[2]);
+        state_after(state, R(0.5) * step, rates[0], at);
+        state_slopes(robust, at, drive, disturbance, rates[1]);
+        state_after(state, R(0.5) * step, rates[1], at);
+        state_slopes(robust, at, drive, disturbance, rates[2]);
         find_drive(mpc, rotors, command, decay[3], drive);
-        moved(state, step, rates[2], at);
-        slopes(robust, at, drive, disturbance, rates[3]);
+        state_after(state, step, rates[2], at);
+        state_slopes(robust, at, drive, disturbance, rates[3]);
         for (i = 0; i < 12; i++) {
             state[i] += step / R(6.0) * (rates[0][i] + R(2.0) * (rates[1][i] + rates[2][i]) + rates[3][i]);
         }
@@ -312,14 +314,13 @@ static void update_trim(quadsim_mpc *mpc)
  * They have it at hover speeds, of level velocities in their axes and of rates of Euler angles. */
 static void air_beyond_hover(const quadsim_mpc *mpc, const real *state, real beyond[NU])
 {
-    static const real ONES[NU] = {R(1.0), R(1.0), R(1.0), R(1.0)};
     const quadsim_robust *r = mpc->controller->robust;
-    const real hovering = dot(mpc->controller->hover, ONES, NU), speed = dot(mpc->turning, ONES, NU);
+    const real hovering = sum_of_inputs(mpc->controller->hover), speed = sum_of_inputs(mpc->turning);
     real s[3], k[3], rates[3], along[3], known[3];
     int i;
     sines_of(state, s, k);
     rates_of(state, s, k, rates);
-    beyond[0] = r->loss * hovering * state[VZ] - air_on(r, state, speed, s, k, rates, beyond + 1);
+    beyond[0] = r->loss * hovering * state[VZ] - air_effect(r, state, speed, s, k, rates, beyond + 1);
     along[0] = r->heading ? k[2] * state[VX] + s[2] * state[VY] : state[VX];
     along[1] = r->heading ? k[2] * state[VY] - s[2] * state[VX] : state[VY];
     along[2] = R(0.0); /* of two velocities' product they know nothing */
@@ -364,7 +365,7 @@ static void observe_state(quadsim_mpc *mpc, const real *measured, const real *ex
     const quadsim_robust *r = mpc->controller->robust;
     real axis[3], rates[3], expected_rates[3], surprise[6], upright;
     int i;
-    axis_at(measured, axis);
+    thrust_axis_at(measured, axis);
     body_rates(measured, rates);
     body_rates(expected, expected_rates);
     upright = axis[2] > r->upright ? axis[2] : r->upright;
@@ -381,7 +382,7 @@ static void observe_state(quadsim_mpc *mpc, const real *measured, const real *ex
 /* ---- the robust controller --------------------------------------------------------------------------------------- */
 
 /* Rotor speeds after a time, of which the share that is still what it was is decay. */
-static void spin(real *rotors, const real *command, real decay)
+static void spin_rotors(real *rotors, const real *command, real decay)
 {
     int j;
     for (j = 0; j < NU; j++) {
@@ -409,8 +410,8 @@ static void later_rates(const quadsim_controller *c, const real *reference, int 
     const int next = i == c->problem->horizon - 1 ? i : i + 1;
     real ahead[4];
     int j;
-    rates_at(c, reference, i, rates);
-    rates_at(c, reference, next, ahead);
+    reference_rates(c, reference, i, rates);
+    reference_rates(c, reference, next, ahead);
     for (j = 0; j < 4; j++) {
         rates[j] += c->robust->delayed_share * (ahead[j] - rates[j]);
     }
@@ -524,27 +525,27 @@ static int predict_ahead(quadsim_mpc *mpc, const real *state, int learns, real a
     real before[NU], expected[12];
     int i;
     memcpy(before, mpc->rotors, sizeof(before));
-    spin(mpc->rotors, in_force, r->spun_before);
+    spin_rotors(mpc->rotors, in_force, r->spun_before);
     if (state != NULL && r->observes && mpc->known && learns) {
         memcpy(expected, mpc->ahead, sizeof(expected));
-        predict_state(mpc, r->rest_of_period, r->decay_before, r->answer_before, before, in_force, expected);
+        predict_vehicle(mpc, r->rest_of_period, r->decay_before, r->answer_before, before, in_force, expected);
         if (is_finite(expected, 12)) {
             observe_state(mpc, state, expected);
         }
     }
     if (state != NULL) {
         memcpy(mpc->ahead, state, sizeof(mpc->ahead));
-        predict_state(mpc, r->delay, r->decay_delay, r->answer_delay, mpc->rotors, in_force, mpc->ahead);
+        predict_vehicle(mpc, r->delay, r->decay_delay, r->answer_delay, mpc->rotors, in_force, mpc->ahead);
     }
-    spin(mpc->rotors, in_force, r->spun_delay);
+    spin_rotors(mpc->rotors, in_force, r->spun_delay);
     memcpy(ahead, mpc->ahead, sizeof(mpc->ahead));
     memcpy(mpc->turning, mpc->rotors, sizeof(mpc->turning));
     for (i = 1; i <= r->under_way; i++) {
         const real *next = sent_command(mpc, i, acting);
         if (state != NULL) {
-            predict_state(mpc, r->period, r->decay_period, r->answer_period, mpc->turning, next, ahead);
+            predict_vehicle(mpc, r->period, r->decay_period, r->answer_period, mpc->turning, next, ahead);
         }
-        spin(mpc->turning, next, r->spun_period);
+        spin_rotors(mpc->turning, next, r->spun_period);
     }
     note_sent(mpc, acting);
     mpc->known = state != NULL && is_finite(ahead, 12);
@@ -613,7 +614,7 @@ static void prepare_paper(quadsim_mpc *mpc, const real *state, const real *refer
         row[3] -= TURN * turns;
         put_places(c->problem, row, desired);
         if (c->follows_rates) {
-            rates_at(c, reference, i, rates);
+            reference_rates(c, reference, i, rates);
             add_rates(c->problem, rates, desired);
         }
     }

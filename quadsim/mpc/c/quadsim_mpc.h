@@ -64,7 +64,7 @@ typedef struct quadsim_controller {
     const quadsim_problem
         *problem;                 /* without axes where another solver optimises: quadsim_mpc_prepare is for it alone */
     const quadsim_robust *robust; /* NULL: the paper's controllers */
-    const quadsim_fallback *fallback; /* NULL where quadsim guards the law: quadsim_mpc_step is not for it */
+    const quadsim_fallback *fallback; /* NULL where quadsim guards: quadsim_mpc_step is not for it */
     quadsim_real hover[4];            /* [rad/s] */
     int follows_rates;                /* whether a desired output is a velocity or the yaw rate of the reference */
     quadsim_real period;              /* [s] */

@@ -1,7 +1,11 @@
-/* Sequential quadratic programming: the reference, the start, steps and what is kept of them. */
+/* Sequential quadratic programming: the reference, the start, steps and what is kept of them.
+ *
+ * Each iteration linearises s_{i+1} = f(s_i, u_i) at the plan, A_i, B_i and c_i, solves the quadratic program of
+ * quadsim_nmpc_qp.h, and takes a share of the step to its optimum,  plan <- plan + share (optimum - plan):  all of it,
+ * unless there are several iterations, of which Aitken's relaxation finds the share. */
 #include "quadsim_nmpc_qp.h"
 
-static const real SHORTEST = R(0.1); /* share of a step that Aitken's relaxation takes */
+static const real SHORTEST_STEP = R(0.1); /* share of a step that Aitken's relaxation takes */
 enum { ROW_INTS = sizeof(quadsim_nmpc_row) / sizeof(int) };
 enum { PATIENCE = 8 }; /* steps without a new shortest one after which the largest share of a step is halved */
 
@@ -11,7 +15,7 @@ typedef struct memory {
     long count;
 } memory;
 
-static void take(memory *from, real **array, long size)
+static void take_reals(memory *from, real **array, long size)
 {
     if (from->reals != NULL) {
         *array = from->reals + from->count;
@@ -37,37 +41,37 @@ static void take_arrays(const quadsim_nmpc_problem *p, quadsim_nmpc_work *work, 
 {
     const long N = p->horizon, n = states_of(p), room = p->room, w = entries_of(p), width = columns_of((int)n);
     const int iterates = p->iterations > 1 || p->targets;
-    take(from, &work->x, (N + 1) * n);
-    take(from, &work->u, N * NU);
-    take(from, &work->frame, (N + 1) * 4);
-    take(from, &work->goal, (N + 1) * n);
-    take(from, &work->aim, N * NU);
-    take(from, &work->face, N * p->faces * 3);
-    take(from, &work->beyond, N * p->faces);
-    take(from, &work->map, N * BODY * width);
-    take(from, &work->offset, N * n);
-    take(from, &work->end, N * n);
-    take(from, &work->axis, p->tilts ? N * 8 : 0);
-    take(from, &work->known, p->tilts ? N * 2 : 0);
-    take(from, &work->gain, N * NU * n);
-    take(from, &work->inverse, N * NU * NU);
-    take(from, &work->feed, N * NU);
-    take(from, &work->more, N * NU);
-    take(from, &work->s, (N + 1) * n);
-    take(from, &work->v, N * NU);
-    take(from, &work->value, (N + 1) * w);
-    take(from, &work->own, (N + 1) * w);
-    take(from, &work->response, responses_size(p));
-    take(from, &work->factor, room * (room + 1) / 2);
-    take(from, &work->multiplier, room);
-    take(from, &work->r, room);
-    take(from, &work->d, room);
-    take(from, &work->price, N * p->slacks);
-    take(from, &work->rate, N * p->slacks);
-    take(from, &work->origin, N * p->slacks);
-    take(from, &work->x_before, iterates ? (N + 1) * n : 0);
-    take(from, &work->u_before, iterates ? N * NU : 0);
-    take(from, &work->last, iterates ? N * NU : 0);
+    take_reals(from, &work->x, (N + 1) * n);
+    take_reals(from, &work->u, N * NU);
+    take_reals(from, &work->frame, (N + 1) * 4);
+    take_reals(from, &work->goal, (N + 1) * n);
+    take_reals(from, &work->aim, N * NU);
+    take_reals(from, &work->face, N * p->faces * 3);
+    take_reals(from, &work->beyond, N * p->faces);
+    take_reals(from, &work->map, N * BODY * width);
+    take_reals(from, &work->offset, N * n);
+    take_reals(from, &work->end, N * n);
+    take_reals(from, &work->axis, p->tilts ? N * 8 : 0);
+    take_reals(from, &work->known, p->tilts ? N * 2 : 0);
+    take_reals(from, &work->gain, N * NU * n);
+    take_reals(from, &work->inverse, N * NU * NU);
+    take_reals(from, &work->feed, N * NU);
+    take_reals(from, &work->more, N * NU);
+    take_reals(from, &work->s, (N + 1) * n);
+    take_reals(from, &work->v, N * NU);
+    take_reals(from, &work->value, (N + 1) * w);
+    take_reals(from, &work->own, (N + 1) * w);
+    take_reals(from, &work->response, responses_size(p));
+    take_reals(from, &work->factor, room * (room + 1) / 2);
+    take_reals(from, &work->multiplier, room);
+    take_reals(from, &work->r, room);
+    take_reals(from, &work->d, room);
+    take_reals(from, &work->price, N * p->slacks);
+    take_reals(from, &work->rate, N * p->slacks);
+    take_reals(from, &work->origin, N * p->slacks);
+    take_reals(from, &work->x_before, iterates ? (N + 1) * n : 0);
+    take_reals(from, &work->u_before, iterates ? N * NU : 0);
+    take_reals(from, &work->last, iterates ? N * NU : 0);
 }
 
 long quadsim_nmpc_reals(const quadsim_nmpc_problem *problem)
@@ -106,7 +110,7 @@ void quadsim_nmpc_reset(quadsim_nmpc_work *work)
 }
 
 /* Frames, goals of states and inputs; the reference's actuators are in goals. */
-static void follow(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, const real *states, const real *thrusts)
+static void set_goals(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, const real *states, const real *thrusts)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int N = p->horizon, n = states_of(p);
@@ -146,7 +150,7 @@ static void follow(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, con
 }
 
 /* A plan to start from: the reference, or the last plan, a node further on. */
-static void guess(quadsim_nmpc_work *work)
+static void set_first_plan(quadsim_nmpc_work *work)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int N = p->horizon, n = states_of(p), befores = p->moves ? NU : 0;
@@ -186,7 +190,7 @@ static void roll_out(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, c
     }
 }
 
-static real squared(const real *weight, const real *left, const real *right, int count)
+static real weighted_square(const real *weight, const real *left, const real *right, int count)
 {
     real sum = R(0.0);
     int j;
@@ -197,18 +201,18 @@ static real squared(const real *weight, const real *left, const real *right, int
 }
 
 /* What the plan costs beside rows: twice the objective, but for a constant. */
-static real cost_of(const quadsim_nmpc_work *work)
+static real plan_cost(const quadsim_nmpc_work *work)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int N = p->horizon, n = states_of(p);
     real sum = R(0.0), s[MOST] = {R(0.0)}, away[MOST];
     int i, j, k;
     for (i = 0; i < N; i++) {
-        sum += squared(p->effort, work->u + i * NU, work->aim + i * NU, NU);
+        sum += weighted_square(p->effort, work->u + i * NU, work->aim + i * NU, NU);
         memcpy(s, work->x + (i + 1) * n, sizeof(real) * (size_t)n);
         into_frame(work->frame + 4 * (i + 1), work->x + (i + 1) * n + Q, s + Q);
         if (i + 1 < N) {
-            sum += squared(p->weight, s, work->goal + (i + 1) * n, n);
+            sum += weighted_square(p->weight, s, work->goal + (i + 1) * n, n);
         }
     }
     for (j = 0; j < n; j++) {
@@ -222,9 +226,9 @@ static real cost_of(const quadsim_nmpc_work *work)
     return sum;
 }
 
-/* Inputs by which a geometric law follows the reference, and the states to which they lead: the thrust axis turns to
- * the acceleration that a damped oscillator about the reference asks for. */
-static void steer(quadsim_nmpc_work *work, const quadsim_nmpc_world *world)
+/* Inputs by which a geometric controller follows the reference, and the states to which they lead: the thrust axis
+ * turns to the acceleration that a damped oscillator about the reference asks for. */
+static void steer_geometrically(quadsim_nmpc_work *work, const quadsim_nmpc_world *world)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int N = p->horizon, n = states_of(p);
@@ -257,16 +261,16 @@ static void steer(quadsim_nmpc_work *work, const quadsim_nmpc_world *world)
     }
 }
 
-/* Take the cheaper one of two plans for the plan: the rollout of inputs [N][4], and that of the geometric law. */
-static real choose(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, const real *inputs)
+/* Take the cheaper one of two plans for the plan: the rollout of inputs [N][4], and the geometric one. */
+static real choose_cheaper_plan(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, const real *inputs)
 {
     real cost, other;
     memcpy(work->u_before, inputs, sizeof(real) * (size_t)(work->p->horizon * NU));
-    steer(work, world);
-    other = cost_of(work);
+    steer_geometrically(work, world);
+    other = plan_cost(work);
     memcpy(work->last, work->u, sizeof(real) * (size_t)(work->p->horizon * NU));
     roll_out(work, world, work->u_before);
-    cost = cost_of(work);
+    cost = plan_cost(work);
     if (cost <= other) {
         return cost;
     }
@@ -284,8 +288,8 @@ int quadsim_nmpc_begin(quadsim_nmpc_work *work, const quadsim_nmpc_world *world,
         return 0;
     }
     memcpy(work->before, before, sizeof work->before);
-    follow(work, world, states, thrusts);
-    guess(work);
+    set_goals(work, world, states, thrusts);
+    set_first_plan(work);
     memcpy(work->measured, measured, sizeof(real) * (size_t)known);
     if (p->moves) {
         memcpy(work->measured + known, before, sizeof(real) * NU);
@@ -293,7 +297,7 @@ int quadsim_nmpc_begin(quadsim_nmpc_work *work, const quadsim_nmpc_world *world,
     memcpy(work->start, work->measured, sizeof(real) * (size_t)n);
     into_frame(work->frame, measured + Q, work->start + Q);
     if (work->doubtful) {
-        (void)choose(work, world, work->u);
+        (void)choose_cheaper_plan(work, world, work->u);
     }
     work->share = work->largest = R(1.0);
     work->least = R(1e30);
@@ -303,7 +307,7 @@ int quadsim_nmpc_begin(quadsim_nmpc_work *work, const quadsim_nmpc_world *world,
     return 1;
 }
 
-static real larger(real largest, real a, real b)
+static real larger_change(real largest, real a, real b)
 {
     const real change = magnitude(a - b);
     return change > largest ? change : largest;
@@ -312,7 +316,7 @@ static real larger(real largest, real a, real b)
 /* Take a share of the step from the plan before.  Full Gauss-Newton steps may oscillate: Aitken's relaxation (Irons and
  * Tuck 1969) finds the share from how much of the previous step a step undoes; the largest share falls for good where
  * steps do not get shorter. */
-static void relax(quadsim_nmpc_work *work)
+static void relax_step(quadsim_nmpc_work *work)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int N = p->horizon, states = (N + 1) * states_of(p), inputs = N * NU;
@@ -332,8 +336,8 @@ static void relax(quadsim_nmpc_work *work)
         work->largest *= R(0.5);
         work->patience = PATIENCE;
     }
-    step = work->share / (undone > SHORTEST ? undone : SHORTEST);
-    step = step > SHORTEST ? step : SHORTEST;
+    step = work->share / (undone > SHORTEST_STEP ? undone : SHORTEST_STEP);
+    step = step > SHORTEST_STEP ? step : SHORTEST_STEP;
     work->share = step < work->largest ? step : work->largest;
     for (i = 0; i < inputs; i++) {
         work->last[i] = work->u[i] - work->u_before[i];
@@ -369,13 +373,13 @@ int quadsim_nmpc_keep(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, 
             from_frame(work->frame + 4 * i, work->s + i * n + Q, s + Q);
         }
         for (j = 0; j < n; j++) {
-            work->moved = larger(work->moved, s[j], x[j]);
+            work->moved = larger_change(work->moved, s[j], x[j]);
             x[j] = s[j];
         }
     }
     for (i = 0; i < N * NU; i++) {
         const real input = clipped(work->v[i], p->lower[i % NU], p->upper[i % NU]); /* beyond by rounding at most */
-        work->moved = larger(work->moved, input, work->u[i]);
+        work->moved = larger_change(work->moved, input, work->u[i]);
         work->u[i] = input;
     }
     work->planned = 1;
@@ -384,11 +388,11 @@ int quadsim_nmpc_keep(quadsim_nmpc_work *work, const quadsim_nmpc_world *world, 
          !(p->iterations > 1 && work->moved <= p->tolerance) &&
          !(p->corrections > 0 && work->iterations >= p->iterations && work->defect <= p->converged);
     if (on && p->iterations > 1) {
-        relax(work);
+        relax_step(work);
     }
     if (!on && work->defect > p->converged) {
         if (p->targets) {
-            (void)choose(work, world, work->u);
+            (void)choose_cheaper_plan(work, world, work->u);
         }
         *status = QUADSIM_NMPC_UNCONVERGED;
     }

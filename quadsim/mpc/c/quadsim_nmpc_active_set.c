@@ -21,13 +21,13 @@
 #include "quadsim_nmpc_qp.h"
 
 #ifdef QUADSIM_FLOAT
-static const real DEPENDENT = 3e-6F; /* share of a row's response to itself that others leave of it */
-static const real NOTHING = 1e-6F;   /* change of a multiplier by that of a row */
+static const real DEPENDENCE_TOLERANCE = 3e-6F; /* share of a row's response to itself that others leave of it */
+static const real LEAST_CHANGE = 1e-6F;         /* change of a multiplier by that of a row */
 #else
-static const real DEPENDENT = 1e-11;
-static const real NOTHING = 1e-13;
+static const real DEPENDENCE_TOLERANCE = 1e-11;
+static const real LEAST_CHANGE = 1e-13;
 #endif
-enum { WARM_ROUNDS = 30 };
+enum { WARM_START_ROUNDS = 30 };
 
 static real *response_of(const quadsim_nmpc_work *work, int j)
 {
@@ -40,7 +40,7 @@ static real *factor_of(const quadsim_nmpc_work *work, int j)
 }
 
 /* A row's response to another, whose response and slack are given. */
-static real mutual(const quadsim_nmpc_work *work, const quadsim_nmpc_row *row, int other, const real *response)
+static real mutual_response(const quadsim_nmpc_work *work, const quadsim_nmpc_row *row, int other, const real *response)
 {
     const int slack = row->slack;
     real sum = quadsim_nmpc_product(work, row, response);
@@ -59,15 +59,15 @@ static int factorise_row(quadsim_nmpc_work *work, int j)
     real *mine = factor_of(work, j), whole;
     int k;
     for (k = 0; k < j; k++) { /* L D first */
-        mine[k] = mutual(work, &work->row[k], slack, response) - dot(mine, factor_of(work, k), k);
+        mine[k] = mutual_response(work, &work->row[k], slack, response) - dot(mine, factor_of(work, k), k);
     }
-    mine[j] = whole = mutual(work, &work->row[j], slack, response);
+    mine[j] = whole = mutual_response(work, &work->row[j], slack, response);
     for (k = 0; k < j; k++) {
         const real scaled = mine[k] / factor_of(work, k)[k];
         mine[j] -= scaled * mine[k];
         mine[k] = scaled;
     }
-    return mine[j] > DEPENDENT * whole;
+    return mine[j] > DEPENDENCE_TOLERANCE * whole;
 }
 
 /* Add weight z z' to the product of the factor, from row j on (Gill, Golub, Murray and Saunders 1974); z is
@@ -106,7 +106,7 @@ static void solve_active(const quadsim_nmpc_work *work, const real *d, real *r)
     }
 }
 
-static void drop(quadsim_nmpc_work *work, int j)
+static void drop_row(quadsim_nmpc_work *work, int j)
 {
     const size_t size = sizeof(real) * (size_t)entries_size(work->p);
     const real weight = factor_of(work, j)[j];
@@ -138,7 +138,7 @@ static void set_slack(quadsim_nmpc_work *work, int slack, int free)
 }
 
 /* Move all entries by a step along a row's response, and the active rows' answer r. */
-static void move(quadsim_nmpc_work *work, real step, const real *response)
+static void move_along_response(quadsim_nmpc_work *work, real step, const real *response)
 {
     const long size = entries_size(work->p);
     long i;
@@ -158,7 +158,7 @@ static void move(quadsim_nmpc_work *work, real step, const real *response)
 
 /* The slack at zero that opens first as the multiplier of a row with `slack`, now `multiplier`, grows by less than
  * *longest; -1 if none. */
-static int first_to_open(quadsim_nmpc_work *work, int slack, real multiplier, real *longest)
+static int first_slack_to_open(quadsim_nmpc_work *work, int slack, real multiplier, real *longest)
 {
     const quadsim_nmpc_problem *p = work->p;
     int j, opens = -1;
@@ -174,7 +174,7 @@ static int first_to_open(quadsim_nmpc_work *work, int slack, real multiplier, re
     for (j = 0; j < p->slacks * p->horizon; j++) {
         const real rate = work->rate[j];
         const real room = quadsim_nmpc_linear_price(work, j) - work->price[j] - (j == slack ? multiplier : R(0.0));
-        if (rate > NOTHING && !work->free[j] && room < *longest * rate) {
+        if (rate > LEAST_CHANGE && !work->free[j] && room < *longest * rate) {
             *longest = room > R(0.0) ? room / rate : R(0.0);
             opens = j;
         }
@@ -184,7 +184,7 @@ static int first_to_open(quadsim_nmpc_work *work, int slack, real multiplier, re
 
 /* Whether the active rows and a violated one, whose multipliers change by -r and 1, exclude each other for all inputs
  * within their bounds.  The active set is lost. */
-static int is_proven(quadsim_nmpc_work *work, const quadsim_nmpc_row *violated)
+static int is_proven_infeasible(quadsim_nmpc_work *work, const quadsim_nmpc_row *violated)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int size = p->horizon * NU, w = entries_of(p);
@@ -207,7 +207,7 @@ static int is_proven(quadsim_nmpc_work *work, const quadsim_nmpc_row *violated)
         const real input = work->value[(long)(i / NU + 1) * w + i % NU], slope = work->own[i];
         least += slope * ((slope > R(0.0) ? p->lower[i % NU] : p->upper[i % NU]) - input);
     }
-    return least > FEASIBLE * whole;
+    return least > FEASIBILITY_TOLERANCE * whole;
 }
 
 /* Make a violated row active, and drop what must go. */
@@ -221,33 +221,34 @@ static enum quadsim_nmpc_status add_row(quadsim_nmpc_work *work, const quadsim_n
     }
     quadsim_nmpc_response(work, row, work->own);
     for (;;) {
-        const real whole = mutual(work, row, slack, work->own);
-        real left = whole, longest = NEVER, full;
+        const real whole = mutual_response(work, row, slack, work->own);
+        real left = whole, longest = NO_STEP_LIMIT, full;
         int j, blocks = -1, opens;
         if (++work->changes > work->allowed) {
             return QUADSIM_NMPC_GIVEN_UP;
         }
         for (j = 0; j < work->count; j++) {
-            work->d[j] = mutual(work, &work->row[j], slack, work->own);
+            work->d[j] = mutual_response(work, &work->row[j], slack, work->own);
         }
         solve_active(work, work->d, work->r);
         left -= dot(work->d, work->r, work->count);
         for (j = 0; j < work->count; j++) {
-            if (work->r[j] > NOTHING && work->multiplier[j] < longest * work->r[j]) {
+            if (work->r[j] > LEAST_CHANGE && work->multiplier[j] < longest * work->r[j]) {
                 longest = work->multiplier[j] / work->r[j];
                 blocks = j;
             }
         }
-        opens = first_to_open(work, slack, multiplier, &longest);
-        full = left > DEPENDENT * whole ? quadsim_nmpc_violation(work, row, multiplier) / left : NEVER;
+        opens = first_slack_to_open(work, slack, multiplier, &longest);
+        full =
+            left > DEPENDENCE_TOLERANCE * whole ? quadsim_nmpc_violation(work, row, multiplier) / left : NO_STEP_LIMIT;
         if (full < longest) {
             longest = full;
         }
-        if (longest >= NEVER) {
-            return is_proven(work, row) ? QUADSIM_NMPC_INFEASIBLE : QUADSIM_NMPC_GIVEN_UP;
+        if (longest >= NO_STEP_LIMIT) {
+            return is_proven_infeasible(work, row) ? QUADSIM_NMPC_INFEASIBLE : QUADSIM_NMPC_GIVEN_UP;
         }
         multiplier += longest;
-        move(work, longest, work->own);
+        move_along_response(work, longest, work->own);
         if (longest == full) {
             if (row->kind == QUADSIM_NMPC_SLACK) {
                 set_slack(work, slack, 0);
@@ -264,12 +265,12 @@ static enum quadsim_nmpc_status add_row(quadsim_nmpc_work *work, const quadsim_n
         if (opens >= 0) {
             set_slack(work, opens, 1);
         } else {
-            drop(work, blocks);
+            drop_row(work, blocks);
         }
     }
 }
 
-static void start_cold(quadsim_nmpc_work *work)
+static void clear_active_rows(quadsim_nmpc_work *work)
 {
     work->count = 0;
     quadsim_nmpc_close_slacks(work);
@@ -277,7 +278,7 @@ static void start_cold(quadsim_nmpc_work *work)
 }
 
 /* Start from the active set that is there: the rows that have positive multipliers with the present values. */
-static void start_warm(quadsim_nmpc_work *work)
+static void start_from_active_rows(quadsim_nmpc_work *work)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int slacks = p->slacks * p->horizon, count = work->count;
@@ -292,7 +293,7 @@ static void start_warm(quadsim_nmpc_work *work)
             work->count = kept;
         }
     }
-    for (round = 0; round < WARM_ROUNDS; round++) {
+    for (round = 0; round < WARM_START_ROUNDS; round++) {
         int wrong = 0, opened = 0;
         for (j = 0; j < work->count; j++) {
             const quadsim_nmpc_row *row = &work->row[j];
@@ -304,7 +305,7 @@ static void start_warm(quadsim_nmpc_work *work)
         solve_active(work, work->d, work->multiplier);
         for (j = work->count - 1; j >= 0; j--) {
             if (work->multiplier[j] < R(0.0)) {
-                drop(work, j);
+                drop_row(work, j);
                 wrong = 1;
             }
         }
@@ -326,14 +327,14 @@ static void start_warm(quadsim_nmpc_work *work)
             return;
         }
     }
-    start_cold(work);
+    clear_active_rows(work);
 }
 
 enum quadsim_nmpc_status quadsim_nmpc_search(quadsim_nmpc_work *work)
 {
-    start_warm(work);
+    start_from_active_rows(work);
     for (;;) {
-        real most = FEASIBLE;
+        real most = FEASIBILITY_TOLERANCE;
         quadsim_nmpc_row row;
         enum quadsim_nmpc_status status;
         if (!quadsim_nmpc_worst_row(work, &row, &most)) {
@@ -341,7 +342,7 @@ enum quadsim_nmpc_status quadsim_nmpc_search(quadsim_nmpc_work *work)
         }
         status = add_row(work, &row);
         if (status != QUADSIM_NMPC_BOUNDED) {
-            start_cold(work);
+            clear_active_rows(work);
             return status;
         }
     }

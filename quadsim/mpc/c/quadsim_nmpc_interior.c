@@ -16,9 +16,9 @@
  * that they cost a tenth of the recursion. */
 #include "quadsim_nmpc_qp.h"
 
-static const real SHORTER = R(0.995);        /* share of a step that ends at a bound */
-static const real LEAST_MULTIPLIER = R(3.0); /* of inputs at the start */
-static const real INSIDE = R(0.3);           /* share of an input's range from its bounds, at the start */
+static const real STEP_SHARE_TO_BOUND = R(0.995); /* share of a step that ends at a bound */
+static const real LEAST_MULTIPLIER = R(3.0);      /* of inputs at the start */
+static const real START_MARGIN = R(0.3);          /* share of an input's range from its bounds, at the start */
 
 /* Numbers of each row; those of inputs are first, upper ones [N][4], then lower ones [N][4], those of states
  * [N][quadsim_nmpc_state_rows] follow.  A row of states that is not bounded has t = 0. */
@@ -35,7 +35,7 @@ typedef struct inner {
     quadsim_nmpc_weights weights;
 } inner;
 
-static real *taken(real **memory, long size)
+static real *take_part(real **memory, long size)
 {
     real *start = *memory;
     *memory += size;
@@ -60,7 +60,7 @@ long quadsim_nmpc_interior_size(const quadsim_nmpc_problem *p)
     return 6 * (2 * N * NU + rows) + 7 * rows + entries + N * (3 * NU + states_of(p));
 }
 
-static inner lay_out(const quadsim_nmpc_work *work, int of_states)
+static inner lay_out_rows(const quadsim_nmpc_work *work, int of_states)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int N = p->horizon;
@@ -70,24 +70,24 @@ static inner lay_out(const quadsim_nmpc_work *work, int of_states)
     at.inputs = N * NU;
     at.rows = of_states ? N * quadsim_nmpc_state_rows(p) : 0;
     at.count = 2 * at.inputs + at.rows;
-    at.t = taken(&memory, at.count);
-    at.by = taken(&memory, at.count);
-    at.inverse = taken(&memory, at.count);
-    at.aim = taken(&memory, at.count);
-    at.dt = taken(&memory, at.count);
-    at.dby = taken(&memory, at.count);
-    at.e = taken(&memory, at.rows);
-    at.nu = taken(&memory, at.rows);
-    at.aim_slack = taken(&memory, at.rows);
-    at.de = taken(&memory, at.rows);
-    at.dnu = taken(&memory, at.rows);
-    at.weights.weight = taken(&memory, at.rows);
-    at.weights.slope = taken(&memory, at.rows);
-    at.weights.entries = at.rows > 0 ? taken(&memory, entries_size(p)) : NULL;
-    at.weights.effort = taken(&memory, at.inputs);
-    at.weights.push = taken(&memory, at.inputs);
-    at.weights.inputs = taken(&memory, at.inputs);
-    at.weights.known = taken(&memory, N * states_of(p));
+    at.t = take_part(&memory, at.count);
+    at.by = take_part(&memory, at.count);
+    at.inverse = take_part(&memory, at.count);
+    at.aim = take_part(&memory, at.count);
+    at.dt = take_part(&memory, at.count);
+    at.dby = take_part(&memory, at.count);
+    at.e = take_part(&memory, at.rows);
+    at.nu = take_part(&memory, at.rows);
+    at.aim_slack = take_part(&memory, at.rows);
+    at.de = take_part(&memory, at.rows);
+    at.dnu = take_part(&memory, at.rows);
+    at.weights.weight = take_part(&memory, at.rows);
+    at.weights.slope = take_part(&memory, at.rows);
+    at.weights.entries = at.rows > 0 ? take_part(&memory, entries_size(p)) : NULL;
+    at.weights.effort = take_part(&memory, at.inputs);
+    at.weights.push = take_part(&memory, at.inputs);
+    at.weights.inputs = take_part(&memory, at.inputs);
+    at.weights.known = take_part(&memory, N * states_of(p));
     if (at.rows == 0) {
         at.weights.weight = at.weights.slope = NULL;
     }
@@ -107,7 +107,7 @@ static void start_inputs(const quadsim_nmpc_work *work, inner *at)
         start = half > start ? half : start;
     }
     for (i = 0; i < size; i++) {
-        const real lower = p->lower[i % NU], upper = p->upper[i % NU], margin = INSIDE * (upper - lower);
+        const real lower = p->lower[i % NU], upper = p->upper[i % NU], margin = START_MARGIN * (upper - lower);
         const real input = clipped(work->u[i], lower + margin, upper - margin);
         at->t[i] = upper - input;
         at->t[size + i] = input - lower;
@@ -134,7 +134,7 @@ static void start_states(const quadsim_nmpc_work *work, inner *at)
             *t = *by = at->e[i] = at->nu[i] = R(0.0);
             at->de[i] = at->dnu[i] = at->dt[first + i] = at->dby[first + i] = R(0.0);
             at->weights.weight[i] = at->weights.slope[i] = R(0.0);
-            if (most >= HARD) {
+            if (most >= NO_LIMIT) {
                 continue;
             }
             beyond = quadsim_nmpc_product(work, &row, work->value) - most;
@@ -194,7 +194,7 @@ static void set_weights(const quadsim_nmpc_work *work, const inner *at)
 }
 
 /* The steps that follow from the optimum with these weights. */
-static void find_steps(const quadsim_nmpc_work *work, const inner *at)
+static void find_row_steps(const quadsim_nmpc_work *work, const inner *at)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int size = at->inputs, kinds = quadsim_nmpc_state_rows(p);
@@ -234,7 +234,7 @@ static void find_steps(const quadsim_nmpc_work *work, const inner *at)
 }
 
 /* The largest share of a step, at most 1, that leaves none of the numbers negative. */
-static real longest(real share, const real *numbers, const real *steps, int count)
+static real longest_step(real share, const real *numbers, const real *steps, int count)
 {
     int i;
     for (i = 0; i < count; i++) {
@@ -295,7 +295,7 @@ static void keep_active(quadsim_nmpc_work *work, const inner *at)
 
 int quadsim_nmpc_interior(quadsim_nmpc_work *work, int of_states, quadsim_real tolerance, int most)
 {
-    inner at = lay_out(work, of_states);
+    inner at = lay_out_rows(work, of_states);
     const int count = at.count, rows = at.rows;
     int i, k, pass;
     real mu;
@@ -314,9 +314,9 @@ int quadsim_nmpc_interior(quadsim_nmpc_work *work, int of_states, quadsim_real t
         for (pass = 0; pass < 2; pass++) {
             set_weights(work, &at);
             quadsim_nmpc_weighted_optimum(work, &at.weights, pass == 0);
-            find_steps(work, &at);
-            primal = longest(longest(R(1.0), at.t, at.dt, count), at.e, at.de, rows);
-            dual = longest(longest(R(1.0), at.by, at.dby, count), at.nu, at.dnu, rows);
+            find_row_steps(work, &at);
+            primal = longest_step(longest_step(R(1.0), at.t, at.dt, count), at.e, at.de, rows);
+            dual = longest_step(longest_step(R(1.0), at.by, at.dby, count), at.nu, at.dnu, rows);
             if (pass > 0) {
                 break;
             }
@@ -329,8 +329,8 @@ int quadsim_nmpc_interior(quadsim_nmpc_work *work, int of_states, quadsim_real t
                 at.aim_slack[i] = centre - at.de[i] * at.dnu[i];
             }
         }
-        primal *= SHORTER;
-        dual *= SHORTER;
+        primal *= STEP_SHARE_TO_BOUND;
+        dual *= STEP_SHARE_TO_BOUND;
         move_by(at.t, primal, at.dt, count);
         move_by(at.by, dual, at.dby, count);
         move_by(at.e, primal, at.de, rows);

@@ -1,4 +1,4 @@
-/* Arithmetic of the rigid body that the files of the nonlinear law share. */
+/* Arithmetic of the rigid body that the files of the nonlinear controller share. */
 #ifndef QUADSIM_NMPC_MATH_H
 #define QUADSIM_NMPC_MATH_H
 
@@ -7,17 +7,7 @@
 
 #include <string.h>
 
-/* A function whose sizes are constants wherever it is called: the compiler makes one of each size, and with
- * QUADSIM_ANY_SIZE one for all, smaller and slower. */
-#if defined QUADSIM_ANY_SIZE
-#define INLINED static
-#elif defined __GNUC__
-#define INLINED static inline __attribute__((always_inline))
-#else
-#define INLINED static inline
-#endif
-
-enum { LONG_AGO = 64 }; /* periods after which actuators have reached their command */
+enum { SETTLED_PERIODS = 64 }; /* periods after which actuators have reached their command */
 
 enum { BODY = QUADSIM_NMPC_BODY, MOST = QUADSIM_NMPC_MOST, LEFT = QUADSIM_NMPC_LEFT, P = 0, Q = 3, V = 7, W = 10 };
 

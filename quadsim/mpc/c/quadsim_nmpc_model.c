@@ -1,5 +1,8 @@
 /* The rigid body from node to node: the Runge-Kutta map and its exact derivatives.
  *
+ *     dp/dt = v,   dq/dt = q (0, omega) / 2,   dv/dt = T R(q) e_z - R(q) D R(q)' v - g e_z + a,
+ *     d(omega)/dt = I^-1 (tau - omega x I omega + air) + alpha,   actuator = input + left (actuator - input).
+ *
  * Columns of derivatives pass through the stages with the value.  Two kinds of them are apart: those that turn the
  * attitude ("turning": of the quaternion, body rates, and what acts on these), and those of velocity and of targets of
  * thrust, which only push ("pushing").  Where the air turns the body, so does velocity.  Actuators follow their inputs
@@ -8,7 +11,8 @@
 
 enum { PUSHING = 6, TURNING = 18 };
 
-static const real SLOW = R(0.01); /* share of thrust below which a parabola stands for the root, which is steep at 0 */
+/* Share of thrust below which a parabola stands for the root, which is steep at 0. */
+static const real PARABOLA_BELOW = R(0.01);
 
 /* What acts at an instant. */
 struct drive {
@@ -27,10 +31,10 @@ struct slope {
 };
 
 /* A rotor's speed, as a share, of a share of thrust, and its slope. */
-static real speed_of(real share, real *slope)
+static real speed_share(real share, real *slope)
 {
-    if (share < SLOW) {
-        const real edge = square_root(SLOW), part = share / SLOW;
+    if (share < PARABOLA_BELOW) {
+        const real edge = square_root(PARABOLA_BELOW), part = share / PARABOLA_BELOW;
         *slope = (R(1.5) - part) / edge;
         return edge * (R(1.5) - R(0.5) * part) * part;
     } else {
@@ -74,7 +78,7 @@ static struct drive drive_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_w
         }
         if (p->moments) {
             by_share[4][j] = R(1.0);
-            drive.speed += p->speeds ? now : speed_of(now, &by_share[4][j]);
+            drive.speed += p->speeds ? now : speed_share(now, &by_share[4][j]);
         }
     }
     return drive;
@@ -99,15 +103,15 @@ real quadsim_nmpc_turned(const quadsim_nmpc_problem *p, const real *state, const
         along[i] = along_axis(turn, i, state + V);
     }
     for (i = 0; p->moments && i < NU; i++) {
-        speed += speed_of(thrusts[i] / p->largest, &slope);
+        speed += speed_share(thrusts[i] / p->largest, &slope);
     }
     turn_by_air(p->moment, p->inflow, p->damping, speed, along, state + W, turned);
     return p->loss * speed * along[2];
 }
 
 /* Add to a slope what the air does, drag and torque, and, where wanted, its derivatives. */
-static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive,
-                    const real *q, const real *v, const real *w_b, int derive, struct slope *k)
+static void add_air_slopes(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive,
+                           const real *q, const real *v, const real *w_b, int derive, struct slope *k)
 {
     const real w = q[0], x = q[1], y = q[2], z = q[3];
     const real slopes[4][3][3] = {{{R(0.0), -z, y}, {z, R(0.0), -x}, {-y, x, R(0.0)}},
@@ -170,8 +174,8 @@ static void add_air(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wor
     }
 }
 
-static void slope_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive, int air,
-                     int derive, const real *q, const real *v, const real *w, struct slope *k)
+static void find_slope(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const struct drive *drive,
+                       int air, int derive, const real *q, const real *v, const real *w, struct slope *k)
 {
     const real T = drive->thrust, twice = R(2.0) * T;
     quaternion_rate(q, w, k->q);
@@ -188,7 +192,7 @@ static void slope_at(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *wo
         memcpy(k->by_q, by_q, sizeof by_q);
     }
     if (air) {
-        add_air(p, world, drive, q, v, w, derive, k);
+        add_air_slopes(p, world, drive, q, v, w, derive, k);
     }
 }
 
@@ -310,9 +314,9 @@ static void actuators_after(const quadsim_nmpc_problem *p, const real *x, const 
 /* Runge-Kutta's classical method over a step with held inputs: it moves y, the quaternion, velocity and body rates
  * [10], and adds to `place` how far the position went; and, where `derive`, moves the columns: m that turn, padded,
  * with targets or not, so many actuators, and with the air's torque or not. */
-INLINED void integrate(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
-                       const int derive, const int m, const int targets, const int actuators, const int moments,
-                       real *y, real *place, struct columns *columns)
+INLINED void integrate_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x,
+                            const real *u, const int derive, const int m, const int targets, const int actuators,
+                            const int moments, real *y, real *place, struct columns *columns)
 {
     const real h = p->step / (real)p->substeps, part[4] = {R(0.0), R(0.5) * h, R(0.5) * h, h};
     const int air = meets_air(p, world);
@@ -351,7 +355,7 @@ INLINED void integrate(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *
             if (targets) {
                 set_rates(p, &drive, derive, ys, Ds);
             }
-            slope_at(p, world, &drive, air, derive, ys, ys + 4, ys + 7, &k);
+            find_slope(p, world, &drive, air, derive, ys, ys + 4, ys + 7, &k);
             for (i = 0; i < 3; i++) { /* the position's slope is the velocity */
                 place[i] += stage < 3 ? h * h / R(6.0) * k.v[i] : h * y[4 + i];
             }
@@ -423,7 +427,7 @@ INLINED void linearise_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_wo
             d.turning[4 + i][turning + i] = R(1.0);
         }
     }
-    integrate(p, world, x, u, 1, m, targets, actuators, moments, y, travelled, &d);
+    integrate_node(p, world, x, u, 1, m, targets, actuators, moments, y, travelled, &d);
     /* The map's columns: quaternion, velocity, body rates, actuators, inputs. */
     memset(map, 0, sizeof(real) * (size_t)(BODY * width));
     for (c = 0; c < turning + (moments ? 3 : 0); c++) {
@@ -531,13 +535,13 @@ void quadsim_nmpc_linearise(quadsim_nmpc_work *work, const quadsim_nmpc_world *w
 }
 
 /* The next state, without derivatives. */
-static void predict_state(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
-                          real *end)
+static void predict_node(const quadsim_nmpc_problem *p, const quadsim_nmpc_world *world, const real *x, const real *u,
+                         real *end)
 {
     real y[10];
     memcpy(y, x + Q, sizeof y);
     memcpy(end, x, sizeof(real) * 3);
-    integrate(p, world, x, u, 0, 0, p->targets, p->actuators, p->moments, y, end, NULL);
+    integrate_node(p, world, x, u, 0, 0, p->targets, p->actuators, p->moments, y, end, NULL);
     memcpy(end + Q, y, sizeof y);
     actuators_after(p, x, u, end);
 }
@@ -548,7 +552,7 @@ void quadsim_nmpc_advance(const quadsim_nmpc_problem *p, const quadsim_nmpc_worl
     const int n = states_of(p);
     int i;
     for (i = 0; i < count; i++) {
-        predict_state(p, world, states + i * n, inputs + i * NU, ends + i * n);
+        predict_node(p, world, states + i * n, inputs + i * NU, ends + i * n);
     }
 }
 
@@ -560,7 +564,7 @@ real quadsim_nmpc_defect(const quadsim_nmpc_work *work, const quadsim_nmpc_world
     real largest = R(0.0), end[MOST];
     int i, j;
     for (i = 0; i < p->horizon; i++) {
-        predict_state(p, world, work->x + i * n, work->u + i * NU, end);
+        predict_node(p, world, work->x + i * n, work->u + i * NU, end);
         for (j = 0; j < n; j++) {
             const real miss = magnitude(work->x[(i + 1) * n + j] - end[j]);
             largest = miss > largest ? miss : largest;

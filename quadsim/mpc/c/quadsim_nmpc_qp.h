@@ -14,13 +14,13 @@
 #include "quadsim_nmpc_math.h"
 
 #ifdef QUADSIM_FLOAT
-static const real FEASIBLE = 2e-5F; /* violation of a row */
+static const real FEASIBILITY_TOLERANCE = 2e-5F; /* violation of a row */
 #else
-static const real FEASIBLE = 1e-10;
+static const real FEASIBILITY_TOLERANCE = 1e-10;
 #endif
-static const real HARD = R(1e29); /* a price, or a bound, that is none */
-static const real NEVER = R(1e30);
-static const real CURVATURE = R(1e-5); /* of a linear price, in its proportion */
+static const real NO_LIMIT = R(1e29); /* a price, or a bound, that is none */
+static const real NO_STEP_LIMIT = R(1e30);
+static const real LINEAR_PRICE_CURVATURE = R(1e-5); /* of a linear price, in its proportion */
 
 /* ---- quadsim_nmpc_rows.c ----------------------------------------------------------------------------------------- */
 

@@ -23,7 +23,7 @@ static const real SIDE[SIDES][2] = {
 /* A row of states; `of` is which slack of its node it has, where that has a price. */
 static quadsim_nmpc_row row_of(const quadsim_nmpc_problem *p, int node, int kind, int index, int sign, int of)
 {
-    const int soft = of >= 0 && p->linear[of] < HARD;
+    const int soft = of >= 0 && p->linear[of] < NO_LIMIT;
     const quadsim_nmpc_row row = {node, kind, index, sign, soft ? p->slacks * node + of : -1};
     return row;
 }
@@ -77,14 +77,14 @@ void quadsim_nmpc_state_row(const quadsim_nmpc_problem *p, int node, int k, quad
 /* ---- entries ----------------------------------------------------------------------------------------------------- */
 
 /* Where a node's body rates, and positions and velocities, are among its entries. */
-static int rates_at(const quadsim_nmpc_problem *p)
+static int rate_entries(const quadsim_nmpc_problem *p)
 {
     return NU + (p->tilts ? 2 : 0);
 }
 
-static int places_at(const quadsim_nmpc_problem *p)
+static int place_entries(const quadsim_nmpc_problem *p)
 {
-    return rates_at(p) + (p->turns ? AXES : 0);
+    return rate_entries(p) + (p->turns ? AXES : 0);
 }
 
 void quadsim_nmpc_entries_at(const quadsim_nmpc_work *work, int i, int whole, const quadsim_real *inputs,
@@ -116,7 +116,7 @@ quadsim_real quadsim_nmpc_product(const quadsim_nmpc_work *work, const quadsim_n
 {
     const quadsim_nmpc_problem *p = work->p;
     const int w = entries_of(p), index = row->index;
-    const real *at = entries + (long)(row->node + 1) * w, *place = at + places_at(p), *normal;
+    const real *at = entries + (long)(row->node + 1) * w, *place = at + place_entries(p), *normal;
     real sum = R(0.0);
     int j;
     switch (row->kind) {
@@ -125,7 +125,7 @@ quadsim_real quadsim_nmpc_product(const quadsim_nmpc_work *work, const quadsim_n
     case QUADSIM_NMPC_TILT:
         return SIDE[index][0] * at[NU] + SIDE[index][1] * at[NU + 1];
     case QUADSIM_NMPC_RATE:
-        at += rates_at(p);
+        at += rate_entries(p);
         return row->sign > 0 ? at[index] : -at[index];
     case QUADSIM_NMPC_STATED:
         for (j = p->first[index]; j < p->first[index + 1]; j++) {
@@ -178,15 +178,15 @@ static void add_entry_gradient(const quadsim_nmpc_work *work, int node, int entr
     int j;
     if (entry < NU) {
         inputs[entry] += factor;
-    } else if (entry < rates_at(p)) {
+    } else if (entry < rate_entries(p)) {
         const real *axis = work->axis + 8 * node + 4 * (entry - NU);
         for (j = 0; j < 4; j++) {
             state[Q + j] += factor * axis[j];
         }
-    } else if (entry < places_at(p)) {
-        state[W + entry - rates_at(p)] += factor;
+    } else if (entry < place_entries(p)) {
+        state[W + entry - rate_entries(p)] += factor;
     } else {
-        const int of = entry - places_at(p);
+        const int of = entry - place_entries(p);
         state[of < 3 ? P + of : V + of - 3] += factor;
     }
 }
@@ -218,7 +218,7 @@ void quadsim_nmpc_add_row_gradient(const quadsim_nmpc_work *work, const quadsim_
         add_entry_gradient(work, node, NU + 1, factor * SIDE[index][1], inputs, state);
         break;
     case QUADSIM_NMPC_RATE:
-        add_entry_gradient(work, node, rates_at(p) + index, row->sign > 0 ? factor : -factor, inputs, state);
+        add_entry_gradient(work, node, rate_entries(p) + index, row->sign > 0 ? factor : -factor, inputs, state);
         break;
     case QUADSIM_NMPC_FACE:
         normal = work->face + 3 * (node * p->faces + index);
@@ -248,7 +248,7 @@ void quadsim_nmpc_add_active_gradients(const quadsim_nmpc_work *work, int node, 
 quadsim_real quadsim_nmpc_quadratic_price(const quadsim_nmpc_problem *p, int slack)
 {
     const real quadratic = p->quadratic[slack % p->slacks];
-    return quadratic > R(0.0) ? quadratic : CURVATURE * p->linear[slack % p->slacks];
+    return quadratic > R(0.0) ? quadratic : LINEAR_PRICE_CURVATURE * p->linear[slack % p->slacks];
 }
 
 quadsim_real quadsim_nmpc_linear_price(const quadsim_nmpc_work *work, int slack)
@@ -309,7 +309,7 @@ int quadsim_nmpc_worst_row(const quadsim_nmpc_work *work, quadsim_nmpc_row *wors
     const int w = entries_of(p);
     int i, j, any = 0;
     for (i = 0; i < p->horizon; i++) {
-        const real *at = work->value + (long)(i + 1) * w, *rates = at + rates_at(p);
+        const real *at = work->value + (long)(i + 1) * w, *rates = at + rate_entries(p);
         for (j = 0; j < NU; j++) {
             const real above = at[j] - p->upper[j], below = p->lower[j] - at[j];
             if (is_worse(above > below ? above : below, most)) {

@@ -13,20 +13,20 @@
 #include "quadsim_nmpc_qp.h"
 
 #ifdef QUADSIM_FLOAT
-static const real COMPLEMENTARY_ROWS = 1e-4F; /* mean product of multipliers and distances, where all rows tell */
+static const real COMPLEMENTARITY_OF_ROWS = 1e-4F; /* mean product of multipliers and distances, where all rows tell */
 #else
-static const real COMPLEMENTARY_ROWS = 1e-6;
+static const real COMPLEMENTARITY_OF_ROWS = 1e-6;
 #endif
-static const real COMPLEMENTARY = R(1e-3); /* the same, where bounds of inputs tell */
-static const real AGAIN = R(1e-5);         /* and where what is active at first does not settle */
-enum { MOST_ROUNDS = 4, MOST_INNER = 30, MOST_INNER_ROWS = 60, MOST_AGAIN = 20 };
+static const real COMPLEMENTARITY_OF_INPUTS = R(1e-3); /* the same, where bounds of inputs tell */
+static const real COMPLEMENTARITY_AGAIN = R(1e-5);     /* and where what is active at first does not settle */
+enum { MOST_ROUNDS = 4, MOST_INNER = 30, MOST_INNER_ROWS = 60, MOST_PROXIMAL_STEPS = 20 };
 enum { LONG_SEARCH = 5 }; /* changes per node that a search has before the interior point method of all rows */
 
 /* Hold inputs that leave their bounds, release those whose multipliers have the wrong sign, until there are none: the
  * primal-dual active-set method (Hintermueller, Ito and Kunisch 2002), a Riccati recursion each, from the last node
  * that changes.  Where it is `hasty`, it ends as soon as the changes do not get fewer, or are many at first.  Whether
  * it settled. */
-static int settle(quadsim_nmpc_work *work, int rounds, int hasty)
+static int settle_held_inputs(quadsim_nmpc_work *work, int rounds, int hasty)
 {
     const quadsim_nmpc_problem *p = work->p;
     const int size = p->horizon * NU;
@@ -50,7 +50,8 @@ static int settle(quadsim_nmpc_work *work, int rounds, int hasty)
                     changed++;
                     at = i;
                 }
-            } else if (input > p->upper[i % NU] + FEASIBLE || input < p->lower[i % NU] - FEASIBLE) {
+            } else if (input > p->upper[i % NU] + FEASIBILITY_TOLERANCE ||
+                       input < p->lower[i % NU] - FEASIBILITY_TOLERANCE) {
                 work->held[i] = input > p->upper[i % NU] ? 1 : -1;
                 changed++;
                 at = i;
@@ -120,7 +121,7 @@ static void hold_rows(quadsim_nmpc_work *work)
 }
 
 /* Release the held inputs whose multipliers have the wrong sign; whether there were any. */
-static int release(quadsim_nmpc_work *work)
+static int release_inputs(quadsim_nmpc_work *work)
 {
     const int size = work->p->horizon * NU;
     int i, any = 0;
@@ -157,7 +158,7 @@ static enum quadsim_nmpc_status search_held(quadsim_nmpc_work *work)
             break; /* perhaps of the held inputs */
         }
         quadsim_nmpc_add_multipliers(work);
-        if (!release(work)) {
+        if (!release_inputs(work)) {
             return QUADSIM_NMPC_BOUNDED;
         }
     }
@@ -173,38 +174,39 @@ static enum quadsim_nmpc_status search_held(quadsim_nmpc_work *work)
 }
 
 /* The optimum where inputs alone may be at bounds; whether there is one that satisfies all rows. */
-static int solve_inputs(quadsim_nmpc_work *work)
+static int solve_input_bounds(quadsim_nmpc_work *work)
 {
     quadsim_nmpc_row worst;
-    real most = FEASIBLE;
+    real most = FEASIBILITY_TOLERANCE;
     int settled, again;
     quadsim_nmpc_close_slacks(work);
     quadsim_nmpc_sum_prices(work);
-    settled = settle(work, MOST_ROUNDS, 1);
+    settled = settle_held_inputs(work, MOST_ROUNDS, 1);
     for (again = 0; !settled && again < 2; again++) {
-        work->inner += quadsim_nmpc_interior(work, 0, again ? AGAIN : COMPLEMENTARY, MOST_INNER);
-        settled = settle(work, 2 * MOST_ROUNDS, 0);
+        work->inner +=
+            quadsim_nmpc_interior(work, 0, again ? COMPLEMENTARITY_AGAIN : COMPLEMENTARITY_OF_INPUTS, MOST_INNER);
+        settled = settle_held_inputs(work, 2 * MOST_ROUNDS, 0);
     }
     return settled && !quadsim_nmpc_worst_row(work, &worst, &most);
 }
 
 /* The optimum with slacks of linear prices alone, by the proximal point method, each from the active set before. */
-static enum quadsim_nmpc_status solve_again(quadsim_nmpc_work *work)
+static enum quadsim_nmpc_status solve_linear_slacks(quadsim_nmpc_work *work)
 {
     const quadsim_nmpc_problem *p = work->p;
     enum quadsim_nmpc_status status = QUADSIM_NMPC_BOUNDED;
     int i, again;
-    for (again = 0; again < MOST_AGAIN && status == QUADSIM_NMPC_BOUNDED; again++) {
+    for (again = 0; again < MOST_PROXIMAL_STEPS && status == QUADSIM_NMPC_BOUNDED; again++) {
         real changed = R(0.0);
         for (i = 0; i < p->horizon * p->slacks; i++) {
             if (!(p->quadratic[i % p->slacks] > R(0.0))) {
                 const real slack = quadsim_nmpc_slack_value(work, i);
-                const real change = CURVATURE * magnitude(slack - work->origin[i]);
+                const real change = LINEAR_PRICE_CURVATURE * magnitude(slack - work->origin[i]);
                 work->origin[i] = slack;
                 changed = change > changed ? change : changed;
             }
         }
-        if (changed <= FEASIBLE) {
+        if (changed <= FEASIBILITY_TOLERANCE) {
             break;
         }
         status = search_held(work);
@@ -230,7 +232,7 @@ enum quadsim_nmpc_status quadsim_nmpc_solve(quadsim_nmpc_work *work)
         shift_active(work);
         work->shifted = 0;
     }
-    if (work->count == 0 && solve_inputs(work)) { /* no other rows were active, so perhaps none is */
+    if (work->count == 0 && solve_input_bounds(work)) { /* no other rows were active, so perhaps none is */
         for (i = 0; i < size; i++) {
             status = work->held[i] != 0 ? QUADSIM_NMPC_BOUNDED : status;
         }
@@ -239,13 +241,13 @@ enum quadsim_nmpc_status quadsim_nmpc_solve(quadsim_nmpc_work *work)
         if (status == QUADSIM_NMPC_GIVEN_UP && work->allowed < work->p->changes) {
             memset(work->held, 0, sizeof(int) * (size_t)size);
             quadsim_nmpc_optimum(work, work->p->horizon - 1);
-            work->inner += quadsim_nmpc_interior(work, 1, COMPLEMENTARY_ROWS, MOST_INNER_ROWS);
+            work->inner += quadsim_nmpc_interior(work, 1, COMPLEMENTARITY_OF_ROWS, MOST_INNER_ROWS);
             work->allowed = work->p->changes;
             status = search_held(work);
         }
         work->allowed = work->p->changes;
         if (status == QUADSIM_NMPC_BOUNDED) {
-            status = solve_again(work);
+            status = solve_linear_slacks(work);
         }
     }
     work->violation = R(0.0);

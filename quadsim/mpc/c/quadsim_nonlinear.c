@@ -1,14 +1,19 @@
+/* The controller around quadsim_nmpc.h: the reference's nodes, the disturbance, commands for shares, and the guard.
+ *
+ * A constant disturbance follows d <- d + L (v - v expected), with the state expected by quadsim_nmpc_model.c; one that
+ * changes is quadsim_ramp.h's.  The reference is balanced against it: of thrust T b per mass and drag D, each node gets
+ * the thrust axis along  T b - d - D, by the least rotation, and the thrusts that give its length and torque -d_R. */
 #include "quadsim_nonlinear.h"
 
 #include <string.h>
 
 #include "quadsim_nmpc_math.h"
 
-static const real KEPT_SIDE = R(-0.08715574274765817); /* cosine of 95 deg, half of what a heading may be off */
+static const real SIDE_KEPT_ABOVE = R(-0.08715574274765817); /* cosine of 95 deg, half of what a heading may be off */
 #ifdef QUADSIM_FLOAT
-static const real OUTSIDE = 1e-3F; /* tolerance of bounds on inputs, as a share of the largest */
+static const real INPUT_TOLERANCE = 1e-3F; /* tolerance of bounds on inputs, as a share of the largest */
 #else
-static const real OUTSIDE = 1e-6;
+static const real INPUT_TOLERANCE = 1e-6;
 #endif
 
 /* Periods of the reference and of the plan. */
@@ -93,7 +98,8 @@ static void put_node(quadsim_nonlinear *law, int node, const real *place, const 
 
 /* Row k of a preview as it is the delay later, its yaw without turns: `turns` are those of the row read before, and
  * become those of this one.  Past the end the last row is held. */
-static void read_row(const quadsim_nonlinear_numbers *numbers, const real *reference, int k, real *turns, real row[4])
+static void read_preview_row(const quadsim_nonlinear_numbers *numbers, const real *reference, int k, real *turns,
+                             real row[4])
 {
     const int last = rows_of(numbers) - 1, at = k + under_way_of(numbers), now = at < last ? at : last;
     int i;
@@ -121,11 +127,11 @@ static void take_preview(quadsim_nonlinear *law, const real *reference, real yaw
     real turns = first_turns(&law->headed, &law->heading, reference, yaw);
     real place[4], next[4], step[4] = {R(0.0)}, rates[4];
     int k, j;
-    read_row(numbers, reference, 0, &turns, place);
+    read_preview_row(numbers, reference, 0, &turns, place);
     for (k = 1; k <= rows; k++) { /* the k-th row, k periods from now */
         memcpy(next, place, sizeof(next));
         if (k < rows) {
-            read_row(numbers, reference, k, &turns, next);
+            read_preview_row(numbers, reference, k, &turns, next);
         }
         for (j = 0; j < 4; j++) {
             const real ahead = k < rows ? next[j] - place[j] : step[j];
@@ -265,7 +271,7 @@ static void balance_reference(quadsim_nonlinear *law)
 }
 
 /* Split the observed force into drag, as far as it follows the velocity, and a constant remainder. */
-static void follow_force(quadsim_nonlinear *law, int follows, const real *acting)
+static void update_drag_and_force(quadsim_nonlinear *law, int follows, const real *acting)
 {
     const quadsim_nonlinear_numbers *numbers = law->numbers;
     quadsim_nmpc_world *world = &law->world;
@@ -311,7 +317,7 @@ static void update_actuators(quadsim_nonlinear *law, int periods, const real *ac
     if (law->called && left > R(0.0)) {
         for (j = 0; j < NU; j++) {
             real away = law->rotors[j] - law->before[j];
-            for (i = 0; i < periods && i < LONG_AGO; i++) {
+            for (i = 0; i < periods && i < SETTLED_PERIODS; i++) {
                 away *= left;
             }
             law->rotors[j] = law->before[j] + away;
@@ -355,7 +361,7 @@ static void choose_sides(quadsim_nonlinear *law)
         }
     }
     memcpy(law->quaternion, q, sizeof(law->quaternion));
-    if (law->side * dot(q, law->states + Q, 4) < KEPT_SIDE) {
+    if (law->side * dot(q, law->states + Q, 4) < SIDE_KEPT_ABOVE) {
         law->side = -law->side;
     }
     for (i = 0; i <= N && law->side < R(0.0); i++) {
@@ -453,7 +459,7 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int
             update_estimate(law);
         }
         if (numbers->ramp != NULL) {
-            follow_force(law, learns, numbers->delay == NULL ? acting : law->delay.sent[0]);
+            update_drag_and_force(law, learns, numbers->delay == NULL ? acting : law->delay.sent[0]);
         }
         law->learns = 1;
         memcpy(law->last, law->measured, sizeof(law->last));
@@ -480,7 +486,8 @@ enum quadsim_status quadsim_nonlinear_end(quadsim_nonlinear *law, enum quadsim_n
     for (i = 0; status <= QUADSIM_WHOLE && i < p->horizon * NU; i++) {
         if (!is_finite(inputs + i, 1)) {
             status = QUADSIM_NOT_FINITE;
-        } else if (!(inputs[i] <= p->upper[i % NU] + OUTSIDE && inputs[i] >= p->lower[i % NU] - OUTSIDE)) {
+        } else if (!(inputs[i] <= p->upper[i % NU] + INPUT_TOLERANCE &&
+                     inputs[i] >= p->lower[i % NU] - INPUT_TOLERANCE)) {
             status = QUADSIM_OUT_OF_BOUNDS;
         }
     }

@@ -1,4 +1,4 @@
-/* Nonlinear model predictive control of quadrotors at any attitude: the law around quadsim_nmpc.h.
+/* Nonlinear model predictive control of quadrotors at any attitude: the controller around quadsim_nmpc.h.
  *
  * Once every period, call quadsim_nonlinear_step with what is measured now; hold the command until the next call.
  *
@@ -33,7 +33,7 @@ typedef struct quadsim_nonlinear_numbers {
     const quadsim_nmpc_problem *problem;  /* the program */
     const quadsim_nmpc_problem *period;   /* its body over a control period: sizes, step, substeps and lags count */
     const quadsim_nmpc_problem *unlagged; /* the same without lag of thrusts, for plans */
-    const quadsim_fallback *fallback;     /* NULL where quadsim guards the law: quadsim_nonlinear_step is not for it */
+    const quadsim_fallback *fallback;     /* NULL where quadsim guards: quadsim_nonlinear_step is not for it */
     const quadsim_delay_numbers *delay;   /* NULL where commands act at once */
     const quadsim_ramp_numbers *ramp;     /* NULL where no changing force is followed */
     int stride;                           /* control periods from node to node */
@@ -108,8 +108,8 @@ int quadsim_nonlinear_begin(quadsim_nonlinear *law, int periods, int flying, int
 /* law->plan of the program's answer, and the period's status. */
 enum quadsim_status quadsim_nonlinear_end(quadsim_nonlinear *law, enum quadsim_nmpc_status answer);
 
-/* The command of the period that starts now, always finite and within its bounds: the law's, or without one what the
- * fallback contract flies instead (quadsim_guard.h).  Channels of the state that are not measured are not finite. */
+/* The command of the period that starts now, always finite and within its bounds: the controller's, or without one what
+ * the fallback contract flies instead (quadsim_guard.h).  Channels that are not measured are not finite. */
 enum quadsim_status quadsim_nonlinear_step(quadsim_nonlinear *law, enum quadsim_phase phase,
                                            const quadsim_real state[QUADSIM_MEASURED], const quadsim_real *reference,
                                            const quadsim_real acting[4], quadsim_real command[4]);

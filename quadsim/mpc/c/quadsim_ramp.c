@@ -1,4 +1,9 @@
-/* Filters of unmodelled force and torque; see quadsim_ramp.h. */
+/* Filters of unmodelled force and torque; see quadsim_ramp.h.
+ *
+ * The mean acceleration of a period tau_s that the model misses, m = (v(k) - v(k-1)) / tau_s - model, enters the filter
+ * of a disturbance d and its rate of change c, within limits; the angular acceleration likewise:
+ *
+ *     r = m - (d + tau_s c),   d <- d + tau_s c + gain r,   c <- c + gain_of_change r. */
 #include "quadsim_ramp.h"
 
 #include <string.h>
@@ -63,8 +68,7 @@ static void mean_wrench(quadsim_ramp *ramp, const ramp_numbers *n, const real *c
 /* Sum of the rotors' speeds [rad/s]. */
 static real rotors_speed(const quadsim_ramp *ramp)
 {
-    static const real ONES[NU] = {R(1.0), R(1.0), R(1.0), R(1.0)};
-    return dot(ramp->acting, ONES, NU);
+    return sum_of_inputs(ramp->acting);
 }
 
 /* Drag, and loss of thrust to inflow, that the model knows, world axes [m/s^2]. */

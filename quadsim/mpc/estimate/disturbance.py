@@ -109,7 +109,7 @@ class RampObserver:
     estimated then. The model knows `drag` (3,) [1/s] and `quadratic_drag` (3,) [1/m], of the square of each component,
     in body axes, and with `moment` the vehicle's `air_moment`. A command takes over `late` [s] after an update.
 
-    The core computes it, `quadsim_ramp.c`; a law in C calls it there, with the addresses of both attributes.
+    The core computes it, `quadsim_ramp.c`; a controller in C calls it there, with the addresses of both attributes.
 
     Attributes:
         numbers: what does not change.
@@ -138,7 +138,8 @@ class RampObserver:
         # What C reads in an update, and what it writes.
         self._measured = np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros(N_ROTORS)
         self._foreseen = np.zeros((3, 3))
-        self._addresses = [array.ctypes.data for array in (*self._measured, *self._foreseen)]
+        arrays = (*self._measured, *self._foreseen)
+        self._addresses = [array.ctypes.data for array in arrays]
         self.reset(vehicle.mass * vehicle.gravity if self.numbers.targets else vehicle.hover_speeds)
 
     def bind(self, state: Struct) -> None:

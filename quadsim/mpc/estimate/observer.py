@@ -53,7 +53,7 @@ class ObserverSettings:
 
 @runtime_checkable
 class Observing(Protocol):
-    """A law that estimates the disturbance."""
+    """A controller that estimates the disturbance."""
 
     @property
     def disturbance(self) -> Array | None:
@@ -62,7 +62,7 @@ class Observing(Protocol):
 
 
 def disturbance_of(law: object) -> Array | None:
-    """Return (6,) the disturbance that a law estimates; None if it estimates none."""
+    """Return (6,) the disturbance that a controller estimates; None if it estimates none."""
     if isinstance(law, Observing):
         return law.disturbance
     return None
@@ -86,8 +86,8 @@ class DisturbanceObserver:
     Predictions start from the last measurement, so the estimate of v need not be stored. Measurement noise then enters
     twice, with opposite signs, and the gains are those for twice its variance.
 
-    Estimated are accelerations [m/s^2], in a linear law along world x, y and the thrust and in a nonlinear one along
-    world x, y, z, and angular accelerations [rad/s^2] about the body axes.
+    Estimated are accelerations [m/s^2], in a linear controller along world x, y and the thrust and in a nonlinear one
+    along world x, y, z, and angular accelerations [rad/s^2] about the body axes.
 
     Attributes:
         gain: (6,) per innovation of velocities and body rates [1/s].

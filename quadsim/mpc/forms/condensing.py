@@ -135,7 +135,8 @@ class Condensed:
         N = problem.horizon
         nu = problem.model.nu
         maps = prediction(model, N)
-        self.cost, self._values = condensed_cost(problem, maps), row_maps(self._rows, maps)
+        self.cost = condensed_cost(problem, maps)
+        self._values = row_maps(self._rows, maps)
         rows = self._rows
         self._inputs = N * nu
         m_s = rows.slack.shape[1]
@@ -145,13 +146,17 @@ class Condensed:
         self._linear = np.concatenate([np.zeros(self._inputs), l1])
         G = np.zeros((N, len(rows.C), self._inputs + N * m_s))
         G[:, :, : self._inputs] = self._values.of_inputs
-        for i in range(N if m_s else 0):
-            G[i, :, self._inputs + i * m_s : self._inputs + (i + 1) * m_s] = rows.slack
+        hessian = self.cost.H
+        if m_s:
+            hessian = scipy.linalg.block_diag(self.cost.H, 2.0 * np.diag(l2))
+            for i in range(N):
+                first = self._inputs + i * m_s
+                G[i, :, first : first + m_s] = rows.slack
         self._of_rest = self._values.of_inputs.reshape(N, len(rows.C), N, nu).sum(axis=2)  # constant input u_s
         self._pull = self.cost.H.reshape(N * nu, N, nu).sum(axis=1)  # constant input u_s
         size = self._inputs + N * m_s
         self._blank = QP(
-            P=np.asfortranarray(scipy.linalg.block_diag(self.cost.H, 2.0 * np.diag(l2)) if m_s else self.cost.H),
+            P=np.asfortranarray(hessian),
             c=np.zeros(size),
             A=np.zeros((0, size)),
             b=np.zeros(0),
@@ -191,7 +196,9 @@ class Condensed:
             ParameterError: an array has another shape.
         """
         problem = self._problem
-        state, reference, u_before = (np.asarray(array, float) for array in (state, reference, u_before))
+        state = np.asarray(state, float)
+        reference = np.asarray(reference, float)
+        u_before = np.asarray(u_before, float)
         n = problem.model.n
         u_bar = problem.model.u_bar
         check_shape("u_before", u_before, u_bar.shape)

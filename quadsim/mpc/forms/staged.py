@@ -36,8 +36,13 @@ class Pattern:
 
     def __init__(self, blocks: Sequence[Block], shape: tuple[int, int]) -> None:
         values = _entries(blocks)
-        rows = np.concatenate([np.repeat(block.rows, block.columns.shape[1], axis=1).ravel() for block in blocks])
-        columns = np.concatenate([np.tile(block.columns, block.rows.shape[1]).ravel() for block in blocks])
+        row_parts = []
+        column_parts = []
+        for block in blocks:
+            row_parts.append(np.repeat(block.rows, block.columns.shape[1], axis=1).ravel())
+            column_parts.append(np.tile(block.columns, block.rows.shape[1]).ravel())
+        rows = np.concatenate(row_parts)
+        columns = np.concatenate(column_parts)
         kept = np.flatnonzero(values)
         places = csc_matrix((kept, (rows[kept], columns[kept])), shape=shape)
         self._order = places.data
@@ -52,9 +57,11 @@ class Pattern:
 
 def _entries(blocks: Sequence[Block]) -> Array:
     """Return all values of some blocks."""
-    shapes = [(len(block.rows), block.rows.shape[1], block.columns.shape[1]) for block in blocks]
-    pairs = zip(blocks, shapes, strict=True)
-    return np.concatenate([np.broadcast_to(block.values, shape).ravel() for block, shape in pairs])
+    parts = []
+    for block in blocks:
+        shape = (len(block.rows), block.rows.shape[1], block.columns.shape[1])
+        parts.append(np.broadcast_to(block.values, shape).ravel())
+    return np.concatenate(parts)
 
 
 def steps_of(problem: Problem, query: Query) -> tuple[Array, Array, Array]:
@@ -90,7 +97,8 @@ class Staged:
         inequalities = self._inequalities(rows)
         self._inequality = Pattern(inequalities, (rows.lower.size, self._size))
         self._G = self._inequality.matrix(inequalities)
-        self._x_l, self._x_u = np.full(self._size, -math.inf), np.full(self._size, math.inf)
+        self._x_l = np.full(self._size, -math.inf)
+        self._x_u = np.full(self._size, math.inf)
         self._x_l[self._u] = rows.u_min
         self._x_u[self._u] = rows.u_max
         self._x_l[self._e] = 0.0
@@ -119,16 +127,22 @@ class Staged:
         if problem is not None:
             rows = QPRows(problem)
             G = self._inequality.matrix(self._inequalities(rows))
-        first = rows.C if rows.C.ndim == 2 else rows.C[0]
+        first = rows.C
+        if first.ndim == 3:
+            first = first[0]
         known = np.zeros(rows.lower.shape)
         known[0] = (first * ~rows.of_states[:, None]) @ query.state - rows.E @ query.u_before
         A, B, c = steps_of(self._problem, query)
+        if query.steps is None:
+            equalities = self._A
+        else:
+            equalities = self._equalities(A, B)
         b = c.copy()
         b[0] += A[0] @ query.state
         return QP(
             P=self._P,
             c=self._gradient(query),
-            A=self._A if query.steps is None else self._equalities(A, B),
+            A=equalities,
             b=b.ravel(),
             G=G,
             h_l=(rows.lower - known).ravel(),
@@ -187,9 +201,11 @@ class Staged:
         numbers = np.arange(rows.lower.size).reshape(rows.lower.shape)
         of_ends = rows.C * rows.of_states[:, None]
         of_starts = rows.C * ~rows.of_states[:, None]
+        if of_starts.ndim == 3:
+            of_starts = of_starts[1:]
         return [
             Block(numbers, self._x, of_ends),
-            Block(numbers[1:], self._x[:-1], of_starts if of_starts.ndim == 2 else of_starts[1:]),
+            Block(numbers[1:], self._x[:-1], of_starts),
             Block(numbers, self._u, rows.D + rows.E),
             Block(numbers[1:], self._u[:-1], -rows.E),
             Block(numbers, self._e, rows.slack),

@@ -1,1 +1,1 @@
-"""The one test of every answer, and the fallback contract: the commands flown when a law has no usable answer."""
+"""The one test of every answer, and the fallback contract: what is flown when a controller has no usable answer."""

@@ -1,4 +1,8 @@
-"""The one test of every solver answer: solved, finite and within the actuators' limits; otherwise the reason."""
+"""The one test of every solver answer: solved, finite and within the actuators' limits; otherwise the reason.
+
+A plan is predicted anew from the measured state, and must violate no normalised row by more than `INFEASIBLE`; KKT
+residuals are computed now and then.  `quadsim.mpc.guard.contract` then decides what is flown.
+"""
 
 from __future__ import annotations
 
@@ -61,8 +65,14 @@ class ActuatorBounds:
     @classmethod
     def alike(cls, speed: tuple[float, float], slew: tuple[float, float] = (-math.inf, math.inf)) -> ActuatorBounds:
         """Return the same (lower, upper) bounds on speed and slew for every rotor [rad/s]."""
-        (u_min, u_max), (down, up) = (np.full((2, N_ROTORS), np.reshape(pair, (2, 1))) for pair in (speed, slew))
-        return cls(u_min=u_min, u_max=u_max, delta_min=down, delta_max=up)
+        slowest, fastest = speed
+        down, up = slew
+        return cls(
+            u_min=np.full(N_ROTORS, slowest),
+            u_max=np.full(N_ROTORS, fastest),
+            delta_min=np.full(N_ROTORS, down),
+            delta_max=np.full(N_ROTORS, up),
+        )
 
     @classmethod
     def of_problem(cls, problem: Problem) -> ActuatorBounds:
@@ -255,17 +265,18 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
     """Return speeds (4,) and a plan (N, 4) as a command, with its status and the statistics of the answer."""
-    accepted = status in ACCEPTED
     stats = answer.stats
-    if not accepted:
+    answered_by = answer.answered_by
+    if status not in ACCEPTED:
         stats = stats._replace(active=0, sqp_defect=math.nan, sqp_step=math.nan)
+        answered_by = FALLBACK
     elif answer.slacks.size:
         stats = stats._replace(slack=max(float(answer.slacks.max()), 0.0))
     return Command(
         speeds=speeds.copy(),
         plan=plan,
         status=status,
-        answered_by=answer.answered_by if accepted else FALLBACK,
+        answered_by=answered_by,
         fallback=fallback,
         stats=stats,
         iterations_by=answer.answered_by,

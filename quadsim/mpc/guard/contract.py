@@ -2,7 +2,7 @@
 
 Each period flies the first of these that is available:
 
-0. the law's answer, if its status is one of `ACCEPTED` and it is finite and within the actuators' bounds;
+0. the controller's answer, if its status is one of `ACCEPTED` and it is finite and within the actuators' bounds;
 1. its last good plan, shifted by the periods since, with an LQR correction towards the states that the plan predicted,
 unless the plan is too old or the vehicle too far from it;
 
@@ -10,15 +10,14 @@ unless the plan is too old or the vehicle too far from it;
 
 3. descent: the same, sinking at a constant speed, after level 2 has lasted too long.
 
-The law is called in every period with a known state, so it resumes automatically.  It receives the command in force, so
-that its slew bounds refer to the acting command, and the list of predicted channels
-(`StepInputs.unseen`).
+The controller is called in every period with a known state, so it resumes automatically.  It receives the command in
+force, so that its slew bounds refer to the acting command, and the list of predicted channels (`StepInputs.unseen`).
 
-The contract is `quadsim/mpc/c/quadsim_guard.c`, for exported laws and here: `Guard` calls the law, and gives the C what
-only Python has.
+The contract is `quadsim/mpc/c/quadsim_guard.c`, for exported controllers and here: `Guard` calls the controller, and
+gives the C what only Python has.
 
-A law that estimates disturbances is `quadsim.mpc.problem.equilibrium.Trimmed`.  Levels 1 to 3, and predictions of
-missing channels, start from its equilibrium; it is held while nothing is measured.
+A controller that estimates disturbances is `quadsim.mpc.problem.equilibrium.Trimmed`.  Levels 1 to 3, and predictions
+of missing channels, start from its equilibrium; it is held while nothing is measured.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ from quadsim.vehicle import N_ROTORS
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """Exceptions of numerics and compiled back ends.  Programming errors (`TypeError`, `KeyError`, ...) end the run."""
 _MISTAKES: Final = (NotImplementedError, RecursionError)  # subclasses of `RuntimeError` that are programming errors
-_CALLED: Final = constant("QUADSIM_FREE")  # by which the C wants the law to be called
+_CALLED: Final = constant("QUADSIM_FREE")  # by which the C wants the controller to be called
 _ANSWERED: Final = STATUSES.index(COMMANDED)
 _FAILED: Final = STATUSES.index(INVALID_DATA)
 _LOST: Final = STATUSES.index("state_unknown")
@@ -74,10 +73,10 @@ PHASES: Final[Mapping[Phase, int]] = {
 
 
 class Guard:
-    """The fallback contract around a law, which `quadsim.mpc.pilot.pilot.Pilot` passes to it, whatever that law does.
+    """The fallback contract around any controller, which `quadsim.mpc.pilot.pilot.Pilot` passes to it.
 
-    It never sends a command that is not finite or not within the bounds.  It passes the law's usable commands
-    unchanged; a law may have its own fallback.
+    It never sends a command that is not finite or not within the bounds.  It passes the controller's usable commands
+    unchanged; a controller may have its own fallback.
 
     Attributes:
         model: of level hover.
@@ -123,7 +122,7 @@ class Guard:
         return np.array(self._struct.before)
 
     def adopt(self, previous: Guard, horizon: int) -> None:
-        """Take over the previous contract's level, state and plan, for a law of N = `horizon`."""
+        """Take over the previous contract's level, state and plan, for a controller of N = `horizon`."""
         self._fit(horizon)
         self._library.quadsim_guard_adopt(self._struct, previous._struct)
         self._predicted = None
@@ -131,8 +130,8 @@ class Guard:
     def step(self, law: Controller, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the command of the first available level; see `quadsim.controller.Controller.step`.
 
-        It catches the `FAILURES` of the law; their names become the status.  While grounded, the rotors slow down to
-        their lowest speed as fast as the bounds allow.
+        It catches the `FAILURES` of the controller; their names become the status.  While grounded, the rotors slow
+        down to their lowest speed as fast as the bounds allow.
         """
         self._fit(law.horizon)
         code = self._begin(law, now, state, reference)
@@ -141,7 +140,9 @@ class Guard:
         plan = self._kept
         if code == _CALLED:
             status, answer = self._call(law, now, reference)
-            code = _LOST if status == STATUSES[_LOST] else _FAILED
+            code = _FAILED
+            if status == STATUSES[_LOST]:
+                code = _LOST
         if answer is not None and status in ACCEPTED:
             plan = _plan_of(answer)
             code = self._library.quadsim_guard_check(self._struct, _ANSWERED, plan.ctypes.data)
@@ -180,7 +181,7 @@ class Guard:
         return self._end(law, Phase.FLYING, _FAILED, self._kept)
 
     def trim(self, law: Controller) -> Trim:
-        """Return the equilibrium that the law estimates; level hover if it estimates none."""
+        """Return the equilibrium that the controller estimates; level hover if it estimates none."""
         trim = _tried(lambda: self._trim_of(law))
         if isinstance(trim, Trim):
             return trim
@@ -189,21 +190,25 @@ class Guard:
     def _trim_of(self, law: Controller) -> object:
         if law is not self._law:  # asked once: a runtime protocol takes as long as ten array operations
             self._law = law
-            self._trimmed = law if isinstance(law, Trimmed) else None
+            self._trimmed = None
+            if isinstance(law, Trimmed):
+                self._trimmed = law
         if self._trimmed is None:
             return None
         return self._trimmed.trim
 
     def predict(self, law: Controller, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Predicting`; by the hover model where the law cannot."""
-        predicted = _tried(lambda: law.predict(states, plans) if isinstance(law, Predicting) else None)
+        """See `quadsim.controller.Predicting`; by the hover model where the controller cannot."""
+        predicted = None
+        if isinstance(law, Predicting):
+            predicted = _tried(lambda: law.predict(states, plans))
         if isinstance(predicted, np.ndarray) and predicted.shape == (*plans.shape[:2], N_STATES):
             return predicted
         trim = self.trim(law)
         return predict_in_heading_frame(anchored(self.model, trim), states, plans, trim)
 
     def _fit(self, horizon: int) -> None:
-        """Give plans as much room as a law's horizon."""
+        """Give plans as much room as a controller's horizon."""
         if horizon == self._struct.horizon:
             return
         if horizon < 1:
@@ -220,7 +225,7 @@ class Guard:
         self._rest_twist[:] = trim.twist
 
     def _begin(self, law: Controller, now: StepInputs, state: Array, reference: Array) -> int:
-        """Complete the state; return the status for which the law is not to be called, or `_CALLED`."""
+        """Complete the state; return the status for which the controller is not to be called, or `_CALLED`."""
         self._measured[:] = _numbers(state, (N_STATES,))
         path = _numbers(reference, (law.horizon, len(REFERENCE_STATES)))
         self._acting[:] = _numbers(now.acting, (N_ROTORS,))
@@ -232,22 +237,22 @@ class Guard:
         return code
 
     def _call(self, law: Controller, now: StepInputs, reference: Array) -> tuple[str, Command | None]:
-        """Return the law's status and, if it gave one, its answer, of the right shape if it is accepted."""
+        """Return the controller's status and, if it gave one, its answer, of the right shape if it is accepted."""
         known = self._state.copy()
         completed = completed_inputs(now, self._in_force.copy(), self._unseen.astype(float), known)
         answer: Command | Exception = _tried(lambda: law.step(completed, known.copy(), reference))
         if isinstance(answer, Exception):  # e.g. `PlanExhaustedError` as `plan_exhausted_error`
             return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(answer).__name__).lower(), None
-        if answer.status in ACCEPTED and (
-            np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (law.horizon, N_ROTORS)
-        ):
-            return "wrong_shape", answer
+        if answer.status in ACCEPTED:
+            shaped = np.shape(answer.speeds) == (N_ROTORS,) and np.shape(answer.plan) == (law.horizon, N_ROTORS)
+            if not shaped:
+                return "wrong_shape", answer
         return answer.status, answer
 
     def _end(self, law: Controller, phase: Phase, code: int, answered: Array) -> Array:
-        """Return the plan (N, 4) of the period, its command first, of a law's status and perhaps its plan (N, 4)."""
+        """Return the plan (N, 4) of the period, its command first, of a controller's status and perhaps its plan."""
         if code != _ANSWERED:
-            self._set_trim(law)  # the law's call may have changed it
+            self._set_trim(law)  # the controller's call may have changed it
         if self._library.quadsim_guard_foresees(self._struct, PHASES[phase], code):
             self._foresee(law)
         plan = np.empty_like(self._kept)
@@ -275,9 +280,12 @@ def completed_inputs(now: StepInputs, acting: Array, unseen: Array, known: Array
     Attitude and body rates are omitted where those of the state are predicted.  Near a pitch of 90 deg, Euler rates are
     implausibly large, but body rates are not.
     """
-    attitude = None if unseen[ANGLES].any() else now.attitude
-    turned = unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT
-    rates = None if turned else now.body_rates
+    attitude = now.attitude
+    rates = now.body_rates
+    if unseen[ANGLES].any():
+        attitude = None
+    if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
+        rates = None
     return StepInputs(  # `replace` takes five times as long, in every period
         time=now.time,
         phase=now.phase,

@@ -98,17 +98,19 @@ def fallback_numbers(
     Args:
         model: of level hover.
         bounds: on commands; None for none.
-        settings: the table, with the tilt that its law's bounds leave.
+        settings: the table, with the tilt that its controller's bounds leave.
     """
     period = model.period
     hover = HoverGain.of_model(model)
     assert settings.tilt is not None
     process = [acceleration_noise(period, sigma)[np.triu_indices(2)] for sigma in ACCELERATION]
-    free = np.full(N_ROTORS, NO_BOUND)
-    sides = (-free, free, -free, free)
+    most = step_most = np.full(N_ROTORS, NO_BOUND)
+    least = step_least = -most
     if bounds is not None:
-        sides = (bounds.u_min, bounds.u_max, bounds.delta_min, bounds.delta_max)
-    least, most, step_least, step_most = (np.clip(side, -NO_BOUND, NO_BOUND) for side in sides)
+        least = np.clip(bounds.u_min, -NO_BOUND, NO_BOUND)
+        most = np.clip(bounds.u_max, -NO_BOUND, NO_BOUND)
+        step_least = np.clip(bounds.delta_min, -NO_BOUND, NO_BOUND)
+        step_most = np.clip(bounds.delta_max, -NO_BOUND, NO_BOUND)
     return {
         "targets": int(model.targets),
         "plan_age": _periods(settings.plan_age + _ROUNDING, period),

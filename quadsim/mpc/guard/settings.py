@@ -53,9 +53,12 @@ class FallbackSettings:
         """Return the same with the tilt that `output_bounds` [deg] leave it, unless it has one."""
         if self.tilt is not None:
             return self
-        pairs = (output_bounds[name] for name in ("roll", "pitch") if name in output_bounds)
-        tightest = min((_SHARE * min(-lower, upper) for lower, upper in pairs), default=USUAL_TILT)
-        return replace(self, tilt=min(max(tightest, _SMALLEST_TILT), USUAL_TILT))
+        tightest = USUAL_TILT
+        for name in ("roll", "pitch"):
+            if name in output_bounds:
+                lower, upper = output_bounds[name]
+                tightest = min(tightest, _SHARE * min(-lower, upper))
+        return replace(self, tilt=max(tightest, _SMALLEST_TILT))
 
 
 USUAL_FALLBACK: Final = FallbackSettings()

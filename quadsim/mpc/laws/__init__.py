@@ -1,7 +1,7 @@
-"""The control laws by name: a file each, with the table `[controller]`, whose method `law` builds the law.
+"""The controllers by name: a file each, with the table `[controller]`, whose method `law` builds the controller.
 
-`register` says what else is known of a law; a module of this folder needs no line elsewhere.  The law itself is in the
-same file, or in `parts`, as all that laws are made of.
+`register` says what else is known of a controller; a module of this folder needs no line elsewhere.  The controller
+itself is in the same file, or in `parts`, as all that controllers are made of.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _registered: Final[dict[str, type[ControllerTable]]] = {}
 
 
 def register(*, title: str, description: str, place: int = _LAST) -> Callable[[TableClass], TableClass]:
-    """Register the table of a law, a dataclass that this decorates; see `ControllerTable` for the arguments.
+    """Register the table of a controller, a dataclass that this decorates; see `ControllerTable` for the arguments.
 
     Raises:
         ValueError: another table has that name.
@@ -41,7 +41,7 @@ def register(*, title: str, description: str, place: int = _LAST) -> Callable[[T
 
 @cache
 def laws() -> Mapping[str, type[ControllerTable]]:
-    """Return the tables of the laws by name; the first call imports every module of this folder."""
+    """Return the tables of the controllers by name; the first call imports every module of this folder."""
     for module in pkgutil.iter_modules(__path__):
         importlib.import_module(f"{__name__}.{module.name}")
     ordered = sorted(_registered.values(), key=lambda table: (table.place, table.type))

@@ -75,11 +75,11 @@ class GeometricGains:
 def geometric_gains(vehicle: Vehicle, period: float, settings: Geometric) -> GeometricGains:
     """Return gains that follow from the period [s] and the lag.
 
-    The law feeds forward the rotation of the desired attitude, so its linearisation has the polynomial (s^2 + k_Omega s
-    + k_R)(s^2 + k_v s + k_x), and its gain from rate error to angular acceleration is about k_Omega + k_v.  That sum is
-    1 / (2 (period / 2 + lag)), as in `bandwidths`. The outer pair is four times slower than the inner pair (twice the
-    cascade's separation of 2), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2. The integrals of Goodarzi et
-    al.  (2013) act at a quarter of the bandwidth of the loops that they support.
+    The controller feeds forward the rotation of the desired attitude, so its linearisation has the polynomial (s^2 +
+    k_Omega s + k_R)(s^2 + k_v s + k_x), and its gain from rate error to angular acceleration is about k_Omega + k_v.
+    That sum is 1 / (2 (period / 2 + lag)), as in `bandwidths`. The outer pair is four times slower than the inner pair
+    (twice the cascade's separation of 2), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2. The integrals of
+    Goodarzi et al.  (2013) act at a quarter of the bandwidth of the loops that they support.
 
     An autopilot's rates follow with its `inner_lag`; `lag` replaces that of p and q.  About each
     axis, an attitude error has the gain k = k_R / k_Omega, with the sum k + k_v = 1 / (2 (period / 2 + lag)), that of
@@ -91,25 +91,32 @@ def geometric_gains(vehicle: Vehicle, period: float, settings: Geometric) -> Geo
     require_positive("period", period)
     lag = settings.lag
     targets = settings.commands != ROTORS
-    if lag is None:
+    allowed = lag
+    if allowed is None:
         allowed = lag_to_allow_for(vehicle, period)
-    else:
-        allowed = lag
     k_Omega = 1.0 / (2.0 * (0.5 * period + allowed)) / (1.0 + SEPARATION**-2)
     k_v = k_Omega / SEPARATION**2
     k = np.zeros(3)
     if targets:
         _, p, q, r = require_lags(settings.inner_lag)
-        lags = np.array([p, q, r] if lag is None else [lag, lag, r])
+        if lag is not None:
+            p = q = lag
+        lags = np.array([p, q, r])
         k = 1.0 / (2.0 * (0.5 * period + lags)) / (1.0 + SEPARATION**-1)
         k_v = float(k[:2].min()) / SEPARATION
+    k_i = 0.0
+    k_I = 0.0
+    if settings.integral:
+        k_i = 0.25 * k_v**2 / SEPARATION
+    if settings.integral and not targets:  # an autopilot has an integral of its own
+        k_I = 0.05 * k_Omega**2 / SEPARATION
     return GeometricGains(
         k_x=k_v**2 / SEPARATION,
         k_v=k_v,
         k_R=k_Omega**2 / SEPARATION,
         k_Omega=k_Omega,
-        k_i=0.25 * k_v**2 / SEPARATION if settings.integral else 0.0,
-        k_I=0.05 * k_Omega**2 / SEPARATION if settings.integral and not targets else 0.0,
+        k_i=k_i,
+        k_I=k_I,
         c_1=k_v / SEPARATION,
         c_2=k_Omega / SEPARATION,
         k_attitude=tuple(k.tolist()),
@@ -143,7 +150,7 @@ class GeometricController(FeedbackLaw):
 
     It commands rotor speeds, or to an autopilot targets: thrust and body rates (4,) [N, rad/s], or these and a
     quaternion wxyz (8,), with rates that are fed forward. With targets, `reset` and `StepInputs.acting` are targets.
-    The law is in C, `quadsim_geometric.c`; the core's allocation turns its wrench into rotor speeds.
+    The controller is in C, `quadsim_geometric.c`; the core's allocation turns its wrench into rotor speeds.
 
     Attributes:
         commands: what it commands.
@@ -173,20 +180,25 @@ class GeometricController(FeedbackLaw):
         self._targets = settings.commands != ROTORS
         self.gains = gains = geometric_gains(vehicle, period, settings)
         self._feedforward = settings.feedforward
-        lags = settings.inner_lag or NO_LAG
+        model = None  # that of rotor speeds
+        thrust_lag = None
+        if self._targets:
+            lags = settings.inner_lag or NO_LAG
+            model = target_model(vehicle, period, lags)
+            thrust_lag = lags[0]
         if settings.moment:
             vehicle.require_moment("controller")
         self.observer: RampObserver | None = None
         if settings.disturbance is not None:
-            lag = lags[0] if self._targets else None
+            _, late = split_delay(settings.delay, period)
             self.observer = RampObserver(
                 settings.disturbance,
                 vehicle,
                 period,
                 drag=settings.drag,
                 moment=settings.moment,
-                thrust_lag=lag,
-                late=split_delay(settings.delay, period)[1],
+                thrust_lag=thrust_lag,
+                late=late,
             )
         self.k_R = gains.k_R * np.array([1.0, 1.0, YAW_SHARE**2])
         self.k_Omega = gains.k_Omega * np.array([1.0, 1.0, YAW_SHARE])
@@ -195,7 +207,8 @@ class GeometricController(FeedbackLaw):
         self.pointed = previews(settings, period)
         self.numbers = geometric_numbers(vehicle, period, settings, gains)
         set_members(self.numbers, k_R=self.k_R, k_Omega=self.k_Omega)
-        self.numbers.preview, self.numbers.course = (array.ctypes.data for array in self.pointed.values())
+        self.numbers.preview = self.pointed["preview"].ctypes.data
+        self.numbers.course = self.pointed["course"].ctypes.data
         self.delay = None
         self.delay_bodies = Bodies()
         if settings.delay:
@@ -208,7 +221,7 @@ class GeometricController(FeedbackLaw):
             self.observer.bind(self._law.ramp)
             self.numbers.ramp = ctypes.addressof(self.observer.numbers)
         self._library.quadsim_geometric_start(self._law, self.numbers, None)
-        super().__init__(vehicle, period, settings, target_model(vehicle, period, lags) if self._targets else None)
+        super().__init__(vehicle, period, settings, model)
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], or target."""
@@ -237,9 +250,12 @@ class GeometricController(FeedbackLaw):
         return _integrals_of(self._law)
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
-        """Return the law's wrench as rotor speeds, or its targets; the integrals hold while bounds limit it."""
+        """Return the controller's wrench as rotor speeds, or its targets; the integrals hold while bounds limit it."""
         flying = now.phase is Phase.FLYING
-        self._measure(state, *((now.attitude, now.body_rates) if self.numbers.exact else (None, None)))
+        if self.numbers.exact:
+            self._measure(state, now.attitude, now.body_rates)
+        else:
+            self._measure(state, None, None)
         self._aim(reference, now.motion)
         follows = flying and self.observer is not None and self.observer.follows(now.time)
         acting = np.ascontiguousarray(before, np.float64)
@@ -252,18 +268,23 @@ class GeometricController(FeedbackLaw):
         if self._targets:
             return self._held_for_a_period(command)
         speeds = allocate(self._allocation, command, *self.bounds.reach(before))
-        given = self._allocation.wrench(speeds)
+        achieved = self._allocation.wrench(speeds)
         smallest = 1e-6 * self._allocation.scale.max()
-        if flying and np.allclose(given, command, rtol=0.0, atol=smallest):
+        if flying and np.allclose(achieved, command, rtol=0.0, atol=smallest):
             self._library.quadsim_geometric_integrate(self._law, self._motion, self._target)
         return self._held_for_a_period(speeds)
 
     def _measure(self, state: Array, attitude: Array | None, rates: Array | None) -> None:
         """Take the motion of a state, with the attitude and the body rates that are measured, if they are."""
-        arrays = []
+        kept = []  # until the call has read them
+        addresses: list[int | None] = []
         for array in (state, attitude, rates):
-            arrays.append(None if array is None else np.ascontiguousarray(array, np.float64))
-        addresses = (None if array is None else array.ctypes.data for array in arrays)
+            if array is None:
+                addresses.append(None)
+                continue
+            numbers = np.ascontiguousarray(array, np.float64)
+            kept.append(numbers)
+            addresses.append(numbers.ctypes.data)
         self._library.quadsim_geometric_measure(*addresses, self._motion)
 
     def _aim(self, reference: Array, motion: Motion | None) -> None:
@@ -285,6 +306,9 @@ class GeometricController(FeedbackLaw):
         self._aim(reference, motion)
         path = np.array(self._target.path)
         yaw = list(self._target.yaw)
+        heading = None
+        if self._target.headed:
+            heading = np.array(self._target.heading).reshape(3, 3)
         return Target(
             position=path[0],
             velocity=path[1],
@@ -294,7 +318,7 @@ class GeometricController(FeedbackLaw):
             yaw=yaw[0],
             yaw_rate=yaw[1],
             yaw_acceleration=yaw[2],
-            heading=np.array(self._target.heading).reshape(3, 3) if self._target.headed else None,
+            heading=heading,
         )
 
     def wrench(
@@ -339,9 +363,9 @@ class GeometricController(FeedbackLaw):
     def integrate(self, integrals: Integrals, motion: Measured, target: Target, desired: DesiredAttitude) -> Integrals:
         """Return the integrals of e_v + c_1 e_x and e_Omega + c_2 e_R one period later, saturated."""
         law = self._copy(integrals)
-        measured, wanted = _structs(motion, target)
+        measured, target_struct = _structs(motion, target)
         set_members(law.desired, **vars(desired))
-        self._library.quadsim_geometric_integrate(law, measured, wanted)
+        self._library.quadsim_geometric_integrate(law, measured, target_struct)
         return _integrals_of(law)
 
     def _evaluate(
@@ -357,7 +381,8 @@ class GeometricController(FeedbackLaw):
         structs = _structs(motion, target)
         result = np.empty(size)
         d = DisturbanceStruct()
-        set_members(d, **dict(zip(("force", "change", "torque"), disturbance, strict=True)))
+        force, change, torque = disturbance
+        set_members(d, force=force, change=change, torque=torque)
         law_in_c(law, *structs, d, result.ctypes.data)
         desired = law.desired
         attitude = DesiredAttitude(
@@ -368,7 +393,7 @@ class GeometricController(FeedbackLaw):
         return result, attitude
 
     def _copy(self, integrals: Integrals) -> Struct:
-        """Return the law with other integrals."""
+        """Return the controller with other integrals."""
         law = GeometricStruct.from_buffer_copy(self._law)
         set_members(law, **vars(integrals))
         return law
@@ -381,15 +406,21 @@ def _integrals_of(law: Struct) -> Integrals:
 def _structs(motion: Measured, target: Target) -> tuple[Struct, Struct]:
     """Return both as C takes them."""
     measured = MotionStruct()
-    wanted = TargetStruct()
+    target_struct = TargetStruct()
     measured.yaw = motion.yaw
-    set_members(measured, **{name: getattr(motion, name) for name in ("position", "velocity", "attitude", "rates")})
+    set_members(
+        measured,
+        position=motion.position,
+        velocity=motion.velocity,
+        attitude=motion.attitude,
+        rates=motion.rates,
+    )
     path = (target.position, target.velocity, target.acceleration, target.jerk, target.snap)
-    set_members(wanted, path=np.stack(path), yaw=(target.yaw, target.yaw_rate, target.yaw_acceleration))
+    set_members(target_struct, path=np.stack(path), yaw=(target.yaw, target.yaw_rate, target.yaw_acceleration))
     if target.heading is not None:
-        wanted.headed = 1
-        set_members(wanted, heading=target.heading)
-    return measured, wanted
+        target_struct.headed = 1
+        set_members(target_struct, heading=target.heading)
+    return measured, target_struct
 
 
 def _delay_of(settings: Geometric, vehicle: Vehicle, period: float) -> tuple[Struct, Bodies]:
@@ -403,14 +434,13 @@ def _delay_of(settings: Geometric, vehicle: Vehicle, period: float) -> tuple[Str
     if targets and settings.delay >= period:
         rule = f"below the control period of {period:g} s where an autopilot flies the commands"
         raise ParameterError("controller", "delay", settings.delay, rule)
-    model = rigid_body(
-        vehicle,
-        period,
-        substeps=SUBSTEPS,
-        inputs=Inputs.RATES if targets else Inputs.SPEED,
-        rotor_lag=None if targets else vehicle.rotor_rise or None,
-        lag=settings.inner_lag or NO_LAG,
-    )
+    inputs = Inputs.RATES
+    rotor_lag = None
+    if not targets:
+        inputs = Inputs.SPEED
+        rotor_lag = vehicle.rotor_rise or None
+    lag = settings.inner_lag or NO_LAG
+    model = rigid_body(vehicle, period, substeps=SUBSTEPS, inputs=inputs, rotor_lag=rotor_lag, lag=lag)
     return delay_numbers(settings.delay, model, vehicle, period)
 
 
@@ -419,7 +449,7 @@ def previews(settings: Geometric, period: float) -> dict[str, Array]:
 
     They give values and derivatives when the command takes over.
     """
-    degree = PREVIEW_DEGREE if settings.feedforward else 2
+    degree = _preview_degree(settings)
     late = settings.delay / period  # periods
     course = []
     for count in range(1, MOTION_SAMPLES + 1):  # near the end the last sample is held
@@ -429,20 +459,33 @@ def previews(settings: Geometric, period: float) -> dict[str, Array]:
     return {"preview": np.ascontiguousarray(preview), "course": np.concatenate(course)}
 
 
+def _preview_degree(settings: Geometric) -> int:
+    """Return the degree of the polynomial through a preview: up to snap with feed-forward, else up to acceleration."""
+    if settings.feedforward:
+        return PREVIEW_DEGREE
+    return 2
+
+
 def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gains: GeometricGains) -> Struct:
-    """Return the law's numbers for C but for `k_R`, `k_Omega`, and what they point to."""
+    """Return the controller's numbers for C but for `k_R`, `k_Omega`, and what they point to."""
     numbers = GeometricNumbersStruct()
     targets = settings.commands != ROTORS
     bounds = settings.actuators(vehicle)
     lags = settings.inner_lag or NO_LAG
     half = 0.5 * period
+    ahead = half
+    lead = np.array(lags[1:])
+    if targets:
+        ahead += lags[0]
+    if settings.feedforward:
+        lead = lead + half
     weight = vehicle.mass * vehicle.gravity
     numbers.commands = list(TARGET_SIZES).index(settings.commands)
     numbers.feedforward = settings.feedforward
     numbers.moment = settings.moment
     numbers.horizon = settings.horizon
     numbers.exact = settings.feedforward or settings.disturbance is not None
-    numbers.orders = (PREVIEW_DEGREE if settings.feedforward else 2) + 1
+    numbers.orders = _preview_degree(settings) + 1
     numbers.period = period
     numbers.mass = vehicle.mass
     numbers.gravity = vehicle.gravity
@@ -450,13 +493,13 @@ def geometric_numbers(vehicle: Vehicle, period: float, settings: Geometric, gain
         setattr(numbers, name, getattr(gains, name))
     numbers.least_lift = LEAST_THRUST_SHARE * weight
     numbers.slope = math.tan(math.radians(settings.tilt))
-    numbers.ahead = half + (lags[0] if targets else 0.0)
+    numbers.ahead = ahead
     numbers.turning = float(vehicle.hover_speeds.sum())
     numbers.loss = vehicle.inflow or 0.0
     set_members(
         numbers,
         k_attitude=gains.k_attitude,
-        lead=np.array(lags[1:]) + (half if settings.feedforward else 0.0),
+        lead=lead,
         drag=settings.drag,
         inertia=vehicle.inertia_matrix,
         across=vehicle.rotor_moment or (0.0, 0.0),

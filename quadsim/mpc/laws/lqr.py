@@ -127,8 +127,8 @@ class LQR(FeedbackLaw):
     more, S the accelerations per rotor speed at hover and F those per velocity and rate (`air_slopes`).
 
     Speeds beyond the bounds are limited as by `allocate`: thrust, roll and pitch torque take precedence over yaw.  The
-    law is linear up to the largest tilt that errors of x, y and their rates may demand: without that limit, a large
-    error demands more tilt than the model, or the vehicle, tolerates.
+    controller is linear up to the largest tilt that errors of x, y and their rates may demand: without that limit, a
+    large error demands more tilt than the model, or the vehicle, tolerates.
 
     Attributes:
         objective: the weights of one period.
@@ -197,7 +197,7 @@ class LQR(FeedbackLaw):
     def _limited(self, error: Array) -> Array:
         """Scale down the horizontal part of the error (12,) where it demands more tilt than allowed.
 
-        K e = K_tilt (tilt + G e_horizontal) + ..., so -G e_horizontal is the tilt that the law demands.
+        K e = K_tilt (tilt + G e_horizontal) + ..., so -G e_horizontal is the tilt that the controller demands.
         """
         demanded = float(np.linalg.norm(self._tilt_demand @ error[HORIZONTAL]))
         if demanded <= self._largest_tilt:

@@ -15,7 +15,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 
 from quadsim import shorthands
-from quadsim.controller import ATTITUDE, ROTORS, Controller
+from quadsim.controller import ROTORS, Controller
 from quadsim.core.mirror import constant
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Seconds, Weight
@@ -25,10 +25,8 @@ from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws import register
-from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.pilot.indi import INDISettings, TorqueIncrement, require_one_scale
 from quadsim.mpc.problem.constraints import Constraint, Soft, origin_of_state, selection
-from quadsim.mpc.problem.model import LinearModel, hover_model, target_model
 from quadsim.mpc.problem.polytope import Polytope, rows_of
 from quadsim.mpc.problem.qp import KKT_EVERY
 from quadsim.mpc.problem.rigidbody import RATE_SCALE
@@ -41,10 +39,9 @@ from quadsim.mpc.tables.commands import (
     Rates,
     RotorBounds,
     TargetBounds,
-    attitude_targets,
     require_space,
 )
-from quadsim.mpc.tables.controller import ControllerTable, Horizon, KktEvery, Range, ranges, require_ordered
+from quadsim.mpc.tables.controller import Horizon, KktEvery, Range, ranges, require_ordered
 from quadsim.mpc.tables.lags import (
     ATTITUDE_LAG,
     INNER_LAG,
@@ -56,6 +53,7 @@ from quadsim.mpc.tables.lags import (
     require_lag,
     require_lags,
 )
+from quadsim.mpc.tables.targets import TargetTable
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
@@ -89,13 +87,13 @@ class Weights:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             array = np.asarray(value, float)
-            axes = ((),) if name in ("input", "move") else ((), (3,))
             inside = np.isfinite(array) & (array >= 0.0) & ((array > 0.0) | (name == "move"))
-            if array.shape not in axes or not inside.all():
-                if len(axes) == 2:
-                    rule = "positive: one number, or three"
-                else:
-                    rule = "one positive number"
+            shapes: tuple[tuple[int, ...], ...] = ((), (3,))
+            rule = "positive: one number, or three"
+            if name in ("input", "move"):
+                shapes = ((),)
+                rule = "one positive number"
+            if array.shape not in shapes or not inside.all():
                 raise ParameterError("controller.weights", name, value, rule)
             if array.ndim:
                 object.__setattr__(self, name, tuple(array.tolist()))
@@ -114,7 +112,7 @@ def _three(weight: AxisWeights) -> Array:
     place=4,
 )
 @dataclass(frozen=True, kw_only=True)
-class Nonlinear(ControllerTable):
+class Nonlinear(TargetTable):
     """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period.
 
     Examples:
@@ -243,12 +241,7 @@ class Nonlinear(ControllerTable):
             "input_bounds": VEHICLES_SPEEDS,
         }
         require_space(self, of_rotors)
-        speeds = []
-        for polytope in self.polytopes:
-            if any("speed_" in name for name in polytope.of):
-                speeds.append(polytope.name)
-        if speeds and self.commands != ROTORS:
-            raise ValueError(f'polytopes must be without rotor speeds where commands = "{self.commands}"; got {speeds}')
+        self._require_polytopes_without_speeds()
         if self.inputs == "thrust" and self.input_bounds.slew is not None:
             raise ValueError(
                 'input_bounds.slew must be absent where inputs = "thrust", in which steps of speeds are not linear: '
@@ -272,21 +265,6 @@ class Nonlinear(ControllerTable):
         )
         return law
 
-    @property
-    def turns_by_attitude(self) -> bool:
-        """See `quadsim.mpc.tables.controller.ControllerTable.turns_by_attitude`."""
-        return self.commands == ATTITUDE
-
-    def attitudes(self) -> AttitudeTargets | None:
-        """See `quadsim.mpc.tables.controller.ControllerTable.attitudes`."""
-        return attitude_targets(self)
-
-    def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
-        """See `quadsim.mpc.tables.controller.ControllerTable.level_hover`."""
-        if self.commands == ROTORS:
-            return hover_model(vehicle, period)
-        return target_model(vehicle, period, require_lags(self.inner_lag), self.attitude_lag)
-
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
         bounds = ranges(self.output_bounds)
@@ -296,12 +274,16 @@ class Nonlinear(ControllerTable):
             bounds |= ranges({CLIMB: self.climb_acceleration})
         if self.body_rate is not None:
             rates = _three(self.body_rate).tolist()
-            bounds |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", rates, strict=True)}
-        if self.commands == "rotors":
+            for axis, rate in zip("xyz", rates, strict=True):
+                bounds[f"body_rate_{axis}"] = (-rate, rate)
+        if self.commands == ROTORS:
             return bounds | self.input_bounds.audited(vehicle)
-        targets = self.target_bounds.audited(vehicle)
-        tightest = {name: min(bounds.get(name, pair), pair, key=lambda side: side[1]) for name, pair in targets.items()}
-        return bounds | tightest
+        for name, target in self.target_bounds.audited(vehicle).items():
+            bound = bounds.get(name, target)
+            if target[1] < bound[1]:  # the tighter of both
+                bound = target
+            bounds[name] = bound
+        return bounds
 
     def space(self, shapes: Sequence[Shape], vehicle: Vehicle, period: float) -> Space | None:
         """Return the half-spaces of obstacles and regions; None without any."""
@@ -320,20 +302,18 @@ class Nonlinear(ControllerTable):
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """See `quadsim.mpc.tables.controller.ControllerTable.actuators`."""
-        bounds = self.input_bounds if self.commands == ROTORS else self.target_bounds
-        return bounds.actuators(vehicle)
+        if self.commands == ROTORS:
+            return self.input_bounds.actuators(vehicle)
+        return self.target_bounds.actuators(vehicle)
 
     def outputs(self) -> tuple[Array, Array]:
         """Return C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
         weights = self.weights
-        difference = self.attitude_error == "difference"
-        if difference:
+        if self.attitude_error == "difference":
             rows = np.eye(13)
-        else:
-            rows = np.delete(np.eye(13), 3, axis=0)
-        if difference:
             attitude = np.full(4, weights.attitude)
         else:
+            rows = np.delete(np.eye(13), 3, axis=0)
             attitude = 4.0 * _three(weights.attitude)
         parts = (_three(weights.position), attitude, _three(weights.velocity), _three(weights.body_rates))
         return rows, np.concatenate(parts)
@@ -341,7 +321,9 @@ class Nonlinear(ControllerTable):
     @property
     def largest_rates(self) -> Array:
         """(3,) bounds on body rates [rad/s], infinite for none."""
-        return np.radians(_three(math.inf if self.body_rate is None else self.body_rate))
+        if self.body_rate is None:
+            return np.full(3, math.inf)
+        return np.radians(_three(self.body_rate))
 
     def stride(self, period: float) -> int:
         """Return the number of periods per node."""

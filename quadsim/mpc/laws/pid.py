@@ -39,7 +39,7 @@ it to yaw."""
 
 
 YAW_WEIGHT: Final = 0.4  # share of the heading error corrected while turning the thrust; PX4's MC_YAW_WEIGHT
-LARGEST_RATES: Final = (220.0, 220.0, 200.0)  # body rates commanded [deg/s]; PX4's MC_ROLLRATE_MAX
+LARGEST_BODY_RATES: Final = (220.0, 220.0, 200.0)  # body rates commanded [deg/s]; PX4's MC_ROLLRATE_MAX
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,9 @@ class PIDGains:
 
 def pid_gains(vehicle: Vehicle, *, period: float, lag: float | None = None) -> PIDGains:
     """Return gains that follow from the period and the lag [s], by default the vehicle's."""
-    speeds = bandwidths(period=period, lag=lag_to_allow_for(vehicle, period) if lag is None else lag)
+    if lag is None:
+        lag = lag_to_allow_for(vehicle, period)
+    speeds = bandwidths(period=period, lag=lag)
     return PIDGains(bandwidths=speeds, velocity_integral=0.25 * speeds.position, rate_integral=0.5 * speeds.position)
 
 
@@ -145,8 +147,8 @@ class CascadedPID(FeedbackLaw):
         wrench -= by_air
         speeds = allocate(self.allocation, wrench, lower, upper)
         # Anti-windup: an integral stops where it would ask for more than the mixer can give.
-        given = self._vehicle.angular_acceleration(self.allocation.wrench(speeds)[1:] + by_air[1:])
-        missed = acceleration - given
+        achieved = self._vehicle.angular_acceleration(self.allocation.wrench(speeds)[1:] + by_air[1:])
+        missed = acceleration - achieved
         windup = missed * error > 1e-9 * (1.0 + np.abs(acceleration)) * np.abs(error)
         summed = np.where(windup, 0.0, error)
         return speeds, Memory(
@@ -200,7 +202,7 @@ class CascadedPID(FeedbackLaw):
     def _desired_rates(self, motion: Measured, force: Array, target: Target) -> Array:
         """Return the body rates (3,) [rad/s] that the attitude loop demands."""
         k = self.gains.bandwidths
-        limit = np.radians(LARGEST_RATES)
+        limit = np.radians(LARGEST_BODY_RATES)
         error = prioritised_error(motion.attitude, attitude_for(force, target.yaw), YAW_WEIGHT)
         heading = motion.attitude[2] * target.yaw_rate  # a rotation about world z, in body axes
         return np.clip(np.array([k.attitude, k.attitude, k.yaw]) * error + heading, -limit, limit)

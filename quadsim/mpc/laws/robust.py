@@ -16,16 +16,15 @@ import numpy as np
 from annotated_types import Gt, Le, doc
 
 from quadsim import shorthands
-from quadsim.controller import ATTITUDE, CORE, ROTORS
+from quadsim.controller import CORE, ROTORS
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
 from quadsim.mpc.estimate.observer import ObserverSettings
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.guard.settings import USUAL_FALLBACK, FallbackSettings
 from quadsim.mpc.laws import register
-from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.problem.constraints import Constraint, Origin, Soft, origin_of_state
-from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model, target_model
+from quadsim.mpc.problem.model import LinearModel, continuous_model, discretise, hover_model
 from quadsim.mpc.problem.ocp import Objective, Problem, lqr_terminal_weight, objective_of
 from quadsim.mpc.problem.tightening import TighteningSettings, margins, position_margins
 from quadsim.mpc.space import Shape, Space
@@ -38,7 +37,6 @@ from quadsim.mpc.tables.commands import (
     InputWeights,
     TargetBounds,
     TargetWeights,
-    attitude_targets,
     require_targets,
 )
 from quadsim.mpc.tables.controller import Range
@@ -51,9 +49,9 @@ from quadsim.mpc.tables.lags import (
     LagSeconds,
     require_attitude_lag,
     require_lag,
-    require_lags,
     resolved_lag,
 )
+from quadsim.mpc.tables.targets import TargetTable
 from quadsim.state import INDEX, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -71,7 +69,7 @@ TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that depend o
     place=3,
 )
 @dataclass(frozen=True, kw_only=True)
-class Robust(Bounded):
+class Robust(TargetTable, Bounded):
     """The robust MPC: soft bounds, rotor lag, delay, disturbances, heading and more, each switched on separately.
 
     Examples:
@@ -130,17 +128,9 @@ class Robust(Bounded):
         if self.tightening is not None and not self.output_bounds:
             raise ValueError("tightening must be absent where there are no output_bounds to tighten")
         if self.heading:
-            bounded = {
-                "output_bounds": [*self.output_bounds],
-                **{polytope.name: polytope.of for polytope in self.polytopes},
-            }
-            for name, states in bounded.items():
-                turned = [state for state in states if state in TURNED]
-                if turned:
-                    raise ValueError(
-                        f"{name} must not be of {', '.join(turned)} where heading turns the model: "
-                        'heading = false, or type = "nonlinear"'
-                    )
+            _require_unturned("output_bounds", [*self.output_bounds])
+            for polytope in self.polytopes:
+                _require_unturned(polytope.name, polytope.of)
 
     def _check_commands(self) -> None:
         """Refuse fields of the other space of commands.
@@ -169,28 +159,7 @@ class Robust(Bounded):
             if value is not None:
                 reason = "the autopilot turns the rotors; inner_lag, target_weights and target_bounds describe it"
                 raise ValueError(f'{name} must be absent where commands = "{self.commands}": {reason}')
-        speeds = []
-        for polytope in self.polytopes:
-            if any("speed_" in name for name in polytope.of):
-                speeds.append(polytope.name)
-        if speeds:
-            rule = f'without rotor speeds where commands = "{self.commands}"'
-            raise ValueError(f"polytopes must be {rule}; got {speeds}")
-
-    @property
-    def turns_by_attitude(self) -> bool:
-        """See `quadsim.mpc.tables.controller.ControllerTable.turns_by_attitude`."""
-        return self.commands == ATTITUDE
-
-    def attitudes(self) -> AttitudeTargets | None:
-        """See `quadsim.mpc.tables.controller.ControllerTable.attitudes`."""
-        return attitude_targets(self)
-
-    def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
-        """See `quadsim.mpc.tables.controller.ControllerTable.level_hover`."""
-        if self.commands == ROTORS:
-            return hover_model(vehicle, period)
-        return target_model(vehicle, period, require_lags(self.inner_lag), self.attitude_lag)
+        self._require_polytopes_without_speeds()
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `quadsim.mpc.tables.controller.ControllerTable.audited`."""
@@ -233,9 +202,8 @@ class Robust(Bounded):
         model = self._model(vehicle, period)
         objective = self.objective()
         n = model.n
-        if self.move_weight is None:
-            moves = None
-        else:
+        moves = None
+        if self.move_weight is not None:
             moves = self.move_weight * np.eye(N_ROTORS)
         objective = replace(objective, C_r=_widened(objective.C_r, n), Q_d=moves)
         if self.terminal == "lqr":
@@ -243,20 +211,18 @@ class Robust(Bounded):
         if self.commands != ROTORS:
             constraints = (*self._target_constraints(vehicle), *self.constraints(vehicle))
             return Problem(model=model, horizon=self.horizon, objective=objective, constraints=constraints)
-        bounds = self.bounds()
-        if self.soft is None:
-            penalty = None
-        else:
+        penalty = None
+        if self.soft is not None:
             penalty = self.soft.penalty(len(self.output_bounds))
-        return Problem(
-            model=model,
-            horizon=self.horizon,
-            objective=objective,
-            bounds=replace(bounds, C_c=_widened(bounds.C_c, n), penalty=penalty, margins=self.margins(vehicle, period)),
-            constraints=tuple(
-                part if part.C is None else replace(part, C=_widened(part.C, n)) for part in self.constraints(vehicle)
-            ),
-        )
+        bounds = self.bounds()
+        C_c = _widened(bounds.C_c, n)
+        bounds = replace(bounds, C_c=C_c, penalty=penalty, margins=self.margins(vehicle, period))
+        parts = []
+        for part in self.constraints(vehicle):
+            if part.C is not None:
+                part = replace(part, C=_widened(part.C, n))
+            parts.append(part)
+        return Problem(model=model, horizon=self.horizon, objective=objective, bounds=bounds, constraints=tuple(parts))
 
     def _model(self, vehicle: Vehicle, period: float) -> LinearModel:
         """Return the prediction model: with rotor speeds as states if they lag, or above an autopilot."""
@@ -274,9 +240,8 @@ class Robust(Bounded):
         """Return the bounds on outputs and on an autopilot's targets as constraints."""
         C_c, lower, upper = self.output_limits()
         names = [name for name in STATE_NAMES if name in self.output_bounds]
-        if self.soft is None:
-            penalty = None
-        else:
+        penalty = None
+        if self.soft is not None:
             penalty = self.soft.penalty(len(names))
         origins = tuple(origin_of_state(INDEX[name]) for name in names)
         outputs = Constraint(name="outputs", lower=lower, upper=upper, C=C_c, penalty=penalty, origins=origins)
@@ -331,6 +296,16 @@ class Robust(Bounded):
             "delay": self.delay,
             "estimated": self.offset_free is not None,
         }
+
+
+def _require_unturned(name: str, states: Sequence[str]) -> None:
+    """Refuse bounds on states that depend on the yaw of the axes, where these are turned by the measured yaw."""
+    turned = [state for state in states if state in TURNED]
+    if turned:
+        raise ValueError(
+            f"{name} must not be of {', '.join(turned)} where heading turns the model: "
+            'heading = false, or type = "nonlinear"'
+        )
 
 
 def _widened(matrix: Array, n: int) -> Array:

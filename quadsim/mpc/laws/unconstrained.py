@@ -78,7 +78,7 @@ class UnconstrainedMPC:
         self._turns = ReferenceTurns()
 
     def reset(self, speeds: Array) -> None:
-        """Forget the turn of the heading, the law's only state."""
+        """Forget the turn of the heading, the controller's only state."""
         self._turns.reset()
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:

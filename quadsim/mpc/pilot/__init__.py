@@ -1,1 +1,1 @@
-"""What flies a vehicle: a law, its guard, the faster loop around it, and control allocation."""
+"""What flies a vehicle: a controller, its guard, the faster loop around it, and control allocation."""

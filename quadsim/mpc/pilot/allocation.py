@@ -56,7 +56,7 @@ def make_allocation(vehicle: Vehicle) -> Allocation:
 
 
 def thrust_to_command(largest: float, weight: float, share: float) -> float:
-    """Return the largest collective thrust [N] that a law commands; the rest is for torques.
+    """Return the largest collective thrust [N] that a controller commands; the rest is for torques.
 
     It is a share of the `largest` that the rotors give [N], but at least half way from the weight [N] to it: a vehicle
     of low thrust to weight still climbs.  All of it, if the rotors cannot carry the weight.

@@ -1,7 +1,7 @@
-"""Attitudes as commands: the body rates that a law asks for, as the attitude whose error makes an autopilot turn so.
+"""Attitudes as commands: of the body rates that a controller asks for, the attitude whose error gives these rates.
 
 An autopilot that holds an attitude q_c commands the body rates omega_c = 2 vec(q* q_c) / tau_a, axis by axis, with the
-measured attitude q.  A law that wants omega_c now therefore commands
+measured attitude q.  A controller that wants omega_c now therefore commands
 
     q_c = q (s, tau_a omega_c / 2),    s = sqrt(1 - |tau_a omega_c / 2|^2),
 
@@ -23,7 +23,7 @@ from quadsim.rotation import conjugate, multiply
 from quadsim.state import Array
 
 REMEMBERED: Final = 16
-"""Commands of which it is known what the law asked for; more are never under way in a flight that goes on."""
+"""Commands of which it is known what the controller asked for; more are never under way in a flight that goes on."""
 
 
 class AttitudeTargets:
@@ -60,8 +60,8 @@ class AttitudeTargets:
     def command(self, target: Array, attitude: Array) -> Array:
         """Return the thrust and the body rates (4,) that a target (8,) stands for.
 
-        Of a target of its own these are what the law asked for when it was commanded; of another's, what the target
-        commands at a measured attitude wxyz (4,).
+        Of a target of its own these are what the controller asked for when it was commanded; of another's, what the
+        target commands at a measured attitude wxyz (4,).
         """
         for sent, command in reversed(self._sent):
             if np.array_equal(sent, target):

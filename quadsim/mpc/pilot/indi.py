@@ -1,7 +1,7 @@
-"""Incremental nonlinear dynamic inversion (INDI) of the angular acceleration, an inner loop around any law.
+"""Incremental nonlinear dynamic inversion (INDI) of the angular acceleration, an inner loop around any controller.
 
-The law's rotor speeds define a wrench, and so the angular acceleration that its model demands. At its own rate, above
-the control rate, the inner loop demands the torque
+The controller's rotor speeds define a wrench, and so the angular acceleration that its model demands. At its own rate,
+above the control rate, the inner loop demands the torque
 
     tau_c = tau_f + J (alpha_c - alpha_f),
 
@@ -13,7 +13,7 @@ quadrotor agile flight", 2022. Torques that the model omits (drag of the body, a
 appear in alpha_f and are compensated; collective thrust is passed through.
 
 With the gyroscopic torque outside the filter, tau_c = tau(u) + filtered(tau - J alpha - omega x J omega), so that a
-vehicle that matches its model flies the law's speeds unchanged.
+vehicle that matches its model flies the controller's speeds unchanged.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def require_one_scale(indi: INDISettings | None, disturbance: RampSettings | Non
 
 
 class TorqueIncrement(CompiledLoop):
-    """The inner loop: corrects the commanded rotor speeds so that the vehicle turns as the law's model predicts.
+    """The inner loop: corrects the commanded rotor speeds so that the vehicle turns as the controller's model predicts.
 
     See `quadsim.controller.InnerLoop`.  The core computes it: the filter y'' = omega^2 (value - y) - 2 zeta omega y',
     Butterworth's damping as in Tal and Karaman, implicit, so that it is stable at any rate; and the allocation.

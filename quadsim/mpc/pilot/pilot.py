@@ -1,4 +1,4 @@
-"""What flies a vehicle: a law, the fallback contract that guards it, and the faster loop that flies its commands."""
+"""What flies a vehicle: a controller, the fallback contract around it, and the faster loop that flies its commands."""
 
 from __future__ import annotations
 
@@ -35,14 +35,15 @@ from quadsim.vehicle import Vehicle
 
 
 class Pilot:
-    """A law, with or without the fallback contract around it, and with or without an inner loop.
+    """A controller, with or without the fallback contract around it, and with or without an inner loop.
 
-    An inner loop corrects the rotor speeds that the law commands (`quadsim.mpc.pilot.indi.TorqueIncrement`), or is an
-    autopilot. The law then commands targets: `speeds` a row, thrust [N] and body rates [rad/s] (4,), perhaps with an
-    attitude (8,), `plan` such rows; `now.acting` and `reset` give it the target in force. To the flight the pilot is
+    An inner loop corrects the rotor speeds that the controller commands (`quadsim.mpc.pilot.indi.TorqueIncrement`), or
+    is an autopilot. The controller then commands targets: `speeds` a row, thrust [N] and body rates [rad/s] (4,),
+    perhaps with an attitude (8,), `plan` such rows; `now.acting` and `reset` give it the target in force. To the flight
+    the pilot is
     the inner loop then: it passes calls on to the autopilot, and so knows the target in force whenever commands come
-    late.  With `attitudes` the law and the contract know thrust and body rates, `plan` has them, and what is commanded
-    are the attitudes whose errors make the autopilot turn so.
+    late.  With `attitudes` the controller and the contract know thrust and body rates, `plan` has them, and what is
+    commanded are the attitudes whose errors make the autopilot turn so.
 
     Attributes:
         law: the law.
@@ -75,7 +76,9 @@ class Pilot:
         self.inner = inner
         self.attitudes = attitudes
         self.takes_targets = takes_targets(inner)
-        self.rate = 0.0 if inner is None else inner.rate
+        self.rate = 0.0
+        if inner is not None:
+            self.rate = inner.rate
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._slowest = np.full(4, vehicle.speed_min)
         # the target in force; whether the autopilot is to be reset
@@ -101,7 +104,7 @@ class Pilot:
 
     @property
     def solver(self) -> str:
-        """Name of the law's QP solver; empty for a closed form."""
+        """Name of the controller's QP solver; empty for a closed form."""
         return self.law.solver
 
     @property
@@ -111,14 +114,14 @@ class Pilot:
 
     @property
     def commands(self) -> str:
-        """What the law commands: rotor speeds, or the targets of an autopilot by name."""
+        """What the controller commands: rotor speeds, or the targets of an autopilot by name."""
         if isinstance(self.law, Commanding):
             return self.law.commands
         return ROTORS
 
     @property
     def infeasible_period(self) -> object:
-        """The law's first period since `reset` whose QP had no answer; None if there is none."""
+        """The controller's first period since `reset` whose QP had no answer; None if there is none."""
         if isinstance(self.law, Diagnosable):
             return self.law.infeasible_period
         return None
@@ -148,15 +151,14 @@ class Pilot:
         self._rates = rates.copy()
 
     def adopt(self, previous: object) -> None:
-        """Take over what the previous pilot's law, contract and inner loop know; a vehicle has one autopilot."""
-        if isinstance(previous, Pilot):
-            before = previous
-        else:
-            before = None
-        if isinstance(self.law, Adopting):
-            self.law.adopt(previous if before is None else before.law)
-        if before is None:
+        """Take over what the previous pilot's controller, contract and inner loop know; a vehicle has one autopilot."""
+        if not isinstance(previous, Pilot):
+            if isinstance(self.law, Adopting):
+                self.law.adopt(previous)
             return
+        before = previous
+        if isinstance(self.law, Adopting):
+            self.law.adopt(before.law)
         if self.guard is not None and before.guard is not None:
             self.guard.adopt(before.guard, self.horizon)
         if isinstance(self.inner, TorqueIncrement):
@@ -168,7 +170,7 @@ class Pilot:
             self._fresh = before._fresh
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """Return the law's or the contract's command, with its inner loop; that is off on the ground."""
+        """Return the controller's or the contract's command, with its inner loop; that is off on the ground."""
         if self.takes_targets:
             now = replace(now, acting=self._acting(now, state))
         if self.guard is None:
@@ -181,7 +183,9 @@ class Pilot:
             if self.attitudes is not None:
                 target = self.attitudes.target(command.speeds, self._attitude(now, state))
                 command = replace(command, speeds=target)
-            return replace(command, inner=self if self.takes_targets else self.inner)
+            if self.takes_targets:
+                return replace(command, inner=self)
+            return replace(command, inner=self.inner)
         if isinstance(self.inner, TorqueIncrement):
             self.inner.reset()
             return command
@@ -191,7 +195,7 @@ class Pilot:
         return stopped(self._slowest.copy(), self.horizon, now.phase)
 
     def _acting(self, now: StepInputs, state: Array) -> Array:
-        """Return the target in force as the law knows targets."""
+        """Return the target in force as the controller knows targets."""
         if self.attitudes is None or self._target.size == self._hover.size:
             return self._target
         return self.attitudes.command(self._target, self._attitude(now, state))
@@ -229,7 +233,7 @@ class Pilot:
         return self.inner.speeds(time, commanded, rates, rotors, attitude)
 
     def in_core(self) -> CoreController | None:
-        """Return the law and its contract in the core, for a flight of their own; None where they are not C's alone."""
+        """Return controller and contract in the core, for a flight of their own; None where they are not C's alone."""
         if self.guard is None or self.inner is not None or not isinstance(self.law, InCore):
             return None
         return self.law.in_core(self.guard.numbers)

@@ -6,6 +6,7 @@ has those of the paper, Eqs. (12)-(20); `Rows` stacks all constraints of a `quad
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -125,8 +126,9 @@ class Constraint:
         _check_order(f"{self.name}.lower", self.lower, "upper", self.upper)
         m = self.lower.shape[-1]
         matrices = [matrix for matrix in (self.C, self.D, self.E) if matrix is not None]
-        if not matrices or any(matrix.shape[-2] != m for matrix in matrices):
-            raise ParameterError("controller", self.name, [matrix.shape[-2] for matrix in matrices], f"{m} rows")
+        counts = [matrix.shape[-2] for matrix in matrices]
+        if not matrices or counts != [m] * len(matrices):
+            raise ParameterError("controller", self.name, counts, f"{m} rows")
         if not all(np.isfinite(matrix).all() for matrix in matrices):
             raise ParameterError("controller", self.name, matrices, "finite numbers")
         if self.C is not None and self.C.ndim == 3 and (self.D is not None or self.E is not None):
@@ -140,7 +142,9 @@ class Constraint:
         """Return where a row comes from; by default its own name, with the row's number if there are several."""
         if self.origins:
             return self.origins[row]
-        return Origin(self.name if self.lower.shape[-1] == 1 else f"{self.name}, row {row + 1},")
+        if self.lower.shape[-1] == 1:
+            return Origin(self.name)
+        return Origin(f"{self.name}, row {row + 1},")
 
 
 def _check_order(low: str, lower: Array, high: str, upper: Array) -> None:
@@ -204,14 +208,14 @@ class Bounds:
             penalty=self.penalty,
             origins=tuple(map(self.output, range(len(self.C_c)))),
         )
-        each = np.eye(self.u_min.size)
-        rotors = range(1, self.u_min.size + 1)
-        slews, speeds = (
-            tuple(Origin(name, "rad/s", rotor=rotor, field=f"{_INPUTS}.{name}") for rotor in rotors)
-            for name in ("slew", "speed")
-        )
+        if self.margins is not None:
+            outputs = tightened(outputs, self.margins)
+        rotors = self.u_min.size
+        each = np.eye(rotors)
+        slews = _rotor_origins("slew", rotors)
+        speeds = _rotor_origins("speed", rotors)
         return (
-            outputs if self.margins is None else tightened(outputs, self.margins),
+            outputs,
             Constraint(name="slews", lower=self.delta_min, upper=self.delta_max, E=each, origins=slews),
             Constraint(name="inputs", lower=self.u_min, upper=self.u_max, D=each, origins=speeds),
         )
@@ -224,9 +228,16 @@ class Bounds:
         return origin_of_state(int(states[0]))
 
 
+def _rotor_origins(name: str, rotors: int) -> tuple[Origin, ...]:
+    """Return the origins of a bound that files state for all rotors alike."""
+    field = f"{_INPUTS}.{name}"
+    return tuple(Origin(name, "rad/s", rotor=rotor, field=field) for rotor in range(1, rotors + 1))
+
+
 def selection(names: Sequence[str]) -> Array:
     """Return the rows of the identity that select states by name."""
-    return np.eye(N_STATES)[[INDEX[name] for name in names]]
+    indices = [INDEX[name] for name in names]
+    return np.eye(N_STATES)[indices]
 
 
 def origin_of_state(index: int) -> Origin:
@@ -267,7 +278,7 @@ class Rows:
     @cached_property
     def on_states(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
         """Return (m,) whether a row involves states."""
-        return np.asarray(self.C.any(axis=(0, 2) if self.C.ndim == 3 else 1)).reshape(len(self.D))
+        return _involves_states(self.C).reshape(len(self.D))
 
     @cached_property
     def starts(self) -> bool:
@@ -282,7 +293,8 @@ class Rows:
     @cached_property
     def slacks(self) -> Indices:
         """Return (m_s,) the first row of each slack; all soft rows if none share a slack."""
-        return self.soft[np.unique(self.slack[self.soft], return_index=True)[1]]
+        _, first = np.unique(self.slack[self.soft], return_index=True)
+        return self.soft[first]
 
 
 SCALE_ROUNDING: Final = 1e-9
@@ -304,4 +316,102 @@ def row_scale(largest: Array) -> Array:
 
 def renumbered(slack: Indices) -> Indices:
     """Return the slack numbers (m,) without gaps; hard rows keep -1."""
-    return np.asarray(np.unique(np.concatenate([[-1], slack]), return_inverse=True)[1][1:] - 1)
+    _, numbers = np.unique(np.concatenate([[-1], slack]), return_inverse=True)
+    return np.asarray(numbers[1:] - 1)
+
+
+def stacked_rows(constraints: Sequence[Constraint], *, horizon: int, n: int, nu: int) -> Rows:
+    """Return the normalised rows of constraints on a model of n states and nu inputs."""
+    steps: tuple[int, ...] = ()
+    if any(part.C is not None and part.C.ndim == 3 for part in constraints):
+        steps = (horizon,)
+    on_states = []
+    on_inputs = []
+    on_moves = []
+    lowers = []
+    uppers = []
+    linear = []
+    quadratic = []
+    slacks = []
+    names: list[str] = []
+    for part in constraints:
+        m = part.lower.shape[-1]
+        on_states.append(_broadcast(part.C, (*steps, m, n)))
+        on_inputs.append(_broadcast(part.D, (m, nu)))
+        on_moves.append(_broadcast(part.E, (m, nu)))
+        lowers.append(np.broadcast_to(part.lower, (horizon, m)))
+        uppers.append(np.broadcast_to(part.upper, (horizon, m)))
+        if part.penalty is None:
+            linear.append(np.full(m, math.inf))
+            quadratic.append(np.zeros(m))
+            slacks.append(np.full(m, -1))
+        else:
+            linear.append(part.penalty.l1)
+            quadratic.append(part.penalty.l2)
+            first = len(names)  # the constraint's first row: its number is that of the slack, or of the first slack
+            if part.penalty.largest:
+                slacks.append(np.full(m, first))
+            else:
+                slacks.append(first + np.arange(m))
+        names += [part.name] * m
+    C = np.concatenate(on_states, axis=-2)
+    D = np.concatenate(on_inputs, axis=-2)
+    E = np.concatenate(on_moves, axis=-2)
+    slack = np.concatenate(slacks)
+    scale = row_scale(_largest_coefficients(C, D, E))
+    for first_row in np.unique(slack[slack >= 0]):
+        shared = slack == first_row
+        scale[shared] = scale[shared].min()
+    C = C * scale[:, None]
+    D = D * scale[:, None]
+    E = E * scale[:, None]
+    lower = np.concatenate(lowers, axis=1) * scale
+    upper = np.concatenate(uppers, axis=1) * scale
+    l1 = np.concatenate(linear) / scale
+    l2 = np.concatenate(quadratic) / scale**2
+    hard_on_inputs = np.isinf(l1) & ~_involves_states(C)
+    bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
+    return Rows(
+        scale=scale[bounded],
+        C=C[..., bounded, :],
+        D=D[bounded],
+        E=E[bounded],
+        lower=lower[:, bounded],
+        upper=upper[:, bounded],
+        l1=l1[bounded],
+        l2=l2[bounded],
+        slack=renumbered(slack[bounded]),
+        of_states=np.asarray(~D[bounded].any(axis=1) & ~E[bounded].any(axis=1)).reshape(bounded.size),
+        input=np.where(hard_on_inputs, _single_column(D, E), -1)[bounded],
+        step=np.where(hard_on_inputs, _single_column(E, D), -1)[bounded],
+        names=tuple(names[i] for i in bounded),
+    )
+
+
+def _broadcast(matrix: Array | None, shape: tuple[int, ...]) -> Array:
+    """Return the matrix in a shape; zeros for None."""
+    if matrix is None:
+        return np.zeros(shape)
+    return np.broadcast_to(matrix, shape)
+
+
+def _largest_coefficients(C: Array, D: Array, E: Array) -> Array:
+    """Return (m,) the largest magnitude of a row's coefficients in C (m, n) or (N, m, n), D and E (m, nu)."""
+    of_states = np.abs(C).max(axis=-1, initial=0.0)
+    if C.ndim == 3:
+        of_states = of_states.max(axis=0)
+    of_inputs = np.maximum(np.abs(D).max(axis=1, initial=0.0), np.abs(E).max(axis=1, initial=0.0))
+    return np.asarray(np.maximum(of_states, of_inputs))
+
+
+def _involves_states(C: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Return (m,) whether rows of C (m, n) or (N, m, n) involve a state."""
+    if C.ndim == 3:
+        return np.asarray(C.any(axis=(0, 2)))
+    return np.asarray(C.any(axis=1))
+
+
+def _single_column(matrix: Array, other: Array) -> Indices:
+    """Return (m,) the only column of a row of the matrix (m, nu), where it is 1 and the other's row is 0; else -1."""
+    single = (np.count_nonzero(matrix, axis=1) == 1) & (matrix.max(axis=1, initial=0.0) == 1.0)
+    return np.where(single & ~other.any(axis=1), np.argmax(matrix, axis=1), -1)

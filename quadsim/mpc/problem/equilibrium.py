@@ -59,7 +59,7 @@ class Trim:
 
 @runtime_checkable
 class Trimmed(Protocol):
-    """A law that estimates the equilibrium of its vehicle."""
+    """A controller that estimates the equilibrium of its vehicle."""
 
     @property
     def trim(self) -> Trim | None:

@@ -20,10 +20,10 @@ import numpy as np
 
 from quadsim import shorthands
 from quadsim.errors import ParameterError
-from quadsim.mpc.problem.constraints import Bounds, Constraint, Rows, renumbered, row_scale, selection
+from quadsim.mpc.problem.constraints import Bounds, Constraint, Rows, selection, stacked_rows
 from quadsim.mpc.problem.model import LinearModel
 from quadsim.mpc.problem.regulator import stabilising
-from quadsim.state import REFERENCE_RATES, REFERENCE_STATES, STATE_NAMES, Array, Indices
+from quadsim.state import REFERENCE_RATES, REFERENCE_STATES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
 
@@ -113,9 +113,10 @@ class Objective:
 def objective_of(output_weights: Mapping[str, float], speed_weights: float | Sequence[float]) -> Objective:
     """Return C_r, Q_y and Q_u for weights of states by name, and one of all rotor speeds or one per rotor."""
     regulated = [name for name in STATE_NAMES if name in output_weights]
+    weights = [output_weights[name] for name in regulated]
     return Objective(
         C_r=selection(regulated),
-        Q_y=np.diag([output_weights[name] for name in regulated]),
+        Q_y=np.diag(weights),
         Q_u=np.diag(np.broadcast_to(np.asarray(speed_weights, float), N_ROTORS)),
     )
 
@@ -223,15 +224,19 @@ class Problem:
         nu = self.model.nu
         check_shape("C_r", self.objective.C_r, (self.objective.C_r.shape[0], n))
         check_shape("Q_u", self.objective.Q_u, (nu, nu))
-        for name, matrix, shape in (("Q_d", self.objective.Q_d, (nu, nu)), ("P", self.objective.P, (n, n))):
-            if matrix is not None:
-                check_shape(name, matrix, shape)
+        if self.objective.Q_d is not None:
+            check_shape("Q_d", self.objective.Q_d, (nu, nu))
+        if self.objective.P is not None:
+            check_shape("P", self.objective.P, (n, n))
         for constraint in self.every_constraint:
             m = constraint.lower.shape[-1]
             for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
-                if matrix is not None:
-                    steps = (self.horizon,) if matrix.ndim == 3 else ()
-                    check_shape(f"{constraint.name}.{name}", matrix, (*steps, m, columns))
+                if matrix is None:
+                    continue
+                shape: tuple[int, ...] = (m, columns)
+                if matrix.ndim == 3:
+                    shape = (self.horizon, m, columns)
+                check_shape(f"{constraint.name}.{name}", matrix, shape)
             if constraint.lower.ndim == 2:
                 check_shape(f"{constraint.name}.lower", constraint.lower, (self.horizon, m))
 
@@ -253,7 +258,9 @@ class Problem:
     @property
     def every_constraint(self) -> tuple[Constraint, ...]:
         """The paper's constraints, in the order of `Bounds.constraints`, then the others."""
-        return (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
+        if self.bounds is None:
+            return self.constraints
+        return (*self.bounds.constraints, *self.constraints)
 
     def rates(self, reference: Array) -> Array | None:
         """Return the `reference_rates` of a preview (N, 4); None if no desired output depends on them."""
@@ -320,75 +327,7 @@ class Problem:
         constraints = self.every_constraint
         if not constraints:
             raise ValueError("a constrained MPC needs a problem with bounds")
-        N = self.horizon
-        n = self.model.n
-        nu = self.model.nu
-        parts = [(part, part.lower.shape[-1]) for part in constraints]
-        differing = (N,) if any(part.C is not None and part.C.ndim == 3 for part in constraints) else ()
-
-        def stacked(name: str, columns: int, steps: tuple[int, ...] = ()) -> Array:
-            matrices = [(0.0 if getattr(part, name) is None else getattr(part, name), m) for part, m in parts]
-            return np.concatenate([np.broadcast_to(M, (*steps, m, columns)) for M, m in matrices], axis=-2)
-
-        C = stacked("C", n, differing)
-        D = stacked("D", nu)
-        E = stacked("E", nu)
-        lower = np.concatenate([np.broadcast_to(part.lower, (N, m)) for part, m in parts], axis=1)
-        upper = np.concatenate([np.broadcast_to(part.upper, (N, m)) for part, m in parts], axis=1)
-        l1 = np.concatenate([np.full(m, math.inf) if part.penalty is None else part.penalty.l1 for part, m in parts])
-        l2 = np.concatenate([np.zeros(m) if part.penalty is None else part.penalty.l2 for part, m in parts])
-        names = [part.name for part, m in parts for _ in range(m)]
-        first = np.cumsum([0, *(m for _, m in parts)])
-        slack = np.concatenate(
-            [
-                np.full(m, -1) if part.penalty is None else k + (0 if part.penalty.largest else 1) * np.arange(m)
-                for (part, m), k in zip(parts, first, strict=False)
-            ]
-        )
-        scale = row_scale(_largest_coefficients(C, D, E))
-        for first_row in np.unique(slack[slack >= 0]):
-            shared = slack == first_row
-            scale[shared] = scale[shared].min()
-        C = C * scale[:, None]
-        D = D * scale[:, None]
-        E = E * scale[:, None]
-        lower = lower * scale
-        upper = upper * scale
-        l1 = l1 / scale
-        l2 = l2 / scale**2
-        of_states = C.any(axis=-1) if C.ndim == 2 else C.any(axis=(0, 2))
-
-        def alone(of: Array, other: Array) -> Indices:
-            single = (
-                ~of_states & ~other.any(1) & (np.count_nonzero(of, axis=1) == 1) & (of.max(axis=1, initial=0.0) == 1.0)
-            )
-            return np.where(np.isinf(l1) & single, np.argmax(of, axis=1), -1)
-
-        bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
-        return Rows(
-            scale=scale[bounded],
-            C=C[..., bounded, :],
-            D=D[bounded],
-            E=E[bounded],
-            lower=lower[:, bounded],
-            upper=upper[:, bounded],
-            l1=l1[bounded],
-            l2=l2[bounded],
-            slack=renumbered(slack[bounded]),
-            of_states=np.asarray(~D[bounded].any(axis=1) & ~E[bounded].any(axis=1)).reshape(bounded.size),
-            input=alone(D, E)[bounded],
-            step=alone(E, D)[bounded],
-            names=tuple(names[i] for i in bounded),
-        )
-
-
-def _largest_coefficients(C: Array, D: Array, E: Array) -> Array:
-    """Return (m,) the largest magnitude of a row's coefficients in C (m, n) or (N, m, n), D and E (m, nu)."""
-    of_states = np.abs(C).max(axis=-1, initial=0.0)
-    if C.ndim == 3:
-        of_states = of_states.max(axis=0)
-    of_inputs = np.maximum(np.abs(D).max(axis=1, initial=0.0), np.abs(E).max(axis=1, initial=0.0))
-    return np.asarray(np.maximum(of_states, of_inputs))
+        return stacked_rows(constraints, horizon=self.horizon, n=self.model.n, nu=self.model.nu)
 
 
 class Query(NamedTuple):

@@ -25,7 +25,8 @@ IN_DEGREES: Final = frozenset(
     name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad")
 )
 """States that scenario files give in degrees (per second)."""
-TERMS: Final = (*STATE_NAMES, *(f"speed_{i + 1}" for i in range(N_ROTORS)))
+_SPEEDS: Final = tuple(f"speed_{i + 1}" for i in range(N_ROTORS))
+TERMS: Final = (*STATE_NAMES, *_SPEEDS)
 """The quantities that the rows of a polytope may combine."""
 
 
@@ -92,19 +93,23 @@ class Polytope:
         C = np.zeros((count, N_STATES))
         D = np.zeros((count, N_ROTORS))
         for name, column in zip(self.of, rows.T, strict=True):
-            if name in INDEX:
-                C[:, INDEX[name]] = column * (math.degrees(1.0) if name in IN_DEGREES else 1.0)
+            if name in IN_DEGREES:
+                C[:, INDEX[name]] = column * math.degrees(1.0)
+            elif name in INDEX:
+                C[:, INDEX[name]] = column
             else:
                 D[:, int(name.removeprefix("speed_")) - 1] = column
-        return Constraint(
-            name=self.name,
-            lower=np.full(count, -math.inf) if self.lower is None else np.array(self.lower, float),
-            upper=np.full(count, math.inf) if self.upper is None else np.array(self.upper, float),
-            C=C,
-            D=D,
-            penalty=None if self.soft is None else self.soft.penalty(count),
-            origins=tuple(map(self._origin, range(count))),
-        )
+        lower = np.full(count, -math.inf)
+        upper = np.full(count, math.inf)
+        if self.lower is not None:
+            lower = np.array(self.lower, float)
+        if self.upper is not None:
+            upper = np.array(self.upper, float)
+        penalty = None
+        if self.soft is not None:
+            penalty = self.soft.penalty(count)
+        origins = tuple(map(self._origin, range(count)))
+        return Constraint(name=self.name, lower=lower, upper=upper, C=C, D=D, penalty=penalty, origins=origins)
 
     def _origin(self, row: int) -> Origin:
         units = set()

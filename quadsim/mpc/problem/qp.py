@@ -71,7 +71,8 @@ class QPRows:
         self.upper = rows.upper[:, origin].copy()
         self.lower[:, hard.size : hard.size + above.size] = -np.inf
         self.upper[:, hard.size + above.size :] = np.inf
-        self.u_min, self.u_max = (np.full((problem.horizon, problem.model.nu), side) for side in (-np.inf, np.inf))
+        self.u_min = np.full((problem.horizon, problem.model.nu), -np.inf)
+        self.u_max = np.full((problem.horizon, problem.model.nu), np.inf)
         for row, j in zip(self._boxed, rows.input[self._boxed], strict=True):
             self.u_min[:, j] = np.maximum(self.u_min[:, j], rows.lower[:, row])
             self.u_max[:, j] = np.minimum(self.u_max[:, j], rows.upper[:, row])

@@ -26,6 +26,8 @@ _NEAR: Final = 1e-3
 four equal modes of x, vx, pitch and its rate by some 1e-4."""
 _RANK: Final = 1e-9  # least size of a further direction of what outputs show, relative to the matrix
 _PART: Final = 1e-6  # least size of a state in a mode that is named after it
+_ROTORS: Final = tuple(f"rotor {i + 1}" for i in range(N_ROTORS))
+_VEHICLES_STATES: Final = (*STATE_NAMES, *_ROTORS)
 
 
 def lqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
@@ -52,18 +54,18 @@ def stabilising(
     Raises:
         ValueError: there is no such regulator; the text says which states do not come to rest.
     """
-    names = states or [*STATE_NAMES, *(f"rotor {i + 1}" for i in range(N_ROTORS))]
-    adrift = undetected(A, C)
-    if adrift.size:
-        raise ValueError(f"nothing weighted shows {_listed(adrift, names)}, which would not come to rest")
+    names = states or _VEHICLES_STATES
+    hidden = undetected(A, C)
+    if hidden.size:
+        raise ValueError(f"nothing weighted shows {_listed(hidden, names)}, which would not come to rest")
     try:
         P = scipy.linalg.solve_discrete_are(A, B, C.T @ Q @ C, R)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise ValueError("with these weights the Riccati equation has no solution") from error
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-    adrift = _states_of(_moving(A - B @ K))
-    if adrift.size:
-        raise ValueError(f"with these weights nothing brings {_listed(adrift, names)} to rest")
+    moving = _states_of(_moving(A - B @ K))
+    if moving.size:
+        raise ValueError(f"with these weights nothing brings {_listed(moving, names)} to rest")
     return np.asarray(P), np.asarray(K)
 
 
@@ -107,4 +109,10 @@ def _states_of(basis: Array) -> Indices:
 
 def _listed(indices: Indices, names: Sequence[str]) -> str:
     """Return the names of states, of `state i` where one has none."""
-    return ", ".join(names[i] if i < len(names) else f"state {i + 1}" for i in indices.tolist())
+    listed = []
+    for i in indices.tolist():
+        if i < len(names):
+            listed.append(names[i])
+        else:
+            listed.append(f"state {i + 1}")
+    return ", ".join(listed)

@@ -161,7 +161,9 @@ class RigidBody:
 
     def thrusts(self, shares: Array) -> Array:
         """Return the rotor thrusts [N] for inputs, or for the rotors' states."""
-        return self.largest_thrust * (np.square(shares) if self.inputs is Inputs.SPEED else shares)
+        if self.inputs is Inputs.SPEED:
+            return self.largest_thrust * np.square(shares)
+        return self.largest_thrust * shares
 
     def shares(self, thrusts: Array) -> Array:
         """Return the inputs for rotor thrusts [N]; negative ones count as zero if inputs are speeds."""
@@ -230,7 +232,9 @@ def inner_response(step: float, count: int, lag: float, attitude_lag: float | No
     """
     times = step * np.arange(count)
     if attitude_lag is None:
-        left = np.exp(-times / lag) if lag else np.zeros(count)
+        left = np.zeros(count)
+        if lag > 0.0:
+            left = np.exp(-times / lag)
         return left, np.zeros(count)
     lag = max(lag, SHORTEST_LAG)
     # Of the turn theta, the rate omega and the held target omega_0.

@@ -179,7 +179,9 @@ def _corrected(
     C = C @ basis
     E = basis.T @ E
     K = correction(*discretise(A, B, period), C / sizes[:, None], SPEED_SHARE * vehicle.hover_speed)
-    largest = (2.0 if estimated else 1.0) * np.repeat([settings.acceleration, settings.angular_acceleration], 3)
+    largest = np.repeat([settings.acceleration, settings.angular_acceleration], 3)
+    if estimated:  # a disturbance that changes sign differs from its estimate by twice the bounds
+        largest = 2.0 * largest
     return A, B, C, E * largest, K
 
 

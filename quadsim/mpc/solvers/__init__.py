@@ -104,15 +104,10 @@ def solver_entries() -> dict[str, SolverEntry]:
         return entries
     from qpsolvers import available_solvers  # imports every installed solver
 
-    others = sorted({*available_solvers} - {*entries, *ALIASES})
-    return entries | {
-        name: SolverEntry(
-            description=f"{name} through qpsolvers, condensed, set up anew in each period",
-            package="qpsolvers",
-            extra="solvers",
-        )
-        for name in others
-    }
+    for name in sorted({*available_solvers} - {*entries, *ALIASES}):
+        description = f"{name} through qpsolvers, condensed, set up anew in each period"
+        entries[name] = SolverEntry(description=description, package="qpsolvers", extra="solvers")
+    return entries
 
 
 def make_backend(name: str) -> Backend:
@@ -239,8 +234,8 @@ class QPSolver:
         state, desired, u_before = query[:3]
         form = self.formulation
         if not math.isfinite(state.sum() + desired.sum() + u_before.sum()):
-            nowhere = np.full_like(form.qp.c, math.nan)
-            return Answer(form.inputs(nowhere), form.slacks(nowhere), INVALID_DATA, self.name)
+            no_solution = np.full_like(form.qp.c, math.nan)
+            return Answer(form.inputs(no_solution), form.slacks(no_solution), INVALID_DATA, self.name)
         started = clock.perf_counter()
         if self._free is None:
             answer = None

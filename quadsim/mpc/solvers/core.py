@@ -48,18 +48,21 @@ class CoreProblem:
         # Independent hard rows are at most as many as inputs; violated soft rows may add their number.
         N = problem.horizon
         rows = self.tables.rows
-        at_most = N * (N_ROTORS + sum(math.isfinite(row.l1) for row in rows))
+        soft_rows = sum(math.isfinite(row.l1) for row in rows)
+        at_most = N * (N_ROTORS + soft_rows)
         room = min(N * len(rows), at_most) + 1
         self.struct = self._filled(struct("quadsim_problem"), members(self.tables, room=room, changes=MOST_CHANGES))
 
     def _filled(self, kind: type[Filled], values: Mapping[str, Any]) -> Filled:
         """Return a struct, and keep the memory that it points to."""
-        return kind(**{name: self._member(name, value) for name, value in values.items()})
+        members = {name: self._member(name, value) for name, value in values.items()}
+        return kind(**members)
 
     def _member(self, name: str, value: Any) -> int | float:
         if isinstance(value, list):
             kind = ENTRIES[name]
-            value = (kind * len(value))(*(self._filled(kind, entry) for entry in value))
+            entries = [self._filled(kind, entry) for entry in value]
+            value = (kind * len(value))(*entries)
         elif not isinstance(value, np.ndarray):
             return value
         self._kept.append(value)
@@ -128,14 +131,13 @@ class Optimum:
         self._soft = rows.soft
         self._scale = rows.scale
         self._slack_scale = rows.slack_scale
-        self._no_slacks, self._no_multipliers = (
-            read_only(np.zeros((problem.horizon, count))) for count in (rows.soft.size, len(rows.D))
-        )
+        self._no_slacks = read_only(np.zeros((problem.horizon, rows.soft.size)))
+        self._no_multipliers = read_only(np.zeros((problem.horizon, len(rows.D))))
         step_rows = shared.struct.step_rows
         self.plan = self._view(work.plan, ctypes.c_double, N_ROTORS)
-        self._multiplier, self._value, self._shift = (
-            self._view(at, ctypes.c_double, step_rows) for at in (work.multiplier, work.value, work.shift)
-        )
+        self._multiplier = self._view(work.multiplier, ctypes.c_double, step_rows)
+        self._value = self._view(work.value, ctypes.c_double, step_rows)
+        self._shift = self._view(work.shift, ctypes.c_double, step_rows)
         self._side = self._view(work.last, ctypes.c_int8, step_rows)
 
     def _view(self, address: int, kind: type[ctypes.c_double | ctypes.c_int8], columns: int) -> Array:
@@ -154,16 +156,21 @@ class Optimum:
         method = Method(found)
         plan = self.plan.copy()
         slacks = self.slacks(method)
-        multipliers = self._no_multipliers
-        active = 0
-        if method is not Method.FREE:
+        if method is Method.FREE:
+            multipliers = self._no_multipliers
+            active = 0
+            status = UNCONSTRAINED
+            answered_by = GAIN
+        else:
             multipliers = self._multiplier * self._scale
             active = self.active
+            status = SOLVED
+            answered_by = CORE
         return Answer(
             plan,
             slacks,
-            UNCONSTRAINED if method is Method.FREE else SOLVED,
-            GAIN if method is Method.FREE else CORE,
+            status,
+            answered_by,
             method=method,
             certificate=partial(self._certificate, query, plan, slacks, multipliers),
             stats=Statistics(iterations=self._work.changes, active=active, solve_s=clock.perf_counter() - started),
@@ -230,7 +237,8 @@ class Core:
         parts = np.split(self._query, np.cumsum(sizes[:-1]))
         self._state, desired, self._x_s, self._u_s, self._before = parts
         self._desired = desired.reshape(p.horizon, -1)
-        self._arguments = self._work, *(part.ctypes.data for part in parts)
+        addresses = [part.ctypes.data for part in parts]
+        self._arguments = self._work, *addresses
 
     def __reduce__(self) -> NoReturn:
         """Refuse: addresses are useless in a copy or another process."""
@@ -250,7 +258,7 @@ class Core:
         """See `quadsim.mpc.solvers.Solver.solve`."""
         started = clock.perf_counter()
         state, desired, u_before, rest, _ = query
-        x_s, u_s = self._equilibrium if rest is None else rest
+        x_s, u_s = rest or self._equilibrium
         self._state[:] = state
         self._desired[:] = desired
         self._x_s[:] = x_s

@@ -68,7 +68,8 @@ def axes(problem: Problem) -> list[Axis]:
     if count == 1 or on_nothing:
         return [whole]
     parts = []
-    for states in (np.flatnonzero(label == g) for g in range(count)):
+    for g in range(count):
+        states = np.flatnonzero(label == g)
         regulated = C_r[:, states].any(axis=1)
         outputs = bounded & C[:, states].any(axis=1)
         if reach[:, states].any() and regulated.any():
@@ -78,35 +79,40 @@ def axes(problem: Problem) -> list[Axis]:
         elif outputs.any():
             return [whole]
     if objective.Q_d is not None:
-        T = np.hstack([axis.T for axis in parts])
-        of = np.repeat(range(len(parts)), [axis.T.shape[1] for axis in parts])
+        inputs = [axis.T for axis in parts]
+        T = np.hstack(inputs)
+        axis_of_input = np.repeat(range(len(parts)), [part.shape[1] for part in inputs])
         moves = np.abs(T.T @ objective.Q_d @ T)
-        if T.shape[0] != T.shape[1] or (moves[of[:, None] != of] > COUPLING_ROUNDING * moves.max()).any():
+        across = moves[axis_of_input[:, None] != axis_of_input]
+        if T.shape[0] != T.shape[1] or (across > COUPLING_ROUNDING * moves.max()).any():
             return [whole]
     return parts
 
 
 def axis_of(problem: Problem, T: Array, states: Indices, regulated: Indices, outputs: Indices) -> Axis:
     """Return the axis of inputs along T, with these states, rows of C_r and rows."""
-    model = problem.model
-    objective = problem.objective
+    model = LinearModel(
+        A=problem.model.A[np.ix_(states, states)],
+        B=problem.model.B[states] @ T,
+        u_bar=np.zeros(T.shape[1]),
+        period=problem.model.period,
+    )
+    whole = problem.objective
+    Q_d = None
+    P = None
+    if whole.Q_d is not None:
+        Q_d = symmetric(T.T @ whole.Q_d @ T)
+    if whole.P is not None:
+        P = whole.P[np.ix_(states, states)]
+    objective = Objective(
+        C_r=whole.C_r[np.ix_(regulated, states)],
+        Q_y=whole.Q_y[np.ix_(regulated, regulated)],
+        Q_u=symmetric(T.T @ whole.Q_u @ T),
+        Q_d=Q_d,
+        P=P,
+    )
     return Axis(
-        problem=Problem(
-            model=LinearModel(
-                A=model.A[np.ix_(states, states)],
-                B=model.B[states] @ T,
-                u_bar=np.zeros(T.shape[1]),
-                period=model.period,
-            ),
-            horizon=problem.horizon,
-            objective=Objective(
-                C_r=objective.C_r[np.ix_(regulated, states)],
-                Q_y=objective.Q_y[np.ix_(regulated, regulated)],
-                Q_u=symmetric(T.T @ objective.Q_u @ T),
-                Q_d=None if objective.Q_d is None else symmetric(T.T @ objective.Q_d @ T),
-                P=None if objective.P is None else objective.P[np.ix_(states, states)],
-            ),
-        ),
+        problem=Problem(model=model, horizon=problem.horizon, objective=objective),
         states=states,
         regulated=regulated,
         outputs=outputs,

@@ -118,23 +118,27 @@ def tables(problem: Problem) -> Tables:
     if problem.model.nu != N_ROTORS:
         raise ParameterError("controller", "problem", f"{problem.model.nu} inputs", f"of {N_ROTORS} inputs")
     parts, T = _all_axes(problem)
-    entries = sum((N * (part.T.shape[1] + part.outputs.size)) ** 2 // 2 for part in parts)
+    entries = 0
+    for part in parts:
+        channels = N * (part.T.shape[1] + part.outputs.size)
+        entries += channels**2 // 2
     if entries > LARGEST_RESPONSES:
         rule = f"so short that its responses have at most {LARGEST_RESPONSES} numbers; they have {entries}"
         raise ParameterError("controller", "horizon", N, rule)
     T_inverse = np.array(np.linalg.inv(T), float)
     T_inverse[np.abs(T_inverse) < ROW_ROUNDING * np.abs(T_inverse).max()] = 0.0
-    first = np.cumsum([0, *(part.T.shape[1] for part in parts)]).tolist()
-    axis_tables = [_axis(rows, part, at, N) for part, at in zip(parts, first, strict=False)]
+    axis_tables = []
+    first = 0
+    for part in parts:
+        axis_tables.append(_axis(rows, part, first, N))
+        first += part.T.shape[1]
     row_tables = [_row(rows, i, axis_tables) for i in range(rows.l1.size)]
-    for name, count, most in (
-        ("states of an axis", max(len(part.B) for part in axis_tables), MOST_STATES),
-        ("rows of a step", len(row_tables), MOST_STEP_ROWS),
-    ):
-        if count > most:
-            raise ParameterError("controller", "problem", f"{count} {name}", f"such that there are at most {most}")
-    alike = bool((rows.lower == rows.lower[0]).all() and (rows.upper == rows.upper[0]).all())
-    steps = slice(0, 1) if alike else slice(None)
+    most_states = max(len(part.B) for part in axis_tables)
+    _require_at_most(MOST_STATES, most_states, "states of an axis")
+    _require_at_most(MOST_STEP_ROWS, len(row_tables), "rows of a step")
+    steps = slice(None)
+    if (rows.lower == rows.lower[0]).all() and (rows.upper == rows.upper[0]).all():
+        steps = slice(0, 1)
     scale = _scale(axis_tables, row_tables, T, N)
     return Tables(
         problem=problem,
@@ -157,10 +161,13 @@ def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
     """
     problem = tables.problem
     rows = tables.rows
-    past = np.cumsum([len(row.terms) for row in rows]).tolist()
-    reals = {name: getattr(tables, name) for name in ("modes", "T", "T_inverse", "scale", "tolerance")}
-    reals["C_r"] = problem.objective.C_r
-    limits = {name: np.clip(getattr(tables, name), -NO_BOUND, NO_BOUND) for name in ("lower", "upper")}
+    row_members = []
+    terms: list[dict[str, Any]] = []
+    for r, row in enumerate(rows):
+        first = len(terms)
+        for coefficient, j, lag in row.terms:
+            terms.append({"coefficient": coefficient, "input": j, "lag": lag})
+        row_members.append(_row_members(row, output=_output(tables, r), first=first, past=len(terms)))
     return {
         "horizon": problem.horizon,
         "states": problem.model.n,
@@ -172,34 +179,55 @@ def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
         "changes": changes,
         "bounds_differ": int(len(tables.lower) > 1),
         "mixed": int(any(row.axis >= 0 and row.terms for row in rows)),
-        **{name: np.array(value, float, order="C") for name, value in (reals | limits).items()},
+        "modes": _reals(tables.modes),
+        "T": _reals(tables.T),
+        "T_inverse": _reals(tables.T_inverse),
+        "scale": _reals(tables.scale),
+        "tolerance": _reals(tables.tolerance),
+        "C_r": _reals(problem.objective.C_r),
+        "lower": _reals(np.clip(tables.lower, -NO_BOUND, NO_BOUND)),
+        "upper": _reals(np.clip(tables.upper, -NO_BOUND, NO_BOUND)),
         "axes": [_axis_members(part, bounded=bool(rows)) for part in tables.axes],
-        "rows": [
-            {
-                "axis": row.axis,
-                "output": tables.axes[row.axis].rows.index(r) if row.axis >= 0 else 0,
-                "later": int(row.later),
-                "first": end - len(row.terms),
-                "past": end,
-                "soft": int(math.isfinite(row.l1)),
-                "l1": row.l1 if math.isfinite(row.l1) else 0.0,
-                "compliance": row.compliance,
-            }
-            for r, (row, end) in enumerate(zip(rows, past, strict=True))
-        ],
-        "terms": [
-            {"coefficient": coefficient, "input": j, "lag": lag} for row in rows for coefficient, j, lag in row.terms
-        ],
+        "rows": row_members,
+        "terms": terms,
     }
+
+
+def _output(tables: Tables, r: int) -> int:
+    """Return which of its axis's rows a row is; 0 of a row without states."""
+    axis = tables.rows[r].axis
+    if axis < 0:
+        return 0
+    return tables.axes[axis].rows.index(r)
+
+
+def _row_members(row: RowTables, *, output: int, first: int, past: int) -> dict[str, Any]:
+    """Return the members of a `quadsim_row`, whose terms are those from `first` on, before `past`."""
+    soft = math.isfinite(row.l1)
+    return {
+        "axis": row.axis,
+        "output": output,
+        "later": int(row.later),
+        "first": first,
+        "past": past,
+        "soft": int(soft),
+        "l1": row.l1 if soft else 0.0,
+        "compliance": row.compliance,
+    }
+
+
+def _reals(values: Array) -> Array:
+    """Return a copy as doubles, row by row."""
+    return np.array(values, float, order="C")
 
 
 def _axis_members(part: AxisTables, *, bounded: bool) -> dict[str, Any]:
     """Return the members of a `quadsim_axis`; its responses only if there are rows."""
     n, m = part.B.shape
-    responses = part.responses[np.tril_indices(len(part.responses))]
-    responses[np.abs(responses) < TINY * np.abs(responses).max(initial=0.0)] = 0.0
-    reals = {name: getattr(part, name) for name in ("B", "closed", "K", "inverse", "W", "W_end", "C")}
-    places = {"state": part.states, "target": part.regulated, "row": part.rows}
+    responses = np.zeros(0)
+    if bounded:
+        responses = part.responses[np.tril_indices(len(part.responses))]
+        responses[np.abs(responses) < TINY * np.abs(responses).max(initial=0.0)] = 0.0
     return {
         "states": n,
         "inputs": m,
@@ -207,10 +235,24 @@ def _axis_members(part: AxisTables, *, bounded: bool) -> dict[str, Any]:
         "outputs": len(part.rows),
         "targets": len(part.regulated),
         "before": int(part.before),
-        **{name: np.array(values, np.uint8) for name, values in places.items()},
-        **{name: np.array(value, float, order="C") for name, value in reals.items()},
-        "responses": responses if bounded else np.zeros(0),
+        "state": np.array(part.states, np.uint8),
+        "target": np.array(part.regulated, np.uint8),
+        "row": np.array(part.rows, np.uint8),
+        "B": _reals(part.B),
+        "closed": _reals(part.closed),
+        "K": _reals(part.K),
+        "inverse": _reals(part.inverse),
+        "W": _reals(part.W),
+        "W_end": _reals(part.W_end),
+        "C": _reals(part.C),
+        "responses": responses,
     }
+
+
+def _require_at_most(most: int, count: int, name: str) -> None:
+    """Reject a problem with more of something than the core has room for."""
+    if count > most:
+        raise ParameterError("controller", "problem", f"{count} {name}", f"such that there are at most {most}")
 
 
 def with_constraints(problem: Problem) -> Problem:
@@ -235,15 +277,23 @@ def _modes(problem: Problem) -> Array:
     model = problem.model
     objective = problem.objective
     n = N_STATES
-    without = Problem(
+    P = None
+    if objective.P is not None:
+        P = objective.P[:n, :n]
+    constraints = []
+    for part in problem.every_constraint:
+        if part.C is None:
+            constraints.append(part)
+        else:
+            constraints.append(replace(part, C=part.C[:, :n]))
+    without_rotors = Problem(
         model=replace(model, A=model.A[:n, :n], B=model.B[:n]),
         horizon=problem.horizon,
-        objective=replace(objective, C_r=objective.C_r[:, :n], P=None if objective.P is None else objective.P[:n, :n]),
-        constraints=tuple(
-            part if part.C is None else replace(part, C=part.C[:, :n]) for part in problem.every_constraint
-        ),
+        objective=replace(objective, C_r=objective.C_r[:, :n], P=P),
+        constraints=tuple(constraints),
     )
-    return np.array(np.linalg.inv(_all_axes(without)[1]), float)
+    _, T = _all_axes(without_rotors)
+    return np.array(np.linalg.inv(T), float)
 
 
 def _in_modes(problem: Problem, modes: Array) -> Problem:
@@ -284,7 +334,8 @@ def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:
 
 
 def _axis(rows: Rows, part: Axis, first: int, N: int) -> AxisTables:
-    n, m = (part.states.size, part.T.shape[1])
+    n = part.states.size
+    m = part.T.shape[1]
     objective = part.problem.objective
     model = part.problem.model
     A = model.A
@@ -299,7 +350,8 @@ def _axis(rows: Rows, part: Axis, first: int, N: int) -> AxisTables:
         B = np.vstack([B, np.eye(m)])
         Q = scipy.linalg.block_diag(Q, objective.Q_d)
         Q_end = scipy.linalg.block_diag(Q_end, np.zeros((m, m)))
-        W, W_end = (np.vstack([weight, np.zeros((m, weight.shape[1]))]) for weight in (W, W_end))
+        W = np.vstack([W, np.zeros((m, W.shape[1]))])
+        W_end = np.vstack([W_end, np.zeros((m, W_end.shape[1]))])
         C = np.hstack([C, np.zeros((len(C), m))])
         R = R + objective.Q_d
         S = np.hstack([S, -objective.Q_d])
@@ -341,21 +393,21 @@ def _gains(A: Array, B: Array, Q: Array, Q_end: Array, R: Array, S: Array, N: in
 
 
 def _row(rows: Rows, i: int, axes: list[AxisTables]) -> RowTables:
-    axis = next((g for g, part in enumerate(axes) if i in part.rows), -1)
-    now = rows.D[i] + rows.E[i]
-    before = -rows.E[i]
-    terms = [(float(now[j]), j, 0) for j in np.flatnonzero(now).tolist()]
-    terms += [(float(before[j]), j, 1) for j in np.flatnonzero(before).tolist()]
+    axis = -1
+    for g, part in enumerate(axes):
+        if i in part.rows:
+            axis = g
+            break
+    terms = []
+    for lag, coefficients in enumerate((rows.D[i] + rows.E[i], -rows.E[i])):
+        for j in np.flatnonzero(coefficients).tolist():
+            terms.append((float(coefficients[j]), j, lag))
     l1 = float(rows.l1[i])
     l2 = float(rows.l2[i])
-    hard = math.isinf(l1)
-    return RowTables(
-        axis=axis,
-        later=bool(rows.of_states[i]),
-        terms=terms,
-        l1=l1,
-        compliance=0.0 if hard else 0.5 / max(l2, LEAST_QUADRATIC * max(l1, 1.0)),
-    )
+    compliance = 0.0
+    if math.isfinite(l1):
+        compliance = 0.5 / max(l2, LEAST_QUADRATIC * max(l1, 1.0))
+    return RowTables(axis=axis, later=bool(rows.of_states[i]), terms=terms, l1=l1, compliance=compliance)
 
 
 def _scale(axes: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> Array:
@@ -365,11 +417,12 @@ def _scale(axes: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> A
         total = np.zeros(N)
         for g, part in enumerate(axes):
             width = part.inputs + len(part.rows)
+            entries = []
             if row.axis == g:
-                entries = [(1.0, part.inputs + part.rows.index(r), 0)]
-            else:
-                entries = []
-            entries += [(c * T[j, part.first + a], a, lag) for c, j, lag in row.terms for a in range(part.inputs)]
+                entries.append((1.0, part.inputs + part.rows.index(r), 0))
+            for coefficient, j, lag in row.terms:
+                for a in range(part.inputs):
+                    entries.append((coefficient * T[j, part.first + a], a, lag))
             for left, a, lag in entries:
                 for right, b, other in entries:
                     first = max(lag, other)

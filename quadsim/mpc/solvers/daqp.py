@@ -77,7 +77,9 @@ class DaqpDense:
 
 def _dense(matrix: Matrix) -> Array:
     """Return a C-contiguous copy of a matrix."""
-    return np.array(matrix.toarray() if isinstance(matrix, csc_matrix) else matrix, order="C")
+    if isinstance(matrix, csc_matrix):
+        matrix = matrix.toarray()
+    return np.array(matrix, order="C")
 
 
 def _bounds(qp: QP) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from quadsim.controller import SOLVED, Statistics
 from quadsim.mpc.problem.qp import QP, Solution
+from quadsim.state import Array
 
 MAX_ITERATIONS: Final = 100  # limit for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 8 to 23
 
@@ -78,7 +79,9 @@ class Piqp:
         """
         self._kept = _bounded(qp)
         self._last = qp
-        G, h_l, h_u = (self._of_rows(part) for part in (qp.G, qp.h_l, qp.h_u))
+        G = self._of_rows(qp.G)
+        h_l = self._of_rows(qp.h_l)
+        h_u = self._of_rows(qp.h_u)
         self._solver.setup(qp.P, qp.c, qp.A, qp.b, G, h_l, h_u, qp.x_l, qp.x_u)
 
     def solve(self, qp: QP) -> Solution:
@@ -106,10 +109,8 @@ class Piqp:
         elapsed = clock.perf_counter() - started
         result = self._solver.result
         info = self._solver.result.info
-        # At an interior-point optimum, a constraint is active if its slack is small and below its multiplier.
-        lower = (result.z_l, result.s_l)
-        upper = (result.z_u, result.s_u)
-        box = (result.z_bl, result.s_bl), (result.z_bu, result.s_bu)
+        active = _active(result.z_l, result.s_l) + _active(result.z_u, result.s_u)
+        active += _active(result.z_bl, result.s_bl) + _active(result.z_bu, result.s_bu)
         z = np.zeros(len(self._kept))
         z[self._kept] = result.z_u - result.z_l
         return Solution(
@@ -120,7 +121,7 @@ class Piqp:
             status=STATUS[status],
             stats=Statistics(
                 iterations=int(info.iter),
-                active=sum(int(np.count_nonzero(np.minimum(m, ACTIVE_SLACK) > s)) for m, s in (lower, upper, *box)),
+                active=active,
                 reported_primal=float(info.primal_res),
                 reported_dual=float(info.dual_res),
                 solve_s=elapsed,
@@ -132,6 +133,11 @@ class Piqp:
         if self._kept.all():
             return part
         return part[self._kept]
+
+
+def _active(multipliers: Array, slacks: Array) -> int:
+    """Return how many constraints are active at an interior-point optimum: their slacks are small, and below these."""
+    return int(np.count_nonzero(np.minimum(multipliers, ACTIVE_SLACK) > slacks))
 
 
 def _bounded(qp: QP) -> NDArray[np.bool_]:

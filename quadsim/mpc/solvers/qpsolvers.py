@@ -51,7 +51,9 @@ class AnyOfQpsolvers:
         above = np.isfinite(upper)
         below = np.isfinite(lower)
         one_sided = np.concatenate([rows[above], -rows[below]])
-        equalities = (self._matrix(qp.A), qp.b) if qp.b.size else (None, None)
+        equalities: tuple[Any, Any] = (None, None)
+        if qp.b.size:
+            equalities = (self._matrix(qp.A), qp.b)
         problem = qpsolvers.Problem(
             self._matrix(qp.P),
             qp.c,
@@ -68,8 +70,9 @@ class AnyOfQpsolvers:
         multipliers = np.zeros(upper.size)
         y = np.full(qp.b.size, np.nan)
         if answer.found and answer.x is not None and answer.z is not None:
-            y = y if answer.y is None else answer.y
             x = answer.x
+            if answer.y is not None:
+                y = answer.y
             of_upper, of_lower = np.split(answer.z, [np.count_nonzero(above)])
             multipliers[above] += of_upper
             multipliers[below] -= of_lower
@@ -77,11 +80,14 @@ class AnyOfQpsolvers:
             x = np.full_like(qp.c, np.nan)
             multipliers = multipliers * np.nan
         z_box, z = np.split(multipliers, [qp.c.size])
+        status = SOLVED
+        if np.isnan(x).any():
+            status = UNSOLVED
         return Solution(
             x=x,
             y=y,
             z=z,
             z_box=z_box,
-            status=UNSOLVED if np.isnan(x).any() else SOLVED,
+            status=status,
             stats=Statistics(active=int(np.count_nonzero(np.abs(multipliers) > ACTIVE_MULTIPLIER)), solve_s=elapsed),
         )

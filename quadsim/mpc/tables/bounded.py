@@ -34,7 +34,7 @@ from quadsim.state import REFERENCE_RATES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 USUAL_SOLVER: Final = "piqp"
-"""The QP solver of a law whose table states none; that of `robust` is the core, where it takes the problem."""
+"""The QP solver of a controller whose table states none; that of `robust` is the core, where it takes the problem."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,8 @@ class Weighted(ControllerTable):
 
     def __post_init__(self) -> None:
         require_states(self.output_weights, "output_weights")
-        rates = [STATE_NAMES[i] for i in REFERENCE_RATES if STATE_NAMES[i] in self.output_weights]
+        rate_names = [STATE_NAMES[i] for i in REFERENCE_RATES]
+        rates = [name for name in rate_names if name in self.output_weights]
         if self.horizon < 2 and rates and self.desired_rates == "reference":
             raise ValueError(
                 f"horizon must be at least 2 where output_weights have {', '.join(rates)}, whose desired values are "
@@ -147,16 +148,31 @@ class Bounded(Weighted):
     def output_limits(self) -> tuple[Array, Array, Array]:
         """Return C_c (n_c, 12), y_min and y_max (n_c,) of the bounds on outputs, in SI units."""
         names = [name for name in STATE_NAMES if name in self.output_bounds]
-        scale = np.array([math.radians(1.0) if name in IN_DEGREES else 1.0 for name in names])
-        lower, upper = scale * np.array([self.output_bounds[name] for name in names], float).reshape(-1, 2).T
+        lower = np.empty(len(names))
+        upper = np.empty(len(names))
+        for i, name in enumerate(names):
+            scale = 1.0
+            if name in IN_DEGREES:
+                scale = math.radians(1.0)
+            least, most = self.output_bounds[name]
+            lower[i] = scale * least
+            upper[i] = scale * most
         return selection(names), lower, upper
 
     def bounds(self) -> Bounds:
         """Return the bounds in SI units."""
-        u_min, u_max = (np.full(N_ROTORS, bound) for bound in self.input_bounds.speed)
-        down, up = (np.full(N_ROTORS, bound) for bound in self.input_bounds.slew)
+        slowest, fastest = self.input_bounds.speed
+        down, up = self.input_bounds.slew
         C_c, lower, upper = self.output_limits()
-        return Bounds(C_c=C_c, y_min=lower, y_max=upper, delta_min=down, delta_max=up, u_min=u_min, u_max=u_max)
+        return Bounds(
+            C_c=C_c,
+            y_min=lower,
+            y_max=upper,
+            delta_min=np.full(N_ROTORS, down),
+            delta_max=np.full(N_ROTORS, up),
+            u_min=np.full(N_ROTORS, slowest),
+            u_max=np.full(N_ROTORS, fastest),
+        )
 
     def constraints(self, vehicle: Vehicle) -> tuple[Constraint, ...]:
         """Return the rows in addition to `bounds`."""
@@ -209,6 +225,8 @@ def require_states(values: Mapping[str, object], name: str) -> None:
     """Reject a table with an entry that is not a state."""
     for key in values:
         if key not in STATE_NAMES:
+            guess = ""
             near = difflib.get_close_matches(key, STATE_NAMES, n=1)
-            guess = f"; did you mean {near[0]!r}?" if near else ""
+            if near:
+                guess = f"; did you mean {near[0]!r}?"
             raise ValueError(f"{name}.{key} is not a state{guess} (there are: {', '.join(STATE_NAMES)})")

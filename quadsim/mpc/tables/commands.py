@@ -1,4 +1,4 @@
-"""Weights and bounds of what laws command: rotor speeds, or an autopilot's targets."""
+"""Weights and bounds of what controllers command: rotor speeds, or an autopilot's targets."""
 
 from __future__ import annotations
 
@@ -15,17 +15,15 @@ from quadsim.errors import ParameterError
 from quadsim.fields import Pair, Positive, Weight
 from quadsim.mpc.guard.answer import ActuatorBounds
 from quadsim.mpc.pilot.allocation import thrust_to_command
-from quadsim.mpc.pilot.attitudes import AttitudeTargets
 from quadsim.mpc.problem.model import SHORTEST_LAG
 from quadsim.mpc.tables.controller import Range, require_ordered
-from quadsim.mpc.tables.lags import require_attitude_lag
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 COMMANDS: Final = (
     "what it commands: rotor speeds, or to an autopilot's inner loop collective thrust and body rates, or collective "
     "thrust and an attitude"
 )
-"""Meaning of the field `commands` of laws that command all of these."""
+"""Meaning of the field `commands` of controllers that command all of these."""
 TARGET_BOUNDS: Final = "only where an autopilot flies; of an attitude, bounds on the body rates that its error commands"
 """Meaning of the field `target_bounds` of such laws."""
 LEAST_THRUST = 0.5
@@ -78,8 +76,12 @@ class RotorBounds:
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """Return the bounds on each rotor's speed [rad/s] and step [rad/s per period], where it has any."""
-        pairs = {"speed": self.speed or (vehicle.speed_min, vehicle.speed_max), "slew": self.slew}
-        return {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
+        slowest, fastest = self.speed or (vehicle.speed_min, vehicle.speed_max)
+        bounds = {"speed": (slowest, fastest)}
+        if self.slew is not None:
+            down, up = self.slew
+            bounds["slew"] = (down, up)
+        return bounds
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """Return the same bounds for the actuators."""
@@ -123,8 +125,10 @@ class TargetBounds:
             rule = f"below and above the weight, {weight:.4g} N"
             raise ParameterError("controller", "target_bounds.thrust", [lower, upper], rule)
         rates = np.broadcast_to(np.asarray(self.body_rate, float), 3).tolist()
-        sides = {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", rates, strict=True)}
-        return {"thrust": (lower, upper), **sides}
+        bounds = {"thrust": (lower, upper)}
+        for axis, rate in zip("xyz", rates, strict=True):
+            bounds[f"body_rate_{axis}"] = (-rate, rate)
+        return bounds
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """Return the same bounds on targets (4,) [N], [rad/s], with unbounded steps."""
@@ -156,13 +160,6 @@ def require_targets(table: Any) -> None:
     if table.commands != ATTITUDE and table.attitude_lag is not None:
         reason = "no attitude is commanded, behind which this is the lag"
         raise ValueError(f'attitude_lag must be absent where commands = "{table.commands}": {reason}')
-
-
-def attitude_targets(table: Any) -> AttitudeTargets | None:
-    """Return what makes attitudes of the body rates of a table's law; None where it commands none so."""
-    if not table.turns_by_attitude:
-        return None
-    return AttitudeTargets(require_attitude_lag(table.attitude_lag))
 
 
 def require_space(table: Any, of_rotors: Mapping[str, object]) -> None:

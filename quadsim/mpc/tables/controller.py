@@ -31,13 +31,13 @@ Law = Annotated[str, doc("the control law, by its name in `quadsim list`")]
 
 
 class ControllerTable:
-    """A table `[controller]`, which builds its law, the guard around it and an inner loop; all else is a default."""
+    """A table `[controller]`: it builds a controller, the guard around it and an inner loop; all else is a default."""
 
-    title: ClassVar[str]  # the law's display name; this and the next two come from `quadsim.mpc.laws.register`
+    title: ClassVar[str]  # the controller's display name; this and the next two come from `quadsim.mpc.laws.register`
     description: ClassVar[str]  # its line in `quadsim list`
-    place: ClassVar[int]  # in lists; laws of one place are in the order of their names
+    place: ClassVar[int]  # in lists; controllers of one place are in the order of their names
     any_attitude: ClassVar = False  # whether the controller reads attitudes as quaternions
-    type: str  # the law's name, as files state and flights record it
+    type: str  # the controller's name, as files state and flights record it
     horizon: int
     polytopes: tuple[Polytope, ...] = ()
     commands: str = ROTORS
@@ -49,7 +49,7 @@ class ControllerTable:
     output_bounds: Mapping[str, Sequence[float]] = MappingProxyType({})
 
     def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """Return the law for a control `period` [s], with obstacles and regions `shapes`.
+        """Return the controller for a control `period` [s], with obstacles and regions `shapes`.
 
         Raises:
             InputError: no controller can be built from these numbers.
@@ -58,15 +58,15 @@ class ControllerTable:
 
     @property
     def turns_by_attitude(self) -> bool:
-        """Whether the law asks for body rates and commands the attitudes whose errors are those rates."""
+        """Whether the controller asks for body rates and commands the attitudes whose errors are those rates."""
         return False
 
     def attitudes(self) -> AttitudeTargets | None:
-        """Return what makes attitudes of the law's body rates; None where its commands are flown as they are."""
+        """Return what makes attitudes of the controller's body rates; None where its commands are flown as they are."""
         return None
 
     def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
-        """Return the fallback contract around the law; None without one."""
+        """Return the fallback contract around the controller; None without one."""
         fallback = self.fallback
         if fallback is None or not fallback.enabled:
             return None
@@ -79,18 +79,18 @@ class ControllerTable:
         )
 
     def level_hover(self, vehicle: Vehicle, period: float) -> LinearModel:
-        """Return the linear model at level hover of what the law commands."""
+        """Return the linear model at level hover of what the controller commands."""
         return hover_model(vehicle, period)
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
-        """Return the bounds on what the law commands."""
+        """Return the bounds on what the controller commands."""
         return ActuatorBounds.of_vehicle(vehicle)
 
     @property
     def holds_speeds(self) -> bool:
         """Whether rotors turn at each command for a whole period, as the audit of a saved run then checks.
 
-        Not behind an autopilot, nor where an inner loop of the law corrects the speeds.
+        Not behind an autopilot, nor where an inner loop of the controller corrects the speeds.
         """
         return self.commands == ROTORS and self.indi is None
 

@@ -17,7 +17,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 LIPO: Final = ((0.0, 3.27), (0.05, 3.61), (0.1, 3.69), (0.5, 3.84), (0.6, 3.87), (0.8, 4.02), (1.0, 4.2))
 """Charge [-] and voltage at rest [V] of a lithium-polymer cell; within 15 mV of https://blog.ampow.com/lipo-voltage-chart."""
 EFFICIENCY: Final = 0.5
-"""Ours: ideal power in hover over battery power, figure of merit 0.6 to 0.7 times motor and ESC 0.8.
+"""Our choice: ideal power in hover over battery power, figure of merit 0.6 to 0.7 times motor and ESC 0.8.
 
 A Crazyflie's brushed motors have some 0.14: 250 mAh last 7 minutes."""
 
@@ -66,10 +66,11 @@ class Battery:
             ParameterError: the curve is impossible, or the current needs a rotor radius.
         """
         charges = [charge for charge, _ in self.curve]
+        voltages = [voltage for _, voltage in self.curve]
         rises = all(low < high for low, high in pairwise(charges))
-        if not rises or (charges[0], charges[-1]) != (0.0, 1.0) or any(voltage <= 0.0 for _, voltage in self.curve):
+        if not rises or (charges[0], charges[-1]) != (0.0, 1.0) or min(voltages) <= 0.0:
             rule = "pairs of a charge that rises from 0 to 1 and a voltage above 0"
-            raise ParameterError("effects.battery", "curve", [list(pair) for pair in self.curve], rule)
+            raise ParameterError("effects.battery", "curve", [*map(list, self.curve)], rule)
         battery = filled(self, reference_voltage=self.cells * self.curve[-1][1])
         if self.hover_current is not None:
             return battery

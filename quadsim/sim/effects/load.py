@@ -100,8 +100,13 @@ def mass_properties(vehicle: Vehicle, load: Load, payloads: Sequence[Payload]) -
     if 2.0 * np.linalg.eigvalsh(moments).max() > np.trace(moments) * (1.0 + 1e-12):
         rule = f"such that no moment of {np.diagonal(moments).tolist()} kg m^2 exceeds the sum of the other two"
         raise ParameterError("effects.load", "inertia_factor", list(load.inertia_factor), rule)
-    masses = np.array([vehicle.mass * load.mass_factor, *(payload.mass for payload in payloads)])
-    positions = np.array([load.centre_of_mass, *(payload.position for payload in payloads)], float)
+    of_parts = [vehicle.mass * load.mass_factor]
+    places = [load.centre_of_mass]
+    for payload in payloads:
+        of_parts.append(payload.mass)
+        places.append(payload.position)
+    masses = np.array(of_parts)
+    positions = np.array(places, float)
     total = float(masses.sum())
     centre = masses @ positions / total
     inertia = moments

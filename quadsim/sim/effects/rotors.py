@@ -69,7 +69,10 @@ class RotorDynamics:
         Raises:
             ParameterError: rotors with inertia change their speed at once.
         """
-        rotors = replace(self, rise=change.rise, fall=change.rise if change.fall is None else change.fall)
+        fall = change.fall
+        if fall is None:
+            fall = change.rise
+        rotors = replace(self, rise=change.rise, fall=fall)
         rotors._check_torque()
         return rotors
 

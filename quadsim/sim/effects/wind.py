@@ -203,8 +203,13 @@ class WindField:
     def reschedule(self, gusts: tuple[Gust, ...], changes: tuple[WindChange, ...]) -> None:
         """Let these gusts and steps of the mean take the place of those before, from the next physics step on."""
         ordered = sorted(changes, key=lambda change: change.at)
-        self._means = np.array([self._mean, *(change.velocity for change in ordered)], float)
-        self._change_times = np.array([change.at for change in ordered])
+        means = [self._mean]
+        times = []
+        for change in ordered:
+            means.append(change.velocity)
+            times.append(change.at)
+        self._means = np.array(means, float)
+        self._change_times = np.array(times)
         self._gusts = gusts
         self._wind = self._sum_up()
 

@@ -1,1 +1,1 @@
-"""What the laws are made of: the linear and the nonlinear MPC, feedback laws, attitudes, previews."""
+"""What the controllers are made of: the linear and the nonlinear MPC, baselines, attitudes, previews."""

@@ -31,11 +31,17 @@ class Measured:
 def motion_of(state: Array, attitude: Array | None = None, rates: Array | None = None) -> Measured:
     """Return the motion of a state (12,), with the attitude (4,) wxyz and body rates (3,) [rad/s] if given."""
     euler = state[list(EULER)]
+    if attitude is None:
+        matrix = body_to_world(euler)
+    else:
+        matrix = rotation(attitude)
+    if rates is None:
+        rates = euler_to_body_rates(euler, state[list(EULER_RATE)])
     return Measured(
         position=state[list(POSITION)],
         velocity=state[list(VELOCITY)],
-        attitude=body_to_world(euler) if attitude is None else rotation(attitude),
-        rates=euler_to_body_rates(euler, state[list(EULER_RATE)]) if rates is None else rates,
+        attitude=matrix,
+        rates=rates,
         yaw=float(euler[2]),
     )
 

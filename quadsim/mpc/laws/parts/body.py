@@ -1,4 +1,4 @@
-"""The rigid body of the nonlinear law in C: its numbers in the core's layout, and its motion from node to node."""
+"""The rigid body of the nonlinear controller in C: its numbers in the core's layout, its motion from node to node."""
 
 from __future__ import annotations
 

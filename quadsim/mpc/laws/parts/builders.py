@@ -1,4 +1,4 @@
-"""From the tables `[controller]` to what flies: a law (`quadsim.mpc.laws`), its guard and inner loop."""
+"""From the tables `[controller]` to what flies: a controller (`quadsim.mpc.laws`), its guard and inner loop."""
 
 from __future__ import annotations
 

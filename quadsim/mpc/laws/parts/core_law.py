@@ -1,7 +1,7 @@
-"""A robust law and its fallback contract as one controller of `quadsim_mpc.h`: a period is one call.
+"""A robust controller and its fallback contract as one controller of `quadsim_mpc.h`: a period is one call.
 
-It is the controller that is exported, with the numbers of the law that flies here.  Every usable answer has the same
-bits as by `quadsim.mpc.laws.parts.linear.LinearMPC` and `quadsim.mpc.guard.contract.Guard`.
+It is the controller that is exported, with the numbers of the controller that flies here.  Every usable answer has the
+same bits as by `quadsim.mpc.laws.parts.linear.LinearMPC` and `quadsim.mpc.guard.contract.Guard`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _FLYING: Final = constant("QUADSIM_PHASE_FLYING")
 
 
 class CoreNumbers(NamedTuple):
-    """The numbers of a law in C, but for those of its problem and of its fallback contract."""
+    """The numbers of a controller in C, but for those of its problem and of its fallback contract."""
 
     controller: Struct  # a `quadsim_controller`
     robust: Struct  # the `quadsim_robust` that it points to
@@ -47,7 +47,7 @@ class CoreLaw:
 
         Args:
             problem: the optimal control problem.
-            numbers: the law's.
+            numbers: the controller's.
             solver: the problem's, whose tables are shared.
             check: of each answer against the problem.
             fallback: the contract's `quadsim_fallback`.
@@ -160,13 +160,19 @@ class CoreLaw:
     @property
     def answered_by(self) -> tuple[str, ...]:
         """K sources of commands."""
-        return tuple(GAIN if method == Method.FREE else CORE for method in self._found[: self._k].tolist())
+        sources = []
+        for method in self._found[: self._k].tolist():
+            if method == Method.FREE:
+                sources.append(GAIN)
+            else:
+                sources.append(CORE)
+        return tuple(sources)
 
 
 def core_law(
     problem: Problem, numbers: CoreNumbers | None, solver: Solver, check: AnswerCheck, fallback: Struct
 ) -> CoreLaw | None:
-    """Return a law of these parts in the core; None where it is not C's alone, or would not have the same bits."""
+    """Return a controller of these parts in the core; None where it is not C's alone, or would have other bits."""
     if numbers is None or not isinstance(solver, Core) or not check.maps:
         return None
     return CoreLaw(problem, numbers, solver, check, fallback)

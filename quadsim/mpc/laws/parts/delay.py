@@ -27,7 +27,7 @@ def make_bodies(**models: RigidBody) -> Bodies:
 
 
 def adopt_sent(mine: Struct, numbers: Struct | None, its: Struct, its_numbers: Struct | None) -> None:
-    """Take over the commands in force and under way, and the actuators, of another law with like commands."""
+    """Take over the commands in force and under way, and the actuators, of another controller with like commands."""
     if numbers is None or its_numbers is None:
         return
     sent = np.array(its.sent)[: its_numbers.under_way + 1]

@@ -1,4 +1,4 @@
-"""Code shared by the feedback laws: a period from measurement to command, and the prediction model."""
+"""What controllers without a QP share: a period from measurement to command, and the prediction model."""
 
 from __future__ import annotations
 
@@ -45,13 +45,16 @@ class FeedbackLaw(ABC):
         self._turns.reset()
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """Return the law's command; on the ground the lowest speed, as fast as bounds allow; see `quadsim.controller`.
+        """Return the command; on the ground the lowest speed, as fast as bounds allow; see `quadsim.controller`.
 
         Raises:
-            CommandError: the state or the reference is not finite; no command is sent, and the law's state is
+            CommandError: the state or the reference is not finite; no command is sent, and the controller's state is
                 unchanged.
         """
-        before = (self._before if now.acting is None else now.acting)[: self.model.nu]
+        before = self._before
+        if now.acting is not None:
+            before = now.acting
+        before = before[: self.model.nu]
         if now.phase in GROUNDED:
             command = stopped(self.bounds.lowest(before), self.horizon, now.phase)
             self.reset(command.speeds)
@@ -83,7 +86,7 @@ class FeedbackLaw(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline(ControllerTable):
-    """The table of a baseline law; every field has a default."""
+    """The table of a baseline controller; every field has a default."""
 
     horizon: Annotated[
         int,
@@ -112,7 +115,7 @@ class Baseline(ControllerTable):
 
 @dataclass(frozen=True, kw_only=True)
 class Tuned(Baseline):
-    """A law whose gains follow from the period and a lag."""
+    """A controller whose gains follow from the period and a lag."""
 
     lag: Annotated[
         NonNegative | None,

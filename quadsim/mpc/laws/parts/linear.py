@@ -59,7 +59,7 @@ class Preparation(Protocol):
 
     @property
     def numbers(self) -> CoreNumbers | None:
-        """The numbers of a law that is C's; None for another."""
+        """The numbers of a controller that is C's; None for another."""
         ...
 
     @property
@@ -87,7 +87,7 @@ class Preparation(Protocol):
         ...
 
     def adopt(self, memory: Remembered | None, disturbance: Array | None) -> None:
-        """Take over what the previous law has learnt: its preparation's memory, if any, and its `disturbance`."""
+        """Take over what the previous controller has learnt: its preparation's memory, if any, its `disturbance`."""
         ...
 
     def stand(self, now: StepInputs, acting: Array) -> None:
@@ -200,7 +200,7 @@ class LinearMPC:
         Args:
             preparation: makes the query of each period.
             solver: the problem's (`quadsim.mpc.solvers.by_name.make_solver`).
-            name: of the law, in summaries.
+            name: of the controller, in summaries.
             holds: whether the last plan is held where a QP has no answer.
             space: the obstacles to avoid; None for none.
             kkt_every: interval of KKT checks [periods].
@@ -234,20 +234,21 @@ class LinearMPC:
             self._obstacles.reset()
 
     def adopt(self, previous: object) -> None:
-        """Take over what the previous law has learnt, and its plan, to hold if a QP has no answer."""
+        """Take over what the previous controller has learnt, and its plan, to hold if a QP has no answer."""
+        memory = None
         if isinstance(previous, LinearMPC):
-            law = previous
-        else:
-            law = None
-        if law is not None and law._plan is not None and self._holds:
-            self._plan = resized(law._plan, self.horizon)
-            self._held = law._held
-        self.preparation.adopt(None if law is None else law.preparation.memory, disturbance_of(previous))
+            memory = previous.preparation.memory
+            if previous._plan is not None and self._holds:
+                self._plan = resized(previous._plan, self.horizon)
+                self._held = previous._held
+        self.preparation.adopt(memory, disturbance_of(previous))
 
     @property
     def iterates(self) -> frozenset[str]:
         """See `quadsim.controller.Iterating`."""
-        return self._solver.iterates | frozenset({SPACE_SOLVER} if self._obstacles is not None else ())
+        if self._obstacles is None:
+            return self._solver.iterates
+        return self._solver.iterates | {SPACE_SOLVER}
 
     @property
     def trim(self) -> Trim | None:
@@ -285,7 +286,9 @@ class LinearMPC:
         answer, reason = self._check(problem, query, answer, reason)
         self.answer = answer
         if reason is None:
-            self._plan = answer.plan if self._holds else None
+            self._plan = None
+            if self._holds:
+                self._plan = answer.plan
             self._held = 0
             self._acting = self._bounds.clip(answer.plan[0], self._acting)
             return command_of(self._acting, answer.plan, answer.status, answer)
@@ -310,7 +313,7 @@ class LinearMPC:
         return self.preparation.predict(states, plans)
 
     def in_core(self, fallback: Struct) -> CoreLaw | None:
-        """Return the law with a fallback contract of these numbers in the core; None where it is not C's alone."""
+        """Return it with a fallback contract of these numbers in the core; None where it is not C's alone."""
         if self._holds or self._obstacles is not None:
             return None
         return core_law(self.problem, self.preparation.numbers, self._solver, self._check, fallback)
@@ -323,7 +326,7 @@ class LinearMPC:
 
 
 def linear_law(table: Bounded, preparation: Preparation, solver: Solver, space: Space | None = None) -> LinearMPC:
-    """Return the law of a table with the parts that it is made of; see `LinearMPC`."""
+    """Return the controller of a table with the parts that it is made of; see `LinearMPC`."""
     return LinearMPC(
         preparation,
         solver,

@@ -1,4 +1,4 @@
-"""What a nonlinear law is told, as `quadsim_nonlinear.c` takes it: measured states and references."""
+"""What a nonlinear controller is told, as `quadsim_nonlinear.c` takes it: measured states and references."""
 
 from __future__ import annotations
 

@@ -100,8 +100,8 @@ _LawStruct: Final = struct("quadsim_nonlinear")
 class NonlinearMPC:
     """One step of sequential quadratic programming per period, or more; see the module.
 
-    The law is in C, `quadsim_nonlinear.c`, around the program of `quadsim_nmpc.h`; exported controllers are the same
-    files.  Here it gets its numbers, its half-spaces and its clock, and its answers are checked.
+    The controller is in C, `quadsim_nonlinear.c`, around the program of `quadsim_nmpc.h`; exported controllers are the
+    same files.  Here it gets its numbers, its half-spaces and its clock, and its answers are checked.
 
     Attributes:
         settings: its table.
@@ -109,13 +109,13 @@ class NonlinearMPC:
         model: the rigid body from node to node.
         problem: what it solves in each step, at hover.
         program: the same for the core.
-        numbers: the law's own, for the core.
+        numbers: the controller's own, for the core.
         bodies: the numbers of the body over a control period, `period`, and of the same without lag of thrusts,
             `unlagged`, each with the array that it points to.
         delay: how late commands act, for the core; None for at once.
         delay_bodies: the bodies that it points to.
         ramp: what follows changing forces; None for nothing.
-        struct: what the law remembers, in C.
+        struct: what the controller remembers, in C.
         plan: (N, 4) its view of the commands of the last optimum.
         clock: returns the time [s].
         infeasible_period: the first period whose QP had no answer or, if there is none, whose SQP did not converge.
@@ -154,9 +154,8 @@ class NonlinearMPC:
         self.commands: str = settings.commands
         self.horizon = settings.horizon
         if bounds is None:
-            self._bounds = settings.actuators(vehicle)
-        else:
-            self._bounds = bounds
+            bounds = settings.actuators(vehicle)
+        self._bounds = bounds
         self.model = prediction_model(settings, vehicle, period)
         self.problem = nonlinear_problem(settings, vehicle, period, self.model, self._bounds, constraints)
         self._nodes = self.problem.horizon
@@ -165,18 +164,29 @@ class NonlinearMPC:
         self._space = space
         self._groups = slack_groups(self.problem, faces=space is not None and space.penalty is not None)
         stride = settings.stride(period)
+        shift = settings.shift
+        if shift is None:
+            shift = stride == 1
+        corrections = 0
+        if self.model.targets:
+            corrections = CORRECTIONS
+        faces = 0
+        price = None
+        if space is not None:
+            faces = space.count
+            price = space.penalty
         self.program = nonlinear_program(
             self.model,
             self.problem,
             inputs=np.stack([self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)]),
             difference=settings.attitude_error == "difference",
-            shift=stride == 1 if settings.shift is None else settings.shift,
+            shift=shift,
             iterations=settings.iterations,
-            corrections=CORRECTIONS if self.model.targets else 0,
+            corrections=corrections,
             tolerance=tolerance,
             converged=CONVERGED,
-            faces=0 if space is None else space.count,
-            price=None if space is None else space.penalty,
+            faces=faces,
+            price=price,
         )
         self.delay = None
         self.delay_bodies = Bodies()
@@ -192,11 +202,9 @@ class NonlinearMPC:
         without_lag = replace(body, rotor_lag=None, lag=(0.0, *self.model.lag[1:]), substeps=1)
         self.bodies = make_bodies(period=body, unlagged=without_lag)
         self._lag = self.model.lags[0]  # of actuator states [s]
-        observing = settings.offset_free
-        if observing is None:
-            self._observer = None
-        else:
-            self._observer = DisturbanceObserver(observing, period)
+        self._observer: DisturbanceObserver | None = None
+        if settings.offset_free is not None:
+            self._observer = DisturbanceObserver(settings.offset_free, period)
         self.ramp = self._make_ramp()
         self.numbers = self._make_numbers(stride)
         self._library = core_library()
@@ -212,10 +220,13 @@ class NonlinearMPC:
         model = self.model
         if settings.disturbance is None:
             return None
-        if settings.disturbance.rotor_lag is None:
+        lag = settings.disturbance.rotor_lag
+        if lag is None:
             lag = self._lag
-        else:
-            lag = settings.disturbance.rotor_lag
+        thrust_lag = None
+        if model.targets:
+            thrust_lag = self._lag
+        _, late = split_delay(settings.delay, self._period)
         return RampObserver(
             replace(settings.disturbance, rotor_lag=lag),
             self._vehicle,
@@ -223,14 +234,17 @@ class NonlinearMPC:
             drag=model.drag / model.mass,
             quadratic_drag=model.quadratic_drag / model.mass,
             moment=settings.moment,
-            thrust_lag=self._lag if model.targets else None,
-            late=split_delay(settings.delay, self._period)[1],
+            thrust_lag=thrust_lag,
+            late=late,
         )
 
     def _make_numbers(self, stride: int) -> Struct:
         vehicle = self._vehicle
         model = self.model
         observer = self._observer
+        left = 0.0  # of actuators' distance from their command after a period
+        if self._lag:
+            left = math.exp(-self._period / self._lag)
         numbers = _NumbersStruct(
             problem=ctypes.addressof(self.program.struct),
             stride=stride,
@@ -238,7 +252,7 @@ class NonlinearMPC:
             control_period=self._period,
             mass=vehicle.mass,
             coefficient=vehicle.mean_coefficient,
-            left=math.exp(-self._period / self._lag) if self._lag else 0.0,
+            left=left,
             least_lift=LEAST_LIFT,
             plausible=PLAUSIBLE.max(),
             infeasible=INFEASIBLE,
@@ -264,13 +278,15 @@ class NonlinearMPC:
         return numbers
 
     def _start(self) -> None:
-        """Start a law in new memory, with views of what Python reads and writes there."""
+        """Start a controller in new memory, with views of what Python reads and writes there."""
         p = self.program.struct
         N = self._nodes
         reals, ints = self.memory()
-        self._memory = np.zeros(reals), np.zeros(ints, np.intc)
+        real_memory = np.zeros(reals)
+        int_memory = np.zeros(ints, np.intc)
+        self._memory = real_memory, int_memory
         self.struct = law = _LawStruct()
-        self._library.quadsim_nonlinear_start(law, self.numbers, *(part.ctypes.data for part in self._memory))
+        self._library.quadsim_nonlinear_start(law, self.numbers, real_memory.ctypes.data, int_memory.ctypes.data)
         if self.ramp is not None:
             self.ramp.bind(law.ramp)
         self._work = work = law.work
@@ -279,7 +295,8 @@ class NonlinearMPC:
         measured = np.ctypeslib.as_array(law.measured)[: self.model.n]
         before = np.ctypeslib.as_array(law.before)
         self._asked = measured, before, core_view(law.states, N + 1, N_BODY), core_view(law.thrusts, N, N_ROTORS)
-        self._arguments = work, law.world, *(array.ctypes.data for array in self._asked)
+        addresses = [array.ctypes.data for array in self._asked]
+        self._arguments = work, law.world, *addresses
         size = self.model.n + N_ROTORS * bool(p.moves)
         self._x = core_view(work.x, N + 1, size)
         self._u = core_view(work.u, N, N_ROTORS)
@@ -304,10 +321,13 @@ class NonlinearMPC:
         self._price = core_view(work.price, N, p.slacks)
         self._free = core_view(work.free, N, p.slacks, kind=ctypes.c_int)
         self._held = core_view(work.held, N, N_ROTORS, kind=ctypes.c_int)
-        self._state, self._attitude, self._rates, self._acting = (np.zeros(size) for size in (N_STATES, 4, 3, N_ROTORS))
+        self._state = np.zeros(N_STATES)
+        self._attitude = np.zeros(4)
+        self._rates = np.zeros(3)
+        self._acting = np.zeros(N_ROTORS)
         self._preview = np.zeros((self.horizon, len(REFERENCE_STATES)))
         self._motion = np.zeros((self.motion_rows, WIDTH_OF_MOTION))
-        self._given = [array.ctypes.data for array in (self._state, self._attitude, self._rates)]
+        self._given = [self._state.ctypes.data, self._attitude.ctypes.data, self._rates.ctypes.data]
         self._references = self._preview.ctypes.data, self._motion.ctypes.data
         self._command = self._acting.ctypes.data
 
@@ -315,7 +335,8 @@ class NonlinearMPC:
         """Return the reals and integers of memory that it needs, with room for so many active rows in its program."""
         numbers = _NumbersStruct.from_buffer_copy(self.numbers)
         program = type(self.program.struct).from_buffer_copy(self.program.struct)
-        program.room = program.room if room is None else room
+        if room is not None:
+            program.room = room
         numbers.problem = ctypes.addressof(program)
         return self._library.quadsim_nonlinear_reals(numbers), self._library.quadsim_nonlinear_ints(numbers)
 
@@ -328,7 +349,9 @@ class NonlinearMPC:
     @property
     def motion_rows(self) -> int:
         """Samples that it takes of a course's motion: one more than there are until the last node's instant."""
-        return self.horizon + 1 + (0 if self.delay is None else self.delay.under_way + 1)
+        if self.delay is None:
+            return self.horizon + 1
+        return self.horizon + 1 + self.delay.under_way + 1
 
     def _shares(self, commands: Array) -> Array:
         """Return the inputs for commands (..., 4): rotor speeds [rad/s] or targets [N], [rad/s]."""
@@ -343,7 +366,7 @@ class NonlinearMPC:
         self.infeasible_period: InfeasiblePeriod | None = None
 
     def adopt(self, previous: object) -> None:
-        """Take over disturbance, rotor speeds and plan of the previous law, these only from one with like commands."""
+        """Take over the previous controller's disturbance, and from one with like commands rotor speeds and plan."""
         estimate = disturbance_of(previous)
         if isinstance(previous, NonlinearMPC):
             self._adopt_memory(previous)
@@ -389,10 +412,9 @@ class NonlinearMPC:
             self._acting[:] = now.acting
         elapsed = now.time - self._called_at
         self._called_at = now.time
+        periods = 0
         if math.isfinite(elapsed):
             periods = round(elapsed / self._period)
-        else:
-            periods = 0
         if now.phase in GROUNDED:
             self._library.quadsim_nonlinear_stand(self.struct, periods, self._command)
             self._acting[:] = self._bounds.lowest(self._acting)
@@ -402,10 +424,15 @@ class NonlinearMPC:
         if self.ramp is not None and now.phase is Phase.FLYING:
             self.ramp.log(now)
         first = self.infeasible_period
-        last_plan = self.stored_plan if first is None else None
+        last_plan = None
+        if first is None:
+            last_plan = self.stored_plan
         answer, code = self._iterate(now.time + self.settings.delay)
         status = STATUSES[code]
-        answer, reason = self._checked(answer, None if status in ACCEPTED else status)
+        refusal = None
+        if status not in ACCEPTED:
+            refusal = status
+        answer, reason = self._checked(answer, refusal)
         if reason is not None:
             if reason != INVALID_DATA and (first is None or first.converges is not None):
                 self.infeasible_period = self._kept_period(now.time, reason)
@@ -588,10 +615,9 @@ class NonlinearMPC:
         code: int = self._library.quadsim_nonlinear_end(self.struct, found)
         spent_s = clock.perf_counter() - started
         if found not in _OPTIMA:
-            nowhere = np.full((self._nodes, N_ROTORS), math.nan)
+            no_plan = np.full((self._nodes, N_ROTORS), math.nan)
             stats = Statistics(iterations=self.changes, solve_s=spent_s)
-            return Answer(nowhere, np.zeros((self._nodes, 0)), STATUSES[code], CORE, stats=stats), code
-        free = found is SQPStatus.FREE
+            return Answer(no_plan, np.zeros((self._nodes, 0)), STATUSES[code], CORE, stats=stats), code
         stats = Statistics(
             iterations=self.changes,
             active=self.active,
@@ -599,12 +625,20 @@ class NonlinearMPC:
             sqp_step=work.moved,
             solve_s=spent_s,
         )
+        if found is SQPStatus.FREE:
+            status = UNCONSTRAINED
+            answered_by = GAIN
+            method = Method.FREE
+        else:
+            status = SOLVED
+            answered_by = CORE
+            method = Method.WHOLE
         answer = Answer(
             self.inputs,
             self._slacks(self._groups),
-            UNCONSTRAINED if free else SOLVED,
-            GAIN if free else CORE,
-            method=Method.FREE if free else Method.WHOLE,
+            status,
+            answered_by,
+            method=method,
             stats=stats,
             certificate=self._certificate,
         )
@@ -649,7 +683,10 @@ class NonlinearMPC:
         """A (N, n, n), B (N, n, 4), c (N, n) of the program; under `tilt`, the thrust axis is two further states."""
         n = self.model.n
         inputs = self._offset.shape[1] - 3
-        A, B, c = (part.copy() for part in self._constant_steps)
+        constant_A, constant_B, constant_c = self._constant_steps
+        A = constant_A.copy()
+        B = constant_B.copy()
+        c = constant_c.copy()
         A[:, :N_BODY, 3:n] = self._map[:, :, : n - 3]
         B[:, :N_BODY] = self._map[:, :, inputs : inputs + N_ROTORS]
         c[:, :n] = self._offset[:, :n]
@@ -665,13 +702,11 @@ class NonlinearMPC:
         query = self._query()
         if problem is self.problem:
             form = self._form
-        else:
-            form = Staged(problem)
-        qp = form.assemble(query)
-        if problem is self.problem:
             groups = self._groups
         else:
+            form = Staged(problem)
             groups = slack_groups(problem)
+        qp = form.assemble(query)
         of_rows = multipliers(self.program, self._work, len(problem.rows.names), len(self.problem.rows.names))
         return qp, form.solution(query, qp, self.inputs, self._slacks(groups), of_rows)
 

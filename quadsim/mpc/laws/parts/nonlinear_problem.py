@@ -87,7 +87,7 @@ def nonlinear_problem(
     bounds: ActuatorBounds,
     constraints: tuple[Constraint, ...],
 ) -> Problem:
-    """Return the problem of a law with this model, at hover.
+    """Return the problem of a controller with this model, at hover.
 
     Args:
         settings: its table.
@@ -108,17 +108,23 @@ def nonlinear_problem(
     x[N_BODY:] = hover[: model.n - N_BODY]
     A, B, _ = linearise(model, x[None], hover[None])
     rows, weights = settings.outputs()
+    Q_d = None
+    if settings.weights.move:
+        Q_d = settings.weights.move * np.eye(N_ROTORS)
     objective = Objective(
         C_r=np.hstack([rows, np.zeros((len(rows), model.n - N_BODY))]),
         Q_y=np.diag(weights),
         Q_u=settings.weights.input * np.eye(N_ROTORS),
-        Q_d=settings.weights.move * np.eye(N_ROTORS) if settings.weights.move else None,
+        Q_d=Q_d,
     )
     linear = LinearModel(A=A[0], B=B[0], u_bar=hover, period=model.step)
+    Q, _ = objective.weights
     if settings.terminal == "lqr":
         P_end = _riccati(settings, linear, objective)
+    elif settings.terminal == "none":
+        P_end = 0.0 * Q
     else:
-        P_end = (0.0 if settings.terminal == "none" else float(settings.terminal)) * objective.weights[0]
+        P_end = settings.terminal * Q
     if settings.tilt is not None:  # two further states: the thrust axis along world x and y
         none = np.zeros((2, 2))
         A_axis = scipy.linalg.block_diag(linear.A, none)
@@ -128,16 +134,12 @@ def nonlinear_problem(
         objective = replace(objective, C_r=np.hstack([objective.C_r, np.zeros((len(rows), 2))]))
     lower = commands_to_inputs(model, vehicle, bounds.u_min)
     upper = commands_to_inputs(model, vehicle, bounds.u_max)
-    return Problem(
-        model=linear,
-        horizon=nodes,
-        objective=replace(objective, P=P_end),
-        constraints=(
-            Constraint(name="inputs", lower=lower, upper=upper, D=np.eye(N_ROTORS)),
-            *_own_bounds(settings, vehicle, model, bounds, linear.n, nodes, stride),
-            *(_of_states(constraint, vehicle, model, linear.n) for constraint in constraints),
-        ),
-    )
+    parts = [Constraint(name="inputs", lower=lower, upper=upper, D=np.eye(N_ROTORS))]
+    parts += _own_bounds(settings, vehicle, model, bounds, linear.n, nodes, stride)
+    for constraint in constraints:
+        parts.append(_of_states(constraint, vehicle, model, linear.n))
+    objective = replace(objective, P=P_end)
+    return Problem(model=linear, horizon=nodes, objective=objective, constraints=tuple(parts))
 
 
 def _own_bounds(

@@ -1,4 +1,4 @@
-"""The numbers of a law in C except those of its problem: members of the structs of quadsim_mpc.h, in their order."""
+"""The numbers of a controller in C except its problem's: members of the structs of quadsim_mpc.h, in their order."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ANSWER: Final = SUBSTEPS * constant("QUADSIM_ANSWER")
 
 @dataclass(frozen=True, kw_only=True)
 class Exportable:
-    """The data of a law in C."""
+    """The data of a controller in C."""
 
     name: str
     problem: Problem
@@ -47,7 +47,7 @@ class Exportable:
 
 
 def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
-    """Return the data of a table's law in C.
+    """Return the data of a table's controller in C.
 
     Raises:
         ExportError: the controller cannot be exported.
@@ -57,11 +57,14 @@ def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequenc
         raise ExportError(AVOIDS)
     if table.commands != ROTORS:
         raise ExportError(f'it is {table.type!r} with commands = "{table.commands}"; exported is "rotors"')
+    settings = None
+    if isinstance(table, Robust):
+        settings = table
     return Exportable(
         name=table.type,
         problem=table.problem(vehicle, period),
         vehicle=vehicle,
-        settings=table if isinstance(table, Robust) else None,
+        settings=settings,
         fallback=(table.fallback or USUAL_FALLBACK).within(table.output_bounds),
     )
 
@@ -78,29 +81,29 @@ def robust_numbers(settings: Robust, vehicle: Vehicle, period: float) -> dict[st
     whole, late = split_delay(settings.delay, period)
     effectiveness = np.asarray(vehicle.accelerations(vehicle.allocation), float)
     ixx, iyy, izz = vehicle.inertia
-    observing = settings.offset_free
-    if observing is None:
-        observer = None
-    else:
-        observer = DisturbanceObserver(observing, period)
+    gain = np.zeros(6)
+    largest = np.zeros(6)
+    if settings.offset_free is not None:
+        observer = DisturbanceObserver(settings.offset_free, period)
+        gain = observer.gain.copy()
+        largest = observer.largest
     air = air_maps(vehicle, 1.0)
     instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
 
     def decay(time: Array | float) -> Array:
         """Return the share of a deviation of rotor speeds that is left after a time [s]."""
-        return np.asarray(np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time)), float)
+        if not lag:
+            return np.zeros(np.shape(time))
+        return np.asarray(np.exp(-np.asarray(time) / lag), float)
 
-    answers = {name: np.zeros(ANSWER) for name in ("before", "delay", "period")}
-    if observer is None:
-        gain = np.zeros(6)
-    else:
-        gain = observer.gain.copy()
+    answer_before = answer_delay = answer_period = np.zeros(ANSWER)
     if settings.commands != ROTORS:
-        spans = {"before": period - late, "delay": late, "period": period}
-        answers = {name: inner_answer(settings, span) for name, span in spans.items()}
+        answer_before = inner_answer(settings, period - late)
+        answer_delay = inner_answer(settings, late)
+        answer_period = inner_answer(settings, period)
         gain[3:] = 0.0  # an inner loop balances the torque
     return {
-        "observes": int(observer is not None),
+        "observes": int(settings.offset_free is not None),
         "heading": int(settings.heading),
         "under_way": whole,
         "gravity": vehicle.gravity,
@@ -124,15 +127,15 @@ def robust_numbers(settings: Robust, vehicle: Vehicle, period: float) -> dict[st
         "loss": air.loss,
         "slope_inverse": np.asarray(np.linalg.inv(slope(hover_model(vehicle, period))), float),
         "gain": gain,
-        "largest": np.zeros(6) if observer is None else observer.largest,
+        "largest": largest,
         "decay_before": decay(instants * (period - late)),
         "decay_delay": decay(instants * late),
         "decay_period": decay(instants * period),
         "targets": int(settings.commands != ROTORS),
         "mass": vehicle.mass,
-        "answer_before": answers["before"],
-        "answer_delay": answers["delay"],
-        "answer_period": answers["period"],
+        "answer_before": answer_before,
+        "answer_delay": answer_delay,
+        "answer_period": answer_period,
         "plausible_state": PLAUSIBLE,
         "plausible_reference": PLAUSIBLE[list(REFERENCE_STATES)],
     }

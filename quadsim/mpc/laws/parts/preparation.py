@@ -96,7 +96,7 @@ class RobustPreparation:
         self._state = np.zeros(N_STATES)
         self._reference = np.zeros((N, 4))
         self._acting = np.zeros(N_ROTORS)
-        self._inputs = [array.ctypes.data for array in (self._state, self._reference, self._acting)]
+        self._inputs = [self._state.ctypes.data, self._reference.ctypes.data, self._acting.ctypes.data]
         self.reset(problem.model.u_bar)
 
     def __reduce__(self) -> NoReturn:
@@ -118,15 +118,21 @@ class RobustPreparation:
     @property
     def memory(self) -> Remembered:
         """See `quadsim.mpc.laws.parts.linear.Preparation`."""
+        ahead = None
+        estimate = None
+        if self._mpc.known:
+            ahead = self._ahead.copy()
+        if self._robust.observes:
+            estimate = self._estimate.copy()
         return Remembered(
             delay=self.delay,
             rotors=self._rotors.copy(),
             turning=self._turning.copy(),
             sent=tuple(self._sent.copy()),
-            ahead=self._ahead.copy() if self._mpc.known else None,
+            ahead=ahead,
             called_at=self._called_at,
             measured=self._measured,
-            estimate=self._estimate.copy() if self._robust.observes else None,
+            estimate=estimate,
             targets=bool(self._robust.targets),
         )
 

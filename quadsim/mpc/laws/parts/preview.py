@@ -1,4 +1,8 @@
-"""The derivatives of a reference now, from its next samples."""
+"""The derivatives of a reference now, from its next samples.
+
+A polynomial is fitted to the samples by least squares; its value and derivatives now are linear in them, with
+coefficients that are computed once (`differentiator`).  Baselines and the geometric controller take their target so.
+"""
 
 from __future__ import annotations
 

@@ -74,9 +74,12 @@ class SafetyFilter:
         steady_rows = _steady_rows(preparation.problem)
         self.problem = _feasibility(preparation.problem, steady_rows)
         self._actuators = ActuatorBounds.of_problem(self.problem)
-        # The same with soft constraints on states, except for the terminal one.
-        parts = self.problem.constraints
-        soft = replace(self.problem, constraints=tuple(p if p.C is None or p.name == END else _soft(p) for p in parts))
+        softened = []  # constraints on states, except for the terminal one
+        for part in self.problem.constraints:
+            if part.C is not None and part.name != END:
+                part = _soft(part)
+            softened.append(part)
+        soft = replace(self.problem, constraints=tuple(softened))
         self._nearest = _Nearest(self.problem)
         self._softened = _Nearest(soft)
         self._acting = self.requested = self.problem.model.u_bar.copy()
@@ -109,12 +112,14 @@ class SafetyFilter:
             answer, reason = self._checked(self._softened, query)
         if reason is not None:
             return refused(query.u_before, self.horizon, reason, answer)
-        plan = answer.plan
+        plan = answer.plan.copy()
+        command = plan[0]
         status = answer.status
-        plan = plan.copy()
-        passed = np.abs(plan[0] - self.requested).max() <= PASS_TOLERANCE
-        plan[0] = self._actuators.clip(self.requested if passed else plan[0], query.u_before)
-        return command_of(plan[0], plan, UNCONSTRAINED if passed else status, answer)
+        if np.abs(command - self.requested).max() <= PASS_TOLERANCE:
+            command = self.requested
+            status = UNCONSTRAINED
+        plan[0] = self._actuators.clip(command, query.u_before)
+        return command_of(plan[0], plan, status, answer)
 
     def _checked(self, nearest: _Nearest, query: Query) -> tuple[Answer, str | None]:
         """Return the answer of one QP and the reason to reject it, None for none; see `answer.AnswerCheck`."""
@@ -154,7 +159,8 @@ class _Nearest:
         self._backend.setup(replace(form.qp, P=self._P))
         rows = problem.rows
         origin = QPRows(problem).origin
-        self._ends = np.array([rows.names[row] == END for row in origin], bool)  # the terminal constraint's rows
+        ends = [rows.names[row] == END for row in origin]
+        self._ends = np.array(ends, bool)  # the terminal constraint's rows
         self._steady_rows = rows.C[origin[self._ends]]
 
     def problem_at(self, query: Query) -> Problem:

@@ -1,4 +1,4 @@
-"""Programs of the nonlinear law: their numbers for the core, which solves each exactly, and what its answers mean."""
+"""Programs of the nonlinear MPC: their numbers for the core, which solves each exactly, and what its answers mean."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class _StatedRow(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SQPProgram:
-    """The numbers of a program of the nonlinear law in the core's layout, and which of the problem's rows they are.
+    """The numbers of the nonlinear controller's program in the core's layout, and which of the problem's rows they are.
 
     Attributes:
         struct: the numbers.
@@ -109,7 +109,7 @@ def nonlinear_program(
     faces: int = 0,
     price: tuple[float, float] | None = None,
 ) -> SQPProgram:
-    """Return a problem of the nonlinear law as the core's numbers.
+    """Return a problem of the nonlinear controller as the core's numbers.
 
     Args:
         model: the rigid body.
@@ -132,7 +132,9 @@ def nonlinear_program(
     parts = {part.name: part for part in problem.every_constraint}
     tilt = parts.get("tilt")
     rates = parts.get("body_rates")
-    prices = [_price(tilt), _price(rates), (_HARD, 1.0) if price is None else _halved(*price)]
+    prices = [_price(tilt), _price(rates), (_HARD, 1.0)]
+    if price is not None:
+        prices[2] = _halved(*price)
     places = N_ROTORS + 2 * (tilt is not None) + 3 * (rates is not None)
     stated, groups = _stated(problem, places, prices)
     slack_scale = np.ones(len(prices))
@@ -140,6 +142,14 @@ def nonlinear_program(
         slack_scale[group] = problem.rows.slack_scale[slack]
     bounds = _bounds(stated, horizon)
     most_rows = horizon * (N_ROTORS + 3 * (tilt is not None) + 3 * (rates is not None) + len(stated) // 2 + faces)
+    terms: list[Any] = []
+    first_terms = [0]  # of each row, and the end
+    has_places = faces > 0
+    for row in stated:
+        for coefficient, entry, lag in row.terms:
+            terms.append(_TermStruct(coefficient, entry, lag))
+            has_places = has_places or entry >= places
+        first_terms.append(len(terms))
     struct = ProblemStruct(
         horizon=horizon,
         difference=difference,
@@ -147,7 +157,7 @@ def nonlinear_program(
         moves=moves,
         tilts=tilt is not None,
         turns=rates is not None,
-        places=bool(faces) or any(entry >= places for row in stated for _, entry, _ in row.terms),
+        places=has_places,
         rows=len(stated),
         bound_nodes=len(bounds),
         faces=faces,
@@ -177,14 +187,13 @@ def nonlinear_program(
         "left": body_numbers(model, struct),
         "terminal": terminal,
         "bounds": np.ascontiguousarray(bounds),
-        "first": np.cumsum([0, *(len(row.terms) for row in stated)], dtype=np.intc),
+        "first": np.array(first_terms, np.intc),
         "slack": np.array([row.slack for row in stated], np.intc),
         "linear": np.ascontiguousarray(linear),
         "quadratic": np.ascontiguousarray(quadratic),
     }
     for name, array in pointed.items():
         setattr(struct, name, array.ctypes.data)
-    terms = [_TermStruct(*term) for row in stated for term in row.terms]
     all_terms = (_TermStruct * max(len(terms), 1))(*terms)
     struct.terms = ctypes.addressof(all_terms)
     return SQPProgram(
@@ -245,8 +254,10 @@ def _price(part: Constraint | None) -> tuple[float, float]:
 
 def _first_rows(problem: Problem) -> dict[str, int]:
     """Return the first row of each constraint among the problem's rows."""
-    names = problem.rows.names
-    return {name: names.index(name) for name in dict.fromkeys(names)}
+    first: dict[str, int] = {}
+    for i, name in enumerate(problem.rows.names):
+        first.setdefault(name, i)
+    return first
 
 
 def _stated(
@@ -262,16 +273,25 @@ def _stated(
     """
     stated: list[_StatedRow] = []
     rows = problem.rows
-    states = {at: places + k for k, at in enumerate([*range(P.start, P.stop), *range(V.start, V.stop)])}
+    entry_of_state: dict[int, int] = {}
+    for state in (*range(P.start, P.stop), *range(V.start, V.stop)):
+        entry_of_state[state] = places + len(entry_of_state)
     groups: dict[int, int] = {}
     for i, name in enumerate(rows.names):
         if name in OWN_NAMES:
             _require_alike(name, rows.lower[:, i], rows.upper[:, i])
             continue
-        lag = 0 if rows.of_states[i] else 1
-        terms = [(float(rows.C[i, k]), states[int(k)], lag) for k in np.flatnonzero(rows.C[i])]
-        terms += [(float(rows.D[i, j] + rows.E[i, j]), int(j), 0) for j in np.flatnonzero(rows.D[i] + rows.E[i])]
-        terms += [(-float(rows.E[i, j]), int(j), 1) for j in np.flatnonzero(rows.E[i])]
+        lag = 1
+        if rows.of_states[i]:
+            lag = 0
+        terms = []
+        for k in np.flatnonzero(rows.C[i]).tolist():
+            terms.append((float(rows.C[i, k]), entry_of_state[k], lag))
+        now = rows.D[i] + rows.E[i]
+        for j in np.flatnonzero(now).tolist():
+            terms.append((float(now[j]), j, 0))
+        for j in np.flatnonzero(rows.E[i]).tolist():
+            terms.append((-float(rows.E[i, j]), j, 1))
         slack = int(rows.slack[i])
         if slack >= 0 and slack not in groups:
             groups[slack] = len(prices)
@@ -297,7 +317,9 @@ def _bounds(rows: list[_StatedRow], horizon: int) -> Array:
     for k, row in enumerate(rows):
         bounds[:, k] = np.minimum(row.bounds, _HARD)
     differing = np.flatnonzero((bounds != bounds[-1]).any(axis=1))
-    last = differing[-1] + 1 if differing.size else 0
+    last = 0
+    if differing.size:
+        last = differing[-1] + 1
     return bounds[: last + 1]
 
 
@@ -315,4 +337,7 @@ def slack_groups(problem: Problem, *, faces: bool = False) -> Indices:
         else:
             groups[slack] = count
             count = count + 1
-    return np.array([groups[slack] for slack in range(len(groups))] + [_OWN_SLACKS["space"]] * faces, int)
+    ordered = [groups[slack] for slack in range(len(groups))]
+    if faces:
+        ordered.append(_OWN_SLACKS["space"])
+    return np.array(ordered, int)
