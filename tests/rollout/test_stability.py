@@ -162,14 +162,17 @@ THEORY: dict[str, tuple[Callable[[str, float], float], float, float]] = {
     "thrust": (scaled, 1.0, 6.0),
 }
 MARGINS = [
-    *((law, "heading") for law in LAWS),
-    *((law, "delay") for law in LAWS),
-    *((law, "lag") for law in LAWS),
+    ("lqr", "heading"),
+    ("lqr", "delay"),
+    ("lqr", "lag"),
     ("paper-unconstrained", "thrust"),
 ]
+SLOW_MARGINS = [(law, quantity) for law in LAWS if law != "lqr" for quantity in ("heading", "delay", "lag")]
 
 
-@pytest.mark.parametrize(("law", "quantity"), MARGINS)
+@pytest.mark.parametrize(
+    ("law", "quantity"), [*MARGINS, *(pytest.param(*each, marks=pytest.mark.slow("stability")) for each in SLOW_MARGINS)]
+)
 def test_the_loop_loses_its_stability_where_the_eigenvalues_say(law: str, quantity: str) -> None:
     exponent_of, low, high = THEORY[quantity]
     margin = first_crossing(lambda value: exponent_of(law, value), low, high)

@@ -269,6 +269,6 @@ def test_wrong_names_are_refused() -> None:
 
 
 def test_the_command_prints_json_alone(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["stability", "hover", "--over", "heading", "--set", "controller.horizon=30", "--json"]) == 0
+    assert main(["stability", "hover", "--over", "heading", "--set", "controller=lqr", "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["loops"][0]["margins"]["heading"]["unit"] == "deg"
