@@ -52,7 +52,7 @@ VARYING: Final = (
 """Patterns of what differs from one time to the next, with what is kept of it."""
 ROUNDING: Final = re.compile(r" *-?\b\d(\.\d+e-0?[78]|(\.\d+)?e-(0?9|[1-9]\d))\b")
 """A number that only rounding made; a tolerance of 1e-08 stays."""
-PROGRESS: Final = re.compile(r"quadsim: .* after \d+ s")
+PROGRESS: Final = re.compile(r"quadsim: .* \d+ s so far")
 
 PUSHED: Final = """
 base = "hover"
