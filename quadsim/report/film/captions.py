@@ -36,7 +36,7 @@ _MOST_LINES: Final = 10  # of the statement at the end: more would reach the str
 _WIDEST: Final = 140  # letters of a line, between the frame's edge and the legend
 
 
-class Line(NamedTuple):
+class Caption(NamedTuple):
     """A line of text in the upper left corner."""
 
     text: str
@@ -102,52 +102,52 @@ class Overlay:
                 return limit
         return None
 
-    def _headlines(self, i: int) -> list[Line]:
+    def _headlines(self, i: int) -> list[Caption]:
         """The lines in the corner."""
         time = self._footage.times[i]
         clock = f"t = {time:.2f} s"
         if self._speed != 1.0:
             clock += f"   {self._speed:g} times real speed"
         lines = [
-            Line(self._run.name, 21, ink.WHITE),
-            Line(self._subtitle, 14, ink.GREY),
-            Line(clock, 20, ink.WHITE),
+            Caption(self._run.name, 21, ink.WHITE),
+            Caption(self._subtitle, 14, ink.GREY),
+            Caption(clock, 20, ink.WHITE),
             self._answer(self._footage.period[i]),
         ]
         if self._footage.wind is not None:
             wind = np.linalg.norm(self._footage.wind[i])
-            lines.append(Line(f"wind {wind:.2g} m/s", 14, ON_DARK.disturbance))
+            lines.append(Caption(f"wind {wind:.2g} m/s", 14, ON_DARK.disturbance))
         if self._footage.force is not None:
             force = np.linalg.norm(self._footage.force[i])
-            lines.append(Line(f"external force {force:.2g} N", 14, ON_DARK.disturbance))
+            lines.append(Caption(f"external force {force:.2g} N", 14, ON_DARK.disturbance))
         lines += self._recent_events(time)
         reason = self._run.log.reason
         if reason is not None and time >= self._run.log.control.t[-1]:
-            lines.append(Line(f"aborted {reason}"[:130], 15, ON_DARK.violated))
+            lines.append(Caption(f"aborted {reason}"[:130], 15, ON_DARK.violated))
         if time >= self._footage.times[-1] - _ENDING * self._speed:
             lines += self._failures()
         return lines
 
-    def _recent_events(self, time: float) -> list[Line]:
+    def _recent_events(self, time: float) -> list[Caption]:
         """The flight's events shortly before a time [s], the latest ones."""
         recent = []
         for event in self._run.events:
             if 0.0 <= time - event["time"] <= _EVENT_TIME * self._speed:
-                recent.append(Line(event["text"][:_WIDEST], 15, ON_DARK.warning))
+                recent.append(Caption(event["text"][:_WIDEST], 15, ON_DARK.warning))
         return recent[-_MOST_EVENTS:]
 
-    def _failures(self) -> list[Line]:
+    def _failures(self) -> list[Caption]:
         """What failed other than a constraint."""
         lines = []
         for sentence in self._run.failures:
             for part in textwrap.wrap(sentence, _WIDEST):
-                lines.append(Line(part, 14, ON_DARK.warning))
+                lines.append(Caption(part, 14, ON_DARK.warning))
         if len(lines) > _MOST_LINES:
-            rest = Line("... all of it is in summary.json", 14, ON_DARK.warning)
+            rest = Caption("... all of it is in summary.json", 14, ON_DARK.warning)
             return [*lines[:_MOST_LINES], rest]
         return lines
 
-    def _answer(self, k: int) -> Line:
+    def _answer(self, k: int) -> Caption:
         """Phase, where the flight has a ground, and what the controller answered in period k; red for a failure."""
         control = self._run.log.control
         status = control.status[k]
@@ -165,7 +165,7 @@ class Overlay:
         if control.iterations[k]:
             phrases += [f"{control.iterations[k]} iterations", f"{control.active[k]} active"]
         failed = fallback != 0 or status not in OPTIMAL | {Phase.LANDED}
-        return Line("  ·  ".join(phrases), 14, _red_if(failed, otherwise=ON_DARK.satisfied))
+        return Caption("  ·  ".join(phrases), 14, _red_if(failed, otherwise=ON_DARK.satisfied))
 
     def _position(self, painter: Painter, x: float, y: float, i: int) -> None:
         painter.text(x + 118, y, "now", size=13, colour=ink.GREY, anchor="ra")
