@@ -15,7 +15,7 @@ from quadsim.controller import OPTIMAL, Phase, counts
 from quadsim.flight.audit import VERDICT_TEXT, Finding
 from quadsim.flight.record import FlightRecord
 from quadsim.mpc.laws import law_name
-from quadsim.report.comparison_rows import NOT_REQUIRED, required, rounded_margin, tracking_values
+from quadsim.report.comparison_rows import NOT_REQUIRED, required, rounded_margin, tracking_values, verdict_mark
 from quadsim.report.flight_sentences import (
     crash,
     departing,
@@ -24,7 +24,7 @@ from quadsim.report.flight_sentences import (
     violated_otherwise,
     violated_unrequired,
 )
-from quadsim.report.table import ABSENT, short_number
+from quadsim.report.table import ABSENT, Cell, short_number
 
 _MOST_NAMED: Final = 3  # violated constraints named in the first line
 _SPARE: Final = ("beyond", "sampled", "plant", "bounds")  # columns that a narrow console does without, in this order
@@ -181,13 +181,9 @@ def _audit_legend(findings: Sequence[Finding], lines: Sequence[tuple[str | Text,
 
 def _verdict(finding: Finding) -> Text:
     text = VERDICT_TEXT[finding.verdict]
-    if finding.verdict == "satisfied":
-        return console.styled((text, "green"))
-    if finding.verdict == "incomplete":
-        return console.styled((text, "yellow"))
-    if finding.limit.required:
-        return console.styled((text, "red"))
-    return console.styled((f"{text}*", "yellow"))
+    if finding.verdict == "violated" and not finding.limit.required:
+        text += "*"
+    return console.styled_cell(Cell(text=text, mark=verdict_mark(finding)))
 
 
 def _tracking_table(flight: FlightRecord) -> Table:

@@ -17,7 +17,7 @@ from quadsim.palette import ON_DARK
 from quadsim.report.film import painter as ink
 from quadsim.report.film.frames import Filmed, Footage, MarginTrack, ranked_tracks
 from quadsim.report.film.painter import Painter, Picture, shade, text_width
-from quadsim.report.table import ABSENT
+from quadsim.report.table import ABSENT, signed_number
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
 
 _STRIP: Final = 150  # height of the bottom strip, in design pixels of a 1280 x 720 frame
@@ -177,24 +177,24 @@ class Overlay:
         for j, (name, state) in enumerate(zip(REFERENCE_NAMES, REFERENCE_STATES, strict=True)):
             unit = "m"
             factor = 1.0
-            digits = 2
+            decimals = 2
             undefined = False
             if state == INDEX["yaw"]:
                 unit = "deg"
                 factor = math.degrees(1.0)
-                digits = 1
+                decimals = 1
                 undefined = tilt is not None and bool(tilt[i] > 0.5 * math.pi)  # there is no heading upside down
             now = factor * values[j]
             target = factor * reference[j]
-            shown = _signed(now, digits)
-            error = _signed(now - target, digits)
+            shown = signed_number(now, decimals)
+            error = signed_number(now - target, decimals)
             if undefined:
                 shown = ABSENT
                 error = ABSENT
             row = y + 24 + 27 * j
             painter.text(x, row, f"{name} [{unit}]", colour=ink.GREY)
             painter.text(x + 118, row, shown, colour=ink.WHITE, anchor="ra")
-            painter.text(x + 192, row, _signed(target, digits), colour=ON_DARK.reference, anchor="ra")
+            painter.text(x + 192, row, signed_number(target, decimals), colour=ON_DARK.reference, anchor="ra")
             painter.text(x + 262, row, error, colour=ink.GREY, anchor="ra")
 
     def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:
@@ -218,7 +218,8 @@ class Overlay:
             span = 2.0 * max(map(abs, bounds), default=15.0)
         broken = _breaks(limit, value)
         painter.text(x, y, name, size=17)
-        painter.text(x + 262, y, _signed(value, 2), size=17, colour=_red_if(broken, otherwise=ink.WHITE), anchor="ra")
+        colour = _red_if(broken, otherwise=ink.WHITE)
+        painter.text(x + 262, y, signed_number(value, 2), size=17, colour=colour, anchor="ra")
         painter.box(x, y + 25, 262, 9, ink.FAINT)
         centre = x + 131
         unit = 131 / span
@@ -285,7 +286,7 @@ class Overlay:
             pitch = 18.5
         for j, track in enumerate(shown):
             row = y + 22 + pitch * j
-            worst = f"{_signed(track.worst[i], 2)} {track.limit.unit}"
+            worst = f"{signed_number(track.worst[i], 2)} {track.limit.unit}"
             name_colour = _red_if(track.violated[i], otherwise=ink.GREY)
             worst_colour = _red_if(track.violated_before[i], otherwise=ink.WHITE)
             painter.text(x, row, track.limit.name, size=14, colour=name_colour)
@@ -305,11 +306,6 @@ def margin_rows(ranked: Sequence[MarginTrack], i: int) -> tuple[list[MarginTrack
     if parts:
         rest = f"and {', '.join(parts)}"
     return begun[:_MOST_MARGINS], rest
-
-
-def _signed(value: float, digits: int) -> str:
-    """A number with its sign, but no "-0.00"."""
-    return f"{round(value, digits) + 0.0:+.{digits}f}"
 
 
 def _red_if(broken: object, *, otherwise: str) -> str:
