@@ -1,10 +1,8 @@
 """What the clients of a live session's page may send: every message is checked before anything acts on it.
 
-A message of a kind that this page has no use for, with a number that is not finite, or of another form is dropped.
-What is no message of viser's at all ends that client's connection, and no other.
-
-All pages share the widgets, so that what a watcher gives would be the driver's next value: only the driver changes a
-widget, and only to a value that the widget itself offers.
+A message of a kind that this page has no use for, with a number that is not finite, or of another form is dropped;
+what is no message of viser's at all ends that client's connection, and no other.  All pages share the widgets: only
+the driver changes one, and only to a value that the widget itself offers.
 """
 
 from __future__ import annotations
@@ -14,6 +12,8 @@ from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, Final
 
 from viser import _messages
+
+from quadsim.features.live.readout import NOT_DRIVING
 
 Handler = Callable[[int, Any], Awaitable[None]]
 _LONGEST: Final = 1000  # characters of a text, or entries of a list
@@ -94,7 +94,7 @@ class Incoming:
         page = self._server.get_clients().get(client)
         if page is None:
             return
-        page.add_notification("You watch", "Another page has the controls: Take the controls changes that.")
+        page.add_notification(*NOT_DRIVING)
         if not widget._impl.is_button:
             in_force = _messages.GuiUpdateMessage(widget._impl.uuid, {"value": widget.value})
             page._websock_connection.queue_message(in_force)

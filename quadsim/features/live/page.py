@@ -27,13 +27,16 @@ from viser import _messages
 
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.features.live import readout
-from quadsim.features.live.controls import BREAKS, ControllerTab, Steering, Widgets, disturb
+from quadsim.features.live.controller_tab import ControllerTab
+from quadsim.features.live.disturb_tab import disturb
 from quadsim.features.live.guard import Guard
 from quadsim.features.live.incoming import Incoming
 from quadsim.features.live.look import dressed
 from quadsim.features.live.pace import Pace
 from quadsim.features.live.session import Frame, Session
 from quadsim.features.live.stage import FIELD, VIEW, Stage
+from quadsim.features.live.steering_tab import Steering
+from quadsim.features.live.widgets import BREAKS, Widgets
 from quadsim.mpc.laws import law_name
 from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import least_range

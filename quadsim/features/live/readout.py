@@ -11,6 +11,7 @@ from quadsim.controller import OPTIMAL, Command
 from quadsim.features.live.session import Frame
 from quadsim.flight.audit import Limit
 from quadsim.palette import COLOUR, line_colour
+from quadsim.report.table import signed_number
 
 NEAR: Final = 0.1  # share of a bound's half band within which the row is marked
 _FULL_BAR: Final = 1.2  # shares of a bound that a whole bar stands for: what is beyond the bound shows too
@@ -20,6 +21,8 @@ HINTS: Final = {
     "break": "<b>Break a rotor</b> with the button in the panel",
 }
 
+NOT_DRIVING: Final = ("You watch", "Another page has the controls: Take the controls changes that.")
+"""Title and text of what a watcher is told who changes something."""
 WATCH: Final = (
     "<style>.mantine-Button-root:not([style*=orange]),.mantine-Slider-root,.mantine-Input-wrapper{opacity:.45}</style>"
     '<div class="q"><div class="watch">You watch; another page has the controls.</div></div>'
@@ -224,7 +227,7 @@ def _number(limit: Limit, margin: float) -> str:
     if math.isnan(margin):
         return ""
     decimals = max(0, 2 - math.floor(math.log10(limit.half_band)))
-    text = f"{round(margin, decimals) + 0.0:+.{decimals}f}"
+    text = signed_number(margin, decimals)
     if limit.violated(margin):
         return f'<span class="bad" title="violated">{text}</span>'
     return text

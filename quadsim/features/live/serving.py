@@ -18,8 +18,9 @@ from quadsim.console.progress import reporting
 from quadsim.console.results import EXIT_DONE, EXIT_FAILED, Document
 from quadsim.errors import MissingPackageError, ParameterError
 from quadsim.features.live.guard import LOOPBACK
+from quadsim.features.live.inputs import read_script
 from quadsim.features.live.pace import Pace
-from quadsim.features.live.session import Session, read_script
+from quadsim.features.live.session import Session
 from quadsim.interrupts import SignalHold
 from quadsim.mpc.laws import law_name
 from quadsim.outputs import run_directory

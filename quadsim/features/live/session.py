@@ -11,25 +11,21 @@ import math
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from annotated_types import Ge, Le, doc
-from pydantic import Field
 
-from quadsim.assets import read_toml
 from quadsim.console.progress import Progress, silent
 from quadsim.controller import Predicting
 from quadsim.errors import FlightError, InputError, ParameterError
-from quadsim.fields import FLOORS, Fraction, Vector
+from quadsim.features.live.inputs import HELD, HeldInput, Pull, Script, Steer, Wear, without_time
+from quadsim.fields import Vector
 from quadsim.flight.audit import COMMAND_SIGNALS, Limit
 from quadsim.rollout.flight_events import Successor
 from quadsim.rollout.flown import Flight
 from quadsim.rollout.rollout import Rollout
 from quadsim.scenarios.assembly import Assembly, preferring_core
 from quadsim.scenarios.schema.controllers import AnyController
-from quadsim.scenarios.schema.events import Event
 from quadsim.scenarios.schema.problems import parse_table
 from quadsim.scenarios.schema.scenario import Scenario
 from quadsim.sim.effects.load import Load, MassChange
@@ -41,60 +37,6 @@ from quadsim.vehicle import Vehicle, span
 
 STIFFNESS: Final = 0.4  # of the spring that a person pulls by, in weights of the vehicle per metre
 STRONGEST: Final = 0.3  # largest pull in weights of the vehicle
-HELD: Final = ("pull", "wear", "steer")  # inputs in force until they are changed; the others are events
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pull:
-    """A spring from the vehicle to a point in the world, active until released."""
-
-    type: Literal["pull"]
-    to: Annotated[Vector | None, doc("[m] world; absent to let go")] = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Wear:
-    """A rotor's loss of thrust, held."""
-
-    type: Literal["wear"]
-    rotor: Annotated[int, Ge(1), Le(4)]
-    loss: Fraction
-
-
-@dataclass(frozen=True, kw_only=True)
-class Steer:
-    """The set-point's velocity, held."""
-
-    type: Literal["steer"]
-    velocity: Annotated[Vector, doc("[m/s]")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _HeldInput:
-    """Declares an input that is in force until it is changed."""
-
-    input: Annotated[Pull | Wear | Steer, Field(discriminator="type")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Inputs:
-    """Declares the inputs of a script."""
-
-    inputs: list[Annotated[Event | Pull | Wear | Steer, Field(discriminator="type")]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Script:
-    """A session without a browser: inputs as `Session.submit` takes them, and the times [s] at which they are given."""
-
-    duration: Annotated[float, Ge(FLOORS["s"]), Le(36_000.0), doc("[s] of the session")]
-    inputs: list[dict[str, Any]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        for i, entry in enumerate(self.inputs):
-            at = entry.get("at")
-            if not isinstance(at, int | float) or isinstance(at, bool) or not 0.0 <= at < self.duration:
-                raise ParameterError("", f"inputs.{i}.at", at, f"below duration = {self.duration} s, and 0 or more")
 
 
 @dataclass(frozen=True)
@@ -334,7 +276,7 @@ class Session:
             progress("session", self.k, round(script.duration / self.period))
             while waiting and waiting[0][1]["at"] <= time + 1e-9:
                 i, entry = waiting.popleft()
-                self.submit(_without_time(entry), name=f"inputs.{i} at t = {time:.3f} s: ")
+                self.submit(without_time(entry), name=f"inputs.{i} at t = {time:.3f} s: ")
             refused += self.advance().refused
         return refused
 
@@ -352,7 +294,7 @@ class Session:
         """Apply an input; a controller event only to the first flight."""
         kind = table.get("type")
         if kind in HELD:
-            self._hold(parse_table(_HeldInput, {"input": table}, "input").input)
+            self._hold(parse_table(HeldInput, {"input": table}, "input").input)
         elif kind == "controller":
             self.flights[0].apply(table, successor)
         else:
@@ -457,28 +399,6 @@ def looping(scenario: Scenario) -> Scenario:
     reference = copy.copy(scenario.reference)  # with the content that a table may have in memory
     vars(reference).update(repeat=length)
     return scenario.altered(reference=reference)
-
-
-def read_script(path: str | Path) -> Script:
-    """Read a script.
-
-    Raises:
-        InputError: it is malformed, or an input is wrong whatever the scenario.
-    """
-    script = parse_table(Script, read_toml(Path(path)), str(path), file="script")
-    inputs = []
-    for entry in script.inputs:
-        if entry.get("type") in HELD:
-            inputs.append(_without_time(entry))
-        else:
-            inputs.append(entry)
-    parse_table(_Inputs, {"inputs": inputs}, str(path), file="script")
-    return script
-
-
-def _without_time(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an entry of a script without the time at which it is given."""
-    return {key: value for key, value in entry.items() if key != "at"}
 
 
 def _in_hover(signal: str, vehicle: Vehicle) -> Array:
